@@ -1,0 +1,103 @@
+"""Patients are found by scanning this folder: a patient is one file with `Parameters` and `make`.
+
+`Parameters` is a frozen dataclass of numbers with defaults; `make(parameters)` gives a `Muscle` at rest.
+A file in TOML or JSON names one of them and overrides its parameters::
+
+    patient = "paper"
+    [parameters]
+    damping_ratio = 0.8
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import json
+import math
+import pkgutil
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from hardware_sim import patients
+from hardware_sim.errors import PatientError
+from hardware_sim.patients.muscle import Muscle
+
+
+def names() -> list[str]:
+    """Names of the patients there are, in alphabetical order."""
+    return sorted(_modules())
+
+
+def make(name: str, parameters: Mapping[str, float] | None = None) -> Muscle:
+    """The named patient at rest, with some of its parameters overridden.
+
+    Raises
+    ------
+    PatientError
+        There is no such patient, or it has no such parameter, or a value is no finite number.
+    """
+    modules = _modules()
+    if name not in modules:
+        raise PatientError(f"patient '{name}' is neither a file nor one of {', '.join(sorted(modules))}")
+    module = modules[name]
+    known = [field.name for field in dataclasses.fields(module.Parameters)]
+    for key, value in (parameters or {}).items():
+        if key not in known:
+            raise PatientError(f"patient '{name}' has no parameter '{key}'; it has {', '.join(known)}")
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            raise PatientError(f"parameter '{key}' must be a finite number, not {value!r}")
+        if key.endswith(("_s", "_ma", "_us")) and not value > 0:
+            raise PatientError(f"parameter '{key}' must be above zero, not {value!r}")
+    return module.make(module.Parameters(**(parameters or {})))
+
+
+def from_file(path: Path) -> Muscle:
+    """The patient that a TOML or JSON file describes.
+
+    Raises
+    ------
+    PatientError
+        The file cannot be read, is malformed, or describes no patient; names the file.
+    """
+    described = _read(path)
+    unknown = sorted(set(described) - {"patient", "parameters"})
+    if unknown:
+        raise PatientError(
+            f"{path}: unknown key '{unknown[0]}'; a patient's file has 'patient' and 'parameters'"
+        )
+    parameters = described.get("parameters", {})
+    if not isinstance(parameters, dict):
+        raise PatientError(f"{path}: 'parameters' must be a table of names and numbers")
+    try:
+        return make(str(described.get("patient", "paper")), parameters)
+    except PatientError as error:
+        raise PatientError(f"{path}: {error}") from None
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        text = path.read_text(encoding="utf-8")
+        described = json.loads(text) if path.suffix.lower() == ".json" else tomllib.loads(text)
+    except (OSError, UnicodeDecodeError) as error:
+        raise PatientError(f"{path}: cannot be read ({error}); give a readable TOML or JSON file") from None
+    except ValueError as error:  # both decoders' errors name line and column
+        raise PatientError(
+            f"{path}: not valid {'JSON' if path.suffix == '.json' else 'TOML'}: {error}"
+        ) from None
+    if not isinstance(described, dict):
+        raise PatientError(f"{path}: must hold a table with 'patient' and 'parameters'")
+    return described
+
+
+def _modules() -> dict[str, ModuleType]:
+    found = {}
+    for entry in pkgutil.iter_modules(patients.__path__):
+        if entry.ispkg or entry.name in {"muscle", "registry"}:
+            continue
+        module = importlib.import_module(f"{patients.__name__}.{entry.name}")
+        if hasattr(module, "Parameters") and hasattr(module, "make"):
+            found[entry.name] = module
+    return found
