@@ -1,0 +1,47 @@
+# stimrig: two commands on a fresh machine, `make demo` and `make test`; beside them `make serve` and `make bench`.
+SHELL := /bin/bash
+.SHELLFLAGS := -eu -o pipefail -c
+VENV := .venv
+BIN := $(VENV)/bin
+export PYTHONUNBUFFERED = 1
+
+.PHONY: demo test serve bench check lint lock clean help setup setup-test
+
+help:
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
+
+demo: setup ## one whole pre-session test on the emulated rig, with its report
+	@$(BIN)/stimrig demo
+
+serve: setup ## service and page on 127.0.0.1:8000 (emulated rig unless RIG=file is given)
+	@$(BIN)/stimrig serve $(if $(RIG),--rig $(RIG))
+
+test: setup-test lint ## every check and every test
+	@$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+lint: setup-test ## style, types, layers
+	@echo "== ruff"; $(BIN)/ruff check . ; $(BIN)/ruff format --check .
+	@echo "== import-linter"; $(BIN)/lint-imports --no-cache
+	@echo "== types"; $(BIN)/basedpyright --level error
+
+bench: $(VENV)-bench/.bench ## the figures in docs/, measured on this machine
+	@$(VENV)-bench/bin/python -m bench
+
+setup: $(VENV)/.run ## the virtual environment from the hash-locked list
+
+setup-test: $(VENV)/.test ## what tests need, a browser included
+
+$(VENV)/.run: requirements/run.txt pyproject.toml deploy/setup.sh
+	@bash deploy/setup.sh run
+
+$(VENV)/.test: requirements/test.txt pyproject.toml deploy/setup.sh
+	@bash deploy/setup.sh test
+
+$(VENV)-bench/.bench: requirements/bench.txt pyproject.toml deploy/setup.sh
+	@bash deploy/setup.sh bench
+
+lock: ## resolve the locked lists anew (needs uv; for maintainers)
+	@bash deploy/lock.sh
+
+clean: ## remove the environment and what tools left
+	@rm -rf $(VENV) $(VENV)-bench build *.egg-info .ruff_cache .pytest_cache

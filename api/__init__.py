@@ -1,0 +1,1 @@
+"""The front doors: REST, page, command line. Never imports a driver."""

@@ -1,0 +1,19 @@
+#!/usr/bin/env bash
+# Resolve the three locked lists: hashes of every wheel for Python 3.11 and later, no index lines.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+compile() { # name, extras…
+  local out=requirements/$1.txt; shift
+  local extras=(); for e in "$@"; do extras+=(--extra "$e"); done
+  uv pip compile pyproject.toml "${extras[@]}" --universal --python-version 3.11 --generate-hashes \
+    --no-emit-index-url --no-emit-find-links --no-annotate --no-header --quiet --upgrade \
+    "${constraint[@]}" -o "$out"
+}
+constraint=()
+compile run build
+pins=$(mktemp); trap 'rm -f "$pins"' EXIT
+grep -E '^[a-z0-9_-]+==' requirements/run.txt | sed 's/ \\$//' > "$pins"
+constraint=(-c "$pins") # tests run with the very versions that users run
+compile test build test
+constraint=() # the peers ask for an older scipy: the bench has an environment of its own
+compile bench build bench

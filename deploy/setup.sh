@@ -1,0 +1,60 @@
+#!/usr/bin/env bash
+# Set up .venv from a hash-locked list: deploy/setup.sh run|test|bench
+# Debian packages are installed only where they are missing, and only as root.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+what=$1
+venv=.venv
+[ "$what" = bench ] && venv=.venv-bench # the peers pin an older scipy
+
+say() { printf '\033[1m[setup]\033[0m %s\n' "$*"; }
+
+debian() { # install Debian packages, as root, only those that are missing
+  local missing=()
+  for package in "$@"; do
+    dpkg-query -W -f='${Status}' "$package" 2>/dev/null | grep -q 'ok installed' || missing+=("$package")
+  done
+  [ ${#missing[@]} -eq 0 ] && return 0
+  if [ "$(id -u)" -ne 0 ]; then
+    say "missing Debian packages: ${missing[*]}. As root: apt-get install ${missing[*]}" >&2
+    exit 1
+  fi
+  say "installing Debian packages: ${missing[*]}"
+  apt-get update -qq
+  DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends "${missing[@]}" >/dev/null
+}
+
+find_python() { # the first Python of 3.11 or later
+  local candidate
+  for candidate in python3 python3.13 python3.12 python3.11; do
+    if command -v "$candidate" >/dev/null 2>&1 &&
+      "$candidate" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then
+      command -v "$candidate"
+      return
+    fi
+  done
+}
+
+python=$(find_python)
+if [ -z "$python" ]; then
+  debian python3 python3-venv
+  python=$(find_python)
+  [ -n "$python" ] || { say "stimrig needs Python 3.11 or later" >&2; exit 1; }
+fi
+if ! [ -x $venv/bin/python ]; then
+  "$python" -c 'import ensurepip, venv' 2>/dev/null || debian python3-venv
+  say "virtual environment in $venv ($("$python" --version))"
+  "$python" -m venv $venv
+fi
+
+say "installing the locked list requirements/$what.txt (the first time takes a minute or two)"
+$venv/bin/python -m pip install --quiet --disable-pip-version-check --require-hashes -r "requirements/$what.txt"
+$venv/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+
+if [ "$what" = test ] && ! command -v chromium >/dev/null 2>&1; then
+  debian chromium
+fi
+touch "$venv/.$what"
+# The test list holds the run list.
+if [ "$what" = test ]; then touch "$venv/.run"; fi
+say "ready"

@@ -1,0 +1,1 @@
+"""Identification and criticism of electrically stimulated muscle. Pure: arrays in, model out."""

@@ -1,0 +1,120 @@
+"""Second-order muscle dynamics on the grid of pulses, exact for a held input.
+
+The linear block of the paper in physical terms, T² y'' + 2 ζ T y' + y = w, with w held over each pulse interval.
+The state (y, y') is carried from one pulse to the next by the matrix exponential; inside an interval y is a smooth
+curve, recovered to micronewton-metres by a cubic through the states at its two ends. A delay therefore needs no
+states of its own: it shifts the times at which the curve is read.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.signal import lfilter
+
+
+def transition(time_constant_s: float, damping: float, step_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """Exact transition of T² y'' + 2 ζ T y' + y = w over one step with w held.
+
+    Parameters
+    ----------
+    time_constant_s : float
+        T, s, positive.
+    damping : float
+        ζ, positive, 1 is critical.
+    step_s : float
+        Length of the step, s.
+
+    Returns
+    -------
+    phi : ndarray, shape (2, 2)
+        State transition of x = (y, y').
+    gamma : ndarray, shape (2,)
+        Input vector: x[k+1] = phi @ x[k] + gamma * w[k].
+    """
+    h = step_s / time_constant_s
+    decay = np.exp(-damping * h)
+    gap = damping * damping - 1.0
+    root = np.sqrt(abs(gap))
+    arg = root * h
+    if abs(gap) < 1e-10:
+        c, s = 1.0, h
+    elif gap < 0:
+        c, s = np.cos(arg), np.sin(arg) / root
+    else:
+        c, s = np.cosh(arg), np.sinh(arg) / root
+    p11 = decay * (c + damping * s)
+    p12 = decay * s * time_constant_s
+    p21 = -decay * s / time_constant_s
+    p22 = decay * (c - damping * s)
+    return np.array([[p11, p12], [p21, p22]]), np.array([1.0 - p11, -p21])
+
+
+def boundary_states(
+    time_constant_s: float, damping: float, step_s: float, drive_nm: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """States at the ends of the pulse intervals, from rest.
+
+    Parameters
+    ----------
+    time_constant_s, damping, step_s : float
+        As in `transition`.
+    drive_nm : ndarray, shape (K,) or (K, M)
+        Held input of each interval; columns are filtered apart.
+
+    Returns
+    -------
+    torque_nm, rate_nm_s : ndarray, shape (K + 1,) or (K + 1, M)
+        y and y' at the start of interval 0, …, at the end of interval K - 1.
+    """
+    phi, gamma = transition(time_constant_s, damping, step_s)
+    trace, determinant = phi[0, 0] + phi[1, 1], phi[0, 0] * phi[1, 1] - phi[0, 1] * phi[1, 0]
+    lead = (phi - trace * np.eye(2)) @ gamma
+    a = np.array([1.0, -trace, determinant])
+    padded = np.concatenate([drive_nm, np.zeros_like(drive_nm[:1])])
+    return (
+        np.asarray(lfilter([0.0, gamma[0], lead[0]], a, padded, axis=0)),
+        np.asarray(lfilter([0.0, gamma[1], lead[1]], a, padded, axis=0)),
+    )
+
+
+def hermite(fraction: np.ndarray, step_s: float) -> np.ndarray:
+    """Weights of (y0, y0', y1, y1') for the cubic at `fraction` of a step; shape (..., 4)."""
+    s = np.asarray(fraction, float)
+    return np.stack(
+        [
+            (1 + 2 * s) * (1 - s) ** 2,
+            s * (1 - s) ** 2 * step_s,
+            s * s * (3 - 2 * s),
+            s * s * (s - 1) * step_s,
+        ],
+        axis=-1,
+    )
+
+
+def read_at(torque_nm: np.ndarray, rate_nm_s: np.ndarray, position: np.ndarray, step_s: float) -> np.ndarray:
+    """The curve through the boundary states, read at times given in steps.
+
+    Parameters
+    ----------
+    torque_nm, rate_nm_s : ndarray, shape (K + 1,)
+        Boundary states.
+    position : ndarray, shape (N,)
+        Times in steps since the start of interval 0; before 0 the muscle is at rest, after K the last state stands.
+    step_s : float
+        Length of a step, s.
+
+    Returns
+    -------
+    ndarray, shape (N,)
+    """
+    last = torque_nm.shape[0] - 2
+    interval = np.clip(np.floor(position).astype(np.int64), 0, last)
+    fraction = np.clip(position - interval, 0.0, 1.0)
+    weight = hermite(fraction, step_s)
+    value = (
+        weight[:, 0] * torque_nm[interval]
+        + weight[:, 1] * rate_nm_s[interval]
+        + weight[:, 2] * torque_nm[interval + 1]
+        + weight[:, 3] * rate_nm_s[interval + 1]
+    )
+    return np.where(position < 0, torque_nm[0], value)

@@ -1,0 +1,214 @@
+"""From samples to pulse intervals: one row a pulse, whatever the sampling rate.
+
+Everything is estimated on the grid of pulses: 40 rows a second carry all that a muscle of 0.1 s and slower can show,
+memory is a time and not a count of samples, and the mean over an interval keeps the information of its samples.
+Half a sample counts (1.25 ms cost 36 log-likelihood units in a trial), so the mean is modelled as what it is, the mean
+of the model's curve at the very times at which the samples of that interval were taken.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from identify.dynamics import hermite
+from identify.errors import BadRecord
+from identify.record import Record
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A record on the grid of its pulses.
+
+    Parameters
+    ----------
+    record : Record
+        What it was made from.
+    start_s : float
+        Time of the first pulse slot, s.
+    step_s : float
+        Pulse interval, s.
+    pulse_width_us : ndarray, shape (K,)
+        Width held in each interval, µs.
+    torque_nm : ndarray, shape (K,)
+        Mean of the samples in each interval, N·m.
+    count : ndarray of int, shape (K,)
+        Samples in each interval; 0 where there is none (its torque is then NaN, and it is never fitted).
+    interval, fraction : ndarray, shape (N,)
+        For each sample: its interval, and where in it, 0 to 1.
+    held_out : ndarray of bool, shape (K,)
+        Intervals with any held-out sample.
+    segment : ndarray of int, shape (K,)
+        Index into the record's `segment_names`.
+    angle_rad, velocity_rad_s : ndarray or None, shape (K,)
+        Means over each interval.
+    """
+
+    record: Record
+    start_s: float
+    step_s: float
+    pulse_width_us: np.ndarray
+    torque_nm: np.ndarray
+    count: np.ndarray
+    interval: np.ndarray
+    fraction: np.ndarray
+    held_out: np.ndarray
+    segment: np.ndarray
+    angle_rad: np.ndarray | None
+    velocity_rad_s: np.ndarray | None
+
+    @property
+    def size(self) -> int:
+        """Number of intervals, K."""
+        return self.pulse_width_us.size
+
+    @cached_property
+    def time_s(self) -> np.ndarray:
+        """Start of each interval, s, shape (K,)."""
+        return self.start_s + self.step_s * np.arange(self.size)
+
+    @cached_property
+    def fitted(self) -> np.ndarray:
+        """bool, shape (K,): intervals that may be used to fit and to choose."""
+        return ~self.held_out & (self.count > 0)
+
+    @cached_property
+    def stretches(self) -> list[slice]:
+        """Contiguous runs of fitted intervals: noise is correlated inside one, not across."""
+        return runs(self.fitted)
+
+    def mean_weights(self, delay_s: float = 0.0) -> tuple[int, np.ndarray]:
+        """How an interval's mean is read off the boundary states, for a model that lags by `delay_s`.
+
+        Returns
+        -------
+        first : int
+            Offset of the earliest boundary used, relative to the interval (0 or negative).
+        weights : ndarray, shape (K, B, 2)
+            Weights of (y, y') at boundaries first, first + 1, … relative to each interval: the mean of interval k is
+            sum over b of weights[k, b, 0] * y[k + first + b] + weights[k, b, 1] * y'[k + first + b].
+        """
+        shifted = self.fraction - delay_s / self.step_s
+        offset = np.floor(shifted).astype(np.int64)
+        cubic = hermite(shifted - offset, self.step_s)
+        first, last = int(offset.min()), int(offset.max()) + 1
+        weights = np.zeros((self.size, last - first + 1, 2))
+        np.add.at(weights, (self.interval, offset - first), cubic[:, :2])
+        np.add.at(weights, (self.interval, offset - first + 1), cubic[:, 2:])
+        return first, weights / np.maximum(self.count, 1)[:, None, None]
+
+    def block_mean(self, torque_nm: np.ndarray, rate_nm_s: np.ndarray, delay_s: float = 0.0) -> np.ndarray:
+        """Mean over each interval's samples of the curve through boundary states.
+
+        Parameters
+        ----------
+        torque_nm, rate_nm_s : ndarray, shape (K + 1,) or (K + 1, M)
+            States at the ends of the intervals; the muscle is taken to be at `torque_nm[0]` before the first.
+        delay_s : float
+            Lag of the curve behind the pulses, s; may be negative by less than a step.
+
+        Returns
+        -------
+        ndarray, shape (K,) or (K, M)
+        """
+        first, weights = self.mean_weights(delay_s)
+        before, after = max(-first, 0), max(weights.shape[1] + first - 2, 0)
+        y = _padded(torque_nm, before, after, hold=True)
+        v = _padded(rate_nm_s, before, after, hold=False)
+        size = self.size
+        result = np.zeros((size, *torque_nm.shape[1:]))
+        lift = (slice(None),) + (None,) * (torque_nm.ndim - 1)
+        for b in range(weights.shape[1]):
+            rows = slice(before + first + b, before + first + b + size)
+            result += weights[:, b, 0][lift] * y[rows] + weights[:, b, 1][lift] * v[rows]
+        return result
+
+
+def _padded(values: np.ndarray, before: int, after: int, *, hold: bool) -> np.ndarray:
+    if not before and not after:
+        return values
+    head = np.repeat(values[:1], before, axis=0) if hold else np.zeros((before, *values.shape[1:]))
+    tail = np.repeat(values[-1:], after, axis=0) if hold else np.zeros((after, *values.shape[1:]))
+    return np.concatenate([head, values, tail])
+
+
+def runs(flags: np.ndarray) -> list[slice]:
+    """Contiguous runs of true values, as slices."""
+    edges = np.flatnonzero(np.diff(np.r_[0, flags.astype(np.int8), 0]))
+    return [slice(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def make_grid(record: Record) -> Grid:
+    """Put a record on the grid of its pulses.
+
+    Raises
+    ------
+    BadRecord
+        Fewer than eight pulse intervals, or sampled more slowly than the pulses.
+    """
+    step_s = 1.0 / record.pulse_rate_hz
+    rate_hz = record.sample_rate_hz
+    if not rate_hz >= 0.999 * record.pulse_rate_hz:
+        raise BadRecord(
+            f"sampled at {rate_hz:.4g} Hz, below the {record.pulse_rate_hz:g} pulses a second",
+            mend="Record at 40 Hz or faster.",
+        )
+    start_s = record.time_s[0] + pulse_phase_s(record)
+    # A hair early, so that a sample taken at the pulse itself falls into the interval that the pulse opens.
+    position = (record.time_s - start_s) / step_s + 1e-6 + 1e-3 * min(1.0, record.pulse_rate_hz / rate_hz)
+    interval = np.floor(position).astype(np.int64)
+    lowest = int(interval[0])
+    start_s, position, interval = start_s + lowest * step_s, position - lowest, interval - lowest
+    size = int(interval[-1]) + 1
+    if size < 8:
+        raise BadRecord(f"only {size} pulse intervals long", mend="Give at least a few seconds of data.")
+    count = np.bincount(interval, minlength=size)
+    filled = np.maximum(count, 1)
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        total = np.bincount(interval, values, minlength=size) / filled
+        return np.where(count > 0, total, np.nan)
+
+    first_of = np.searchsorted(interval, np.arange(size))
+    # The middle sample of an interval: not touched by a pulse that came a sample early or late.
+    middle = np.minimum(first_of + count // 2, record.time_s.size - 1)
+    return Grid(
+        record=record,
+        start_s=start_s,
+        step_s=step_s,
+        pulse_width_us=record.pulse_width_us[middle],
+        torque_nm=mean(record.torque_nm),
+        count=count,
+        interval=interval,
+        fraction=np.clip((record.time_s - start_s) / step_s - interval, 0.0, 1.0),
+        held_out=np.bincount(interval, record.held_out, minlength=size) > 0,
+        segment=record.segment[middle],
+        angle_rad=None if record.angle_rad is None else mean(record.angle_rad),
+        velocity_rad_s=None if record.velocity_rad_s is None else mean(record.velocity_rad_s),
+    )
+
+
+def pulse_phase_s(record: Record) -> float:
+    """Time of the pulse slots after the first sample, modulo the pulse interval, s.
+
+    A change of width seen first in the sample at t puts a pulse into (t - 1/rate, t]. The phase that satisfies the
+    most changes is taken; of those, the latest (the pulse coincides with the sample that shows it).
+    """
+    changes = np.flatnonzero(np.diff(record.pulse_width_us)) + 1
+    step_s, sample_s = 1.0 / record.pulse_rate_hz, 1.0 / record.sample_rate_hz
+    if changes.size == 0 or sample_s > 0.999 * step_s:
+        return 0.0
+    latest = np.mod(record.time_s[changes] - record.time_s[0], step_s)
+    trial = np.linspace(0.0, step_s, 401)[:-1]
+    # How many changes each trial phase explains, with a tolerance of a hair for rounding.
+    lag = np.mod(latest[:, None] - trial[None, :] + 1e-3 * sample_s, step_s)
+    explained = (lag < sample_s * 1.002).sum(axis=0)
+    best = np.flatnonzero(explained == explained.max())
+    anchor = trial[best[best.size // 2]]
+    # From the anchor the earliest 'latest' time is the bound; take it exactly, free of the trial's spacing.
+    ahead = np.mod(latest - anchor + 1e-3 * sample_s, step_s)
+    inside = ahead[ahead < sample_s * 1.002]
+    phase = float(np.mod(anchor + np.min(inside) - 1e-3 * sample_s, step_s))
+    return 0.0 if step_s - phase < 1e-9 else phase

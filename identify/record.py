@@ -1,0 +1,123 @@
+"""A record: what was applied and what was measured, as arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from identify.errors import BadRecord
+
+HELD_OUT = "validate"
+"""Rows of this segment are never used to fit or to choose."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where a record came from, so that a model can say what it was fitted on."""
+
+    name: str = ""
+    recording_id: str = ""
+    sha256: str = ""
+
+
+@dataclass(frozen=True)
+class Record:
+    """Pulse widths applied and torque measured, uniformly sampled.
+
+    Parameters
+    ----------
+    time_s : ndarray, shape (N,)
+        Sample times, s, strictly increasing and uniform.
+    pulse_width_us : ndarray, shape (N,)
+        Pulse width in force at each sample, µs, held between pulses.
+    torque_nm : ndarray, shape (N,)
+        Measured torque, N·m.
+    segment : ndarray of int, shape (N,)
+        Index into `segment_names` for each sample.
+    segment_names : tuple of str
+        One name for each contiguous run of rows; a name may occur several times.
+    angle_rad, velocity_rad_s : ndarray or None, shape (N,)
+        Joint angle, rad, and angular velocity, rad/s, where the record has them.
+    pulse_rate_hz : float
+        Pulses a second.
+    source : Source
+        Origin.
+    """
+
+    time_s: np.ndarray
+    pulse_width_us: np.ndarray
+    torque_nm: np.ndarray
+    segment: np.ndarray
+    segment_names: tuple[str, ...]
+    angle_rad: np.ndarray | None = None
+    velocity_rad_s: np.ndarray | None = None
+    pulse_rate_hz: float = 40.0
+    source: Source = field(default_factory=Source)
+
+    @classmethod
+    def from_arrays(
+        cls,
+        time_s: np.ndarray,
+        pulse_width_us: np.ndarray,
+        torque_nm: np.ndarray,
+        segment: np.ndarray | list[str] | None = None,
+        *,
+        angle_rad: np.ndarray | None = None,
+        velocity_rad_s: np.ndarray | None = None,
+        pulse_rate_hz: float = 40.0,
+        source: Source | None = None,
+    ) -> Record:
+        """Build a record from arrays; `segment` gives a name for each row (default: all `prbs`).
+
+        Raises
+        ------
+        BadRecord
+            Lengths differ, or there is nothing.
+        """
+        time_s = np.ascontiguousarray(time_s, float)
+        size = time_s.size
+        names = np.asarray(["prbs"] * size if segment is None else segment, dtype=str)
+        columns = {"pulse_width_us": pulse_width_us, "torque_nm": torque_nm, "segment": names}
+        for label, column in columns.items():
+            if np.shape(column) != (size,):
+                raise BadRecord(f"{label} has shape {np.shape(column)}, time_s has ({size},)", place=label)
+        if size == 0:
+            raise BadRecord("the record holds no sample", mend="Give at least a few seconds of data.")
+        starts = np.flatnonzero(np.r_[True, names[1:] != names[:-1]])
+        code = np.zeros(size, np.int64)
+        code[starts[1:]] = 1
+        return cls(
+            time_s=time_s,
+            pulse_width_us=np.ascontiguousarray(pulse_width_us, float),
+            torque_nm=np.ascontiguousarray(torque_nm, float),
+            segment=np.cumsum(code),
+            segment_names=tuple(str(name) for name in names[starts]),
+            angle_rad=None if angle_rad is None else np.ascontiguousarray(angle_rad, float),
+            velocity_rad_s=None if velocity_rad_s is None else np.ascontiguousarray(velocity_rad_s, float),
+            pulse_rate_hz=pulse_rate_hz,
+            source=source or Source(),
+        )
+
+    @cached_property
+    def sample_rate_hz(self) -> float:
+        """Samples a second, from the first and last sample."""
+        if self.time_s.size < 2:
+            return self.pulse_rate_hz
+        return (self.time_s.size - 1) / float(self.time_s[-1] - self.time_s[0])
+
+    @cached_property
+    def held_out(self) -> np.ndarray:
+        """bool, shape (N,): rows that are never used to fit or to choose."""
+        flags = np.array([name == HELD_OUT for name in self.segment_names])
+        return flags[self.segment]
+
+    @property
+    def has_held_out(self) -> bool:
+        """Whether the record has rows of `validate`."""
+        return HELD_OUT in self.segment_names
+
+    def with_torque(self, torque_nm: np.ndarray) -> Record:
+        """The same record with another torque, N·m, shape (N,)."""
+        return replace(self, torque_nm=np.ascontiguousarray(torque_nm, float))

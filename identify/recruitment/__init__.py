@@ -1,0 +1,1 @@
+"""Recruitment curves: a basis each, torque at rest state against pulse width, zero at zero width."""
