@@ -1,0 +1,83 @@
+"""The rig's tree of exceptions: mapped once, at the socket (`rig.control`) and the command line (`rig.__main__`)."""
+
+from __future__ import annotations
+
+
+class RigError(Exception):
+    """Anything the rig can name: the text is one line with the place and the mend.
+
+    `code` is stable and goes to clients as `messages.Problem.code`.
+    """
+
+    code = "internal"
+    title = "The rig could not do that"
+
+
+class ConfigError(RigError):
+    """The rig file is wrong: names the key and what would be right."""
+
+    code = "bad-config"
+    title = "The rig file is wrong"
+
+
+class PlanError(RigError):
+    """A test plan that cannot be built: names the segment and the setting."""
+
+    code = "bad-plan"
+    title = "The test plan is wrong"
+
+
+class RefusedError(RigError):
+    """A pulse or plan outside a limit: names the limit, the value and the bound."""
+
+    code = "refused"
+    title = "Refused by a limit"
+
+
+class BusyError(RigError):
+    """A test is running: names it."""
+
+    code = "busy"
+    title = "The rig is busy"
+
+
+class LatchedError(RigError):
+    """Stopped after a fault or a stop, and no person has re-armed yet."""
+
+    code = "latched"
+    title = "The rig is stopped until a person re-arms it"
+
+
+class UncertainError(RigError):
+    """Started after a crash in mid-test, and no person has re-armed yet."""
+
+    code = "uncertain"
+    title = "The rig died in a test and waits for a person"
+
+
+class DeviceError(RigError):
+    """A device that cannot be reached, fell silent or answered with an error."""
+
+    code = "disconnected"
+    title = "A device does not answer"
+
+
+class JournalError(RigError):
+    """The journal could not be written (disk full, I/O error): stimulation stops."""
+
+    code = "journal"
+    title = "The journal could not be written"
+
+
+class RecordingError(RigError):
+    """A recording that could not be sealed or read back; the journal is kept."""
+
+    code = "recording"
+    title = "The recording could not be sealed"
+
+
+class WireError(RigError):
+    """Bytes that are no frame of the protocol: names the rule that they break."""
+
+    code = "wire"
+    title = "The device sent bytes that make no sense"

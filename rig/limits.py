@@ -1,0 +1,195 @@
+"""What may reach a person: ONE table, and the function that admits a pulse or says why not.
+
+Every bound is checked as `if not (lo <= x <= hi)`, so a NaN is refused; rounding to the device's steps is toward
+zero. The tighter of the table, the rig file and the participant's profile wins, and the refusal names which.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from rig.errors import RefusedError
+from rig.messages import Profile
+from rig.signals import Pulse
+
+STEP_PULSE_WIDTH_US = 1.0
+STEP_CURRENT_MA = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Limit:
+    """One row: the closed range that is allowed, why, and where the number comes from."""
+
+    name: str
+    lo: float
+    hi: float
+    unit: str
+    reason: str
+    source: str
+    owner: str = "hard limit"
+
+
+HARD_LIMITS: dict[str, Limit] = {
+    row.name: row
+    for row in (
+        Limit(
+            "pulse_width_us", 0.0, 500.0, "µs",
+            "longer pulses recruit pain fibres and add charge, not torque",
+            "range of clinical FES stimulators (RehaStim 2: 20-500 µs); the P24 could send 4095 µs",
+        ),
+        Limit(
+            "current_ma", 0.0, 100.0, "mA",
+            "with 500 µs at 40 Hz it is 20 mA rms, below 2 mA/cm² on electrodes of 10 cm² or more",
+            "IEC 60601-2-10 (attention above 2 mA/cm²); the P24 could send 130 mA",
+        ),
+        Limit(
+            "charge_per_phase_uc", 0.0, 40.0, "µC",
+            "twice what arm muscles need (300 µs × 60 mA = 18 µC); the protocol could encode 614 µC",
+            "house rule, tighter than IEC 60601-2-10's 300 mJ a pulse into 500 Ω (40 µC at 100 mA: 4 mJ)",
+        ),
+        Limit(
+            "charge_per_second_uc", 0.0, 1600.0, "µC/s",
+            "40 pulses/s at the highest charge: a higher rate must use smaller pulses",
+            "house rule: charge_per_phase_uc × 40 Hz",
+        ),
+        Limit(
+            "pulse_rate_hz", 1.0, 60.0, "Hz",
+            "40 Hz is a fused contraction; faster only tires the muscle",
+            "paper, section II (40 Hz); clinical FES 20-50 Hz",
+        ),
+        Limit(
+            "pulse_interval_s", 0.008, math.inf, "s",
+            "two pulses closer than this sum in the nerve: a late pulse is dropped, never sent in a burst",
+            "shortest interpulse interval of the RehaStim 2 (8 ms)",
+        ),
+        Limit(
+            "torque_nm", -60.0, 60.0, "N·m",
+            "an elbow under maximal voluntary effort gives about 60 N·m: beyond it something is wrong",
+            "house rule; the profile's max_torque_nm is normally far below",
+        ),
+        Limit(
+            "duration_s", 0.0, 300.0, "s",
+            "a pre-session test must not tire the muscle that the session trains",
+            "house rule: a default test takes 40 s",
+        ),
+        Limit(
+            "charge_per_test_uc", 0.0, 50_000.0, "µC",
+            "ten default tests' dose (300 µs, 20 mA: about 4 mC)",
+            "house rule",
+        ),
+    )
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """Why a pulse was not admitted: which limit, the value, the bound, whose bound it is."""
+
+    limit: str
+    value: float
+    lo: float
+    hi: float
+    unit: str
+    owner: str
+    reason: str
+
+    def __str__(self) -> str:
+        if math.isfinite(self.value) and self.value > self.hi:
+            by = f", over by {self.value - self.hi:g}"
+        elif math.isfinite(self.value):
+            by = f", under by {self.lo - self.value:g}"
+        else:
+            by = ""
+        return (
+            f"{self.limit} {self.value:g} {self.unit} is outside {self.lo:g} … {self.hi:g} "
+            f"({self.owner}{by}): {self.reason}"
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Admitted:
+    """A pulse that passed every limit, rounded toward zero to the device's steps.
+
+    Made by `admit` alone; stimulators accept nothing else.
+    """
+
+    pulse_width_us: int
+    current_ma: float
+
+    @property
+    def charge_uc(self) -> float:
+        """Charge of one phase, µC."""
+        return self.pulse_width_us * self.current_ma * 1e-3
+
+
+def check(limit: Limit, value: float) -> Refusal | None:
+    """None if `value` is within the limit, else the refusal. A NaN is refused."""
+    if not (limit.lo <= value <= limit.hi):
+        return Refusal(limit.name, value, limit.lo, limit.hi, limit.unit, limit.owner, limit.reason)
+    return None
+
+
+def tightened(table: dict[str, Limit], name: str, hi: float, owner: str, lo: float | None = None) -> dict[str, Limit]:
+    """The table with one row's range narrowed, never widened.
+
+    Raises
+    ------
+    RefusedError
+        The bound is no number, or leaves nothing: an open door is no limit.
+    """
+    row = table[name]
+    lo = row.lo if lo is None else max(row.lo, lo)
+    if not (lo <= hi):
+        raise RefusedError(f"{owner}: {name} {hi:g} {row.unit} must be at least {lo:g} {row.unit}")
+    if hi >= row.hi and lo <= row.lo:
+        return table
+    bounds = Limit(name, lo, min(hi, row.hi), row.unit, row.reason, row.source, owner)
+    return {**table, name: bounds}
+
+
+def for_profile(table: dict[str, Limit], profile: Profile) -> dict[str, Limit]:
+    """The table as this participant's profile narrows it.
+
+    Raises
+    ------
+    RefusedError
+        The profile holds a number that makes no sense (negative, NaN).
+    """
+    owner = "participant's profile"
+    table = tightened(table, "pulse_width_us", profile.max_pulse_width_us, owner)
+    table = tightened(table, "current_ma", profile.current_ma, owner)
+    if not (0 < profile.max_torque_nm):
+        raise RefusedError(f"{owner}: max_torque_nm {profile.max_torque_nm:g} N·m must be above 0")
+    return tightened(table, "torque_nm", profile.max_torque_nm, owner, lo=-profile.max_torque_nm)
+
+
+def admit(pulse: Pulse, table: dict[str, Limit]) -> Admitted | Refusal:
+    """Admit one pulse or say why not. Pure.
+
+    Parameters
+    ----------
+    pulse
+        Width of one phase (µs) and current (mA) as asked for.
+    table
+        `HARD_LIMITS`, narrowed by `tightened` and `for_profile`.
+
+    Returns
+    -------
+    Admitted
+        Width in whole µs, current in steps of 0.5 mA, both rounded toward zero.
+    Refusal
+        The first limit that the pulse breaks.
+    """
+    for name, value in (
+        ("pulse_width_us", pulse.pulse_width_us),
+        ("current_ma", pulse.current_ma),
+        ("charge_per_phase_uc", pulse.charge_uc),
+    ):
+        refusal = check(table[name], value)
+        if refusal is not None:
+            return refusal
+    return Admitted(
+        int(pulse.pulse_width_us / STEP_PULSE_WIDTH_US),
+        int(pulse.current_ma / STEP_CURRENT_MA) * STEP_CURRENT_MA,
+    )

@@ -1,0 +1,97 @@
+"""The library of stimulation sequences: one file each, found by looking into this folder.
+
+A sequence is a module with `Settings` (a pydantic model, units in the names) and
+`pulse_widths(settings, pulse_rate_hz) -> ndarray`, a pure function giving one pulse width in µs for each pulse.
+The module's name is the sequence's id. Adding one is adding a file.
+"""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from functools import cache
+from typing import Any, Protocol, cast
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from rig.errors import PlanError
+
+
+class SequenceSettings(BaseModel):
+    """Base of every sequence's settings: unknown names are refused, and so are NaN and infinities."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+
+class Sequence(Protocol):
+    """What a module in this folder offers."""
+
+    Settings: type[SequenceSettings]
+
+    @staticmethod
+    def pulse_widths(settings: Any, pulse_rate_hz: float) -> NDArray[np.float64]: ...
+
+
+@cache
+def library() -> dict[str, Sequence]:
+    """Every sequence by its id, in alphabetical order."""
+    names = sorted(m.name for m in pkgutil.iter_modules(__path__) if not m.name.startswith("_"))
+    return {name: cast(Sequence, importlib.import_module(f"{__name__}.{name}")) for name in names}
+
+
+def find(sequence_id: str) -> Sequence:
+    """The sequence of that id.
+
+    Raises
+    ------
+    PlanError
+        No file in this folder has the name; the message lists those that there are.
+    """
+    try:
+        return library()[sequence_id]
+    except KeyError:
+        raise PlanError(f"sequence {sequence_id!r} is unknown; use one of {', '.join(library())}") from None
+
+
+def settings_of(sequence_id: str, settings: dict[str, Any]) -> SequenceSettings:
+    """Checked settings of a sequence.
+
+    Raises
+    ------
+    PlanError
+        Naming the first wrong setting and what is expected there.
+    """
+    model = find(sequence_id).Settings
+    try:
+        return model.model_validate(settings)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"]) or "settings"
+        known = ", ".join(model.model_fields) or "none"
+        raise PlanError(f"{sequence_id}.{place}: {first['msg']} (settings: {known})") from None
+
+
+def build(sequence_id: str, settings: dict[str, Any], pulse_rate_hz: float) -> NDArray[np.float64]:
+    """Pulse widths in µs, one for each pulse, of a sequence with settings given as a dictionary."""
+    checked = settings_of(sequence_id, settings)
+    try:
+        return find(sequence_id).pulse_widths(checked, pulse_rate_hz)
+    except ValueError as error:
+        raise PlanError(f"{sequence_id}: {error}") from None
+
+
+def pulses_in(duration_s: float, pulse_rate_hz: float) -> int:
+    """Number of pulses in a duration, to the nearest."""
+    return round(duration_s * pulse_rate_hz)
+
+
+def dose_uc(pulse_width_us: ArrayLike, current_ma: float) -> float:
+    """Charge of one phase summed over the pulses, µC (width × current)."""
+    return float(np.sum(np.asarray(pulse_width_us, dtype=np.float64)) * current_ma * 1e-3)
+
+
+def torque_time_nms(pulse_width_us: ArrayLike, pulse_rate_hz: float, table_us: ArrayLike, table_nm: ArrayLike) -> float:
+    """Estimated torque-time, N·m·s: the steady torque of each pulse by a recruitment table, times its period."""
+    return float(np.sum(np.interp(pulse_width_us, table_us, table_nm)) / pulse_rate_hz)

@@ -1,0 +1,46 @@
+"""Random levels held for random times: unlike PRBS and ramp, so a model is tested on what it was not fitted to.
+
+The levels are stratified (one from each of n equal bands, in random order), so that a short sequence still
+visits the whole range; some are zero, so that the muscle also relaxes.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from rig.sequences import SequenceSettings, pulses_in
+
+
+class Settings(SequenceSettings):
+    max_pulse_width_us: float = Field(300.0, description="highest level c, µs")
+    min_pulse_width_us: float = Field(0.0, ge=0, description="lowest level that is not zero, µs")
+    duration_s: float = Field(7.0, gt=0, le=600)
+    min_hold_s: float = Field(0.3, gt=0)
+    max_hold_s: float = Field(1.0, gt=0)
+    zero_share: float = Field(0.15, ge=0, lt=1, description="share of the levels that are zero")
+    seed: int = Field(20, ge=0)
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Settings:
+        if not self.min_hold_s <= self.max_hold_s:
+            raise ValueError("min_hold_s must not exceed max_hold_s")
+        return self
+
+
+def pulse_widths(settings: Settings, pulse_rate_hz: float) -> NDArray[np.float64]:
+    """Widths in µs, shape (duration × rate,)."""
+    rng = np.random.default_rng(settings.seed)
+    total = pulses_in(settings.duration_s, pulse_rate_hz)
+    shortest = max(1, pulses_in(settings.min_hold_s, pulse_rate_hz))
+    longest = max(shortest, pulses_in(settings.max_hold_s, pulse_rate_hz))
+    holds: list[int] = []
+    while sum(holds) < total:
+        holds.append(int(rng.integers(shortest, longest + 1)))
+    n_zero = round(settings.zero_share * len(holds))
+    n_levels = len(holds) - n_zero
+    bands = (rng.permutation(n_levels) + rng.random(n_levels)) / max(n_levels, 1)
+    span_us = settings.max_pulse_width_us - settings.min_pulse_width_us
+    levels_us = rng.permutation(np.concatenate([settings.min_pulse_width_us + bands * span_us, np.zeros(n_zero)]))
+    return np.repeat(levels_us, holds)[:total]

@@ -1,0 +1,23 @@
+"""Staircase 0 → c → 0 in equal steps: the steady torque at each level, and whether it differs on the way down."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from rig.sequences import SequenceSettings, pulses_in
+
+
+class Settings(SequenceSettings):
+    max_pulse_width_us: float = Field(300.0, description="highest step c, µs")
+    levels: int = Field(6, ge=1, le=100, description="steps from 0 up to c")
+    hold_s: float = Field(1.0, gt=0, le=60)
+    down: bool = Field(True, description="come down by the same steps")
+
+
+def pulse_widths(settings: Settings, pulse_rate_hz: float) -> NDArray[np.float64]:
+    """Widths in µs, shape (steps × hold × rate,)."""
+    up = np.arange(1, settings.levels + 1) / settings.levels
+    shape = np.concatenate([up, up[-2::-1], [0.0]]) if settings.down else up
+    return np.repeat(shape * settings.max_pulse_width_us, pulses_in(settings.hold_s, pulse_rate_hz))

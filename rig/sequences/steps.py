@@ -1,0 +1,23 @@
+"""On-off steps at one level, repeated: rise and fall times, and what repetition does to the torque (fatigue)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from rig.sequences import SequenceSettings, pulses_in
+
+
+class Settings(SequenceSettings):
+    max_pulse_width_us: float = Field(300.0, description="level while on, µs")
+    on_s: float = Field(1.0, gt=0, le=120)
+    off_s: float = Field(1.5, ge=0, le=120)
+    repeats: int = Field(3, ge=1, le=1000)
+
+
+def pulse_widths(settings: Settings, pulse_rate_hz: float) -> NDArray[np.float64]:
+    """Widths in µs, shape (repeats × (on + off) × rate,)."""
+    on = np.full(pulses_in(settings.on_s, pulse_rate_hz), settings.max_pulse_width_us)
+    off = np.zeros(pulses_in(settings.off_s, pulse_rate_hz))
+    return np.tile(np.concatenate([on, off]), settings.repeats)

@@ -1,0 +1,19 @@
+"""Any list of pulse widths, one for each pulse: sequences made elsewhere."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from rig.sequences import SequenceSettings
+
+
+class Settings(SequenceSettings):
+    pulse_width_us: list[float] = Field(min_length=1, max_length=100_000, description="µs, one for each pulse")
+
+
+def pulse_widths(settings: Settings, pulse_rate_hz: float) -> NDArray[np.float64]:
+    """The list as it is, shape (n,)."""
+    del pulse_rate_hz
+    return np.asarray(settings.pulse_width_us, dtype=np.float64)

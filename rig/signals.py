@@ -1,0 +1,80 @@
+"""The values that flow through the rig: a pulse outwards, its ack and blocks of torque inwards."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class PulseStatus(IntEnum):
+    """What became of a planned pulse; the values of `/pulses/status` in a recording."""
+
+    ACKNOWLEDGED = 0
+    REST = 1
+    DROPPED = 2
+    REFUSED = 3
+    UNACKNOWLEDGED = 4
+    DEVICE_ERROR = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Pulse:
+    """One stimulation pulse as asked for: width of a phase in µs, current in mA. Width 0 is no pulse."""
+
+    pulse_width_us: float
+    current_ma: float
+
+    @property
+    def charge_uc(self) -> float:
+        """Charge of one phase, µC."""
+        return self.pulse_width_us * self.current_ma * 1e-3
+
+
+@dataclass(frozen=True, slots=True)
+class Ack:
+    """A stimulator's answer to one pulse. `error` is None when the pulse was delivered."""
+
+    number: int
+    time_s: float
+    error: str | None = None
+
+
+SAMPLE = np.dtype(
+    [
+        ("host_time_s", "<f8"),
+        ("stamp_s", "<f8"),
+        ("torque_nm", "<f8"),
+        ("counter", "<i8"),
+        ("sync", "u1"),
+    ]
+)
+"""One torque sample: host receive time (rig clock), the transport's own stamp (NaN: none), torque in N·m, the
+cell's counter (raw from a device, unwrapped after the receiver; −1: none), sync line (255: none)."""
+
+
+@dataclass(frozen=True, slots=True)
+class TorqueBlock:
+    """Torque samples in the order in which they came, dtype `SAMPLE`, shape (n,); n may be 0."""
+
+    samples: NDArray[np.void]
+    malformed: int = 0
+    error_frames: int = 0
+
+    def __len__(self) -> int:
+        return len(self.samples)
+
+
+@dataclass(slots=True)
+class Recorded:
+    """Counts that the run keeps while it records."""
+
+    samples: int = 0
+    lost_samples: int = 0
+    duplicate_samples: int = 0
+    disordered_samples: int = 0
+    malformed_frames: int = 0
+    error_frames: int = 0
+    gaps: list[tuple[int, int]] = field(default_factory=list)

@@ -1,0 +1,134 @@
+"""Torque samples out of CAN frames, as a DBC file describes them: any cell is a description, not a driver."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import cast
+
+import cantools
+from cantools.database import Database
+from cantools.database.can import Message
+
+from rig.errors import ConfigError, WireError
+
+PACKAGED = "torque_default"
+"""Name of the description that is used when none is given: frame 0x181, float32 N·m, counter, sync bit."""
+
+
+def load(dbc: str) -> Database:
+    """Read a DBC file, or the packaged one of that name.
+
+    Raises
+    ------
+    ConfigError
+        Not there, or no DBC.
+    """
+    try:
+        if "/" not in dbc and not dbc.endswith(".dbc"):
+            text = resources.files(__package__).joinpath(f"{dbc}.dbc").read_text("utf-8")
+        else:
+            text = Path(dbc).read_text("cp1252")
+        database = cantools.database.load_string(text, "dbc")
+    except OSError:
+        raise ConfigError(f"dbc: no file {dbc!r}; give the path of a .dbc file or {PACKAGED!r}") from None
+    except Exception as error:
+        line = " ".join(str(error).split())
+        raise ConfigError(f"dbc: {dbc} is not a DBC file that can be read: {line}") from None
+    if not isinstance(database, Database):
+        raise ConfigError(f"dbc: {dbc} describes no CAN messages")
+    return database
+
+
+def _choose(kind: str, name: str, known: Sequence[str], place: str) -> str:
+    if name in known:
+        return name
+    near = difflib.get_close_matches(name, known, 1)
+    hint = f"; did you mean {near[0]!r}?" if near else ""
+    raise ConfigError(f"{kind}: {place} has no {kind} {name!r}{hint} (it has: {', '.join(known) or 'none'})")
+
+
+@dataclass(frozen=True, slots=True)
+class FrameSamples:
+    """What one frame carries: one or more torque values in the signal's unit, counter or −1, sync or 255."""
+
+    values: tuple[float, ...]
+    counter: int
+    sync: int
+
+
+class TorqueFrame:
+    """Decoder of the one message that carries torque.
+
+    Parameters
+    ----------
+    dbc
+        Path of a DBC file or the name of a packaged one.
+    message
+        Name of the message; None: the first that has the signal.
+    signals
+        Names of the signals that carry torque, in the order of time (several: a multi-sample frame).
+    counter, sync
+        Names of the counter's and the sync line's signals, None where there is none.
+
+    Raises
+    ------
+    ConfigError
+        A message or signal that the file does not have; the line names those that it has.
+    """
+
+    def __init__(
+        self, dbc: str, message: str | None, signals: Sequence[str], counter: str | None, sync: str | None
+    ) -> None:
+        database = load(dbc)
+        if message is None:
+            having = [m for m in database.messages if signals[0] in m.signal_tree]
+            known = [s.name for m in database.messages for s in m.signals]
+            if not having:
+                _choose("signal", signals[0], known, dbc)
+            found = having[0]
+        else:
+            found = database.get_message_by_name(_choose("message", message, [m.name for m in database.messages], dbc))
+        self.message: Message = found
+        names = [s.name for s in found.signals]
+        place = f"message {found.name} of {dbc}"
+        self._signals = tuple(_choose("signal", s, names, place) for s in signals)
+        self._counter = _choose("counter", counter, names, place) if counter else None
+        self._sync = _choose("sync", sync, names, place) if sync else None
+        self.counter_modulus = 0
+        if self._counter:
+            self.counter_modulus = 1 << found.get_signal_by_name(self._counter).length
+
+    @property
+    def frame_id(self) -> int:
+        """Arbitration id of the frames to decode."""
+        return self.message.frame_id
+
+    @property
+    def samples_per_frame(self) -> int:
+        """How many torque samples each frame carries."""
+        return len(self._signals)
+
+    def decode(self, data: bytes) -> FrameSamples:
+        """Values of one frame.
+
+        Raises
+        ------
+        WireError
+            The frame is too short for the description.
+        """
+        try:
+            values = cast(
+                "dict[str, float]",
+                self.message.decode(data, decode_choices=False, scaling=True, allow_truncated=False),
+            )
+        except Exception as error:
+            raise WireError(f"frame {data.hex(' ')} does not fit {self.message.name}: {error}") from None
+        return FrameSamples(
+            tuple(float(values[s]) for s in self._signals),
+            int(values[self._counter]) if self._counter else -1,
+            int(values[self._sync]) if self._sync else 255,
+        )
