@@ -1,0 +1,75 @@
+"""The house keeps its own rules: what a linter doesn't see."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+FIXED_TOP_LEVEL = {"pyproject.toml", "rig", "identify", "api", "hardware_sim", "tests", "deploy"}
+BESIDE = {
+    "README.md", "Makefile", "docs", "examples", "bench", "requirements", "LICENSE",
+    ".ci", ".gitignore", ".pre-commit-config.yaml",
+}  # fmt: skip
+
+
+def tracked() -> list[Path]:
+    listing = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True)
+    if listing.returncode:
+        pytest.skip("not a git checkout")
+    return [path for name in listing.stdout.splitlines() if (path := ROOT / name).is_file()]
+
+
+def test_top_level_is_as_the_user_fixed_it() -> None:
+    names = {path.relative_to(ROOT).parts[0] for path in tracked()}
+    assert names >= FIXED_TOP_LEVEL
+    assert names <= FIXED_TOP_LEVEL | BESIDE
+
+
+def test_no_file_over_one_megabyte() -> None:
+    assert [path for path in tracked() if path.stat().st_size > 1_000_000] == []
+
+
+def test_no_registry_host_and_no_index_line_in_the_locked_lists() -> None:
+    for name in ("run", "test", "bench"):
+        text = (ROOT / "requirements" / f"{name}.txt").read_text()
+        assert "://" not in text
+        assert not re.search(r"^\s*--(extra-)?index|^\s*-i ", text, re.MULTILINE)
+        pins = [line for line in text.splitlines() if re.match(r"[a-zA-Z0-9]", line)]
+        assert pins
+        assert len(pins) <= text.count("--hash=sha256:")
+
+
+def test_nothing_in_the_lists_hides_our_packages() -> None:
+    for name in ("run", "test", "bench"):
+        pinned = re.findall(r"^([a-z0-9._-]+)==", (ROOT / "requirements" / f"{name}.txt").read_text(), re.MULTILINE)
+        assert not {"identify", "rig", "api", "hardware-sim"} & set(pinned)
+
+
+def test_no_machine_path_in_the_sources() -> None:
+    pattern = re.compile(r"/(?:work|root|home/\w+)/")
+    offenders = [
+        f"{path.relative_to(ROOT)}: {found.group()}"
+        for path in tracked()
+        if path.suffix in {".py", ".md", ".toml", ".sh", ".yaml", ".html", ".js", ".css"} and path != Path(__file__)
+        if (found := pattern.search(path.read_text(encoding="utf-8")))
+    ]
+    assert offenders == []
+
+
+def test_the_emulator_and_identify_import_nothing_of_one_another_or_the_rig() -> None:
+    """import-linter checks this too; this one also sees imports inside functions and by name."""
+    forbidden = {
+        "hardware_sim": ("rig", "identify", "api"),
+        "identify": ("rig", "hardware_sim", "api"),
+        "rig": ("identify", "hardware_sim", "api"),
+    }
+    for package, others in forbidden.items():
+        pattern = re.compile(
+            rf"""^\s*(?:from|import)\s+(?:{"|".join(others)})\b|import_module\(["'](?:{"|".join(others)})\b""", re.M
+        )
+        for path in (ROOT / package).rglob("*.py"):
+            assert not pattern.search(path.read_text(encoding="utf-8")), path
