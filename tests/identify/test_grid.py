@@ -1,0 +1,143 @@
+"""The grid of pulses against integration at 8 kHz, at any sampling rate."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+
+from identify.dynamics import boundary_states, transition
+from identify.errors import BadRecord
+from identify.grid import make_grid, runs
+from identify.noise import best_ar1, log_likelihood, whiten
+from identify.record import Record
+
+PULSE_RATE_HZ = 40.0
+FINE = 200  # steps of the reference integration in each pulse interval
+
+
+def schedule(seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return np.r_[np.zeros(20), rng.integers(0, 2, 200) * 300.0, np.linspace(0, 300, 200)]
+
+
+def fine_torque(widths_us: np.ndarray, time_constant_s: float, damping: float) -> np.ndarray:
+    """Torque at 8 kHz by a method that shares nothing with the grid: a plain recursion at a two-hundredth of a step."""
+    step_s = 1.0 / PULSE_RATE_HZ / FINE
+    y, v, out = 0.0, 0.0, []
+    for w in np.repeat(widths_us / 40.0, FINE):
+        out.append(y)
+        # midpoint rule: second order, at 0.125 ms
+        a = (w - y - 2 * damping * time_constant_s * v) / time_constant_s**2
+        ym, vm = y + step_s / 2 * v, v + step_s / 2 * a
+        y += step_s * vm
+        v += step_s * (w - ym - 2 * damping * time_constant_s * vm) / time_constant_s**2
+    return np.array(out)
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.031])
+@pytest.mark.parametrize("rate_hz", [40, 50, 100, 200, 250, 400, 1000, 1600, 2000])
+def test_block_means_match_fine_integration(rate_hz: int, delay_s: float) -> None:
+    widths_us = schedule()
+    time_constant_s, damping = 0.15, 0.64
+    size = int(len(widths_us) / PULSE_RATE_HZ * rate_hz)
+    time_s = np.arange(size) / rate_hz
+    slot = np.minimum((time_s * PULSE_RATE_HZ + 1e-9).astype(int), len(widths_us) - 1)
+    reference = fine_torque(widths_us, time_constant_s, damping)
+    torque = np.interp(time_s - delay_s, np.arange(reference.size) / (PULSE_RATE_HZ * FINE), reference)
+    grid = make_grid(Record.from_arrays(time_s, widths_us[slot], torque))
+    assert np.array_equal(grid.pulse_width_us, widths_us[: grid.size])
+    states = boundary_states(time_constant_s, damping, grid.step_s, widths_us[: grid.size] / 40.0)
+    assert np.abs(grid.block_mean(*states, delay_s) - grid.torque_nm).max() < 2e-5
+
+
+@given(
+    phase=st.floats(0.0, 0.02499),
+    rate_hz=st.sampled_from([100, 200, 400, 1000, 1600]),
+    start_s=st.floats(-5, 500),
+)
+@settings(max_examples=60, deadline=None)
+def test_the_pulses_are_found_wherever_the_record_starts(phase: float, rate_hz: int, start_s: float) -> None:
+    widths_us = schedule(1)
+    since = np.arange(int(9 * rate_hz)) / rate_hz
+    slot = np.floor((since - phase) * PULSE_RATE_HZ + 1e-9).astype(int) + 1
+    record = Record.from_arrays(start_s + since, widths_us[slot], np.zeros(since.size))
+    grid = make_grid(record)
+    inside = slice(1, -1)  # the first and last interval may be cut short by the record's ends
+    first = np.flatnonzero(grid.pulse_width_us)[0] - np.flatnonzero(widths_us)[0]
+    expected = widths_us[np.arange(grid.size) - first]
+    assert np.array_equal(grid.pulse_width_us[inside], expected[inside])
+
+
+@given(time_constant_s=st.floats(0.03, 1.0), damping=st.floats(0.3, 2.0))
+@settings(max_examples=30, deadline=None)
+def test_transition_is_the_solution_of_the_equation(time_constant_s: float, damping: float) -> None:
+    phi, gamma = transition(time_constant_s, damping, 0.025)
+
+    def slope(_t: float, x: np.ndarray) -> list[float]:
+        return [x[1], (2.0 - x[0] - 2 * damping * time_constant_s * x[1]) / time_constant_s**2]
+
+    solved = solve_ivp(slope, (0, 0.025), [1.5, -3.0], rtol=1e-10, atol=1e-12).y[:, -1]
+    np.testing.assert_allclose(phi @ [1.5, -3.0] + gamma * 2.0, solved, rtol=1e-6, atol=1e-6)
+
+
+def test_critical_damping_has_no_seam() -> None:
+    below, at, above = (transition(0.2, damping, 0.025)[0] for damping in (1 - 1e-6, 1.0, 1 + 1e-6))
+    np.testing.assert_allclose(below, at, atol=1e-5)
+    np.testing.assert_allclose(above, at, atol=1e-5)
+
+
+def test_a_delay_of_nothing_changes_no_bit() -> None:
+    grid = make_grid(Record.from_arrays(np.arange(4000) / 400, np.repeat(schedule()[:400], 10), np.zeros(4000)))
+    states = boundary_states(0.3, 0.8, grid.step_s, grid.pulse_width_us)
+    assert np.array_equal(grid.block_mean(*states), grid.block_mean(*states, 0.0))
+    assert grid.mean_weights(0.0)[0] == 0
+
+
+def test_held_out_rows_are_never_fitted() -> None:
+    names = ["prbs"] * 2000 + ["validate"] * 1000 + ["rest"] * 1000
+    grid = make_grid(Record.from_arrays(np.arange(4000) / 400, np.zeros(4000), np.zeros(4000), names))
+    assert not grid.fitted[200:300].any()
+    assert grid.stretches == [slice(0, 200), slice(300, 400)]
+
+
+@pytest.mark.parametrize(("rate_hz", "size"), [(30, 900), (400, 50)])
+def test_what_cannot_be_put_on_the_grid_is_refused(rate_hz: int, size: int) -> None:
+    with pytest.raises(BadRecord) as refusal:
+        make_grid(Record.from_arrays(np.arange(size) / rate_hz, np.zeros(size), np.zeros(size)))
+    assert refusal.value.mend
+
+
+def test_runs() -> None:
+    assert runs(np.array([1, 1, 0, 1], bool)) == [slice(0, 2), slice(3, 4)]
+    assert runs(np.zeros(3, bool)) == []
+
+
+def test_whitening_is_the_exact_likelihood() -> None:
+    """Against the dense covariance of the stationary process."""
+    rng = np.random.default_rng(3)
+    residual, ar1, parts = rng.normal(size=12), 0.7, [slice(0, 7), slice(8, 12)]
+    expected = 0.0
+    quadratic, count, logdet = 0.0, 0, 0.0
+    for part in parts:
+        e = residual[part]
+        lag = np.abs(np.subtract.outer(np.arange(e.size), np.arange(e.size)))
+        covariance = ar1**lag / (1 - ar1**2)
+        quadratic += e @ np.linalg.solve(covariance, e)
+        logdet += np.linalg.slogdet(covariance)[1]
+        count += e.size
+    variance = quadratic / count
+    expected = -0.5 * (count * (np.log(2 * np.pi * variance) + 1) + logdet)
+    assert log_likelihood(residual, parts, ar1) == pytest.approx(expected, rel=1e-12)
+    assert whiten(residual, parts, ar1).size == count
+
+
+def test_best_ar1_finds_the_correlation() -> None:
+    rng = np.random.default_rng(4)
+    e = np.zeros(20_000)
+    for k in range(1, e.size):
+        e[k] = 0.8 * e[k - 1] + rng.normal()
+    assert best_ar1(e, [slice(0, e.size)]) == pytest.approx(0.8, abs=0.02)
+    assert best_ar1(rng.normal(size=20_000), [slice(0, 20_000)]) == pytest.approx(0.0, abs=0.03)
