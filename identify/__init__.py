@@ -1,1 +1,73 @@
-"""Identification and criticism of electrically stimulated muscle. Pure: arrays in, model out."""
+"""Identification and criticism of electrically stimulated muscle. Pure: arrays in, model out.
+
+Names are loaded when they are first used, so that `import identify` costs nothing.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from identify.criticism import compare
+    from identify.diagnosis import diagnose
+    from identify.errors import (
+        BadModel,
+        BadRecord,
+        BadRequest,
+        Cancelled,
+        IdentifyError,
+        NotIdentifiable,
+    )
+    from identify.estimate import fit
+    from identify.improve import improve
+    from identify.methods import methods
+    from identify.model import Model
+    from identify.record import Record
+    from identify.records import read
+    from identify.simulate import predict
+
+_PLACES = {
+    "read": "identify.records",
+    "Record": "identify.record",
+    "fit": "identify.estimate",
+    "predict": "identify.simulate",
+    "Model": "identify.model",
+    "methods": "identify.methods",
+    "compare": "identify.criticism",
+    "diagnose": "identify.diagnosis",
+    "improve": "identify.improve",
+    "BadModel": "identify.errors",
+    "BadRecord": "identify.errors",
+    "BadRequest": "identify.errors",
+    "Cancelled": "identify.errors",
+    "IdentifyError": "identify.errors",
+    "NotIdentifiable": "identify.errors",
+}
+_MODULES = {"effects", "table1"}
+
+__all__ = [
+    "BadModel",
+    "BadRecord",
+    "BadRequest",
+    "Cancelled",
+    "IdentifyError",
+    "Model",
+    "NotIdentifiable",
+    "Record",
+    "compare",
+    "diagnose",
+    "fit",
+    "improve",
+    "methods",
+    "predict",
+    "read",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _PLACES:
+        return getattr(import_module(_PLACES[name]), name)
+    if name in _MODULES:
+        return import_module(f"identify.{name}")
+    raise AttributeError(f"module 'identify' has no attribute {name!r}")

@@ -118,3 +118,14 @@ def read_at(torque_nm: np.ndarray, rate_nm_s: np.ndarray, position: np.ndarray, 
         + weight[:, 3] * rate_nm_s[interval + 1]
     )
     return np.where(position < 0, torque_nm[0], value)
+
+
+def free_states(time_constant_s: float, damping: float, step_s: float, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Undriven boundary states from a unit torque (column 0) and a unit rate (column 1); each (size + 1, 2)."""
+    phi, _ = transition(time_constant_s, damping, step_s)
+    values, vectors = np.linalg.eig(phi + 0j)
+    if abs(values[0] - values[1]) < 1e-7:  # critical damping: the two poles meet, keep them a hair apart
+        values, vectors = np.linalg.eig(transition(time_constant_s, damping * (1 + 1e-6), step_s)[0] + 0j)
+    powers = values[None, :] ** np.arange(size + 1)[:, None]
+    states = np.real(np.einsum("ij,kj,jl->kil", vectors, powers, np.linalg.inv(vectors)))
+    return states[:, 0, :], states[:, 1, :]

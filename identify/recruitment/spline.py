@@ -58,6 +58,18 @@ class SplineBasis:
         second = self.design(u.ravel(), derivative=2)
         return second.T @ (second * (half[:, None] * weight).ravel()[:, None])
 
+    @property
+    def largest_us(self) -> float:
+        """Pulse width beyond which the curve is held, µs."""
+        return float(self.knots_us[-1])
+
+    def to_dict(self) -> dict:
+        return {"kind": "cubic-spline", "knots_us": [float(u) for u in self.knots_us]}
+
+    @classmethod
+    def from_dict(cls, data: dict) -> SplineBasis:
+        return cls(np.asarray(data["knots_us"], float))
+
     def torque_nm(self, coefficients_nm: np.ndarray, pulse_width_us: np.ndarray) -> np.ndarray:
         """f(u) for coefficients of shape (size,)."""
         return self.design(pulse_width_us) @ coefficients_nm

@@ -1,0 +1,282 @@
+"""The model of one muscle: recruitment, linear dynamics, effects; to and from MODEL.json."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from identify.errors import BadModel
+from identify.linear import Discrete, Linear, SecondOrder, linear_from_dict
+from identify.recruitment.curve import Curve, basis_from_dict
+
+if TYPE_CHECKING:
+    from identify.record import Record
+
+SCHEMA_VERSION = "1.0"
+SOFTWARE = {"name": "stimrig", "version": "0.1.0"}
+
+
+@dataclass(frozen=True)
+class Noise:
+    """What the residual is taken to be.
+
+    Parameters
+    ----------
+    white_sd_nm : float
+        White measurement noise at the record's own rate, N·m.
+    block_sd_nm : float
+        Standard deviation of the noise on the grid of pulses, N·m.
+    ar1 : float
+        Correlation of neighbours on the grid of pulses; 0 where white is the better account.
+    delta_bic : float
+        Evidence for AR(1) over white noise (positive: AR(1)).
+    """
+
+    white_sd_nm: float = 0.0
+    block_sd_nm: float = 0.0
+    ar1: float = 0.0
+    delta_bic: float = 0.0
+
+
+@dataclass(frozen=True)
+class Covariance:
+    """Parameters that were estimated, with their covariance.
+
+    Parameters
+    ----------
+    names : tuple of str
+        One a parameter, ending in its unit: time_constant_s, damping, delay_s, baseline_nm, recruitment_0_nm, …
+    values : ndarray, shape (P,)
+        Estimates.
+    matrix : ndarray, shape (P, P)
+        Covariance, in products of the parameters' units.
+    """
+
+    names: tuple[str, ...]
+    values: np.ndarray
+    matrix: np.ndarray
+
+    def sd(self, name: str) -> float:
+        """Standard deviation of a parameter by its name."""
+        place = self.names.index(name)
+        return float(np.sqrt(max(self.matrix[place, place], 0.0)))
+
+
+@dataclass(frozen=True)
+class Model:
+    """A Hammerstein model, with effects around it or without.
+
+    Parameters
+    ----------
+    method : str
+        Id of the method that made it.
+    recruitment : Curve
+        f(u), N·m.
+    linear : SecondOrder or Discrete
+        G, unit gain at DC.
+    pulse_rate_hz, sample_rate_hz : float
+        Pulses and samples a second of the record it was fitted on.
+    baseline_nm : float
+        Torque at rest, N·m.
+    initial : tuple of float
+        Torque above the baseline, N·m, and its rate, N·m/s, at the fitted record's first pulse; zero from rest.
+    noise : Noise
+        The residual's account.
+    effects : tuple of dict
+        Effects, each {"id", "form", "parameters", …} as its engine writes it; empty for the base model.
+    covariance : Covariance or None
+        All parameters.
+    fit, residual_tests, valid_for, quality, bands, data : dict
+        See `docs/` and MODEL.json; `fit` holds fit_percent, held_out_fit_percent, rms_nm, held_out_rms_nm,
+        ceiling_percent and noise_sd_nm.
+    reasons : tuple of str
+        Why structure, delay, knots and noise model are as they are.
+    """
+
+    method: str
+    recruitment: Curve
+    linear: Linear
+    pulse_rate_hz: float
+    sample_rate_hz: float
+    baseline_nm: float = 0.0
+    initial: tuple[float, float] = (0.0, 0.0)
+    noise: Noise = field(default_factory=Noise)
+    effects: tuple[dict[str, Any], ...] = ()
+    covariance: Covariance | None = None
+    fit: dict[str, Any] = field(default_factory=dict)
+    residual_tests: dict[str, Any] = field(default_factory=dict)
+    valid_for: dict[str, Any] = field(default_factory=dict)
+    quality: dict[str, Any] = field(default_factory=dict)
+    bands: dict[str, Any] = field(default_factory=dict)
+    data: dict[str, Any] = field(default_factory=dict)
+    reasons: tuple[str, ...] = ()
+    extra: dict[str, Any] = field(default_factory=dict)
+    model_id: str = ""
+    created: str = ""
+    software: dict[str, Any] = field(default_factory=lambda: dict(SOFTWARE))
+
+    def predict(self, record: Record) -> np.ndarray:
+        """Free-run torque at the record's samples, N·m, shape (N,)."""
+        from identify.simulate import predict
+
+        return predict(self, record)
+
+    def to_dict(self) -> dict[str, Any]:
+        """MODEL.json as a dict of plain lists and numbers."""
+        width, torque = self.recruitment.table()
+        level, needed = self.recruitment.inverse()
+        rate = self.sample_rate_hz if isinstance(self.linear, SecondOrder) else 1.0 / self.linear.step_s
+        b, a, delay = self.linear.discrete(rate)
+        covariance = self.covariance
+        return _plain(
+            {
+                "schema_version": SCHEMA_VERSION,
+                "model_id": self.model_id,
+                "sample_rate_hz": rate,
+                "pulse_rate_hz": self.pulse_rate_hz,
+                "record_rate_hz": self.sample_rate_hz,
+                "method": self.method,
+                "created": self.created,
+                "linear": {
+                    "b": b,
+                    "a": a,
+                    "delay_samples": delay,
+                    "form": "y[k] = sum_i b[i] w[k - delay_samples - i] - sum_{j>=1} a[j] y[k - j]; w = f(pulse width)",
+                }
+                | self.linear.to_dict(),
+                "recruitment": {
+                    "pulse_width_us": width,
+                    "torque_nm": torque,
+                    "inverse": {"torque_nm": level, "pulse_width_us": needed},
+                }
+                | self.recruitment.to_dict(),
+                "baseline_nm": self.baseline_nm,
+                "initial": list(self.initial),
+                "noise": self.noise.__dict__,
+                "valid_for": self.valid_for,
+                "uncertainty": {
+                    "covariance": None
+                    if covariance is None
+                    else {"names": covariance.names, "values": covariance.values, "matrix": covariance.matrix},
+                    "bands": self.bands,
+                },
+                "effects": self.effects,
+                "fit": self.fit,
+                "residual_tests": self.residual_tests,
+                "quality": self.quality,
+                "reasons": self.reasons,
+                "data": self.data,
+                "software": self.software,
+                "extra": self.extra,
+            }
+        )
+
+    def to_json(self, indent: int | None = 1) -> str:
+        """MODEL.json as text."""
+        return json.dumps(self.to_dict(), indent=indent, ensure_ascii=False, allow_nan=False)
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> Model:
+        """The model that `to_dict` wrote.
+
+        Raises
+        ------
+        BadModel
+            A key is missing, or its value is no such thing.
+        """
+        if not isinstance(data, dict):
+            raise BadModel("a model is a JSON object", mend="Give a file written by `stimrig fit -o`.")
+        version = str(data.get("schema_version", ""))
+        if version.split(".")[0] != SCHEMA_VERSION.split(".")[0]:
+            raise BadModel(
+                f"schema version {version or 'missing'}, this software reads {SCHEMA_VERSION}",
+                place="schema_version",
+                mend="Fit the record again with this version.",
+            )
+        try:
+            return _from_dict(data)
+        except KeyError as error:
+            raise BadModel("key is missing", place=str(error.args[0]), mend="Fit the record again.") from error
+        except (TypeError, ValueError, IndexError, AttributeError) as error:
+            raise BadModel(f"malformed: {error}", mend="Fit the record again.") from error
+
+    @classmethod
+    def from_json(cls, text: str | bytes) -> Model:
+        """The model in a MODEL.json text.
+
+        Raises
+        ------
+        BadModel
+            No JSON, or not a model.
+        """
+        try:
+            data = json.loads(text)
+        except ValueError as error:
+            line, column = getattr(error, "lineno", "?"), getattr(error, "colno", "?")
+            raise BadModel("not JSON", place=f"line {line}, column {column}", mend="Fit the record again.") from error
+        return cls.from_dict(data)
+
+    def with_(self, **changes: Any) -> Model:
+        """The model with some fields changed."""
+        return replace(self, **changes)
+
+
+def _from_dict(data: dict[str, Any]) -> Model:
+    recruitment, uncertainty = data["recruitment"], data.get("uncertainty") or {}
+    basis = basis_from_dict(recruitment["basis"])
+    coefficients = np.asarray(recruitment["basis"]["coefficients_nm"], float)
+    if coefficients.shape != (basis.size,):
+        raise BadModel(
+            f"{coefficients.size} coefficients for a basis of {basis.size}", place="recruitment.basis.coefficients_nm"
+        )
+    covariance = uncertainty.get("covariance")
+    return Model(
+        method=str(data["method"]),
+        recruitment=Curve(basis, coefficients),
+        linear=linear_from_dict(data["linear"]),
+        pulse_rate_hz=float(data["pulse_rate_hz"]),
+        sample_rate_hz=float(data.get("record_rate_hz", data["sample_rate_hz"])),
+        baseline_nm=float(data.get("baseline_nm", 0.0)),
+        initial=(float(data.get("initial", (0, 0))[0]), float(data.get("initial", (0, 0))[1])),
+        noise=Noise(**data.get("noise", {})),
+        effects=tuple(data.get("effects", ())),
+        covariance=None
+        if not covariance
+        else Covariance(
+            tuple(covariance["names"]), np.asarray(covariance["values"], float), np.asarray(covariance["matrix"], float)
+        ),
+        fit=data.get("fit", {}),
+        residual_tests=data.get("residual_tests", {}),
+        valid_for=data.get("valid_for", {}),
+        quality=data.get("quality", {}),
+        bands=uncertainty.get("bands", {}),
+        data=data.get("data", {}),
+        reasons=tuple(data.get("reasons", ())),
+        extra=data.get("extra", {}),
+        model_id=str(data.get("model_id", "")),
+        created=str(data.get("created", "")),
+        software=data.get("software", {}),
+    )
+
+
+def _plain(value: Any) -> Any:
+    """Arrays and numpy numbers as lists and numbers; what is not finite as null, which JSON can hold."""
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if isinstance(value, (bool, np.bool_)):
+        return bool(value)
+    if isinstance(value, (int, np.integer)):
+        return int(value)
+    if isinstance(value, (float, np.floating)):
+        return float(value) if np.isfinite(value) else None
+    return value
+
+
+__all__ = ["SCHEMA_VERSION", "Covariance", "Discrete", "Model", "Noise", "SecondOrder"]

@@ -1,0 +1,65 @@
+"""Free-run prediction: from the recorded pulse widths alone, at the record's own rate."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from identify.dynamics import boundary_states, read_at
+from identify.grid import Grid, make_grid
+from identify.linear import SecondOrder
+from identify.model import Model
+from identify.record import Record
+
+
+def predict(model: Model, record: Record) -> np.ndarray:
+    """Torque the model gives for the record's pulse widths, N·m, shape (N,).
+
+    No measured torque is used: this is what the controller would have seen. A model with effects is run by the
+    engine of the effects.
+    """
+    if model.effects:
+        from identify import engine  # type: ignore[attr-defined]
+
+        return np.asarray(engine.predict(model, record))
+    return predict_on(model, make_grid(record))
+
+
+def predict_on(model: Model, grid: Grid) -> np.ndarray:
+    """As `predict`, for a base model and a grid that is already made."""
+    torque = model.linear.at_samples(grid, model.recruitment(grid.pulse_width_us))
+    if model.extra.get("narx"):
+        from identify.methods.narx import free_run
+
+        torque = free_run(model, grid)
+    if any(model.initial) and isinstance(model.linear, SecondOrder) and same_data(model, grid.record):
+        torque = torque + initial_response(model.linear, grid) @ np.asarray(model.initial)
+    return torque + model.baseline_nm
+
+
+def initial_response(linear: SecondOrder, grid: Grid, at_samples: bool = True) -> np.ndarray:
+    """Response to a unit initial torque (column 0) and a unit initial rate (column 1), undriven."""
+    from identify.dynamics import free_states
+
+    torque, rate = free_states(linear.time_constant_s, linear.damping, grid.step_s, grid.size)
+    if not at_samples:
+        return grid.block_mean(torque, rate, linear.delay_s)
+    position = grid.interval + grid.fraction - linear.delay_s / grid.step_s
+    return np.stack([read_at(torque[:, j], rate[:, j], position, grid.step_s) for j in range(2)], axis=1)
+
+
+def same_data(model: Model, record: Record) -> bool:
+    """Whether the record is the very one that the model was fitted on."""
+    return bool(model.data.get("fingerprint")) and model.data["fingerprint"] == fingerprint(record)
+
+
+def fingerprint(record: Record) -> str:
+    """SHA-256 of time, pulse width and torque."""
+    import hashlib
+
+    digest = hashlib.sha256()
+    for column in (record.time_s, record.pulse_width_us, record.torque_nm):
+        digest.update(np.ascontiguousarray(column))
+    return digest.hexdigest()
+
+
+__all__ = ["boundary_states", "fingerprint", "initial_response", "predict", "predict_on", "same_data"]
