@@ -65,9 +65,7 @@ def from_file(path: Path) -> Muscle:
     described = _read(path)
     unknown = sorted(set(described) - {"patient", "parameters"})
     if unknown:
-        raise PatientError(
-            f"{path}: unknown key '{unknown[0]}'; a patient's file has 'patient' and 'parameters'"
-        )
+        raise PatientError(f"{path}: unknown key '{unknown[0]}'; a patient's file has 'patient' and 'parameters'")
     parameters = described.get("parameters", {})
     if not isinstance(parameters, dict):
         raise PatientError(f"{path}: 'parameters' must be a table of names and numbers")
@@ -84,9 +82,7 @@ def _read(path: Path) -> dict[str, Any]:
     except (OSError, UnicodeDecodeError) as error:
         raise PatientError(f"{path}: cannot be read ({error}); give a readable TOML or JSON file") from None
     except ValueError as error:  # both decoders' errors name line and column
-        raise PatientError(
-            f"{path}: not valid {'JSON' if path.suffix == '.json' else 'TOML'}: {error}"
-        ) from None
+        raise PatientError(f"{path}: not valid {'JSON' if path.suffix == '.json' else 'TOML'}: {error}") from None
     if not isinstance(described, dict):
         raise PatientError(f"{path}: must hold a table with 'patient' and 'parameters'")
     return described

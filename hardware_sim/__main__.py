@@ -1,0 +1,108 @@
+"""`python -m hardware_sim`: the process behind `stimrig emulate`."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import os
+import signal
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from hardware_sim import options as command_line
+from hardware_sim.emulator import Emulator
+from hardware_sim.errors import FaultError, HardwareSimError, PatientError
+from hardware_sim.patients import registry
+from hardware_sim.patients.muscle import Muscle
+
+PROG = "stimrig emulate"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the emulator; the exit code: 0 done, 2 bad input."""
+    try:
+        options = command_line.parse(arguments, PROG)
+    except SystemExit as done:
+        return done.code if isinstance(done.code, int) else 2
+    try:
+        if options.reveal is not None:
+            print(json.dumps(_hidden().reveal(options.reveal)))
+            return 0
+        muscle, name = _patient(options)
+        emulator = Emulator(muscle, command_line.settings(options, name))
+    except HardwareSimError as error:
+        print(f"{PROG}: {error}", file=sys.stderr)
+        return 2
+    try:
+        for text in options.fault:
+            emulator.faults.on(*_fault(text))
+        return _run(emulator, options)
+    except FaultError as error:
+        print(f"{PROG}: {error}", file=sys.stderr)
+        return 2
+    finally:
+        emulator.close()
+
+
+def _run(emulator: Emulator, options: argparse.Namespace) -> int:
+    signals: list[int] = []
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda caught, _frame: signals.append(caught))
+    ready = emulator.ready()
+    if options.no_json:
+        print(*(f"{key}: {value}" for key, value in ready.items()), sep="\n", flush=True)
+    else:
+        print(json.dumps(ready), flush=True)
+    orphaned = _orphan_watch() if options.die_with_parent else lambda: False
+    emulator.run(lambda: bool(signals) or orphaned())
+    return 0
+
+
+def _orphan_watch() -> Callable[[], bool]:
+    """Whether the parent has gone. Asked of the kernel each time: a death signal would follow the thread
+    that started this process, not the process."""
+    parent = os.getppid()
+    return lambda: os.getppid() != parent
+
+
+def _patient(options: argparse.Namespace) -> tuple[Muscle, str]:
+    if options.hidden is not None:
+        return _hidden().make(options.hidden), f"hidden:{options.hidden}"
+    name = options.patient
+    if name in registry.names():
+        return registry.make(name), name
+    if Path(name).suffix.lower() in {".toml", ".json"} or Path(name).exists():
+        return registry.from_file(Path(name)), name
+    return registry.make(name), name
+
+
+def _hidden() -> Any:
+    module = "hardware_sim.patients.hidden"
+    try:
+        hidden = importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name != module:
+            raise
+        hidden = None
+    if not hasattr(hidden, "make"):
+        raise PatientError("hidden patients are not part of this installation; use --patient")
+    return hidden
+
+
+def _fault(text: str) -> tuple[str, dict[str, Any]]:
+    name, *pairs = text.split(",")
+    settings: dict[str, Any] = {}
+    for pair in pairs:
+        key, _, value = pair.partition("=")
+        try:
+            settings[key] = {"true": True, "false": False}[value] if value in ("true", "false") else float(value)
+        except ValueError:
+            raise FaultError(f"--fault {text}: '{pair}' must be SETTING=NUMBER") from None
+    return name, settings
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,120 @@
+"""The control line for tests: a Unix socket, one JSON object a line each way. No part of the rig.
+
+`{"cmd": "state"}`, `{"cmd": "pulses", "since": 0}`, `{"cmd": "faults"}` (what there is),
+`{"cmd": "fault", "name": …, "on": true, "for_s": …, <settings>}`. Answers carry `"ok"`; if it is false, `"error"`.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import socket
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hardware_sim.errors import FaultError, HardwareSimError
+from hardware_sim.reactor import Reactor
+
+if TYPE_CHECKING:
+    from hardware_sim.emulator import Emulator
+
+LONGEST_LINE = 65536
+SEND_TIMEOUT_S = 1.0
+
+
+class Control:
+    """Answers any number of clients, in the emulator's own thread."""
+
+    def __init__(self, reactor: Reactor, path: Path, emulator: Emulator) -> None:
+        self.path = path
+        self._reactor, self._emulator = reactor, emulator
+        self._clients: dict[socket.socket, bytes] = {}
+        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        self._listener.bind(str(path))
+        self._listener.listen()
+        self._listener.setblocking(False)
+        reactor.add(self._listener, self._accept)
+        self._commands = {
+            "state": self._state,
+            "pulses": self._pulses,
+            "faults": self._faults,
+            "fault": self._fault,
+        }
+
+    def close(self) -> None:
+        """Hang up."""
+        for client in list(self._clients):
+            self._drop(client)
+        self._reactor.remove(self._listener)
+        self._listener.close()
+
+    def answer(self, line: bytes) -> dict[str, Any]:
+        """The answer to one line."""
+        try:
+            request = json.loads(line)
+            command = request.pop("cmd")
+        except (ValueError, AttributeError, KeyError, TypeError):
+            return {"ok": False, "error": 'expected one JSON object a line with "cmd"'}
+        if command not in self._commands:
+            known = ", ".join(self._commands)
+            return {"ok": False, "error": f"unknown command {command!r}; there are {known}"}
+        self._emulator.catch_up()
+        try:
+            return {"ok": True, **self._commands[command](request)}
+        except HardwareSimError as error:
+            return {"ok": False, "error": str(error)}
+
+    def _state(self, _request: dict[str, Any]) -> dict[str, Any]:
+        return self._emulator.state()
+
+    def _pulses(self, request: dict[str, Any]) -> dict[str, Any]:
+        since = request.get("since", 0)
+        pulses = self._emulator.electrodes.pulses(since if isinstance(since, int) and since >= 0 else 0)
+        for pulse in pulses:
+            pulse["monotonic_s"] = self._emulator.clock.monotonic_s(pulse["time_s"])
+        return {"pulses": pulses}
+
+    def _faults(self, _request: dict[str, Any]) -> dict[str, Any]:
+        return {"faults": self._emulator.faults.describe(), "active": self._emulator.faults.active()}
+
+    def _fault(self, request: dict[str, Any]) -> dict[str, Any]:
+        name, on, for_s = request.pop("name", ""), request.pop("on", True), request.pop("for_s", None)
+        if for_s is not None and not (isinstance(for_s, int | float) and 0 <= for_s < math.inf):
+            raise FaultError(f"'for_s' must be a number of seconds, not {for_s!r}")
+        if on:
+            self._emulator.faults.on(str(name), request, for_s)
+        else:
+            self._emulator.faults.off(str(name))
+        time_s = self._emulator.timeline.now_s
+        return {
+            "time_s": time_s,
+            "monotonic_s": self._emulator.clock.monotonic_s(time_s),
+            "active": self._emulator.faults.active(),
+            "pulses_received": len(self._emulator.electrodes.log),
+        }
+
+    def _accept(self) -> None:
+        try:
+            client, _ = self._listener.accept()
+        except OSError:
+            return
+        client.settimeout(SEND_TIMEOUT_S)
+        self._clients[client] = b""
+        self._reactor.add(client, lambda: self._read(client))
+
+    def _read(self, client: socket.socket) -> None:
+        try:
+            data = client.recv(LONGEST_LINE)
+            *lines, rest = (self._clients[client] + data).split(b"\n")
+            self._clients[client] = rest[-LONGEST_LINE:]
+            for line in lines:
+                client.sendall(json.dumps(self.answer(line)).encode() + b"\n")
+        except OSError:  # gone, or does not read: it cannot be allowed to hold the rig's time
+            data = b""
+        if not data:
+            self._drop(client)
+
+    def _drop(self, client: socket.socket) -> None:
+        if self._clients.pop(client, None) is not None:
+            self._reactor.remove(client)
+            client.close()

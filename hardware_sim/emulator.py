@@ -1,0 +1,176 @@
+"""The emulator: stimulator, muscle and load cell put together, and the loop that lets time pass."""
+
+from __future__ import annotations
+
+import os
+import random
+import shutil
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from hardware_sim import stimulators
+from hardware_sim.control import Control
+from hardware_sim.electrodes import Electrodes
+from hardware_sim.faults.registry import Faults
+from hardware_sim.load_cells import cells, transports
+from hardware_sim.load_cells.sampler import LoadCell, Noise, deliver
+from hardware_sim.patients.muscle import Muscle
+from hardware_sim.pseudo_terminal import PseudoTerminal
+from hardware_sim.reactor import Reactor
+from hardware_sim.scan import pick
+from hardware_sim.settings import Settings
+from hardware_sim.stimulators.board import Board
+from hardware_sim.timeline import Timeline, WallClock
+
+TICK_S = 0.0025
+"""How often frames are handed over, in real time: four at 1600 samples/s."""
+SHORTEST_TICK_S = 0.0005
+
+
+class Emulator:
+    """The rig's other side in one process and one thread.
+
+    Time moves in `run`: each turn takes muscle, cell and firmware up to now, hands the frames over, and waits
+    for the host or the next tick. A command from the host takes time up to its arrival first.
+    """
+
+    def __init__(self, muscle: Muscle, settings: Settings) -> None:
+        self.settings = settings
+        self.random = random.Random(settings.noise_seed)
+        self.timeline = Timeline()
+        self._reactor = Reactor()
+        self._folder = Path(tempfile.mkdtemp(prefix="stimrig-emulator-"))
+        cell = pick(cells, "Cell", settings.cell, "load cell")()
+        noise = Noise(settings.noise_nm, settings.noise_seed)
+        self.load_cell = LoadCell(
+            muscle,
+            cell,
+            noise,
+            settings.rate_hz,
+            offset_nm=settings.torque_offset_nm,
+            clock_ppm=settings.clock_ppm,
+            has_sync=settings.sync,
+            epoch_us=time.time_ns() // 1000,
+        )
+        self.timeline.followers.append(self.load_cell.produce)
+        self.electrodes = Electrodes(muscle, self.load_cell.raise_sync)
+        self.board = Board(self.timeline, self.electrodes, self._write)
+        self.firmware = pick(stimulators, "Firmware", settings.stimulator, "stimulator")(self.board)
+        self.faults = Faults(self)
+        self._received = cell.received
+        self._transport_class = pick(transports, "Transport", settings.transport, "transport")
+        self.plug_stimulator()
+        self.plug_cell()
+        self._control = Control(self._reactor, self._folder / "control", self)
+        self.clock = WallClock(settings.speed)
+
+    def ready(self) -> dict[str, Any]:
+        """What the host needs to know: the line printed once the devices answer."""
+        return {
+            "stimulator": self.port.path,
+            "stimulator_link": str(self._link),
+            "can": self.transport.can,
+            "control": str(self._control.path),
+            "pid": os.getpid(),
+            "sample_rate_hz": self.settings.rate_hz,
+            "speed": self.settings.speed,
+            "patient": self.settings.patient,
+            "noise_nm": self.settings.noise_nm,
+            "noise_seed": self.settings.noise_seed,
+            "sync": self.settings.sync,
+        }
+
+    def run(self, stopping: Callable[[], bool]) -> None:
+        """Let time pass until `stopping`."""
+        tick_s = max(SHORTEST_TICK_S, TICK_S / self.settings.speed)
+        next_tick_s = time.monotonic()
+        while not stopping():
+            self.catch_up()
+            deliver(self.load_cell, self.transport)
+            self.port.flush()
+            now_s = time.monotonic()
+            next_tick_s = max(next_tick_s + tick_s, now_s)
+            while (left_s := self._wait_s(next_tick_s)) > 0 and not stopping():
+                self._reactor.poll(left_s)
+                self.catch_up()
+
+    def catch_up(self) -> None:
+        """Take everything up to the present."""
+        self.timeline.run_until(self.clock.now_s())
+
+    def close(self) -> None:
+        """Pull everything out and leave nothing behind."""
+        self._control.close()
+        self.unplug_stimulator()
+        self.unplug_cell()
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+    def plug_stimulator(self) -> None:
+        """The stimulator's port appears, and the link points to it."""
+        self.port = PseudoTerminal()
+        self._reactor.add(self.port, self._read)
+        self._link.unlink(missing_ok=True)
+        self._link.symlink_to(self.port.path)
+
+    def unplug_stimulator(self) -> None:
+        """The stimulator's port is gone; the device itself goes on."""
+        if self.port.is_open:
+            self._reactor.remove(self.port)
+            self.port.close()
+        self._link.unlink(missing_ok=True)
+
+    def plug_cell(self) -> None:
+        """The cell's adapter appears, on a port of its own."""
+        self.transport = self._transport_class(self._reactor, self._received)
+
+    def unplug_cell(self) -> None:
+        """The cell's adapter is gone."""
+        self.transport.close()
+
+    def state(self) -> dict[str, Any]:
+        """Where everything stands, for the control line."""
+        log = self.electrodes.log
+        last_s = log[-1].time_s if log else None
+        return {
+            **self.firmware.state(),
+            "time_s": self.timeline.now_s,
+            "monotonic_s": self.clock.monotonic_s(self.timeline.now_s),
+            "pulses_received": len(log),
+            "pulses_delivered": self.electrodes.delivered_pulses,
+            "unbalanced_pulses": self.electrodes.unbalanced_pulses,
+            "last_pulse_time_s": last_s,
+            "last_pulse_monotonic_s": None if last_s is None else self.clock.monotonic_s(last_s),
+            "torque_nm": self.load_cell.torque_nm,
+            "samples": self.load_cell.samples,
+            "frames_overrun": self.transport.overruns,
+            "faults": self.faults.active(),
+            "stimulator": self.port.path if self.port.is_open else None,
+            "can": self.transport.can,
+        }
+
+    @property
+    def _link(self) -> Path:
+        return self._folder / "stimulator"
+
+    def _wait_s(self, next_tick_s: float) -> float:
+        """Real time until the next tick or event, whichever comes first; zero when a tick is due."""
+        now_s = time.monotonic()
+        left_s = next_tick_s - now_s
+        event_s = self.timeline.next_s()
+        if event_s is None:
+            return left_s
+        return min(left_s, max(self.clock.monotonic_s(event_s) - now_s, 1e-5))
+
+    def _read(self) -> None:
+        data: bytes | None = self.port.read()
+        self.catch_up()
+        for hook in self.board.incoming:
+            data = hook(data) if data else None
+        if data:
+            self.firmware.received(data)
+
+    def _write(self, frame: bytes) -> None:
+        self.port.write(frame)

@@ -1,0 +1,1 @@
+"""Load cells: `cells` lays samples out in CAN frames, `transports` carries frames, `sampler` makes samples."""

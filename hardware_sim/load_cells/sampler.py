@@ -1,0 +1,125 @@
+"""Samples of the muscle's torque at exact multiples of the cell's own period, and the frames they travel in."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+import numpy as np
+
+from hardware_sim.load_cells.frames import CellProtocol, Frame, Sample, TransportProtocol
+from hardware_sim.patients.muscle import Muscle
+
+TorqueHook = Callable[[float], float]
+FrameHook = Callable[[Frame], Iterable[Frame]]
+NOISE_BLOCK = 4096
+
+
+class Noise:
+    """White noise of the sensor, the same for the same seed, drawn in blocks to be cheap."""
+
+    def __init__(self, sd_nm: float, seed: int) -> None:
+        self._sd_nm = sd_nm
+        self._random = np.random.default_rng(seed)
+        self._block: list[float] = []
+
+    def next_nm(self) -> float:
+        """Noise of the next sample, N·m."""
+        if not self._block:
+            self._block = (self._sd_nm * self._random.standard_normal(NOISE_BLOCK))[::-1].tolist()
+        return self._block.pop()
+
+
+class LoadCell:
+    """Takes the muscle along as time goes by, and turns its torque into frames.
+
+    `torque_hooks` and `frame_hooks` are where faults enter: a torque hook changes a reading, a frame hook gives
+    the frames that are sent in place of one.
+    """
+
+    def __init__(
+        self,
+        muscle: Muscle,
+        cell: CellProtocol,
+        noise: Noise,
+        rate_hz: float,
+        offset_nm: float = 0.0,
+        clock_ppm: float = 0.0,
+        has_sync: bool = True,
+        epoch_us: int = 0,
+    ) -> None:
+        self.torque_hooks: list[TorqueHook] = []
+        self.frame_hooks: list[FrameHook] = []
+        self.counter = 0
+        self.samples = 0
+        self.torque_nm = 0.0
+        self._muscle, self._cell, self._noise = muscle, cell, noise
+        self._offset_nm, self._has_sync = offset_nm, has_sync
+        self._nominal_hz = rate_hz
+        self._clock_rate = 1.0 + clock_ppm * 1e-6
+        self._epoch_us = epoch_us
+        self._sync = False
+        self._held: list[Sample] = []
+        self._frames: list[Frame] = []
+        self._anchor_s, self._anchor_sample, self._period_s = 0.0, 0, 1.0 / (rate_hz * self._clock_rate)
+
+    def raise_sync(self) -> None:
+        """The stimulator's sync line: seen in the first sample from now on."""
+        self._sync = self._has_sync
+
+    def set_rate_factor(self, factor: float) -> None:
+        """Sample `factor` times as fast as nominal from the next sample on."""
+        self._anchor_s, self._anchor_sample = self._next_s(), self.samples
+        self._period_s = 1.0 / (self._nominal_hz * self._clock_rate * factor)
+
+    def produce(self, until_s: float) -> None:
+        """All samples that are due before `until_s`, in emulated seconds."""
+        time_s = self._next_s()
+        while time_s < until_s:
+            self._sample(time_s)
+            time_s = self._next_s()
+
+    def take_frames(self) -> list[Frame]:
+        """The frames made since the last call."""
+        frames, self._frames = self._frames, []
+        return frames
+
+    def add_frame(self, frame: Frame) -> None:
+        """A frame of no sample: a bus error, or one that a fault had kept back."""
+        self._frames.append(frame)
+
+    def time_us(self, time_s: float) -> int:
+        """The cell's clock, which drifts by `clock_ppm`, at an emulated time."""
+        return self._epoch_us + round(time_s * self._clock_rate * 1e6)
+
+    def _next_s(self) -> float:
+        return self._anchor_s + (self.samples - self._anchor_sample) * self._period_s
+
+    def _sample(self, time_s: float) -> None:
+        self.torque_nm = self._muscle.torque_nm(time_s)
+        reading_nm = self.torque_nm + self._offset_nm + self._noise.next_nm()
+        for hook in self.torque_hooks:
+            reading_nm = hook(reading_nm)
+        sample = Sample(reading_nm, self.counter, self._sync, self.time_us(time_s))
+        self._sync = False
+        self.samples += 1
+        self.counter = (self.counter + 1) & 0xFFFF
+        if not self._cell.running():
+            self._held.clear()
+            return
+        self._held.append(sample)
+        if len(self._held) >= self._cell.samples_per_frame:
+            self._queue(self._cell.encode(self._held))
+            self._held.clear()
+
+    def _queue(self, frame: Frame) -> None:
+        frames = [frame]
+        for hook in self.frame_hooks:
+            frames = [changed for one in frames for changed in hook(one)]
+        self._frames += frames
+
+
+def deliver(load_cell: LoadCell, transport: TransportProtocol) -> None:
+    """Hand the frames made since the last call to the transport."""
+    frames = load_cell.take_frames()
+    if frames:
+        transport.send(frames)

@@ -1,0 +1,1 @@
+"""A transport is one file with a class `Transport`, found by scanning."""

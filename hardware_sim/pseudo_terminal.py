@@ -1,0 +1,63 @@
+"""A serial port that is not there: the master's side of a pseudo-terminal."""
+
+from __future__ import annotations
+
+import os
+import tty
+
+
+class PseudoTerminal:
+    """A raw pseudo-terminal that outlives its clients and never blocks.
+
+    The emulator keeps the slave side open itself: else the master would report EIO each time the rig closes
+    the port. What nobody reads waits in `pending` like in a device's FIFO, and beyond `fifo_bytes` whole
+    messages are dropped.
+    """
+
+    def __init__(self, fifo_bytes: int = 65536) -> None:
+        self._master, self._slave = os.openpty()
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        self.path = os.ttyname(self._slave)
+        self.dropped_messages = 0
+        self.is_open = True
+        self._fifo_bytes = fifo_bytes
+        self._pending = bytearray()
+
+    def fileno(self) -> int:
+        """The master's descriptor, for select."""
+        return self._master
+
+    def read(self) -> bytes:
+        """What the client has written since; empty where there is nothing."""
+        try:
+            return os.read(self._master, 65536)
+        except OSError:
+            return b""
+
+    def write(self, message: bytes) -> None:
+        """Queue one message for the client and hand over what fits."""
+        if not self.is_open:
+            return
+        if len(self._pending) + len(message) > self._fifo_bytes:
+            self.dropped_messages += 1
+        else:
+            self._pending += message
+        self.flush()
+
+    def flush(self) -> None:
+        """Hand over as much of what is pending as fits."""
+        if not (self._pending and self.is_open):
+            return
+        try:
+            written = os.write(self._master, self._pending)
+        except OSError:  # full: nobody reads
+            return
+        del self._pending[:written]
+
+    def close(self) -> None:
+        """Unplug: a client that has the port open reads end of file or EIO."""
+        if self.is_open:
+            self.is_open = False
+            os.close(self._slave)
+            os.close(self._master)

@@ -1,0 +1,235 @@
+"""Hasomed RehaMove P24's firmware, ScienceMode 4: general commands and low level; mid level next door.
+
+Low level: the host sends one LLChannelConfig per pulse. Silence means no stimulation.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable
+from typing import Any
+
+from hardware_sim.stimulators import sciencemode4
+from hardware_sim.stimulators.board import Board
+from hardware_sim.stimulators.p24_mid_level import MidLevel
+from hardware_sim.stimulators.p24_points import (
+    ELECTRODE,
+    ELECTRODE_DETECTION_MA,
+    HIGH_VOLTAGE,
+    INVALID_COMMAND,
+    NOT_INITIALISED,
+    OK,
+    PARAMETER,
+    TRANSFER,
+    parse_points,
+    within_limits,
+)
+from hardware_sim.stimulators.sciencemode4 import Packet
+from hardware_sim.timeline import Event
+
+LL_INIT, LL_CHANNEL_CONFIG, LL_STOP = 0, 2, 4
+ML_INIT, ML_UPDATE, ML_STOP, ML_GET_CURRENT_DATA = 30, 32, 34, 36
+DEVICE_ID, RESET, STIM_STATUS, GENERAL_ERROR, UNKNOWN_COMMAND, EXTENDED_VERSION = 52, 58, 62, 66, 67, 68
+SWITCH_TIME_S = 0.040
+RESET_TIME_S = 0.2
+HIGH_VOLTAGE_OFF, HIGH_VOLTAGE_ON_CODE = 1, 6
+NO_LEVEL, LOW_LEVEL, MID_LEVEL_READY, MID_LEVEL_RUNNING = 0, 1, 2, 3
+MODES = ("none", "low level", "mid level", "mid level running")
+MEASUREMENT_SAMPLES = 128
+LOAD_KILOOHM = 1.0
+SOURCE_VOLT = 150.0
+
+
+class Firmware:
+    """The P24's state machine; commands are done one after another, in the order they came."""
+
+    def __init__(self, board: Board) -> None:
+        self._board = board
+        self._decoder = sciencemode4.Decoder()
+        self._queue: deque[Packet] = deque()
+        self._doing: Event | None = None
+        self._level = NO_LEVEL
+        self._source = self._measurement = 0
+        self._mid_level = MidLevel(board)
+        self.commands: Counter[int] = Counter()
+        self._handlers: dict[int, Callable[[Packet], None]] = {
+            LL_INIT: self._ll_init,
+            LL_CHANNEL_CONFIG: self._ll_channel_config,
+            LL_STOP: self._ll_stop,
+            ML_INIT: self._ml_init,
+            ML_UPDATE: self._ml_update,
+            ML_STOP: self._ml_stop,
+            ML_GET_CURRENT_DATA: self._ml_get_current_data,
+            DEVICE_ID: lambda p: self._ack(p, bytes((OK,)) + b"EMULATED24"),
+            RESET: self._reset_command,
+            STIM_STATUS: self._stim_status,
+            # firmware 1.0.0, ScienceMode 4.0.0, hash 0 of kind git, valid
+            EXTENDED_VERSION: lambda p: self._ack(p, bytes((OK, 1, 0, 0, 4, 0, 0, 0, 0, 0, 0, 1, 1))),
+        }
+
+    @property
+    def level(self) -> int:
+        """Stimulation status as the protocol counts it: 0 none, 1 low, 2 mid, 3 mid running."""
+        if self._level == MID_LEVEL_READY and self._mid_level.running:
+            return MID_LEVEL_RUNNING
+        return self._level
+
+    @property
+    def high_voltage_on(self) -> bool:
+        """Whether the source that drives the pulses is up."""
+        return self._level != NO_LEVEL and self._source != HIGH_VOLTAGE_OFF and self._board.high_voltage_works
+
+    def received(self, data: bytes) -> None:
+        """Bytes from the host; a corrupt frame is answered with a general error."""
+        corrupt = self._decoder.corrupt_frames
+        packets = self._decoder.feed(data, self._board.timeline.now_s)
+        if self._decoder.corrupt_frames > corrupt:
+            self._send(Packet(0, GENERAL_ERROR, bytes((TRANSFER,))))
+        self._queue.extend(packets)
+        self._work()
+
+    def reset(self) -> None:
+        """Power lost and back: no stimulation, nothing initialised, commands forgotten."""
+        self._queue.clear()
+        if self._doing is not None:
+            self._doing.cancel()
+            self._doing = None
+        self._end_levels()
+
+    def state(self) -> dict[str, Any]:
+        """For the control line."""
+        return {
+            "device": "P24",
+            "mode": MODES[self.level],
+            "high_voltage_on": self.high_voltage_on,
+            "corrupt_frames": self._decoder.corrupt_frames,
+            "commands": {str(command): count for command, count in sorted(self.commands.items())},
+        }
+
+    def _work(self) -> None:
+        while self._queue and self._doing is None:
+            packet = self._queue.popleft()
+            self.commands[packet.command] += 1
+            self._handlers.get(packet.command, self._unknown)(packet)
+
+    def _later(self, delay_s: float, finish: Callable[[], None]) -> None:
+        """Be busy for `delay_s`, then finish and take the next command."""
+
+        def done() -> None:
+            self._doing = None
+            finish()
+            self._work()
+
+        self._doing = self._board.timeline.after(delay_s, done)
+
+    def _send(self, packet: Packet) -> None:
+        self._board.send(sciencemode4.encode(packet))
+
+    def _ack(self, packet: Packet, data: bytes) -> None:
+        self._send(Packet(packet.number, packet.command + 1, data))
+
+    def _end_levels(self) -> None:
+        self._mid_level.stop()
+        self._level = NO_LEVEL
+
+    def _unknown(self, packet: Packet) -> None:
+        self._send(Packet(packet.number, UNKNOWN_COMMAND, bytes((INVALID_COMMAND,))))
+
+    def _stim_status(self, packet: Packet) -> None:
+        high_voltage = HIGH_VOLTAGE_ON_CODE if self.high_voltage_on else 0
+        self._ack(packet, bytes((OK, self.level, high_voltage)))
+
+    def _reset_command(self, packet: Packet) -> None:
+        self._ack(packet, bytes((OK,)))
+        self._end_levels()
+        self._queue.clear()
+        self._later(RESET_TIME_S, lambda: None)
+
+    def _ll_init(self, packet: Packet) -> None:
+        self._end_levels()
+        settings = packet.data[0] if len(packet.data) == 1 else -1
+        measurement, source = settings >> 4 & 7, settings >> 1 & 7
+        if settings < 0 or settings & 0x81 or measurement > 3 or source > HIGH_VOLTAGE_ON_CODE:
+            self._ack(packet, bytes((PARAMETER,)))
+            return
+
+        def finish() -> None:
+            self._measurement, self._source = measurement, source
+            works = self._board.high_voltage_works or source == HIGH_VOLTAGE_OFF
+            self._level = LOW_LEVEL if works else NO_LEVEL
+            self._ack(packet, bytes((OK if works else HIGH_VOLTAGE,)))
+
+        self._later(SWITCH_TIME_S, finish)
+
+    def _ll_stop(self, packet: Packet) -> None:
+        result = OK if self._level == LOW_LEVEL else NOT_INITIALISED
+        self._end_levels()
+        self._later(SWITCH_TIME_S, lambda: self._ack(packet, bytes((result,))))
+
+    def _ll_channel_config(self, packet: Packet) -> None:
+        head = packet.data[0] if packet.data else 0
+        execute, channel, connector = head >> 7, head >> 5 & 3, head >> 4 & 1
+        points = parse_points(packet.data[1:], (head & 0xF) + 1) if packet.data else None
+        place = connector << 4 | channel
+
+        def answer(result: int) -> None:
+            measured = self._measurement if result == OK and execute and points else 0
+            self._ack(packet, bytes((result, place, measured)) + self._samples(measured, points or []))
+
+        if self._level != LOW_LEVEL:
+            answer(NOT_INITIALISED)
+        elif points is None or not within_limits(points):
+            answer(PARAMETER)
+        elif not execute:
+            answer(OK)
+        elif not self.high_voltage_on:
+            answer(HIGH_VOLTAGE)
+        else:
+            flowed = self._board.electrodes.fire(self._board.timeline.now_s, points, (connector, channel), "low level")
+            seen = max(abs(current_ma) for _, current_ma in points) >= ELECTRODE_DETECTION_MA
+            result = ELECTRODE if seen and not flowed else OK
+            self._later(sum(width for width, _ in points) * 1e-6, lambda: answer(result))
+
+    @staticmethod
+    def _samples(measurement: int, points: list[tuple[int, float]]) -> bytes:
+        """Sampling time (µs) and 128 samples ×100 of current (1), voltage (2) or source voltage (3)."""
+        if not measurement:
+            return b""
+        step_us = max(1, -(-sum(width for width, _ in points) // MEASUREMENT_SAMPLES))
+        shape = [abs(current) for width, current in points for _ in range(width)][::step_us]
+        shape = (shape + [0.0] * MEASUREMENT_SAMPLES)[:MEASUREMENT_SAMPLES]
+        scale = {1: 1.0, 2: LOAD_KILOOHM, 3: 0.0}[measurement]
+        constant = SOURCE_VOLT if measurement == 3 else 0.0
+        values = [step_us, *(round(100 * (scale * sample + constant)) for sample in shape)]
+        return b"".join(value.to_bytes(2, "big") for value in values)
+
+    def _ml_init(self, packet: Packet) -> None:
+        self._end_levels()
+        if len(packet.data) != 1 or packet.data[0] > 1:
+            self._ack(packet, bytes((PARAMETER,)))
+            return
+        if not self._board.high_voltage_works:
+            self._ack(packet, bytes((HIGH_VOLTAGE,)))
+            return
+
+        def finish() -> None:
+            self._level, self._source = MID_LEVEL_READY, 0
+            self._mid_level.start(stop_on_error=bool(packet.data[0]))
+            self._ack(packet, bytes((OK,)))
+
+        self._later(SWITCH_TIME_S, finish)
+
+    def _ml_update(self, packet: Packet) -> None:
+        ready = self._level == MID_LEVEL_READY
+        self._ack(packet, bytes((self._mid_level.update(packet.data) if ready else NOT_INITIALISED,)))
+
+    def _ml_get_current_data(self, packet: Packet) -> None:
+        if self._level != MID_LEVEL_READY:
+            self._ack(packet, bytes((NOT_INITIALISED, 4, 0, 0, 0, 0, 0)))
+        else:
+            self._ack(packet, self._mid_level.current_data(packet.data))
+
+    def _ml_stop(self, packet: Packet) -> None:
+        result = OK if self._level == MID_LEVEL_READY else NOT_INITIALISED
+        self._end_levels()
+        self._later(SWITCH_TIME_S, lambda: self._ack(packet, bytes((result,))))

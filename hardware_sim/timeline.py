@@ -1,0 +1,84 @@
+"""The emulator's time: a row of events on a clock that somebody else moves.
+
+The process moves it with the machine's monotonic clock; tests move it by hand and finish fast.
+"""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+import time
+from collections.abc import Callable
+
+
+class Event:
+    """Something that is to happen at `time_s`; `cancel` makes it not happen."""
+
+    __slots__ = ("action", "time_s")
+
+    def __init__(self, time_s: float, action: Callable[[], None]) -> None:
+        self.time_s = time_s
+        self.action: Callable[[], None] | None = action
+
+    def cancel(self) -> None:
+        """Let the event pass without a deed."""
+        self.action = None
+
+
+class Timeline:
+    """Events in the order of their time, in seconds of the emulator's own clock.
+
+    `followers` are called with the new time before time moves there, so that whatever is continuous
+    (the sampled muscle) has been taken up to an event before the event changes it.
+    """
+
+    def __init__(self) -> None:
+        self.now_s = 0.0
+        self.followers: list[Callable[[float], None]] = []
+        self._events: list[tuple[float, int, Event]] = []
+        self._order = itertools.count()
+
+    def at(self, time_s: float, action: Callable[[], None]) -> Event:
+        """Do `action` when time reaches `time_s`; at once when it has passed and time next moves."""
+        event = Event(max(time_s, self.now_s), action)
+        heapq.heappush(self._events, (event.time_s, next(self._order), event))
+        return event
+
+    def after(self, delay_s: float, action: Callable[[], None]) -> Event:
+        """Do `action` in `delay_s` seconds."""
+        return self.at(self.now_s + delay_s, action)
+
+    def next_s(self) -> float | None:
+        """Time of the next event, or None where there is none."""
+        return self._events[0][0] if self._events else None
+
+    def run_until(self, time_s: float) -> None:
+        """Move time to `time_s`, with everything that happens on the way."""
+        while self._events and self._events[0][0] <= time_s:
+            event_s, _, event = heapq.heappop(self._events)
+            if event.action is not None:
+                self._move(event_s)
+                event.action()
+        self._move(time_s)
+
+    def _move(self, time_s: float) -> None:
+        if time_s > self.now_s:
+            for follow in self.followers:
+                follow(time_s)
+            self.now_s = time_s
+
+
+class WallClock:
+    """Seconds since the start on the monotonic clock, `speed` times faster."""
+
+    def __init__(self, speed: float = 1.0) -> None:
+        self.speed = speed
+        self._start_s = time.monotonic()
+
+    def now_s(self) -> float:
+        """Emulated seconds since the start."""
+        return (time.monotonic() - self._start_s) * self.speed
+
+    def monotonic_s(self, time_s: float) -> float:
+        """The machine's monotonic time at an emulated time."""
+        return self._start_s + time_s / self.speed
