@@ -1,0 +1,228 @@
+"""Records of muscles with something hidden in them, made off line for developing and judging the diagnosis.
+
+Seeds 0 to 99 are for development; report on seeds from 1000.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.random import Generator
+
+from hardware_sim.patients.hidden.draw import draw_scenario, effect_ids, outside_ids, rng_of
+from hardware_sim.patients.hidden.kernels import Floats
+from hardware_sim.patients.hidden.scenario import simulate
+
+NOISES = ("white", "ar1", "slow")
+SLOW_CORRELATION_S = 0.075
+
+
+def _ar1(rng: Generator, count: int, sd_nm: float, rho: float) -> Floats:
+    from scipy.signal import lfilter
+
+    innovations = rng.normal(0.0, sd_nm * math.sqrt(1.0 - rho * rho), count)
+    innovations[0] = rng.normal(0.0, sd_nm)
+    return np.asarray(lfilter([1.0], [1.0, -rho], innovations))
+
+
+def draw_noise(
+    kind: str, rng: Generator, count: int, rate_hz: float, sd_nm: float, rho_40hz: float, slow_sd_nm: float
+) -> Floats:
+    """Sensor noise at the record's rate, N·m, shape (count,).
+
+    `white`; `ar1`: first-order, with autocorrelation `rho_40hz` over 25 ms and sd `sd_nm`; `slow`: sd `slow_sd_nm`
+    with a correlation time of 75 ms beside the white.
+
+    Raises
+    ------
+    ValueError
+        No such kind.
+    """
+    if kind == "white":
+        return rng.normal(0.0, sd_nm, count)
+    if kind == "ar1":
+        return _ar1(rng, count, sd_nm, rho_40hz ** (40.0 / rate_hz))
+    if kind == "slow":
+        slow = _ar1(rng, count, slow_sd_nm, math.exp(-1.0 / (rate_hz * SLOW_CORRELATION_S)))
+        return rng.normal(0.0, sd_nm, count) + slow
+    raise ValueError(f"noise {kind!r}: one of {', '.join(NOISES)}")
+
+
+def generate(
+    effect: str | list[str] | tuple[str, ...] | None,
+    strength: str = "middle",
+    seed: int = 0,
+    *,
+    rate_hz: float = 400,
+    design: str = "full",
+    noise_sd_nm: float = 0.04,
+    noise: str = "white",
+    rho_40hz: float | None = None,
+    slow_sd_nm: float = 0.04,
+    with_validate: bool = True,
+    validate_s: float = 16.0,
+    steep: bool = False,
+    moving: bool = False,
+    formulation: int | None = None,
+) -> dict[str, Any]:
+    """One record.
+
+    Parameters
+    ----------
+    effect
+        An id, several, or None for nothing hidden.
+    strength
+        `weak`, `middle` or `strong`: the best effect-free Hammerstein fit leaves 2 to 5, 5 to 10, over 10 times
+        `noise_sd_nm` in the held-out rows (of a noise-free twin of this record).
+    seed
+        Settles everything.
+    rate_hz
+        40 to 2000; torque is point-sampled from a simulation at 1600 Hz or more.
+    design
+        `full`, `short` (PRBS and ramp only) or `long`.
+    noise, rho_40hz, slow_sd_nm
+        See `draw_noise`; without `rho_40hz` it is drawn between 0.5 and 0.99.
+    steep
+        Recruitment that rises within 5 to 25 µs.
+    moving
+        The joint moves slowly, `angle_rad` and `velocity_rad_s` are recorded (always so where an effect needs it).
+    formulation
+        Which of the effect's formulations; drawn if None.
+
+    Returns
+    -------
+    dict
+        `time_s`, `pulse_width_us`, `torque_nm`, `segment`, shape (n,), with `angle_rad` and `velocity_rad_s` where the
+        joint moves; and `truth`.
+
+    Raises
+    ------
+    ValueError
+        Unknown effect, strength, noise or design; a rate out of range.
+    """
+    if not 40 <= rate_hz <= 2000:
+        raise ValueError(f"rate {rate_hz} Hz: give 40 to 2000")
+    names = () if effect is None else (effect,) if isinstance(effect, str) else tuple(effect)
+    scenario = draw_scenario(
+        names,
+        strength if names else "middle",
+        seed,
+        noise_sd_nm=noise_sd_nm,
+        steep=steep,
+        moving=moving,
+        formulation=formulation,
+        design=design,
+        validate_s=validate_s,
+        with_validate=with_validate,
+    )
+    every = math.ceil(1600 / rate_hz)
+    step_s = 1.0 / (rate_hz * every)
+    sequence = scenario.design
+    rng = rng_of(seed, "noise", *names, strength)
+    rho = float(1.0 - np.exp(rng.uniform(np.log(0.01), np.log(0.5)))) if rho_40hz is None else rho_40hz
+    width, _, angle, velocity = sequence.fine(step_s)
+    fine_noise = np.zeros(width.size)
+    count = len(range(0, width.size, every))
+    fine_noise[::every] = draw_noise(noise, rng, count, rate_hz, noise_sd_nm, rho, slow_sd_nm)
+    torque = simulate(scenario.base, scenario.stages(), sequence, step_s, fine_noise)[::every]
+    held = np.minimum(np.floor(np.arange(count) / rate_hz * 40 + 1e-9).astype(int), sequence.width_us.size - 1)
+    record: dict[str, Any] = {
+        "time_s": np.arange(count) / rate_hz,
+        "pulse_width_us": sequence.width_us[held],
+        "torque_nm": torque,
+        "segment": sequence.segment[held],
+    }
+    if sequence.movement is not None:
+        record |= {"angle_rad": angle[::every], "velocity_rad_s": velocity[::every]}
+    conditions = {"kind": noise, "sd_nm": noise_sd_nm}
+    if noise == "ar1":
+        conditions["rho_40hz"] = round(rho, 5)
+    if noise == "slow":
+        conditions |= {"slow_sd_nm": slow_sd_nm, "slow_correlation_s": SLOW_CORRELATION_S}
+    record["truth"] = scenario.truth(noise_sd_nm) | {
+        "seed": seed,
+        "noise": conditions,
+        "steep": steep,
+        "design": design,
+        "rate_hz": rate_hz,
+    }
+    return record
+
+
+def write_csv(record: dict[str, Any], path: str | Path) -> None:
+    """Write a record as `time_s,pulse_width_us,torque_nm,segment[,angle_rad,velocity_rad_s]`."""
+    names = ["time_s", "pulse_width_us", "torque_nm", "segment"]
+    texts = [
+        np.char.mod("%.7f", record["time_s"]),
+        np.char.mod("%g", record["pulse_width_us"]),
+        np.char.mod("%.6f", record["torque_nm"]),
+        record["segment"],
+    ]
+    if "angle_rad" in record:
+        names += ["angle_rad", "velocity_rad_s"]
+        texts += [np.char.mod("%.6f", record["angle_rad"]), np.char.mod("%.6f", record["velocity_rad_s"])]
+    lines = [",".join(names), *map(",".join, zip(*texts, strict=True))]
+    Path(path).write_text("\n".join(lines) + "\n")
+
+
+def _seeds(text: str) -> range:
+    first, _, last = text.partition(":")
+    return range(int(first), int(last)) if last else range(int(first), int(first) + 1)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Write a set of records with `truth.json`."""
+    parser = argparse.ArgumentParser(prog="python -m hardware_sim.hidden_records", description=main.__doc__)
+    parser.add_argument("--out", type=Path, required=True, help="folder, made if absent")
+    parser.add_argument("--seeds", type=_seeds, default=range(1), help="first:last, last not included")
+    parser.add_argument(
+        "--effects",
+        default="all",
+        help="ids with commas; a+b for two at once; 'all', 'outside', 'none' (nothing hidden)",
+    )
+    parser.add_argument("--strengths", default="weak,middle,strong")
+    parser.add_argument("--rate-hz", type=float, default=400)
+    parser.add_argument("--design", default="full")
+    parser.add_argument("--noise", choices=NOISES, default="white")
+    parser.add_argument("--noise-sd-nm", type=float, default=0.04)
+    parser.add_argument("--steep", action="store_true")
+    parser.add_argument("--no-validate", action="store_true")
+    settings = parser.parse_args(arguments)
+    settings.out.mkdir(parents=True, exist_ok=True)
+    effects: list[str | None] = []
+    for word in settings.effects.split(","):
+        effects += {"all": effect_ids(), "outside": outside_ids(), "none": (None,)}.get(word, (word,))
+    truths = {}
+    for effect in effects:
+        for strength in settings.strengths.split(",") if effect else ["none"]:
+            for seed in settings.seeds:
+                name = f"{effect or 'none'}-{strength}-{seed}.csv"
+                try:
+                    record = generate(
+                        effect.split("+") if effect else None,
+                        strength,
+                        seed,
+                        rate_hz=settings.rate_hz,
+                        design=settings.design,
+                        noise=settings.noise,
+                        noise_sd_nm=settings.noise_sd_nm,
+                        steep=settings.steep,
+                        with_validate=not settings.no_validate,
+                    )
+                except ValueError as problem:
+                    print(f"{name}: {problem}", file=sys.stderr)
+                    continue
+                truths[name] = record["truth"]
+                write_csv(record, settings.out / name)
+    (settings.out / "truth.json").write_text(json.dumps(truths, indent=1))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,140 @@
+# ruff: noqa: ARG001 (every kernel takes the same four arguments)
+"""The muscle before anything is hidden in it: recruitment drawn from many shapes, linear second-order dynamics."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.random import Generator
+
+from hardware_sim.patients.hidden import recruitment
+from hardware_sim.patients.hidden.kernels import (
+    ACTIVATION,
+    FORCE,
+    LARGEST_NM,
+    SPEED,
+    STEP_S,
+    Floats,
+    Stage,
+    helper,
+    kernel,
+)
+
+TABLE_SIZE = 512
+"""Recruitment is a table with one entry a µs."""
+
+
+@helper
+def look_up(table: Any, width_us: float) -> float:
+    """The recruitment table between its entries, N·m."""
+    if not width_us > 0.0:
+        return table[0]
+    if width_us >= 511.0:
+        return table[511]
+    i = int(width_us)
+    return table[i] + (width_us - i) * (table[i + 1] - table[i])
+
+
+@kernel
+def recruit(x, p, s, c):
+    """p[0:512]: torque at every µs."""
+    w = look_up(p, x)
+    c[ACTIVATION] = w / c[LARGEST_NM]
+    return w
+
+
+@helper
+def second_order_step(w, rate, damping, s, step_s):
+    """Fourth-order Runge-Kutta step of y'' = rate² (w - y) - 2 damping rate y', state s[0:2]."""
+    y, v = s[0], s[1]
+    a = rate * rate
+    b = 2.0 * damping * rate
+    k1 = a * (w - y) - b * v
+    v2 = v + 0.5 * step_s * k1
+    k2 = a * (w - y - 0.5 * step_s * v) - b * v2
+    v3 = v + 0.5 * step_s * k2
+    k3 = a * (w - y - 0.5 * step_s * v2) - b * v3
+    v4 = v + step_s * k3
+    k4 = a * (w - y - step_s * v3) - b * v4
+    s[0] = y + step_s / 6.0 * (v + 2.0 * v2 + 2.0 * v3 + v4)
+    s[1] = v + step_s / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+    return s[0]
+
+
+@kernel
+def second_order(x, p, s, c):
+    """p: 1/Tω, ζ."""
+    y = second_order_step(x, p[0] * c[SPEED], p[1], s, c[STEP_S])
+    c[FORCE] = y / c[LARGEST_NM]
+    return y
+
+
+@dataclass(frozen=True)
+class Base:
+    """A muscle with nothing hidden in it.
+
+    `lags_s` are the two time constants where the dynamics are two first-order lags in a row, else None.
+    """
+
+    shape: str
+    table_nm: Floats
+    largest_width_us: int
+    t_omega_s: float
+    zeta: float
+    lags_s: tuple[float, float] | None
+    dynamics: str
+    numbers: dict[str, float]
+
+    @property
+    def largest_nm(self) -> float:
+        """Steady torque at the largest pulse width."""
+        return float(self.table_nm[self.largest_width_us])
+
+    def rise_us(self) -> tuple[float, float]:
+        """Pulse widths at 10 and 90 % of the largest torque."""
+        share = np.maximum.accumulate(self.table_nm) / self.largest_nm
+        return float(np.argmax(share >= 0.1)), float(np.argmax(share >= 0.9))
+
+    def stages(self) -> list[Stage]:
+        """Recruitment and dynamics."""
+        return [
+            Stage("recruitment", recruit, self.table_nm),
+            Stage("dynamics", second_order, (1.0 / self.t_omega_s, self.zeta)),
+        ]
+
+    def describe(self) -> dict[str, Any]:
+        """What `reveal` tells of it."""
+        return {
+            "recruitment": self.shape,
+            "dynamics": self.dynamics,
+            "largest_torque_nm": round(self.largest_nm, 4),
+            "largest_width_us": self.largest_width_us,
+            "rise_10_90_us": list(self.rise_us()),
+            "t_omega_s": round(self.t_omega_s, 5),
+            "zeta": round(self.zeta, 5),
+            **self.numbers,
+        }
+
+
+def _draw_dynamics(rng: Generator) -> tuple[str, float, float, tuple[float, float] | None]:
+    kind = str(rng.choice(["second order", "two lags", "calcium then force"], p=[0.5, 0.3, 0.2]))
+    if kind == "second order":
+        return kind, float(np.exp(rng.uniform(np.log(0.1), np.log(0.6)))), float(rng.uniform(0.6, 1.2)), None
+    if kind == "two lags":
+        first = float(np.exp(rng.uniform(np.log(0.08), np.log(0.45))))
+        second = first * float(rng.uniform(0.5, 1.0))
+    else:
+        first, second = float(rng.uniform(0.02, 0.08)), float(np.exp(rng.uniform(np.log(0.12), np.log(0.5))))
+    t_omega = float(np.sqrt(first * second))
+    return kind, t_omega, (first + second) / (2.0 * t_omega), (first, second)
+
+
+def draw_base(rng: Generator, steep: bool = False) -> Base:
+    """Draw a muscle; `steep` asks for recruitment that rises (10 to 90 %) within 5 to 25 µs."""
+    shape, share, numbers, largest_width_us = recruitment.draw(rng, steep, TABLE_SIZE)
+    gain_nm = float(np.exp(rng.uniform(np.log(3.0), np.log(15.0))))
+    table = np.ascontiguousarray(share / share[largest_width_us] * gain_nm)
+    dynamics, t_omega, zeta, lags = _draw_dynamics(rng)
+    return Base(shape, table, largest_width_us, t_omega, zeta, lags, dynamics, numbers)

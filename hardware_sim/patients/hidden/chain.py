@@ -1,0 +1,99 @@
+"""Stages in a row: one compiled loop, for a whole record at once or a step at a time."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba as nb
+import numpy as np
+
+from hardware_sim.patients.hidden import kernels
+from hardware_sim.patients.hidden.kernels import (
+    ANGLE_RAD,
+    CONTEXT_SIZE,
+    COUNT,
+    LARGEST_NM,
+    PAUSE_S,
+    PULSE,
+    ROW,
+    SINCE_S,
+    SLOTS,
+    SPEED,
+    STEP_S,
+    TIME_S,
+    VELOCITY_RAD_S,
+    WIDTH_US,
+    Floats,
+    Stage,
+)
+
+_call: Any = kernels.call_kernel  # to a type checker, an intrinsic still has its typing context
+TRAIN_GAP_S = 0.15
+"""A pause longer than this starts a new train."""
+
+
+@nb.njit(cache=True)
+def _run(
+    addresses: Any, p: Any, s: Any, c: Any, x_in: Any, pulse: Any, angle: Any, velocity: Any, first: Any, out: Any
+):
+    c_address = c.ctypes.data
+    for k in range(x_in.size):
+        c[TIME_S] = (first + k) * c[STEP_S]
+        c[WIDTH_US] = x_in[k]
+        c[PULSE] = pulse[k]
+        c[ANGLE_RAD] = angle[k]
+        c[VELOCITY_RAD_S] = velocity[k]
+        c[SPEED] = 1.0
+        c[SINCE_S] += c[STEP_S]
+        if pulse[k] > 0.0:
+            if c[SINCE_S] > TRAIN_GAP_S:
+                c[PAUSE_S] = c[SINCE_S]
+                c[COUNT] = 0.0
+            c[COUNT] += 1.0
+            c[SINCE_S] = 0.0
+        x = x_in[k]
+        for i in range(addresses.size):
+            x = _call(addresses[i], x, p[i].ctypes.data, s[i].ctypes.data, c_address)
+        out[k] = x
+
+
+class Chain:
+    """Stages ordered by their slot, with their state.
+
+    Parameters
+    ----------
+    stages
+        Any number; within a slot they keep the order given.
+    largest_nm
+        The base's largest torque, by which activation and force are counted, N·m.
+    step_s
+        Step of the simulation, s.
+    """
+
+    def __init__(self, stages: list[Stage], largest_nm: float, step_s: float) -> None:
+        ordered = sorted(stages, key=lambda stage: SLOTS.index(stage.slot))
+        self._addresses = np.array([stage.kernel.address for stage in ordered], dtype=np.int64)
+        rows = [stage.rows() for stage in ordered]
+        self._p = np.array([p for p, _ in rows]).reshape(-1, ROW)
+        self._s = np.array([s for _, s in rows]).reshape(-1, ROW)
+        self._c = np.zeros(CONTEXT_SIZE)
+        self._c[STEP_S] = step_s
+        self._c[SINCE_S] = 10.0
+        self._c[LARGEST_NM] = largest_nm
+        self._steps = 0
+        self._one = np.zeros((5, 1))
+
+    def run(self, x: Floats, pulse: Floats, angle_rad: Floats, velocity_rad_s: Floats) -> Floats:
+        """Advance by as many steps as `x` has entries; what leaves the last stage at the end of each."""
+        out = np.empty(x.size)
+        _run(self._addresses, self._p, self._s, self._c, x, pulse, angle_rad, velocity_rad_s, self._steps, out)
+        self._steps += x.size
+        return out
+
+    def step(self, x: float, pulse: float) -> float:
+        """One step with the joint held still."""
+        one = self._one
+        one[0, 0], one[1, 0] = x, pulse
+        _run(self._addresses, self._p, self._s, self._c, one[0], one[1], one[2], one[3], self._steps, one[4])
+        self._steps += 1
+        return float(one[4, 0])

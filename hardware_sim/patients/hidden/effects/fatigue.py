@@ -1,0 +1,94 @@
+# ruff: noqa: ARG001 (every kernel takes the same four arguments)
+"""Fatigue: the torque a given recruitment yields falls with use and comes back with rest."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.random import Generator
+
+from hardware_sim.patients.hidden.base import Base
+from hardware_sim.patients.hidden.kernels import (
+    ACTIVATION,
+    FORCE,
+    LARGEST_NM,
+    SPEED,
+    STEP_S,
+    Formulation,
+    Stage,
+    kernel,
+)
+
+
+@kernel
+def _force_driven(x, p, s, c):
+    """p: α per s, τ s, slowing. s[0]: share of the gain lost. Ding's dA/dt = -(A - A0)/τ + α F, α < 0."""
+    s[0] += c[STEP_S] * (p[0] * c[FORCE] - s[0] / p[1])
+    s[0] = min(max(s[0], 0.0), 0.95)
+    c[SPEED] *= 1.0 / (1.0 + p[2] * s[0])
+    return x * (1.0 - s[0])
+
+
+@kernel
+def _three_compartments(x, p, s, c):
+    """p: F per s, R per s, r. s[0]: fatigued share. Units work, tire, and rest into use again."""
+    working = c[ACTIVATION] * (1.0 - s[0])
+    recovery = p[1] * (p[2] if c[ACTIVATION] < 0.02 else 1.0)
+    s[0] += c[STEP_S] * (p[0] * working - recovery * s[0])
+    s[0] = min(max(s[0], 0.0), 0.98)
+    return x * (1.0 - s[0])
+
+
+UNITS = 24
+
+
+@kernel
+def _motor_units(x, p, s, c):
+    """p[0:24]: rate of tiring of each unit, p[24:48]: of recovery. s: each unit's lost share, in recruitment order."""
+    level = c[ACTIVATION] * 24.0
+    torque = 0.0
+    for i in range(24):
+        on = min(max(level - i, 0.0), 1.0)
+        s[i] += c[STEP_S] * (p[i] * on * (1.0 - s[i]) - p[24 + i] * s[i])
+        torque += on * (1.0 - s[i])
+    return torque / 24.0 * c[LARGEST_NM] + max(level - 24.0, 0.0) / 24.0 * c[LARGEST_NM]
+
+
+def ding(rng: Generator, _base: Base) -> Formulation:
+    tau = float(rng.uniform(40.0, 150.0))
+    slowing = float(rng.choice([0.0, 0.3, 0.8]))
+    return Formulation(
+        "gain falls with force, fatigue slows the muscle" if slowing else "gain falls with force",
+        "Ding, Wexler and Binder-Macleod 2003",
+        lambda m: [Stage("gain", _force_driven, (m, tau, slowing))],
+        0.25,
+        "alpha_per_s",
+        {"tau_s": tau, "slowing": slowing},
+    )
+
+
+def xia_frey_law(rng: Generator, _base: Base) -> Formulation:
+    recovery, factor = float(rng.uniform(0.004, 0.03)), float(rng.uniform(1.0, 10.0))
+    return Formulation(
+        "three compartments: resting, active, fatigued",
+        "Xia and Frey-Law 2008; rest factor Looft, Herkert and Frey-Law 2018",
+        lambda m: [Stage("gain", _three_compartments, (m, recovery, factor))],
+        0.3,
+        "F_per_s",
+        {"R_per_s": recovery, "rest_factor": factor},
+    )
+
+
+def motor_units(rng: Generator, _base: Base) -> Formulation:
+    rate = np.sort(np.exp(rng.normal(0.0, 0.7, UNITS)))[::-1]  # large fast units come first under stimulation
+    recovery = rng.uniform(0.01, 0.04, UNITS)
+    return Formulation(
+        "motor units tire one by one, the fast ones first",
+        "after Potvin and Fuglevand 2017, reversed order as in Gregory and Bickel 2005",
+        lambda m: [Stage("gain", _motor_units, (*(m * rate), *recovery))],
+        0.3,
+        "median_rate_per_s",
+        {"fastest_over_slowest": float(rate[0] / rate[-1])},
+    )
+
+
+FORMULATIONS = (ding, xia_frey_law, motor_units)

@@ -1,0 +1,85 @@
+# ruff: noqa: ARG001 (every kernel takes the same four arguments)
+"""Mains hum: 50 or 60 Hz and harmonics on the load cell's line."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.random import Generator
+
+from hardware_sim.patients.hidden.base import Base
+from hardware_sim.patients.hidden.kernels import STEP_S, TIME_S, Formulation, Stage, kernel, normal
+
+
+@kernel
+def _harmonics(x, p, s, c):
+    """p: size, mains Hz, depth and Hz of a slow change of size, then amplitude and phase of five harmonics."""
+    turn = 2.0 * math.pi * p[1] * c[TIME_S]
+    size = p[0] * (1.0 + p[2] * math.sin(2.0 * math.pi * p[3] * c[TIME_S]))
+    for i in range(5):
+        x += size * p[4 + 2 * i] * math.sin((i + 1) * turn + p[5 + 2 * i])
+    return x
+
+
+@kernel
+def _rectifier(x, p, s, c):
+    """p: size, mains Hz, phase, share of the flattened sine; the rest are a rectifier's current peaks."""
+    wave = math.sin(2.0 * math.pi * p[1] * c[TIME_S] + p[2])
+    peaks = wave**5
+    return x + p[0] * (p[3] * 1.2 * math.tanh(1.6 * wave) + (1.0 - p[3]) * 1.5 * peaks)
+
+
+@kernel
+def _wandering(x, p, s, c):
+    """p: size, mains Hz, spread of the grid's frequency Hz, its time constant s. s: phase, detuning, generator."""
+    s[1] += -c[STEP_S] * s[1] / p[3] + p[2] * math.sqrt(2.0 * c[STEP_S] / p[3]) * normal(s, 2)
+    s[0] = (s[0] + 2.0 * math.pi * (p[1] + s[1]) * c[STEP_S]) % (2.0 * math.pi)
+    return x + p[0] * (math.sin(s[0]) + 0.3 * math.sin(3.0 * s[0]))
+
+
+def _mains(rng: Generator) -> float:
+    return float(rng.choice([50.0, 60.0]) + rng.normal(0.0, 0.01))
+
+
+def harmonics(rng: Generator, _base: Base) -> Formulation:
+    mains = _mains(rng)
+    amplitude = np.array([1.0, 0.1, 0.4, 0.05, 0.2]) * rng.uniform(0.3, 1.2, 5)
+    parts = np.column_stack([amplitude, rng.uniform(0.0, 2.0 * np.pi, 5)]).ravel()
+    depth, slow = float(rng.uniform(0.0, 0.3)), float(rng.uniform(0.02, 0.2))
+    return Formulation(
+        "fundamental and harmonics",
+        "textbook",
+        lambda m: [Stage("sensor", _harmonics, (m, mains, depth, slow, *parts))],
+        2.0,
+        "amplitude_nm",
+        {"mains_hz": mains, "harmonics": amplitude.tolist()},
+    )
+
+
+def rectifier(rng: Generator, _base: Base) -> Formulation:
+    mains, phase, share = _mains(rng), float(rng.uniform(0.0, 2.0 * np.pi)), float(rng.uniform(0.2, 0.8))
+    return Formulation(
+        "flattened sine with current peaks",
+        "capacitor-input rectifiers",
+        lambda m: [Stage("sensor", _rectifier, (m, mains, phase, share))],
+        2.0,
+        "amplitude_nm",
+        {"mains_hz": mains, "share_flattened": share},
+    )
+
+
+def wandering(rng: Generator, _base: Base) -> Formulation:
+    mains, spread, tau = _mains(rng), float(rng.uniform(0.005, 0.03)), float(rng.uniform(3.0, 20.0))
+    seed = int(rng.integers(1, 2**31))
+    return Formulation(
+        "the grid's frequency wanders",
+        "grid frequency as an Ornstein-Uhlenbeck process",
+        lambda m: [Stage("sensor", _wandering, (m, mains, spread, tau), (0.0, 0.0, seed))],
+        2.0,
+        "amplitude_nm",
+        {"mains_hz": mains, "spread_hz": spread},
+    )
+
+
+FORMULATIONS = (harmonics, rectifier, wandering)

@@ -1,0 +1,149 @@
+"""How a stage of the hidden muscle is written: a small compiled function with its numbers and its state.
+
+Every kernel takes `(x, p, s, c)`: the signal that reaches it, its parameters, its state and the context all stages
+share, and gives the signal that leaves. Kernels are C functions, called by address, so that any set of them runs in
+one compiled loop without compiling anew, and one step of a live muscle costs about a microsecond.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numba as nb
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+ROW = 1024
+"""Parameters and states a stage may have."""
+
+# The context: one array that all stages of a muscle read, and some write.
+TIME_S = 0
+STEP_S = 1
+WIDTH_US = 2  # what the stimulator sends, before any electrode effect
+PULSE = 3  # 1 in the step a pulse with some width arrives in
+SINCE_S = 4  # since the last such pulse
+COUNT = 5  # pulses of the present train
+PAUSE_S = 6  # the pause before the present train
+ANGLE_RAD = 7
+VELOCITY_RAD_S = 8
+ACTIVATION = 9  # recruited share, 0 to 1, before any gain
+FORCE = 10  # what the dynamics gave in the step before, as a share of the largest torque
+SPEED = 11  # factor on the rates of the dynamics; 1 unless a stage before them changes it
+LARGEST_NM = 12
+CONTEXT_SIZE = 16
+
+SLOTS = (
+    "electrode",  # pulse width -> pulse width the nerve feels
+    "recruitment",  # -> recruited torque
+    "gain",
+    "delay",
+    "dynamics",  # -> torque
+    "structure",  # tendon, fixture
+    "joint",
+    "additive",
+    "sensor",  # before the measurement noise
+    "converter",  # after it
+)
+
+_NUMBER = nb.float64
+_POINTER = types.CPointer(_NUMBER)
+_SIGNATURE = _NUMBER(_NUMBER, _POINTER, _POINTER, _POINTER)
+
+
+def kernel(function: Callable[..., float]) -> Any:
+    """Compile a stage's function `(x, p, s, c) -> float` to a C function."""
+    return nb.cfunc(_SIGNATURE, cache=True)(function)
+
+
+helper: Any = nb.njit(cache=True)
+"""Decorator of what several kernels share."""
+
+
+@intrinsic
+def call_kernel(_typing: Any, _address: Any, _x: Any, _p: Any, _s: Any, _c: Any) -> Any:
+    """Call a kernel by its address; parameters, state and context by theirs."""
+
+    def generate(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+        double = ir.DoubleType()
+        pointer = double.as_pointer()
+        function_type = ir.FunctionType(double, [double, pointer, pointer, pointer])
+        function = builder.inttoptr(arguments[0], function_type.as_pointer())
+        pointers = [builder.inttoptr(argument, pointer) for argument in arguments[2:]]
+        return builder.call(function, [arguments[1], *pointers])
+
+    return _NUMBER(types.int64, _NUMBER, types.int64, types.int64, types.int64), generate
+
+
+@helper
+def uniform(s: Any, i: int) -> float:
+    """A number in [0, 1) from the generator whose state is s[i] (a whole number under 2^32)."""
+    s[i] = (1664525.0 * s[i] + 1013904223.0) % 4294967296.0
+    return s[i] / 4294967296.0
+
+
+@helper
+def normal(s: Any, i: int) -> float:
+    """A standard normal number from the same generator (Box-Muller)."""
+    a = uniform(s, i)
+    b = uniform(s, i)
+    return math.sqrt(-2.0 * math.log(a + 1e-12)) * math.cos(2.0 * math.pi * b)
+
+
+@helper
+def smooth_table(p: Any, first: int, count: int, position: float) -> float:
+    """Catmull-Rom curve through p[first : first + count] at `position` (0 is the first knot); held at the end."""
+    if position >= count - 1:
+        return p[first + count - 1]
+    i = int(position)
+    r = position - i
+    b = p[first + i]
+    d = p[first + i + 1]
+    a = p[first + i - 1] if i > 0 else b
+    e = p[first + i + 2] if i + 2 < count else d
+    return b + 0.5 * r * (d - a + r * (2 * a - 5 * b + 4 * d - e + r * (3 * (b - d) + e - a)))
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A kernel with its numbers, in one slot of the muscle."""
+
+    slot: str
+    kernel: Any
+    parameters: Any = ()
+    state: Any = ()
+
+    def rows(self) -> tuple[Floats, Floats]:
+        """Parameters and starting state, padded to full rows."""
+        parameters, state = np.zeros(ROW), np.zeros(ROW)
+        parameters[: len(self.parameters)] = self.parameters
+        state[: len(self.state)] = self.state
+        return parameters, state
+
+
+@dataclass(frozen=True)
+class Formulation:
+    """One way of writing an effect down.
+
+    `build(magnitude)` gives its stages; at magnitude 0 they leave the base muscle as it is. A stage in the slot
+    `recruitment` or `dynamics` takes the place of the base's own.
+    """
+
+    name: str
+    source: str
+    build: Callable[[float], list[Stage]]
+    top: float
+    magnitude: str
+    parameters: dict[str, Any] = field(default_factory=dict)
+    needs_movement: bool = False
+
+
+class NotSuited(Exception):
+    """This formulation cannot be written on this base muscle; draw another."""

@@ -1,0 +1,107 @@
+"""How much a hidden effect shows: what the best effect-free Hammerstein model leaves of a noise-free record.
+
+A cubic spline with many knots (half of them where the base really rises: a privilege the identification does not
+have) times a second-order system, fitted by variable projection (Golub and Pereyra 1973) at the pulse rate.
+Held-out rows take no part. Only the size of a hidden effect is set by this; no verdict rests on it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.interpolate import BSpline
+from scipy.linalg import cho_factor, cho_solve
+from scipy.optimize import least_squares
+from scipy.signal import lfilter
+
+from hardware_sim.patients.hidden.base import Base
+from hardware_sim.patients.hidden.kernels import Floats
+
+PULSE_RATE_HZ = 40.0
+STIFFNESS = 1e-3
+"""Weight of the coefficients' second differences, over the mean square of a basis column's response."""
+
+
+def _knots(base: Base, count: int = 40) -> Floats:
+    """Interior and end knots over the widths sent: half evenly, half where the base rises."""
+    top = float(base.largest_width_us)
+    u = np.arange(base.largest_width_us + 1, dtype=np.float64)
+    rising = np.maximum.accumulate(base.table_nm[: u.size]) + 1e-6 * u
+    by_rise = np.interp(np.linspace(0.0, 1.0, count // 2), rising / rising[-1], u)
+    inner = np.unique(np.round(np.concatenate([np.linspace(0.0, top, count // 2), by_rise]), 1))
+    keep = [inner[0]]
+    for knot in inner[1:]:
+        if knot - keep[-1] >= 1.0:
+            keep.append(knot)
+    keep[-1] = top
+    return np.concatenate([[0.0] * 3, keep, [top] * 3])
+
+
+def _filter(t_omega_s: float, zeta: float, step_s: float) -> tuple[Floats, Floats]:
+    """Exact zero-order-hold discretisation of 1 / (Tω² s² + 2 ζ Tω s + 1); output before the input acts."""
+    wn, root = 1.0 / t_omega_s, np.sqrt(complex(zeta * zeta - 1.0))
+    if abs(root) < 1e-6:
+        root = complex(1e-6)
+    s1, s2 = wn * (-zeta + root), wn * (-zeta - root)
+    e1, e2 = np.exp(s1 * step_s), np.exp(s2 * step_s)
+    a1, a2 = (e1 + e2).real, (e1 * e2).real
+    # step response 1 - (s2 e^(s1 t) - s1 e^(s2 t)) / (s2 - s1), sampled, gives the numerator
+    y1 = (1.0 - (s2 * e1 - s1 * e2) / (s2 - s1)).real
+    b2 = 1.0 - a1 + a2 - y1
+    return np.array([0.0, y1, b2]), np.array([1.0, -a1, a2])
+
+
+@dataclass
+class Yardstick:
+    """The effect-free fit for one base and one design, at the pulse rate.
+
+    Parameters
+    ----------
+    base
+        Gives knots and starting values.
+    width_us, held_out
+        Pulse widths at the pulse rate, shape (n,); rows of the held-out segment, bool, shape (n,).
+    """
+
+    base: Base
+    width_us: Floats
+    held_out: np.ndarray
+    _start: Floats = field(init=False)
+    _basis: Floats = field(init=False)
+    _bend: Floats = field(init=False)
+
+    def __post_init__(self) -> None:
+        knots = _knots(self.base)
+        u = np.clip(self.width_us, 0.0, knots[-1])
+        basis = BSpline.design_matrix(u, knots, 3).toarray()[:, 1:]  # f(0) = 0
+        self._basis = np.ascontiguousarray(basis[:, basis[~self.held_out].any(axis=0)])
+        bend = np.diff(np.eye(self._basis.shape[1] + 1), 2, axis=0)[:, 1:]  # the coefficient left out is zero
+        self._bend = bend.T @ bend
+        self._start = np.log([self.base.t_omega_s, self.base.zeta])
+
+    def _predict(self, theta: Floats, torque_nm: Floats) -> Floats:
+        b, a = _filter(float(np.exp(theta[0])), float(np.exp(theta[1])), 1.0 / PULSE_RATE_HZ)
+        x = np.asarray(lfilter(b, a, self._basis, axis=0))
+        train = x[~self.held_out]
+        gram = train.T @ train
+        weight = np.trace(gram) / len(gram)
+        gram += STIFFNESS * weight * self._bend
+        gram[np.diag_indices_from(gram)] += 1e-9 * weight
+        return x @ cho_solve(cho_factor(gram), train.T @ torque_nm[~self.held_out])
+
+    def fit(self, torque_nm: Floats) -> Floats:
+        """Residual of the best effect-free model over all rows, free run, N·m."""
+        train = ~self.held_out
+        result = least_squares(
+            lambda theta: (torque_nm - self._predict(theta, torque_nm))[train],
+            self._start,
+            bounds=(np.log([0.004, 0.08]), np.log([4.0, 12.0])),
+            x_scale=(0.3, 0.3),
+            diff_step=1e-4,
+            max_nfev=14,
+            xtol=1e-4,
+            ftol=1e-5,
+        )
+        self._start = result.x
+        return torque_nm - self._predict(result.x, torque_nm)
