@@ -123,9 +123,10 @@ def read_at(torque_nm: np.ndarray, rate_nm_s: np.ndarray, position: np.ndarray, 
 def free_states(time_constant_s: float, damping: float, step_s: float, size: int) -> tuple[np.ndarray, np.ndarray]:
     """Undriven boundary states from a unit torque (column 0) and a unit rate (column 1); each (size + 1, 2)."""
     phi, _ = transition(time_constant_s, damping, step_s)
-    values, vectors = np.linalg.eig(phi + 0j)
-    if abs(values[0] - values[1]) < 1e-7:  # critical damping: the two poles meet, keep them a hair apart
-        values, vectors = np.linalg.eig(transition(time_constant_s, damping * (1 + 1e-6), step_s)[0] + 0j)
-    powers = values[None, :] ** np.arange(size + 1)[:, None]
-    states = np.real(np.einsum("ij,kj,jl->kil", vectors, powers, np.linalg.inv(vectors)))
-    return states[:, 0, :], states[:, 1, :]
+    trace = phi[0, 0] + phi[1, 1]
+    a = np.array([1.0, -trace, phi[0, 0] * phi[1, 1] - phi[0, 1] * phi[1, 0]])
+    impulse = np.zeros(size + 1)
+    impulse[0] = 1.0
+    start, turn = np.eye(2), phi - trace * np.eye(2)
+    columns = [[lfilter([start[i, j], turn[i, j]], a, impulse) for j in range(2)] for i in range(2)]
+    return np.stack(columns[0], axis=1), np.stack(columns[1], axis=1)

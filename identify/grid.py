@@ -71,8 +71,12 @@ class Grid:
 
     @cached_property
     def fitted(self) -> np.ndarray:
-        """bool, shape (K,): intervals that may be used to fit and to choose."""
-        return ~self.held_out & (self.count > 0)
+        """bool, shape (K,): intervals that may be used to fit and to choose.
+
+        An interval with fewer than half of its samples (an edge, a gap) is left out: its mean is noisier than the rest.
+        """
+        usual = float(np.median(self.count[self.count > 0])) if np.any(self.count) else 1.0
+        return ~self.held_out & (self.count > 0) & (2 * self.count >= usual)
 
     @cached_property
     def stretches(self) -> list[slice]:

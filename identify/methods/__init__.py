@@ -1,0 +1,87 @@
+"""Identification methods: one file each, found by scanning this folder.
+
+A method is a module here with a module-level `METHOD`, an object that satisfies `Method`.
+"""
+
+from __future__ import annotations
+
+import pkgutil
+from collections.abc import Mapping
+from functools import cache
+from importlib import import_module
+from typing import Any, Protocol, runtime_checkable
+
+from identify.errors import BadRequest
+from identify.grid import Grid
+from identify.model import Model
+
+
+@runtime_checkable
+class Method(Protocol):
+    """A way to get a Hammerstein model from a record.
+
+    Attributes
+    ----------
+    id : str
+        As users write it: `two-stage`.
+    summary : str
+        One line.
+    options : mapping of str to str
+        Each option's name and what it does.
+    """
+
+    @property
+    def id(self) -> str: ...
+
+    @property
+    def summary(self) -> str: ...
+
+    @property
+    def options(self) -> Mapping[str, str]: ...
+
+    def fit(self, grid: Grid, fit_on: tuple[str, ...] | None, **options: Any) -> Model:
+        """Model of the grid's record, from rows that may be fitted; `fit_on` names the segments to use."""
+        ...
+
+
+@cache
+def methods() -> dict[str, Method]:
+    """Every method by its id."""
+    found: dict[str, Method] = {}
+    for info in pkgutil.iter_modules(__path__):
+        method = getattr(import_module(f"{__name__}.{info.name}"), "METHOD", None)
+        if isinstance(method, Method):
+            found[method.id] = method
+    return dict(sorted(found.items()))
+
+
+def method_of(name: str) -> Method:
+    """The method of that id; its file alone is loaded where the file has the id's name.
+
+    Raises
+    ------
+    BadRequest
+        There is none.
+    """
+    own = name.replace("-", "_")
+    if own.isidentifier() and any(info.name == own for info in pkgutil.iter_modules(__path__)):
+        found = getattr(import_module(f"{__name__}.{own}"), "METHOD", None)
+        if isinstance(found, Method) and found.id == name:
+            return found
+    if name not in methods():
+        raise BadRequest(f"unknown method {name!r}", place="method", mend=f"Known: {', '.join(methods())}.")
+    return methods()[name]
+
+
+def known_options(chosen: Method, options: Mapping[str, Any]) -> None:
+    """Refuse options that a method doesn't have.
+
+    Raises
+    ------
+    BadRequest
+        Naming the option and those there are.
+    """
+    for name in options:
+        if name not in chosen.options:
+            known = ", ".join(chosen.options) or "none"
+            raise BadRequest(f"unknown option {name!r} of {chosen.id}", place=name, mend=f"Known: {known}.")

@@ -1,0 +1,45 @@
+"""Time between the pulse and the first torque."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from identify.effects.base import Effect, Form, Parameter, Scene
+from identify.effects.kernels import activate
+
+_DELAY = Parameter("delay_s", "s", 0.0, 0.15, 0.0, (0.02, 0.06), about="delay beyond the record's own timing")
+
+
+def _delay(_: None, p: dict[str, Any], scene: Scene) -> np.ndarray:
+    return p["delay_s"]
+
+
+def _lag(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+    tau = p["lag_s"][:, 0]
+    return activate(np.ascontiguousarray(drive), tau, tau, scene.step_s)
+
+
+EFFECT = Effect(
+    id="electromechanical_delay",
+    name="Electromechanical delay",
+    forms=(
+        Form("delay", "delay", "y(t - delay)", (_DELAY,), _delay, True),
+        Form(
+            "lag",
+            "gain",
+            "a' = (w - a)/lag: a spread-out delay, one more pole",
+            (Parameter("lag_s", "s", 0.0, 0.12, 0.0, (0.03,), about="mean of the spread-out delay"),),
+            _lag,
+            True,
+        ),
+    ),
+    signature="The model is early at every change: residual like the torque's rate, correlated from sample to sample.",
+    resembles=("series_compliance", "mixed_fibres", "asymmetric_relaxation"),
+    separated_by="Single pulses, sampled at 400 Hz or faster.",
+    plain="Some hundredths of a second pass between the pulse and the first torque. Longer delays force a gentler "
+    "controller.",
+    source="Sinclair et al.: quadriceps onset 31 ± 3 ms at 90°, 67 ± 24 ms at 15°; offset 58 ± 5 ms",
+    experiment=("steps", "prbs"),
+)

@@ -1,0 +1,75 @@
+"""Muscle fatigue: the gain falls with use and comes back with rest."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from identify.effects.base import Effect, Form, Parameter, Scene
+from identify.effects.kernels import adapt
+
+_DEPTH = Parameter("depth", "1", 0.0, 0.95, 0.0, (0.3, 0.6), about="largest share of torque that can be lost")
+_ONSET = Parameter("onset_s", "s", 3.0, 250.0, 30.0, (15.0, 50.0), "log", about="time constant under full stimulation")
+_RECOVERY = Parameter("recovery_s", "s", 4.0, 400.0, 50.0, (40.0, 90.0), "log", about="time constant at rest")
+
+
+def _level(drive: np.ndarray, scene: Scene) -> np.ndarray:
+    return np.minimum(np.abs(drive) / scene.scale_nm, 1.0)
+
+
+def _fitness(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+    x = adapt(_level(drive, scene), p["onset_s"][:, 0], p["recovery_s"][:, 0], False, scene.step_s)
+    return drive * (1.0 - p["depth"] * x)
+
+
+def _compartments(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+    x = adapt(_level(drive, scene), p["onset_s"][:, 0], p["recovery_s"][:, 0], True, scene.step_s)
+    return drive * (1.0 - p["depth"] * x)
+
+
+def _by_pulses(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+    on = np.broadcast_to(scene.on, drive.shape)
+    x = adapt(on, p["onset_s"][:, 0], p["recovery_s"][:, 0], False, scene.step_s)
+    return drive * (1.0 - p["depth"] * x)
+
+
+EFFECT = Effect(
+    id="fatigue",
+    name="Fatigue",
+    forms=(
+        Form(
+            "fitness",
+            "gain",
+            "w = μ f(u); μ = 1 - depth·x; x' = a(1 - x)/onset - (1 - a) x/recovery; a = |f|/f_max",
+            (_DEPTH, _ONSET, _RECOVERY),
+            _fitness,
+            batched=True,
+            source="Riener, Quintern, Schmidt 1996, muscle fitness",
+        ),
+        Form(
+            "compartments",
+            "gain",
+            "w = (1 - depth·x) f(u); x' = a(1 - x)/onset - x/recovery",
+            (_DEPTH, _ONSET, _RECOVERY),
+            _compartments,
+            batched=True,
+            source="Ding et al. 2003 (A falls with force, recovers with one time constant); Xia, Frey-Law 2008",
+        ),
+        Form(
+            "by_pulses",
+            "gain",
+            "as fitness, with a = 1 while pulses come, whatever their width",
+            (_DEPTH, _ONSET, _RECOVERY),
+            _by_pulses,
+            batched=True,
+        ),
+    ),
+    signature="Torque above the model early in stimulation, below it late; the sign turns in rest.",
+    resembles=("threshold_drift", "potentiation", "baseline_drift"),
+    separated_by="Repeat the ramp after stimulation and again after a rest.",
+    plain="The muscle tires: the same pulse gives less torque the longer it has worked, and recovers when it rests. "
+    "After a stroke muscles tire sooner. The controller must give more charge late in a session, or rest must be longer.",
+    source="Riener et al. 1996; Ding et al. 2003",
+    experiment=("ramp", "rest", "steps"),
+)

@@ -1,0 +1,122 @@
+"""Recursions that numpy can't vectorise over time, compiled: rows are parameter sets, columns are pulse intervals."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+
+@njit(cache=True, nogil=True)
+def adapt(
+    drive: np.ndarray, onset_s: np.ndarray, recovery_s: np.ndarray, constant: bool, step_s: float
+) -> np.ndarray:  # pragma: no cover
+    """State x in [0, 1] with x' = a (1 - x)/onset - (1 - a) x/recovery, exact for a held drive a; from x = 0.
+
+    With `constant` the recovery goes on under stimulation, too: x' = a (1 - x)/onset - x/recovery.
+
+    Parameters
+    ----------
+    drive : ndarray, shape (M, K)
+        a, in [0, 1].
+    onset_s, recovery_s : ndarray, shape (M,)
+        Time constants, s.
+    constant : bool
+        Whether recovery is independent of the drive.
+    step_s : float
+        Length of an interval, s.
+
+    Returns
+    -------
+    ndarray, shape (M, K)
+        Mean of x at the two ends of each interval.
+    """
+    rows, size = drive.shape
+    out = np.empty((rows, size))
+    for m in range(rows):
+        x = 0.0
+        for k in range(size):
+            a = min(max(drive[m, k], 0.0), 1.0)
+            up = a / onset_s[m]
+            down = 1.0 / recovery_s[m] if constant else (1.0 - a) / recovery_s[m]
+            rate = up + down
+            end = x
+            if rate > 0.0:
+                goal = up / rate
+                end = goal + (x - goal) * np.exp(-rate * step_s)
+            out[m, k] = 0.5 * (x + end)
+            x = end
+    return out
+
+
+@njit(cache=True, nogil=True)
+def play(width_us: np.ndarray, half_us: np.ndarray) -> np.ndarray:  # pragma: no cover
+    """Play operator: the output follows the input at a distance of at most `half_us`; from 0. Shapes (M, K), (M,)."""
+    rows, size = width_us.shape
+    out = np.empty((rows, size))
+    for m in range(rows):
+        p = 0.0
+        for k in range(size):
+            p = max(width_us[m, k] - half_us[m], min(width_us[m, k] + half_us[m], p))
+            out[m, k] = p
+    return out
+
+
+@njit(cache=True, nogil=True)
+def dahl(width_us: np.ndarray, reach_us: np.ndarray) -> np.ndarray:  # pragma: no cover
+    """Direction memory z in [-1, 1]: dz = (du - z |du|)/reach, Dahl's friction; from -1. Shapes (M, K), (M,)."""
+    rows, size = width_us.shape
+    out = np.empty((rows, size))
+    for m in range(rows):
+        z, last = 0.0, 0.0
+        for k in range(size):
+            change = width_us[m, k] - last
+            last = width_us[m, k]
+            if change != 0.0:
+                goal = 1.0 if change > 0.0 else -1.0
+                z = goal + (z - goal) * np.exp(-abs(change) / reach_us[m])
+            out[m, k] = z
+    return out
+
+
+@njit(cache=True, nogil=True)
+def activate(
+    drive: np.ndarray, rise_s: np.ndarray, fall_s: np.ndarray, step_s: float
+) -> np.ndarray:  # pragma: no cover
+    """First-order activation with its own time constants for rise and fall; mean over each interval, from 0.
+
+    a' = (w - a)/τ, τ = rise where the drive exceeds the activation. A time constant of 0 follows at once.
+    Shapes (M, K), (M,).
+    """
+    rows, size = drive.shape
+    out = np.empty((rows, size))
+    for m in range(rows):
+        a = 0.0
+        for k in range(size):
+            w = drive[m, k]
+            tau = rise_s[m] if w > a else fall_s[m]
+            if tau <= 0.0:
+                a = w
+                out[m, k] = w
+            else:
+                decay = np.exp(-step_s / tau)
+                out[m, k] = w + (a - w) * (1.0 - decay) * tau / step_s
+                a = w + (a - w) * decay
+    return out
+
+
+@njit(cache=True, nogil=True)
+def since_onset(on: np.ndarray, least_gap_s: float, step_s: float) -> np.ndarray:  # pragma: no cover
+    """Time since the first pulse of the present train, s, at the middle of each interval; large where there is none."""
+    out = np.full(on.size, 1e9)
+    gap, since = 1e9, 1e9
+    for k in range(on.size):
+        if on[k] > 0:
+            if gap >= least_gap_s:
+                since = 0.0
+            gap = 0.0
+            out[k] = since + 0.5 * step_s
+            since += step_s
+        else:
+            gap += step_s
+            since += step_s
+    return out

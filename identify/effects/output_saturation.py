@@ -1,0 +1,68 @@
+"""Saturation after the dynamics: tendon, joint stop or fixture take no more."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from identify.effects.base import Effect, Form, Parameter, Scene
+
+_CEILING = Parameter("ceiling_nm", "N·m", 0.4, 4.0, np.inf, (1.2, 2.0), "log", "torque", "torque never exceeded")
+
+
+def _knee(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+    return y / (1.0 + np.abs(y / p["ceiling_nm"]) ** p["sharpness"]) ** (1.0 / p["sharpness"])
+
+
+def _exponential(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+    c = p["ceiling_nm"]
+    with np.errstate(invalid="ignore"):
+        bent = np.sign(y) * c * -np.expm1(-np.abs(y) / c)
+    return np.where(np.isinf(c), y, bent)
+
+
+def _yielding(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+    width = 0.05 * scene.scale_nm
+    over = np.abs(y) - p["knee_nm"]
+    soft = np.where(np.isinf(over), 0.0, 0.5 * (over + np.sqrt(over * over + width * width)))
+    soft = soft - 0.5 * (np.sqrt(p["knee_nm"] ** 2 + width * width) - p["knee_nm"]) * np.isfinite(p["knee_nm"])
+    return y - np.sign(y) * p["yield_share"] * soft
+
+
+EFFECT = Effect(
+    id="output_saturation",
+    name="Saturation of the output",
+    forms=(
+        Form(
+            "knee",
+            "output",
+            "y/(1 + |y/ceiling|^n)^(1/n)",
+            (
+                _CEILING,
+                Parameter("sharpness", "1", 1.6, 25.0, 4.0, (4.0, 8.0), "log", about="n, sharpness of the knee"),
+            ),
+            _knee,
+            True,
+        ),
+        Form("exponential", "output", "ceiling (1 - exp(-y/ceiling))", (_CEILING,), _exponential, True),
+        Form(
+            "yielding",
+            "output",
+            "y - yield·max(y - knee, 0), with a soft corner",
+            (
+                Parameter("knee_nm", "N·m", 0.2, 1.1, np.inf, (0.6, 0.8), "log", "torque", "where it begins to yield"),
+                Parameter("yield_share", "1", 0.0, 1.0, 0.0, (0.5, 0.8), about="share lost above the knee"),
+            ),
+            _yielding,
+            True,
+        ),
+    ),
+    signature="Tops are cut whatever the way to them: fast rises near the top, slow ones alike.",
+    resembles=("asymmetric_relaxation", "sensor_clipping", "activation_dependent_speed"),
+    separated_by="The plateaus of a staircase, approached from both sides.",
+    plain="Above some torque the limb or the fixture gives way, or the tendon takes no more: the muscle pulls harder, "
+    "the cell doesn't see it.",
+    source="Soft knee of tendon and compliance after the dynamics (Wiener structure)",
+    experiment=("staircase", "steps"),
+)

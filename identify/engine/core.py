@@ -1,0 +1,218 @@
+"""Second-order muscle dynamics whose speed may vary from pulse to pulse, compiled.
+
+T² y'' + 2 ζ T y' + y = w with w held over each pulse interval, and T there multiplied by a factor that depends on the
+state at its start. Where the factor is exactly 1 the transition of the base is used, bit for bit.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+LAWS = 8
+"""Columns of the speed law: see `factor`."""
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _transition(time_constant_s, damping, step_s):  # noqa: ANN001, ANN202  # pragma: no cover
+    h = step_s / time_constant_s
+    decay = np.exp(-damping * h)
+    gap = damping * damping - 1.0
+    root = np.sqrt(abs(gap))
+    arg = root * h
+    if abs(gap) < 1e-10:
+        c, s = 1.0, h
+    elif gap < 0:
+        c, s = np.cos(arg), np.sin(arg) / root
+    else:
+        c, s = np.cosh(arg), np.sinh(arg) / root
+    return (
+        decay * (c + damping * s),
+        decay * s * time_constant_s,
+        -decay * s / time_constant_s,
+        decay * (c - damping * s),
+    )
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _factor(law, w, y, v, scale_nm):  # noqa: ANN001, ANN202  # pragma: no cover
+    """Factor on T. `law` holds, each neutral at 0:
+
+    0 log ratio where the drive is below the torque (relaxing), 1 log ratio where torque falls,
+    2 linear in torque, 3 linear in drive, 4 exponential in torque, 5 linear in the square root of torque,
+    6 log ratio for a drive below half the torque and above alike, by how far it is from the torque, 7 unused.
+    """
+    m = 1.0
+    if law[0] != 0.0:
+        d = (w - y) / (0.02 * scale_nm)
+        m *= np.exp(law[0] * 0.5 * (1.0 - d / np.sqrt(1.0 + d * d)))
+    if law[1] != 0.0:
+        d = v / (0.1 * scale_nm)
+        m *= np.exp(law[1] * 0.5 * (1.0 - d / np.sqrt(1.0 + d * d)))
+    level = abs(y) / scale_nm
+    if law[2] != 0.0:
+        m *= max(1.0 + law[2] * level, 0.08)
+    if law[3] != 0.0:
+        m *= max(1.0 + law[3] * abs(w) / scale_nm, 0.08)
+    if law[4] != 0.0:
+        m *= np.exp(law[4] * level)
+    if law[5] != 0.0:
+        m *= 1.0 / max(1.0 + law[5] * level, 0.08)
+    if law[6] != 0.0:
+        m *= 1.0 / max(1.0 + law[6] * abs(w) / scale_nm, 0.08)
+    return min(max(m, 0.02), 50.0)
+
+
+@njit(cache=True, nogil=True)
+def run_core(drive, time_constant_s, damping, law, multiplier, scale_nm, step_s):  # noqa: ANN001, ANN201  # pragma: no cover
+    """Boundary states of rows of drives.
+
+    Parameters
+    ----------
+    drive : ndarray, shape (M, K)
+        Held drive of each interval, N·m.
+    time_constant_s, damping : ndarray, shape (M,)
+        T, s, and ζ.
+    law : ndarray, shape (M, LAWS)
+        Coefficients of the speed law.
+    multiplier : ndarray, shape (M or 1 or 0, K)
+        A further factor on T, given; no rows where there is none.
+    scale_nm : float
+        Torque that counts as full, N·m.
+    step_s : float
+        Pulse interval, s.
+
+    Returns
+    -------
+    torque_nm, rate_nm_s : ndarray, shape (M, K + 1)
+    """
+    rows, size = drive.shape
+    given = multiplier.shape[0]
+    torque = np.zeros((rows, size + 1))
+    rate = np.zeros((rows, size + 1))
+    for m in range(rows):
+        base = time_constant_s[m]
+        b11, b12, b21, b22 = _transition(base, damping[m], step_s)
+        lawful = False
+        for j in range(law.shape[1]):
+            lawful = lawful or law[m, j] != 0.0
+        y, v = 0.0, 0.0
+        for k in range(size):
+            w = drive[m, k]
+            f = 1.0
+            if lawful:
+                f = _factor(law[m], w, y, v, scale_nm)
+            if given > 0:
+                f *= multiplier[m if given > 1 else 0, k]
+            if f == 1.0:
+                p11, p12, p21, p22 = b11, b12, b21, b22
+            else:
+                p11, p12, p21, p22 = _transition(base * f, damping[m], step_s)
+            gap = y - w
+            y, v = w + p11 * gap + p12 * v, p21 * gap + p22 * v
+            torque[m, k + 1] = y
+            rate[m, k + 1] = v
+    return torque, rate
+
+
+@njit(cache=True, nogil=True)
+def mean_weights(fraction, interval, count, shift):  # noqa: ANN001, ANN201  # pragma: no cover
+    """Weights of the boundary states in each interval's mean of samples read `shift` steps late.
+
+    Returns
+    -------
+    first : int
+        Offset of the earliest boundary.
+    weights : ndarray, shape (K, B, 2)
+        For (y, y' times step).
+    """
+    low, high = 1 << 30, -(1 << 30)
+    for n in range(fraction.size):
+        o = int(np.floor(fraction[n] - shift))
+        low, high = min(low, o), max(high, o)
+    width = high - low + 2
+    weights = np.zeros((count.size, width, 2))
+    for n in range(fraction.size):
+        at = fraction[n] - shift
+        o = int(np.floor(at))
+        s = at - o
+        k, b = interval[n], o - low
+        r = 1.0 / count[k]
+        weights[k, b, 0] += r * (1 + 2 * s) * (1 - s) ** 2
+        weights[k, b, 1] += r * s * (1 - s) ** 2
+        weights[k, b + 1, 0] += r * s * s * (3 - 2 * s)
+        weights[k, b + 1, 1] += r * s * s * (s - 1)
+    return low, weights
+
+
+@njit(cache=True, nogil=True)
+def read_means(torque, rate, first, weights, step_s):  # noqa: ANN001, ANN201  # pragma: no cover
+    """Means over intervals, shape (M, K), from boundary states of shape (M, K + 1)."""
+    rows, size = torque.shape[0], weights.shape[0]
+    out = np.zeros((rows, size))
+    for m in range(rows):
+        for k in range(size):
+            total = 0.0
+            for b in range(weights.shape[1]):
+                at = k + first + b
+                if at < 0:
+                    total += weights[k, b, 0] * torque[m, 0]
+                elif at > size:
+                    total += weights[k, b, 0] * torque[m, size]
+                else:
+                    total += weights[k, b, 0] * torque[m, at] + weights[k, b, 1] * rate[m, at] * step_s
+            out[m, k] = total
+    return out
+
+
+@njit(cache=True, nogil=True)
+def whiten_rows(rows, start, stop, ar1, share):  # noqa: ANN001, ANN201  # pragma: no cover
+    """Innovations of white plus AR(1) noise, scaled to equal variance, by an exact Kalman filter.
+
+    Parameters
+    ----------
+    rows : ndarray, shape (M, K)
+        Residuals or derivatives on the grid.
+    start, stop : ndarray of int, shape (S,)
+        Stretches of fitted intervals.
+    ar1 : float
+        Correlation of neighbours of the slow part.
+    share : float
+        Share of the variance that is slow, 0 … 1; the rest is white.
+
+    Returns
+    -------
+    white : ndarray, shape (M, F)
+        Fitted intervals in order, unit variance where the total variance is 1.
+    half_log_det : float
+        0.5 log det of the correlation matrix.
+    """
+    total = 0
+    for i in range(start.size):
+        total += stop[i] - start[i]
+    white = np.empty((rows.shape[0], total))
+    gain = np.empty(total)
+    scale = np.empty(total)
+    logdet = 0.0
+    f = 0
+    noise = (1.0 - ar1 * ar1) * share
+    for i in range(start.size):
+        p = share
+        for _ in range(stop[i] - start[i]):
+            s = p + 1.0 - share
+            s = max(s, 1e-12)
+            gain[f] = p / s
+            scale[f] = 1.0 / np.sqrt(s)
+            logdet += 0.5 * np.log(s)
+            p = ar1 * ar1 * (p - p * p / s) + noise
+            f += 1
+    for m in range(rows.shape[0]):
+        f = 0
+        for i in range(start.size):
+            x = 0.0
+            for k in range(start[i], stop[i]):
+                e = rows[m, k] - x
+                white[m, f] = e * scale[f]
+                x = ar1 * (x + gain[f] * e)
+                f += 1
+    return white, logdet

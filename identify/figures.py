@@ -1,0 +1,98 @@
+"""Figures of a fit: best-fit %, errors, white noise, and the ceiling that noise sets."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from identify.grid import Grid
+
+
+def best_fit_percent(measured_nm: np.ndarray, predicted_nm: np.ndarray) -> float:
+    """100 (1 - ||y - ŷ|| / ||y - mean y||), as in the paper; NaN where y is constant."""
+    spread = float(np.linalg.norm(measured_nm - np.mean(measured_nm))) if measured_nm.size else 0.0
+    if not spread > 0:
+        return float("nan")
+    return 100.0 * (1.0 - float(np.linalg.norm(measured_nm - predicted_nm)) / spread)
+
+
+def rms(residual_nm: np.ndarray) -> float:
+    """Root mean square, N·m."""
+    return float(np.sqrt(np.mean(residual_nm**2))) if residual_nm.size else float("nan")
+
+
+def white_sd(grid: Grid, predicted_nm: np.ndarray, block_sd_nm: float) -> float:
+    """White measurement noise at the record's own rate, N·m.
+
+    Where an interval has several samples, from their spread about the interval's mean residual: what is slower than a
+    pulse, a missing effect or correlated noise, doesn't enter. With one sample a pulse, from second differences of
+    the residual, if they are smaller than what the fit left over.
+    """
+    residual = grid.record.torque_nm - predicted_nm
+    if np.median(grid.count) >= 4:
+        jump = np.diff(residual, 2)
+        same = (grid.interval[2:] == grid.interval[:-2]) & ~grid.record.held_out[2:]
+        if same.sum() >= 16:
+            return float(np.sqrt(np.mean(jump[same] ** 2) / 6.0))
+    inner = ~grid.record.held_out
+    jump = np.diff(residual, 2)[inner[2:] & inner[:-2]]
+    if jump.size < 16:
+        return block_sd_nm
+    return float(min(np.sqrt(np.mean(jump**2) / 6.0), block_sd_nm))
+
+
+def ceiling_percent(measured_nm: np.ndarray, sd_nm: float) -> float:
+    """Best-fit % that the true system would reach on this noisy record: 100 (1 - ||noise|| / ||y - mean y||)."""
+    spread = float(np.linalg.norm(measured_nm - np.mean(measured_nm))) if measured_nm.size else 0.0
+    if not spread > 0:
+        return float("nan")
+    return 100.0 * (1.0 - sd_nm * float(np.sqrt(measured_nm.size)) / spread)
+
+
+def figures(grid: Grid, rows: np.ndarray, predicted_nm: np.ndarray, sd_nm: float) -> dict[str, Any]:
+    """What MODEL.json tells under `fit`, at the record's own rate."""
+    record = grid.record
+    measured = record.torque_nm
+    used = rows[grid.interval] & ~record.held_out
+    held = record.held_out
+    result: dict[str, Any] = {
+        "fit_percent": best_fit_percent(measured[used], predicted_nm[used]),
+        "ceiling_percent": ceiling_percent(measured[used], sd_nm),
+        "rms_nm": rms((measured - predicted_nm)[used]),
+        "noise_sd_nm": sd_nm,
+        "held_out_fit_percent": None,
+        "held_out_ceiling_percent": None,
+        "held_out_rms_nm": None,
+        "held_out_by": "none",
+        "samples": int(used.sum()),
+        "held_out_samples": int(held.sum()),
+        "segments": segment_figures(grid, predicted_nm, sd_nm),
+    }
+    if held.any():
+        result |= {
+            "held_out_fit_percent": best_fit_percent(measured[held], predicted_nm[held]),
+            "held_out_ceiling_percent": ceiling_percent(measured[held], sd_nm),
+            "held_out_rms_nm": rms((measured - predicted_nm)[held]),
+            "held_out_by": "validate",
+        }
+    return result
+
+
+def segment_figures(grid: Grid, predicted_nm: np.ndarray, sd_nm: float) -> list[dict[str, Any]]:
+    """Fit and ceiling of each segment, in order."""
+    record, rows = grid.record, []
+    edges = np.searchsorted(record.segment, np.arange(len(record.segment_names) + 1))
+    for name, start, end in zip(record.segment_names, edges[:-1], edges[1:], strict=True):
+        measured, predicted = record.torque_nm[start:end], predicted_nm[start:end]
+        rows.append(
+            {
+                "segment": name,
+                "start_s": float(record.time_s[start]),
+                "end_s": float(record.time_s[end - 1]),
+                "rms_nm": rms(measured - predicted),
+                "fit_percent": best_fit_percent(measured, predicted),
+                "ceiling_percent": ceiling_percent(measured, sd_nm),
+            }
+        )
+    return rows

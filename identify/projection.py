@@ -1,0 +1,397 @@
+"""Variable projection: recruitment in linear coefficients, dynamics in three numbers, one joint estimate.
+
+For given (T, ζ, delay) the model is linear in the recruitment's coefficients, the baseline and, where the record
+doesn't begin at rest, the initial state. They are solved for exactly; only the three numbers are searched
+(Golub & Pereyra 1973, with Kaufman's Jacobian: the Gauss-Newton step of the joint problem).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from identify.dynamics import boundary_states
+from identify.errors import NotIdentifiable
+from identify.grid import Grid
+from identify.linear import SecondOrder
+from identify.noise import whiten
+from identify.recruitment.curve import Basis
+from identify.recruitment.knots import PILOT_KNOTS, even_knots, spline_roughness
+from identify.recruitment.smoothing import choose_weight
+from identify.recruitment.spline import SplineBasis
+
+T_BOUNDS_S = (0.012, 4.0)
+ZETA_BOUNDS = (0.15, 4.0)
+LONGEST_DELAY_S = 0.2
+STARTS_S = (0.06, 0.15, 0.35, 0.8)
+
+
+@dataclass
+class Problem:
+    """One record, one basis: what doesn't change while the dynamics are searched.
+
+    Parameters
+    ----------
+    grid : Grid
+        The record on the grid of pulses.
+    basis : Basis
+        Of the recruitment curve.
+    roughness : ndarray, shape (P, P)
+        Penalty on the coefficients.
+    rows : ndarray of bool, shape (K,)
+        Rows that are fitted.
+    from_rest : bool
+        Whether the muscle is at rest before the first pulse; else two columns carry the initial state.
+    delay_s : float or None
+        A fixed delay; None to estimate it.
+    """
+
+    grid: Grid
+    basis: Basis
+    roughness: np.ndarray
+    rows: np.ndarray
+    from_rest: bool = True
+    delay_s: float | None = None
+    stretches: list[slice] = field(init=False)
+
+    def __post_init__(self) -> None:
+        from identify.grid import runs
+
+        self.stretches = runs(self.rows)
+        if not self.stretches:
+            raise NotIdentifiable("no row may be fitted", mend="Give rows outside `validate`.")
+
+    @cached_property
+    def drive(self) -> np.ndarray:
+        """Basis functions of each interval's width, shape (K, P)."""
+        widths, place = np.unique(self.grid.pulse_width_us, return_inverse=True)
+        return self.basis.design(widths)[place]
+
+    @cached_property
+    def target(self) -> np.ndarray:
+        """Torque, with zeros where there is none (such rows are never fitted)."""
+        return np.nan_to_num(self.grid.torque_nm)
+
+    @property
+    def extras(self) -> int:
+        """Linear columns that aren't recruitment: baseline, and the initial state."""
+        return 1 if self.from_rest else 3
+
+    def columns(self, linear: SecondOrder) -> np.ndarray:
+        """Block means of the response to each linear coefficient, shape (K, P + extras)."""
+        response = linear.on_grid(self.grid, self.drive)
+        return np.concatenate([response, *self._extra_columns(linear)], axis=1)
+
+    def _extra_columns(self, linear: SecondOrder) -> list[np.ndarray]:
+        baseline = np.ones((self.grid.size, 1))
+        if self.from_rest:
+            return [baseline]
+        from identify.simulate import initial_response
+
+        return [baseline, initial_response(linear, self.grid, at_samples=False)]
+
+    def single(self, linear: SecondOrder, coefficients: np.ndarray) -> np.ndarray:
+        """Block means for one set of coefficients, shape (K,)."""
+        size = self.basis.size
+        response = linear.on_grid(self.grid, self.drive @ coefficients[:size])
+        extra = np.concatenate(self._extra_columns(linear), axis=1)
+        return response + extra @ coefficients[size:]
+
+    @property
+    def searched(self) -> int:
+        """How many numbers of the dynamics are searched."""
+        return 3 if self.delay_s is None else 2
+
+    def slopes(self, linear: SecondOrder, coefficients: np.ndarray) -> np.ndarray:
+        """Derivatives of the block means by log T, log ζ and (if searched) the delay, shape (K, 2 or 3)."""
+        step = 1e-5
+        t, z, d = linear.time_constant_s, linear.damping, linear.delay_s
+        up = [SecondOrder(t * np.exp(step), z, d), SecondOrder(t, z * np.exp(step), d), SecondOrder(t, z, d + step)]
+        down = [SecondOrder(t * np.exp(-step), z, d), SecondOrder(t, z * np.exp(-step), d), SecondOrder(t, z, d - step)]
+        pairs = list(zip(up, down, strict=True))[: self.searched]
+        return np.stack(
+            [(self.single(a, coefficients) - self.single(b, coefficients)) / (2 * step) for a, b in pairs], axis=1
+        )
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Where a search ended.
+
+    Parameters
+    ----------
+    problem : Problem
+        What was solved.
+    linear : SecondOrder
+        Dynamics.
+    coefficients : ndarray, shape (P + extras,)
+        Recruitment, baseline, initial state.
+    weight : float
+        Of the roughness.
+    ar1 : float
+        Correlation of the noise that rows were whitened with.
+    columns, slopes : ndarray, shape (K, P + extras), (K, 2 or 3)
+        The model's derivatives there.
+    gram : ndarray
+        A'A of the whitened [columns, slopes], penalty added: the information, times the noise variance.
+    freedom : float
+        Effective number of coefficients in all.
+    variance : float
+        Innovation variance on the grid, N²m².
+    iterations : int
+        Steps taken.
+    converged : bool
+        Whether the last step was far below its standard error.
+    """
+
+    problem: Problem
+    linear: SecondOrder
+    coefficients: np.ndarray
+    weight: float
+    ar1: float
+    columns: np.ndarray
+    slopes: np.ndarray
+    gram: np.ndarray
+    freedom: float
+    variance: float
+    iterations: int
+    converged: bool
+
+    @cached_property
+    def fitted_nm(self) -> np.ndarray:
+        """Block means of the model, shape (K,)."""
+        return self.columns @ self.coefficients
+
+    @cached_property
+    def residual_nm(self) -> np.ndarray:
+        """Measured less model on the grid, shape (K,); meaningful in rows with samples."""
+        return self.problem.target - self.fitted_nm
+
+
+def search(
+    problem: Problem,
+    start: SecondOrder,
+    *,
+    ar1: float = 0.0,
+    weight: float | None = None,
+    most: int = 25,
+    tolerance: float = 1e-3,
+) -> Solution:
+    """Gauss-Newton on the dynamics with the coefficients projected out, damped where a step fails.
+
+    Parameters
+    ----------
+    problem : Problem
+        Record and basis.
+    start : SecondOrder
+        Where to begin.
+    ar1 : float
+        Correlation of the noise.
+    weight : float, optional
+        Of the roughness; None to choose it by REML on the way.
+    most : int
+        Steps at most.
+    tolerance : float
+        Converged once a step is this small in standard errors.
+    """
+    linear = _bounded(problem, start)
+    target = whiten(problem.target, problem.stretches, ar1)
+    state = _assess(problem, linear, target, ar1, weight)
+    damping, taken, converged = 0.0, 0, False
+    while taken < most:
+        taken += 1
+        step = state.step(damping)
+        trial = _bounded(problem, _moved(linear, step))
+        moved = _difference(linear, trial)
+        # Steps in units of standard errors, from the information itself.
+        size = float(np.sqrt(max(moved @ state.information @ moved, 0.0) / max(state.variance, 1e-300)))
+        if size < tolerance or np.max(np.abs(moved)) < 1e-9:
+            converged = True
+            break
+        keep = None if (weight is None and taken <= 4) else state.weight
+        attempt = _assess(problem, trial, target, ar1, keep)
+        against = state.cost if keep is not None else state.cost_at(attempt.weight)
+        if attempt.cost <= against * (1 + 1e-9):
+            linear, state, damping = trial, attempt, damping / 10 if damping > 1e-4 else 0.0
+        else:
+            damping = max(10 * damping, 1e-2)
+            if damping > 1e8:
+                break
+    return state.solution(taken, converged)
+
+
+class _State:
+    """The joint linear problem at one point of the search."""
+
+    def __init__(
+        self, problem: Problem, linear: SecondOrder, target: np.ndarray, ar1: float, weight: float | None
+    ) -> None:
+        self.problem, self.linear, self.target, self.ar1 = problem, linear, target, ar1
+        self.columns = problem.columns(linear)
+        white = whiten(self.columns, problem.stretches, ar1)
+        self.zz, self.zy = white.T @ white, white.T @ target
+        self.energy = float(target @ target)
+        size, extras = problem.basis.size, problem.extras
+        self.size, self.extras = size, extras
+        if weight is None:
+            weight = self._chosen(size)
+        self.weight = weight
+        self.penalty = np.zeros_like(self.zz)
+        self.penalty[:size, :size] = problem.roughness
+        self.coefficients = _solve(self.zz + weight * self.penalty, self.zy)
+        self.cost = self.energy - float(self.zy @ self.coefficients)
+        slopes = problem.slopes(linear, self.coefficients)
+        self.slopes = slopes
+        bent = whiten(slopes, problem.stretches, ar1)
+        cross = white.T @ bent
+        self.full = np.block([[self.zz + weight * self.penalty, cross], [cross.T, bent.T @ bent]])
+        self.right = np.r_[self.zy, bent.T @ target]
+        inner = _solve(self.zz + weight * self.penalty, cross)
+        self.information = bent.T @ bent - cross.T @ inner
+        self.gradient = bent.T @ target - inner.T @ self.zy
+        self.freedom = float(np.trace(_solve(self.zz + weight * self.penalty, self.zz))) + slopes.shape[1]
+        c = self.coefficients
+        squares = self.energy - 2 * float(self.zy @ c) + float(c @ self.zz @ c)
+        self.variance = max(squares / max(target.size - self.freedom, 1.0), 1e-14 * self.energy / target.size, 1e-24)
+
+    def _chosen(self, size: int) -> float:
+        outer = self.zz[size:, size:]
+        inner = _solve(outer, np.c_[self.zz[size:, :size], self.zy[size:]])
+        gram = self.zz[:size, :size] - self.zz[:size, size:] @ inner[:, :-1]
+        moment = self.zy[:size] - self.zz[:size, size:] @ inner[:, -1]
+        energy = self.energy - float(self.zy[size:] @ inner[:, -1])
+        if not np.any(self.problem.roughness):
+            return 0.0
+        return choose_weight(
+            (gram + gram.T) / 2, moment, energy, self.target.size, self.problem.roughness, self.extras
+        ).weight
+
+    def cost_at(self, weight: float) -> float:
+        """The penalised cost here under another weight."""
+        return self.energy - float(self.zy @ _solve(self.zz + weight * self.penalty, self.zy))
+
+    def step(self, damping: float) -> np.ndarray:
+        """Step in (log T, log ζ, delay)."""
+        scale = np.diag(np.diag(self.information)) * damping
+        return _solve(self.information + scale, self.gradient)
+
+    def solution(self, taken: int, converged: bool) -> Solution:
+        return Solution(
+            problem=self.problem,
+            linear=self.linear,
+            coefficients=self.coefficients,
+            weight=self.weight,
+            ar1=self.ar1,
+            columns=self.columns,
+            slopes=self.slopes,
+            gram=self.full,
+            freedom=self.freedom,
+            variance=self.variance,
+            iterations=taken,
+            converged=converged,
+        )
+
+
+def _assess(problem: Problem, linear: SecondOrder, target: np.ndarray, ar1: float, weight: float | None) -> _State:
+    return _State(problem, linear, target, ar1, weight)
+
+
+def _solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Solve a symmetric system, scaled to a unit diagonal, with a hair of ridge against empty columns."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    scaled = matrix * scale[:, None] * scale[None, :]
+    scaled[np.diag_indices_from(scaled)] = 1.0 + 1e-12
+    lift = scale if right.ndim == 1 else scale[:, None]
+    return lift * np.linalg.solve(scaled, lift * right)
+
+
+def _moved(linear: SecondOrder, step: np.ndarray) -> SecondOrder:
+    t, z = np.exp(np.clip(step[:2], -0.7, 0.7))
+    delay = float(np.clip(step[2], -0.03, 0.03)) if step.size > 2 else 0.0
+    return SecondOrder(linear.time_constant_s * float(t), linear.damping * float(z), linear.delay_s + delay)
+
+
+def _difference(before: SecondOrder, after: SecondOrder) -> np.ndarray:
+    return np.array(
+        [
+            np.log(after.time_constant_s / before.time_constant_s),
+            np.log(after.damping / before.damping),
+            after.delay_s - before.delay_s,
+        ]
+    )
+
+
+def _bounded(problem: Problem, linear: SecondOrder) -> SecondOrder:
+    # A record's first sample after a pulse is off by up to one sample, so the delay may be negative by as much.
+    earliest = -min(1.0 / problem.grid.record.sample_rate_hz, problem.grid.step_s)
+    delay = float(np.clip(linear.delay_s, earliest, LONGEST_DELAY_S)) if problem.delay_s is None else problem.delay_s
+    return SecondOrder(
+        float(np.clip(linear.time_constant_s, *T_BOUNDS_S)), float(np.clip(linear.damping, *ZETA_BOUNDS)), delay
+    )
+
+
+def pilot_solution(grid: Grid, rows: np.ndarray, from_rest: bool, delay_s: float | None = None) -> Solution:
+    """A first fit with few knots, from several time constants, the best start taken.
+
+    Raises
+    ------
+    NotIdentifiable
+        The pulse width never changes, or the torque never does.
+    """
+    largest = float(np.max(grid.pulse_width_us))
+    seen = grid.pulse_width_us[rows]
+    if not largest > 0 or np.ptp(seen) <= 0:
+        raise NotIdentifiable(
+            "the pulse width never changes in the rows that are fitted" if largest > 0 else "no pulse is in the record",
+            mend="Record a PRBS and a ramp.",
+        )
+    if np.ptp(grid.torque_nm[rows]) <= 0:
+        raise NotIdentifiable("the torque never changes", mend="Check the load cell and the electrodes.")
+    basis = SplineBasis(even_knots(largest, PILOT_KNOTS))
+    problem = Problem(grid, basis, spline_roughness(basis), rows, from_rest, delay_s)
+    target = whiten(problem.target, problem.stretches, 0.0)
+    delay = 0.02 if delay_s is None else delay_s
+    starts = [_assess(problem, _bounded(problem, SecondOrder(t, 0.9, delay)), target, 0.0, None) for t in STARTS_S]
+    best = min(starts, key=lambda state: state.cost)
+    return search(problem, best.linear, most=12, tolerance=0.1)
+
+
+def pilot(grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+    """Recruitment curve of a pilot fit: pulse widths, µs, and torques, N·m."""
+    solution = pilot_solution(grid, grid.fitted, begins_at_rest(grid))
+    return pilot_curve(solution)
+
+
+def pilot_curve(solution: Solution) -> tuple[np.ndarray, np.ndarray]:
+    """The curve of a solution on 201 pulse widths."""
+    basis = solution.problem.basis
+    u = np.linspace(0.0, basis.largest_us, 201)
+    return u, basis.design(u) @ solution.coefficients[: basis.size]
+
+
+def begins_at_rest(grid: Grid) -> bool:
+    """Whether the record opens with at least 0.1 s without stimulation and without a trend in torque."""
+    opening = max(int(round(0.1 / grid.step_s)), 2)
+    still = not np.any(grid.pulse_width_us[:opening] > 0)
+    torque = grid.torque_nm[:opening]
+    later = grid.torque_nm[np.isfinite(grid.torque_nm)]
+    if still and np.all(np.isfinite(torque)):
+        span = float(np.ptp(later)) if later.size else 0.0
+        return bool(abs(torque.mean() - np.min(later)) < 0.25 * span or span == 0.0)
+    # Stimulated from the first pulse on: at rest if the torque starts where it is lowest.
+    first = grid.torque_nm[np.flatnonzero(np.isfinite(grid.torque_nm))[:2]]
+    return bool(first.size and abs(first.mean() - np.min(later)) < 0.1 * np.ptp(later))
+
+
+__all__ = [
+    "Problem",
+    "Solution",
+    "begins_at_rest",
+    "boundary_states",
+    "pilot",
+    "pilot_curve",
+    "pilot_solution",
+    "search",
+]
