@@ -159,7 +159,7 @@ def for_profile(table: dict[str, Limit], profile: Profile) -> dict[str, Limit]:
     owner = "participant's profile"
     table = tightened(table, "pulse_width_us", profile.max_pulse_width_us, owner)
     table = tightened(table, "current_ma", profile.current_ma, owner)
-    if not (0 < profile.max_torque_nm):
+    if not (profile.max_torque_nm > 0):
         raise RefusedError(f"{owner}: max_torque_nm {profile.max_torque_nm:g} N·m must be above 0")
     return tightened(table, "torque_nm", profile.max_torque_nm, owner, lo=-profile.max_torque_nm)
 

@@ -53,6 +53,13 @@ class TestPlan(Message):
     pulse_rate_hz: float = 40.0
 
 
+class RecruitmentTable(Message):
+    """A recruitment curve as the participant's last model gives it: linear between the points."""
+
+    pulse_width_us: list[float]
+    torque_nm: list[float]
+
+
 class StatusRequest(Message):
     kind: Literal["status"] = "status"
     id: int = 0
@@ -69,6 +76,7 @@ class PreviewRequest(Message):
     kind: Literal["preview"] = "preview"
     id: int = 0
     plan: TestPlan
+    recruitment: RecruitmentTable | None = Field(None, description="to estimate the torque-time with")
 
 
 class StartRequest(Message):
@@ -124,6 +132,9 @@ class Status(Message):
     load_cell: dict[str, Any] = Field(default_factory=dict, description="device, rate measured, bus")
     torque_age_s: float | None = Field(None, description="age of the newest torque sample; None: never seen")
     torque_nm: float | None = None
+    finished: FinishedEvent | None = Field(
+        None, description="the newest FinishedEvent since the rig started, a recovered one included: for who came late"
+    )
 
 
 class Preview(Message):

@@ -93,7 +93,7 @@ def library(kind: Kind) -> dict[str, ModuleType]:
     """Device modules of a kind, by id."""
     names = sorted(m.name for m in pkgutil.iter_modules(__path__) if not m.name.startswith("_"))
     modules = {name: importlib.import_module(f"{__name__}.{name}") for name in names}
-    return {name: module for name, module in modules.items() if module.KIND == kind}
+    return {name: module for name, module in modules.items() if kind == module.KIND}
 
 
 def find(kind: Kind, device_id: object) -> ModuleType:

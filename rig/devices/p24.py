@@ -5,6 +5,7 @@ Takes only width and current and draws the symmetric biphasic pulse itself: an u
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -49,8 +50,8 @@ class P24:
         self._answered = threading.Condition()
         self._waiting: dict[int, Packet | None] = {}
         self._lost = ""
-        self._on_ack: Callable[[Ack], None] = lambda ack: None
-        self._on_lost: Callable[[str], None] = lambda reason: None
+        self._on_ack: Callable[[Ack], None] = lambda _: None
+        self._on_lost: Callable[[str], None] = lambda _: None
 
     def listen(self, on_ack: Callable[[Ack], None], on_lost: Callable[[str], None]) -> None:
         self._on_ack, self._on_lost = on_ack, on_lost
@@ -121,10 +122,8 @@ class P24:
         if self._reader is not None and self._reader is not threading.current_thread():
             self._reader.join(timeout=1.0)
         if self._serial is not None:
-            try:
+            with contextlib.suppress(OSError):  # an unplugged line cannot be given back
                 self._serial.close()
-            except OSError:
-                pass  # an unplugged line cannot be given back, and nobody else needs to know
             self._serial = None
 
     def _next_number(self) -> int:

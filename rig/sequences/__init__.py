@@ -13,10 +13,12 @@ from functools import cache
 from typing import Any, Protocol, cast
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from rig.errors import PlanError
+
+Floats = NDArray[np.float64] | list[float]
 
 
 class SequenceSettings(BaseModel):
@@ -87,11 +89,11 @@ def pulses_in(duration_s: float, pulse_rate_hz: float) -> int:
     return round(duration_s * pulse_rate_hz)
 
 
-def dose_uc(pulse_width_us: ArrayLike, current_ma: float) -> float:
+def dose_uc(pulse_width_us: Floats, current_ma: float) -> float:
     """Charge of one phase summed over the pulses, µC (width × current)."""
     return float(np.sum(np.asarray(pulse_width_us, dtype=np.float64)) * current_ma * 1e-3)
 
 
-def torque_time_nms(pulse_width_us: ArrayLike, pulse_rate_hz: float, table_us: ArrayLike, table_nm: ArrayLike) -> float:
+def torque_time_nms(pulse_width_us: Floats, pulse_rate_hz: float, table_us: Floats, table_nm: Floats) -> float:
     """Estimated torque-time, N·m·s: the steady torque of each pulse by a recruitment table, times its period."""
-    return float(np.sum(np.interp(pulse_width_us, table_us, table_nm)) / pulse_rate_hz)
+    return float(np.sum(np.interp(np.asarray(pulse_width_us), table_us, table_nm)) / pulse_rate_hz)

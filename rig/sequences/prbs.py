@@ -54,4 +54,4 @@ def pulse_widths(settings: Settings, pulse_rate_hz: float) -> NDArray[np.float64
     del pulse_rate_hz
     chips = settings.chips or 2**settings.bits - 1
     bits = shift_register(settings.bits, chips, settings.seed)
-    return np.repeat(bits * settings.max_pulse_width_us, settings.clock_pulses)
+    return np.repeat(bits.astype(np.float64) * settings.max_pulse_width_us, settings.clock_pulses)

@@ -29,7 +29,7 @@ def load(dbc: str) -> Database:
     """
     try:
         if "/" not in dbc and not dbc.endswith(".dbc"):
-            text = resources.files(__package__).joinpath(f"{dbc}.dbc").read_text("utf-8")
+            text = resources.files("rig.wire").joinpath(f"{dbc}.dbc").read_text("utf-8")
         else:
             text = Path(dbc).read_text("cp1252")
         database = cantools.database.load_string(text, "dbc")

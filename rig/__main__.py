@@ -1,0 +1,107 @@
+"""`python -m rig`: the process that owns the devices.
+
+Prints one JSON line on standard output when its socket answers, logs on standard error, runs until SIGTERM or
+SIGINT: then it stops stimulation first, sees that it stopped, seals, and exits 0. Exit 2: a mistake in the rig file.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import json
+import logging
+import os
+import signal
+import sys
+from pathlib import Path
+
+from rig import config as configuration
+from rig.clock import MonotonicClock
+from rig.control.rig import Rig
+from rig.control.server import Server
+from rig.errors import RigError
+
+SWITCH_INTERVAL_S = 0.0005
+"""How long a thread may hold the interpreter while the sender waits; Python's default is 5 ms."""
+PROCESS_PRIORITY = 10
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the rig; returns the exit code."""
+    options = _parser().parse_args(arguments)
+    logging.basicConfig(level=logging.DEBUG if options.verbose else logging.INFO, handlers=[_handler()], force=True)
+    try:
+        config = _configure(options)
+        asyncio.run(_serve(config))
+    except RigError as error:
+        print(f"rig: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m rig", description="The process that owns the rig's devices.")
+    source = parser.add_mutually_exclusive_group(required=True)
+    source.add_argument("--config", type=Path, metavar="FILE", help="rig file (TOML), see docs/rig-file.md")
+    source.add_argument("--emulator-json", metavar="LINE", help="JSON line of `stimrig emulate`, or a file with it")
+    parser.add_argument("--socket", type=Path, help="Unix socket to listen on; wins over the rig file")
+    parser.add_argument("--data", type=Path, help="folder for journals and recordings; wins over the rig file")
+    parser.add_argument("--clock-speed", type=float, help="rig seconds a real second, for an emulator that runs faster")
+    parser.add_argument("--check", action="store_true", help="check the rig file and the DBC, then exit")
+    parser.add_argument("--verbose", action="store_true")
+    return parser
+
+
+def _configure(options: argparse.Namespace) -> configuration.RigConfig:
+    overrides = {"data_dir": options.data, "socket": options.socket, "clock_speed": options.clock_speed}
+    if options.config is not None:
+        return configuration.load(options.config, **overrides)
+    return configuration.for_emulator(options.emulator_json, **overrides)
+
+
+async def _serve(config: configuration.RigConfig) -> None:
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
+    with contextlib.suppress(OSError):
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(PROCESS_PRIORITY))
+    stop = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, stop.set)
+    server = Server()
+    rig = Rig(config, MonotonicClock(config.clock_speed), server.publish)
+    await asyncio.to_thread(rig.open)
+    await server.start(rig, config.socket)
+    print(json.dumps({"socket": str(config.socket), "state": rig.status().state}), flush=True)
+    await stop.wait()
+    logging.getLogger("rig").info("asked to end")
+    await asyncio.to_thread(rig.close)
+    await server.close()
+    config.socket.unlink(missing_ok=True)
+
+
+def _handler() -> logging.Handler:
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(_JsonLines())
+    return handler
+
+
+class _JsonLines(logging.Formatter):
+    """One JSON object a line, with the test's id where there is one."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        line = {
+            "time": self.formatTime(record, "%Y-%m-%dT%H:%M:%S%z"),
+            "level": record.levelname.lower(),
+            "logger": record.name,
+            "message": record.getMessage(),
+        }
+        if (test_id := getattr(record, "test_id", None)) is not None:
+            line["test_id"] = test_id
+        if record.exc_info:
+            line["exception"] = self.formatException(record.exc_info)
+        return json.dumps(line, ensure_ascii=False)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,39 @@
+"""The one way to end a test early: the first reason wins and wakes the sender at once."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Literal
+
+from rig.clock import Clock
+
+Cause = Literal["stopped", "fault"]
+
+
+class Halt:
+    """Set from any thread, once; `event` wakes whoever waits."""
+
+    def __init__(self, clock: Clock) -> None:
+        self.event = threading.Event()
+        self.cause: Cause | None = None
+        self.reason = ""
+        self.time_s = 0.0
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._heard: list[Callable[[], None]] = []
+
+    def on_set(self, action: Callable[[], None]) -> None:
+        """Call `action` when halted, from the halting thread."""
+        self._heard.append(action)
+
+    def set(self, cause: Cause, reason: str) -> bool:
+        """End the test; False if it was ending already."""
+        with self._lock:
+            if self.cause is not None:
+                return False
+            self.cause, self.reason, self.time_s = cause, reason, self._clock.now_s()
+            self.event.set()
+        for action in self._heard:
+            action()
+        return True

@@ -1,0 +1,219 @@
+"""The torque receiver: one thread from connecting to disconnecting, recording while a test runs.
+
+Unwraps the cell's counter, finds lost, repeated and disordered samples, and tells at once when a torque is over
+its limit or no number.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.clock import Clock
+from rig.devices import LoadCell
+from rig.errors import DeviceError, JournalError
+from rig.journal import Journal, Kind
+from rig.signals import Recorded, TorqueBlock
+
+READ_TIMEOUT_S = 0.02
+SILENCE_S = 1.0
+"""Real seconds without a sample after which the cell counts as gone and its bus is closed: some buses spin then."""
+LIVE_BLOCKS = 4000
+JUMP_ALLOWANCE_S = 0.5
+"""A counter that runs further ahead of the host's clock than this has jumped: no time can be given to its samples."""
+
+
+class CounterUnwrapper:
+    """Raw counters (modulo the device's) to one that never wraps, across blocks.
+
+    A step of zero is a repeated frame, a step backwards a late one: both are left out of the record.
+    """
+
+    def __init__(self, modulus: int) -> None:
+        self._modulus = modulus
+        self._last: int | None = None
+
+    def forget(self) -> None:
+        """Start anew with the next sample."""
+        self._last = None
+
+    def unwrap(self, raw: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_], int, int]:
+        """Unwrapped counters, which samples to keep, how many were repeats, how many came late."""
+        if self._last is None:
+            self._last = int(raw[0]) - 1
+        ahead = (raw - self._last + self._modulus // 2) % self._modulus - self._modulus // 2
+        counter = self._last + ahead
+        newest = np.maximum.accumulate(np.concatenate([[self._last], counter]))
+        keep = counter > newest[:-1]
+        repeats = int(np.sum(counter == newest[:-1]))
+        self._last = int(newest[-1])
+        return counter, keep, repeats, int(len(raw) - np.sum(keep)) - repeats
+
+
+class Receiver:
+    """Owns the load cell's reading thread.
+
+    Parameters
+    ----------
+    cell
+        An opened load cell.
+    on_lost
+        Called once, with the reason, when the cell is gone; the thread then ends.
+    """
+
+    def __init__(self, cell: LoadCell, clock: Clock, on_lost: Callable[[str], None]) -> None:
+        self._cell = cell
+        self._clock = clock
+        self._on_lost = on_lost
+        self._lock = threading.Lock()
+        self._closing = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._unwrapper = CounterUnwrapper(cell.counter_modulus) if cell.counter_modulus else None
+        self._journal: Journal | None = None
+        self._limits_nm = (-np.inf, np.inf)
+        self._on_fault: Callable[[str], None] = lambda _: None
+        self._previous: tuple[int, float] | None = None
+        self._rate: deque[tuple[float, int]] = deque(maxlen=2000)
+        self._total = 0
+        self.counts = Recorded()
+        self.last_s: float | None = None
+        self.last_unix_s: float | None = None
+        self.last_torque_nm: float | None = None
+        self.peak_nm = 0.0
+        self.live: deque[NDArray[Any]] = deque(maxlen=LIVE_BLOCKS)
+        self.recent: deque[tuple[float, float]] = deque(maxlen=400)
+
+    def start(self) -> None:
+        """Begin to read."""
+        self._thread = threading.Thread(target=self._run, name="torque-receiver", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the thread and give the bus back."""
+        self._closing.set()
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._thread.join(timeout=2.0)
+        self._cell.close()
+
+    def record(self, journal: Journal, limits_nm: tuple[float, float], on_fault: Callable[[str], None]) -> None:
+        """From here on every sample goes to the journal and is checked; faults are told at once."""
+        with self._lock:
+            self._journal, self._limits_nm, self._on_fault = journal, limits_nm, on_fault
+            self.counts, self.peak_nm = Recorded(), 0.0
+
+    def release(self) -> Recorded:
+        """Stop recording; what was counted since `record`."""
+        with self._lock:
+            self._journal = None
+            self._limits_nm, self._on_fault = (-np.inf, np.inf), lambda _: None
+            return replace(self.counts)
+
+    def age_s(self, now_s: float) -> float:
+        """Age of the newest sample, infinite before the first."""
+        last_s = self.last_s
+        return np.inf if last_s is None else now_s - last_s
+
+    def torque_around(self, duration_s: float) -> float | None:
+        """Median of the torque over the last `duration_s`, N·m; None where there is none."""
+        since_s = self._clock.now_s() - duration_s
+        values = [torque for time_s, torque in tuple(self.recent) if time_s >= since_s]
+        return float(np.median(values)) if values else None
+
+    def measured_rate_hz(self) -> float | None:
+        """Samples a second over the last seconds, by the host's clock."""
+        rate = tuple(self._rate)
+        if len(rate) < 2 or rate[-1][0] <= rate[0][0]:
+            return None
+        return (rate[-1][1] - rate[0][1]) / (rate[-1][0] - rate[0][0])
+
+    def take(self, block: TorqueBlock) -> None:
+        """One block from the cell: unwrap, record, check."""
+        with self._lock:
+            self.counts.malformed_frames += block.malformed
+            self.counts.error_frames += block.error_frames
+            if len(block) == 0:
+                return
+            samples = self._placed(block.samples)
+            if len(samples) == 0:
+                return
+            self._remember(samples)
+            if self._journal is not None:
+                self.counts.samples += len(samples)
+                try:
+                    self._journal.append(Kind.TORQUE, samples.tobytes())
+                except JournalError as error:
+                    self._on_fault(str(error))
+            self._check(samples["torque_nm"])
+
+    def _placed(self, samples: NDArray[Any]) -> NDArray[Any]:
+        """The samples with unwrapped counters, without repeats and late ones; losses counted."""
+        if self._unwrapper is None:
+            return samples
+        counter, keep, repeats, late = self._unwrapper.unwrap(samples["counter"])
+        self.counts.duplicate_samples += repeats
+        self.counts.disordered_samples += late
+        samples = samples[keep].copy()
+        samples["counter"] = counter[keep]
+        if len(samples) == 0:
+            return samples
+        before = self._previous or (int(samples["counter"][0]) - 1, float(samples["host_time_s"][0]))
+        steps = np.diff(samples["counter"], prepend=before[0])
+        missing = int(np.sum(steps - 1))
+        if missing:
+            self.counts.lost_samples += missing
+            self._check_jump(samples, before, missing)
+        self._previous = int(samples["counter"][-1]), float(samples["host_time_s"][-1])
+        return samples
+
+    def _check_jump(self, samples: NDArray[Any], before: tuple[int, float], missing: int) -> None:
+        elapsed_s = float(samples["host_time_s"][-1]) - before[1]
+        if missing / self._cell.sample_rate_hz > elapsed_s + JUMP_ALLOWANCE_S:
+            self._on_fault(f"load cell: its counter jumped by {missing} samples within {elapsed_s * 1e3:.0f} ms")
+
+    def _remember(self, samples: NDArray[Any]) -> None:
+        self.last_s = float(samples["host_time_s"][-1])
+        self.last_unix_s = self._clock.unix_s()
+        self.last_torque_nm = float(samples["torque_nm"][-1])
+        self.recent.append((self.last_s, float(np.mean(samples["torque_nm"]))))
+        self._total += len(samples)
+        self._rate.append((self.last_s, self._total))
+        self.live.append(samples)
+
+    def _check(self, torque_nm: NDArray[np.float64]) -> None:
+        lo, hi = self._limits_nm
+        within = (torque_nm >= lo) & (torque_nm <= hi)
+        if not np.all(within):
+            worst = float(torque_nm[np.argmin(within)])
+            if np.isnan(worst):
+                self._on_fault("load cell: sent a torque that is no number (NaN); check its amplifier")
+            else:
+                self._on_fault(f"torque {worst:.2f} N·m is outside {lo:g} … {hi:g} N·m")
+        elif self._journal is not None:
+            self.peak_nm = max(self.peak_nm, float(np.max(np.abs(torque_nm))))
+
+    def _run(self) -> None:
+        last_heard_s = self._clock.now_s()
+        while not self._closing.is_set():
+            try:
+                block = self._cell.read(READ_TIMEOUT_S)
+            except DeviceError as error:
+                self._lose(str(error))
+                return
+            now_s = self._clock.now_s()
+            if len(block):
+                last_heard_s = now_s
+            self.take(block)
+            if now_s - last_heard_s > SILENCE_S * self._clock.speed:
+                self._lose(f"load cell: silent for {SILENCE_S:g} s; check its cable and supply")
+                return
+
+    def _lose(self, reason: str) -> None:
+        if not self._closing.is_set():
+            self._cell.close()
+            self._on_lost(reason)

@@ -1,0 +1,297 @@
+"""One test, played in its own thread: arm, a pulse at each deadline, stop, and see that it stopped.
+
+Deadlines are absolute on the monotonic clock. Before each pulse the proof of health is looked at; a late pulse is
+dropped and recorded, never sent in a burst.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import os
+import threading
+import time
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from rig.acquire.halt import Cause, Halt
+from rig.acquire.receiver import Receiver
+from rig.clock import Clock
+from rig.errors import DeviceError, JournalError
+from rig.gate import Gate
+from rig.journal import Journal, Kind
+from rig.limits import Limit
+from rig.messages import StopEvidence
+from rig.plan import PlannedTest
+from rig.signals import Pulse, Recorded
+
+LEAD_S = 0.1
+"""Real seconds between arming and the first deadline."""
+SENDER_PRIORITY = 50
+FRESH_S = 0.5
+"""Real seconds to wait for a fresh torque before arming."""
+DECAY_S = 3.0
+NEAR_REST_NM = 0.5
+SYNC_PERIOD_S = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Watch:
+    """When silence counts as a fault, real seconds, and when a pulse is too late, as a share of the period."""
+
+    stale_torque_s: float = 0.1
+    missing_ack_s: float = 0.1
+    late_pulse_periods: float = 0.4
+
+
+@dataclass(slots=True)
+class RunResult:
+    """How a test went; lateness of the written pulses in s."""
+
+    outcome: Cause | str
+    reason: str
+    evidence: StopEvidence
+    counts: Recorded = field(default_factory=Recorded)
+    lateness_s: list[float] = field(default_factory=list)
+    dropped: int = 0
+    charge_uc: float = 0.0
+    peak_nm: float = 0.0
+    cpu_percent: float = 0.0
+    duration_s: float = 0.0
+    last_sample_unix_s: float | None = None
+
+
+class TestRun:
+    """A test on its way.
+
+    Parameters
+    ----------
+    test, table
+        What to play, and the limits narrowed by the participant's profile.
+    journal
+        Already holding header and plan.
+    halt
+        Ends the test early from any thread.
+    """
+
+    __test__ = False
+
+    def __init__(
+        self,
+        test: PlannedTest,
+        table: dict[str, Limit],
+        journal: Journal,
+        gate: Gate,
+        receiver: Receiver,
+        clock: Clock,
+        halt: Halt,
+        watch: Watch = Watch(),
+    ) -> None:
+        self.test = test
+        self.halt = halt
+        self.started = threading.Event()
+        self.t0_s: float | None = None
+        self.stimulation_ended = threading.Event()
+        self._table = table
+        self._journal = journal
+        self._gate = gate
+        self._receiver = receiver
+        self._clock = clock
+        self._watch = watch
+        self._baseline_nm: float | None = None
+        self._counts = Recorded()
+        halt.on_set(gate.shut)
+
+    def execute(self) -> RunResult:
+        """Play the test to its end or its halt; never raises for a fault, the result says it."""
+        cpu_s, wall_s = time.process_time(), time.monotonic()
+        torque = self._table["torque_nm"]
+        self._receiver.record(self._journal, (torque.lo, torque.hi), lambda reason: self._fault(reason))
+        syncing = _Syncing(self._journal)
+        try:
+            if self._arm():
+                with _undisturbed():
+                    self._play()
+        except (DeviceError, JournalError) as error:
+            self._fault(str(error))
+        evidence = self._stop()
+        elapsed_s = max(time.monotonic() - wall_s, 1e-9)
+        cpu_percent = 100 * (time.process_time() - cpu_s) / elapsed_s
+        syncing.end()
+        return self._result(evidence, cpu_percent)
+
+    @property
+    def dropped(self) -> int:
+        """Pulses dropped so far because they were late."""
+        return self._gate.dropped
+
+    def elapsed_s(self) -> float:
+        """Time on the test's clock, 0 before its start."""
+        return 0.0 if self.t0_s is None else max(0.0, self._clock.now_s() - self.t0_s)
+
+    def _fault(self, reason: str) -> None:
+        self.halt.set("fault", reason)
+
+    def _arm(self) -> bool:
+        speed = self._clock.speed
+        deadline_s = self._clock.now_s() + FRESH_S * speed
+        while not (self._receiver.age_s(self._clock.now_s()) <= self._watch.stale_torque_s * speed):
+            if self._clock.now_s() >= deadline_s:
+                self._fault("load cell: no fresh torque before the test; check its cable and supply")
+            if self._clock.wait(self._clock.now_s() + 0.005 * speed, self.halt.event):
+                return False
+        self._baseline_nm = self._receiver.torque_around(0.1 * speed)
+        self._gate.open(self._journal, self._table)
+        if self.halt.event.is_set():
+            self._gate.shut()  # halted while arming: the gate was opened after the halt had shut it
+            return False
+        return True
+
+    def _play(self) -> None:
+        clock, plan = self._clock, self.test.plan
+        period_s = 1 / plan.pulse_rate_hz
+        t0_s = clock.now_s() + LEAD_S * clock.speed
+        self._journal.append_json(Kind.START, {"t0_s": t0_s, "unix_s": clock.unix_s() + LEAD_S})
+        self.t0_s = t0_s
+        self.started.set()
+        late_s = self._watch.late_pulse_periods * period_s
+        for index, width_us in enumerate(self.test.pulse_width_us.tolist()):
+            due_s = t0_s + index * period_s
+            if clock.wait(due_s, self.halt.event):
+                return
+            self._look_after_health(clock.now_s())
+            if self.halt.event.is_set():
+                return
+            self._gate.fire(index, Pulse(width_us, plan.profile.current_ma), due_s, due_s + late_s)
+        clock.wait(t0_s + self.test.duration_s, self.halt.event)
+
+    def _look_after_health(self, now_s: float) -> None:
+        speed = self._clock.speed
+        age_s = self._receiver.age_s(now_s)
+        if not (age_s <= self._watch.stale_torque_s * speed):
+            self._fault(f"load cell: torque is stale, the newest sample is {age_s / speed * 1e3:.0f} ms old")
+        oldest_s = self._gate.oldest_unacknowledged_s()
+        if oldest_s is not None and not (now_s - oldest_s <= self._watch.missing_ack_s * speed):
+            self._fault(f"stimulator: a pulse was not acknowledged within {self._watch.missing_ack_s * 1e3:.0f} ms")
+
+    def _stop(self) -> StopEvidence:
+        """Stop the device, ask its state, watch the torque fall."""
+        clock = self._clock
+        at_stop_nm = self._receiver.torque_around(0.05 * clock.speed)
+        said, state, safe = "", None, False
+        try:
+            self._gate.stop()
+        except DeviceError as error:
+            said = str(error)
+        try:
+            safe, state = self._gate.state()
+        except DeviceError as error:
+            said = said or str(error)
+        self.stimulation_ended.set()
+        end_s = clock.now_s()
+        if self.halt.cause is None:
+            clock.wait(end_s + 0.05 * clock.speed)  # samples on their way still belong to the test
+            falling, words = True, "the test ended by itself"
+        else:
+            falling, words = self._watch_decay(at_stop_nm)
+        last_s = self._gate.last_pulse_s
+        if self.halt.cause is None and self.t0_s is not None:
+            end_s = self.t0_s + self.test.duration_s
+        self._end_journal(end_s if self.halt.cause is None else clock.now_s())
+        return StopEvidence(
+            confirmed=safe and falling,
+            detail="; ".join(part for part in (f"device: {state or 'did not answer'}", said, words) if part),
+            last_pulse_age_s=None if last_s is None else clock.now_s() - last_s,
+            device_state=state,
+        )
+
+    def _watch_decay(self, at_stop_nm: float | None) -> tuple[bool, str]:
+        """Wait until the torque has fallen to half, or close to where it was before the test."""
+        clock = self._clock
+        if at_stop_nm is None or self._baseline_nm is None:
+            return False, "no torque to confirm the stop by"
+        above_nm = abs(at_stop_nm - self._baseline_nm)
+        deadline_s = clock.now_s() + DECAY_S
+        while True:
+            now_nm = self._receiver.torque_around(0.05 * clock.speed)
+            if now_nm is None:
+                return False, "no torque to confirm the stop by"
+            if abs(now_nm - self._baseline_nm) <= max(NEAR_REST_NM, 0.5 * above_nm):
+                return True, f"torque fell from {at_stop_nm:.2f} to {now_nm:.2f} N·m"
+            if clock.now_s() >= deadline_s:
+                return False, f"torque is still {now_nm:.2f} N·m {DECAY_S:g} s after the stop"
+            clock.wait(clock.now_s() + 0.01 * clock.speed)
+
+    def _end_journal(self, end_s: float) -> None:
+        content = {"outcome": self.halt.cause or "completed", "reason": self.halt.reason, "time_s": end_s}
+        self._gate.release()
+        self._counts = self._receiver.release()
+        # An end that cannot be written leaves a journal without one, which is recovered as such.
+        with contextlib.suppress(JournalError):
+            if self.halt.cause is not None:
+                event = {"event": self.halt.cause, "reason": self.halt.reason, "time_s": self.halt.time_s}
+                self._journal.append_json(Kind.EVENT, event)
+            self._journal.append_json(Kind.END, content)
+
+    def _result(self, evidence: StopEvidence, cpu_percent: float) -> RunResult:
+        self._journal.close()
+        return RunResult(
+            outcome=self.halt.cause or "completed",
+            reason=self.halt.reason,
+            evidence=evidence,
+            counts=self._counts,
+            lateness_s=list(self._gate.lateness_s),
+            dropped=self._gate.dropped,
+            charge_uc=self._gate.charge_uc,
+            peak_nm=self._receiver.peak_nm,
+            cpu_percent=cpu_percent,
+            duration_s=min(self.elapsed_s(), self.test.duration_s),
+            last_sample_unix_s=self._receiver.last_unix_s,
+        )
+
+
+class _Syncing:
+    """Brings the journal to the disk once a second, outside the threads that must be on time."""
+
+    def __init__(self, journal: Journal) -> None:
+        self._journal = journal
+        self._done = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="journal-sync", daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        while not self._done.wait(SYNC_PERIOD_S):
+            self._journal.sync()
+
+    def end(self) -> None:
+        self._done.set()
+        self._thread.join()
+
+
+@contextlib.contextmanager
+def _undisturbed():
+    """No garbage collection, and real-time priority for this thread where the system allows it."""
+    gc.collect()
+    gc.disable()
+    policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
+    with contextlib.suppress(OSError):
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(SENDER_PRIORITY))
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError):
+            os.sched_setscheduler(0, policy, parameters)
+        gc.enable()
+
+
+def lateness_ms(lateness_s: list[float]) -> dict[str, float]:
+    """Median, 99th percentile and maximum of the written pulses' lateness, ms; empty without pulses."""
+    if not lateness_s:
+        return {}
+    values = np.asarray(lateness_s) * 1e3
+    return {
+        "median": float(np.median(values)),
+        "p99": float(np.percentile(values, 99)),
+        "max": float(np.max(values)),
+    }

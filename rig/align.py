@@ -1,0 +1,141 @@
+"""The load cell's clock on the test's clock, with a standard error.
+
+Best by the sync line: the cell saw each pulse begin, and the host knows when it wrote each pulse. Without one,
+the cell's counter is fitted to the host's receive times along their lower envelope: a sample can come late,
+never early. What that cannot see is the shortest delay of the transport itself, which stays in the result.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import theilslopes
+
+Array = NDArray[np.float64]
+
+MIN_EDGES = 8
+MEDIAN_EFFICIENCY = 1.2533
+"""Standard error of a median over that of a mean, for normal errors (sqrt(pi / 2))."""
+MAX_POINTS = 400
+
+
+@dataclass(frozen=True, slots=True)
+class Alignment:
+    """How the times were got.
+
+    Attributes
+    ----------
+    error_ms
+        Standard error of the offset, ms; NaN where too little came to tell.
+    delay_ms
+        Median time from a sample's aligned time to its arrival at the host, ms.
+    rate_ppm
+        How much slower (+) the cell's clock runs than the host's.
+    """
+
+    method: Literal["sync", "regression"]
+    error_ms: float
+    delay_ms: float
+    rate_ppm: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Line:
+    offset_s: float
+    rate: float
+    centre_s: float
+    error_s: float
+
+    def at(self, cell_s: Array) -> Array:
+        return self.offset_s + self.centre_s + self.rate * (cell_s - self.centre_s)
+
+
+def cell_time(counter: NDArray[np.int64], stamp_s: Array, sample_rate_hz: float) -> Array:
+    """Time on the cell's own clock, s: by its counter, else the transport's stamps, else by counting samples."""
+    if len(counter) and np.all(counter >= 0):
+        return counter / sample_rate_hz
+    if len(stamp_s) and np.all(np.isfinite(stamp_s)):
+        return stamp_s - stamp_s[0]
+    return np.arange(len(counter)) / sample_rate_hz
+
+
+def align(
+    cell_s: Array, host_s: Array, sync: NDArray[np.uint8], written_s: Array, sample_rate_hz: float
+) -> tuple[Array, Alignment]:
+    """Aligned time of each torque sample.
+
+    Parameters
+    ----------
+    cell_s, host_s, sync
+        Time on the cell's clock (s), receive time on the test's clock (s) and sync line (255: none), shape (N,).
+    written_s
+        When the pulses were written, s on the test's clock, shape (M,), rising, no NaN.
+    sample_rate_hz
+        Nominal; a sync edge lies half a sample, on average, before the sample that shows it.
+
+    Returns
+    -------
+    time_s
+        Shape (N,), on the test's clock.
+    Alignment
+    """
+    if len(cell_s) < 2:
+        return host_s.copy(), Alignment("regression", float("nan"), 0.0, 0.0)
+    envelope = _lower_envelope(cell_s, host_s)
+    pairs = _edges(cell_s, sync, written_s, envelope, sample_rate_hz)
+    if pairs is not None and len(pairs[0]) >= MIN_EDGES:
+        line, method = _robust_line(*pairs), "sync"
+        # Pulses often keep step with the samples, so where in its sample a pulse began does not average out.
+        error_s = float(np.hypot(line.error_s, 1 / sample_rate_hz / np.sqrt(12)))
+    else:
+        line, method, error_s = envelope, "regression", envelope.error_s
+    time_s = line.at(cell_s)
+    delay_ms = float(np.median(host_s - time_s)) * 1e3
+    return time_s, Alignment(method, error_s * 1e3, delay_ms, (line.rate - 1) * 1e6)
+
+
+def _robust_line(cell_s: Array, host_s: Array) -> _Line:
+    """host ≈ offset + rate × cell through points of which up to a quarter may be far off."""
+    centre_s = float(np.mean(cell_s))
+    lead_s = host_s - cell_s
+    chosen = np.unique(np.linspace(0, len(cell_s) - 1, min(len(cell_s), MAX_POINTS)).round().astype(int))
+    slope = 0.0
+    if np.ptp(cell_s[chosen]) > 0 and len(chosen) >= 3:
+        slope = float(np.asarray(theilslopes(lead_s[chosen], cell_s[chosen]))[0])
+    residual_s = lead_s - slope * (cell_s - centre_s)
+    offset_s = float(np.median(residual_s))
+    spread_s = 1.4826 * float(np.median(np.abs(residual_s - offset_s)))
+    error_s = MEDIAN_EFFICIENCY * spread_s / np.sqrt(len(cell_s))
+    return _Line(offset_s, 1 + slope, centre_s, float(error_s))
+
+
+def _lower_envelope(cell_s: Array, host_s: Array) -> _Line:
+    """A line under the receive times: through the earliest sample of each of many windows."""
+    windows = int(np.clip((cell_s[-1] - cell_s[0]) / 0.5, 1, MAX_POINTS))
+    lead_s = host_s - cell_s
+    edges = np.searchsorted(cell_s, np.linspace(cell_s[0], cell_s[-1], windows + 1)[1:-1])
+    parts = [part for part in np.split(np.arange(len(cell_s)), edges) if len(part)]
+    earliest = np.array([part[np.argmin(lead_s[part])] for part in parts])
+    return _robust_line(cell_s[earliest], host_s[earliest])
+
+
+def _edges(
+    cell_s: Array, sync: NDArray[np.uint8], written_s: Array, envelope: _Line, sample_rate_hz: float
+) -> tuple[Array, Array] | None:
+    """Pairs (cell's time of a pulse, host's time of writing it), matched by the coarse line; None without sync."""
+    if len(written_s) < MIN_EDGES or not np.any(sync == 1):
+        return None
+    period_s = 1 / sample_rate_hz
+    rising = (sync[1:] == 1) & (sync[:-1] == 0) & (np.diff(cell_s) < 1.5 * period_s)
+    edge_s = cell_s[1:][rising] - period_s / 2
+    if len(edge_s) == 0:
+        return None
+    about_s = envelope.at(edge_s)
+    after = np.clip(np.searchsorted(written_s, about_s), 1, len(written_s) - 1)
+    nearest = np.where(about_s - written_s[after - 1] < written_s[after] - about_s, after - 1, after)
+    within_s = 0.45 * float(np.min(np.diff(written_s)))
+    near = np.abs(written_s[nearest] - about_s) < within_s
+    return edge_s[near], written_s[nearest[near]]

@@ -1,0 +1,164 @@
+"""The rig file (TOML): which devices, on which ports, which tighter limits. `docs/rig-file.md` lists every key.
+
+A mistake is one line: file, key, what is wrong, what would be right.
+"""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from rig import devices, limits
+from rig.acquire.run import Watch
+from rig.devices import DeviceSettings, Kind
+from rig.errors import ConfigError, RefusedError
+from rig.limits import Limit
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+
+class LimitSettings(_Table):
+    """Tightens the hard limits for this rig; a value above the hard limit changes nothing."""
+
+    pulse_width_us: float | None = Field(None, ge=0)
+    current_ma: float | None = Field(None, ge=0)
+    charge_per_phase_uc: float | None = Field(None, ge=0)
+    charge_per_second_uc: float | None = Field(None, ge=0)
+    pulse_rate_hz: float | None = Field(None, ge=1)
+    torque_nm: float | None = Field(None, gt=0)
+    duration_s: float | None = Field(None, gt=0)
+    charge_per_test_uc: float | None = Field(None, ge=0)
+
+    def table(self) -> dict[str, Limit]:
+        """The hard limits, tightened."""
+        table = limits.HARD_LIMITS
+        for name, value in self.model_dump(exclude_none=True).items():
+            lo = -value if name == "torque_nm" else None
+            table = limits.tightened(table, name, value, "rig file", lo)
+        return table
+
+
+class WatchSettings(_Table):
+    """When silence counts as a fault, real seconds; tighter or a little looser than the defaults."""
+
+    stale_torque_s: float = Field(0.1, gt=0, le=0.5)
+    missing_ack_s: float = Field(0.1, gt=0, le=0.5)
+    late_pulse_periods: float = Field(0.4, gt=0, le=0.6)
+
+    def watch(self) -> Watch:
+        """As `rig.acquire` takes it."""
+        return Watch(**self.model_dump())
+
+
+class RigConfig(_Table):
+    """A whole rig file, checked. `stimulator` and `load_cell` are the settings of the chosen devices."""
+
+    data_dir: Path
+    socket: Path
+    clock_speed: float = Field(1.0, gt=0, le=100)
+    stimulator: DeviceSettings
+    load_cell: DeviceSettings
+    limits: LimitSettings = LimitSettings.model_validate({})
+    watch: WatchSettings = WatchSettings.model_validate({})
+
+    def public(self) -> dict[str, Any]:
+        """The configuration as it is kept in every recording."""
+        content = self.model_dump(mode="json")
+        content["stimulator"] = self.stimulator.model_dump(mode="json")
+        content["load_cell"] = self.load_cell.model_dump(mode="json")
+        return content
+
+
+def load(path: Path, **overrides: Any) -> RigConfig:
+    """Read a rig file.
+
+    Parameters
+    ----------
+    path
+        The TOML file; a relative DBC path in it is taken from the file's folder.
+    overrides
+        Values that win over the file's: `data_dir`, `socket`, `clock_speed`.
+
+    Raises
+    ------
+    ConfigError
+        One line with file, key and mend.
+    """
+    try:
+        content = tomllib.loads(path.read_text("utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}; give the path of a rig file (see docs/rig-file.md)") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: not TOML: {error}") from None
+    cell = content.get("load_cell")
+    if isinstance(cell, dict) and str(cell.get("dbc", "")).endswith(".dbc"):
+        cell["dbc"] = str(path.parent / cell["dbc"])
+    return check(content, str(path), **overrides)
+
+
+def for_emulator(ready: str, **overrides: Any) -> RigConfig:
+    """A rig on the emulator's devices, from the JSON line that it prints (or a file holding that line).
+
+    Raises
+    ------
+    ConfigError
+        No such line.
+    """
+    try:
+        text = ready if ready.lstrip().startswith("{") else Path(ready).read_text("utf-8")
+        line = json.loads(text)
+        stimulator, can = line["stimulator"], line["can"]
+    except OSError as error:
+        raise ConfigError(f"--emulator-json {ready}: {error.strerror}") from None
+    except (ValueError, KeyError, TypeError) as error:
+        raise ConfigError(f"--emulator-json: not the line that `stimrig emulate` prints ({error})") from None
+    content: dict[str, Any] = {
+        "clock_speed": line.get("speed", 1.0),
+        "stimulator": {"device": "p24", "port": stimulator},
+        "load_cell": {"device": "can_load_cell", "bus": can},
+    }
+    return check(content, "--emulator-json", **overrides)
+
+
+def check(content: dict[str, Any], place: str, **overrides: Any) -> RigConfig:
+    """Check a rig file's content (see `load`)."""
+    content = {**content, **{key: value for key, value in overrides.items() if value is not None}}
+    for kind in ("stimulator", "load_cell"):
+        content[kind] = _device(kind, content.get(kind), place)
+    try:
+        config = RigConfig.model_validate(content)
+        config.limits.table()
+    except ValidationError as error:
+        raise ConfigError(f"{place}: {_first(error, RigConfig)}") from None
+    except RefusedError as error:
+        raise ConfigError(f"{place}: limits: {error}") from None
+    return config
+
+
+def _device(kind: Kind, table: object, place: str) -> DeviceSettings:
+    if not isinstance(table, dict):
+        raise ConfigError(f"{place}: [{kind}] is missing; name its device, one of: {', '.join(devices.library(kind))}")
+    try:
+        settings: type[DeviceSettings] = devices.find(kind, table.get("device")).Settings
+    except ConfigError as error:
+        raise ConfigError(f"{place}: {error}") from None
+    try:
+        return settings.model_validate(table)
+    except ValidationError as error:
+        raise ConfigError(f"{place}: {kind}.{_first(error, settings)}") from None
+
+
+def _first(error: ValidationError, model: type[BaseModel]) -> str:
+    first = error.errors()[0]
+    key = ".".join(str(part) for part in first["loc"])
+    if first["type"] == "extra_forbidden":
+        return f"{key}: unknown key (known here: {', '.join(model.model_fields)})"
+    if first["type"] == "missing":
+        return f"{key}: missing; see docs/rig-file.md"
+    return f"{key}: {first['msg']}, not {first['input']!r}"

@@ -1,0 +1,191 @@
+"""The only way to a stimulator: open only during a test, limits first, intent on disk before the command.
+
+Once `shut` has returned, no pulse is on its way and none will follow, whatever other threads still try.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections import deque
+from collections.abc import Callable
+
+from rig import journal as jn
+from rig.clock import Clock
+from rig.devices import Stimulator
+from rig.errors import DeviceError, JournalError
+from rig.journal import Journal, Kind
+from rig.limits import Limit, Refusal, admit, check
+from rig.signals import Ack, Pulse, PulseStatus
+
+
+class Gate:
+    """Holds the stimulator and lets admitted pulses through.
+
+    Parameters
+    ----------
+    stimulator
+        The device; nothing else keeps a reference to it.
+    clock
+        The rig's clock.
+    on_fault
+        Called with the reason when the device reports an error or is lost; from any thread.
+    """
+
+    def __init__(self, stimulator: Stimulator, clock: Clock, on_fault: Callable[[str], None]) -> None:
+        self._stimulator = stimulator
+        self._clock = clock
+        self._on_fault = on_fault
+        self._lock = threading.Lock()
+        self._journal: Journal | None = None
+        self._passing = False
+        self._table: dict[str, Limit] = {}
+        self._index_of: dict[int, int] = {}
+        self._unacknowledged: dict[int, float] = {}
+        self._recent: deque[tuple[float, float]] = deque()
+        self.last_pulse_s: float | None = None
+        self.lateness_s: list[float] = []
+        self.charge_uc = 0.0
+        self.dropped = 0
+        stimulator.listen(self._acknowledged, on_fault)
+
+    @property
+    def is_open(self) -> bool:
+        """A test may send pulses now."""
+        return self._passing
+
+    def identify(self) -> dict[str, object]:
+        """Open the line to the device and ask who it is. Raises DeviceError."""
+        return self._stimulator.open()
+
+    def state(self) -> tuple[bool, str]:
+        """(True if the device says that it cannot stimulate, its state in words). Raises DeviceError."""
+        return self._stimulator.state()
+
+    def open(self, journal: Journal, table: dict[str, Limit]) -> None:
+        """Arm the device for one test.
+
+        Raises
+        ------
+        DeviceError, JournalError
+            The gate then stays shut.
+        """
+        journal.append_json(Kind.EVENT, {"event": "arm", "time_s": self._clock.now_s()})
+        self._stimulator.arm()
+        with self._lock:
+            self._table = table
+            self._index_of.clear()
+            self._unacknowledged.clear()
+            self._recent.clear()
+            self.last_pulse_s, self.lateness_s, self.charge_uc, self.dropped = None, [], 0.0, 0
+            self._journal = journal
+            self._passing = True
+
+    def fire(self, index: int, pulse: Pulse, due_s: float, latest_s: float) -> PulseStatus:
+        """Let one pulse through, or record why not.
+
+        Parameters
+        ----------
+        index
+            Its number in the test.
+        due_s, latest_s
+            When it was due, and after when it is dropped rather than sent.
+
+        Raises
+        ------
+        DeviceError, JournalError
+            Nothing may follow; the caller stops the test.
+        """
+        with self._lock:
+            journal = self._journal
+            if journal is None or not self._passing:
+                return PulseStatus.REFUSED
+            if pulse.pulse_width_us == 0:
+                return PulseStatus.REST
+            verdict = admit(pulse, self._table)
+            if isinstance(verdict, Refusal):
+                return self._skip(journal, index, PulseStatus.REFUSED, str(verdict))
+            if verdict.pulse_width_us == 0 or verdict.current_ma == 0:
+                return self._skip(journal, index, PulseStatus.REST)
+            now_s = self._clock.now_s()
+            if not (now_s <= latest_s):
+                return self._skip(journal, index, PulseStatus.DROPPED)
+            refusal = self._too_much(now_s, verdict.charge_uc)
+            if refusal is not None:
+                return self._skip(journal, index, PulseStatus.REFUSED, str(refusal))
+            intent = jn.INTENT.pack(index, now_s, due_s, verdict.pulse_width_us, verdict.current_ma)
+            journal.append(Kind.INTENT, intent)
+            if not (self._clock.now_s() <= latest_s):  # the disk was slow
+                return self._skip(journal, index, PulseStatus.DROPPED)
+            number = self._stimulator.send(verdict)
+            written_s = self._clock.now_s()
+            self._index_of[number] = index
+            self._unacknowledged[index] = written_s
+            self._recent.append((written_s, verdict.charge_uc))
+            self.last_pulse_s = written_s
+            self.lateness_s.append(written_s - due_s)
+            self.charge_uc += verdict.charge_uc
+            journal.append(Kind.WRITTEN, jn.WRITTEN.pack(index, number, written_s))
+        return PulseStatus.UNACKNOWLEDGED
+
+    def shut(self) -> None:
+        """From here on nothing passes; returns when nothing is on its way either."""
+        with self._lock:
+            self._passing = False
+
+    def release(self) -> None:
+        """Shut, and let the test's journal go: late acks are no longer written."""
+        with self._lock:
+            self._passing = False
+            self._journal = None
+
+    def stop(self) -> None:
+        """Shut, and tell the device to stop. Raises DeviceError."""
+        self.shut()
+        self._stimulator.stop()
+
+    def oldest_unacknowledged_s(self) -> float | None:
+        """When the oldest pulse that waits for its ack was written."""
+        return next(iter(self._unacknowledged.copy().values()), None)
+
+    def disconnect(self) -> None:
+        """Stop if it still can be, and give the line back; never raises."""
+        with contextlib.suppress(DeviceError):
+            self.stop()
+        self._stimulator.close()
+
+    def _skip(self, journal: Journal, index: int, status: PulseStatus, reason: str = "") -> PulseStatus:
+        now_s = self._clock.now_s()
+        journal.append(Kind.SKIPPED, jn.SKIPPED.pack(index, status, now_s))
+        if status == PulseStatus.DROPPED:
+            self.dropped += 1
+        if reason:
+            journal.append_json(Kind.EVENT, {"event": "refused", "index": index, "reason": reason, "time_s": now_s})
+        return status
+
+    def _too_much(self, now_s: float, charge_uc: float) -> Refusal | None:
+        while self._recent and self._recent[0][0] <= now_s - 1.0:
+            self._recent.popleft()
+        if self._recent:
+            refusal = check(self._table["pulse_interval_s"], now_s - self._recent[-1][0])
+            if refusal is not None:
+                return refusal
+        return check(self._table["charge_per_second_uc"], charge_uc + sum(c for _, c in self._recent))
+
+    def _acknowledged(self, ack: Ack) -> None:
+        with self._lock:  # `fire` holds it until the number is known
+            index = self._index_of.pop(ack.number, -1)
+            self._unacknowledged.pop(index, None)
+            failure = self._write_ack(index, ack)
+        if failure:
+            self._on_fault(failure)  # outside the lock: a fault shuts the gate
+        if ack.error is not None:
+            self._on_fault(f"stimulator: {ack.error}" + (f" at pulse {index + 1}" if index >= 0 else ""))
+
+    def _write_ack(self, index: int, ack: Ack) -> str:
+        try:
+            if self._journal is not None:
+                self._journal.append(Kind.ACKED, jn.ACKED.pack(index, ack.time_s) + (ack.error or "").encode())
+        except JournalError as error:
+            return str(error)
+        return ""

@@ -1,0 +1,185 @@
+"""The journal: what happened, in append-only blocks with length and CRC-32, while it happens.
+
+A process that is killed, or a disk that fills up, costs the last block at most. Blocks reach the kernel before
+`append` returns (so they outlive this process) and the disk at the start, once a second and at the end.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import struct
+import threading
+import zlib
+from dataclasses import dataclass
+from enum import IntEnum
+from pathlib import Path
+from typing import Any
+
+from rig.errors import JournalError, RecordingError
+
+MAGIC = b"STIMRIG\x01"
+_BLOCK = struct.Struct("<4sBxHII")
+"""Mark, kind, (spare), sequence number (16 bits), length, CRC-32 over the fields before it and the payload."""
+_MARK = b"\xa5BLK"
+_CRC_AT = 12
+MAX_PAYLOAD = 64 * 1024 * 1024
+
+INTENT = struct.Struct("<idddd")
+"""Pulse index, time_s, due_s, width µs, current mA: written before the command goes out."""
+WRITTEN = struct.Struct("<iBd")
+"""Pulse index, packet number, time_s when the last byte was handed to the line."""
+SKIPPED = struct.Struct("<iBd")
+"""Pulse index, `PulseStatus`, time_s."""
+ACKED = struct.Struct("<id")
+"""Pulse index (−1: not of this test), time_s; then the error's words in UTF-8, none when delivered."""
+
+
+class Kind(IntEnum):
+    """What a block holds."""
+
+    HEADER = 1
+    PLAN = 2
+    START = 3
+    INTENT = 4
+    WRITTEN = 5
+    SKIPPED = 6
+    ACKED = 7
+    TORQUE = 8
+    EVENT = 9
+    END = 10
+
+
+class Journal:
+    """One test's journal, open for appending from several threads.
+
+    After the first failure every further `append` raises: a journal with a hole must not look whole.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._lock = threading.Lock()
+        self._number = 0
+        self._failure = ""
+        try:
+            self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o640)
+            self._put(MAGIC)
+            self.sync()
+            _sync_directory(path.parent)
+        except OSError as error:
+            raise JournalError(f"journal {path}: {error.strerror}; free the disk or correct data_dir") from None
+
+    def append(self, kind: Kind, payload: bytes) -> None:
+        """Write one block through to the kernel.
+
+        Raises
+        ------
+        JournalError
+            The disk refused it, now or before.
+        """
+        with self._lock:
+            if self._failure:
+                raise JournalError(self._failure)
+            head = _BLOCK.pack(_MARK, kind, self._number & 0xFFFF, len(payload), 0)[:_CRC_AT]
+            crc = zlib.crc32(payload, zlib.crc32(head))
+            try:
+                self._put(head + struct.pack("<I", crc) + payload)
+            except OSError as error:
+                self._failure = f"journal {self.path}: {error.strerror}; the test stops, what was written is kept"
+                raise JournalError(self._failure) from None
+            self._number += 1
+
+    def append_json(self, kind: Kind, content: dict[str, Any]) -> None:
+        """Write one block of JSON."""
+        self.append(kind, json.dumps(content).encode())
+
+    def _put(self, data: bytes) -> None:
+        written = os.write(self._fd, data)
+        if written != len(data):
+            raise OSError(28, "disk full: block cut short")
+
+    def sync(self) -> None:
+        """Bring everything written so far to the disk. A failure shows in the next `append`."""
+        try:
+            os.fdatasync(self._fd)
+        except OSError as error:
+            self._failure = f"journal {self.path}: {error.strerror}; the test stops, what was written is kept"
+
+    def close(self) -> None:
+        """Bring everything to the disk and close."""
+        self.sync()
+        os.close(self._fd)
+
+
+def _sync_directory(path: Path) -> None:
+    fd = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)
+
+
+@dataclass(frozen=True, slots=True)
+class JournalContents:
+    """Every whole block in order; `damaged_bytes` were skipped, `blocks_missing` by the sequence numbers."""
+
+    path: Path
+    blocks: list[tuple[Kind, bytes]]
+    damaged_bytes: int
+    blocks_missing: int
+
+    @property
+    def ended(self) -> bool:
+        """The test's end was written: nothing is missing at the tail."""
+        return any(kind == Kind.END for kind, _ in self.blocks)
+
+    def first_json(self, kind: Kind) -> dict[str, Any] | None:
+        """The first block of a kind as JSON, None where there is none."""
+        return next((json.loads(payload) for k, payload in self.blocks if k == kind), None)
+
+
+def read(path: Path) -> JournalContents:
+    """Read a journal, whole or half-written: damage costs the damaged blocks only.
+
+    Raises
+    ------
+    RecordingError
+        Not there, or not a journal at all.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise RecordingError(f"journal {path}: {error.strerror}") from None
+    if not data.startswith(MAGIC):
+        raise RecordingError(f"journal {path}: does not start like a journal; it is another file or was overwritten")
+    blocks: list[tuple[Kind, bytes]] = []
+    at, damaged, missing, expected = len(MAGIC), 0, 0, 0
+    while at < len(data):
+        block = _block_at(data, at)
+        if block is None:
+            found = data.find(_MARK, at + 1)
+            following = found if found >= 0 else len(data)
+            damaged += following - at
+            at = following
+            continue
+        kind, number, payload, at = block
+        missing += (number - expected) & 0xFFFF
+        expected = number + 1
+        blocks.append((kind, payload))
+    return JournalContents(path, blocks, damaged, missing)
+
+
+def _block_at(data: bytes, at: int) -> tuple[Kind, int, bytes, int] | None:
+    if at + _BLOCK.size > len(data):
+        return None
+    mark, kind, number, length, crc = _BLOCK.unpack_from(data, at)
+    start = at + _BLOCK.size
+    if mark != _MARK or length > MAX_PAYLOAD or start + length > len(data):
+        return None
+    payload = data[start : start + length]
+    if zlib.crc32(payload, zlib.crc32(data[at : at + _CRC_AT])) != crc:
+        return None
+    try:
+        return Kind(kind), number, payload, start + length
+    except ValueError:
+        return None

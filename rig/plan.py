@@ -1,0 +1,164 @@
+"""From a `TestPlan` to every pulse of the test: built and checked whole before anything is sent."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig import sequences
+from rig.errors import PlanError, RefusedError
+from rig.limits import Limit, Refusal, admit, check
+from rig.messages import Preview, RecruitmentTable, SegmentPlan, TestPlan
+from rig.signals import Pulse
+
+MAX_WIDTH_SETTING = "max_pulse_width_us"
+"""Where a sequence has this setting and the plan does not give it, it becomes the profile's comfort maximum."""
+
+
+def default_segments() -> list[SegmentPlan]:
+    """The pre-session test: PRBS (12.7 s), triangular ramp (10 s), held-out levels (7 s), rests around them; 38.7 s.
+
+    PRBS: 7 bits, chips of 4 pulses (0.1 s): a whole period of 12.7 s excites 0.08 to 4.4 Hz, which covers muscles
+    with time constants of 0.1 to 0.6 s, and doses half of the pulses at c. The rest after it is long enough
+    for the slowest muscle to fall to a few percent before the ramp.
+    """
+    return [
+        SegmentPlan(name="rest", sequence="rest", settings={"duration_s": 2.0}),
+        SegmentPlan(name="prbs", sequence="prbs", settings={}),
+        SegmentPlan(name="rest", sequence="rest", settings={"duration_s": 3.0}),
+        SegmentPlan(name="ramp", sequence="ramp", settings={}),
+        SegmentPlan(name="rest", sequence="rest", settings={"duration_s": 2.0}),
+        SegmentPlan(name="validate", sequence="multilevel", settings={}),
+        SegmentPlan(name="rest", sequence="rest", settings={"duration_s": 2.0}),
+    ]
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedSegment:
+    """A segment as indices of pulses, end exclusive."""
+
+    name: str
+    start: int
+    end: int
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedTest:
+    """A test ready to be played.
+
+    Attributes
+    ----------
+    pulse_width_us
+        Width for each pulse, µs, shape (P,); pulse i is due i / pulse_rate_hz after the start.
+    """
+
+    plan: TestPlan
+    pulse_width_us: NDArray[np.float64]
+    segments: tuple[PlannedSegment, ...]
+
+    @property
+    def duration_s(self) -> float:
+        """Length of the test, s."""
+        return len(self.pulse_width_us) / self.plan.pulse_rate_hz
+
+    @property
+    def charge_uc(self) -> float:
+        """Charge of one phase summed over the pulses, µC."""
+        return sequences.dose_uc(self.pulse_width_us, self.plan.profile.current_ma)
+
+    def segment_at(self, time_s: float) -> str | None:
+        """Name of the segment at a time on the test's clock, None outside."""
+        index = int(np.floor(time_s * self.plan.pulse_rate_hz + 1e-9))
+        return next((s.name for s in self.segments if s.start <= index < s.end), None)
+
+
+def build(plan: TestPlan, table: dict[str, Limit]) -> PlannedTest:
+    """Build every pulse of the plan and check it against the limits.
+
+    Parameters
+    ----------
+    plan
+        As a client sent it.
+    table
+        Limits already narrowed by the profile.
+
+    Raises
+    ------
+    PlanError
+        Unknown sequence, wrong setting, no segment: names the segment.
+    RefusedError
+        A limit that the plan would break, which pulse breaks it and by how much.
+    """
+    _refuse(check(table["pulse_rate_hz"], plan.pulse_rate_hz), "plan")
+    segments: list[PlannedSegment] = []
+    parts: list[NDArray[np.float64]] = []
+    start = 0
+    chosen = default_segments() if plan.segments is None else plan.segments
+    if not chosen:
+        raise PlanError("plan.segments is empty; leave it out for the default test, or give at least one segment")
+    for number, segment in enumerate(chosen, start=1):
+        try:
+            widths = sequences.build(segment.sequence, _settings(segment, plan), plan.pulse_rate_hz)
+        except PlanError as error:
+            raise PlanError(f"segment {number} ({segment.name}): {error}") from None
+        parts.append(widths)
+        segments.append(PlannedSegment(segment.name, start, start + len(widths)))
+        start += len(widths)
+    test = PlannedTest(plan, np.concatenate(parts), tuple(segments))
+    _check(test, table)
+    return test
+
+
+def _settings(segment: SegmentPlan, plan: TestPlan) -> dict[str, object]:
+    settings = dict(segment.settings)
+    if MAX_WIDTH_SETTING in sequences.find(segment.sequence).Settings.model_fields:
+        settings.setdefault(MAX_WIDTH_SETTING, plan.profile.max_pulse_width_us)
+    return settings
+
+
+def _check(test: PlannedTest, table: dict[str, Limit]) -> None:
+    current_ma, rate_hz = test.plan.profile.current_ma, test.plan.pulse_rate_hz
+    for width_us in np.unique(test.pulse_width_us):
+        verdict = admit(Pulse(float(width_us), current_ma), table)
+        if isinstance(verdict, Refusal):
+            same = (test.pulse_width_us == width_us) | np.isnan(test.pulse_width_us) & np.isnan(width_us)
+            first = int(np.argmax(same))
+            segment = next(s for s in test.segments if s.start <= first < s.end)
+            raise RefusedError(f"segment {segment.name}, pulse {first - segment.start + 1}: {verdict}")
+    charge_uc = test.pulse_width_us * current_ma * 1e-3
+    window = min(max(1, round(rate_hz)), len(charge_uc))
+    worst_uc = float(np.max(np.convolve(charge_uc, np.ones(window), "valid")))
+    _refuse(check(table["charge_per_second_uc"], worst_uc), "plan")
+    _refuse(check(table["charge_per_test_uc"], test.charge_uc), "plan")
+    _refuse(check(table["duration_s"], test.duration_s), "plan")
+
+
+def _refuse(refusal: Refusal | None, place: str) -> None:
+    if refusal is not None:
+        raise RefusedError(f"{place}: {refusal}")
+
+
+def preview(test: PlannedTest, recruitment: RecruitmentTable | None = None) -> Preview:
+    """What a person should know before the test is played.
+
+    Raises
+    ------
+    PlanError
+        A recruitment table that is no curve.
+    """
+    rate_hz = test.plan.pulse_rate_hz
+    torque_time_nms = None
+    if recruitment is not None:
+        widths, torques = recruitment.pulse_width_us, recruitment.torque_nm
+        if len(widths) != len(torques) or len(widths) < 2 or not np.all(np.diff(widths) > 0):
+            raise PlanError("recruitment: give as many torques as pulse widths, at least two, the widths rising")
+        torque_time_nms = sequences.torque_time_nms(test.pulse_width_us, rate_hz, widths, torques)
+    return Preview(
+        duration_s=test.duration_s,
+        charge_uc=test.charge_uc,
+        torque_time_nms=torque_time_nms,
+        pulse_width_us=test.pulse_width_us.tolist(),
+        segments=[{"name": s.name, "start_s": s.start / rate_hz, "end_s": s.end / rate_hz} for s in test.segments],
+    )

@@ -1,0 +1,121 @@
+"""The life of the rig from one test to the next: a pure state machine.
+
+    disconnected -> ready -> arming -> running -> sealing -> ready
+                              |          |
+                              +-> stopping -> sealing -> latched -> (a person) -> ready
+
+Every method gives a new `Trial` or raises the reason why not. Nothing but a person's `rearm` leads out of
+`latched` and `uncertain`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from rig.errors import BusyError, DeviceError, LatchedError, RigError, UncertainError
+from rig.messages import RigState
+
+BUSY: tuple[RigState, ...] = ("arming", "running", "sealing", "stopping")
+
+
+class TransitionError(RigError):
+    """A step that the state machine does not know: a fault in this program."""
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """State, why, and whose test; `latch` and `lost` say what follows when the test is over."""
+
+    state: RigState = "disconnected"
+    reason: str = "not connected yet"
+    test_id: str | None = None
+    participant: str | None = None
+    latch: bool = False
+    lost: str = ""
+
+    @property
+    def busy(self) -> bool:
+        """A test is on its way; its devices and files are in use."""
+        return self.state in BUSY
+
+    def connected(self, before: RigState | None = None, reason: str = "") -> Trial:
+        """Both devices answer. `before`: what the rig was when it died, from its latch file."""
+        self._only("disconnected")
+        if before == "latched":
+            return Trial("latched", reason)
+        if before is not None:
+            return Trial("uncertain", reason)
+        return Trial("ready", "")
+
+    def disconnected(self, reason: str) -> Trial:
+        """A device is gone: at once when idle, after the test's end when one runs; a latch stays a latch."""
+        if self.busy or self.state in ("latched", "uncertain"):
+            return replace(self, lost=reason)
+        return Trial("disconnected", reason)
+
+    def start(self, test_id: str, participant: str) -> Trial:
+        """A person asks for a test.
+
+        Raises
+        ------
+        BusyError, LatchedError, UncertainError, DeviceError
+            Naming the holder or the reason.
+        """
+        self.may_start()
+        return Trial("arming", "", test_id, participant)
+
+    def may_start(self) -> None:
+        """Raise what forbids a start now (see `start`)."""
+        if self.busy:
+            raise BusyError(f"test {self.test_id} of participant {self.participant} is {self.state}; wait or stop it")
+        if self.state == "latched":
+            raise LatchedError(f"{self.reason}; look at the participant and the rig, then re-arm")
+        if self.state == "uncertain":
+            raise UncertainError(f"{self.reason}; look at the participant and the rig, then re-arm")
+        if self.state == "disconnected":
+            raise DeviceError(f"{self.reason}; mend it, then re-arm")
+
+    def armed(self) -> Trial:
+        """The device is ready and the first pulse is due."""
+        self._only("arming")
+        return replace(self, state="running")
+
+    def halted(self, reason: str) -> Trial:
+        """A stop or a fault, at any time: idle, it latches; in a test, the test is ending."""
+        if self.state in ("arming", "running"):
+            return replace(self, state="stopping", reason=reason, latch=True)
+        if self.busy:
+            return replace(self, reason=self.reason or reason, latch=True)
+        if self.state == "ready":
+            return Trial("latched", reason)
+        return self
+
+    def ended(self) -> Trial:
+        """Stimulation is over; the recording is being sealed."""
+        self._only("running", "stopping", "arming")
+        return replace(self, state="sealing")
+
+    def sealed(self) -> Trial:
+        """The recording is safe (or its journal kept)."""
+        self._only("sealing")
+        if self.latch:
+            return Trial("latched", self.reason, lost=self.lost)
+        if self.lost:
+            return Trial("disconnected", self.lost)
+        return Trial("ready", "")
+
+    def rearm(self) -> Trial:
+        """A person has looked; both devices have just answered.
+
+        Raises
+        ------
+        BusyError
+            A test is on its way.
+        """
+        if self.busy:
+            raise BusyError(f"test {self.test_id} is {self.state}; nothing to re-arm")
+        return Trial("ready", "")
+
+    def _only(self, *states: RigState) -> None:
+        if self.state not in states:
+            raise TransitionError(f"the rig is {self.state}, this step needs {' or '.join(states)}")
