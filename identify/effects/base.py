@@ -141,7 +141,10 @@ class Form:
     log_law : bool
         The law takes the parameter's logarithm.
     propose : callable or None
-        `propose(residual_nm, scene)` gives starting values found in the data: a list of dicts.
+        `propose(residual_nm, scene, previous)` gives starting values found in the data: a list of dicts, none where
+        there is nothing to start from. `previous` holds the parameters of the form before in a chain.
+    grows : bool
+        The form is the next in a chain: it is tried only while the form before it gained.
     source : str
         Paper and equation.
     """
@@ -154,7 +157,8 @@ class Form:
     batched: bool = False
     law: dict[str, int] = field(default_factory=dict)
     log_law: bool = False
-    propose: Callable[[np.ndarray, Scene], list[dict[str, float]]] | None = None
+    propose: Callable[[np.ndarray, Scene, dict[str, float]], list[dict[str, float]]] | None = None
+    grows: bool = False
     source: str = ""
 
     def neutral(self) -> dict[str, float]:

@@ -120,3 +120,38 @@ def since_onset(on: np.ndarray, least_gap_s: float, step_s: float) -> np.ndarray
             gap += step_s
             since += step_s
     return out
+
+
+@njit(cache=True, nogil=True)
+def follow(
+    torque: np.ndarray, slope: np.ndarray, phi: np.ndarray, gamma: np.ndarray, step_s: float
+) -> tuple[np.ndarray, np.ndarray]:  # pragma: no cover
+    """A second-order system driven by the cubic through boundary states; (M, K + 1) to (M, K + 1).
+
+    `slope` is the rate times the step; `phi` (M, 2, 2) and `gamma` (M, 2, 4) act on (z, z'·step), (x0, x0', x1, x1').
+    """
+    rows, size = torque.shape
+    out = np.zeros((rows, size))
+    rate = np.zeros((rows, size))
+    for m in range(rows):
+        z, v = torque[m, 0], 0.0
+        out[m, 0] = z
+        for k in range(size - 1):
+            a, b, c, d = torque[m, k], slope[m, k], torque[m, k + 1], slope[m, k + 1]
+            z, v = (
+                phi[m, 0, 0] * z
+                + phi[m, 0, 1] * v
+                + gamma[m, 0, 0] * a
+                + gamma[m, 0, 1] * b
+                + gamma[m, 0, 2] * c
+                + gamma[m, 0, 3] * d,
+                phi[m, 1, 0] * z
+                + phi[m, 1, 1] * v
+                + gamma[m, 1, 0] * a
+                + gamma[m, 1, 1] * b
+                + gamma[m, 1, 2] * c
+                + gamma[m, 1, 3] * d,
+            )
+            out[m, k + 1] = z
+            rate[m, k + 1] = v / step_s
+    return out, rate

@@ -24,9 +24,9 @@ def _exponential(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
 
 def _yielding(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
     width = 0.05 * scene.scale_nm
-    over = np.abs(y) - p["knee_nm"]
-    soft = np.where(np.isinf(over), 0.0, 0.5 * (over + np.sqrt(over * over + width * width)))
-    soft = soft - 0.5 * (np.sqrt(p["knee_nm"] ** 2 + width * width) - p["knee_nm"]) * np.isfinite(p["knee_nm"])
+    over, rest = np.abs(y) - p["knee_nm"], -p["knee_nm"]
+    # A soft corner, exactly zero at zero torque.
+    soft = 0.5 * (over + np.sqrt(over * over + width * width)) - 0.5 * (rest + np.sqrt(rest * rest + width * width))
     return y - np.sign(y) * p["yield_share"] * soft
 
 
@@ -51,7 +51,7 @@ EFFECT = Effect(
             "output",
             "y - yield·max(y - knee, 0), with a soft corner",
             (
-                Parameter("knee_nm", "N·m", 0.2, 1.1, np.inf, (0.6, 0.8), "log", "torque", "where it begins to yield"),
+                Parameter("knee_nm", "N·m", 0.2, 1.1, 0.8, (0.6, 0.8), "log", "torque", "where it begins to yield"),
                 Parameter("yield_share", "1", 0.0, 1.0, 0.0, (0.5, 0.8), about="share lost above the knee"),
             ),
             _yielding,

@@ -1,0 +1,76 @@
+"""Drift of the zero: the cell warms up, the limb settles, an offset creeps."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from identify.effects.base import Effect, Form, Parameter, Scene
+
+
+def _linear(_: None, p: dict[str, Any], scene: Scene) -> np.ndarray:
+    return p["slope_nm_per_s"] * scene.time_s
+
+
+def _warming(_: None, p: dict[str, Any], scene: Scene) -> np.ndarray:
+    return p["shift_nm"] * -np.expm1(-scene.time_s / p["time_constant_s"])
+
+
+def _bent(_: None, p: dict[str, Any], scene: Scene) -> np.ndarray:
+    s = scene.time_s / 60.0
+    return 60.0 * p["slope_nm_per_s"] * s + p["bend_nm"] * s * s
+
+
+def _breathing(_: None, p: dict[str, Any], scene: Scene) -> np.ndarray:
+    turn = 2 * np.pi * scene.time_s / p["period_s"]
+    return p["cos_nm"] * (np.cos(turn) - 1.0) + p["sin_nm"] * np.sin(turn)
+
+
+_SLOPE = Parameter("slope_nm_per_s", "N·m/s", -0.25, 0.25, 0.0, (0.0,), about="drift in a second")
+_WAVE = (-1.5, 1.5, 0.0, (0.02,))
+
+EFFECT = Effect(
+    id="baseline_drift",
+    name="Drift of the baseline",
+    forms=(
+        Form("linear", "additive", "y + slope·t", (_SLOPE,), _linear, True),
+        Form(
+            "warming",
+            "additive",
+            "y + shift (1 - exp(-t/time_constant))",
+            (
+                Parameter("shift_nm", "N·m", -4.0, 4.0, 0.0, (0.0,), about="final shift"),
+                Parameter("time_constant_s", "s", 2.0, 80.0, 15.0, (5.0, 20.0), "log", about="how fast it settles"),
+            ),
+            _warming,
+            True,
+        ),
+        Form(
+            "bent",
+            "additive",
+            "y + slope·t + bend (t/60)²",
+            (_SLOPE, Parameter("bend_nm", "N·m", -12.0, 12.0, 0.0, (0.0,), about="bend over a minute")),
+            _bent,
+            True,
+        ),
+        Form(
+            "wave",
+            "additive",
+            "y + cos·(cos(2πt/period) - 1) + sin·sin(2πt/period)",
+            (
+                Parameter("period_s", "s", 9.0, 90.0, 30.0, (12.0, 25.0, 50.0), "log", about="period of a slow wave"),
+                Parameter("cos_nm", "N·m", *_WAVE),
+                Parameter("sin_nm", "N·m", *_WAVE),
+            ),
+            _breathing,
+            True,
+        ),
+    ),
+    signature="The rests don't return to the same torque; the error is the same whether the muscle works or not.",
+    resembles=("voluntary_effort", "fatigue", "mixed_fibres", "passive_torque"),
+    separated_by="Rests at zero pulse width before and after each part.",
+    plain="The zero of the measurement moves. It isn't the muscle: let the cell warm up, support the limb, zero again.",
+    source="Load-cell warm-up and limb settling",
+    experiment=("rest",),
+)

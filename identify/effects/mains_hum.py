@@ -1,0 +1,48 @@
+"""Mains hum: a line at 50 or 60 Hz and its harmonics, sought at the record's own rate."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from identify.effects.base import Effect, Form, Parameter, Scene
+
+HARMONICS = 4
+
+
+def _hum(_: None, p: dict[str, Any], scene: Scene) -> np.ndarray:
+    total = 0.0
+    for h in range(1, HARMONICS + 1):
+        turn = 2 * np.pi * h * p["frequency_hz"] * scene.time_s
+        total = total + p[f"cos_{h}_nm"] * np.cos(turn) + p[f"sin_{h}_nm"] * np.sin(turn)
+    return np.asarray(total)
+
+
+_PARTS = tuple(
+    Parameter(f"{part}_{h}_nm", "N·m", -2.0, 2.0, 0.0, (0.0,), about=f"harmonic {h}")
+    for h in range(1, HARMONICS + 1)
+    for part in ("cos", "sin")
+)
+
+EFFECT = Effect(
+    id="mains_hum",
+    name="Mains hum",
+    forms=(
+        Form(
+            "line",
+            "additive",
+            "y + Σ cos_h cos(2πhft) + sin_h sin(2πhft)",
+            (Parameter("frequency_hz", "Hz", 49.0, 61.0, 50.0, (50.0, 60.0), about="mains frequency"), *_PARTS),
+            _hum,
+            batched=True,
+        ),
+    ),
+    signature="Lines at 50 or 60 Hz and multiples; in one mean a pulse they fold to some low frequency.",
+    resembles=(),
+    separated_by="The spectrum at rest, at a high sampling rate.",
+    plain="The mains couples into the load cell. It isn't the muscle: check shielding and earth.",
+    source="Interference",
+    raw=True,
+    experiment=("rest",),
+)

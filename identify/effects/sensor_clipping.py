@@ -1,0 +1,55 @@
+"""The load cell or its amplifier reaches the end of its range."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy.special import ndtr
+
+from identify.effects.base import Effect, Form, Parameter, Scene
+
+
+def _clipped(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+    """Mean of min(y + noise, ceiling): near the ceiling only the noise's upper half is cut."""
+    ceiling, sd = p["ceiling_nm"], max(scene.noise_sd_nm, 1e-6)
+    with np.errstate(invalid="ignore"):
+        over = (y - ceiling) / sd
+        bell = np.exp(-0.5 * np.minimum(over * over, 700.0)) / np.sqrt(2 * np.pi)
+        cut = y - sd * (over * ndtr(over) + bell)
+    return np.where(np.isinf(ceiling), y, cut)
+
+
+def _floored(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+    return -_clipped(-y, {"ceiling_nm": -p["floor_nm"]}, scene)
+
+
+EFFECT = Effect(
+    id="sensor_clipping",
+    name="Clipping of the sensor",
+    forms=(
+        Form(
+            "ceiling",
+            "sensor",
+            "min(y + noise, ceiling)",
+            (Parameter("ceiling_nm", "N·m", 0.1, 1.5, np.inf, (0.9,), "log", "torque", "largest torque shown"),),
+            _clipped,
+            True,
+        ),
+        Form(
+            "floor",
+            "sensor",
+            "max(y + noise, floor)",
+            (Parameter("floor_nm", "N·m", -1.5, 0.9, -np.inf, (-0.5,), "linear", "torque", "smallest torque shown"),),
+            _floored,
+            True,
+        ),
+    ),
+    signature="Flat tops: many samples at exactly the same greatest value.",
+    resembles=("output_saturation",),
+    separated_by="A lower gain of the amplifier; the count of equal greatest values.",
+    plain="The measurement hits its ceiling: the muscle gives more than the cell shows. Lower the gain or the charge.",
+    source="Range of the analogue-to-digital converter",
+    raw=True,
+    experiment=("staircase",),
+)

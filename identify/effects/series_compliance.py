@@ -1,0 +1,69 @@
+"""A spring in series: tendon, strap or fixture add a resonance between muscle and load cell."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy.linalg import expm
+
+from identify.effects.base import Effect, Form, Parameter, Scene
+from identify.effects.kernels import follow
+
+_RESONANCE = (
+    Parameter("resonance_hz", "Hz", 1.2, 16.0, np.inf, (3.0, 6.0, 10.0), "log", about="of the series spring"),
+    Parameter("damping", "1", 0.02, 0.7, 0.2, (0.15,), "log", about="of the resonance, 1 is critical"),
+)
+
+
+def _steps(frequency_hz: float, damping: float, step_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """Exact transition of z'' = ω²(x - z) - 2ζω z' for x a cubic between states (x, x') at both ends."""
+    omega = 2 * np.pi * frequency_hz * step_s
+    system = np.zeros((6, 6))
+    system[0, 1] = 1.0
+    system[1, :3] = [-(omega**2), -2 * damping * omega, omega**2]
+    system[2, 3] = system[3, 4] = system[4, 5] = 1.0
+    phi = expm(system)
+    # Time in steps: the cubic's derivatives at the start, from x0, x0', x1, x1'.
+    cubic = np.array([[1, 0, 0, 0], [0, 1, 0, 0], [-6, -4, 6, -2], [12, 6, -12, 6]], float)
+    return phi[:2, :2], phi[:2, 2:] @ cubic
+
+
+def _series(x: tuple[np.ndarray, np.ndarray], p: dict[str, Any], scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    torque, rate = x
+    frequency, damping = p["resonance_hz"][:, 0], p["damping"][:, 0]
+    if np.all(np.isinf(frequency)):
+        return x
+    matrices = [_steps(f, z, scene.step_s) for f, z in zip(frequency, damping, strict=True)]
+    phi = np.stack([m[0] for m in matrices])
+    gamma = np.stack([m[1] for m in matrices])
+    return follow(torque, rate * scene.step_s, phi, gamma, scene.step_s)
+
+
+def _partly(x: tuple[np.ndarray, np.ndarray], p: dict[str, Any], scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    torque, rate = _series(x, p, scene)
+    share = p["share"]
+    return x[0] + share * (torque - x[0]), x[1] + share * (rate - x[1])
+
+
+EFFECT = Effect(
+    id="series_compliance",
+    name="Compliance in series",
+    forms=(
+        Form("series", "filter", "z'' + 2 ζ ω z' + ω² z = ω² y", _RESONANCE, _series, True),
+        Form(
+            "partly",
+            "filter",
+            "y + share (z - y), z as in series",
+            (*_RESONANCE, Parameter("share", "1", 0.0, 1.0, 0.0, (0.5,), about="share of torque through the spring")),
+            _partly,
+            True,
+        ),
+    ),
+    signature="Ringing after every step.",
+    resembles=("electromechanical_delay",),
+    separated_by="Steps, sampled fast.",
+    plain="Strap, tendon or fixture give like a spring: the torque rings after every step. Fasten the limb and the cell.",
+    source="An extra resonance in series with the muscle",
+    experiment=("steps",),
+)

@@ -1,0 +1,76 @@
+"""Active torque depends on the joint's velocity."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from identify.effects.base import Effect, Form, Parameter, Scene
+
+_SIDE = Parameter("slope_s_per_rad", "s/rad", -2.0, 2.0, 0.0, (0.1, -0.1), about="share of torque lost per rad/s")
+
+
+def _linear(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+    assert scene.velocity_rad_s is not None
+    return y * np.maximum(1.0 - p["slope_s_per_rad"] * scene.velocity_rad_s, 0.0)
+
+
+def _hill(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+    """Hill's hyperbola on the shortening side, its mirror to a plateau on the other."""
+    assert scene.velocity_rad_s is not None
+    v = p["slope_s_per_rad"] * scene.velocity_rad_s
+    shape = p["shape"]
+    shortening = np.maximum(1.0 - v, 0.0) / (1.0 + np.maximum(v, 0.0) / shape)
+    top = p["top"]
+    lengthening = 1.0 + (top - 1.0) * -v / (-v + (top - 1.0) / (1.0 + 1.0 / shape) + 1e-12)
+    return y * np.where(v >= 0, shortening, lengthening)
+
+
+def _marion(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+    assert scene.angle_rad is not None and scene.velocity_rad_s is not None
+    angle = np.abs(scene.angle_rad)
+    return y + p["gain_nm_s_per_rad2"] * angle * np.exp(-p["decay_per_rad"] * angle) * scene.velocity_rad_s * np.minimum(
+        np.abs(y) / (0.2 * scene.scale_nm), 1.0
+    )
+
+
+EFFECT = Effect(
+    id="torque_velocity",
+    name="Torque depends on velocity",
+    forms=(
+        Form("linear", "output", "y (1 - slope·velocity)", (_SIDE,), _linear, True),
+        Form(
+            "hill",
+            "output",
+            "y (1 - v)/(1 + v/shape) shortening; to `top` lengthening; v = slope·velocity",
+            (
+                _SIDE,
+                Parameter("shape", "1", 0.1, 2.0, 0.25, (0.25,), "log", about="Hill's a/F0"),
+                Parameter("top", "1", 1.05, 1.9, 1.4, (1.4,), about="greatest torque when lengthened, over isometric"),
+            ),
+            _hill,
+            True,
+            source="Hill 1938; Thelen 2003",
+        ),
+        Form(
+            "marion",
+            "output",
+            "y + gain·θ exp(-decay·θ) θ' under stimulation",
+            (
+                Parameter("gain_nm_s_per_rad2", "N·m·s/rad²", -6.0, 6.0, 0.0, (0.2, -0.2), about="V1"),
+                Parameter("decay_per_rad", "1/rad", 0.0, 4.0, 1.3, (1.0,), about="V2"),
+            ),
+            _marion,
+            True,
+            source="Marion, Wexler, Hull: V1 θ exp(-V2 θ) θ'",
+        ),
+    ),
+    signature="The error follows the measured velocity, and only under stimulation.",
+    resembles=("torque_angle", "passive_torque"),
+    separated_by="The same movement with stimulation and without.",
+    plain="A muscle that shortens quickly pulls less, one that is stretched pulls more.",
+    source="Hill 1938; Marion et al. 2010; De Groote et al. 2016",
+    needs=("velocity_rad_s",),
+    experiment=("ramp",),
+)

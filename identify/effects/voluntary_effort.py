@@ -1,0 +1,89 @@
+"""Voluntary effort or spasm: torque that has nothing to do with the stimulation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from identify.effects.base import Effect, Form, Parameter, Scene
+
+MOST = 7
+"""Bumps at most: with more, they imitate anything."""
+
+
+def _bumps(count: int) -> Callable[..., np.ndarray]:
+    def apply(_: None, p: dict[str, Any], scene: Scene) -> np.ndarray:
+        total = np.zeros(np.broadcast_shapes(scene.time_s.shape, np.shape(p["height_0_nm"])))
+        for i in range(count):
+            away = np.abs((scene.time_s - p[f"centre_{i}_s"]) / p[f"width_{i}_s"]) + 1e-12
+            total = total + p[f"height_{i}_nm"] * np.exp(-0.5 * away ** p["flatness"])
+        return total
+
+    return apply
+
+
+def _propose(count: int) -> Callable[..., list[dict[str, float]]]:
+    def propose(residual_nm: np.ndarray, scene: Scene, previous: dict[str, float]) -> list[dict[str, float]]:
+        """The bump that best matches the residual, at each of a few widths."""
+        known = np.isfinite(residual_nm)
+        value = np.where(known, residual_nm, 0.0)
+        found = []
+        for width_s in (0.2, 0.5, 1.2):
+            half = int(np.ceil(3 * width_s / scene.step_s))
+            kernel = np.exp(-0.5 * (np.arange(-half, half + 1) * scene.step_s / width_s) ** 2)
+            match = np.convolve(value, kernel, "same")
+            power = np.convolve(known.astype(float), kernel**2, "same") + 0.3 * np.sum(kernel**2)
+            score = np.where(match > 0, match**2 / power, 0.0)
+            at = int(np.argmax(score))
+            found.append((float(score[at]), width_s, at, float(match[at] / power[at])))
+        starts = []
+        for score, width_s, at, height in sorted(found, reverse=True)[:2]:
+            if score <= 0.0:
+                continue
+            start = {"flatness": 2.0} | dict(previous)
+            i = count - 1
+            start |= {f"centre_{i}_s": float(scene.time_s[at]), f"width_{i}_s": width_s, f"height_{i}_nm": height}
+            starts.append(start)
+        return starts
+
+    return propose
+
+
+def _parameters(count: int) -> tuple[Parameter, ...]:
+    listed = [Parameter("flatness", "1", 1.3, 6.0, 2.0, (2.0,), "log", about="2 is a Gaussian, more is flatter")]
+    for i in range(count):
+        listed += [
+            Parameter(f"centre_{i}_s", "s", 0.0, 600.0, 0.0, (1.0,), about="middle"),
+            Parameter(f"width_{i}_s", "s", 0.08, 3.0, 0.5, (0.5,), "log", about="half-width"),
+            Parameter(f"height_{i}_nm", "N·m", 0.0, 1.2, 0.0, (0.1,), relative="torque", about="peak torque"),
+        ]
+    return tuple(listed)
+
+
+EFFECT = Effect(
+    id="voluntary_effort",
+    name="Voluntary effort or spasm",
+    forms=tuple(
+        Form(
+            f"bumps_{count}",
+            "additive",
+            f"y + Σ height·exp(-|t - centre|^flatness/(2 width^flatness)), {count} of them",
+            _parameters(count),
+            _bumps(count),
+            batched=True,
+            propose=_propose(count),
+            grows=count > 1,
+        )
+        for count in range(1, MOST + 1)
+    ),
+    signature="Isolated bumps, in rests as well, at times that have nothing to do with the stimulation.",
+    resembles=("threshold_drift", "recruitment_hysteresis", "catch_like", "baseline_drift"),
+    separated_by="A sham trial without stimulation; EMG; the instruction to relax.",
+    plain="The participant helped, resisted, or had a spasm. No model of the muscle can predict it. Repeat the test with "
+    "the instruction to relax, and leave these stretches out.",
+    source="Additive torque unrelated to the stimulation",
+    foreseeable=False,
+    experiment=("rest",),
+)
