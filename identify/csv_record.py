@@ -54,9 +54,7 @@ def read_csv(path: Path, pulse_rate_hz: float = 40.0) -> Record:
             place=f"{name}, line {lines[empty[0]]}, column segment",
             mend="Name it: rest, prbs, ramp, validate…",
         )
-    time_s = uniform_time(
-        columns["time_s"], [f"{name}, line {line}, column time_s" for line in (lines[0],)][0], lines, name
-    )
+    time_s = uniform_time(columns["time_s"], lines, name)
     if (negative := np.flatnonzero(columns["pulse_width_us"] < 0)).size:
         raise BadRecord(
             f"{columns['pulse_width_us'][negative[0]]:g} µs is negative",
@@ -135,7 +133,7 @@ def _is_number(cell: str) -> bool:
     return True
 
 
-def uniform_time(time_s: np.ndarray, first: str, lines: list[int] | None, name: str) -> np.ndarray:
+def uniform_time(time_s: np.ndarray, lines: list[int], name: str) -> np.ndarray:
     """Times freed of the rounding they were written with.
 
     Raises
@@ -145,36 +143,32 @@ def uniform_time(time_s: np.ndarray, first: str, lines: list[int] | None, name: 
     """
 
     def at(index: int) -> str:
-        return f"{name}, line {lines[index]}, column time_s" if lines is not None else f"{name}, sample {index}"
+        return f"{name}, line {lines[index]}, column time_s"
 
     if time_s.size < 8:
-        raise BadRecord(f"only {time_s.size} samples", place=first, mend="Give a few seconds of data.")
+        raise BadRecord(f"only {time_s.size} samples", place=at(0), mend="Give a few seconds of data.")
     gaps = np.diff(time_s)
     backwards = np.flatnonzero(~(gaps > 0))
     if backwards.size:
         index = int(backwards[0]) + 1
         verb = "stands still" if gaps[index - 1] == 0 else "runs backwards"
-        raise BadRecord(
-            f"time {verb} at {time_s[index]:g} s", place=at(index), mend="Sort the rows by time, once each."
-        )
-    step = float(np.median(gaps))
-    if abs(time_s[-1] - time_s[0] - step * (time_s.size - 1)) > 0.5 * step:
-        step = (time_s[-1] - time_s[0]) / (time_s.size - 1)
-    uneven = np.flatnonzero(np.abs(gaps - step) > 0.5 * step + 1e-6)
+        raise BadRecord(f"time {verb} at {time_s[index]:g} s", place=at(index), mend="Sort the rows by time, once each.")
+    slope = float(time_s[-1] - time_s[0]) / (time_s.size - 1)
+    typical = float(np.median(gaps))
+    uneven = np.flatnonzero(np.abs(gaps - typical) > 0.75 * typical)
     if uneven.size:
         index = int(uneven[0]) + 1
         raise BadRecord(
-            f"uneven sampling: {gaps[index - 1]:.6g} s after steps of {step:.6g} s",
+            f"uneven sampling: {gaps[index - 1]:.6g} s after steps of {typical:.6g} s",
             place=at(index),
             mend="Resample to one rate, or give the sealed recording, which knows its gaps.",
         )
-    line = time_s[0] + step * np.arange(time_s.size)
-    slope = (time_s[-1] - time_s[0]) / (time_s.size - 1)
-    line = time_s.mean() + slope * (np.arange(time_s.size) - (time_s.size - 1) / 2)
+    line = time_s[0] + slope * np.arange(time_s.size)
+    # Rounding shifts all times alike: centre the line on the times that were written.
+    line += float(np.median(time_s - line))
     far = np.flatnonzero(np.abs(time_s - line) > 0.75 * slope)
     if far.size:
-        index = int(far[0])
-        raise BadRecord("uneven sampling: the rate changes", place=at(index), mend="Resample to one rate.")
+        raise BadRecord("uneven sampling: the rate changes", place=at(int(far[0])), mend="Resample to one rate.")
     if not LOWEST_HZ <= 1 / slope <= HIGHEST_HZ:
-        raise BadRecord(f"sampled at {1 / slope:.4g} Hz", place=first, mend="40 Hz to 2 kHz can be used.")
+        raise BadRecord(f"sampled at {1 / slope:.4g} Hz", place=at(0), mend="40 Hz to 2 kHz can be used.")
     return line

@@ -9,7 +9,7 @@ states of its own: it shifts the times at which the curve is read.
 from __future__ import annotations
 
 import numpy as np
-from scipy.signal import lfilter
+from scipy.linalg.lapack import dtbtrs
 
 
 def transition(time_constant_s: float, damping: float, step_s: float) -> tuple[np.ndarray, np.ndarray]:
@@ -49,6 +49,25 @@ def transition(time_constant_s: float, damping: float, step_s: float) -> tuple[n
     return np.array([[p11, p12], [p21, p22]]), np.array([1.0 - p11, -p21])
 
 
+def recursion(a: np.ndarray, forced: np.ndarray) -> np.ndarray:
+    """y[k] = forced[k] - a[1] y[k-1] - a[2] y[k-2] …, from rest, along the first axis.
+
+    A lower triangular banded system, which LAPACK solves by exactly this recursion; scipy.signal's filter does the same
+    but takes 0.3 s to import, a third of what `stimrig fit` may take as a whole.
+
+    Parameters
+    ----------
+    a : ndarray, shape (l + 1,)
+        Denominator, a[0] = 1.
+    forced : ndarray, shape (K,) or (K, M)
+        Right-hand side.
+    """
+    bands = np.empty((len(a), forced.shape[0]), order="F")
+    bands[:] = np.asarray(a, float)[:, None]
+    solved, _ = dtbtrs(bands, forced if forced.ndim == 2 else forced[:, None], uplo="L")
+    return solved if forced.ndim == 2 else solved[:, 0]
+
+
 def boundary_states(
     time_constant_s: float, damping: float, step_s: float, drive_nm: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -70,11 +89,14 @@ def boundary_states(
     trace, determinant = phi[0, 0] + phi[1, 1], phi[0, 0] * phi[1, 1] - phi[0, 1] * phi[1, 0]
     lead = (phi - trace * np.eye(2)) @ gamma
     a = np.array([1.0, -trace, determinant])
-    padded = np.concatenate([drive_nm, np.zeros_like(drive_nm[:1])])
-    return (
-        np.asarray(lfilter([0.0, gamma[0], lead[0]], a, padded, axis=0)),
-        np.asarray(lfilter([0.0, gamma[1], lead[1]], a, padded, axis=0)),
-    )
+    shape = (drive_nm.shape[0] + 1, *drive_nm.shape[1:])
+    forced = []
+    for i in range(2):
+        right = np.zeros(shape, order="F")
+        right[1:] = gamma[i] * drive_nm
+        right[2:] += lead[i] * drive_nm[:-1]
+        forced.append(right)
+    return recursion(a, forced[0]), recursion(a, forced[1])
 
 
 def hermite(fraction: np.ndarray, step_s: float) -> np.ndarray:
@@ -125,8 +147,11 @@ def free_states(time_constant_s: float, damping: float, step_s: float, size: int
     phi, _ = transition(time_constant_s, damping, step_s)
     trace = phi[0, 0] + phi[1, 1]
     a = np.array([1.0, -trace, phi[0, 0] * phi[1, 1] - phi[0, 1] * phi[1, 0]])
-    impulse = np.zeros(size + 1)
-    impulse[0] = 1.0
     start, turn = np.eye(2), phi - trace * np.eye(2)
-    columns = [[lfilter([start[i, j], turn[i, j]], a, impulse) for j in range(2)] for i in range(2)]
-    return np.stack(columns[0], axis=1), np.stack(columns[1], axis=1)
+    states = []
+    for i in range(2):
+        forced = np.zeros((size + 1, 2), order="F")
+        forced[0] = start[i]
+        forced[1] = turn[i]
+        states.append(recursion(a, forced))
+    return states[0], states[1]

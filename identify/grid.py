@@ -13,7 +13,6 @@ from functools import cached_property
 
 import numpy as np
 
-from identify.dynamics import hermite
 from identify.errors import BadRecord
 from identify.record import Record
 
@@ -94,14 +93,47 @@ class Grid:
             Weights of (y, y') at boundaries first, first + 1, … relative to each interval: the mean of interval k is
             sum over b of weights[k, b, 0] * y[k + first + b] + weights[k, b, 1] * y'[k + first + b].
         """
-        shifted = self.fraction - delay_s / self.step_s
-        offset = np.floor(shifted).astype(np.int64)
-        cubic = hermite(shifted - offset, self.step_s)
-        first, last = int(offset.min()), int(offset.max()) + 1
-        weights = np.zeros((self.size, last - first + 1, 2))
-        np.add.at(weights, (self.interval, offset - first), cubic[:, :2])
-        np.add.at(weights, (self.interval, offset - first + 1), cubic[:, 2:])
+        shift = delay_s / self.step_s
+        whole = int(np.floor(shift))
+        part = shift - whole
+        # Samples past `part` of their interval are read in the interval `whole` before, the others one earlier still.
+        split = np.searchsorted(self._position, np.arange(self.size) + part, side="left")
+        split = np.clip(split, self._edges[:-1], self._edges[1:])
+        groups = []
+        for offset, start, stop, lag in (
+            (-whole - 1, self._edges[:-1], split, part - 1.0),
+            (-whole, split, self._edges[1:], part),
+        ):
+            if np.any(stop > start):
+                groups.append((offset, _mean_hermite(self._powers[:, stop] - self._powers[:, start], lag, self.step_s)))
+        if not groups:
+            groups.append((-whole, np.zeros((self.size, 4))))
+        first = groups[0][0]
+        weights = np.zeros((self.size, groups[-1][0] - first + 2, 2))
+        for offset, cubic in groups:
+            weights[:, offset - first] += cubic[:, :2]
+            weights[:, offset - first + 1] += cubic[:, 2:]
         return first, weights / np.maximum(self.count, 1)[:, None, None]
+
+    @cached_property
+    def _position(self) -> np.ndarray:
+        """Each sample's place in steps since the first pulse slot, rising."""
+        return self.interval + self.fraction
+
+    @cached_property
+    def _edges(self) -> np.ndarray:
+        """First sample of each interval, and the number of samples; shape (K + 1,)."""
+        return np.searchsorted(self.interval, np.arange(self.size + 1))
+
+    @cached_property
+    def _powers(self) -> np.ndarray:
+        """Running sums of 1, f, f², f³ over the samples, f their place in the interval; shape (4, N + 1)."""
+        sums = np.zeros((4, self.fraction.size + 1))
+        term = np.ones(self.fraction.size)
+        for power in range(4):
+            np.cumsum(term, out=sums[power, 1:])
+            term = term * self.fraction
+        return sums
 
     def block_mean(self, torque_nm: np.ndarray, rate_nm_s: np.ndarray, delay_s: float = 0.0) -> np.ndarray:
         """Mean over each interval's samples of the curve through boundary states.
@@ -128,6 +160,16 @@ class Grid:
             rows = slice(before + first + b, before + first + b + size)
             result += weights[:, b, 0][lift] * y[rows] + weights[:, b, 1][lift] * v[rows]
         return result
+
+
+def _mean_hermite(sums: np.ndarray, lag: float, step_s: float) -> np.ndarray:
+    """Sums of the cubic's four weights over samples at f - lag, from their sums of powers of f; shape (K, 4)."""
+    s0, s1, s2, s3 = sums
+    x1 = s1 - lag * s0
+    x2 = s2 - 2 * lag * s1 + lag * lag * s0
+    x3 = s3 - 3 * lag * s2 + 3 * lag * lag * s1 - lag**3 * s0
+    rise = 3 * x2 - 2 * x3
+    return np.stack([s0 - rise, step_s * (x1 - 2 * x2 + x3), rise, step_s * (x3 - x2)], axis=1)
 
 
 def _padded(values: np.ndarray, before: int, after: int, *, hold: bool) -> np.ndarray:

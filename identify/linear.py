@@ -146,7 +146,7 @@ class Discrete:
         slope = np.gradient(mean) / grid.step_s
         return read_at(np.r_[mean, mean[-1]], np.r_[slope, 0.0], position, grid.step_s)
 
-    def discrete(self, sample_rate_hz: float) -> tuple[np.ndarray, np.ndarray, int]:
+    def discrete(self, sample_rate_hz: float) -> tuple[np.ndarray, np.ndarray, int]:  # noqa: ARG002
         """(b, a, d) at the pulse rate, the only rate at which this block is defined."""
         return np.array(self.b), np.array(self.a), self.delay_samples
 

@@ -6,6 +6,8 @@ instead of one after the other; noise may be correlated; the spline's smoothness
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -25,7 +27,7 @@ class MaximumLikelihood:
 
     id = "maximum-likelihood"
     summary = "Joint estimate of recruitment spline and second-order dynamics by variable projection on all segments."
-    options = {"knots": "how many knots the spline has (31)"}
+    options: Mapping[str, str] = MappingProxyType({"knots": "how many knots the spline has (31)"})
 
     def fit(self, grid: Grid, fit_on: tuple[str, ...] | None, **options: Any) -> Model:
         """Fit; see `identify.fit`."""
