@@ -152,7 +152,9 @@ def uniform_time(time_s: np.ndarray, lines: list[int], name: str) -> np.ndarray:
     if backwards.size:
         index = int(backwards[0]) + 1
         verb = "stands still" if gaps[index - 1] == 0 else "runs backwards"
-        raise BadRecord(f"time {verb} at {time_s[index]:g} s", place=at(index), mend="Sort the rows by time, once each.")
+        raise BadRecord(
+            f"time {verb} at {time_s[index]:g} s", place=at(index), mend="Sort the rows by time, once each."
+        )
     slope = float(time_s[-1] - time_s[0]) / (time_s.size - 1)
     typical = float(np.median(gaps))
     uneven = np.flatnonzero(np.abs(gaps - typical) > 0.75 * typical)

@@ -60,11 +60,11 @@ def recursion(a: np.ndarray, forced: np.ndarray) -> np.ndarray:
     a : ndarray, shape (l + 1,)
         Denominator, a[0] = 1.
     forced : ndarray, shape (K,) or (K, M)
-        Right-hand side.
+        Right-hand side; in Fortran's order it is overwritten.
     """
     bands = np.empty((len(a), forced.shape[0]), order="F")
     bands[:] = np.asarray(a, float)[:, None]
-    solved, _ = dtbtrs(bands, forced if forced.ndim == 2 else forced[:, None], uplo="L")
+    solved, _ = dtbtrs(bands, forced if forced.ndim == 2 else forced[:, None], uplo="L", overwrite_b=True)
     return solved if forced.ndim == 2 else solved[:, 0]
 
 
@@ -89,14 +89,20 @@ def boundary_states(
     trace, determinant = phi[0, 0] + phi[1, 1], phi[0, 0] * phi[1, 1] - phi[0, 1] * phi[1, 0]
     lead = (phi - trace * np.eye(2)) @ gamma
     a = np.array([1.0, -trace, determinant])
-    shape = (drive_nm.shape[0] + 1, *drive_nm.shape[1:])
-    forced = []
-    for i in range(2):
-        right = np.zeros(shape, order="F")
-        right[1:] = gamma[i] * drive_nm
-        right[2:] += lead[i] * drive_nm[:-1]
-        forced.append(right)
-    return recursion(a, forced[0]), recursion(a, forced[1])
+    torque = _forced(a, gamma[0], lead[0], drive_nm)
+    if phi[0, 1] < 1e-3 * step_s:  # y' can't be had from y: a slow pulse rate, near a whole number of oscillations
+        return torque, _forced(a, gamma[1], lead[1], drive_nm)
+    rate = np.empty_like(torque)
+    rate[:-1] = (torque[1:] - phi[0, 0] * torque[:-1] - gamma[0] * drive_nm) / phi[0, 1]
+    rate[-1] = phi[1, 0] * torque[-2] + phi[1, 1] * rate[-2] + gamma[1] * drive_nm[-1]
+    return torque, rate
+
+
+def _forced(a: np.ndarray, gain: float, lead: float, drive_nm: np.ndarray) -> np.ndarray:
+    right = np.zeros((drive_nm.shape[0] + 1, *drive_nm.shape[1:]), order="F")
+    right[1:] = gain * drive_nm
+    right[2:] += lead * drive_nm[:-1]
+    return recursion(a, right)
 
 
 def hermite(fraction: np.ndarray, step_s: float) -> np.ndarray:

@@ -93,6 +93,8 @@ class Grid:
             Weights of (y, y') at boundaries first, first + 1, … relative to each interval: the mean of interval k is
             sum over b of weights[k, b, 0] * y[k + first + b] + weights[k, b, 1] * y'[k + first + b].
         """
+        if delay_s in self._weights:
+            return self._weights[delay_s]
         shift = delay_s / self.step_s
         whole = int(np.floor(shift))
         part = shift - whole
@@ -113,7 +115,14 @@ class Grid:
         for offset, cubic in groups:
             weights[:, offset - first] += cubic[:, :2]
             weights[:, offset - first + 1] += cubic[:, 2:]
-        return first, weights / np.maximum(self.count, 1)[:, None, None]
+        if len(self._weights) >= 4:  # a search asks for the same delay several times, then never again
+            self._weights.clear()
+        self._weights[delay_s] = first, weights / np.maximum(self.count, 1)[:, None, None]
+        return self._weights[delay_s]
+
+    @cached_property
+    def _weights(self) -> dict[float, tuple[int, np.ndarray]]:
+        return {}
 
     @cached_property
     def _position(self) -> np.ndarray:

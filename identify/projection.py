@@ -106,14 +106,11 @@ class Problem:
 
     def slopes(self, linear: SecondOrder, coefficients: np.ndarray) -> np.ndarray:
         """Derivatives of the block means by log T, log ζ and (if searched) the delay, shape (K, 2 or 3)."""
-        step = 1e-5
+        step = 1e-6
         t, z, d = linear.time_constant_s, linear.damping, linear.delay_s
-        up = [SecondOrder(t * np.exp(step), z, d), SecondOrder(t, z * np.exp(step), d), SecondOrder(t, z, d + step)]
-        down = [SecondOrder(t * np.exp(-step), z, d), SecondOrder(t, z * np.exp(-step), d), SecondOrder(t, z, d - step)]
-        pairs = list(zip(up, down, strict=True))[: self.searched]
-        return np.stack(
-            [(self.single(a, coefficients) - self.single(b, coefficients)) / (2 * step) for a, b in pairs], axis=1
-        )
+        here = self.single(linear, coefficients)
+        near = [SecondOrder(t * np.exp(step), z, d), SecondOrder(t, z * np.exp(step), d), SecondOrder(t, z, d + step)]
+        return np.stack([(self.single(at, coefficients) - here) / step for at in near[: self.searched]], axis=1)
 
 
 @dataclass(frozen=True)
@@ -242,19 +239,48 @@ class _State:
         self.penalty[:size, :size] = problem.roughness
         self.coefficients = _solve(self.zz + weight * self.penalty, self.zy)
         self.cost = self.energy - float(self.zy @ self.coefficients)
-        slopes = problem.slopes(linear, self.coefficients)
-        self.slopes = slopes
-        bent = whiten(slopes, problem.stretches, ar1)
-        cross = white.T @ bent
-        self.full = np.block([[self.zz + weight * self.penalty, cross], [cross.T, bent.T @ bent]])
-        self.right = np.r_[self.zy, bent.T @ target]
-        inner = _solve(self.zz + weight * self.penalty, cross)
-        self.information = bent.T @ bent - cross.T @ inner
-        self.gradient = bent.T @ target - inner.T @ self.zy
-        self.freedom = float(np.trace(_solve(self.zz + weight * self.penalty, self.zz))) + slopes.shape[1]
+        self.white = white
+
+    @cached_property
+    def slopes(self) -> np.ndarray:
+        """Derivatives by the searched numbers, shape (K, 2 or 3)."""
+        return self.problem.slopes(self.linear, self.coefficients)
+
+    @cached_property
+    def _bent(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        bent = whiten(self.slopes, self.problem.stretches, self.ar1)
+        return self.white.T @ bent, bent.T @ bent, bent.T @ self.target
+
+    @cached_property
+    def _inner(self) -> np.ndarray:
+        cross = self._bent[0]
+        return _solve(self.zz + self.weight * self.penalty, np.concatenate([cross, self.zz], axis=1))
+
+    @cached_property
+    def full(self) -> np.ndarray:
+        """The joint information of coefficients and searched numbers, times the noise variance."""
+        cross, square, _ = self._bent
+        return np.block([[self.zz + self.weight * self.penalty, cross], [cross.T, square]])
+
+    @cached_property
+    def information(self) -> np.ndarray:
+        """That of the searched numbers, coefficients projected out."""
+        cross, square, _ = self._bent
+        return square - cross.T @ self._inner[:, : cross.shape[1]]
+
+    @cached_property
+    def freedom(self) -> float:
+        """Effective number of parameters."""
+        searched = self.slopes.shape[1]
+        return float(np.trace(self._inner[:, searched:])) + searched
+
+    @cached_property
+    def variance(self) -> float:
+        """Innovation variance, N²m²."""
         c = self.coefficients
         squares = self.energy - 2 * float(self.zy @ c) + float(c @ self.zz @ c)
-        self.variance = max(squares / max(target.size - self.freedom, 1.0), 1e-14 * self.energy / target.size, 1e-24)
+        rows = self.target.size
+        return max(squares / max(rows - self.freedom, 1.0), 1e-14 * self.energy / rows, 1e-24)
 
     def _chosen(self, size: int) -> float:
         outer = self.zz[size:, size:]
@@ -275,7 +301,9 @@ class _State:
     def step(self, damping: float) -> np.ndarray:
         """Step in (log T, log ζ, delay)."""
         scale = np.diag(np.diag(self.information)) * damping
-        return _solve(self.information + scale, self.gradient)
+        cross, _, moment = self._bent
+        gradient = moment - self._inner[:, : cross.shape[1]].T @ self.zy
+        return _solve(self.information + scale, gradient)
 
     def solution(self, taken: int, converged: bool) -> Solution:
         return Solution(
