@@ -1,0 +1,71 @@
+"""The service: its parts, its routes, its page."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from importlib.metadata import PackageNotFoundError, version
+
+from fastapi import FastAPI
+
+from api import errors, pages, routes
+from api.clock import Clock
+from api.context import Context, build
+from api.fitting import WORKER
+from api.settings import Settings
+
+
+def software_version() -> str:
+    """The installed distribution's version."""
+    try:
+        return version("stimrig")
+    except PackageNotFoundError:
+        return "0"
+
+
+def create_app(
+    settings: Settings | None = None, *, clock: Clock | None = None, worker: tuple[str, ...] = WORKER
+) -> FastAPI:
+    """The application.
+
+    Parameters
+    ----------
+    settings : Settings, optional
+        Default: from the environment.
+    clock : Clock, optional
+        Another clock, for tests.
+    worker : tuple of str
+        How to start a worker process.
+
+    Raises
+    ------
+    ApiError
+        The database cannot be opened.
+    """
+    context = build(settings or Settings(), clock, worker)
+    app = FastAPI(
+        title="stimrig",
+        version=software_version(),
+        summary="Pre-session tests, models of stimulated muscle, and the approved one for the controller.",
+        lifespan=_lifespan(context),
+        docs_url=None,
+        redoc_url=None,
+        openapi_url="/openapi.json",
+    )
+    app.state.context = context
+    errors.install(app)
+    for router in [*routes.routers(), *pages.routers()]:
+        app.include_router(router)
+    return app
+
+
+def _lifespan(context: Context):
+    @asynccontextmanager
+    async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
+        await context.open()
+        try:
+            yield
+        finally:
+            await context.close()
+
+    return lifespan

@@ -1,0 +1,191 @@
+"""What a worker process does, verb by verb: paths and plain objects in, plain objects out.
+
+Imported by the worker only; the web process never loads numpy, and never fits.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+Progress = Callable[[float, str], None]
+POINTS = 2400
+"""Most points in a drawn curve: more than a screen has pixels."""
+
+
+def fit(
+    data: str,
+    progress: Progress,
+    method: str = "maximum-likelihood",
+    effects: tuple[str, ...] | list[str] = (),
+    fit_on: list[str] | None = None,
+) -> dict[str, Any]:
+    """Read a recording and identify; the model document as JSON text, and as an object."""
+    import identify
+
+    progress(0.05, "reading the recording")
+    record = identify.read(Path(data))
+    progress(0.2, "identifying")
+    model = identify.fit(record, method=method, effects=tuple(effects), fit_on=fit_on)
+    return {"json": model.to_json(), "model": model.to_dict()}
+
+
+def comparison(data: str, progress: Progress, model_json: str) -> dict[str, Any]:
+    """Measurement against model: identify's comparison, and the curves a page draws."""
+    import identify
+
+    progress(0.1, "reading the recording")
+    record = identify.read(Path(data))
+    model = identify.Model.from_json(model_json)
+    progress(0.4, "comparing")
+    found = dict(identify.compare(model, record))
+    progress(0.8, "drawing")
+    found["curves"] = curves(model, record)
+    return clean(found)
+
+
+def curves(model: Any, record: Any) -> dict[str, Any]:
+    """The measured, predicted and commanded curves, thinned to what a screen shows."""
+    import numpy as np
+
+    import identify
+
+    predicted = np.asarray(identify.predict(model, record))
+    time_s, torque_nm = np.asarray(record.time_s), np.asarray(record.torque_nm)
+    step = max(1, math.ceil(len(time_s) / POINTS))
+    labels = [str(record.segment_names[index]) for index in record.segment]
+    pick = slice(None, None, step)
+    return {
+        "time_s": time_s[pick].round(5).tolist(),
+        "torque_nm": torque_nm[pick].round(5).tolist(),
+        "predicted_torque_nm": predicted[pick].round(5).tolist(),
+        "pulse_width_us": np.asarray(record.pulse_width_us)[pick].round(2).tolist(),
+        "segments": runs(labels, time_s),
+        "step_response": step_response(model.to_dict()),
+    }
+
+
+def runs(labels: list[str], time_s: Any) -> list[dict[str, Any]]:
+    """Stretches of rows that carry the same segment's name."""
+    found: list[dict[str, Any]] = []
+    for index, label in enumerate(labels):
+        if not found or found[-1]["name"] != label:
+            found.append({"name": label, "start_s": float(time_s[index])})
+        found[-1]["end_s"] = float(time_s[index])
+    return found
+
+
+def step_response(document: dict[str, Any], seconds: float = 4.0) -> dict[str, list[float]]:
+    """The linear part's answer to a unit step (eq. 2 of the paper: B(q)/A(q)), thinned."""
+    import numpy as np
+    from scipy.signal import lfilter
+
+    linear, rate_hz = document["linear"], float(document["sample_rate_hz"])
+    count = max(2, round(seconds * rate_hz))
+    response = np.asarray(lfilter(linear["b"], linear["a"], np.ones(count)))
+    delay = int(linear.get("delay_samples", 0))
+    response = np.concatenate([np.zeros(delay), response])[:count]
+    pick = slice(None, None, max(1, count // 400))
+    return {"time_s": (np.arange(count) / rate_hz)[pick].tolist(), "response": response[pick].round(6).tolist()}
+
+
+def diagnosis(data: str, progress: Progress) -> dict[str, Any]:
+    """What is missing in the model of a recording."""
+    import identify
+
+    record = identify.read(Path(data))
+    return clean(identify.diagnose(record, progress=progress))
+
+
+def improve(data: str, progress: Progress) -> dict[str, Any]:
+    """Effects added one by one while the evidence lasts, each step with its model."""
+    import identify
+
+    record = identify.read(Path(data))
+    found = dict(identify.improve(record, progress=progress))
+    models = [json.loads(model.to_json()) if hasattr(model, "to_json") else model for model in found["models"]]
+    return clean({**found, "models": models})
+
+
+def effects(progress: Progress) -> dict[str, Any]:
+    """The library of effects."""
+    from identify import effects as library
+
+    progress(0.5, "reading the library")
+    return clean({"effects": library.library()})
+
+
+def warm(progress: Progress) -> dict[str, Any]:
+    """Load identify and its compiled parts, so that the fit after a test starts at once."""
+    import tempfile
+
+    import identify
+
+    progress(0.1, "loading")
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "warm.csv"
+        path.write_text(_warm_csv())
+        identify.fit(identify.read(path))
+    return {}
+
+
+def _warm_csv() -> str:
+    """A small made-up record, only to have every compiled part compiled: a lag behind a switching input."""
+    rows, torque = ["time_s,pulse_width_us,torque_nm,segment"], 0.0
+    for index in range(800):
+        seconds = index / 40
+        level = (
+            0.0 if seconds < 1 else 200.0 * (index // 13 % 2) if seconds < 9 else max(0.0, 200 - 40 * abs(seconds - 14))
+        )
+        torque += (level / 40 - torque) / 20
+        name = "rest" if seconds < 1 else "prbs" if seconds < 9 else "ramp"
+        wobble = 0.03 * math.sin(index * index * 0.7)
+        rows.append(f"{seconds:.4f},{level:.1f},{torque + wobble:.5f},{name}")
+    return "\n".join(rows) + "\n"
+
+
+def clean(value: Any) -> Any:
+    """A value as JSON holds it: arrays as lists, numbers that are none as null."""
+    if isinstance(value, dict):
+        return {str(key): clean(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [clean(item) for item in value]
+    if hasattr(value, "tolist"):
+        return clean(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def find_recording(progress: Progress, folder: str, test_id: str) -> dict[str, Any]:
+    """The sealed recording of a test, when the service did not hear of its end."""
+    import hashlib
+
+    import h5py
+
+    progress(0.1, "looking through the recordings")
+    for path in sorted(Path(folder).glob("**/*.h5")):
+        try:
+            with h5py.File(path) as file:
+                attributes = {key: str(file.attrs[key]) for key in ("test_id", "recording_id", "outcome", "reason")}
+        except (OSError, KeyError):
+            continue
+        if attributes["test_id"] == test_id:
+            digest = hashlib.sha256(path.read_bytes()).hexdigest()
+            kept = {key: attributes[key] for key in ("recording_id", "outcome", "reason")}
+            return {"found": {**kept, "recording_path": str(path), "file_sha256": digest}}
+    return {"found": None}
+
+
+VERBS: dict[str, Callable[..., dict[str, Any]]] = {
+    "fit": fit,
+    "comparison": comparison,
+    "diagnosis": diagnosis,
+    "improve": improve,
+    "effects": effects,
+    "warm": warm,
+    "find_recording": find_recording,
+}

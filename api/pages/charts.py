@@ -1,0 +1,143 @@
+"""Plotly figures as plain objects: the same for the page and for reports."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+INK, MEASURED, MODEL, BAND, STIMULUS, GRID = (
+    "#1b2733",
+    "#7a8896",
+    "#0b6b75",
+    "rgba(11,107,117,.15)",
+    "#b4690e",
+    "#e6eaee",
+)
+SEGMENT_FILL = {"validate": "rgba(180,105,14,.07)", "rest": "rgba(0,0,0,0)"}
+FONT = {"family": "system-ui, -apple-system, 'Segoe UI', 'DejaVu Sans', sans-serif", "size": 13, "color": INK}
+
+
+def axis(title: str, **more: Any) -> dict[str, Any]:
+    """An axis with its quantity and unit."""
+    base = {"title": {"text": title, "standoff": 8}, "gridcolor": GRID, "zerolinecolor": "#c3ccd4", "automargin": True}
+    return {**base, **more}
+
+
+def layout(**more: Any) -> dict[str, Any]:
+    """What all figures share."""
+    return {
+        "font": FONT,
+        "paper_bgcolor": "#fff",
+        "plot_bgcolor": "#fff",
+        "margin": {"l": 64, "r": 16, "t": 24, "b": 48},
+        "legend": {"orientation": "h", "x": 0, "y": 1.0, "yanchor": "bottom"},
+        "hovermode": "x unified",
+        **more,
+    }
+
+
+def line(
+    x: Sequence[float], y: Sequence[float | None], name: str, colour: str, width: float = 1.6, **more: Any
+) -> dict[str, Any]:
+    """A line trace."""
+    return {"type": "scatter", "mode": "lines", "x": x, "y": y, "name": name,
+            "line": {"color": colour, "width": width, **more.pop("line", {})}, **more}  # fmt: skip
+
+
+def of_model(document: dict[str, Any], comparison: dict[str, Any] | None) -> dict[str, Any]:
+    """All figures of a model's page; those that need the comparison only if there is one."""
+    figures = {"recruitment": recruitment(document)}
+    if comparison is not None and comparison.get("curves"):
+        noise_sd_nm = (document.get("fit") or {}).get("noise_sd_nm")
+        figures["comparison"] = measurement(comparison["curves"], noise_sd_nm)
+        figures["step"] = step(comparison["curves"]["step_response"])
+    return figures
+
+
+def measurement(curves: dict[str, Any], noise_sd_nm: float | None) -> dict[str, Any]:
+    """Torque measured and predicted, what is left, and the pulse width, on one time axis."""
+    time_s = curves["time_s"]
+    residual = [
+        None if predicted is None else measured - predicted
+        for measured, predicted in zip(curves["torque_nm"], curves["predicted_torque_nm"], strict=True)
+    ]
+    data = [
+        line(time_s, curves["torque_nm"], "measured", MEASURED, 1.4),
+        line(time_s, curves["predicted_torque_nm"], "model, free run", MODEL, 1.8),
+        line(time_s, residual, "measured − model", INK, 1.0, yaxis="y2", showlegend=False),
+        line(time_s, curves["pulse_width_us"], "pulse width", STIMULUS, 1.2, yaxis="y3", showlegend=False,
+             line={"shape": "hv"}),
+    ]  # fmt: skip
+    shapes, labels = segment_marks(curves["segments"])
+    if noise_sd_nm:
+        shapes.append(
+            {"type": "rect", "xref": "x", "yref": "y2", "x0": time_s[0], "x1": time_s[-1], "y0": -2 * noise_sd_nm,
+             "y1": 2 * noise_sd_nm, "fillcolor": BAND, "line": {"width": 0}, "layer": "below"}
+        )  # fmt: skip
+    return {
+        "data": data,
+        "layout": layout(
+            height=640,
+            shapes=shapes,
+            annotations=labels,
+            legend={"orientation": "h", "x": 0, "y": 1.04, "yanchor": "bottom"},
+            margin={"l": 64, "r": 16, "t": 60, "b": 48},
+            xaxis=axis("Time (s)", anchor="y3", range=[time_s[0], time_s[-1]]),
+            yaxis=axis("Torque (N·m)", domain=[0.46, 1.0]),
+            yaxis2=axis("Residual (N·m)", domain=[0.22, 0.41]),
+            yaxis3=axis("Pulse width (µs)", domain=[0.0, 0.17], rangemode="tozero"),
+        ),
+    }
+
+
+def segment_marks(segments: list[dict[str, Any]]) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Shades and names of the segments; the held-out one stands out."""
+    shapes, labels = [], []
+    for segment in segments:
+        name, start_s, end_s = segment["name"], segment["start_s"], segment["end_s"]
+        if name == "rest":
+            continue
+        shapes.append({"type": "rect", "xref": "x", "yref": "paper", "x0": start_s, "x1": end_s, "y0": 0, "y1": 1,
+                       "fillcolor": SEGMENT_FILL.get(name, "rgba(27,39,51,.035)"), "line": {"width": 0},
+                       "layer": "below"})  # fmt: skip
+        words = "validate (held out)" if name == "validate" else name
+        labels.append({"xref": "x", "yref": "paper", "x": (start_s + end_s) / 2, "y": 1.0, "yanchor": "bottom",
+                       "text": words, "showarrow": False, "font": {"size": 12, "color": "#52606d"}})  # fmt: skip
+    return shapes, labels
+
+
+def recruitment(document: dict[str, Any]) -> dict[str, Any]:
+    """The recruitment curve with its band."""
+    curve = document["recruitment"]
+    data = []
+    band = ((document.get("uncertainty") or {}).get("bands") or {}).get("recruitment") or {}
+    low, high = band.get("lower_nm"), band.get("upper_nm")
+    if low and high:
+        width = band.get("pulse_width_us") or curve["pulse_width_us"]
+        data += [
+            line(width, high, "", MODEL, 0, showlegend=False, hoverinfo="skip"),
+            line(width, low, "95 % band", MODEL, 0, fill="tonexty", fillcolor=BAND, hoverinfo="skip"),
+        ]
+    data.append(line(curve["pulse_width_us"], curve["torque_nm"], "recruitment curve", MODEL, 2.2))
+    return {
+        "data": data,
+        "layout": layout(
+            height=340,
+            xaxis=axis("Pulse width (µs)"),
+            yaxis=axis("Steady torque (N·m)", rangemode="tozero"),
+            showlegend=len(data) > 1,
+        ),
+    }
+
+
+def step(response: dict[str, list[float]]) -> dict[str, Any]:
+    """The linear part's step response."""
+    return {
+        "data": [line(response["time_s"], response["response"], "step response", MODEL, 2.2)],
+        "layout": layout(
+            height=340,
+            xaxis=axis("Time (s)"),
+            yaxis=axis("Share of the final torque (1)", rangemode="tozero"),
+            showlegend=False,
+        ),
+    }

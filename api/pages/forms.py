@@ -1,0 +1,64 @@
+"""What is pressed: plain forms that do what the REST routes do, and lead back to a page."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Annotated
+
+from fastapi import APIRouter, Form
+from fastapi.responses import RedirectResponse, Response
+from pydantic import ValidationError
+
+from api.context import Approver, Ctx, Tester
+from api.errors import ApiError
+from api.routes import participants
+from api.routes.rig import rearm_rig
+from api.schemas import ParticipantIn, ProfileIn, TestIn
+
+router = APIRouter(include_in_schema=False)
+
+
+@router.post("/participants")
+async def create_participant(context: Ctx, who: Tester, code: Annotated[str, Form()] = "") -> Response:
+    """A new participant."""
+    try:
+        body = ParticipantIn(code=code.strip(), profile=ProfileIn())
+    except ValidationError:
+        detail = (
+            f"{code.strip()[:40]!r} is not a code. Take 1 to 32 letters, digits, - or _ (for example P017). "
+            "Please no names: the link from a code to a person is kept elsewhere."
+        )
+        raise ApiError(422, "invalid-input", "This code cannot be used", detail) from None
+    row = await asyncio.to_thread(participants.create, context, body, who.name)
+    return RedirectResponse(f"/participants/{row.code}", 303)
+
+
+@router.post("/participants/{code}/tests")
+async def start_test(context: Ctx, who: Tester, code: str) -> Response:
+    """Start the default pre-session test."""
+    await asyncio.to_thread(participants.find, context, code)
+    row = await context.trials.start(TestIn.model_validate({"participant": code}), who.name)
+    return RedirectResponse(f"/tests/{row.id}", 303)
+
+
+@router.post("/models/{model_id}/approve")
+async def approve(context: Ctx, who: Approver, model_id: str, reason: Annotated[str, Form()] = "") -> Response:
+    """Let the controller have a version."""
+    await asyncio.to_thread(context.versions.decide, model_id, True, who.name, reason[:500])
+    return RedirectResponse(f"/models/{model_id}", 303)
+
+
+@router.post("/models/{model_id}/reject")
+async def reject(context: Ctx, who: Approver, model_id: str, reason: Annotated[str, Form()] = "") -> Response:
+    """Keep a version from the controller."""
+    await asyncio.to_thread(context.versions.decide, model_id, False, who.name, reason[:500])
+    return RedirectResponse(f"/models/{model_id}", 303)
+
+
+@router.post("/rearm")
+async def rearm(context: Ctx, who: Tester, back: Annotated[str, Form()] = "/") -> Response:
+    """A person has looked, and lets the rig work again."""
+    from api.pages.home import local
+
+    await rearm_rig(context, who.name)
+    return RedirectResponse(local(back), 303)

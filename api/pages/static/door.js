@@ -1,0 +1,7 @@
+// A link printed by the service may carry the token after '#': that part never leaves the browser.
+"use strict";
+const carried = new URLSearchParams(location.hash.slice(1)).get("token");
+if (carried) {
+  document.getElementById("token").value = carried;
+  history.replaceState(null, "", location.pathname + location.search);
+}

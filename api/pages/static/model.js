@@ -1,0 +1,8 @@
+// Draws the figures that the server has prepared.
+"use strict";
+const figures = JSON.parse(document.getElementById("data").textContent);
+const settings = { responsive: true, displaylogo: false, modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"] };
+for (const box of document.querySelectorAll("[data-figure]")) {
+  const figure = figures[box.dataset.figure];
+  if (figure) Plotly.newPlot(box, figure.data, figure.layout, settings);
+}

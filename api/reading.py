@@ -1,0 +1,61 @@
+"""What a person reads off a MODEL.json: threshold and plateau, natural period and damping, or the poles."""
+
+from __future__ import annotations
+
+import cmath
+import math
+from typing import Any
+
+THRESHOLD_SHARE = 0.05
+"""The threshold is where the recruitment curve has risen by this share of its range."""
+
+
+def recruitment(document: dict[str, Any]) -> dict[str, float | None]:
+    """Threshold (µs), plateau (N·m) and the width at which 95 % of it is reached (µs)."""
+    width_us, torque_nm = document["recruitment"]["pulse_width_us"], document["recruitment"]["torque_nm"]
+    low, high = torque_nm[0], max(torque_nm)
+    rise = high - low
+    return {
+        "threshold_us": _crossing(width_us, torque_nm, low + THRESHOLD_SHARE * rise),
+        "plateau_nm": high,
+        "saturation_us": _crossing(width_us, torque_nm, low + (1 - THRESHOLD_SHARE) * rise),
+    }
+
+
+def _crossing(width_us: list[float], torque_nm: list[float], level_nm: float) -> float | None:
+    for index in range(1, len(width_us)):
+        before, after = torque_nm[index - 1], torque_nm[index]
+        if before < level_nm <= after:
+            share = (level_nm - before) / (after - before)
+            return width_us[index - 1] + share * (width_us[index] - width_us[index - 1])
+    return None
+
+
+def dynamics(document: dict[str, Any]) -> dict[str, Any]:
+    """Tω (s), ζ and delay (s) where the linear part is of second order; its poles (1/s) besides.
+
+    Tω and ζ are those of eq. (31) with damping: 1 / (Tω² s² + 2 ζ Tω s + 1).
+    """
+    linear = document["linear"]
+    found: dict[str, Any] = {key: linear.get(key) for key in ("time_constant_s", "damping", "delay_s")}
+    step_s = linear.get("step_s") or 1.0 / document["sample_rate_hz"]
+    poles = _poles(linear["a"], step_s)
+    found["poles_per_s"] = [[round(pole.real, 4), round(pole.imag, 4)] for pole in poles]
+    if found["time_constant_s"] is None and len(poles) == 2 and abs(poles[0] * poles[1]) > 0:
+        speed = math.sqrt(abs(poles[0] * poles[1]))
+        found["time_constant_s"], found["damping"] = 1.0 / speed, -(poles[0] + poles[1]).real / 2 / speed
+    return found
+
+
+def _poles(a: list[float], step_s: float) -> list[complex]:
+    """Continuous poles of a denominator of at most second order, 1/s."""
+    while len(a) > 1 and a[-1] == 0.0:
+        a = a[:-1]
+    if len(a) == 2:
+        roots = [complex(-a[1] / a[0])]
+    elif len(a) == 3:
+        root = cmath.sqrt(a[1] ** 2 - 4 * a[0] * a[2])
+        roots = [(-a[1] + root) / (2 * a[0]), (-a[1] - root) / (2 * a[0])]
+    else:
+        return []
+    return [cmath.log(root) / step_s for root in roots if root != 0]

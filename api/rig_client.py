@@ -1,0 +1,201 @@
+"""The service's end of the rig's Unix socket: asks, listens, remembers, reconnects."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import itertools
+import json
+import logging
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from pydantic import TypeAdapter, ValidationError
+
+from api.clock import Clock
+from api.errors import ApiError, from_rig
+from rig.messages import (
+    Event,
+    FinishedEvent,
+    LiveEvent,
+    Reply,
+    Request,
+    StateEvent,
+    Status,
+    StatusRequest,
+    SubscribeRequest,
+)
+
+log = logging.getLogger("stimrig.rig_client")
+
+LINE_LIMIT = 32 * 1024 * 1024
+RECONNECT_S = 0.25
+STATUS_EVERY_S = 1.0
+
+AnyEvent = StateEvent | LiveEvent | FinishedEvent
+_events: TypeAdapter[AnyEvent] = TypeAdapter(Event)
+
+
+class RigClient:
+    """One lasting connection to the rig, and the newest state with its age.
+
+    Parameters
+    ----------
+    path : Path or None
+        The rig's socket; None: there is no rig, every request is refused with the reason.
+    clock : Clock
+        Ages are measured on it.
+    """
+
+    def __init__(self, path: Path | None, clock: Clock) -> None:
+        self.path, self.clock = path, clock
+        self.status: Status | None = None
+        self.connected = False
+        self.listeners: list[Callable[[AnyEvent], None]] = []
+        self.link_listeners: list[Callable[[bool], None]] = []
+        self._heard_s: float | None = None
+        self._numbers = itertools.count(1)
+        self._waiting: dict[int, asyncio.Future[Reply]] = {}
+        self._writer: asyncio.StreamWriter | None = None
+        self._task: asyncio.Task[None] | None = None
+
+    def start(self) -> None:
+        """Begin to connect, in the background."""
+        if self.path is not None:
+            self._task = asyncio.create_task(self._stay_connected(self.path), name="rig client")
+
+    async def close(self) -> None:
+        """Let the rig go."""
+        if self._task is not None:
+            self._task.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await self._task
+
+    @property
+    def age_s(self) -> float | None:
+        """Seconds since the rig last spoke; None: never."""
+        return None if self._heard_s is None else self.clock.monotonic_s() - self._heard_s
+
+    async def request(self, message: Any, timeout_s: float = 5.0) -> Reply:
+        """Ask the rig; its answer, whatever it is.
+
+        Raises
+        ------
+        ApiError
+            503: no rig, or it does not answer in time.
+        """
+        if self._writer is None:
+            return await self._request_apart(message, timeout_s)
+        message = message.model_copy(update={"id": next(self._numbers)})
+        future: asyncio.Future[Reply] = asyncio.get_running_loop().create_future()
+        self._waiting[message.id] = future
+        try:
+            self._writer.write(message.model_dump_json().encode() + b"\n")
+            return await asyncio.wait_for(future, timeout_s)
+        except TimeoutError:
+            raise no_rig(f"It did not answer within {timeout_s:g} s.") from None
+        except OSError as error:
+            raise no_rig(str(error)) from error
+        finally:
+            self._waiting.pop(message.id, None)
+
+    async def ask(self, message: Any, timeout_s: float = 5.0) -> dict[str, Any]:
+        """Ask the rig; its body, or its refusal raised as an `ApiError`."""
+        reply = await self.request(message, timeout_s)
+        if not reply.ok:
+            problem = reply.problem
+            raise from_rig(problem) if problem else no_rig("It refused without a reason.")
+        return reply.body
+
+    async def fresh_status(self) -> Status:
+        """Ask for the state now."""
+        self.status = Status.model_validate(await self.ask(StatusRequest()))
+        return self.status
+
+    async def _request_apart(self, message: Any, timeout_s: float) -> Reply:
+        """Ask on a connection of its own: a stop must not wait for the lasting one to come back."""
+        if self.path is None:
+            raise no_rig("This service was started without one.")
+        try:
+            async with asyncio.timeout(timeout_s):
+                reader, writer = await asyncio.open_unix_connection(str(self.path), limit=LINE_LIMIT)
+                try:
+                    writer.write(message.model_dump_json().encode() + b"\n")
+                    line = await reader.readline()
+                    return Reply.model_validate_json(line)
+                finally:
+                    writer.close()
+        except (OSError, TimeoutError, ValidationError) as error:
+            raise no_rig(str(error) or "It did not answer in time.") from error
+
+    async def _stay_connected(self, path: Path) -> None:
+        while True:
+            try:
+                reader, self._writer = await asyncio.open_unix_connection(str(path), limit=LINE_LIMIT)
+                await self._listen(reader)
+            except (OSError, ValueError, asyncio.IncompleteReadError) as error:
+                log.debug("rig link: %s", error)
+            finally:
+                self._lose_link()
+            await asyncio.sleep(RECONNECT_S)
+
+    def _lose_link(self) -> None:
+        if self._writer is not None:
+            self._writer.close()
+            self._writer = None
+        for future in self._waiting.values():
+            if not future.done():
+                future.set_exception(no_rig("The connection broke while it was asked."))
+        if self.connected:
+            log.warning("the rig's socket closed")
+            self.connected = False
+            self._tell_link()
+
+    def _tell_link(self) -> None:
+        for listener in list(self.link_listeners):
+            listener(self.connected)
+
+    async def _listen(self, reader: asyncio.StreamReader) -> None:
+        assert self._writer is not None
+        subscription = SubscribeRequest(id=next(self._numbers))
+        self._writer.write(subscription.model_dump_json().encode() + b"\n")
+        poll = asyncio.create_task(self._poll(), name="rig poll")
+        try:
+            while line := await reader.readline():
+                self._heard_s = self.clock.monotonic_s()
+                self._take(json.loads(line), subscription.id)
+        finally:
+            poll.cancel()
+
+    async def _poll(self) -> None:
+        """Ask for the state now and then, so that its age says whether the rig still answers."""
+        while True:
+            await asyncio.sleep(STATUS_EVERY_S)
+            with contextlib.suppress(ApiError):
+                await self.fresh_status()
+
+    def _take(self, message: dict[str, Any], subscription_id: int) -> None:
+        if "event" in message:
+            event = _events.validate_python(message)
+            if isinstance(event, StateEvent):
+                self.status = event.status
+            for listener in list(self.listeners):
+                listener(event)
+            return
+        reply = Reply.model_validate(message)
+        if reply.id == subscription_id and reply.ok:
+            self.status = Status.model_validate(reply.body)
+            self.connected = True
+            self._tell_link()
+        future = self._waiting.get(reply.id)
+        if future is not None and not future.done():
+            future.set_result(reply)
+
+
+def no_rig(detail: str) -> ApiError:
+    """503: the rig cannot be reached."""
+    return ApiError(503, "rig-unreachable", "The rig cannot be reached", f"{detail} Is its process running?")
+
+
+__all__ = ["AnyEvent", "Request", "RigClient", "no_rig"]

@@ -1,0 +1,84 @@
+"""Recordings: the raw HDF5 as it was sealed, and recordings of other tools taken in."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import secrets
+from pathlib import Path
+from typing import Any
+
+from fastapi import APIRouter, Request, Response
+from fastapi.responses import FileResponse
+
+from api import audit
+from api.context import PROBLEM, Context, Ctx, ModelReader, Tester
+from api.errors import ApiError, NotFoundError
+from api.routes import participants
+from api.store.tables import Recording
+
+router = APIRouter(prefix="/v1", tags=["recordings"], responses=PROBLEM)
+
+HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
+
+
+@router.get("/recordings/{recording_id}", response_class=FileResponse)
+def recording(context: Ctx, _who: ModelReader, recording_id: str) -> FileResponse:
+    """The raw recording."""
+    row = context.store.get(Recording, recording_id)
+    if row is None:
+        raise NotFoundError("recording", recording_id, "A test's document names its recording.")
+    path = Path(row.path)
+    if not path.is_file():
+        detail = f"The file of recording {recording_id!r} is not in its place ({path.name}). Restore it from a backup."
+        raise ApiError(410, "recording-gone", "The recording's file is missing", detail)
+    kind = "text/csv" if path.suffix == ".csv" else "application/x-hdf5"
+    return FileResponse(path, media_type=kind, filename=path.name, headers={"X-Content-SHA256": row.file_sha256})
+
+
+@router.post("/participants/{code}/recordings", status_code=201)
+async def upload(context: Ctx, who: Tester, code: str, request: Request, response: Response) -> dict[str, Any]:
+    """Take in a recording of another tool (CSV or HDF5 as the request's body) and identify a model from it."""
+    await asyncio.to_thread(participants.find, context, code)
+    data = await bounded_body(request, context.settings.max_upload_mb)
+    path = await asyncio.to_thread(_write, context, data)
+    try:
+        found = await context.fitting.submit("fit", data=str(path)).result
+    except ApiError as error:
+        path.unlink(missing_ok=True)
+        error.detail = error.detail.replace(str(path), "the upload")
+        raise
+    row = await asyncio.to_thread(_store, context, code, path, data, who.name)
+    model = await asyncio.to_thread(context.versions.add, found["json"], code, row.id, who.name)
+    response.headers["Location"] = f"/v1/recordings/{row.id}"
+    return {"recording_id": row.id, "model": context.versions.public(model)}
+
+
+async def bounded_body(request: Request, limit_mb: float) -> bytes:
+    """The request's body; 413 as soon as it is too long."""
+    data = bytearray()
+    async for chunk in request.stream():
+        data += chunk
+        if len(data) > limit_mb * 1e6:
+            raise ApiError(413, "too-large", "The upload is too large", f"At most {limit_mb:g} MB are taken.")
+    if not data:
+        raise ApiError(422, "empty", "The upload is empty", "Send a CSV file or a sealed recording as the body.")
+    return bytes(data)
+
+
+def _write(context: Context, data: bytes) -> Path:
+    suffix = ".h5" if data.startswith(HDF5_MAGIC) else ".csv"
+    path = context.settings.recordings_dir / f"upload-{secrets.token_hex(8)}{suffix}"
+    path.write_bytes(data)
+    return path
+
+
+def _store(context: Context, code: str, path: Path, data: bytes, by: str) -> Recording:
+    now = context.clock.utc()
+    row = Recording(id=path.stem, participant=code, test_id=None, path=str(path), origin="upload", created_utc=now)
+    row.file_sha256 = hashlib.sha256(data).hexdigest()
+    with context.store.write() as session:
+        session.add(row)
+        session.flush()
+        audit.write(session, now, by, "upload recording", row.id, participant=code, sha256=row.file_sha256)
+    return row

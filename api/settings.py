@@ -1,0 +1,46 @@
+"""What can be set, by environment (prefix ``STIMRIG_``) or by the command line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field, SecretStr
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+
+class Settings(BaseSettings):
+    """Settings of the service.
+
+    Every field has an environment variable: ``data_dir`` is ``STIMRIG_DATA_DIR``.
+    """
+
+    model_config = SettingsConfigDict(env_prefix="STIMRIG_", extra="ignore")
+
+    data_dir: Path = Field(default=Path("var"), description="database, recordings, journals and logs")
+    database_url: str | None = Field(default=None, description="SQLAlchemy URL; default: SQLite in the data folder")
+    host: str = Field(default="127.0.0.1", description="address to listen on")
+    port: Annotated[int, Field(ge=0, le=65535)] = 8000
+    admin_token: SecretStr | None = Field(default=None, description="first administrator's token; default: drawn")
+    rig_socket: Path | None = Field(default=None, description="Unix socket of the rig process")
+    rig_file: Path | None = Field(default=None, description="rig.toml; default: the emulated rig")
+    workers: Annotated[int, Field(ge=1, le=16)] = 2
+    session_hours: Annotated[float, Field(gt=0, le=24)] = 12.0
+    secure_cookies: bool = Field(default=False, description="True behind a TLS proxy: cookies over HTTPS only")
+    max_upload_mb: Annotated[float, Field(gt=0)] = 64.0
+    effects_dir: Path | None = Field(default=None, description="folder of the users' own effects")
+
+    @property
+    def database(self) -> str:
+        """The database's SQLAlchemy URL."""
+        return self.database_url or f"sqlite:///{self.data_dir.absolute() / 'stimrig.db'}"
+
+    @property
+    def recordings_dir(self) -> Path:
+        """Where sealed and uploaded recordings lie."""
+        return self.data_dir / "recordings"
+
+    @property
+    def logs_dir(self) -> Path:
+        """Where each process writes its log."""
+        return self.data_dir / "logs"

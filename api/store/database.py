@@ -1,0 +1,89 @@
+"""One door to the database: SQLite by default (WAL, every commit on the disk), PostgreSQL by URL."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import create_engine, event, select
+from sqlalchemy.engine import make_url
+from sqlalchemy.exc import ArgumentError, OperationalError
+from sqlalchemy.orm import Session, sessionmaker
+
+from api.errors import ApiError
+from api.store import tables
+
+
+class Store:
+    """The database, opened and its tables made.
+
+    Parameters
+    ----------
+    url : str
+        SQLAlchemy URL.
+
+    Raises
+    ------
+    ApiError
+        The URL cannot be read or the database not opened.
+    """
+
+    def __init__(self, url: str) -> None:
+        try:
+            parsed = make_url(url)
+            if parsed.get_backend_name() == "sqlite" and parsed.database:
+                Path(parsed.database).parent.mkdir(parents=True, exist_ok=True)
+            self.engine = create_engine(parsed)
+            if parsed.get_backend_name() == "sqlite":
+                event.listen(self.engine, "connect", _durable_sqlite)
+            tables.Table.metadata.create_all(self.engine)
+        except (ArgumentError, OperationalError, ImportError, OSError) as error:
+            mend = "set STIMRIG_DATABASE_URL or STIMRIG_DATA_DIR to a place this user may write"
+            raise ApiError(503, "database", "The database does not open", f"{_first_line(error)}; {mend}") from error
+        self._sessions = sessionmaker(self.engine, expire_on_commit=False)
+        self.write_lock = threading.RLock()
+
+    @contextmanager
+    def read(self) -> Iterator[Session]:
+        """A session for reading."""
+        with self._sessions() as session:
+            yield session
+
+    @contextmanager
+    def write(self) -> Iterator[Session]:
+        """A transaction: committed at the end, rolled back at an error. One writer at a time."""
+        with self.write_lock, self._sessions.begin() as session:
+            yield session
+
+    def get(self, table: type[Any], key: Any) -> Any:
+        """One row by its key, or None."""
+        with self.read() as session:
+            return session.get(table, key)
+
+    def all(self, table: Any, *where: Any, order: Any = None, limit: int | None = None) -> list[Any]:
+        """Rows that hold the conditions, in order."""
+        query = select(table).where(*where)
+        if order is not None:
+            query = query.order_by(order)
+        if limit is not None:
+            query = query.limit(limit)
+        with self.read() as session:
+            return list(session.scalars(query))
+
+    def close(self) -> None:
+        """Let the connections go."""
+        self.engine.dispose()
+
+
+def _durable_sqlite(connection: Any, _record: Any) -> None:
+    cursor = connection.cursor()
+    for pragma in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON", "busy_timeout=5000"):
+        cursor.execute(f"PRAGMA {pragma}")
+    cursor.close()
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).splitlines()[0]

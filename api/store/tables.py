@@ -1,0 +1,135 @@
+"""The tables. Times are UTC, as ISO 8601 labels; documents are JSON."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sqlalchemy import JSON, Boolean, Float, ForeignKey, Integer, LargeBinary, String, Text
+from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
+
+
+class Table(DeclarativeBase):
+    """Base of all tables."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """The row as a plain object."""
+        return {column.name: getattr(self, column.name) for column in self.__table__.columns}
+
+
+class Participant(Table):
+    __tablename__ = "participants"
+    code: Mapped[str] = mapped_column(String(32), primary_key=True)
+    profile: Mapped[dict[str, Any]] = mapped_column(JSON, default=dict)
+    created_utc: Mapped[str] = mapped_column(String(32))
+    created_by: Mapped[str] = mapped_column(String(80))
+
+
+class Test(Table):
+    """One test; the row is written before the command goes to the rig."""
+
+    __tablename__ = "tests"
+    __test__ = False
+    id: Mapped[str] = mapped_column(String(40), primary_key=True)
+    participant: Mapped[str] = mapped_column(ForeignKey("participants.code"), index=True)
+    kind: Mapped[str] = mapped_column(String(40))
+    state: Mapped[str] = mapped_column(String(20), index=True)
+    reason: Mapped[str] = mapped_column(Text, default="")
+    plan: Mapped[dict[str, Any]] = mapped_column(JSON)
+    summary: Mapped[dict[str, Any]] = mapped_column(JSON, default=dict)
+    recording_id: Mapped[str | None] = mapped_column(String(64), default=None)
+    model_id: Mapped[str | None] = mapped_column(String(64), default=None)
+    requested_by: Mapped[str] = mapped_column(String(80))
+    requested_utc: Mapped[str] = mapped_column(String(32), index=True)
+    finished_utc: Mapped[str | None] = mapped_column(String(32), default=None)
+
+
+class Recording(Table):
+    __tablename__ = "recordings"
+    id: Mapped[str] = mapped_column(String(64), primary_key=True)
+    participant: Mapped[str] = mapped_column(ForeignKey("participants.code"), index=True)
+    test_id: Mapped[str | None] = mapped_column(String(40), default=None, index=True)
+    path: Mapped[str] = mapped_column(Text)
+    file_sha256: Mapped[str] = mapped_column(String(64))
+    origin: Mapped[str] = mapped_column(String(20), default="rig")
+    created_utc: Mapped[str] = mapped_column(String(32))
+
+
+class Model(Table):
+    """One immutable version; adding an effect makes a child."""
+
+    __tablename__ = "models"
+    id: Mapped[str] = mapped_column(String(64), primary_key=True)
+    participant: Mapped[str] = mapped_column(ForeignKey("participants.code"), index=True)
+    recording_id: Mapped[str] = mapped_column(ForeignKey("recordings.id"), index=True)
+    parent_id: Mapped[str | None] = mapped_column(String(64), default=None)
+    added_effect: Mapped[str | None] = mapped_column(String(64), default=None)
+    method: Mapped[str] = mapped_column(String(40))
+    effects: Mapped[list[str]] = mapped_column(JSON, default=list)
+    fit: Mapped[dict[str, Any]] = mapped_column(JSON, default=dict)
+    document: Mapped[bytes] = mapped_column(LargeBinary)
+    etag: Mapped[str] = mapped_column(String(64))
+    created_utc: Mapped[str] = mapped_column(String(32), index=True)
+    created_by: Mapped[str] = mapped_column(String(80))
+
+
+class Approval(Table):
+    """A person's decision on a model; the newest approval of a participant is what the controller gets."""
+
+    __tablename__ = "approvals"
+    id: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=True)
+    model_id: Mapped[str] = mapped_column(ForeignKey("models.id"), index=True)
+    participant: Mapped[str] = mapped_column(ForeignKey("participants.code"), index=True)
+    approved: Mapped[bool] = mapped_column(Boolean)
+    reason: Mapped[str] = mapped_column(Text, default="")
+    by: Mapped[str] = mapped_column(String(80))
+    at_utc: Mapped[str] = mapped_column(String(32))
+    expires_utc: Mapped[str | None] = mapped_column(String(32), default=None)
+
+
+class Analysis(Table):
+    """What a worker found about a model: comparison, diagnosis. Kept, since a model never changes."""
+
+    __tablename__ = "analyses"
+    model_id: Mapped[str] = mapped_column(ForeignKey("models.id"), primary_key=True)
+    kind: Mapped[str] = mapped_column(String(40), primary_key=True)
+    document: Mapped[dict[str, Any]] = mapped_column(JSON)
+    created_utc: Mapped[str] = mapped_column(String(32))
+
+
+class Token(Table):
+    """A bearer token: only its hash is kept."""
+
+    __tablename__ = "tokens"
+    hash: Mapped[str] = mapped_column(String(64), primary_key=True)
+    prefix: Mapped[str] = mapped_column(String(16))
+    name: Mapped[str] = mapped_column(String(80), index=True)
+    scopes: Mapped[list[str]] = mapped_column(JSON)
+    created_utc: Mapped[str] = mapped_column(String(32))
+    expires_utc: Mapped[str | None] = mapped_column(String(32), default=None)
+    revoked: Mapped[bool] = mapped_column(Boolean, default=False)
+    origin: Mapped[str] = mapped_column(String(20), default="issued")
+
+
+class PageSession(Table):
+    """A browser's session, opened by signing in with a token."""
+
+    __tablename__ = "page_sessions"
+    hash: Mapped[str] = mapped_column(String(64), primary_key=True)
+    token_hash: Mapped[str] = mapped_column(ForeignKey("tokens.hash"))
+    csrf: Mapped[str] = mapped_column(String(64))
+    created_unix_s: Mapped[float] = mapped_column(Float)
+    expires_unix_s: Mapped[float] = mapped_column(Float)
+
+
+class AuditEntry(Table):
+    """Who did what, when, to what; each entry holds the hash of the one before."""
+
+    __tablename__ = "audit"
+    seq: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=False)
+    at_utc: Mapped[str] = mapped_column(String(32))
+    who: Mapped[str] = mapped_column(String(80))
+    action: Mapped[str] = mapped_column(String(60))
+    subject: Mapped[str] = mapped_column(String(120))
+    detail: Mapped[dict[str, Any]] = mapped_column(JSON, default=dict)
+    previous_hash: Mapped[str] = mapped_column(String(64))
+    hash: Mapped[str] = mapped_column(String(64))

@@ -1,0 +1,383 @@
+"""A test from the request to the model: intent in the database, command to the rig, recording, identification."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import secrets
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from api import audit
+from api.clock import Clock
+from api.errors import ApiError, NotFoundError
+from api.fitting import Fitting, Job
+from api.live import Hub
+from api.rig_client import AnyEvent, RigClient
+from api.schemas import TestIn
+from api.store import Store
+from api.store.tables import Participant, Recording, Test
+from api.versions import Versions
+from rig.messages import (
+    FinishedEvent,
+    LiveEvent,
+    PreviewRequest,
+    Profile,
+    SegmentPlan,
+    StartRequest,
+    StopEvidence,
+    StopRequest,
+    TestPlan,
+)
+
+log = logging.getLogger("stimrig.trials")
+
+OPEN_STATES = ("requested", "running", "sealing", "identifying")
+
+
+@dataclass
+class Current:
+    """The test the rig is busy with, or that is being identified."""
+
+    test_id: str
+    participant: str
+    by: str
+    finished: asyncio.Event = field(default_factory=asyncio.Event)
+
+
+class Trials:
+    """Starts tests, one at a time, and follows each to its model."""
+
+    def __init__(
+        self, store: Store, clock: Clock, rig: RigClient, fitting: Fitting, versions: Versions, recordings_dir: Path
+    ) -> None:
+        self.store, self.clock, self.rig, self.fitting, self.versions = store, clock, rig, fitting, versions
+        self.recordings_dir = recordings_dir
+        self.hub = Hub()
+        self.current: Current | None = None
+        self.jobs: dict[str, Job] = {}
+        self._lock = asyncio.Lock()
+        self._tasks: set[asyncio.Task[Any]] = set()
+        rig.listeners.append(self._on_event)
+        rig.link_listeners.append(self._on_link)
+
+    # ---- start and stop -------------------------------------------------------------------------------------
+
+    async def start(self, body: TestIn, by: str) -> Test:
+        """Begin a test.
+
+        Raises
+        ------
+        ApiError
+            404 no such participant; 409 another test runs, the holder named; what the rig refuses.
+        """
+        participant = await asyncio.to_thread(self.store.get, Participant, body.participant)
+        if participant is None:
+            raise NotFoundError("participant", body.participant, "POST /v1/participants makes one.")
+        if self.current is not None:
+            raise busy(self.current)
+        async with self._lock:
+            if self.current is not None:
+                raise busy(self.current)
+            return await self._start(body, participant, by)
+
+    async def _start(self, body: TestIn, participant: Participant, by: str) -> Test:
+        plan = self._plan(body, participant)
+        self.current = Current(plan.test_id, plan.participant, by)
+        try:
+            preview = await self.rig.ask(PreviewRequest(plan=plan, recruitment=None))
+            row = await asyncio.to_thread(self._write_intent, plan, preview, by)
+            self.hub.begin(plan.test_id)
+            await self._command(plan)
+        except BaseException:
+            self.current = None
+            raise
+        return await asyncio.to_thread(self._update, row.id, state="running")
+
+    async def _command(self, plan: TestPlan) -> None:
+        try:
+            await self.rig.ask(StartRequest(plan=plan), timeout_s=15.0)
+        except ApiError as error:
+            await asyncio.to_thread(self._update, plan.test_id, state="refused", reason=error.detail or error.title)
+            if error.code == "rig-unreachable":  # it may have heard us all the same
+                await self._stop_quietly(f"start of {plan.test_id} was not answered")
+            status = self.rig.status
+            if error.code == "rig-busy" and status is not None:
+                error.extra["holder"] = {"test_id": status.test_id, "participant": status.participant}
+            raise
+
+    async def _stop_quietly(self, reason: str) -> None:
+        try:
+            await self.rig.request(StopRequest(reason=reason, by="service"))
+        except ApiError as error:
+            log.warning("stop after a failed start: %s", error)
+
+    def _plan(self, body: TestIn, participant: Participant) -> TestPlan:
+        profile = body.profile.model_dump() if body.profile else participant.profile
+        segments = None
+        if body.segments is not None:
+            segments = [SegmentPlan(**segment.model_dump()) for segment in body.segments]
+        return TestPlan(
+            test_id=self._new_id(),
+            participant=participant.code,
+            kind=body.kind,
+            profile=Profile(**profile),
+            segments=segments,
+            pulse_rate_hz=body.pulse_rate_hz,
+        )
+
+    def _new_id(self) -> str:
+        stamp = self.clock.utc()[:19].replace("-", "").replace(":", "")
+        return f"T{stamp}-{secrets.token_hex(3)}"
+
+    def _write_intent(self, plan: TestPlan, preview: dict[str, Any], by: str) -> Test:
+        now = self.clock.utc()
+        row = Test(id=plan.test_id, participant=plan.participant, kind=plan.kind, state="requested")
+        row.plan, row.summary, row.reason = {**plan.model_dump(), "preview": preview}, {}, ""
+        row.requested_by, row.requested_utc = by, now
+        with self.store.write() as session:
+            session.add(row)
+            audit.write(session, now, by, "start test", plan.test_id, participant=plan.participant, kind=plan.kind)
+        return row
+
+    async def preview(self, body: TestIn) -> dict[str, Any]:
+        """A test's duration, dose and pulse widths; nothing is played."""
+        participant = await asyncio.to_thread(self.store.get, Participant, body.participant)
+        if participant is None:
+            raise NotFoundError("participant", body.participant, "POST /v1/participants makes one.")
+        return await self.rig.ask(PreviewRequest(plan=self._plan(body, participant), recruitment=None))
+
+    async def stop(self, reason: str, by: str) -> StopEvidence:
+        """Stop the rig; the audit entry comes after, so that nothing delays the command.
+
+        Raises
+        ------
+        ApiError
+            503: the rig cannot be reached, or it could not confirm that stimulation has stopped.
+        """
+        try:
+            evidence = StopEvidence.model_validate(
+                await self.rig.ask(StopRequest(reason=reason or "stop pressed", by=by), timeout_s=8.0)
+            )
+        except ApiError as error:
+            await asyncio.to_thread(self._audit, by, "stop failed", detail=error.detail)
+            error.detail = f"{error.detail} Use the stimulator's own emergency switch now."
+            raise
+        await asyncio.to_thread(self._audit, by, "stop", reason=reason, confirmed=evidence.confirmed)
+        if not evidence.confirmed:
+            detail = f"{evidence.detail} Use the stimulator's own emergency switch now."
+            raise ApiError(
+                503, "stop-not-confirmed", "The stop is not confirmed", detail, evidence=evidence.model_dump()
+            )
+        return evidence
+
+    def _audit(self, by: str, action: str, **detail: Any) -> None:
+        subject = self.current.test_id if self.current else "rig"
+        with self.store.write() as session:
+            audit.write(session, self.clock.utc(), by, action, subject, **detail)
+
+    # ---- what the rig says ----------------------------------------------------------------------------------
+
+    def _on_event(self, event: AnyEvent) -> None:
+        if isinstance(event, LiveEvent):
+            self.hub.live(event)
+        elif isinstance(event, FinishedEvent):
+            self._spawn(self._finish(event))
+        else:
+            self.hub.send({"type": "state", "rig": event.status.model_dump()})
+
+    def _on_link(self, connected: bool) -> None:
+        self.hub.send({"type": "link", "connected": connected})
+        status = self.rig.status
+        if connected and self.current is not None and status is not None and status.test_id != self.current.test_id:
+            self._spawn(self._recover(self.current.test_id, "the link to the rig broke during the test"))
+
+    def _spawn(self, work: Any) -> None:
+        task = asyncio.create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    async def _finish(self, event: FinishedEvent) -> None:
+        """Take over a finished test: store the recording, identify, store the model."""
+        try:
+            row = await asyncio.to_thread(self._take_recording, event)
+            if row is None:
+                return
+            self.announce(row.id)
+            if event.outcome == "completed" and row.recording_id:
+                self._release(event.test_id)
+                await self.identify(row.id, event.last_sample_unix_s)
+        except Exception as error:
+            log.exception("test %s could not be taken over", event.test_id)
+            await asyncio.to_thread(self._update, event.test_id, state="failed", reason=one_line(error))
+        finally:
+            self._release(event.test_id)
+            self.announce(event.test_id)
+
+    def _release(self, test_id: str) -> None:
+        """The rig is free again; the identification goes on beside it."""
+        if self.current is not None and self.current.test_id == test_id:
+            self.current.finished.set()
+            self.current = None
+
+    def _take_recording(self, event: FinishedEvent) -> Test | None:
+        with self.store.write() as session:
+            row = session.get(Test, event.test_id)
+            if row is None or row.recording_id is not None:
+                return None
+            if event.recording_path and event.recording_id:
+                recording = Recording(
+                    id=event.recording_id,
+                    participant=row.participant,
+                    test_id=row.id,
+                    path=event.recording_path,
+                    file_sha256=event.file_sha256 or "",
+                    origin="rig",
+                    created_utc=self.clock.utc(),
+                )
+                session.add(recording)
+                session.flush()
+                row.recording_id = event.recording_id
+            identifies = event.outcome == "completed" and row.recording_id is not None
+            row.state = "identifying" if identifies else event.outcome
+            row.reason = event.reason
+            row.summary = dict(event.summary)
+            row.finished_utc = now = self.clock.utc()
+            audit.write(session, now, "rig", f"test {event.outcome}", row.id, reason=event.reason)
+        return row
+
+    async def identify(self, test_id: str, last_sample_unix_s: float | None = None) -> None:
+        """Identify a test's recording in a worker and store the model."""
+        row: Test = await asyncio.to_thread(self.store.get, Test, test_id)
+        recording: Recording = await asyncio.to_thread(self.store.get, Recording, row.recording_id)
+        job = self.fitting.submit(
+            "fit", urgent=True, data=recording.path, on_progress=lambda _job: self.announce(test_id)
+        )
+        self.jobs[test_id] = job
+        try:
+            found = await job.result
+        except ApiError as error:
+            reason = f"identification: {error.detail or error.title}"
+            await asyncio.to_thread(self._update, test_id, state="failed", reason=reason)
+            return
+        finally:
+            self.jobs.pop(test_id, None)
+        model = await asyncio.to_thread(
+            self.versions.add, found["json"], row.participant, recording.id, f"test {test_id}"
+        )
+        summary = dict(row.summary)
+        if last_sample_unix_s is not None:
+            summary["last_sample_to_model_s"] = round(self.clock.unix_s() - last_sample_unix_s, 3)
+        await asyncio.to_thread(self._update, test_id, state="completed", model_id=model.id, summary=summary)
+
+    # ---- after a restart ------------------------------------------------------------------------------------
+
+    async def resume(self) -> None:
+        """Take up what a restart of the service left open."""
+        for row in await asyncio.to_thread(self.store.all, Test, Test.state.in_(OPEN_STATES)):
+            status = self.rig.status
+            if (
+                status is not None
+                and status.test_id == row.id
+                and status.state not in ("ready", "latched", "uncertain")
+            ):
+                self.current = Current(row.id, row.participant, row.requested_by)
+                self.hub.begin(row.id)
+            else:
+                self._spawn(self._recover(row.id, "the service was restarted during the test"))
+
+    async def _recover(self, test_id: str, why: str) -> None:
+        """A test whose end was not heard: its recording, if the rig sealed one, is adopted."""
+        row: Test = await asyncio.to_thread(self.store.get, Test, test_id)
+        if row.recording_id is not None:
+            await self.identify(test_id)
+        else:
+            found = await self._find_recording(test_id)
+            event = FinishedEvent(test_id=test_id, outcome="fault", reason=why, last_sample_unix_s=None)
+            await self._finish(event.model_copy(update=found))
+        self._release(test_id)
+        self.announce(test_id)
+
+    async def _find_recording(self, test_id: str) -> dict[str, Any]:
+        job = self.fitting.submit("find_recording", urgent=True, folder=str(self.recordings_dir), test_id=test_id)
+        try:
+            return (await job.result).get("found") or {}
+        except ApiError as error:
+            log.warning("looking for the recording of %s: %s", test_id, error)
+            return {}
+
+    # ---- what clients see -----------------------------------------------------------------------------------
+
+    def announce(self, test_id: str) -> None:
+        """Tell the listeners of the live channel how the test stands."""
+        row = self.store.get(Test, test_id)
+        if row is not None:
+            self.hub.send({"type": "test", "test": self.public(row)})
+
+    def public(self, row: Test) -> dict[str, Any]:
+        """A test as clients see it."""
+        planned = {key: value for key, value in row.plan.get("preview", {}).items() if key != "pulse_width_us"}
+        running = row.state in ("requested", "running")
+        start = (0.0, planned.get("duration_s", 0.0), None)
+        end = (row.summary.get("duration_s", 0.0), row.summary.get("duration_s", 0.0), None)
+        elapsed_s, duration_s, segment = (self.hub.position(row.id) or start) if running else end
+        job = self.jobs.get(row.id)
+        model = self.versions.get(row.model_id) if row.model_id else None
+        return {
+            "id": row.id,
+            "participant": row.participant,
+            "kind": row.kind,
+            "state": row.state,
+            "done": row.state not in OPEN_STATES,
+            "reason": row.reason,
+            "segment": segment,
+            "elapsed_s": elapsed_s,
+            "duration_s": duration_s,
+            "time_left_s": max(0.0, duration_s - elapsed_s),
+            "progress": min(1.0, elapsed_s / duration_s) if duration_s else 0.0,
+            "identification": job.public() if job else None,
+            "requested_by": row.requested_by,
+            "requested_utc": row.requested_utc,
+            "finished_utc": row.finished_utc,
+            "planned": planned,
+            "recording_id": row.recording_id,
+            "recording_url": f"/v1/recordings/{row.recording_id}" if row.recording_id else None,
+            "model_id": row.model_id,
+            "model_url": f"/v1/models/{row.model_id}" if row.model_id else None,
+            "summary": row.summary,
+            "fit": self.versions.public(model) if model else None,
+        }
+
+    def _update(self, test_id: str, **fields: Any) -> Test:
+        with self.store.write() as session:
+            row = session.get(Test, test_id)
+            assert row is not None
+            if fields.get("state") == "running" and row.state != "requested":
+                fields.pop("state")  # the rig was done before we wrote that it had begun
+            for name, value in fields.items():
+                setattr(row, name, value)
+            if row.state not in OPEN_STATES and row.finished_utc is None:
+                row.finished_utc = self.clock.utc()
+        return row
+
+    async def close(self) -> None:
+        """Leave what runs to the next start of the service."""
+        for task in list(self._tasks):
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+
+
+def busy(current: Current) -> ApiError:
+    """409, naming the holder."""
+    detail = (
+        f"{current.test_id} for participant {current.participant}, started by {current.by}, holds the rig. "
+        "Wait for its end, or stop it."
+    )
+    holder = {"test_id": current.test_id, "participant": current.participant, "by": current.by}
+    return ApiError(409, "rig-busy", "Another test is running", detail, holder=holder)
+
+
+def one_line(error: Exception) -> str:
+    """An error's message on one line."""
+    return " ".join(str(error).split())

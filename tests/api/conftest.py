@@ -1,0 +1,121 @@
+"""A service on a real port, with a fake rig behind it."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+import uvicorn
+
+from api.app import create_app
+from api.settings import Settings
+from tests.api.fake_rig import FakeRig, RigThread
+
+TOKEN = "administrator-token-of-the-tests"
+STUB = (sys.executable, str(Path(__file__).parent / "stub_worker.py"))
+
+
+@dataclass
+class Service:
+    """A running service and ways to it."""
+
+    url: str
+    app: Any
+    rig_thread: RigThread
+    data: Path
+
+    @property
+    def rig(self) -> FakeRig:
+        return self.rig_thread.rig
+
+    def client(self, token: str | None = TOKEN, **more: Any) -> httpx.Client:
+        headers = {"Authorization": f"Bearer {token}"} if token else {}
+        return httpx.Client(base_url=self.url, headers=headers, timeout=20, **more)
+
+    def token(self, name: str, *scopes: str) -> str:
+        with self.client() as client:
+            return client.post("/v1/tokens", json={"name": name, "scopes": list(scopes)}).json()["token"]
+
+
+class Server:
+    """uvicorn in a thread."""
+
+    def __init__(self, app: Any) -> None:
+        self.server = uvicorn.Server(uvicorn.Config(app, port=0, log_level="warning", ws_ping_interval=None))
+
+    def __enter__(self) -> str:
+        self.thread = threading.Thread(target=self.server.run, daemon=True)
+        self.thread.start()
+        limit = time.monotonic() + 10
+        while not self.server.started:
+            assert time.monotonic() < limit and self.thread.is_alive()
+            time.sleep(0.01)
+        port = self.server.servers[0].sockets[0].getsockname()[1]
+        return f"http://127.0.0.1:{port}"
+
+    def __exit__(self, *_: object) -> None:
+        self.server.should_exit = True
+        self.thread.join(10)
+
+
+@pytest.fixture(scope="session")
+def short_dir() -> Iterator[Path]:
+    """A folder with a short name: a Unix socket's path holds 107 characters."""
+    path = Path(tempfile.mkdtemp(prefix="stimrig-"))
+    yield path
+    shutil.rmtree(path, ignore_errors=True)
+
+
+@pytest.fixture
+def service(tmp_path: Path, short_dir: Path) -> Iterator[Service]:
+    """A fresh service with the stub worker."""
+    yield from run_service(tmp_path, short_dir, STUB)
+
+
+def run_service(tmp_path: Path, short_dir: Path, worker: Any, speed: float = 30.0) -> Iterator[Service]:
+    socket = short_dir / f"rig-{time.time_ns()}.sock"
+    settings = Settings(data_dir=tmp_path, admin_token=TOKEN, rig_socket=socket, port=0)  # pyright: ignore[reportArgumentType]
+    with RigThread(socket, settings.recordings_dir, speed=speed) as rig:
+        app = create_app(settings, worker=worker)
+        with Server(app) as url:
+            yield Service(url, app, rig, tmp_path)
+
+
+@pytest.fixture
+def client(service: Service) -> Iterator[httpx.Client]:
+    """The administrator's client."""
+    with service.client() as client:
+        yield client
+
+
+@pytest.fixture
+def participant(client: httpx.Client) -> str:
+    assert client.post("/v1/participants", json={"code": "P017"}).status_code == 201
+    return "P017"
+
+
+def wait_done(client: httpx.Client, test_id: str, limit_s: float = 20.0) -> dict[str, Any]:
+    """Poll a test to its end."""
+    end = time.monotonic() + limit_s
+    while time.monotonic() < end:
+        document = client.get(f"/v1/tests/{test_id}").json()
+        if document["done"]:
+            return document
+        time.sleep(0.02)
+    raise AssertionError(f"not done: {document}")
+
+
+def run_test(client: httpx.Client, participant: str) -> dict[str, Any]:
+    """Start a test and follow it to its end."""
+    started = client.post("/v1/tests", json={"participant": participant})
+    assert started.status_code == 202, started.text
+    return wait_done(client, started.json()["id"])

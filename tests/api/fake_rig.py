@@ -1,0 +1,343 @@
+# ruff: noqa: ARG002, N801
+"""A rig that speaks `rig.messages` on a Unix socket and plays a made-up test in a second or two.
+
+Run as a process it prints the one ready line of `python -m rig`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import hashlib
+import json
+import math
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+from pydantic import TypeAdapter
+
+from rig import messages as m
+
+REQUESTS: TypeAdapter[Any] = TypeAdapter(m.Request)
+PULSE_RATE_HZ = 40.0
+FRAME_S = 0.05
+
+
+def default_widths() -> tuple[list[float], list[dict[str, Any]]]:
+    """1 s rest, 6 s of a switching input, 1 s rest, 5 + 5 s ramp, 1 s rest, 6 s of levels held out."""
+    state, widths = 0x5A, []
+    segments: list[dict[str, Any]] = []
+
+    def add(name: str, values: list[float]) -> None:
+        start = len(widths) / PULSE_RATE_HZ
+        widths.extend(values)
+        segments.append({"name": name, "start_s": start, "end_s": len(widths) / PULSE_RATE_HZ})
+
+    prbs: list[float] = []
+    while len(prbs) < 240:
+        bit = (state ^ state >> 1) & 1
+        state = state >> 1 | bit << 6
+        prbs += [300.0 * bit] * 12
+    add("rest", [0.0] * 40)
+    add("prbs", prbs[:240])
+    add("rest", [0.0] * 40)
+    add("ramp", [300.0 * min(k, 400 - k) / 200 for k in range(400)])
+    add("rest", [0.0] * 40)
+    add("validate", [[80.0, 220.0, 140.0, 260.0, 180.0, 0.0][k // 40] for k in range(240)])
+    return widths, segments
+
+
+def muscle(widths: list[float], rate_hz: float) -> list[float]:
+    """A sigmoid and a second-order lag, with a wobble for noise; only to have curves that look right."""
+    per = round(rate_hz / PULSE_RATE_HZ)
+    period, damping, y, v, torque = 0.5284, 0.6369, 0.0, 0.0, []
+    seed = 12345
+    for width in widths:
+        level = 6.9 / (1 + math.exp(-(width - 150) / 25)) - 6.9 / (1 + math.exp(6))
+        for _ in range(per):
+            acceleration = (level - y - 2 * damping * period * v) / period**2
+            v += acceleration / rate_hz
+            y += v / rate_hz
+            noise = 0.0
+            for _ in range(4):
+                seed = (seed * 1103515245 + 12345) & 0x7FFFFFFF
+                noise += seed / 0x7FFFFFFF - 0.5
+            torque.append(y + 0.07 * noise)
+    return torque
+
+
+class FakeRig:
+    """Plays one test at a time; what it does wrong can be set."""
+
+    def __init__(self, path: Path, data: Path, speed: float = 12.0, rate_hz: float = 400.0) -> None:
+        self.path, self.data, self.speed, self.rate_hz = path, data, speed, rate_hz
+        self.state, self.reason = "ready", ""
+        self.plan: m.TestPlan | None = None
+        self.elapsed_s = self.duration_s = 0.0
+        self.segment: str | None = None
+        self.confirms_stop = True
+        self.mute = False
+        self.starts = 0
+        self.stopped_by: str | None = None
+        self._stop = asyncio.Event()
+        self._writers: set[asyncio.StreamWriter] = set()
+        self._play: asyncio.Task[None] | None = None
+        self._server: asyncio.Server | None = None
+
+    def status(self) -> m.Status:
+        return m.Status(
+            state=self.state, reason=self.reason, test_id=self.plan.test_id if self.plan else None,
+            participant=self.plan.participant if self.plan else None, segment=self.segment,
+            elapsed_s=self.elapsed_s, duration_s=self.duration_s,
+            stimulator={"device": "fake P24", "firmware": "1.0"}, load_cell={"device": "fake cell", "rate_hz": 400.0},
+            torque_age_s=0.004, torque_nm=0.01,
+        )  # fmt: skip
+
+    async def serve(self) -> None:
+        self.path.unlink(missing_ok=True)
+        self._server = await asyncio.start_unix_server(self._client, str(self.path), limit=2**25)
+
+    async def close(self) -> None:
+        if self._play:
+            self._play.cancel()
+        if self._server:
+            self._server.close()
+        for writer in list(self._writers):
+            writer.close()
+        self.path.unlink(missing_ok=True)
+
+    async def _client(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        with contextlib.suppress(ConnectionError, asyncio.CancelledError):
+            while line := await reader.readline():
+                if self.mute:
+                    continue
+                request = REQUESTS.validate_json(line)
+                reply = await self._answer(request, writer)
+                writer.write(reply.model_dump_json().encode() + b"\n")
+        self._writers.discard(writer)
+        writer.close()
+
+    async def _answer(self, request: Any, writer: asyncio.StreamWriter) -> m.Reply:
+        try:
+            body = await getattr(self, f"_on_{request.kind}")(request, writer)
+            return m.Reply(id=request.id, ok=True, body=body)
+        except m_refusal as error:
+            code, title, detail = error.args
+            return m.Reply(id=request.id, ok=False, problem=m.Problem(code=code, title=title, detail=detail))
+
+    async def _on_status(self, request: Any, writer: Any) -> dict[str, Any]:
+        return self.status().model_dump()
+
+    async def _on_subscribe(self, request: Any, writer: asyncio.StreamWriter) -> dict[str, Any]:
+        self._writers.add(writer)
+        return self.status().model_dump()
+
+    def _widths(self, plan: m.TestPlan) -> tuple[list[float], list[dict[str, Any]]]:
+        for segment in plan.segments or []:
+            if segment.sequence not in {"prbs", "ramp", "rest", "widths"}:
+                raise m_refusal(
+                    "bad-plan", "No such sequence", f"{segment.sequence!r}; there are prbs, ramp, rest, widths."
+                )
+        return default_widths()
+
+    async def _on_preview(self, request: Any, writer: Any) -> dict[str, Any]:
+        widths, segments = self._widths(request.plan)
+        charge = sum(widths) * request.plan.profile.current_ma / 1000
+        return m.Preview(
+            duration_s=len(widths) / PULSE_RATE_HZ, charge_uc=charge, torque_time_nms=None, pulse_width_us=widths,
+            segments=segments,
+        ).model_dump()  # fmt: skip
+
+    async def _on_start(self, request: Any, writer: Any) -> dict[str, Any]:
+        if self.state == "running":
+            raise m_refusal("busy", "A test is running", "Wait or stop it.")
+        if self.state != "ready":
+            raise m_refusal(self.state, "The rig stands still", f"{self.reason}. Re-arm it.")
+        self._widths(request.plan)
+        self.starts += 1
+        self.plan, self.state, self.reason = request.plan, "running", ""
+        self._stop.clear()
+        self._play = asyncio.create_task(self._run(request.plan))
+        return self.status().model_dump()
+
+    async def _on_stop(self, request: Any, writer: Any) -> dict[str, Any]:
+        self.stopped_by = request.by
+        self._stop.set()
+        if self.state != "running":
+            self.state, self.reason = "latched", f"stopped by {request.by}"
+            self._send(m.StateEvent(status=self.status()))
+        return m.StopEvidence(
+            confirmed=self.confirms_stop, detail="No pulse since the stop command." if self.confirms_stop else "No ack.",
+            last_pulse_age_s=0.06, device_state="stopped",
+        ).model_dump()  # fmt: skip
+
+    async def _on_rearm(self, request: Any, writer: Any) -> dict[str, Any]:
+        self.state, self.reason = "ready", ""
+        self._send(m.StateEvent(status=self.status()))
+        return self.status().model_dump()
+
+    def _send(self, event: Any) -> None:
+        line = event.model_dump_json().encode() + b"\n"
+        for writer in list(self._writers):
+            with contextlib.suppress(ConnectionError, RuntimeError):
+                writer.write(line)
+
+    async def _run(self, plan: m.TestPlan) -> None:
+        widths, segments = default_widths()
+        torque = muscle(widths, self.rate_hz)
+        self.duration_s = len(widths) / PULSE_RATE_HZ
+        self._send(m.StateEvent(status=self.status()))
+        began, sent = time.monotonic(), 0.0
+        while sent < self.duration_s and not self._stop.is_set():
+            await asyncio.sleep(FRAME_S)
+            until = min(self.duration_s, (time.monotonic() - began) * self.speed)
+            self._frame(plan, widths, torque, segments, sent, until)
+            sent = until
+        await self._end(plan, widths[: round(sent * PULSE_RATE_HZ)], torque[: round(sent * self.rate_hz)], segments)
+
+    def _frame(self, plan: m.TestPlan, widths: Any, torque: Any, segments: Any, start: float, end: float) -> None:
+        self.elapsed_s = end
+        self.segment = next((s["name"] for s in segments if s["start_s"] <= end < s["end_s"]), None)
+        bins = [start + (end - start) * k / 4 for k in range(5)]
+        pieces = [torque[round(a * self.rate_hz) : round(b * self.rate_hz)] or [0.0] for a, b in zip(bins, bins[1:])]  # noqa: B905, RUF007
+        first, last = round(start * PULSE_RATE_HZ), round(end * PULSE_RATE_HZ)
+        self._send(
+            m.LiveEvent(
+                test_id=plan.test_id, segment=self.segment, elapsed_s=end, duration_s=self.duration_s, time_s=bins[:-1],
+                torque_min_nm=[min(p) for p in pieces], torque_max_nm=[max(p) for p in pieces],
+                pulse_time_s=[k / PULSE_RATE_HZ for k in range(first, last)], pulse_width_us=widths[first:last],
+                torque_age_s=0.004, lost_samples=0, dropped_pulses=0,
+            )
+        )  # fmt: skip
+
+    async def _end(self, plan: m.TestPlan, widths: list[float], torque: list[float], segments: Any) -> None:
+        stopped = self._stop.is_set()
+        outcome = "stopped" if stopped else "completed"
+        self.reason = f"stopped by {self.stopped_by}" if stopped else ""
+        path, digest = write_recording(self.data, plan, widths, torque, segments, self.rate_hz, outcome)
+        self.state, self.segment = ("latched" if stopped else "ready"), None
+        self.plan = None
+        self._send(m.StateEvent(status=self.status()))
+        self._send(
+            m.FinishedEvent(
+                test_id=plan.test_id, outcome=outcome, reason=self.reason, recording_path=str(path),
+                recording_id=path.stem, file_sha256=digest, last_sample_unix_s=time.time(),
+                summary={
+                    "duration_s": len(widths) / PULSE_RATE_HZ, "samples": len(torque), "lost_samples": 0,
+                    "pulses": sum(1 for w in widths if w), "dropped_pulses": 0,
+                    "lateness_ms": {"median": 0.08, "p99": 0.12, "max": 0.3}, "charge_uc": sum(widths) * 20 / 1000,
+                    "alignment": {"method": "sync", "error_ms": 0.02}, "sample_rate_hz": self.rate_hz,
+                    "torque_peak_nm": max(torque, default=0.0), "cpu_percent": 3.0,
+                },
+            )
+        )  # fmt: skip
+
+
+class m_refusal(Exception):
+    """code, title, detail."""
+
+
+def write_recording(folder: Path, plan: m.TestPlan, widths: list[float], torque: list[float], segments: Any,
+                    rate_hz: float, outcome: str) -> tuple[Path, str]:  # fmt: skip
+    """A recording as docs/recording.md lays it out."""
+    import h5py
+    import numpy as np
+
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"R-{plan.test_id}.h5"
+    count, pulses = len(torque), len(widths)
+    time_s, due = np.arange(count) / rate_hz, np.arange(pulses) / PULSE_RATE_HZ
+    end = pulses / PULSE_RATE_HZ
+    kept = [s for s in segments if s["start_s"] < end]
+    sent = np.asarray(widths, float)
+    sets: dict[str, tuple[Any, str]] = {
+        "torque/time_s": (time_s, "s"), "torque/torque_nm": (np.asarray(torque, float), "N·m"),
+        "torque/counter": (np.arange(count, dtype="i8"), "1"), "torque/host_time_s": (time_s + 0.002, "s"),
+        "torque/sync": (np.zeros(count, "u1"), "1"), "torque/gaps": (np.zeros((0, 2), "i8"), "1"),
+        "pulses/planned_time_s": (due, "s"), "pulses/pulse_width_us": (sent, "µs"),
+        "pulses/sent_pulse_width_us": (sent, "µs"), "pulses/current_ma": (np.where(sent > 0, 20.0, 0.0), "mA"),
+        "pulses/written_time_s": (due, "s"), "pulses/acknowledged_time_s": (due + 0.001, "s"),
+        "pulses/status": (np.where(sent > 0, 0, 1).astype("u1"), "1"),
+        "segments/start_s": (np.array([s["start_s"] for s in kept]), "s"),
+        "segments/end_s": (np.array([min(s["end_s"], end) for s in kept]), "s"),
+    }  # fmt: skip
+    digest = hashlib.sha256(b"".join(np.ascontiguousarray(value).tobytes() for value, _ in sets.values()))
+    with h5py.File(path, "w") as file:
+        for name, (value, unit) in sets.items():
+            data = file.create_dataset(name, data=value)
+            data.attrs["unit"], data.attrs["description"] = unit, name
+        names = file.create_dataset("segments/name", data=[s["name"] for s in kept], dtype=h5py.string_dtype())
+        names.attrs["unit"], names.attrs["description"] = "1", "segments"
+        file.create_group("alignment").attrs.update(
+            {"method": "sync", "error_ms": 0.02, "delay_ms": 0.0, "rate_ppm": 0.0}
+        )
+        file.attrs.update(
+            {
+                "format": "stimrig-recording", "format_version": 1, "recording_id": path.stem, "test_id": plan.test_id,
+                "participant": plan.participant, "kind": plan.kind, "created_utc": "2026-01-01T00:00:00Z",
+                "outcome": outcome, "reason": "", "software": "fake rig", "configuration": "{}",
+                "pulse_rate_hz": PULSE_RATE_HZ, "sample_rate_hz": rate_hz, "sample_rate_measured_hz": rate_hz,
+                "current_ma": 20.0, "content_sha256": digest.hexdigest(),
+            }
+        )  # fmt: skip
+    return path, hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+class RigThread:
+    """A fake rig in a thread with a loop of its own."""
+
+    def __init__(self, path: Path, data: Path, **settings: Any) -> None:
+        self.path, self.data, self.settings = path, data, settings
+        self.rig: FakeRig
+
+    def __enter__(self) -> RigThread:
+        ready = threading.Event()
+        self.loop = asyncio.new_event_loop()
+
+        async def begin() -> None:
+            self.rig = FakeRig(self.path, self.data, **self.settings)
+            await self.rig.serve()
+            ready.set()
+
+        def run() -> None:
+            self.loop.create_task(begin())
+            self.loop.run_forever()
+
+        self.thread = threading.Thread(target=run, daemon=True)
+        self.thread.start()
+        assert ready.wait(5)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        asyncio.run_coroutine_threadsafe(self.rig.close(), self.loop).result(5)
+        self.loop.call_soon_threadsafe(self.loop.stop)
+        self.thread.join(5)
+
+
+def main() -> None:
+    """As a process."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--socket", type=Path, required=True)
+    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--speed", type=float, default=1.0)
+    options, _ = parser.parse_known_args()
+
+    async def serve() -> None:
+        rig = FakeRig(options.socket, options.data / "recordings", speed=options.speed)
+        await rig.serve()
+        print(json.dumps({"socket": str(options.socket)}), flush=True)
+        gone = asyncio.Event()
+        asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, gone.set)
+        await gone.wait()
+        await rig.close()
+
+    asyncio.run(serve())
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,185 @@
+"""A session through REST: participant, test, model, approval, the controller's fetch."""
+
+from __future__ import annotations
+
+import concurrent.futures
+import json
+import sqlite3
+import time
+
+import httpx
+import pytest
+from websockets.sync.client import connect
+
+from tests.api.conftest import TOKEN, Service, run_test, wait_done
+
+
+def test_whole_path_to_the_controller(client: httpx.Client, service: Service, participant: str) -> None:
+    started = client.post("/v1/tests", json={"participant": participant})
+    assert started.status_code == 202
+    assert started.headers["location"] == f"/v1/tests/{started.json()['id']}"
+    document = wait_done(client, started.json()["id"])
+    assert document["state"] == "completed"
+    assert document["summary"]["samples"] == 9600 + 400
+    assert document["summary"]["last_sample_to_model_s"] < 5
+    model_url = document["model_url"]
+    assert client.get(f"/v1/participants/{participant}/model").status_code == 404
+    approved = client.post(f"{model_url}/approve", json={"reason": "good fit"}).json()
+    assert approved["served"] and approved["decision"] == "approved"
+
+    controller = service.client(service.token("controller", "read-model"))
+    first = controller.get(f"/v1/participants/{participant}/model")
+    assert first.status_code == 200 and first.json()["model_id"] == document["model_id"]
+    again = controller.get(f"/v1/participants/{participant}/model", headers={"If-None-Match": first.headers["etag"]})
+    assert again.status_code == 304 and again.content == b"" and again.headers["etag"] == first.headers["etag"]
+    weak = controller.get(
+        f"/v1/participants/{participant}/model", headers={"If-None-Match": f'"x", W/{first.headers["etag"]}'}
+    )
+    assert weak.status_code == 304
+    other = controller.get(f"/v1/participants/{participant}/model", headers={"If-None-Match": '"other"'})
+    assert other.status_code == 200
+
+
+def test_newer_model_does_not_replace_the_approved_one_and_rejection_withdraws(
+    client: httpx.Client, participant: str
+) -> None:
+    first = run_test(client, participant)
+    client.post(f"{first['model_url']}/approve")
+    second = run_test(client, participant)
+    served = client.get(f"/v1/participants/{participant}/model").json()
+    assert served["model_id"] == first["model_id"] != second["model_id"]
+    versions = client.get(f"/v1/participants/{participant}/models").json()
+    assert [v["id"] for v in versions] == [second["model_id"], first["model_id"]]
+    client.post(f"{second['model_url']}/approve")
+    assert client.get(f"/v1/participants/{participant}/model").json()["model_id"] == second["model_id"]
+    client.post(f"{second['model_url']}/reject", json={"reason": "electrode slipped"})
+    assert client.get(f"/v1/participants/{participant}/model").json()["model_id"] == first["model_id"]
+
+
+def test_effect_makes_a_new_version_with_lineage(client: httpx.Client, participant: str) -> None:
+    parent = run_test(client, participant)["model_id"]
+    made = client.post(f"/v1/models/{parent}/effects", json={"effects": ["fatigue"]})
+    assert made.status_code == 201, made.text
+    child = made.json()
+    assert child["parent_id"] == parent and child["added_effect"] == "fatigue" and child["effects"] == ["fatigue"]
+    assert made.headers["location"] == f"/v1/models/{child['id']}"
+    twice = client.post(f"/v1/models/{child['id']}/effects", json={"effects": ["fatigue"]})
+    assert twice.status_code == 409
+    refused = client.post(f"/v1/models/{parent}/effects", json={"effects": ["bad"]})
+    assert refused.status_code == 422 and "no effect bad" in refused.json()["detail"]
+    assert client.get(f"/v1/models/{parent}").json()["effects"] == []
+
+
+def test_second_test_is_refused_naming_the_holder(client: httpx.Client, service: Service, participant: str) -> None:
+    service.rig.speed = 4.0
+    client.post("/v1/participants", json={"code": "P018"})
+    running = client.post("/v1/tests", json={"participant": participant}).json()
+    second = client.post("/v1/tests", json={"participant": "P018"})
+    assert second.status_code == 409
+    assert second.headers["content-type"] == "application/problem+json"
+    assert second.json()["holder"] == {"test_id": running["id"], "participant": participant, "by": "administrator"}
+    assert participant in second.json()["detail"]
+
+
+def test_fifty_starts_at_once_give_one_test(client: httpx.Client, service: Service, participant: str) -> None:
+    service.rig.speed = 6.0
+
+    def start(_: int) -> int:
+        with service.client() as mine:
+            return mine.post("/v1/tests", json={"participant": participant}).status_code
+
+    with concurrent.futures.ThreadPoolExecutor(16) as pool:
+        codes = list(pool.map(start, range(50)))
+    assert sorted(codes) == [202] + [409] * 49
+    assert service.rig.starts == 1
+
+
+def test_live_channel_tells_history_frames_and_the_end(
+    client: httpx.Client, service: Service, participant: str
+) -> None:
+    service.rig.speed = 15.0
+    test_id = client.post("/v1/tests", json={"participant": participant}).json()["id"]
+    time.sleep(0.4)
+    url = service.url.replace("http", "ws") + f"/v1/tests/{test_id}/live"
+    with connect(url, additional_headers={"Authorization": f"Bearer {TOKEN}"}) as socket:
+        messages = [json.loads(text) for text in socket]
+    assert messages[0]["type"] == "history" and len(messages[0]["time_s"]) > 4
+    frames = [message for message in messages if message["type"] == "live"]
+    assert len(frames) > 5
+    times = messages[0]["time_s"] + [t for frame in frames for t in frame["time_s"]]
+    assert times == sorted(times) and times[0] == 0.0
+    assert messages[-1]["type"] == "test" and messages[-1]["test"]["state"] == "completed"
+    states = [message["test"]["state"] for message in messages if message["type"] == "test"]
+    assert "identifying" in states
+
+
+def test_live_channel_wants_a_token(client: httpx.Client, service: Service, participant: str) -> None:
+    test_id = run_test(client, participant)["id"]
+    with connect(service.url.replace("http", "ws") + f"/v1/tests/{test_id}/live") as socket:
+        message = json.loads(socket.recv())
+    assert message["type"] == "problem" and message["problem"]["status"] == 401
+
+
+def test_recording_comes_back_byte_for_byte(client: httpx.Client, service: Service, participant: str) -> None:
+    document = run_test(client, participant)
+    answer = client.get(document["recording_url"])
+    path = service.data / "recordings" / f"{document['recording_id']}.h5"
+    assert answer.content == path.read_bytes()
+    path.unlink()
+    gone = client.get(document["recording_url"])
+    assert gone.status_code == 410 and gone.json()["title"] == "The recording's file is missing"
+
+
+def test_comparison_and_diagnosis_are_made_once_and_kept(
+    client: httpx.Client, service: Service, participant: str
+) -> None:
+    model = run_test(client, participant)["model_url"]
+    first = client.get(f"{model}/comparison").json()
+    done = service.app.state.context.fitting.done_count
+    assert client.get(f"{model}/comparison").json() == first
+    assert service.app.state.context.fitting.done_count == done
+    assert client.get(f"{model}/diagnosis").json()["verdict"] == "nothing_missing"
+
+
+def test_refused_plan_says_why_and_is_kept(client: httpx.Client, participant: str) -> None:
+    body = {"participant": participant, "segments": [{"name": "x", "sequence": "polka"}]}
+    answer = client.post("/v1/tests", json=body)
+    assert answer.status_code == 422 and "'polka'" in answer.json()["detail"]
+    assert client.get("/v1/rig").json()["holder"] is None
+    assert client.post("/v1/tests", json={"participant": participant}).status_code == 202
+
+
+def test_preview_plays_nothing(client: httpx.Client, service: Service, participant: str) -> None:
+    answer = client.post("/v1/preview", json={"participant": participant}).json()
+    assert answer["duration_s"] == 25.0 and len(answer["pulse_width_us"]) == 1000
+    assert service.rig.starts == 0
+
+
+def test_every_deed_is_in_the_audit_trail_and_the_chain_holds(
+    client: httpx.Client, service: Service, participant: str
+) -> None:
+    document = run_test(client, participant)
+    client.post(f"{document['model_url']}/approve", json={"reason": "looks right"})
+    trail = client.get("/v1/audit").json()
+    deeds = [(entry["who"], entry["action"], entry["subject"]) for entry in trail["entries"]]
+    assert trail["whole"]
+    assert ("administrator", "start test", document["id"]) in deeds
+    assert ("administrator", "approve", document["model_id"]) in deeds
+    with sqlite3.connect(service.data / "stimrig.db") as database:
+        database.execute("UPDATE audit SET who = 'nobody' WHERE seq = 3")
+    broken = client.get("/v1/audit").json()
+    assert not broken["whole"] and broken["first_broken"] == 3
+
+
+def test_database_is_durable(service: Service) -> None:
+    with service.app.state.context.store.engine.connect() as connection:
+        assert connection.exec_driver_sql("PRAGMA journal_mode").scalar() == "wal"
+        assert connection.exec_driver_sql("PRAGMA synchronous").scalar() == 2
+
+
+@pytest.mark.parametrize("path", ["/health", "/metrics"])
+def test_operation_needs_no_token_and_names_nobody(service: Service, participant: str, path: str) -> None:
+    with service.client(token=None) as stranger:
+        answer = stranger.get(path)
+    assert answer.status_code == 200
+    assert participant not in answer.text
