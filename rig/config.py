@@ -113,7 +113,8 @@ def for_emulator(ready: str, **overrides: Any) -> RigConfig:
     try:
         text = ready if ready.lstrip().startswith("{") else Path(ready).read_text("utf-8")
         line = json.loads(text)
-        stimulator, can = line["stimulator"], line["can"]
+        # the link, like udev's names by id, outlives a replugging
+        stimulator, can = line.get("stimulator_link", line["stimulator"]), line["can"]
     except OSError as error:
         raise ConfigError(f"--emulator-json {ready}: {error.strerror}") from None
     except (ValueError, KeyError, TypeError) as error:
@@ -121,7 +122,12 @@ def for_emulator(ready: str, **overrides: Any) -> RigConfig:
     content: dict[str, Any] = {
         "clock_speed": line.get("speed", 1.0),
         "stimulator": {"device": "p24", "port": stimulator},
-        "load_cell": {"device": "can_load_cell", "bus": can},
+        "load_cell": {
+            "device": "can_load_cell",
+            "bus": can,
+            "sample_rate_hz": line.get("sample_rate_hz", 1600.0),
+            "sync": "Sync" if line.get("sync", True) else "",
+        },
     }
     return check(content, "--emulator-json", **overrides)
 

@@ -141,9 +141,7 @@ class Bench:
         self._socket_folder = tempfile.TemporaryDirectory(prefix="rig-")
         self.socket = Path(self._socket_folder.name) / "rig.sock"
         self.data = folder / "data"
-        self.emulator = Process(
-            "hardware_sim", "--speed", f"{speed:g}", *emulator_options, log=folder / "emulator.log"
-        )
+        self.emulator = Process("hardware_sim", "--speed", f"{speed:g}", *emulator_options, log=folder / "emulator.log")
         self.rig: Process | None = None
         self._clients: list[RigClient] = []
 

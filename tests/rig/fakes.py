@@ -1,0 +1,184 @@
+"""A stimulator and a load cell that live on a virtual clock, in one thread: for tests of gate, receiver and run."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rig import limits, plan
+from rig.acquire.halt import Halt
+from rig.acquire.receiver import Receiver
+from rig.acquire.run import RunResult, TestRun
+from rig.clock import VirtualClock
+from rig.errors import DeviceError
+from rig.gate import Gate
+from rig.journal import Journal, Kind
+from rig.limits import Admitted
+from rig.messages import Profile, SegmentPlan, TestPlan
+from rig.signals import SAMPLE, Ack, TorqueBlock
+
+RATE_HZ = 1600.0
+
+
+class FakeStimulator:
+    """Acknowledges each pulse `ack_delay_s` later; its faults are plain attributes."""
+
+    def __init__(self, clock: VirtualClock) -> None:
+        self.clock = clock
+        self.sent: list[tuple[float, Admitted]] = []
+        self.armed = False
+        self.stops = 0
+        self.ack_delay_s: float | None = 0.001
+        self.error: str | None = None
+        self.send_error: str | None = None
+        self.silent = False
+        self.on_send: Callable[[int], None] = lambda _: None
+        self._number = 0
+
+    def listen(self, on_ack: Callable[[Ack], None], on_lost: Callable[[str], None]) -> None:
+        self.on_ack, self.on_lost = on_ack, on_lost
+
+    def open(self) -> dict[str, Any]:
+        return {"device": "fake"}
+
+    def arm(self) -> None:
+        self._answer()
+        self.armed = True
+
+    def send(self, pulse: Admitted) -> int:
+        if self.send_error:
+            raise DeviceError(self.send_error)
+        assert self.armed
+        self._number = (self._number + 1) % 64
+        number, error = self._number, self.error
+        self.sent.append((self.clock.now_s(), pulse))
+        self.on_send(len(self.sent))
+        if self.ack_delay_s is not None:
+            at = self.clock.now_s() + self.ack_delay_s
+            self.clock.call_at(at, lambda: self.on_ack(Ack(number, self.clock.now_s(), error)))
+        return number
+
+    def stop(self) -> None:
+        self.stops += 1
+        self._answer()
+        self.armed = False
+
+    def state(self) -> tuple[bool, str]:
+        self._answer()
+        return not self.armed, "armed" if self.armed else "not initialised"
+
+    def close(self) -> None:
+        self.armed = False
+
+    def _answer(self) -> None:
+        if self.silent:
+            raise DeviceError("stimulator fake: no answer")
+
+
+class FakeCell:
+    """Blocks of ten samples with a 16-bit counter, delivered by the clock; torque follows the pulses slowly."""
+
+    sample_rate_hz = RATE_HZ
+    counter_modulus = 65536
+
+    def __init__(self, clock: VirtualClock, stimulator: FakeStimulator) -> None:
+        self.clock = clock
+        self.stimulator = stimulator
+        self.silent = False
+        self.nan = False
+        self.add_nm = 0.0
+        self.skip = 0
+        self.counter = 65000
+        self.torque_nm = 0.0
+        self._seen = 0
+
+    def open(self) -> dict[str, Any]:
+        return {"device": "fake"}
+
+    def read(self, timeout_s: float) -> TorqueBlock:
+        raise NotImplementedError
+
+    def close(self) -> None:
+        self.silent = True
+
+    def feed(self, receiver: Receiver, until_s: float, per_block: int = 10) -> None:
+        """Schedule blocks for the receiver until a time."""
+        period_s = per_block / RATE_HZ
+        first_s = self.clock.now_s()
+        for i in range(1, math.ceil((until_s - first_s) / period_s)):
+            self.clock.call_at(first_s + i * period_s, lambda: self._block(receiver, per_block))
+
+    def _block(self, receiver: Receiver, n: int) -> None:
+        self.counter += n + self.skip
+        self.skip = 0
+        if self.silent:
+            return
+        now_s = self.clock.now_s()
+        recent = [p for t, p in self.stimulator.sent[-3:] if now_s - t < 0.03]
+        target_nm = 0.02 * recent[-1].pulse_width_us if recent else 0.0
+        self.torque_nm += (target_nm - self.torque_nm) * (n / RATE_HZ) / 0.1
+        block = np.zeros(n, SAMPLE)
+        block["host_time_s"] = now_s
+        block["stamp_s"] = np.nan
+        block["torque_nm"] = np.nan if self.nan else self.torque_nm + self.add_nm
+        block["counter"] = (self.counter + np.arange(n)) % 65536
+        block["sync"][0] = len(self.stimulator.sent) > self._seen
+        self._seen = len(self.stimulator.sent)
+        receiver.take(TorqueBlock(block))
+
+
+class VirtualRig:
+    """Gate, receiver and run on fakes and a virtual clock."""
+
+    def __init__(self, folder: Path, segments: list[SegmentPlan] | None = None, **profile: float) -> None:
+        self.clock = VirtualClock()
+        self.stimulator = FakeStimulator(self.clock)
+        self.cell = FakeCell(self.clock, self.stimulator)
+        self.halt = Halt(self.clock)
+        self.gate = Gate(self.stimulator, self.clock, lambda reason: void(self.halt.set("fault", reason)))
+        self.receiver = Receiver(self.cell, self.clock, lambda reason: void(self.halt.set("fault", reason)))
+        segments = segments or [
+            SegmentPlan(name="rest", sequence="rest", settings={"duration_s": 0.5}),
+            SegmentPlan(name="ramp", sequence="ramp", settings={"up_s": 1.0, "down_s": 1.0}),
+            SegmentPlan(name="rest", sequence="rest", settings={"duration_s": 0.5}),
+        ]
+        self.plan = TestPlan(test_id="t", participant="P", profile=Profile(**profile), segments=segments)
+        self.table = limits.for_profile(limits.HARD_LIMITS, self.plan.profile)
+        self.test = plan.build(self.plan, self.table)
+        self.path = folder / "t.journal"
+        self.journal = Journal(self.path)
+        self.journal.append_json(Kind.HEADER, header(self.test, self.clock))
+        self.journal.append(Kind.PLAN, self.test.pulse_width_us.astype("<f8").tobytes())
+        self.run = TestRun(self.test, self.table, self.journal, self.gate, self.receiver, self.clock, self.halt)
+
+    def at(self, time_s: float, action: Callable[[], object]) -> None:
+        """Do something at a time on the test's clock (its start is about 0.1 s after arming)."""
+        self.clock.call_at(self.clock.now_s() + 0.106 + time_s, lambda: void(action()))
+
+    def execute(self) -> RunResult:
+        """Play the test."""
+        self.cell.feed(self.receiver, self.clock.now_s() + self.test.duration_s + 8)
+        return self.run.execute()
+
+
+def header(test: plan.PlannedTest, clock: VirtualClock) -> dict[str, Any]:
+    """A journal's header as the rig writes it."""
+    return {
+        "recording_id": "0" * 32,
+        "plan": test.plan.model_dump(mode="json"),
+        "segments": [{"name": s.name, "start": s.start, "end": s.end} for s in test.segments],
+        "current_ma": test.plan.profile.current_ma,
+        "sample_rate_hz": RATE_HZ,
+        "software": "stimrig test",
+        "configuration": {},
+        "time_s": clock.now_s(),
+        "unix_s": clock.unix_s(),
+    }
+
+
+def void(_: object) -> None:
+    """Throw a value away."""
