@@ -33,7 +33,8 @@ class LoadCell:
     """Takes the muscle along as time goes by, and turns its torque into frames.
 
     `torque_hooks` and `frame_hooks` are where faults enter: a torque hook changes a reading, a frame hook gives
-    the frames that are sent in place of one.
+    the frames that are sent in place of one. A muscle may bring the last stage of its cell along, a method
+    `converted_nm(reading_nm)` that comes after noise and offset (a converter that clips).
     """
 
     def __init__(
@@ -53,6 +54,9 @@ class LoadCell:
         self.samples = 0
         self.torque_nm = 0.0
         self._muscle, self._cell, self._noise = muscle, cell, noise
+        converted_nm: TorqueHook | None = getattr(muscle, "converted_nm", None)
+        if converted_nm is not None:
+            self.torque_hooks.append(converted_nm)
         self._offset_nm, self._has_sync = offset_nm, has_sync
         self._nominal_hz = rate_hz
         self._clock_rate = 1.0 + clock_ppm * 1e-6

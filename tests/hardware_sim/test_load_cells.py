@@ -1,0 +1,262 @@
+"""Samples, frames and both transports; python-can is the oracle on the wire."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import os
+import socket
+import struct
+import threading
+import time
+
+import can
+import numpy as np
+import pytest
+
+from hardware_sim.load_cells.cells import canopen, counts, plain
+from hardware_sim.load_cells.frames import Frame, Sample
+from hardware_sim.load_cells.sampler import LoadCell, Noise
+from hardware_sim.load_cells.transports import slcan, socketcand
+from hardware_sim.pseudo_terminal import PseudoTerminal
+from hardware_sim.reactor import Reactor
+from tests.hardware_sim.emulated import emulated
+
+LAYOUT = struct.Struct("<fHBB")
+
+
+class Ramp:
+    """Torque equals time."""
+
+    def pulse(self, time_s: float, width_us: float, current_ma: float) -> None:
+        raise AssertionError((time_s, width_us, current_ma))
+
+    def torque_nm(self, time_s: float) -> float:
+        return time_s
+
+
+def cell(noise_nm: float = 0.0, seed: int = 0, **settings) -> LoadCell:
+    return LoadCell(Ramp(), plain.Cell(), Noise(noise_nm, seed), 1600.0, **settings)
+
+
+def decoded(frames: list[Frame]) -> list[tuple[float, int, int]]:
+    return [LAYOUT.unpack(frame.data)[:3] for frame in frames]
+
+
+class TestSampler:
+    def test_times_are_exact_multiples_of_the_period_however_it_is_called(self) -> None:
+        made = cell()
+        for until_s in np.cumsum(np.random.default_rng(0).uniform(0, 0.01, 300)):
+            made.produce(until_s)
+        frames = made.take_frames()
+        assert [f.time_us for f in frames] == [625 * n for n in range(len(frames))]
+        assert [torque for torque, *_ in decoded(frames)] == [np.float32(n / 1600) for n in range(len(frames))]
+
+    def test_counter_wraps(self) -> None:
+        made = cell()
+        made.counter = 65534
+        made.produce(3.5 / 1600)
+        assert [counter for _, counter, _ in decoded(made.take_frames())] == [65534, 65535, 0, 1]
+
+    @pytest.mark.parametrize(("pulse_s", "first"), [(0.0, 0), (1.2 / 1600, 2), (2 / 1600, 2), (2.01 / 1600, 3)])
+    def test_sync_is_in_the_first_sample_at_or_after_the_pulse(self, pulse_s: float, first: int) -> None:
+        made = cell()
+        made.produce(pulse_s)
+        made.raise_sync()
+        made.produce(6 / 1600)
+        assert [n for n, (_, _, status) in enumerate(decoded(made.take_frames())) if status & 1] == [first]
+
+    def test_no_sync_line(self) -> None:
+        made = cell(has_sync=False)
+        made.raise_sync()
+        made.produce(0.01)
+        assert not any(status for _, _, status in decoded(made.take_frames()))
+
+    def test_drift_offset_and_noise(self) -> None:
+        made = cell(noise_nm=0.1, seed=5, offset_nm=2.0, clock_ppm=200.0)
+        made.produce(10.0)
+        frames = made.take_frames()
+        assert len(frames) == pytest.approx(16003, abs=1)
+        assert frames[1600].time_us == pytest.approx(1_000_000, abs=1)  # its own clock does not know
+        noise = np.array([t for t, *_ in decoded(frames)]) - np.arange(len(frames)) / 1600.32 - 2.0
+        assert noise.mean() == pytest.approx(0.0, abs=0.004)
+        assert noise.std() == pytest.approx(0.1, rel=0.03)
+        assert abs(np.corrcoef(noise[1:], noise[:-1])[0, 1]) < 0.03
+
+    def test_the_same_seed_gives_the_same_record(self) -> None:
+        records = []
+        for seed in (7, 7, 8):
+            made = cell(noise_nm=0.1, seed=seed)
+            made.produce(1.0)
+            records.append(made.take_frames())
+        assert records[0] == records[1] != records[2]
+
+    def test_rate_factor_changes_from_the_next_sample_on(self) -> None:
+        made = cell()
+        made.produce(1.0)
+        made.set_rate_factor(1.05)
+        made.produce(2.0)
+        assert made.samples == pytest.approx(1600 + 1680, abs=1)
+
+
+class TestCells:
+    def test_counts_have_stops(self) -> None:
+        frames = [counts.Cell().encode([Sample(t, 0, True, 0)]) for t in (0.0, 50.0, -60.0, 60.0, math.nan)]
+        assert [int.from_bytes(f.data, "big") for f in frames] == [32768, 65535, 0, 65535, 0]
+
+    def test_canopen_sends_between_start_and_stop(self) -> None:
+        made = canopen.Cell()
+        assert not made.running()
+        for message, running in ((b"\x01\x02", False), (b"\x01\x01", True), (b"\x80\x00", False), (b"\x01\x00", True)):
+            made.received(0, message)
+            assert made.running() is running
+
+
+def listen(bus: can.BusABC, seconds: float) -> list[can.Message]:
+    messages, end_s = [], time.monotonic() + seconds
+    while time.monotonic() < end_s:
+        message = bus.recv(0.5)
+        if message is not None:
+            messages.append(message)
+    return messages
+
+
+@pytest.mark.wire
+@pytest.mark.parametrize("transport", ["socketcand", "slcan"])
+def test_python_can_loses_no_frame(transport: str) -> None:
+    with emulated("--load-cell", transport) as rig, can.Bus(**rig.ready["can"]) as bus:
+        messages = listen(bus, 2.5)
+    counters = [LAYOUT.unpack(message.data)[1] for message in messages]
+    assert {(later - earlier) & 0xFFFF for earlier, later in itertools.pairwise(counters)} == {1}
+    assert len(messages) > 2.2 * 1600
+    assert {(m.arbitration_id, m.dlc, m.is_extended_id) for m in messages} == {(0x181, 8, False)}
+    if transport == "socketcand":
+        steps_s = np.diff([message.timestamp for message in messages])
+        assert steps_s == pytest.approx(np.full(steps_s.size, 1 / 1600), abs=2e-6)
+
+
+@pytest.mark.wire
+@pytest.mark.parametrize("transport", ["socketcand", "slcan"])
+def test_a_canopen_cell_is_started_and_stopped_over_the_bus(transport: str) -> None:
+    with emulated("--load-cell", transport, "--cell", "canopen") as rig, can.Bus(**rig.ready["can"]) as bus:
+        assert bus.recv(0.3) is None
+        bus.send(can.Message(arbitration_id=0, data=[1, 0], is_extended_id=False))
+        assert len(listen(bus, 0.5)) > 600
+        bus.send(can.Message(arbitration_id=0, data=[2, 0], is_extended_id=False))
+        listen(bus, 0.3)
+        assert bus.recv(0.3) is None
+
+
+@pytest.mark.wire
+def test_clients_come_and_go_and_a_deaf_one_harms_nobody() -> None:
+    with emulated("--speed", "20") as rig:
+        where = rig.ready["can"]
+        deaf = socket.create_connection((where["host"], where["port"]))
+        for expected, reply in ((b"< hi >", b"< open can0 >"), (b"< ok >", b"< rawmode >"), (b"< ok >", b"")):
+            assert deaf.recv(64) == expected
+            deaf.sendall(reply)
+        for _ in range(2):
+            with can.Bus(**where) as bus:
+                assert len(listen(bus, 0.5)) > 0.3 * 32000
+        assert rig.ask(cmd="state")["ok"]
+        deaf.close()
+
+
+class Turning:
+    """A reactor turned by a thread of its own, for a transport alone."""
+
+    def __init__(self) -> None:
+        self.reactor = Reactor()
+        self.received: list[tuple[int, bytes]] = []
+        self._running = True
+        self._thread = threading.Thread(target=self._turn)
+        self._thread.start()
+
+    def _turn(self) -> None:
+        while self._running:
+            self.reactor.poll(0.01)
+
+    def take(self, can_id: int, data: bytes) -> None:
+        self.received.append((can_id, data))
+
+    def stop(self) -> None:
+        self._running = False
+        self._thread.join()
+
+
+@pytest.fixture
+def turning():
+    made = Turning()
+    yield made
+    made.stop()
+
+
+def test_socketcand_handshake_is_quiet_and_bad_input_is_answered(turning: Turning) -> None:
+    server = socketcand.Transport(turning.reactor, turning.take)
+    client = socket.create_connection((server.can["host"], server.can["port"]), timeout=2)
+
+    def ask(text: bytes) -> bytes:
+        client.sendall(text)
+        return client.recv(256)
+
+    assert client.recv(256) == b"< hi >"
+    assert ask(b"< rawmode >") == b"< error unknown command >"
+    assert ask(b"< open can7 >") == b"< error could not open bus >"
+    assert ask(b"< open can0 >") == b"< ok >"
+    assert ask(b"< rawmode >") == b"< ok >"
+    server.send([Frame(0x181, b"\x01", 1_000_001)])
+    client.settimeout(0.02)
+    with pytest.raises(TimeoutError):
+        client.recv(256)
+    client.settimeout(2)
+    time.sleep(socketcand.QUIET_S)
+    server.send(
+        [Frame(0x181, b"\x01\xab", 1_000_001), Frame(0x18FF0001, b"", 0), Frame(0x20000040, b"", 5, error=True)]
+    )
+    assert client.recv(256) == (b"< frame 181 1.000001 01AB >< frame 18FF0001 0.000000  >< error 20000040 0.000005 >")
+    assert ask(b"< send 181 2 a ff >< send 181 3 a ff >") == b"< error unknown command >"
+    assert turning.received == [(0x181, b"\x0a\xff")]
+    client.close()
+    server.close()
+
+
+def test_slcan_commands(turning: Turning) -> None:
+    adapter = slcan.Transport(turning.reactor, turning.take)
+    port = os.open(adapter.can["channel"], os.O_RDWR | os.O_NOCTTY)
+
+    def ask(text: bytes) -> bytes:
+        os.write(port, text)
+        time.sleep(0.05)
+        return os.read(port, 256)
+
+    adapter.send([Frame(0x181, b"\x01", 0)])  # closed: nothing is sent
+    assert [ask(line + b"\r") for line in (b"C", b"S6", b"", b"O", b"O", b"q")] == [b"\r"] * 5 + [b"\a"]
+    adapter.send([Frame(0x181, b"\x01\xab", 0), Frame(0x181, b"", 0, error=True), Frame(0x18FF0001, b"", 0)])
+    assert os.read(port, 256) == b"t181201AB\rT18FF00010\r"
+    assert ask(b"t00020100\r") == b"z\r"
+    assert ask(b"t0003010\r") == b"\a"
+    assert turning.received == [(0, b"\x01\x00")]
+    os.close(port)
+    adapter.close()
+
+
+def test_a_pseudo_terminal_that_nobody_reads_never_blocks() -> None:
+    port = PseudoTerminal(fifo_bytes=10_000)
+    started_s = time.monotonic()
+    for n in range(20_000):
+        port.write(b"%06d\n" % n)
+    assert time.monotonic() - started_s < 5
+    assert port.dropped_messages > 10_000
+    reader = os.open(port.path, os.O_RDONLY | os.O_NOCTTY | os.O_NONBLOCK)
+    text = b""
+    for _ in range(100):
+        port.flush()
+        try:
+            text += os.read(reader, 65536)
+        except BlockingIOError:
+            break
+    lines = text.splitlines()
+    assert lines == [b"%06d" % n for n in range(len(lines))]  # whole messages, in order
+    os.close(reader)
+    port.close()
+    port.write(b"x")

@@ -1,0 +1,246 @@
+"""The P24's firmware on a virtual clock."""
+
+from __future__ import annotations
+
+import pytest
+
+from hardware_sim.stimulators.sciencemode4 import Packet
+from tests.hardware_sim.bench_board import (
+    LL_CONFIG,
+    LL_INIT,
+    LL_STOP,
+    ML_DATA,
+    ML_INIT,
+    ML_STOP,
+    ML_UPDATE,
+    Bench,
+    biphasic,
+    config,
+    points,
+)
+
+OK, PARAMETER, NOT_INITIALISED, HIGH_VOLTAGE, ELECTRODE = 0, 2, 7, 8, 10
+STATUS = 62
+
+
+@pytest.fixture
+def bench() -> Bench:
+    return Bench()
+
+
+@pytest.fixture
+def ready(bench: Bench) -> Bench:
+    assert bench.ask(LL_INIT, b"\x00").data == bytes((OK,))
+    return bench
+
+
+def update(*shape: tuple[int, float], period_ms: float = 25, ramp: int = 0, mask: int = 1) -> bytes:
+    head = bytes((len(shape) - 1 << 4 | ramp,)) + (round(2 * period_ms) << 1).to_bytes(2, "big")
+    return bytes((mask,)) + (head + points(*shape)) * mask.bit_count()
+
+
+def test_init_takes_40_ms_and_turns_the_source_on(bench: Bench) -> None:
+    bench.send(4, LL_INIT, b"\x00")
+    bench.run(0.039)
+    assert bench.sent == []
+    bench.run(0.002)
+    assert bench.sent == [(pytest.approx(0.040), Packet(4, 1, b"\x00"))]
+    assert bench.ask(STATUS).data == bytes((OK, 1, 6))
+
+
+def test_a_pulse_reaches_the_muscle_at_receipt_and_is_acked_when_it_has_ended(ready: Bench) -> None:
+    now_s = ready.timeline.now_s
+    ack = ready.ask(LL_CONFIG, config(*biphasic(250, 20.5)), number=33)
+    assert ack == Packet(33, 3, bytes((OK, 0, 0)))
+    assert ready.muscle.pulses == [(now_s, 250.0, 20.5)]
+    assert ready.syncs == [now_s]
+    assert ready.sent[-1][0] == pytest.approx(now_s + 600e-6)
+    assert ready.electrodes.unbalanced_pulses == 0
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [
+        [(250, 20.0)],
+        [(250, 20.0), (100, 0.0), (249, -20.0)],
+        [(250, 20.0), (100, 0.0), (250, -19.5)],
+        [(250, -20.0)],
+    ],
+)
+def test_an_unbalanced_shape_is_counted(ready: Bench, shape: list[tuple[int, float]]) -> None:
+    ready.ask(LL_CONFIG, config(*shape))
+    assert ready.electrodes.unbalanced_pulses == 1
+    assert ready.muscle.pulses[0][1:] == (250.0, 20.0)
+
+
+def test_not_initialised_before_init_and_after_stop(bench: Bench) -> None:
+    assert bench.ask(LL_CONFIG, config(*biphasic(250, 20))).data[0] == NOT_INITIALISED
+    assert bench.ask(LL_STOP).data == bytes((NOT_INITIALISED,))
+    bench.ask(LL_INIT, b"\x00")
+    assert bench.ask(LL_STOP).data == bytes((OK,))
+    assert bench.ask(LL_CONFIG, config(*biphasic(250, 20))).data[0] == NOT_INITIALISED
+    assert bench.ask(STATUS).data == bytes((OK, 0, 0))
+    assert bench.muscle.pulses == []
+
+
+def test_a_pulse_behind_a_stop_is_not_fired(ready: Bench) -> None:
+    ready.send(1, LL_STOP)
+    ready.send(2, LL_CONFIG, config(*biphasic(250, 20)))
+    ready.run(0.1)
+    assert [(p.number, p.data[0]) for _, p in ready.sent[-2:]] == [(1, OK), (2, NOT_INITIALISED)]
+    assert ready.muscle.pulses == []
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        config(*biphasic(250, 130.5)),
+        config(*biphasic(0, 20), (0, 0.0))[:1] + points(*biphasic(250, 20))[:-1],
+        config(*biphasic(250, 20)) + b"\x00",
+        config((0, 20.0)),
+    ],
+)
+def test_parameters_out_of_range_are_refused(ready: Bench, data: bytes) -> None:
+    assert ready.ask(LL_CONFIG, data).data[0] == PARAMETER
+    assert ready.muscle.pulses == []
+
+
+def test_limits_are_inclusive(ready: Bench) -> None:
+    assert ready.ask(LL_CONFIG, config(*biphasic(4095, 130))).data[0] == OK
+    assert ready.muscle.pulses[0][1:] == (4095.0, 130.0)
+
+
+def test_config_without_execute_fires_nothing(ready: Bench) -> None:
+    assert ready.ask(LL_CONFIG, config(*biphasic(250, 20), execute=False)).data[0] == OK
+    assert ready.electrodes.log == []
+
+
+def test_an_open_electrode_is_seen_from_15_ma_and_nothing_flows(ready: Bench) -> None:
+    ready.electrodes.attached = False
+    assert ready.ask(LL_CONFIG, config(*biphasic(250, 15))).data[0] == ELECTRODE
+    assert ready.ask(LL_CONFIG, config(*biphasic(250, 14.5))).data[0] == OK
+    assert (ready.muscle.pulses, ready.syncs, len(ready.electrodes.log)) == ([], [], 2)
+
+
+def test_the_muscle_hangs_on_one_output(ready: Bench) -> None:
+    assert ready.ask(LL_CONFIG, config(*biphasic(250, 20), channel=2, connector=1)).data == bytes((ELECTRODE, 0x12, 0))
+
+
+def test_high_voltage_off_or_broken(bench: Bench) -> None:
+    assert bench.ask(LL_INIT, bytes((1 << 1,))).data[0] == OK
+    assert bench.ask(STATUS).data == bytes((OK, 1, 0))
+    assert bench.ask(LL_CONFIG, config(*biphasic(250, 20))).data[0] == HIGH_VOLTAGE
+    bench.board.high_voltage_works = False
+    assert bench.ask(LL_INIT, b"\x00").data[0] == HIGH_VOLTAGE
+    assert bench.muscle.pulses == []
+
+
+@pytest.mark.parametrize("data", [b"", b"\x00\x00", b"\x80", b"\x01", b"\x0e", b"\x40"])
+def test_init_refuses_what_it_does_not_know(bench: Bench, data: bytes) -> None:
+    assert bench.ask(LL_INIT, data).data == bytes((PARAMETER,))
+
+
+def test_unknown_command_and_corrupt_frame(bench: Bench) -> None:
+    assert bench.ask(999, number=5) == Packet(5, 67, b"\x0b")
+    bench.firmware.received(bytes.fromhex("f081558158811681371000000f"))  # one bit of the CRC differs
+    assert bench.sent[-1][1] == Packet(0, 66, b"\x01")
+    assert bench.firmware.state()["corrupt_frames"] == 1
+
+
+def test_reset_forgets_everything(ready: Bench) -> None:
+    assert ready.ask(58, wait_s=0.3).data == bytes((OK,))
+    assert ready.ask(STATUS).data == bytes((OK, 0, 0))
+    ready.send(1, LL_INIT, b"\x00")
+    ready.firmware.reset()
+    ready.run(0.1)
+    assert ready.firmware.state()["mode"] == "none"
+
+
+def test_silence_after_a_low_level_pulse_means_no_more_pulses(ready: Bench) -> None:
+    ready.ask(LL_CONFIG, config(*biphasic(250, 20)))
+    ready.run(60)
+    assert len(ready.muscle.pulses) == 1
+
+
+class TestMidLevel:
+    @pytest.fixture
+    def running(self, bench: Bench) -> Bench:
+        assert bench.ask(ML_INIT, b"\x00").data == bytes((OK,))
+        assert bench.ask(ML_UPDATE, update(*biphasic(250, 20)), wait_s=0).data == bytes((OK,))
+        return bench
+
+    def test_repeats_on_its_own_grid(self, running: Bench) -> None:
+        start_s = running.timeline.now_s
+        running.run(1.01)
+        expected = [start_s + 0.025 * k for k in range(41)]
+        assert [p[0] for p in running.muscle.pulses] == pytest.approx(expected)
+        assert running.firmware.level == 3
+
+    def test_keep_alive_holds_it_and_silence_stops_it_within_2_s(self, running: Bench) -> None:
+        for _ in range(4):
+            running.run(1.9)
+            ack = running.ask(ML_DATA, b"\x04", wait_s=0)
+            assert ack.data == bytes((OK, 4, 1, 0, 0, 0, 0))
+        alive_s = running.timeline.now_s
+        running.run(10.0)
+        assert alive_s + 1.97 < running.muscle.pulses[-1][0] <= alive_s + 2.0
+        assert running.ask(ML_DATA, b"\x04").data == bytes((OK, 4, 0, 0, 0, 0, 0))
+        assert running.firmware.level == 2
+
+    def test_update_is_no_sign_of_life(self, running: Bench) -> None:
+        start_s = running.muscle.pulses[0][0]
+        for _ in range(4):
+            running.run(0.45)
+            running.send(1, ML_UPDATE, update(*biphasic(100, 20)))
+        running.run(1.0)
+        assert start_s + 1.97 < running.muscle.pulses[-1][0] <= start_s + 2.0
+
+    def test_update_changes_a_running_channel_on_its_grid(self, running: Bench) -> None:
+        running.run(0.030)
+        running.send(1, ML_UPDATE, update(*biphasic(100, 10)))
+        running.run(0.050)
+        first_s = running.muscle.pulses[0][0]
+        assert [w for _, w, _ in running.muscle.pulses] == [250, 250, 100, 100]
+        assert running.muscle.pulses[-1][0] == pytest.approx(first_s + 0.075)
+
+    def test_stop_and_empty_mask(self, running: Bench) -> None:
+        running.send(1, ML_UPDATE, b"\x00")
+        fired = len(running.muscle.pulses)
+        running.run(1.0)
+        assert len(running.muscle.pulses) == fired
+        assert running.ask(ML_STOP).data == bytes((OK,))
+        assert running.ask(ML_UPDATE, update(*biphasic(250, 20))).data == bytes((NOT_INITIALISED,))
+
+    def test_ramp_reaches_the_full_current(self, bench: Bench) -> None:
+        bench.ask(ML_INIT, b"\x00")
+        bench.ask(ML_UPDATE, update(*biphasic(250, 20), ramp=3), wait_s=0.13)
+        assert [i for _, _, i in bench.muscle.pulses][:5] == [5, 10, 15, 20, 20]
+
+    @pytest.mark.parametrize("stop_on_error", [0, 1])
+    def test_electrode_error(self, bench: Bench, stop_on_error: int) -> None:
+        bench.ask(ML_INIT, bytes((stop_on_error,)))
+        bench.send(1, ML_UPDATE, update(*biphasic(250, 20)))
+        bench.run(0.1)
+        bench.electrodes.attached = False
+        bench.run(0.1)
+        delivered = len(bench.muscle.pulses)
+        assert bench.ask(ML_DATA, b"\x04").data == bytes((ELECTRODE, 4, 0, 1, 0, 0, 0))
+        bench.electrodes.attached = True
+        bench.run(0.2)
+        assert len(bench.muscle.pulses) == delivered
+
+    @pytest.mark.parametrize(
+        "data",
+        [b"", update(*biphasic(250, 20))[:-1], update(*biphasic(250, 131)), update(*biphasic(250, 20), period_ms=0)],
+    )
+    def test_bad_updates_are_refused(self, bench: Bench, data: bytes) -> None:
+        bench.ask(ML_INIT, b"\x00")
+        assert bench.ask(ML_UPDATE, data).data == bytes((PARAMETER,))
+        assert bench.muscle.pulses == []
+
+    def test_low_level_init_ends_mid_level(self, running: Bench) -> None:
+        running.ask(LL_INIT, b"\x00")
+        fired = len(running.muscle.pulses)
+        running.run(0.5)
+        assert len(running.muscle.pulses) == fired

@@ -1,0 +1,230 @@
+"""The muscles against closed forms and independent integration, and offline records."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.signal import lsim
+
+from hardware_sim.errors import PatientError
+from hardware_sim.patients import registry
+from hardware_sim.patients.calcium import CalciumMuscle
+from hardware_sim.patients.paper import PaperMuscle
+from hardware_sim.patients.paper import Parameters as PaperParameters
+from hardware_sim.records import simulate
+
+PERIOD_S = 0.025
+T, ZETA = 0.5284, 0.6369
+
+
+def sigmoid(u: np.ndarray) -> np.ndarray:
+    """Eq. (35), as the paper writes it."""
+    return 6.8994 * (np.exp(0.0410 * u) - 1) / (np.exp(0.0410 * u) + 2.3897e3)
+
+
+def train(widths_us: np.ndarray) -> np.ndarray:
+    return PERIOD_S * np.arange(widths_us.size)
+
+
+def integrated(widths_us: np.ndarray, period_s: float, sample_s: np.ndarray, times_s: np.ndarray) -> np.ndarray:
+    """The paper's muscle by Runge-Kutta, the recruitment held from each pulse for one period."""
+
+    def held(t: float) -> float:
+        k = int(np.searchsorted(times_s, t, side="right")) - 1
+        return float(sigmoid(widths_us[k])) if k >= 0 and t < times_s[k] + period_s else 0.0
+
+    edges = np.unique(np.concatenate([[0.0], times_s, times_s + period_s, [sample_s[-1] + 1e-9]]))
+    edges = edges[edges <= sample_s[-1] + 1e-9]
+    state, torque = np.zeros(2), np.empty(sample_s.size)
+    for start, end in itertools.pairwise(edges):
+        w = held((start + end) / 2)
+        inside = (sample_s >= start) & (sample_s < end)
+        solved = solve_ivp(
+            lambda _t, x, w=w: [x[1], (w - x[0] - 2 * ZETA * T * x[1]) / T**2],
+            (start, end),
+            state,
+            t_eval=np.append(sample_s[inside], end),
+            rtol=1e-10,
+            atol=1e-12,
+        )
+        torque[inside] = solved.y[0][:-1]
+        state = solved.y[:, -1]
+    return torque
+
+
+class TestPaper:
+    def test_recruitment_is_equation_35(self) -> None:
+        widths = np.arange(0.0, 501.0)
+        curve = [PaperMuscle().recruitment_nm(w, 20.0) for w in widths]
+        np.testing.assert_allclose(curve, sigmoid(widths), atol=1e-12)
+        assert PaperMuscle().recruitment_nm(4095.0, 130.0) == pytest.approx(6.8994)
+
+    def test_an_equal_train_is_the_step_response(self) -> None:
+        widths = np.full(400, 250.0)
+        torque = simulate(PaperMuscle(), train(widths), widths, 20.0, 1600.0, 10.0)
+        t = np.arange(16000) / 1600
+        wd = math.sqrt(1 - ZETA**2) / T
+        decay = np.exp(-ZETA / T * t)
+        step = 1 - decay * (np.cos(wd * t) + ZETA / math.sqrt(1 - ZETA**2) * np.sin(wd * t))
+        np.testing.assert_allclose(torque, sigmoid(np.array(250.0)) * step, atol=1e-9)
+
+    def test_prbs_against_scipy(self) -> None:
+        widths = np.repeat(np.random.default_rng(1).integers(0, 2, 40) * 300.0, 4)
+        torque = simulate(PaperMuscle(), train(widths), widths, 20.0, 1600.0, widths.size * PERIOD_S)
+        held = np.repeat(sigmoid(widths), 40)
+        _, expected, _ = lsim(([1], [T**2, 2 * ZETA * T, 1]), held, np.arange(held.size) / 1600, interp=False)
+        np.testing.assert_allclose(torque, expected, atol=1e-9)
+
+    @pytest.mark.parametrize("jitter_s", [0.0005, 0.004])
+    def test_jitter_leaves_no_gap(self, jitter_s: float) -> None:
+        widths = np.full(200, 250.0)
+        rng = np.random.default_rng(2)
+        times = train(widths) + jitter_s * rng.random(widths.size)
+        torque = simulate(PaperMuscle(), times, widths, 20.0, 1600.0, 5.0)
+        start = times[0]
+        t = np.arange(8000) / 1600
+        even = simulate(PaperMuscle(), train(widths) + start, widths, 20.0, 1600.0, 5.0)
+        late_nm = 6.9 * jitter_s**2 / (2 * T**2)
+        assert np.abs(torque - even)[t < times[-1]].max() < 1.5 * late_nm
+
+    def test_a_missing_pulse_gives_zero_from_when_it_was_due(self) -> None:
+        widths = np.full(80, 250.0)
+        rng = np.random.default_rng(3)
+        kept = np.sort(rng.choice(80, 60, replace=False))
+        times = train(widths)[kept]
+        torque = simulate(PaperMuscle(), times, widths[kept], 20.0, 1600.0, 2.5)
+        expected = integrated(widths[kept], PERIOD_S, np.arange(4000) / 1600, times)
+        np.testing.assert_allclose(torque, expected, atol=1e-7)
+
+    def test_charge_scales_the_width(self) -> None:
+        muscle = PaperMuscle()
+        assert muscle.recruitment_nm(200.0, 30.0) == muscle.recruitment_nm(300.0, 20.0)
+
+    @pytest.mark.parametrize("damping", [0.3, 1.0, 1.7])
+    def test_other_dampings(self, damping: float) -> None:
+        muscle = PaperMuscle(PaperParameters(damping_ratio=damping))
+        torque = simulate(muscle, [0.0], [300.0], 20.0, 1600.0, 1.0)
+        held = np.where(np.arange(1600) < 40, sigmoid(np.array(300.0)), 0.0)
+        _, expected, _ = lsim(([1], [T**2, 2 * damping * T, 1]), held, np.arange(1600) / 1600, interp=False)
+        np.testing.assert_allclose(torque, expected, atol=1e-9)
+
+    def test_the_times_of_reading_do_not_matter(self) -> None:
+        times, widths = train(np.full(20, 200.0)), np.full(20, 200.0)
+        coarse = simulate(PaperMuscle(), times, widths, 20.0, 100.0, 1.0)
+        fine = simulate(PaperMuscle(), times, widths, 20.0, 1600.0, 1.0)
+        np.testing.assert_allclose(coarse, fine[::16], atol=1e-9)
+
+
+class TestCalcium:
+    def test_against_an_independent_integration(self) -> None:
+        """Cn as the published sum over all pulses, F by an adaptive stiff solver."""
+        rng = np.random.default_rng(4)
+        times = np.cumsum(rng.uniform(0.015, 0.06, 30))
+        widths = rng.uniform(120.0, 500.0, 30)
+        sample_s = np.arange(2000) / 1600
+        torque = simulate(CalciumMuscle(), times, widths, 20.0, 1600.0, 1.25)
+
+        felt = widths > 131.0
+        tc, km = 0.020, 0.103
+        ti, gains = times[felt], 4920.0 * (1 - np.exp(-(widths[felt] - 131.0) / 194.0))
+        ri = np.append(1.0, 1 + (km + 1.04 - 1) * np.exp(-np.diff(ti) / tc))
+
+        def slope(t: float, x: np.ndarray, gain: float, n: int) -> list[float]:
+            release = float(np.sum(ri[:n] * np.exp(-(t - ti[:n]) / tc)))
+            bound = x[0] / (km + x[0])
+            return [release / tc - x[0] / tc, gain * bound - x[1] / (0.051 + 0.060 * bound)]
+
+        state, expected = np.zeros(2), np.zeros(sample_s.size)
+        edges = np.append(ti, max(ti[-1], sample_s[-1]) + 1e-6)
+        for n in range(ti.size):
+            inside = (sample_s >= edges[n]) & (sample_s < edges[n + 1])
+            solved = solve_ivp(
+                slope,
+                (edges[n], edges[n + 1]),
+                state,
+                method="LSODA",
+                t_eval=np.append(sample_s[inside], edges[n + 1]),
+                args=(gains[n], n + 1),
+                rtol=1e-9,
+                atol=1e-10,
+            )
+            expected[inside] = 0.035 * solved.y[1][:-1]
+            state = solved.y[:, -1]
+        assert expected.max() > 5
+        assert np.abs(torque - expected).max() < 2e-3
+
+    def test_plateau_is_an_elbows(self) -> None:
+        widths = np.full(80, 300.0)
+        torque = simulate(CalciumMuscle(), train(widths), widths, 20.0, 1600.0, 2.0)
+        assert 8.0 < torque[-40:].mean() < 10.0
+
+    def test_below_threshold_nothing(self) -> None:
+        widths = np.full(40, 131.0)
+        assert not simulate(CalciumMuscle(), train(widths), widths, 20.0, 1600.0, 1.0).any()
+
+    def test_coarse_reading_is_stable(self) -> None:
+        muscle = CalciumMuscle()
+        muscle.pulse(0.0, 500.0, 20.0)
+        assert 0.0 <= muscle.torque_nm(100.0) < 1e-6
+
+
+def test_width_zero_is_no_pulse_and_records_repeat() -> None:
+    widths = np.array([300.0, 0.0, 300.0, 0.0])
+    for name in registry.names():
+        first = simulate(registry.make(name), train(widths), widths, 20.0, 1600.0, 0.2)
+        sparse = simulate(registry.make(name), train(widths)[::2], widths[::2], 20.0, 1600.0, 0.2)
+        np.testing.assert_array_equal(first, sparse)
+
+
+@pytest.mark.parametrize(("times", "widths"), [([0.0, 1.0], [1.0]), ([1.0, 0.5], [1.0, 1.0]), ([0.0, np.nan], [1, 1])])
+def test_records_refuse_what_is_no_train(times: list[float], widths: list[float]) -> None:
+    with pytest.raises(ValueError, match="pulse times"):
+        simulate(PaperMuscle(), times, widths, 20.0, 1600.0, 1.0)
+
+
+class TestRegistry:
+    def test_both_are_found(self) -> None:
+        assert {"paper", "calcium"} <= set(registry.names())
+
+    @pytest.mark.parametrize("suffix", [".toml", ".json"])
+    def test_file_overrides_by_name(self, tmp_path: Path, suffix: str) -> None:
+        path = tmp_path / f"patient{suffix}"
+        if suffix == ".toml":
+            path.write_text('patient = "paper"\n[parameters]\na1 = 2.0\n')
+        else:
+            path.write_text(json.dumps({"patient": "paper", "parameters": {"a1": 2.0}}))
+        muscle = registry.from_file(path)
+        assert isinstance(muscle, PaperMuscle)
+        assert muscle.recruitment_nm(4000.0, 20.0) == pytest.approx(2.0)
+
+    @pytest.mark.parametrize(
+        ("text", "told"),
+        [
+            ('patient = "papr"', "calcium, paper"),
+            ('patient = "paper"\n[parameters]\na9 = 1.0', "no parameter 'a9'"),
+            ('patient = "paper"\n[parameters]\na1 = "x"', "finite number"),
+            ('patient = "paper"\n[parameters]\na1 = nan', "finite number"),
+            ('patient = "paper"\n[parameters]\nnatural_period_s = 0', "above zero"),
+            ("patient = \nx = 1", "line 1"),
+            ('patent = "paper"', "unknown key 'patent'"),
+            ('patient = "paper"\nparameters = 3', "must be a table"),
+        ],
+    )
+    def test_bad_files_are_told_with_their_name(self, tmp_path: Path, text: str, told: str) -> None:
+        path = tmp_path / "patient.toml"
+        path.write_text(text)
+        with pytest.raises(PatientError) as caught:
+            registry.from_file(path)
+        assert told in str(caught.value)
+        assert str(path) in str(caught.value)
+        assert "\n" not in str(caught.value)
+
+    def test_a_file_that_is_not_there(self, tmp_path: Path) -> None:
+        with pytest.raises(PatientError, match="cannot be read"):
+            registry.from_file(tmp_path / "none.toml")

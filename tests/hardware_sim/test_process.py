@@ -1,0 +1,136 @@
+"""The emulator as a process: start, ready line, signals, bad input, its parent's death."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.hardware_sim.emulated import ROOT, Emulated, emulated, wait_for
+
+pytestmark = pytest.mark.wire
+
+
+def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "hardware_sim", *arguments], cwd=ROOT, capture_output=True, text=True, timeout=30
+    )
+
+
+def test_the_ready_line() -> None:
+    with emulated("--noise-seed", "3", "--rate-hz", "800", "--speed", "2") as rig:
+        ready = rig.ready
+        assert Path(ready["stimulator"]).is_char_device()
+        assert Path(ready["stimulator_link"]).resolve() == Path(ready["stimulator"])
+        assert set(ready["can"]) == {"interface", "host", "port", "channel"}
+        wanted = {"pid": rig.process.pid, "sample_rate_hz": 800.0, "speed": 2.0, "patient": "paper", "noise_seed": 3}
+        assert {key: ready[key] for key in wanted} == wanted
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_signals_end_it_cleanly(number: signal.Signals) -> None:
+    rig = Emulated()
+    rig.process.send_signal(number)
+    output, errors = rig.process.communicate(timeout=5)
+    assert (rig.process.returncode, output, errors) == (0, "", "")
+    assert not Path(rig.ready["control"]).parent.exists()
+    rig.close()
+
+
+def test_it_ends_with_its_parent() -> None:
+    parent = subprocess.Popen(
+        [
+            sys.executable,
+            "-c",
+            "import subprocess, sys, time\n"
+            "subprocess.Popen([sys.executable, '-m', 'hardware_sim', '--die-with-parent'])\n"
+            "time.sleep(60)",
+        ],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert parent.stdout is not None
+    child = json.loads(parent.stdout.readline())["pid"]
+    parent.kill()
+    parent.wait()
+    wait_for(lambda: not Path(f"/proc/{child}").exists() or _is_zombie(child))
+    parent.stdout.close()
+
+
+def _is_zombie(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] == "Z"
+    except FileNotFoundError:
+        return True
+
+
+def test_patient_file_and_readable_lines(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text('patient = "calcium"\n[parameters]\nmoment_arm_m = 0.04\n')
+    with emulated("--patient", str(path)) as rig:
+        assert rig.ready["patient"] == str(path)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "hardware_sim", "--no-json"], cwd=ROOT, stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline().startswith("stimulator: /dev/pts/")
+    process.send_signal(signal.SIGTERM)
+    process.communicate(timeout=5)
+    assert process.returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["--patient", "nobody"], "calcium, paper"),
+        (["--patient", "nobody.toml"], "nobody.toml: cannot be read"),
+        (["--noise-nm", "much"], "--noise-nm"),
+        (["--noise-nm", "nan"], "--noise-nm must be between 0 and 10"),
+        (["--noise-nm", "-1"], "--noise-nm must be between 0 and 10"),
+        (["--rate-hz", "0"], "--rate-hz must be between"),
+        (["--speed", "inf"], "--speed must be between"),
+        (["--load-cell", "usb"], "slcan"),
+        (["--fault", "earthquake"], "unknown fault 'earthquake'"),
+        (["--fault", "late_ack,delay_s=long"], "SETTING=NUMBER"),
+        (["--fault", "late_ack,delay=1"], "no setting 'delay'; it has delay_s"),
+        (["--hidden", "x"], "--hidden"),
+        (["--wrong"], "--wrong"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_2(arguments: list[str], told: str) -> None:
+    done = run(*arguments)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr.count("\n") == 1
+    assert told in done.stderr
+
+
+def test_help() -> None:
+    done = run("--help")
+    assert done.returncode == 0
+    assert "--speed" in done.stdout
+
+
+def test_speed_moves_the_emulators_time() -> None:
+    with emulated("--speed", "10") as rig:
+        before, start_s = rig.ask(cmd="state"), time.monotonic()
+        time.sleep(0.5)
+        after, end_s = rig.ask(cmd="state"), time.monotonic()
+        assert after["time_s"] - before["time_s"] == pytest.approx(10 * (end_s - start_s), rel=0.05)
+        assert after["samples"] - before["samples"] == pytest.approx(16000 * (end_s - start_s), rel=0.05)
+
+
+def test_stopped_and_continued_it_catches_up() -> None:
+    with emulated() as rig:
+        os.kill(rig.process.pid, signal.SIGSTOP)
+        time.sleep(0.5)
+        os.kill(rig.process.pid, signal.SIGCONT)
+        state = rig.ask(cmd="state")
+        assert state["samples"] == pytest.approx(1600 * state["time_s"], abs=2)
