@@ -209,6 +209,8 @@ class TestRun:
     def _watch_decay(self, at_stop_nm: float | None) -> tuple[bool, str]:
         """Wait until the torque has fallen to half, or close to where it was before the test."""
         clock = self._clock
+        if self._gate.last_pulse_s is None:
+            return True, "no pulse had been sent"
         if at_stop_nm is None or self._baseline_nm is None:
             return False, "no torque to confirm the stop by"
         above_nm = abs(at_stop_nm - self._baseline_nm)

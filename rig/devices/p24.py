@@ -27,6 +27,7 @@ KIND = "stimulator"
 BAUD_RATE = 3_000_000
 READ_TIMEOUT_S = 0.05
 WRITE_TIMEOUT_S = 0.05
+NOT_INITIALISED = 7
 
 
 class Settings(DeviceSettings):
@@ -109,7 +110,7 @@ class P24:
         return number
 
     def stop(self) -> None:
-        self._ask(Command.LL_STOP)
+        self._ask(Command.LL_STOP, fine=(0, NOT_INITIALISED))  # one that is not initialised has stopped already
 
     def state(self) -> tuple[bool, str]:
         result, level, _ = wire.parse_status(self._ask(Command.STIM_STATUS).data)
@@ -138,7 +139,7 @@ class P24:
         except (serial.SerialException, OSError) as error:
             raise DeviceError(f"stimulator {self._settings.port} took no bytes: {error}") from None
 
-    def _ask(self, command: Command) -> Packet:
+    def _ask(self, command: Command, fine: tuple[int, ...] = (0,)) -> Packet:
         """Send a command and wait for its ack.
 
         Raises
@@ -168,7 +169,7 @@ class P24:
             raise DeviceError(f"stimulator {self._settings.port}: {name}: {why}; is it switched on?")
         if packet.command != command + 1:
             raise DeviceError(f"stimulator {self._settings.port}: {name}: answered with command {packet.command}")
-        if packet.data and packet.data[0] != 0:
+        if packet.data and packet.data[0] not in fine:
             raise DeviceError(f"stimulator {self._settings.port}: {name}: {wire.result_text(packet.data[0])}")
         return packet
 

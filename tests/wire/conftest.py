@@ -1,0 +1,33 @@
+"""Fixtures: the emulated rig as processes, sped up unless a test says otherwise."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.wire.processes import Bench
+
+SPEED = 4.0
+
+
+@pytest.fixture
+def make_bench(tmp_path: Path) -> Iterator[Callable[..., Bench]]:
+    """Start an emulator with options; it and its rig end with the test."""
+    benches: list[Bench] = []
+
+    def make(*options: str, speed: float = SPEED) -> Bench:
+        bench = Bench(tmp_path / f"bench{len(benches)}", *options, speed=speed)
+        benches.append(bench)
+        return bench
+
+    yield make
+    for bench in benches:
+        bench.close()
+
+
+@pytest.fixture
+def bench(make_bench: Callable[..., Bench]) -> Bench:
+    """An emulator of the paper's patient at the tests' usual speed."""
+    return make_bench("--noise-seed", "7")

@@ -1,0 +1,176 @@
+"""Stops and faults over the wire: stimulation ends, the reason is told, the rig stays latched, nothing is lost."""
+
+from __future__ import annotations
+
+import signal
+import time
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+from rig import archive
+from tests.wire.processes import Bench, RigClient, control, default_plan, kill_hard, short_plan
+
+pytestmark = pytest.mark.wire
+
+FAULTS = {
+    "electrode_error": "electrode error",
+    "no_ack": "not acknowledged",
+    "cell_silent": "stale",
+    "torque_nan": "no number",
+    "torque_step": "outside",
+    "counter_jump": "jumped",
+    "stimulator_unplugged": "stimulator",
+    "cell_unplugged": "load cell",
+    "device_reset": "not initialised",
+}
+
+
+def start(bench: Bench, test_id: str = "t") -> RigClient:
+    """A test that runs, its first pulses felt."""
+    client = bench.start_rig()
+    client.ask("subscribe")
+    reply = client.ask("start", plan=default_plan(test_id))
+    assert reply["ok"], reply
+    client.wait_state("running")
+    end = time.monotonic() + 10
+    while state(bench)["pulses_received"] < 20:
+        assert time.monotonic() < end
+        time.sleep(0.02)
+    return client
+
+
+def state(bench: Bench) -> dict[str, Any]:
+    """What the emulator says of itself."""
+    return control(bench.emulator.ready["control"], {"cmd": "state"})
+
+
+def check_kept(event: dict[str, Any], outcome: str) -> None:
+    """The part that was played is sealed and readable."""
+    assert event["outcome"] == outcome
+    path = Path(event["recording_path"])
+    with h5py.File(path) as file:
+        assert file.attrs["outcome"] == outcome
+        assert file.attrs["reason"]
+        assert archive.verify(path) == file.attrs["content_sha256"]
+        assert np.sum(file["pulses/status"][:] == 0) >= 15
+        assert len(file["torque/time_s"]) > 1000
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_stops_is_told_and_latches(bench: Bench, fault: str):
+    client = start(bench, fault)
+    settings = {"step": 5000} if fault == "counter_jump" else {}
+    injected = bench.fault(cmd="fault", name=fault, on=True, **settings)
+    assert injected["ok"], injected
+    event = client.wait_finished(fault, timeout_s=20)
+    check_kept(event, "fault")
+    assert FAULTS[fault] in event["reason"]
+    after = control(bench.emulator.ready["control"], {"cmd": "pulses", "since": 0})["pulses"]
+    # real milliseconds from the fault to the last pulse: watch period, plus slack for a shared machine
+    late_ms = [1e3 * (p["monotonic_s"] - injected["monotonic_s"]) for p in after]
+    assert max(late_ms) < 250, max(late_ms)
+    status = client.wait_state("latched")
+    assert FAULTS[fault] in status["reason"]
+    refused = client.ask("start", plan=short_plan("again"))
+    assert refused["problem"]["code"] == "latched"
+    bench.fault(cmd="fault", name=fault, on=False)
+    time.sleep(0.2)
+    if fault == "cell_unplugged":  # the emulated adapter comes back under another port
+        assert client.ask("rearm", by="nurse")["problem"]["code"] == "disconnected"
+        return
+    rearmed = client.ask("rearm", by="nurse")
+    assert rearmed["ok"], rearmed
+    assert client.ask("start", plan=short_plan("again"))["ok"]
+    assert client.wait_finished("again")["outcome"] == "completed"
+
+
+def test_stop_is_confirmed_by_device_and_torque(bench: Bench):
+    client = start(bench)
+    other = bench.client()
+    evidence = other.ask("stop", reason="participant asks", by="nurse")["body"]
+    assert evidence["confirmed"], evidence
+    assert evidence["device_state"] == "not initialised"
+    assert "torque fell" in evidence["detail"]
+    count = state(bench)["pulses_received"]
+    event = client.wait_finished("t")
+    check_kept(event, "stopped")
+    assert "participant asks (by nurse)" in event["reason"]
+    time.sleep(0.2)
+    assert state(bench)["pulses_received"] == count
+    assert client.wait_state("latched")["reason"] == "participant asks (by nurse)"
+    assert client.ask("rearm", by="nurse")["body"]["state"] == "ready"
+
+
+def test_stop_while_idle_latches_too(bench: Bench):
+    client = bench.start_rig()
+    assert client.ask("stop", reason="check", by="nurse")["body"]["confirmed"]
+    assert client.status()["state"] == "latched"
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_stops_stimulation_first_and_seals(bench: Bench, number: int):
+    start(bench)
+    assert bench.rig is not None
+    assert bench.rig.stop(number) == 0
+    before = state(bench)
+    time.sleep(0.1)
+    assert state(bench)["pulses_received"] == before["pulses_received"]
+    sealed = list((bench.data / "recordings").glob("*.h5"))
+    assert len(sealed) == 1
+    with h5py.File(sealed[0]) as file:
+        assert file.attrs["outcome"] == "stopped"
+    client = bench.start_rig()  # what stopped it is remembered
+    assert client.status()["state"] == "latched"
+    assert "shutting down" in client.status()["reason"]
+
+
+def test_a_killed_rig_sends_no_more_and_comes_back_uncertain(bench: Bench):
+    start(bench, "killed")
+    assert bench.rig is not None
+    kill_hard(bench.rig)
+    time.sleep(0.05)
+    count = state(bench)["pulses_received"]
+    time.sleep(0.3)
+    assert state(bench)["pulses_received"] == count  # silence is no stimulation
+    client = bench.start_rig()
+    status = client.status()
+    assert status["state"] == "uncertain"
+    assert "killed" in status["reason"]
+    event = status["finished"]
+    check_kept(event, "fault")
+    with h5py.File(event["recording_path"]) as file:
+        acknowledged = int(np.sum(file["pulses/status"][:] == 0))
+        assert acknowledged >= count - 2  # the last ack may have been on its way
+        assert np.sum(np.isfinite(file["pulses/sent_pulse_width_us"][:]) & (file["pulses/status"][:] != 1)) >= count
+    refused = client.ask("start", plan=short_plan("next"))
+    assert refused["problem"]["code"] == "uncertain"
+    assert client.ask("rearm", by="nurse")["ok"]
+    client.ask("subscribe")
+    assert client.ask("start", plan=short_plan("next"))["ok"]
+    assert client.wait_finished("next")["outcome"] == "completed"
+
+
+def test_lost_samples_are_found_and_marked(bench: Bench):
+    client = bench.start_rig()
+    client.ask("subscribe")
+    assert bench.fault(cmd="fault", name="frames_dropped", on=True, probability=0.02)["ok"]
+    assert client.ask("start", plan=short_plan("gaps"))["ok"]
+    event = client.wait_finished("gaps")
+    assert event["outcome"] == "completed"
+    with h5py.File(event["recording_path"]) as file:
+        gaps, counter = file["torque/gaps"][:], file["torque/counter"][:]
+        steps = np.diff(counter)
+        assert np.array_equal(gaps[:, 0], np.flatnonzero(steps > 1) + 1)
+        assert np.array_equal(gaps[:, 1], steps[steps > 1] - 1)
+        assert 40 < gaps[:, 1].sum() < 400
+        assert np.allclose(np.diff(file["torque/time_s"][:]), steps / 1600, rtol=0.01)
+
+
+def test_two_rigs_cannot_share_the_data_or_the_port(bench: Bench):
+    bench.start_rig()
+    with pytest.raises(RuntimeError, match="another rig"):
+        bench.start_rig()

@@ -1,0 +1,100 @@
+"""The rig's socket: refusals with their reasons, several clients, live events."""
+
+from __future__ import annotations
+
+import json
+import time
+
+import pytest
+
+from tests.wire.processes import Bench, default_plan, short_plan
+
+pytestmark = pytest.mark.wire
+
+
+def test_a_page_sees_torque_before_and_during_a_test(bench: Bench):
+    client = bench.start_rig()
+    client.ask("subscribe")
+    first = client.events.get(timeout=5)
+    assert first["event"] == "state"
+    live = client.events.get(timeout=5)
+    assert live["event"] == "live"
+    assert live["test_id"] is None
+    assert len(live["time_s"]) == len(live["torque_min_nm"]) == len(live["torque_max_nm"]) > 0
+    assert client.ask("start", plan=short_plan("live"))["ok"]
+    events, end = [], time.monotonic() + 30
+    while not events or events[-1]["event"] != "finished":
+        events.append(client.events.get(timeout=end - time.monotonic()))
+    states = [e["status"]["state"] for e in events if e["event"] == "state"]
+    assert states[:4] == ["arming", "running", "sealing", "ready"]
+    running = [e for e in events if e["event"] == "live" and e["test_id"] == "live" and e["elapsed_s"] > 0]
+    widths = [w for e in running for w in e["pulse_width_us"]]
+    assert len(widths) > 100
+    assert max(widths) == 300.0
+    assert {"rest", "prbs", "ramp"} <= {e["segment"] for e in running}
+    assert all(lo <= hi for e in running for lo, hi in zip(e["torque_min_nm"], e["torque_max_nm"], strict=True))
+    assert max(hi for e in running for hi in e["torque_max_nm"]) > 1.0
+    assert client.status()["finished"]["test_id"] == "live"
+
+
+def test_refusals_name_the_reason(bench: Bench):
+    client = bench.start_rig()
+    wide = default_plan("w")
+    wide["profile"]["max_pulse_width_us"] = 250.0
+    wide["segments"] = [{"name": "ramp", "sequence": "ramp", "settings": {"max_pulse_width_us": 300}}]
+    refused = client.ask("start", plan=wide)
+    assert refused["problem"]["code"] == "refused"
+    assert "segment ramp, pulse 167" in refused["problem"]["detail"]
+    assert "participant's profile" in refused["problem"]["detail"]
+    wrong = default_plan("w", segments=[{"name": "x", "sequence": "prsb"}])
+    assert client.ask("start", plan=wrong)["problem"]["code"] == "bad-plan"
+    assert client.ask("start", plan=default_plan("../etc"))["problem"]["code"] == "bad-plan"
+    assert client.ask("start", plan=default_plan("f", pulse_rate_hz=400.0))["problem"]["code"] == "refused"
+    assert client.status()["state"] == "ready"
+
+
+def test_malformed_requests_are_answered_not_fatal(bench: Bench):
+    client = bench.start_rig()
+    for line in ("not json", '{"kind": "dance"}', '{"kind": "start", "plan": {"test_id": 5}}', "[]"):
+        raw = bench.client()
+        raw._replies[0] = client.events.__class__()
+        raw.send_raw(line)
+        reply = raw._replies[0].get(timeout=5)
+        assert not reply["ok"]
+        assert reply["problem"]["detail"]
+    assert client.status()["state"] == "ready"
+
+
+def test_preview_gives_duration_and_dose(bench: Bench):
+    client = bench.start_rig()
+    table = {"pulse_width_us": [0.0, 100.0, 300.0], "torque_nm": [0.0, 0.0, 8.0]}
+    body = client.ask("preview", plan=default_plan("p"), recruitment=table)["body"]
+    assert body["duration_s"] == pytest.approx(38.7)
+    assert 3000 < body["charge_uc"] < 4000
+    assert body["torque_time_nms"] > 50
+    assert [s["name"] for s in body["segments"]][1] == "prbs"
+    assert len(body["pulse_width_us"]) == 1548
+
+
+def test_a_second_start_is_refused_and_names_the_holder(bench: Bench):
+    client, other = bench.start_rig(), bench.client()
+    assert client.ask("start", plan=default_plan("mine"))["ok"]
+    reply = other.ask("start", plan=default_plan("yours"))
+    assert reply["problem"]["code"] == "busy"
+    assert "mine" in reply["problem"]["detail"]
+    evidence = other.ask("stop", reason="enough", by="somebody else")["body"]
+    assert evidence["confirmed"], evidence
+
+
+def test_status_is_answered_in_milliseconds_while_a_test_runs(bench: Bench):
+    client = bench.start_rig()
+    client.ask("start", plan=default_plan("s"))
+    waits = []
+    for _ in range(20):
+        start = time.monotonic()
+        status = client.status()
+        waits.append(time.monotonic() - start)
+        time.sleep(0.02)
+    assert status["participant"] == "P01"
+    assert sorted(waits)[10] < 0.1
+    assert json.dumps(status)

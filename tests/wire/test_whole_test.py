@@ -1,0 +1,125 @@
+"""A whole test over the wire: what is sealed is what was played, and what the muscle felt is what was sealed."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+from rig import archive
+from tests.wire.processes import Bench, control, default_plan, short_plan
+
+pytestmark = pytest.mark.wire
+
+
+def play(bench: Bench, plan: dict[str, Any], timeout_s: float = 90.0) -> dict[str, Any]:
+    """Play a plan to its end and return the finished event."""
+    client = bench.start_rig()
+    client.ask("subscribe")
+    reply = client.ask("start", plan=plan)
+    assert reply["ok"], reply
+    return client.wait_finished(plan["test_id"], timeout_s)
+
+
+def fired(bench: Bench) -> list[dict[str, Any]]:
+    """Every pulse that the emulated electrodes felt."""
+    return control(bench.emulator.ready["control"], {"cmd": "pulses", "since": 0})["pulses"]
+
+
+def check_recording(bench: Bench, event: dict[str, Any]) -> None:
+    """The file is whole, hashed, and agrees with what the electrodes felt."""
+    path = Path(event["recording_path"])
+    assert hashlib.sha256(path.read_bytes()).hexdigest() == event["file_sha256"]
+    with h5py.File(path) as file:
+        assert archive.verify(path) == file.attrs["content_sha256"]
+        assert file.attrs["outcome"] == "completed"
+        status = file["pulses/status"][:]
+        planned = file["pulses/pulse_width_us"][:]
+        sent = file["pulses/sent_pulse_width_us"][:]
+        acknowledged = status == 0
+        assert np.array_equal(status == 1, planned == 0)
+        assert np.mean(acknowledged[planned > 0]) > 0.98  # a busy machine may drop a late one
+        assert np.array_equal(sent[acknowledged], np.trunc(planned[acknowledged]))
+        felt = fired(bench)
+        assert [p["width_us"] for p in felt] == list(sent[acknowledged])
+        assert {p["current_ma"] for p in felt} == {20.0}
+        assert all(p["balanced"] for p in felt)
+        delay = file["pulses/acknowledged_time_s"][:][acknowledged] - file["pulses/written_time_s"][:][acknowledged]
+        assert np.all(delay > 0)
+        time_s = file["torque/time_s"][:]
+        assert np.all(np.diff(time_s) > 0)
+        assert np.all(np.diff(file["torque/counter"][:]) == 1)
+        assert len(time_s) == pytest.approx(event["summary"]["duration_s"] * 1600, abs=20)
+        assert file["torque/gaps"].shape == (0, 2)
+        assert json.loads(file.attrs["configuration"])["plan"]["test_id"] == event["test_id"]
+        for name in ("torque/torque_nm", "pulses/pulse_width_us", "segments/start_s"):
+            assert file[name].attrs["unit"]
+            assert file[name].attrs["description"]
+
+
+@pytest.mark.realtime
+@pytest.mark.slow
+def test_default_test_in_real_time(make_bench: Callable[..., Bench]):
+    bench = make_bench("--noise-seed", "3", speed=1.0)
+    event = play(bench, default_plan("real"))
+    assert event["outcome"] == "completed"
+    check_recording(bench, event)
+    summary = event["summary"]
+    assert summary["duration_s"] == pytest.approx(38.7)
+    assert summary["lost_samples"] == 0
+    assert summary["alignment"]["method"] == "sync"
+    assert summary["alignment"]["error_ms"] < 1.0
+    assert summary["torque_peak_nm"] > 3.0
+    with h5py.File(event["recording_path"]) as file:
+        names = [n.decode() for n in file["segments/name"][:]]
+        assert names == ["rest", "prbs", "rest", "ramp", "rest", "validate", "rest"]
+        assert file["segments/end_s"][-1] == pytest.approx(38.7)
+
+
+def test_sped_up_default_test_over_slcan(make_bench: Callable[..., Bench]):
+    bench = make_bench("--load-cell", "slcan", "--noise-seed", "5")
+    event = play(bench, default_plan("fast"))
+    check_recording(bench, event)
+
+
+def test_without_a_sync_line_the_clocks_are_aligned_by_regression(make_bench: Callable[..., Bench]):
+    bench = make_bench("--no-sync", "--clock-ppm", "200", speed=1.0)
+    event = play(bench, short_plan("nosync"))
+    alignment = event["summary"]["alignment"]
+    assert alignment["method"] == "regression"
+    assert alignment["error_ms"] < 1.0
+
+
+def test_aligned_times_are_those_of_the_muscle(make_bench: Callable[..., Bench]):
+    """The emulator knows when each pulse was felt; the recording's sync edges must lie there."""
+    bench = make_bench(speed=1.0)
+    event = play(bench, short_plan("align"))
+    felt_s = np.array([p["monotonic_s"] for p in fired(bench)])
+    with h5py.File(event["recording_path"]) as file:
+        written_s = file["pulses/written_time_s"][:]
+        written_s = written_s[np.isfinite(written_s)]
+        edges_s = file["torque/time_s"][:][file["torque/sync"][:] == 1]
+    assert len(edges_s) == len(felt_s) == len(written_s)
+    # the muscle's clock and the test's differ by a constant; what is left is line delay and alignment error
+    since_first = (felt_s - felt_s[0]) - (edges_s - edges_s[0])
+    assert np.median(np.abs(since_first)) < 1e-3
+    assert np.median(np.abs(edges_s - written_s)) < 1e-3
+
+
+def test_two_tests_one_after_the_other(bench: Bench):
+    first = play(bench, short_plan("one"))
+    client = bench.client()
+    client.ask("subscribe")
+    assert client.ask("start", plan=short_plan("two"))["ok"]
+    second = client.wait_finished("two")
+    assert first["recording_id"] != second["recording_id"]
+    assert second["outcome"] == "completed"
+    again = client.ask("start", plan=short_plan("two"))
+    assert again["problem"]["code"] == "bad-plan"
+    assert "used before" in again["problem"]["detail"]
