@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib
 import json
 import os
@@ -19,6 +20,7 @@ from hardware_sim.patients import registry
 from hardware_sim.patients.muscle import Muscle
 
 PROG = "stimrig emulate"
+FASTEST_AT_PRIORITY = 5.0
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -56,9 +58,17 @@ def _run(emulator: Emulator, options: argparse.Namespace) -> int:
         print(*(f"{key}: {value}" for key, value in ready.items()), sep="\n", flush=True)
     else:
         print(json.dumps(ready), flush=True)
+    if options.speed <= FASTEST_AT_PRIORITY:
+        _take_priority()
     orphaned = _orphan_watch() if options.die_with_parent else lambda: False
     emulator.run(lambda: bool(signals) or orphaned())
     return 0
+
+
+def _take_priority() -> None:
+    """Real-time priority where the system allows it: a real device does not slow down with the host's load."""
+    with contextlib.suppress(OSError):
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
 
 
 def _orphan_watch() -> Callable[[], bool]:
