@@ -155,3 +155,28 @@ def follow(
             out[m, k + 1] = z
             rate[m, k + 1] = v / step_s
     return out, rate
+
+
+@njit(cache=True, nogil=True)
+def exponential(matrix: np.ndarray) -> np.ndarray:  # pragma: no cover
+    """Matrix exponential of a small matrix of norm up to about 20, by scaled Taylor series."""
+    size = matrix.shape[0]
+    scaled = matrix / 64.0
+    term, total = np.eye(size), np.eye(size)
+    for n in range(1, 13):
+        term = _product(term, scaled) / n
+        total += term
+    for _ in range(6):
+        total = _product(total, total)
+    return total
+
+
+@njit(cache=True, nogil=True)
+def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:  # pragma: no cover
+    size = a.shape[0]
+    out = np.zeros((size, size))
+    for i in range(size):
+        for k in range(size):
+            for j in range(size):
+                out[i, j] += a[i, k] * b[k, j]
+    return out

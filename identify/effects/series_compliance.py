@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy.linalg import expm
 
 from identify.effects.base import Effect, Form, Parameter, Scene
-from identify.effects.kernels import follow
+from identify.effects.kernels import exponential, follow
 
 _RESONANCE = (
     Parameter("resonance_hz", "Hz", 1.2, 16.0, np.inf, (3.0, 6.0, 10.0), "log", about="of the series spring"),
@@ -23,7 +22,7 @@ def _steps(frequency_hz: float, damping: float, step_s: float) -> tuple[np.ndarr
     system[0, 1] = 1.0
     system[1, :3] = [-(omega**2), -2 * damping * omega, omega**2]
     system[2, 3] = system[3, 4] = system[4, 5] = 1.0
-    phi = expm(system)
+    phi = exponential(system)
     # Time in steps: the cubic's derivatives at the start, from x0, x0', x1, x1'.
     cubic = np.array([[1, 0, 0, 0], [0, 1, 0, 0], [-6, -4, 6, -2], [12, 6, -12, 6]], float)
     return phi[:2, :2], phi[:2, 2:] @ cubic
@@ -34,7 +33,8 @@ def _series(x: tuple[np.ndarray, np.ndarray], p: dict[str, Any], scene: Scene) -
     frequency, damping = p["resonance_hz"][:, 0], p["damping"][:, 0]
     if np.all(np.isinf(frequency)):
         return x
-    matrices = [_steps(f, z, scene.step_s) for f, z in zip(frequency, damping, strict=True)]
+    known = {key: _steps(*key, scene.step_s) for key in set(zip(frequency.tolist(), damping.tolist(), strict=True))}
+    matrices = [known[key] for key in zip(frequency.tolist(), damping.tolist(), strict=True)]
     phi = np.stack([m[0] for m in matrices])
     gamma = np.stack([m[1] for m in matrices])
     return follow(torque, rate * scene.step_s, phi, gamma, scene.step_s)

@@ -216,3 +216,97 @@ def whiten_rows(rows, start, stop, ar1, share):  # noqa: ANN001, ANN201  # pragm
                 x = ar1 * (x + gain[f] * e)
                 f += 1
     return white, logdet
+
+
+@njit(cache=True, nogil=True)
+def _squares(row, start, stop, ar1, share):  # noqa: ANN001, ANN202  # pragma: no cover
+    """Sum of squared innovations, half the log determinant, count; the filter's gain settles within some steps."""
+    total, squares, logdet = 0, 0.0, 0.0
+    noise = (1.0 - ar1 * ar1) * share
+    for i in range(start.size):
+        p, x, k, end = share, 0.0, start[i], stop[i]
+        total += end - k
+        s = 1.0
+        while k < end:
+            s = max(p + 1.0 - share, 1e-12)
+            e = row[k] - x
+            squares += e * e / s
+            logdet += 0.5 * np.log(s)
+            x = ar1 * (x + p / s * e)
+            fresh = ar1 * ar1 * (p - p * p / s) + noise
+            k += 1
+            if abs(fresh - p) < 1e-10 * (1e-6 + p):
+                break
+            p = fresh
+        if k < end:
+            gain, sum_e = p / s, 0.0
+            logdet += 0.5 * (end - k) * np.log(s)
+            for j in range(k, end):
+                e = row[j] - x
+                sum_e += e * e
+                x = ar1 * (x + gain * e)
+            squares += sum_e / s
+    return squares, logdet, total
+
+
+@njit(cache=True, nogil=True)
+def _minus_log_likelihood(row, start, stop, ar1, share):  # noqa: ANN001, ANN202  # pragma: no cover
+    """Minus the profiled log-likelihood of one residual, up to a constant."""
+    squares, logdet, total = _squares(row, start, stop, ar1, share)
+    return 0.5 * total * np.log(max(squares / max(total, 1), 1e-24)) + logdet
+
+
+@njit(cache=True, nogil=True)
+def profile_noise(row, start, stop, ar1, share):  # noqa: ANN001, ANN201  # pragma: no cover
+    """Correlation and slow share that make a residual most likely, by a pattern search from where it stands.
+
+    Returns
+    -------
+    ar1, share, sd, log_likelihood : float
+        `sd` is the total standard deviation, slow and white together.
+    """
+    total = 0
+    for i in range(start.size):
+        total += stop[i] - start[i]
+    # On the scale of memory: a = log(1 - ar1), from 0.002 (long) to 1 (none).
+    low, high = np.log(0.002), 0.0
+    a = min(max(np.log(1.0 - min(ar1, 0.9985)), low), high)
+    b = min(max(share, 0.0), 1.0)
+    best = _minus_log_likelihood(row, start, stop, 1.0 - np.exp(a), b)
+    for guess_a, guess_b in ((np.log(0.3), 0.9), (np.log(0.03), 0.3), (np.log(0.03), 1.0), (np.log(0.5), 0.02)):
+        value = _minus_log_likelihood(row, start, stop, 1.0 - np.exp(guess_a), guess_b)
+        if value < best:
+            best, a, b = value, guess_a, guess_b
+    da, db = 0.6, 0.2
+    while da > 0.01:
+        moved = False
+        for i in range(8):
+            na = a + da * (1.0 if i in (0, 4, 5) else -1.0 if i in (1, 6, 7) else 0.0)
+            nb = b + db * (1.0 if i in (2, 4, 6) else -1.0 if i in (3, 5, 7) else 0.0)
+            na, nb = min(max(na, low), high), min(max(nb, 0.0), 1.0)
+            if na == a and nb == b:
+                continue
+            value = _minus_log_likelihood(row, start, stop, 1.0 - np.exp(na), nb)
+            if value < best - 1e-9:
+                best, a, b, moved = value, na, nb, True
+        if not moved:
+            da, db = 0.5 * da, 0.5 * db
+    ar1 = 1.0 - np.exp(a)
+    squares = _squares(row, start, stop, ar1, b)[0]
+    sd = np.sqrt(max(squares / max(total, 1), 1e-24))
+    return ar1, b, sd, -best - 0.5 * total * (np.log(2 * np.pi) + 1.0)
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def gram(rows):  # noqa: ANN001, ANN201  # pragma: no cover
+    """rows @ rows.T for few long rows, on one core: a library's threads cost more than they give here."""
+    count, size = rows.shape
+    out = np.empty((count, count))
+    for i in range(count):
+        for j in range(i + 1):
+            total = 0.0
+            for k in range(size):
+                total += rows[i, k] * rows[j, k]
+            out[i, j] = total
+            out[j, i] = total
+    return out

@@ -1,0 +1,272 @@
+"""Maximum a posteriori by Gauss-Newton on whitened residuals, with the noise profiled, and the evidence by Laplace."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
+from identify.effects.base import Form
+from identify.engine.core import gram, profile_noise, whiten_rows
+from identify.engine.problem import FIRST_COEFFICIENT, Problem
+from identify.engine.setup import Setup
+
+
+@dataclass(frozen=True)
+class NoiseLevel:
+    """White plus slow noise on the grid.
+
+    Parameters
+    ----------
+    ar1 : float
+        Correlation of neighbours of the slow part.
+    share : float
+        Share of the variance that is slow.
+    sd_nm : float
+        Total standard deviation of an interval's mean, N·m.
+    """
+
+    ar1: float
+    share: float
+    sd_nm: float
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A candidate at its most probable parameters.
+
+    Parameters
+    ----------
+    problem : Problem
+        Stages and parameters.
+    theta : ndarray, shape (P,)
+        On the scale of variation.
+    noise : NoiseLevel
+        Profiled.
+    log_likelihood : float
+        At the optimum.
+    log_evidence : float
+        Laplace's approximation with the priors of `Problem.prior`.
+    residual_nm : ndarray, shape (K,)
+        Target minus prediction, all intervals.
+    hessian : ndarray, shape (P, P)
+        Of minus the log posterior.
+    iterations : int
+        Steps taken.
+    """
+
+    problem: Problem
+    theta: np.ndarray
+    noise: NoiseLevel
+    log_likelihood: float
+    log_evidence: float
+    residual_nm: np.ndarray
+    hessian: np.ndarray
+    iterations: int
+
+    @property
+    def effects(self) -> list[tuple[str, Form]]:
+        """Effects and their forms."""
+        return [(chosen.effect, chosen.form) for chosen in self.problem.chosen]
+
+    @property
+    def physical(self) -> np.ndarray:
+        """Parameters in their units."""
+        return self.problem.physical(self.theta)
+
+    @property
+    def rms_nm(self) -> float:
+        """Of the fitted intervals' residual, N·m."""
+        return float(np.sqrt(np.mean(self.residual_nm[self.problem.setup.fitted] ** 2)))
+
+    def parameters_of(self, effect: str) -> dict[str, float]:
+        """An effect's parameters by name."""
+        values = self.physical
+        for chosen in self.problem.chosen:
+            if chosen.effect == effect:
+                return {p.name: float(values[i]) for i, p in zip(chosen.places, chosen.parameters, strict=True)}
+        return {}
+
+    def covariance(self) -> np.ndarray:
+        """Covariance of the parameters in their units, shape (P, P)."""
+        inverse = np.linalg.pinv(self.hessian, hermitian=True)
+        slope = np.where(self.problem.log, self.physical, 1.0)
+        return inverse * slope[:, None] * slope[None, :]
+
+
+def _noise(problem: Problem, residual: np.ndarray, near: NoiseLevel) -> tuple[NoiseLevel, float]:
+    start, stop = problem.setup.stretches
+    ar1, share, sd, log_likelihood = profile_noise(residual, start, stop, near.ar1, near.share)
+    return NoiseLevel(ar1, share, max(sd, 1e-9)), log_likelihood
+
+
+def _whiten(problem: Problem, rows: np.ndarray, noise: NoiseLevel) -> np.ndarray:
+    start, stop = problem.setup.stretches
+    return whiten_rows(rows, start, stop, noise.ar1, noise.share)[0] / noise.sd_nm
+
+
+def _residual(problem: Problem, mean: np.ndarray) -> np.ndarray:
+    return problem.setup.target_nm - mean
+
+
+def _penalty(problem: Problem, theta: np.ndarray) -> float:
+    mean, precision = problem.prior
+    away = theta - mean
+    return 0.5 * float(away @ precision @ away)
+
+
+def solve(problem: Problem, theta: np.ndarray, noise: NoiseLevel, *, most: int = 20, tolerance: float = 0.02) -> Fitted:
+    """Most probable parameters, from a start.
+
+    Parameters
+    ----------
+    problem : Problem
+        The candidate.
+    theta : ndarray, shape (P,)
+        Start, on the scale of variation.
+    noise : NoiseLevel
+        Start of the noise.
+    most : int
+        Steps at most.
+    tolerance : float
+        Gain in log posterior below which it stops.
+    """
+    theta = np.clip(theta, problem.lower, problem.upper)
+    prior_mean, precision = problem.prior
+    frozen = np.zeros(problem.size, bool)
+    for chosen in problem.chosen:
+        if chosen.effect == "mains_hum":
+            frozen[chosen.places.start : chosen.places.stop] = True
+    damping, iterations = 1e-3, 0
+    mean, jacobian = problem.run(theta, derivatives=True)
+    residual = _residual(problem, mean)
+    noise, log_likelihood = _noise(problem, residual, noise)
+    value = log_likelihood - _penalty(problem, theta)
+    small = 0
+    while iterations < most:
+        iterations += 1
+        assert jacobian is not None
+        white = _whiten(problem, np.vstack([residual, jacobian]), noise)
+        products = gram(white)
+        gradient = products[0, 1:] - precision @ (theta - prior_mean)
+        hessian = products[1:, 1:] + precision
+        gain, accepted = 0.0, False
+        for _ in range(6):
+            step = _step(hessian, gradient, damping, theta, problem, frozen)
+            trial = np.clip(theta + step, problem.lower, problem.upper)
+            trial_mean, _ = problem.run(trial)
+            trial_residual = _residual(problem, trial_mean)
+            if np.all(np.isfinite(trial_mean)):
+                new_noise, new_likelihood = _noise(problem, trial_residual, noise)
+                new_value = new_likelihood - _penalty(problem, trial)
+                if new_value > value - 1e-9:
+                    gain, accepted = new_value - value, True
+                    break
+            damping = max(damping * 8.0, 1e-3)
+        if not accepted:
+            break
+        theta, residual, noise, value, log_likelihood = trial, trial_residual, new_noise, new_value, new_likelihood
+        damping = max(damping / 6.0, 1e-7)
+        small = small + 1 if gain < tolerance else 0
+        _, jacobian = problem.run(theta, derivatives=True)
+        if small >= 1 and iterations >= 2:
+            break
+    assert jacobian is not None
+    white = _whiten(problem, jacobian, noise)
+    hessian = gram(white) + precision
+    return Fitted(
+        problem=problem,
+        theta=theta,
+        noise=noise,
+        log_likelihood=log_likelihood,
+        log_evidence=value - 0.5 * _log_det_ratio(hessian, precision),
+        residual_nm=residual,
+        hessian=hessian,
+        iterations=iterations,
+    )
+
+
+def _step(
+    hessian: np.ndarray, gradient: np.ndarray, damping: float, theta: np.ndarray, problem: Problem, frozen: np.ndarray
+) -> np.ndarray:
+    """Damped Newton step; parameters at a bound that want further out stay."""
+    stuck = frozen | ((theta <= problem.lower) & (gradient < 0)) | ((theta >= problem.upper) & (gradient > 0))
+    free = np.flatnonzero(~stuck)
+    scale = np.sqrt(np.diag(hessian)[free])
+    system = hessian[np.ix_(free, free)] / scale[:, None] / scale[None, :]
+    system[np.diag_indices_from(system)] += damping
+    step = np.zeros(theta.size)
+    step[free] = cho_solve(cho_factor(system, check_finite=False), gradient[free] / scale, check_finite=False) / scale
+    # Time constants and damping move by a factor of 2 at most, effects by a third of their range.
+    limit = np.full(theta.size, np.inf)
+    limit[:2] = 0.7
+    for chosen in problem.chosen:
+        for place in chosen.places:
+            limit[place] = (problem.upper[place] - problem.lower[place]) / 3.0
+    over = float(np.max(np.abs(step) / limit))
+    return step / over if over > 1.0 else step
+
+
+def _log_det_ratio(hessian: np.ndarray, precision: np.ndarray) -> float:
+    return float(np.linalg.slogdet(hessian)[1] - np.linalg.slogdet(precision)[1])
+
+
+def start_from(problem: Problem, base: Fitted, values: dict[int, dict[str, float]]) -> np.ndarray:
+    """A start for a larger problem: what a smaller one found, and values for the effects it lacks.
+
+    Parameters
+    ----------
+    problem : Problem
+        The larger.
+    base : Fitted
+        The smaller; its effects come first in `problem.chosen` in the same order, unless given in `values`.
+    values : dict
+        Parameters in their units by index in `problem.chosen`.
+    """
+    theta = np.zeros(problem.size)
+    common = problem.coefficients.stop
+    theta[:common] = base.theta[:common]
+    old = {chosen.effect: base.parameters_of(chosen.effect) for chosen in base.problem.chosen}
+    physical = problem.physical(theta)
+    for index, chosen in enumerate(problem.chosen):
+        known = values.get(index) or old.get(chosen.effect) or {}
+        for place, p in zip(chosen.places, chosen.parameters, strict=True):
+            physical[place] = np.clip(known.get(p.name, p.start[0]), p.lower, p.upper)
+    return problem.from_physical(physical)
+
+
+def base_fit(setup: Setup, noise: NoiseLevel | None = None, starts: tuple[float, ...] = (0.06, 0.2, 0.5)) -> Fitted:
+    """The Hammerstein model without effects, from several time constants."""
+    problem = Problem(setup, [])
+    noise = noise or NoiseLevel(0.5, 0.5, 0.1 * setup.scale_nm)
+    best: Fitted | None = None
+    for time_constant_s in starts:
+        theta = np.zeros(problem.size)
+        theta[0], theta[1] = np.log(time_constant_s), np.log(0.9)
+        theta = linear_start(problem, theta, noise)
+        fitted = solve(problem, theta, noise, most=12, tolerance=0.5)
+        if best is None or fitted.log_evidence > best.log_evidence:
+            best = fitted
+    assert best is not None
+    return solve(problem, best.theta, best.noise, most=25)
+
+
+def linear_start(problem: Problem, theta: np.ndarray, noise: NoiseLevel) -> np.ndarray:
+    """Coefficients and baseline solved for, at given other parameters."""
+    mean, jacobian = problem.run(theta, derivatives=True)
+    assert jacobian is not None
+    free = np.r_[3, np.arange(FIRST_COEFFICIENT, problem.coefficients.stop)]
+    white = _whiten(problem, np.vstack([_residual(problem, mean), jacobian[free]]), noise)
+    prior_mean, precision = problem.prior
+    part = precision[np.ix_(free, free)]
+    products = gram(white)
+    gradient = products[0, 1:] - part @ (theta[free] - prior_mean[free])
+    result = theta.copy()
+    result[free] += np.linalg.solve(products[1:, 1:] + part, gradient)
+    return np.clip(result, problem.lower, problem.upper)
+
+
+def relabel(fitted: Fitted, **changes: object) -> Fitted:
+    """The same with some fields changed."""
+    return replace(fitted, **changes)  # type: ignore[arg-type]
