@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -46,9 +47,9 @@ def recruit(x, p, s, c):
 
 
 @helper
-def second_order_step(w, rate, damping, s, step_s):
-    """Fourth-order Runge-Kutta step of y'' = rate² (w - y) - 2 damping rate y', state s[0:2]."""
-    y, v = s[0], s[1]
+def second_order_step(w, rate, damping, s, first, step_s):
+    """Fourth-order Runge-Kutta step of y'' = rate² (w - y) - 2 damping rate y', state s[first : first + 2]."""
+    y, v = s[first], s[first + 1]
     a = rate * rate
     b = 2.0 * damping * rate
     k1 = a * (w - y) - b * v
@@ -58,15 +59,21 @@ def second_order_step(w, rate, damping, s, step_s):
     k3 = a * (w - y - 0.5 * step_s * v2) - b * v3
     v4 = v + step_s * k3
     k4 = a * (w - y - step_s * v3) - b * v4
-    s[0] = y + step_s / 6.0 * (v + 2.0 * v2 + 2.0 * v3 + v4)
-    s[1] = v + step_s / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
-    return s[0]
+    s[first] = y + step_s / 6.0 * (v + 2.0 * v2 + 2.0 * v3 + v4)
+    s[first + 1] = v + step_s / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+    return s[first]
+
+
+@helper
+def lag_after(before, after, state, tau_s, step_s):
+    """A first-order lag whose input goes from `before` to `after` over the step: its state at the end."""
+    return state + (0.5 * (before + after) - state) * (1.0 - math.exp(-step_s / tau_s))
 
 
 @kernel
 def second_order(x, p, s, c):
     """p: 1/Tω, ζ."""
-    y = second_order_step(x, p[0] * c[SPEED], p[1], s, c[STEP_S])
+    y = second_order_step(x, p[0] * c[SPEED], p[1], s, 0, c[STEP_S])
     c[FORCE] = y / c[LARGEST_NM]
     return y
 

@@ -80,7 +80,7 @@ class Chain:
         self._c[STEP_S] = step_s
         self._c[SINCE_S] = 10.0
         self._c[LARGEST_NM] = largest_nm
-        self._steps = 0
+        self._steps = 0.0
         self._one = np.zeros((5, 1))
 
     def run(self, x: Floats, pulse: Floats, angle_rad: Floats, velocity_rad_s: Floats) -> Floats:
@@ -90,10 +90,20 @@ class Chain:
         self._steps += x.size
         return out
 
-    def step(self, x: float, pulse: float) -> float:
-        """One step with the joint held still."""
+    def step(self, x: float, pulse: float, at_step: float | None = None) -> float:
+        """One step with the joint held still; `at_step` sets the time, in steps."""
         one = self._one
         one[0, 0], one[1, 0] = x, pulse
+        if at_step is not None:
+            self._steps = at_step
         _run(self._addresses, self._p, self._s, self._c, one[0], one[1], one[2], one[3], self._steps, one[4])
-        self._steps += 1
+        self._steps += 1.0
         return float(one[4, 0])
+
+    def save(self) -> tuple[Floats, Floats, float]:
+        """The state as it is now."""
+        return self._s.copy(), self._c.copy(), self._steps
+
+    def restore(self, saved: tuple[Floats, Floats, float]) -> None:
+        """Go back to a saved state."""
+        self._s[:], self._c[:], self._steps = saved

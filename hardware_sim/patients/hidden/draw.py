@@ -22,6 +22,9 @@ from hardware_sim.patients.hidden.scenario import BANDS, Hidden, combine, jsonab
 ATTEMPTS = 40
 CALIBRATION_STEP_S = 1.0 / 1600.0
 
+MOVING = frozenset({"torque_angle", "torque_velocity", "passive_torque"})
+"""Show only where the joint moves."""
+
 Writer = Callable[[Generator, Base], Formulation]
 
 
@@ -86,10 +89,6 @@ def rng_of(seed: int, *labels: str) -> Generator:
     return np.random.default_rng([seed, *(zlib.crc32(label.encode()) for label in labels)])
 
 
-def _needs_movement(names: tuple[str, ...]) -> bool:
-    return bool({"torque_angle", "torque_velocity", "passive_torque"} & set(names))
-
-
 def draw_scenario(
     names: tuple[str, ...],
     strength: str,
@@ -113,13 +112,12 @@ def draw_scenario(
     """
     if strength not in BANDS:
         raise ValueError(f"strength {strength!r}: one of {', '.join(BANDS)}")
-    moving = moving or _needs_movement(names)
+    moving = moving or bool(MOVING & set(names))
     low, high = BANDS[strength]
     for attempt in range(ATTEMPTS):
         rng = rng_of(seed, *names, strength, str(attempt))
         base = draw_base(rng, steep)
         sequence = make_design(design, rng, float(base.largest_width_us), moving=moving, **design_settings)
-        calibration = sequence
         hidden: list[Hidden] = []
         try:
             for name in names:
@@ -127,10 +125,18 @@ def draw_scenario(
                 choice = int(rng.integers(len(writers))) if formulation is None else formulation
                 written = writers[choice](rng, base)
                 target = noise_sd_nm * float(np.exp(rng.uniform(np.log(low * 1.08), np.log(min(high, 20.0) * 0.92))))
-                size, excess = set_size(name, written, base, calibration, target, CALIBRATION_STEP_S)
+                band = noise_sd_nm * low, noise_sd_nm * high
+                size, excess = set_size(name, written, base, sequence, target, band, CALIBRATION_STEP_S)
                 hidden.append(Hidden(name, written, size, strength, excess))
             combine(base, [(one.formulation, one.magnitude) for one in hidden])
         except NotSuited:
             continue
         return Scenario(base, tuple(hidden), sequence)
     raise ValueError(f"{' and '.join(names)}, {strength}: no muscle found that shows it this strongly")
+
+
+def draw_pair(rng: Generator) -> tuple[str, str]:
+    """Two different effects of the library that need no movement."""
+    still = [name for name in effect_ids() if name not in MOVING]
+    first, second = rng.choice(len(still), 2, replace=False)
+    return still[int(first)], still[int(second)]

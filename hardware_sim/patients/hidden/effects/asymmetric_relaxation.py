@@ -1,4 +1,3 @@
-
 """Asymmetric relaxation: torque develops and decays at different speeds."""
 
 from __future__ import annotations
@@ -7,7 +6,7 @@ import math
 
 from numpy.random import Generator
 
-from hardware_sim.patients.hidden.base import Base
+from hardware_sim.patients.hidden.base import Base, lag_after, second_order_step
 from hardware_sim.patients.hidden.kernels import FORCE, LARGEST_NM, STEP_S, Formulation, NotSuited, Stage, kernel
 
 
@@ -18,8 +17,9 @@ def _thelen(x, p, s, c):
     e = x / c[LARGEST_NM]
     factor = (0.5 + 1.5 * a) ** p[3]
     tau = p[0] / math.sqrt(p[2]) * factor if e > a else p[0] * math.sqrt(p[2]) / factor
-    s[0] += (e - a) * (1.0 - math.exp(-c[STEP_S] / tau))
-    s[1] += (s[0] * c[LARGEST_NM] - s[1]) * (1.0 - math.exp(-c[STEP_S] / p[1]))
+    before = s[0]
+    s[0] += (e - s[0]) * (1.0 - math.exp(-c[STEP_S] / tau))
+    s[1] = lag_after(before * c[LARGEST_NM], s[0] * c[LARGEST_NM], s[1], p[1], c[STEP_S])
     c[FORCE] = s[1] / c[LARGEST_NM]
     return s[1]
 
@@ -33,8 +33,8 @@ def _de_groote(x, p, s, c):
     factor = 1.0 + p[4] * (max(a, 0.0) - 0.4)
     up = math.exp(0.5 * p[2]) / (p[0] * factor)
     down = math.exp(-0.5 * p[2]) * factor / p[0]
-    s[0] += c[STEP_S] * ((f + 0.5) * up + (0.5 - f) * down) * (e - a)
-    s[1] += c[STEP_S] * (s[0] * c[LARGEST_NM] - s[1]) / p[1]
+    s[0] += (e - a) * (1.0 - math.exp(-c[STEP_S] * ((f + 0.5) * up + (0.5 - f) * down)))
+    s[1] = lag_after(a * c[LARGEST_NM], s[0] * c[LARGEST_NM], s[1], p[1], c[STEP_S])
     c[FORCE] = s[1] / c[LARGEST_NM]
     return s[1]
 
@@ -44,12 +44,9 @@ def _cross_bridges(x, p, s, c):
     """p: 1/Tω, ζ, log ratio, smoothing. Second order; the rate depends on whether force is being made or lost."""
     made = math.tanh((x - s[0]) / (p[3] * c[LARGEST_NM]))
     rate = p[0] * math.exp(0.25 * p[2] * made)
-    for _ in range(2):
-        h = 0.5 * c[STEP_S]
-        s[1] += h * (rate * rate * (x - s[0]) - 2.0 * p[1] * rate * s[1])
-        s[0] += h * s[1]
-    c[FORCE] = s[0] / c[LARGEST_NM]
-    return s[0]
+    y = second_order_step(x, rate, p[1], s, 0, c[STEP_S])
+    c[FORCE] = y / c[LARGEST_NM]
+    return y
 
 
 def _lags(base: Base, rng: Generator) -> tuple[float, float]:

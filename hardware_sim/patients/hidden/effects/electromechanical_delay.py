@@ -1,4 +1,3 @@
-
 """Electromechanical delay: torque answers some tens of milliseconds after the pulse."""
 
 from __future__ import annotations

@@ -1,0 +1,93 @@
+
+"""Mixed fibres: fast and slow fibres answer side by side."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.random import Generator
+
+from hardware_sim.patients.hidden.base import Base, second_order_step
+from hardware_sim.patients.hidden.kernels import FORCE, LARGEST_NM, STEP_S, Formulation, Stage, kernel
+
+
+@kernel
+def _two_branches(x, p, s, c):
+    """p: 1/Tω fast, 1/Tω slow, ζ, fast share; last: whether the fast fibres are recruited first."""
+    if p[4] > 0.5:
+        fast = min(x, p[3] * c[LARGEST_NM])
+        slow = x - fast
+    else:
+        fast, slow = p[3] * x, (1.0 - p[3]) * x
+    y = second_order_step(fast, p[0], p[2], s, 0, c[STEP_S]) + second_order_step(slow, p[1], p[2], s, 2, c[STEP_S])
+    c[FORCE] = y / c[LARGEST_NM]
+    return y
+
+
+@kernel
+def _spectrum(x, p, s, c):
+    """p: ζ, then seven shares and seven rates."""
+    y = 0.0
+    for i in range(7):
+        y += second_order_step(p[1 + i] * x, p[8 + i], p[0], s, 2 * i, c[STEP_S])
+    c[FORCE] = y / c[LARGEST_NM]
+    return y
+
+
+@kernel
+def _slow_tail(x, p, s, c):
+    """p: 1/Tω, ζ, slow share, time constant of the slow first-order fibres s."""
+    fast = second_order_step(x, p[0], p[1], s, 0, c[STEP_S])
+    s[2] += (x - s[2]) * (1.0 - math.exp(-c[STEP_S] / p[3]))
+    y = (1.0 - p[2]) * fast + p[2] * s[2]
+    c[FORCE] = y / c[LARGEST_NM]
+    return y
+
+
+def _pair(rng: Generator, base: Base, name: str, source: str, ordered: bool) -> Formulation:
+    share, rate = float(rng.uniform(0.3, 0.7)), 1.0 / base.t_omega_s
+
+    def build(m: float) -> list[Stage]:
+        rates = rate * math.exp(m * (1.0 - share)), rate * math.exp(-m * share)
+        return [Stage("dynamics", _two_branches, (*rates, base.zeta, share, 1.0 if ordered else 0.0))]
+
+    return Formulation(name, source, build, 2.3, "log_ratio", {"fast_share": share})
+
+
+def fast_and_slow(rng: Generator, base: Base) -> Formulation:
+    return _pair(rng, base, "fast and slow in parallel", "Milner-Brown, Stein and Yemm 1973", False)
+
+
+def fast_first(rng: Generator, base: Base) -> Formulation:
+    name = "fast fibres recruited before the slow ones"
+    return _pair(rng, base, name, "reversed order: Trimble and Enoka 1991; Gregory and Bickel 2005", True)
+
+
+def spectrum(rng: Generator, base: Base) -> Formulation:
+    share = rng.dirichlet(np.full(7, 4.0))
+    z = np.linspace(-1.5, 1.5, 7)
+    z = z - float(share @ z)
+    return Formulation(
+        "spectrum of contraction times",
+        "spread of twitch times as in Fuglevand, Winter and Patla 1993",
+        lambda m: [Stage("dynamics", _spectrum, (base.zeta, *share, *(np.exp(-m * z) / base.t_omega_s)))],
+        1.3,
+        "log_spread",
+        {"shares": share.tolist()},
+    )
+
+
+def slow_tail(rng: Generator, base: Base) -> Formulation:
+    tail = float(np.exp(rng.uniform(np.log(2.5), np.log(8.0)))) * base.t_omega_s
+    return Formulation(
+        "second-order fast fibres, first-order slow ones",
+        "sim",
+        lambda m: [Stage("dynamics", _slow_tail, (1.0 / base.t_omega_s, base.zeta, m, tail))],
+        0.7,
+        "slow_share",
+        {"tau_slow_s": tail},
+    )
+
+
+FORMULATIONS = (fast_and_slow, fast_first, spectrum, slow_tail)

@@ -1,0 +1,109 @@
+# ruff: noqa: ARG001 (every kernel takes the same four arguments)
+"""Passive torque: tissue resists movement without any stimulation."""
+
+from __future__ import annotations
+
+import math
+
+from numpy.random import Generator
+
+from hardware_sim.patients.hidden.base import Base
+from hardware_sim.patients.hidden.kernels import ANGLE_RAD, STEP_S, VELOCITY_RAD_S, Formulation, Stage, kernel
+
+
+@kernel
+def _exponential(x, p, s, c):
+    """p: size N·m, fibre lengths per rad (signed), angle of slack, viscosity as a share of the size, per rad/s."""
+    stretch = p[1] * (c[ANGLE_RAD] - p[2])
+    elastic = (math.exp(4.0 * stretch / 0.6) - 1.0) / (math.exp(4.0) - 1.0) if stretch > 0.0 else 0.0
+    return x - p[0] * (elastic * p[4] + p[3] * c[VELOCITY_RAD_S])
+
+
+@kernel
+def _two_ends(x, p, s, c):
+    """p: size, steepness per rad and angle of the flexed and of the extended end, viscosity share."""
+    flexed = math.exp(-p[1] * (c[ANGLE_RAD] - p[2]))
+    extended = math.exp(p[3] * (c[ANGLE_RAD] - p[4]))
+    return x + p[0] * (flexed - extended - p[5] * c[VELOCITY_RAD_S])
+
+
+@kernel
+def _friction(x, p, s, c):
+    """p: size, stiffness, viscosity and dry friction as shares."""
+    v = c[VELOCITY_RAD_S]
+    return x - p[0] * (p[1] * (c[ANGLE_RAD] - 0.5 * math.pi) + p[2] * v + p[3] * math.tanh(v / 0.05))
+
+
+@kernel
+def _relaxing(x, p, s, c):
+    """p: size, lasting stiffness share, relaxation time s. s: the dashpot's angle. A standard linear solid."""
+    angle = c[ANGLE_RAD] - 0.5 * math.pi
+    if s[1] == 0.0:
+        s[0], s[1] = angle, 1.0
+    s[0] += c[STEP_S] * (angle - s[0]) / p[2]
+    return x - p[0] * (p[1] * angle + (1.0 - p[1]) * (angle - s[0]))
+
+
+def exponential(rng: Generator, _base: Base) -> Formulation:
+    per_rad = float(rng.choice([-1.0, 1.0]) * rng.uniform(0.4, 0.7))
+    slack = 0.5 * math.pi - math.copysign(float(rng.uniform(0.1, 0.6)), per_rad)
+    viscous = float(rng.uniform(0.1, 0.6))
+    return Formulation(
+        "exponential spring and dashpot",
+        "De Groote, Kinney, Rao and Fregly 2016",
+        lambda m: [Stage("additive", _exponential, (m, per_rad, slack, viscous, 4.0 * math.copysign(1.0, per_rad)))],
+        8.0,
+        "size_nm",
+        {"lengths_per_rad": per_rad, "slack_rad": slack, "viscous_share_s": viscous},
+        True,
+    )
+
+
+def two_ends(rng: Generator, _base: Base) -> Formulation:
+    numbers = (
+        float(rng.uniform(2.0, 5.0)),
+        float(rng.uniform(0.8, 1.3)),
+        float(rng.uniform(2.0, 5.0)),
+        float(rng.uniform(1.8, 2.3)),
+        float(rng.uniform(0.1, 0.6)),
+    )
+    return Formulation(
+        "exponentials at both ends of the range",
+        "Hatze 1997; Riener and Edrich 1999",
+        lambda m: [Stage("additive", _two_ends, (m, *numbers))],
+        6.0,
+        "size_nm",
+        dict(
+            zip(("flexed_per_rad", "flexed_rad", "extended_per_rad", "extended_rad", "viscous_s"), numbers, strict=True)
+        ),
+        True,
+    )
+
+
+def friction(rng: Generator, _base: Base) -> Formulation:
+    shares = float(rng.uniform(0.6, 1.4)), float(rng.uniform(0.2, 0.8)), float(rng.uniform(0.0, 0.25))
+    return Formulation(
+        "spring, dashpot and some dry friction",
+        "Ashworth-like stiffness, linear",
+        lambda m: [Stage("additive", _friction, (m, *shares))],
+        5.0,
+        "size_nm",
+        dict(zip(("stiffness", "viscosity_s", "dry"), shares, strict=True)),
+        True,
+    )
+
+
+def relaxing(rng: Generator, _base: Base) -> Formulation:
+    lasting, tau = float(rng.uniform(0.3, 0.7)), float(rng.uniform(0.4, 2.0))
+    return Formulation(
+        "standard linear solid",
+        "Fung 1981",
+        lambda m: [Stage("additive", _relaxing, (m, lasting, tau))],
+        6.0,
+        "stiffness_nm_per_rad",
+        {"lasting_share": lasting, "relaxation_s": tau},
+        True,
+    )
+
+
+FORMULATIONS = (exponential, two_ends, friction, relaxing)

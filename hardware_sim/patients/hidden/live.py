@@ -1,0 +1,107 @@
+"""The hidden muscle in real time: single pulses in, torque out."""
+
+from __future__ import annotations
+
+import math
+
+from hardware_sim.patients.hidden.chain import Chain
+from hardware_sim.patients.hidden.draw import Scenario
+from hardware_sim.patients.hidden.kernels import Floats
+from hardware_sim.patients.hidden.scenario import split
+
+STEPS_PER_S = 1600.0
+PULSE_PERIOD_S = 0.025
+LATE_S = 0.005
+NOMINAL_CURRENT_MA = 20.0
+
+_Saved = tuple[Floats, Floats, float]
+
+
+class HiddenMuscle:
+    """A muscle with something hidden in it; answers to the `Muscle` protocol, joint held still.
+
+    A pulse's width is held for 25 ms; what jitter leaves open between two holds, up to 5 ms, is closed by going
+    back to the end of the first. Another current than 20 mA scales the width by charge.
+
+    Parameters
+    ----------
+    scenario
+        The base muscle and what is hidden in it.
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        before, after = split(scenario.stages())
+        largest_nm = scenario.base.largest_nm
+        self._muscle = Chain(before, largest_nm, 1.0 / STEPS_PER_S)
+        self._converters = [Chain(after, largest_nm, 1.0 / STEPS_PER_S) for _ in range(2)] if after else []
+        self._done = 0  # steps made; the state is that at `_done` / STEPS_PER_S
+        self._values = (0.0, 0.0)  # at the last two steps
+        self._edges: list[tuple[float, float]] = []  # times in steps from which a width holds, not yet passed
+        self._width_us = 0.0
+        self._arrivals: list[float] = []
+        self._hold_end = -math.inf
+        self._at_hold_end: tuple[_Saved, int, tuple[float, float], float] | None = None
+
+    def pulse(self, time_s: float, width_us: float, current_ma: float) -> None:
+        """A pulse of `width_us` a phase and `current_ma` reaches the electrodes at `time_s`."""
+        at = time_s * STEPS_PER_S
+        width = width_us * current_ma / NOMINAL_CURRENT_MA
+        self._run_to(math.floor(at + 1e-6))
+        late = at - self._hold_end
+        if 0.0 < late <= LATE_S * STEPS_PER_S:
+            self._close_gap(at)
+        self._at_hold_end = None
+        self._edges = [edge for edge in self._edges if edge[0] < at]
+        self._edges += [(at, width), (at + PULSE_PERIOD_S * STEPS_PER_S, 0.0)]
+        if width > 0.0:
+            self._arrivals.append(at)
+        self._hold_end = at + PULSE_PERIOD_S * STEPS_PER_S
+
+    def torque_nm(self, time_s: float) -> float:
+        """Advance to `time_s` and give the torque the load cell would read there, N·m, before its noise."""
+        at = time_s * STEPS_PER_S
+        self._run_to(math.floor(at + 1e-6))
+        before, last = self._values
+        torque = last + (last - before) * (at - self._done) if at > self._done + 1e-6 else last
+        return self._converters[0].step(torque, 0.0, at) if self._converters else torque
+
+    def sensor(self, reading_nm: float, time_s: float) -> float:
+        """What the converter makes of a reading that has its noise already: rails and steps come after noise."""
+        return self._converters[1].step(reading_nm, 0.0, time_s * STEPS_PER_S) if self._converters else reading_nm
+
+    def _close_gap(self, at: float) -> None:
+        """Hold the last width up to `at`, though its hold had run out."""
+        if self._at_hold_end is None:  # the step in which it ends has not been made
+            self._edges = [edge for edge in self._edges if edge[0] != self._hold_end]
+            return
+        saved, done, values, width = self._at_hold_end
+        reached = self._done
+        self._muscle.restore(saved)
+        self._done, self._values, self._width_us = done, values, width
+        self._edges = [(at, 0.0)]
+        self._at_hold_end = None
+        self._run_to(reached)
+
+    def _run_to(self, step: int) -> None:
+        while self._done < step:
+            width, pulse = self._input()
+            self._values = (self._values[1], self._muscle.step(width, pulse, self._done + 1.0))
+            self._done += 1
+
+    def _input(self) -> tuple[float, float]:
+        """Mean width over the step about to be made, and whether a pulse arrives in it."""
+        start, end = float(self._done), self._done + 1.0
+        pulse = 0.0
+        if self._arrivals and self._arrivals[0] < end:
+            self._arrivals.pop(0)
+            pulse = 1.0
+        if not self._edges or self._edges[0][0] >= end:
+            return self._width_us, pulse
+        mean, since = 0.0, start
+        while self._edges and self._edges[0][0] < end:
+            at, width = self._edges.pop(0)
+            if at == self._hold_end:
+                self._at_hold_end = (self._muscle.save(), self._done, self._values, self._width_us)
+            mean += self._width_us * max(at - since, 0.0)
+            since, self._width_us = max(at, start), width
+        return mean + self._width_us * (end - since), pulse

@@ -1,0 +1,42 @@
+# ruff: noqa: ARG001 (every kernel takes the same four arguments)
+"""A slow converter: the sensor holds each reading for a while, or rounds it coarsely."""
+
+from __future__ import annotations
+
+from numpy.random import Generator
+
+from hardware_sim.patients.hidden.base import Base
+from hardware_sim.patients.hidden.kernels import LARGEST_NM, TIME_S, Formulation, Stage, kernel
+
+
+@kernel
+def _held(x, p, s, c):
+    """p: how long a reading is held, s. s: reading, time of the next."""
+    if p[0] <= 0.0:
+        return x
+    if c[TIME_S] >= s[1]:
+        s[0] = x
+        s[1] += p[0]
+    return s[0]
+
+
+@kernel
+def _coarse(x, p, s, c):
+    """p: step as a share of the largest torque."""
+    if p[0] <= 0.0:
+        return x
+    step = p[0] * c[LARGEST_NM]
+    return round(x / step) * step
+
+
+def held(_rng: Generator, _base: Base) -> Formulation:
+    return Formulation(
+        "each reading is held", "sample and hold", lambda m: [Stage("converter", _held, (m,))], 1.2, "held_s"
+    )
+
+
+def coarse(_rng: Generator, _base: Base) -> Formulation:
+    return Formulation("coarse steps", "quantiser", lambda m: [Stage("converter", _coarse, (m,))], 0.6, "step_share")
+
+
+FORMULATIONS = (held, coarse)
