@@ -22,24 +22,34 @@ def rms(residual_nm: np.ndarray) -> float:
     return float(np.sqrt(np.mean(residual_nm**2))) if residual_nm.size else float("nan")
 
 
-def white_sd(grid: Grid, predicted_nm: np.ndarray, block_sd_nm: float) -> float:
+def white_sd(grid: Grid, predicted_nm: np.ndarray, block_sd_nm: float, freedom: float, white: bool) -> float:
     """White measurement noise at the record's own rate, N·m.
 
-    Where an interval has several samples, from their spread about the interval's mean residual: what is slower than a
-    pulse, a missing effect or correlated noise, doesn't enter. With one sample a pulse, from second differences of
-    the residual, if they are smaller than what the fit left over.
+    Where the residual is white on the grid and as large there as white samples would make it, from all of it, which is
+    the efficient way. Else something slower is left in it (a missing effect, correlated noise, hum), and the noise is
+    estimated from second differences, which hardly see what is slow.
+
+    Parameters
+    ----------
+    grid : Grid
+        The record.
+    predicted_nm : ndarray, shape (N,)
+        Of the model.
+    block_sd_nm : float
+        Standard deviation of the residual on the grid.
+    freedom : float
+        Effective number of parameters.
+    white : bool
+        Whether the residual on the grid is better called white than correlated.
     """
+    rows = grid.fitted[grid.interval] & ~grid.record.held_out
     residual = grid.record.torque_nm - predicted_nm
-    if np.median(grid.count) >= 4:
-        jump = np.diff(residual, 2)
-        same = (grid.interval[2:] == grid.interval[:-2]) & ~grid.record.held_out[2:]
-        if same.sum() >= 16:
-            return float(np.sqrt(np.mean(jump[same] ** 2) / 6.0))
-    inner = ~grid.record.held_out
-    jump = np.diff(residual, 2)[inner[2:] & inner[:-2]]
-    if jump.size < 16:
-        return block_sd_nm
-    return float(min(np.sqrt(np.mean(jump**2) / 6.0), block_sd_nm))
+    used = residual[rows]
+    plain = float(np.sqrt(used @ used / max(used.size - freedom, 1.0)))
+    jump = np.diff(residual, 2)[rows[2:] & rows[1:-1] & rows[:-2]]
+    if white and abs(block_sd_nm * np.sqrt(np.median(grid.count[grid.fitted])) / max(plain, 1e-300) - 1.0) < 0.2:
+        return plain
+    return plain if jump.size < 16 else float(min(np.sqrt(np.mean(jump**2) / 6.0), plain))
 
 
 def ceiling_percent(measured_nm: np.ndarray, sd_nm: float) -> float:

@@ -40,7 +40,7 @@ def finish(method_id: str, solution: Solution, delta_bic: float) -> Model:
         },
     )
     predicted = predict_on(model, grid)
-    sd = white_sd(grid, predicted, block_sd)
+    sd = white_sd(grid, predicted, block_sd, solution.freedom, solution.ar1 == 0.0)
     noise = Noise(white_sd_nm=sd, block_sd_nm=block_sd, ar1=solution.ar1, delta_bic=delta_bic)
     return model.with_(noise=noise, fit=figures(grid, problem.rows, predicted, sd))
 

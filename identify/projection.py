@@ -12,13 +12,12 @@ from functools import cached_property
 
 import numpy as np
 
-from identify.dynamics import boundary_states
 from identify.errors import NotIdentifiable
 from identify.grid import Grid
 from identify.linear import SecondOrder
 from identify.noise import whiten
 from identify.recruitment.curve import Basis
-from identify.recruitment.knots import PILOT_KNOTS, even_knots, spline_roughness
+from identify.recruitment.knots import KNOTS, PILOT_KNOTS, adapted_knots, even_knots, spline_roughness
 from identify.recruitment.smoothing import choose_weight
 from identify.recruitment.spline import SplineBasis
 
@@ -201,7 +200,7 @@ def search(
         taken += 1
         step = state.step(damping)
         trial = _bounded(problem, _moved(linear, step))
-        moved = _difference(linear, trial)
+        moved = _difference(linear, trial)[: problem.searched]
         # Steps in units of standard errors, from the information itself.
         size = float(np.sqrt(max(moved @ state.information @ moved, 0.0) / max(state.variance, 1e-300)))
         if size < tolerance or np.max(np.abs(moved)) < 1e-9:
@@ -386,10 +385,21 @@ def pilot_solution(grid: Grid, rows: np.ndarray, from_rest: bool, delay_s: float
     return search(problem, best.linear, most=12, tolerance=0.1)
 
 
-def pilot(grid: Grid) -> tuple[np.ndarray, np.ndarray]:
-    """Recruitment curve of a pilot fit: pulse widths, µs, and torques, N·m."""
-    solution = pilot_solution(grid, grid.fitted, begins_at_rest(grid))
-    return pilot_curve(solution)
+def designed(first: Solution, count: int = KNOTS) -> tuple[Problem, SecondOrder]:
+    """The problem with its final spline, in two steps from a pilot, and where to begin its search.
+
+    The pilot's few knots say roughly where the curve bends; a first fit with all knots says it well, and how much.
+    """
+    grid, rows = first.problem.grid, first.problem.rows
+    from_rest, delay_s = first.problem.from_rest, first.problem.delay_s
+    largest = float(np.max(grid.pulse_width_us))
+    basis = SplineBasis(adapted_knots(pilot_curve(first), largest, count))
+    rough = search(
+        Problem(grid, basis, spline_roughness(basis), rows, from_rest, delay_s), first.linear, most=3, tolerance=0.3
+    )
+    final = SplineBasis(adapted_knots(pilot_curve(rough), largest, count))
+    roughness = spline_roughness(final, (basis, rough.coefficients[: basis.size]))
+    return Problem(grid, final, roughness, rows, from_rest, delay_s), rough.linear
 
 
 def pilot_curve(solution: Solution) -> tuple[np.ndarray, np.ndarray]:
@@ -411,15 +421,3 @@ def begins_at_rest(grid: Grid) -> bool:
     # Stimulated from the first pulse on: at rest if the torque starts where it is lowest.
     first = grid.torque_nm[np.flatnonzero(np.isfinite(grid.torque_nm))[:2]]
     return bool(first.size and abs(first.mean() - np.min(later)) < 0.1 * np.ptp(later))
-
-
-__all__ = [
-    "Problem",
-    "Solution",
-    "begins_at_rest",
-    "boundary_states",
-    "pilot",
-    "pilot_curve",
-    "pilot_solution",
-    "search",
-]

@@ -17,9 +17,8 @@ from identify.grid import Grid
 from identify.methods.common import fitted_rows
 from identify.model import Model
 from identify.noise import noise_evidence
-from identify.projection import Problem, Solution, begins_at_rest, pilot_curve, pilot_solution, search
-from identify.recruitment.knots import KNOTS, adapted_knots, spline_roughness
-from identify.recruitment.spline import SplineBasis
+from identify.projection import Solution, begins_at_rest, designed, pilot_solution, search
+from identify.recruitment.knots import KNOTS
 
 
 class MaximumLikelihood:
@@ -40,11 +39,8 @@ METHOD = MaximumLikelihood()
 
 def estimate(grid: Grid, rows: np.ndarray, knots: int = KNOTS, delay_s: float | None = None) -> tuple[Solution, float]:
     """The solution, and the evidence for AR(1) over white noise (ΔBIC)."""
-    from_rest = begins_at_rest(grid)
-    first = pilot_solution(grid, rows, from_rest, delay_s)
-    basis = SplineBasis(adapted_knots(pilot_curve(first), float(np.max(grid.pulse_width_us)), knots))
-    problem = Problem(grid, basis, spline_roughness(basis), rows, from_rest, delay_s)
-    solution = search(problem, first.linear)
+    problem, start = designed(pilot_solution(grid, rows, begins_at_rest(grid), delay_s), knots)
+    solution = search(problem, start)
     ar1, delta_bic = noise_evidence(solution.residual_nm, problem.stretches)
     for _ in range(3):
         if delta_bic <= 0:

@@ -1,4 +1,4 @@
-"""Where the knots of the recruitment spline stand: one common set for a record, whatever is fitted on it."""
+"""Where the knots of the recruitment spline stand, and how much each part may bend: one design for a record."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 KNOTS = 31
 PILOT_KNOTS = 12
 NARROWEST_US = 0.5
+STRAIGHTEST = 0.01
+"""Least share of the strongest bending that the penalty expects anywhere: a floor, so that no part is forced straight."""
 
 
 def even_knots(largest_us: float, count: int) -> np.ndarray:
@@ -27,9 +29,33 @@ def design_knots(grid: Grid, count: int = KNOTS) -> np.ndarray:
     Half of the knots are spread evenly, half go where a pilot fit says that the curve bends, so that a rise within
     5 µs is met as well as one over 200 µs. The same knots serve every candidate: what one model may bend, all may.
     """
-    from identify.projection import pilot
+    return design_spline(grid, count=count)[0].knots_us
 
-    return adapted_knots(pilot(grid), float(np.max(grid.pulse_width_us)), count)
+
+def design_spline(grid: Grid, rows: np.ndarray | None = None, count: int = KNOTS) -> tuple[SplineBasis, np.ndarray]:
+    """Basis and penalty of a record's recruitment spline: the common design for every candidate.
+
+    Parameters
+    ----------
+    grid : Grid
+        The record.
+    rows : ndarray of bool, shape (K,), optional
+        Rows that are fitted; by default all that may be.
+    count : int
+        Knots.
+
+    Returns
+    -------
+    basis : SplineBasis
+    roughness : ndarray, shape (size, size)
+        Penalty without units, to be weighted by `choose_weight`.
+    """
+    from identify.projection import begins_at_rest, designed, pilot_solution
+
+    rows = grid.fitted if rows is None else rows
+    problem = designed(pilot_solution(grid, rows, begins_at_rest(grid)), count)[0]
+    assert isinstance(problem.basis, SplineBasis)
+    return problem.basis, problem.roughness
 
 
 def adapted_knots(pilot_curve: tuple[np.ndarray, np.ndarray], largest_us: float, count: int = KNOTS) -> np.ndarray:
@@ -47,14 +73,29 @@ def adapted_knots(pilot_curve: tuple[np.ndarray, np.ndarray], largest_us: float,
     return knots
 
 
-def spline_roughness(basis: SplineBasis) -> np.ndarray:
-    """∫ω f'' ² with ω lower where knots are denser, scaled to be free of units: the one penalty for every candidate."""
-    node, weight = np.polynomial.legendre.leggauss(3)
+def spline_roughness(basis: SplineBasis, pilot: tuple[SplineBasis, np.ndarray] | None = None) -> np.ndarray:
+    """∫ω f'''² over the knots, scaled to be free of units.
+
+    The third derivative, since a recruitment curve is a smooth bend and not a straight line; ω lets it bend where it
+    does bend: from a pilot's own third derivative where there is one, else from the spacing of the knots. A rise
+    within a few µs then doesn't cost the smoothness of the plateau.
+
+    Parameters
+    ----------
+    basis : SplineBasis
+        The spline that is penalised.
+    pilot : tuple of SplineBasis and ndarray, optional
+        A first estimate: basis and coefficients.
+    """
     gaps = np.diff(basis.knots_us)
-    half = gaps / 2
-    u = (basis.knots_us[:-1] + half)[:, None] + half[:, None] * node
-    second = basis.design(u.ravel(), derivative=2)
-    local = (gaps / gaps.mean()) ** 3
-    weights = (local * half)[:, None] * weight
-    span = basis.knots_us[-1]
-    return second.T @ (second * weights.ravel()[:, None]) * span**3
+    middle = basis.knots_us[:-1] + gaps / 2
+    third = basis.design(middle, derivative=3)
+    if pilot is None:
+        ease = (gaps / gaps.mean()) ** 3
+    else:
+        own = pilot[0].knots_us
+        centre = (own[1:] + own[:-1]) / 2
+        energy = (pilot[0].design(centre, derivative=3) @ pilot[1]) ** 2
+        energy = np.convolve(np.pad(energy, 2, mode="edge"), [0.1, 0.2, 0.4, 0.2, 0.1], mode="valid")
+        ease = 1.0 / (np.interp(middle, centre, energy) / max(float(energy.max()), 1e-300) + STRAIGHTEST)
+    return third.T @ (third * (ease * gaps)[:, None]) * basis.largest_us**5
