@@ -116,7 +116,15 @@ def _penalty(problem: Problem, theta: np.ndarray) -> float:
     return 0.5 * float(away @ precision @ away)
 
 
-def solve(problem: Problem, theta: np.ndarray, noise: NoiseLevel, *, most: int = 20, tolerance: float = 0.02) -> Fitted:
+def solve(
+    problem: Problem,
+    theta: np.ndarray,
+    noise: NoiseLevel,
+    *,
+    most: int = 20,
+    tolerance: float = 0.02,
+    floor: float | None = None,
+) -> Fitted:
     """Most probable parameters, from a start.
 
     Parameters
@@ -131,6 +139,8 @@ def solve(problem: Problem, theta: np.ndarray, noise: NoiseLevel, *, most: int =
         Steps at most.
     tolerance : float
         Gain in log posterior below which it stops.
+    floor : float or None
+        Log evidence of a rival start: a run that stays far below it and hardly gains is given up.
     """
     theta = np.clip(theta, problem.lower, problem.upper)
     prior_mean, precision = problem.prior
@@ -144,6 +154,7 @@ def solve(problem: Problem, theta: np.ndarray, noise: NoiseLevel, *, most: int =
     noise, log_likelihood = _noise(problem, residual, noise)
     value = log_likelihood - _penalty(problem, theta)
     small = 0
+    best_occam = 60.0  # the evidence is at least about this far below the log posterior
     while iterations < most:
         iterations += 1
         assert jacobian is not None
@@ -171,6 +182,8 @@ def solve(problem: Problem, theta: np.ndarray, noise: NoiseLevel, *, most: int =
         small = small + 1 if gain < tolerance else 0
         _, jacobian = problem.run(theta, derivatives=True)
         if small >= 1 and iterations >= 2:
+            break
+        if floor is not None and iterations >= 4 and gain < 2.0 and value - best_occam < floor - 12.0:
             break
     assert jacobian is not None
     white = _whiten(problem, jacobian, noise)

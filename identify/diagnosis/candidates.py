@@ -1,0 +1,107 @@
+"""Every effect of the library tried on a record: its likeliest form, and the evidence for it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from identify.effects.base import Effect, Form, Scene
+from identify.engine.fit import Fitted, solve, start_from
+from identify.engine.problem import Problem
+from identify.engine.setup import Setup
+
+Progress = Callable[[float, str], None]
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One effect added to a model.
+
+    Parameters
+    ----------
+    effect : Effect
+        Which.
+    form : Form
+        Its likeliest form.
+    fitted : Fitted
+        The model with it.
+    gain : float
+        Log evidence over the model without it, the effect's prior odds included.
+    forms : dict
+        Gain by form.
+    """
+
+    effect: Effect
+    form: Form
+    fitted: Fitted
+    gain: float
+    forms: dict[str, float]
+
+
+def applicable(effect: Effect, setup: Setup, present: Iterable[str]) -> bool:
+    """Whether an effect can be considered: its columns are there, it isn't sought elsewhere, it isn't in already."""
+    record = setup.grid.record
+    return not effect.raw and effect.id not in present and all(getattr(record, need) is not None for need in effect.needs)
+
+
+def try_effect(effect: Effect, base: Fitted, forms: Iterable[Form] | None = None) -> Candidate | None:
+    """The effect's best form added to a model; None where there is nothing to start from."""
+    best: Fitted | None = None
+    best_form: Form | None = None
+    gains: dict[str, float] = {}
+    previous: dict[str, float] = {}
+    chain_gain = 0.0
+    residual = base.residual_nm
+    for form in forms or effect.forms:
+        if form.grows and (not gains or chain_gain <= 0.0):
+            break
+        found = fit_form(effect, form, base, residual, previous)
+        if found is None:
+            continue
+        gain = found.log_evidence - base.log_evidence + effect.prior
+        chain_gain = gain - (max(gains.values()) if gains else 0.0)
+        gains[form.name] = gain
+        if form.propose is not None:
+            previous, residual = found.parameters_of(effect.id), found.residual_nm
+        if best is None or found.log_evidence > best.log_evidence:
+            best, best_form = found, form
+    if best is None or best_form is None:
+        return None
+    return Candidate(effect, best_form, best, gains[best_form.name], gains)
+
+
+def fit_form(
+    effect: Effect, form: Form, base: Fitted, residual: np.ndarray, previous: dict[str, float]
+) -> Fitted | None:
+    """One form added to a model, from each of its starting values; the best."""
+    setup = base.problem.setup
+    scene: Scene = setup.scene
+    problem = Problem(setup, [*base.effects, (effect.id, form)])
+    starts = form.starts(scene)
+    if form.propose is not None:
+        starts = form.propose(np.where(setup.fitted, residual, np.nan), scene, previous)
+    best: Fitted | None = None
+    for start in starts:
+        theta = start_from(problem, base, {len(base.effects): start})
+        found = solve(problem, theta, base.noise, floor=None if best is None else best.log_evidence)
+        if best is None or found.log_evidence > best.log_evidence:
+            best = found
+    return best
+
+
+def scan(
+    base: Fitted, effects: Iterable[Effect], progress: Progress | None = None, share: tuple[float, float] = (0.0, 1.0)
+) -> list[Candidate]:
+    """Every applicable effect added to a model, best first."""
+    present = {name for name, _ in base.effects}
+    listed = [effect for effect in effects if applicable(effect, base.problem.setup, present)]
+    found = []
+    for index, effect in enumerate(listed):
+        if progress is not None:
+            progress(share[0] + (share[1] - share[0]) * index / len(listed), f"trying {effect.name.lower()}")
+        candidate = try_effect(effect, base)
+        if candidate is not None:
+            found.append(candidate)
+    return sorted(found, key=lambda candidate: -candidate.gain)
