@@ -29,6 +29,10 @@ class Analyses:
         """Measurement against model."""
         return await self._kept(model, "comparison", model_json=model.document.decode())
 
+    async def curves(self, model: Model) -> dict[str, Any]:
+        """Measured, predicted and commanded curves, thinned to what a screen shows."""
+        return await self._kept(model, "curves", model_json=model.document.decode())
+
     async def diagnosis(self, model: Model) -> dict[str, Any]:
         """What is missing."""
         return await self._kept(model, "diagnosis")

@@ -33,18 +33,25 @@ def fit(
     return {"json": model.to_json(), "model": model.to_dict()}
 
 
+def drawn(data: str, progress: Progress, model_json: str) -> dict[str, Any]:
+    """The curves a page draws: measured, predicted, commanded, and the step response."""
+    import identify
+
+    progress(0.1, "reading the recording")
+    record = identify.read(Path(data))
+    progress(0.5, "predicting")
+    return clean(curves(identify.Model.from_json(model_json), record))
+
+
 def comparison(data: str, progress: Progress, model_json: str) -> dict[str, Any]:
-    """Measurement against model: identify's comparison, and the curves a page draws."""
+    """Measurement against model: identify's comparison."""
     import identify
 
     progress(0.1, "reading the recording")
     record = identify.read(Path(data))
     model = identify.Model.from_json(model_json)
     progress(0.4, "comparing")
-    found = dict(identify.compare(model, record))
-    progress(0.8, "drawing")
-    found["curves"] = curves(model, record)
-    return clean(found)
+    return clean(dict(identify.compare(model, record)))
 
 
 def curves(model: Any, record: Any) -> dict[str, Any]:
@@ -183,6 +190,7 @@ def find_recording(progress: Progress, folder: str, test_id: str) -> dict[str, A
 VERBS: dict[str, Callable[..., dict[str, Any]]] = {
     "fit": fit,
     "comparison": comparison,
+    "curves": drawn,
     "diagnosis": diagnosis,
     "improve": improve,
     "effects": effects,

@@ -322,13 +322,14 @@ class Trials:
         start = (0.0, planned.get("duration_s", 0.0), None)
         end = (row.summary.get("duration_s", 0.0), row.summary.get("duration_s", 0.0), None)
         elapsed_s, duration_s, segment = (self.hub.position(row.id) or start) if running else end
-        job = self.jobs.get(row.id)
+        job, rig = self.jobs.get(row.id), self.rig.status
+        sealing = running and rig is not None and rig.test_id == row.id and rig.state == "sealing"
         model = self.versions.get(row.model_id) if row.model_id else None
         return {
             "id": row.id,
             "participant": row.participant,
             "kind": row.kind,
-            "state": row.state,
+            "state": "sealing" if sealing else row.state,
             "done": row.state not in OPEN_STATES,
             "reason": row.reason,
             "segment": segment,

@@ -37,20 +37,20 @@ def layout(**more: Any) -> dict[str, Any]:
 
 
 def line(
-    x: Sequence[float], y: Sequence[float | None], name: str, colour: str, width: float = 1.6, **more: Any
+    x: Sequence[float | str], y: Sequence[float | None], name: str, colour: str, width: float = 1.6, **more: Any
 ) -> dict[str, Any]:
     """A line trace."""
     return {"type": "scatter", "mode": "lines", "x": x, "y": y, "name": name,
             "line": {"color": colour, "width": width, **more.pop("line", {})}, **more}  # fmt: skip
 
 
-def of_model(document: dict[str, Any], comparison: dict[str, Any] | None) -> dict[str, Any]:
-    """All figures of a model's page; those that need the comparison only if there is one."""
+def of_model(document: dict[str, Any], curves: dict[str, Any] | None) -> dict[str, Any]:
+    """All figures of a model's page; those that need the measurement only if there is one."""
     figures = {"recruitment": recruitment(document)}
-    if comparison is not None and comparison.get("curves"):
+    if curves is not None:
         noise_sd_nm = (document.get("fit") or {}).get("noise_sd_nm")
-        figures["comparison"] = measurement(comparison["curves"], noise_sd_nm)
-        figures["step"] = step(comparison["curves"]["step_response"])
+        figures["comparison"] = measurement(curves, noise_sd_nm)
+        figures["step"] = step(curves["step_response"])
     return figures
 
 
@@ -141,3 +141,22 @@ def step(response: dict[str, list[float]]) -> dict[str, Any]:
             showlegend=False,
         ),
     }
+
+
+def steps(found: dict[str, Any]) -> dict[str, Any]:
+    """The falling error over the versions, with the noise as a line to fall to."""
+    names = [step["added"] or "base model" for step in found["steps"]]
+    dots = {"mode": "lines+markers", "marker": {"size": 9}}
+    data = [
+        line(names, [step["rms_nm"] for step in found["steps"]], "error on fitted rows", MEASURED, 2.0, **dots),
+        line(names, [step["held_out_rms_nm"] for step in found["steps"]], "held-out error", MODEL, 2.4, **dots),
+    ]
+    noise = {"type": "line", "xref": "paper", "x0": 0, "x1": 1, "y0": found["noise_sd_nm"], "y1": found["noise_sd_nm"],
+             "line": {"color": STIMULUS, "width": 1.5, "dash": "dash"}}  # fmt: skip
+    label = {"xref": "paper", "x": 1, "y": found["noise_sd_nm"], "text": "noise", "showarrow": False,
+             "yanchor": "bottom", "xanchor": "right", "font": {"color": STIMULUS}}  # fmt: skip
+    return {
+        "data": data,
+        "layout": layout(height=420, shapes=[noise], annotations=[label], xaxis=axis("Effect added", type="category"),
+                         yaxis=axis("RMS error (N·m)", rangemode="tozero")),
+    }  # fmt: skip

@@ -53,7 +53,7 @@ async def model(request: Request, context: Ctx, _who: ModelReader, model_id: str
     document = json.loads(row.document)
     found, problem = None, None
     try:
-        found = await context.analyses.comparison(row)
+        found = await context.analyses.curves(row)
     except ApiError as error:
         problem = error
     public = await asyncio.to_thread(context.versions.public, row)
@@ -64,7 +64,6 @@ async def model(request: Request, context: Ctx, _who: ModelReader, model_id: str
         document=document,
         recruitment=reading.recruitment(document),
         dynamics=reading.dynamics(document),
-        comparison=found,
         problem=problem,
         figures=charts.of_model(document, found),
     )

@@ -81,6 +81,13 @@ async def comparison(context: Ctx, _who: ModelReader, model_id: str) -> dict[str
     return await context.analyses.comparison(row)
 
 
+@router.get("/models/{model_id}/curves")
+async def curves(context: Ctx, _who: ModelReader, model_id: str) -> dict[str, Any]:
+    """The measured, predicted and commanded curves and the step response, thinned to what a screen shows."""
+    row = await asyncio.to_thread(context.versions.get, model_id)
+    return await context.analyses.curves(row)
+
+
 @router.get("/models/{model_id}/diagnosis")
 async def diagnosis(context: Ctx, _who: ModelReader, model_id: str) -> dict[str, Any]:
     """What is missing, ranked; or that nothing is; or that what is left has no name in the library."""

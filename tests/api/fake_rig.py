@@ -171,10 +171,10 @@ class FakeRig:
         if self.state != "running":
             self.state, self.reason = "latched", f"stopped by {request.by}"
             self._send(m.StateEvent(status=self.status()))
+        words = "No pulse since the stop command." if self.confirms_stop else "No ack."
         return m.StopEvidence(
-            confirmed=self.confirms_stop, detail="No pulse since the stop command." if self.confirms_stop else "No ack.",
-            last_pulse_age_s=0.06, device_state="stopped",
-        ).model_dump()  # fmt: skip
+            confirmed=self.confirms_stop, detail=words, last_pulse_age_s=0.06, device_state="stopped"
+        ).model_dump()
 
     async def _on_rearm(self, request: Any, writer: Any) -> dict[str, Any]:
         self.state, self.reason = "ready", ""

@@ -25,15 +25,14 @@ def model(effects: list[str]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def comparison() -> dict[str, Any]:
+def curves() -> dict[str, Any]:
     time_s = [k / 10 for k in range(200)]
     torque = [k % 50 / 10 for k in range(200)]
-    curves = {
+    return {
         "time_s": time_s, "torque_nm": torque, "predicted_torque_nm": [y + 0.05 for y in torque],
         "pulse_width_us": [k % 300 for k in range(200)], "segments": [{"name": "prbs", "start_s": 0, "end_s": 20}],
         "step_response": {"time_s": [0, 1, 2], "response": [0, 0.8, 1.0]},
     }  # fmt: skip
-    return {"fit_percent": 98.5, "curves": curves}
 
 
 def answer(verb: str, arguments: dict[str, Any], say: Any) -> dict[str, Any]:
@@ -50,7 +49,9 @@ def answer(verb: str, arguments: dict[str, Any], say: Any) -> dict[str, Any]:
         document = model(list(arguments.get("effects", [])))
         return {"result": {"json": json.dumps(document), "model": document}}
     if verb == "comparison":
-        return {"result": comparison()}
+        return {"result": {"fit_percent": 98.5}}
+    if verb == "curves":
+        return {"result": curves()}
     if verb == "diagnosis":
         return {"result": {"verdict": "nothing_missing", "missing": [], "where": []}}
     if verb == "effects":

@@ -1,0 +1,56 @@
+"""`stimrig improve`: effects added one by one while the evidence lasts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from api.terminal import Data, Json, number, progress_line, say, say_json, table, write
+
+
+def register(app: typer.Typer) -> None:
+    """Add the verb."""
+    app.command("improve")(improve)
+
+
+def improve(
+    data: Data,
+    html: Annotated[Path | None, typer.Option(help="write a report with charts here")] = None,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="write the last MODEL.json here")] = None,
+    as_json: Json = False,
+) -> None:
+    """Add effects one by one while the held-out error falls; each step is a model."""
+    import identify
+    from api.jobs import clean
+    from api.report import improvement_html
+
+    record = identify.read(data)
+    found = dict(identify.improve(record, progress=progress_line()))
+    models = found.pop("models")
+    if output is not None:
+        write(output, models[-1].to_json())
+    if html is not None:
+        write(html, improvement_html(clean(found), data.name))
+    if as_json:
+        say_json(found)
+        return
+    say(*improvement_lines(found))
+    say(*[f"written to {path}" for path in (output, html) if path is not None])
+
+
+def improvement_lines(found: dict[str, Any]) -> list[str]:
+    """The steps for people."""
+    rows = [
+        (
+            step["added"] or "base model",
+            number(step.get("fit_percent")),
+            number(step.get("rms_nm"), 4),
+            number(step.get("held_out_fit_percent")),
+            number(step.get("held_out_rms_nm"), 4),
+        )
+        for step in found["steps"]
+    ]
+    header = ("added", "fit %", "rms N·m", "held-out %", "held-out rms N·m")
+    return [*table(header, rows), "", f"noise {number(found['noise_sd_nm'], 4)} N·m; verdict: {found['verdict']}"]

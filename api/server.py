@@ -1,0 +1,73 @@
+"""`python -m api.server`: the web process. Prints one JSON line when it answers; ends at SIGTERM.
+
+Exit 2: a setting does not hold, the port is taken, or the database does not open.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import socket
+import sys
+
+import uvicorn
+from pydantic import ValidationError
+
+from api import logs
+from api.app import create_app
+from api.errors import ApiError
+from api.settings import Settings
+
+
+def main() -> int:
+    """Run the service; the exit code."""
+    logs.configure()
+    try:
+        settings = Settings()
+        listener = bind(settings.host, settings.port)
+        app = create_app(settings)
+    except ValidationError as error:
+        first = error.errors()[0]
+        name = "STIMRIG_" + "_".join(str(part) for part in first["loc"]).upper()
+        print(f"stimrig: {name}: {first['msg']}, not {first['input']!r}", file=sys.stderr)
+        return 2
+    except (ApiError, OSError) as error:
+        print(f"stimrig: {error}", file=sys.stderr)
+        return 2
+    host, port = listener.getsockname()[:2]
+    ready = {"url": f"http://{host}:{port}", "port": port, "drawn_token": app.state.context.drawn_token}
+    config = uvicorn.Config(
+        app, log_config=None, access_log=False, timeout_graceful_shutdown=2, ws_max_size=2**20, server_header=False
+    )
+    with contextlib.suppress(KeyboardInterrupt):
+        asyncio.run(serve(uvicorn.Server(config), listener, ready))
+    return 0
+
+
+def bind(host: str, port: int) -> socket.socket:
+    """A listening address, or the reason why it cannot be had."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    listener = socket.socket(family, socket.SOCK_STREAM)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind((host, port))
+    except OSError as error:
+        listener.close()
+        detail = f"{host}:{port}: {error.strerror or error}; take another port with --port"
+        raise OSError(detail) from error
+    return listener
+
+
+async def serve(server: uvicorn.Server, listener: socket.socket, ready: dict[str, object]) -> None:
+    """Serve; say so once the first request would be answered."""
+    running = asyncio.create_task(server.serve(sockets=[listener]))
+    while not server.started and not running.done():
+        await asyncio.sleep(0.01)
+    if server.started:
+        print(json.dumps(ready), flush=True)
+    await running
+
+
+if __name__ == "__main__":
+    sys.exit(main())

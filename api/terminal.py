@@ -1,0 +1,130 @@
+"""What the verbs of the command line share: reading what is asked for, and saying what was found."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+
+class InputError(Exception):
+    """Bad input: one line on standard error, exit 2."""
+
+
+Json = Annotated[bool, typer.Option("--json", help="one JSON object on standard output, nothing else there")]
+Data = Annotated[Path, typer.Argument(help="sealed recording (HDF5) or CSV file", metavar="DATA", show_default=False)]
+ModelFile = Annotated[
+    Path, typer.Argument(help="MODEL.json of `stimrig fit -o`", metavar="MODEL.json", show_default=False)
+]
+
+
+def names(text: str | None) -> tuple[str, ...]:
+    """A comma-separated list."""
+    return tuple(part.strip() for part in (text or "").split(",") if part.strip())
+
+
+def load_model(path: Path) -> Any:
+    """A model from its file.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, or holds no model.
+    """
+    import identify
+
+    try:
+        return identify.Model.from_json(path.read_text("utf-8"))
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror}. Give a file written by `stimrig fit -o`.") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: not a text file. Give a file written by `stimrig fit -o`.") from error
+    except identify.IdentifyError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def write(path: Path, text: str) -> None:
+    """Write a file.
+
+    Raises
+    ------
+    InputError
+        It cannot be written.
+    """
+    try:
+        path.write_text(text, "utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror}. Give a file in a folder that can be written.") from error
+
+
+def say_json(found: dict[str, Any]) -> None:
+    """One JSON object, nothing else."""
+    from api.jobs import clean
+
+    print(json.dumps(clean(found), ensure_ascii=False, allow_nan=False))
+
+
+def say(*lines: str) -> None:
+    """Lines for people."""
+    print("\n".join(lines))
+
+
+def number(value: float | None, digits: int = 2, unit: str = "") -> str:
+    """A number for people; a dash where there is none."""
+    text = "–" if value is None else f"{value:.{digits}f}"
+    return f"{text} {unit}".rstrip()
+
+
+def table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
+    """Columns, aligned."""
+    cells = [list(header), *[list(row) for row in rows]]
+    widths = [max(len(row[index]) for row in cells) for index in range(len(cells[0]))]
+    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in cells]
+    return [lines[0], "  ".join("-" * width for width in widths), *lines[1:]]
+
+
+def progress_line() -> Callable[[float, str], None]:
+    """A progress line on standard error, where a person looks at it."""
+    shown = sys.stderr.isatty()
+
+    def progress(fraction: float, text: str = "") -> None:
+        if shown:
+            end = "\n" if fraction >= 1 else ""
+            print(f"\r\x1b[K{100 * fraction:3.0f} %  {text[:90]}", end=end, file=sys.stderr, flush=True)
+
+    return progress
+
+
+def model_report(document: dict[str, Any]) -> list[str]:
+    """What a person reads off a model."""
+    from api import reading
+    from api.verdict import figures, quality
+
+    fit = figures(document)
+    dynamics, curve = reading.dynamics(document), reading.recruitment(document)
+    effects = ", ".join(effect["id"] for effect in document.get("effects") or []) or "none"
+    lines = [
+        f"model          {document['model_id']}  ({document['method']}, effects: {effects})",
+        f"fit            {number(fit['fit_percent'])} %  (ceiling {number(fit['ceiling_percent'])} %), "
+        f"rms {number(fit['rms_nm'], 4)} N·m, noise {number(fit['noise_sd_nm'], 4)} N·m",
+        f"held out       {number(fit['held_out_fit_percent'])} %, rms {number(fit['held_out_rms_nm'], 4)} N·m",
+    ]
+    if dynamics["time_constant_s"] is not None:
+        lines.append(
+            f"dynamics       Tω {number(dynamics['time_constant_s'], 4)} s, ζ {number(dynamics['damping'], 4)}, "
+            f"delay {number(1000 * (dynamics['delay_s'] or 0), 1)} ms"
+        )
+    elif dynamics["poles_per_s"]:
+        lines.append(
+            "dynamics       poles " + ", ".join(f"{re:+.3f}{im:+.3f}j" for re, im in dynamics["poles_per_s"]) + " 1/s"
+        )
+    lines.append(
+        f"recruitment    threshold {number(curve['threshold_us'], 0)} µs (5 % of the rise), "
+        f"plateau {number(curve['plateau_nm'])} N·m (95 % at {number(curve['saturation_us'], 0)} µs)"
+    )
+    lines.append(f"quality        {quality(fit)['verdict']}: {quality(fit)['words']}")
+    return lines
