@@ -106,13 +106,14 @@ def assemble(contents: JournalContents, outcome: str = "fault", reason: str = ""
     end = contents.first_json(Kind.END) or {"outcome": outcome, "reason": reason, "time_s": _last_time(contents)}
     rate_hz = float(header["plan"]["pulse_rate_hz"])
     end_s = float(end["time_s"]) - t0_s
-    columns, pulse_times = _pulses(contents, planned, rate_hz, t0_s, end_s)
+    played_s = min(end_s, float(end.get("stimulation_end_s", end["time_s"])) - t0_s)
+    columns, pulse_times = _pulses(contents, planned, rate_hz, t0_s, played_s)
     torque, alignment, measured_hz = _torque(contents, t0_s, end_s, pulse_times, float(header["sample_rate_hz"]))
     columns.update(torque)
-    names = [s["name"] for s in header["segments"] if s["start"] / rate_hz < max(end_s, 1e-9)]
+    names = [s["name"] for s in header["segments"] if s["start"] / rate_hz < max(played_s, 1e-9)]
     columns["segments/start_s"] = np.array([s["start"] / rate_hz for s in header["segments"][: len(names)]])
     ends = np.array([s["end"] / rate_hz for s in header["segments"][: len(names)]])
-    columns["segments/end_s"] = np.minimum(ends, max(end_s, 0.0))
+    columns["segments/end_s"] = np.minimum(ends, max(played_s, 0.0))
     attributes = {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
@@ -151,7 +152,7 @@ def _last_time(contents: JournalContents) -> float:
 
 
 def _pulses(
-    contents: JournalContents, planned: NDArray[Any], rate_hz: float, t0_s: float, end_s: float
+    contents: JournalContents, planned: NDArray[Any], rate_hz: float, t0_s: float, played_s: float
 ) -> tuple[dict[str, NDArray[Any]], NDArray[np.float64]]:
     n = len(planned)
     sent_us, current = np.full(n, np.nan), np.zeros(n)
@@ -175,7 +176,7 @@ def _pulses(
                 failed = len(payload) > journal.ACKED.size
                 status[i] = PulseStatus.DEVICE_ERROR if failed else PulseStatus.ACKNOWLEDGED
     sent_us[status == PulseStatus.REST] = 0.0
-    reached = int(np.clip(np.ceil(end_s * rate_hz - 1e-6), 0, n))
+    reached = int(np.clip(np.ceil(played_s * rate_hz - 1e-6), 0, n))
     columns: dict[str, NDArray[Any]] = {
         "pulses/planned_time_s": np.arange(n) / rate_hz,
         "pulses/pulse_width_us": planned.astype(np.float64),

@@ -62,6 +62,12 @@ class Gate:
         """(True if the device says that it cannot stimulate, its state in words). Raises DeviceError."""
         return self._stimulator.state()
 
+    def reset(self) -> None:
+        """Forget the counts of the test before."""
+        with self._lock:
+            self.last_pulse_s, self.lateness_s, self.charge_uc, self.dropped = None, [], 0.0, 0
+            self._recent.clear()
+
     def open(self, journal: Journal, table: dict[str, Limit]) -> None:
         """Arm the device for one test.
 
@@ -76,8 +82,6 @@ class Gate:
             self._table = table
             self._index_of.clear()
             self._unacknowledged.clear()
-            self._recent.clear()
-            self.last_pulse_s, self.lateness_s, self.charge_uc, self.dropped = None, [], 0.0, 0
             self._journal = journal
             self._passing = True
 

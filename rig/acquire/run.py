@@ -34,6 +34,8 @@ FRESH_S = 0.5
 DECAY_S = 3.0
 NEAR_REST_NM = 0.5
 SYNC_PERIOD_S = 1.0
+STALL_S = 0.25
+"""Real seconds of lateness that are no hiccup any more: a test with such a hole ends."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,6 +108,7 @@ class TestRun:
     def execute(self) -> RunResult:
         """Play the test to its end or its halt; never raises for a fault, the result says it."""
         cpu_s, wall_s = time.process_time(), time.monotonic()
+        self._gate.reset()
         torque = self._table["torque_nm"]
         self._receiver.record(self._journal, (torque.lo, torque.hi), lambda reason: self._fault(reason))
         syncing = _Syncing(self._journal)
@@ -160,14 +163,16 @@ class TestRun:
             due_s = t0_s + index * period_s
             if clock.wait(due_s, self.halt.event):
                 return
-            self._look_after_health(clock.now_s())
+            self._look_after_health(clock.now_s(), due_s)
             if self.halt.event.is_set():
                 return
             self._gate.fire(index, Pulse(width_us, plan.profile.current_ma), due_s, due_s + late_s)
         clock.wait(t0_s + self.test.duration_s, self.halt.event)
 
-    def _look_after_health(self, now_s: float) -> None:
+    def _look_after_health(self, now_s: float, due_s: float) -> None:
         speed = self._clock.speed
+        if not (now_s - due_s <= STALL_S * speed):
+            self._fault(f"the computer stood still for {(now_s - due_s) / speed:.1f} s; what else runs on it?")
         age_s = self._receiver.age_s(now_s)
         if not (age_s <= self._watch.stale_torque_s * speed):
             self._fault(f"load cell: torque is stale, the newest sample is {age_s / speed * 1e3:.0f} ms old")
@@ -226,7 +231,12 @@ class TestRun:
             clock.wait(clock.now_s() + 0.01 * clock.speed)
 
     def _end_journal(self, end_s: float) -> None:
-        content = {"outcome": self.halt.cause or "completed", "reason": self.halt.reason, "time_s": end_s}
+        content = {
+            "outcome": self.halt.cause or "completed",
+            "reason": self.halt.reason,
+            "time_s": end_s,
+            "stimulation_end_s": end_s if self.halt.cause is None else self.halt.time_s,
+        }
         self._gate.release()
         self._counts = self._receiver.release()
         # An end that cannot be written leaves a journal without one, which is recovered as such.

@@ -14,7 +14,7 @@ from typing import Any
 from rig import archive, devices, journal, limits, plan
 from rig.acquire.halt import Halt
 from rig.acquire.receiver import Receiver
-from rig.acquire.run import RunResult, TestRun, lateness_ms
+from rig.acquire.run import FRESH_S, RunResult, TestRun, lateness_ms
 from rig.clock import Clock
 from rig.config import RigConfig
 from rig.control.latch import Latch, lock_folder
@@ -225,18 +225,33 @@ class Rig:
         """
         with self._lock:
             following = self._trial.rearm()
-            healthy = self._gate is not None and self._receiver is not None and not self._trial.lost
-            if healthy and self._trial.state != "disconnected":
-                assert self._gate is not None
-                self._gate.stop()
-                self._gate.state()
-            else:
+            if not self._both_answer():
                 self._disconnect()
                 self._connect()
+                self._wait_for_torque()
             self._latch.clear()
             log.info("re-armed by %s after: %s", by, self._trial.reason)
             self._change(following)
         return self.status()
+
+    def _both_answer(self) -> bool:
+        """Stop the stimulator anew and ask its state; is torque coming?"""
+        if self._gate is None or self._receiver is None or self._trial.lost:
+            return False
+        try:
+            self._gate.stop()
+            self._gate.state()
+        except DeviceError:
+            return False
+        return self._receiver.age_s(self._clock.now_s()) <= FRESH_S * self._clock.speed
+
+    def _wait_for_torque(self) -> None:
+        assert self._receiver is not None
+        end_s = self._clock.now_s() + 2 * FRESH_S * self._clock.speed
+        while self._receiver.last_s is None:
+            if self._clock.now_s() > end_s:
+                raise DeviceError("load cell: connected, but no torque comes; check its cable and start frames")
+            self._clock.wait(self._clock.now_s() + 0.01 * self._clock.speed)
 
     def _connect(self) -> None:
         stimulator = devices.find("stimulator", self._config.stimulator.device).create(

@@ -1,0 +1,82 @@
+"""Alignment on synthetic clocks: the true times are known, jitter and drift are not told."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rig.align import align, cell_time
+
+RATE_HZ = 1600.0
+
+
+def made(seed: int, ppm: float, jitter_ms: float, duration_s: float = 38.7, sync: bool = True, batch: int = 8):
+    """A cell whose clock is off by `ppm`, samples that arrive late in batches, pulses that the cell sees."""
+    rng = np.random.default_rng(seed)
+    n = int(duration_s * RATE_HZ)
+    counter = np.arange(n) + 12345
+    true_s = 0.317 + np.arange(n) / RATE_HZ * (1 + ppm * 1e-6)
+    late_s = rng.exponential(jitter_ms * 1e-3, n)
+    late_s += (rng.random(n) < 2e-4) * rng.uniform(0, 0.05, n)  # the process was not scheduled
+    arrived_s = true_s + 1e-4 + late_s
+    host_s = np.maximum.accumulate(arrived_s)
+    host_s = np.repeat(host_s[batch - 1 :: batch], batch)[:n] if batch > 1 else host_s
+    host_s = np.concatenate([host_s, np.full(n - len(host_s), host_s[-1])])
+    written_s = np.arange(0.5, duration_s, 0.025) + rng.exponential(1e-4, len(np.arange(0.5, duration_s, 0.025)))
+    felt_s = written_s + 5e-5
+    flag = np.zeros(n, np.uint8)
+    seen = np.searchsorted(true_s, felt_s)
+    flag[seen[seen < n]] = 1
+    return counter, host_s, flag if sync else np.full(n, 255, np.uint8), written_s, true_s
+
+
+@pytest.mark.parametrize("ppm", [-200.0, -3.0, 0.0, 200.0])
+@pytest.mark.parametrize("jitter_ms", [0.2, 2.0])
+@pytest.mark.parametrize("sync", [True, False])
+def test_error_is_below_a_millisecond(ppm: float, jitter_ms: float, sync: bool):
+    for seed in range(3):
+        counter, host_s, flag, written_s, true_s = made(seed, ppm, jitter_ms, sync=sync)
+        cell_s = cell_time(counter, np.full(len(counter), np.nan), RATE_HZ)
+        time_s, found = align(cell_s, host_s, flag, written_s, RATE_HZ)
+        assert found.method == ("sync" if sync else "regression")
+        # without sync, nobody can see the transport's shortest delay (here 0.1 ms) and the batch's length
+        known_s = 0.0 if sync else 1e-4
+        error_s = time_s - true_s - known_s
+        assert np.max(np.abs(error_s)) < 1e-3
+        assert found.error_ms < 1.0
+        assert found.rate_ppm == pytest.approx(ppm, abs=15)
+
+
+@pytest.mark.parametrize("sync", [True, False])
+def test_lost_samples_do_not_shift_the_rest(sync: bool):
+    counter, host_s, flag, written_s, true_s = made(9, 50.0, 0.5, sync=sync)
+    keep = np.ones(len(counter), bool)
+    keep[20000:20800] = False
+    keep[np.random.default_rng(1).random(len(keep)) < 0.02] = False
+    cell_s = cell_time(counter[keep], np.full(keep.sum(), np.nan), RATE_HZ)
+    time_s, _ = align(cell_s, host_s[keep], flag[keep], written_s, RATE_HZ)
+    assert np.max(np.abs(time_s - true_s[keep])) < 1.2e-3
+
+
+def test_the_stated_error_covers_the_true_one():
+    """Over many clocks, the stated standard error is not smaller than what was really wrong."""
+    wrong, stated = [], []
+    for seed in range(20):
+        counter, host_s, flag, written_s, true_s = made(100 + seed, 20.0, 0.5, duration_s=12.0)
+        cell_s = cell_time(counter, np.full(len(counter), np.nan), RATE_HZ)
+        time_s, found = align(cell_s, host_s, flag, written_s, RATE_HZ)
+        wrong.append(float(np.mean(time_s - true_s)) * 1e3)
+        stated.append(found.error_ms)
+    assert np.sqrt(np.mean(np.square(wrong))) < 2 * np.mean(stated)
+
+
+def test_too_little_to_align():
+    time_s, found = align(np.array([0.0]), np.array([5.0]), np.array([0], np.uint8), np.empty(0), RATE_HZ)
+    assert list(time_s) == [5.0]
+    assert np.isnan(found.error_ms)
+
+
+def test_a_cell_without_counter_is_counted_or_stamped():
+    none = np.full(4, -1, np.int64)
+    assert list(cell_time(none, np.full(4, np.nan), 1000.0)) == [0.0, 0.001, 0.002, 0.003]
+    assert list(cell_time(none, np.array([7.0, 7.5, 8.0, 9.0]), 1000.0)) == [0.0, 0.5, 1.0, 2.0]

@@ -1,0 +1,156 @@
+"""A test on the virtual clock: pulses on time, late ones dropped, every fault stops it, all of it in the journal."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from rig import archive, journal
+from rig.messages import SegmentPlan
+from rig.signals import Pulse, PulseStatus
+from tests.rig.fakes import VirtualRig
+
+
+def test_a_test_plays_to_its_end(tmp_path: Path):
+    rig = VirtualRig(tmp_path)
+    result = rig.execute()
+    assert (result.outcome, result.reason) == ("completed", "")
+    assert result.evidence.confirmed
+    assert rig.stimulator.stops == 1
+    times = np.array([t for t, _ in rig.stimulator.sent])
+    assert len(times) == np.count_nonzero(np.trunc(rig.test.pulse_width_us)) == len(result.lateness_s)
+    assert max(result.lateness_s) < 1e-9
+    assert np.allclose(np.diff(times), 0.025)
+    assert result.charge_uc == pytest.approx(np.trunc(rig.test.pulse_width_us).sum() * 20e-3)
+    assert result.counts.lost_samples == 0
+
+
+def test_the_sealed_file_holds_what_was_played(tmp_path: Path):
+    rig = VirtualRig(tmp_path)
+    rig.execute()
+    sealed = archive.seal(journal.read(rig.path), tmp_path)
+    with h5py.File(sealed.path) as file:
+        assert file.attrs["outcome"] == "completed"
+        assert file.attrs["content_sha256"] == sealed.content_sha256 == archive.verify(sealed.path)
+        status = file["pulses/status"][:]
+        assert np.array_equal(status == PulseStatus.REST, np.trunc(rig.test.pulse_width_us) == 0)
+        assert np.all(status[status != PulseStatus.REST] == PulseStatus.ACKNOWLEDGED)
+        written = file["pulses/written_time_s"][:]
+        assert np.allclose(written[np.isfinite(written)], file["pulses/planned_time_s"][:][np.isfinite(written)])
+        assert np.nanmedian(file["pulses/acknowledged_time_s"][:] - written) == pytest.approx(0.001)
+        time_s = file["torque/time_s"][:]
+        assert len(time_s) == pytest.approx(rig.test.duration_s * 1600, abs=12)
+        assert time_s[0] < 0.01
+        assert np.diff(time_s) == pytest.approx(1 / 1600)
+        assert list(file["segments/name"].asstr()[:]) == ["rest", "ramp", "rest"]
+        assert list(file["segments/start_s"][:]) == [0.0, 0.5, 2.5]
+        assert list(file["segments/end_s"][:]) == [0.5, 2.5, 3.0]
+        assert file["alignment"].attrs["method"] == "sync"
+
+
+def test_a_late_pulse_is_dropped_and_recorded_never_burst(tmp_path: Path):
+    rig = VirtualRig(tmp_path)
+    rig.at(1.2, lambda: rig.clock.advance(0.040))  # the process is not scheduled for 40 ms
+    result = rig.execute()
+    assert result.outcome == "completed"
+    assert result.dropped in (1, 2)
+    times = np.array([t for t, _ in rig.stimulator.sent])
+    assert np.min(np.diff(times)) > 0.025 - 0.4 * 0.025 - 1e-9
+    recording = archive.assemble(journal.read(rig.path))
+    status, sent = recording.columns["pulses/status"], recording.columns["pulses/sent_pulse_width_us"]
+    assert np.sum(status == PulseStatus.DROPPED) == result.dropped
+    assert np.all(np.isnan(sent[status == PulseStatus.DROPPED]))
+
+
+def test_a_long_stall_sends_nothing_afterwards(tmp_path: Path):
+    rig = VirtualRig(tmp_path)
+    rig.at(1.0, lambda: rig.clock.advance(2.0))  # SIGSTOP
+    result = rig.execute()
+    assert result.outcome == "fault"
+    assert "stood still for 2.0 s" in result.reason
+    assert rig.clock.now_s() - rig.stimulator.sent[-1][0] > 2.0
+
+
+FAULTS: dict[str, tuple[Callable[[VirtualRig], object], str]] = {
+    "silent cell": (lambda r: setattr(r.cell, "silent", True), "torque is stale"),
+    "NaN": (lambda r: setattr(r.cell, "nan", True), "no number"),
+    "torque over its limit": (lambda r: setattr(r.cell, "add_nm", 35.0), "outside -30 … 30"),
+    "torque under its limit": (lambda r: setattr(r.cell, "add_nm", -35.0), "outside -30 … 30"),
+    "counter jump": (lambda r: setattr(r.cell, "skip", 5000), "jumped"),
+    "no ack": (lambda r: setattr(r.stimulator, "ack_delay_s", None), "not acknowledged"),
+    "late ack": (lambda r: setattr(r.stimulator, "ack_delay_s", 0.3), "not acknowledged"),
+    "electrode": (lambda r: setattr(r.stimulator, "error", "electrode error"), "electrode error at pulse"),
+    "line broken": (lambda r: setattr(r.stimulator, "send_error", "no bytes taken"), "no bytes taken"),
+    "unplugged": (lambda r: r.stimulator.on_lost("unplugged"), "unplugged"),
+    "journal": (lambda r: setattr(r.journal, "_failure", "disk full"), "disk full"),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_every_fault_stops_the_test(tmp_path: Path, name: str):
+    inject, words = FAULTS[name]
+    rig = VirtualRig(tmp_path)
+    at: list[float] = []
+    rig.at(1.2, lambda: (at.append(rig.clock.now_s()), inject(rig)))
+    result = rig.execute()
+    assert result.outcome == "fault"
+    assert words in result.reason
+    assert rig.stimulator.stops == 1
+    assert rig.stimulator.sent[-1][0] - at[0] < 0.15  # watch period of 100 ms and two pulses
+    assert rig.gate.fire(99, Pulse(100.0, 20.0), rig.clock.now_s(), math.inf) == PulseStatus.REFUSED
+    recording = archive.assemble(journal.read(rig.path))
+    assert recording.attributes["outcome"] == "fault"
+    assert len(recording.columns["pulses/status"]) < len(rig.test.pulse_width_us)
+
+
+def test_a_stop_is_confirmed_by_the_torque_falling(tmp_path: Path):
+    hold = [SegmentPlan(name="hold", sequence="steps", settings={"on_s": 3.0, "off_s": 0.0})]
+    rig = VirtualRig(tmp_path, hold)
+    rig.at(1.5, lambda: rig.halt.set("stopped", "enough"))
+    result = rig.execute()
+    assert (result.outcome, result.reason) == ("stopped", "enough")
+    assert result.evidence.confirmed
+    assert "torque fell from 6.00" in result.evidence.detail
+    assert rig.stimulator.sent[-1][0] <= rig.halt.time_s
+
+
+def test_a_stop_without_effect_is_not_called_confirmed(tmp_path: Path):
+    hold = [SegmentPlan(name="hold", sequence="steps", settings={"on_s": 3.0, "off_s": 0.0})]
+    rig = VirtualRig(tmp_path, hold)
+    rig.at(1.5, lambda: (setattr(rig.cell, "add_nm", 10.0), rig.halt.set("stopped", "enough")))
+    assert not rig.execute().evidence.confirmed
+    (tmp_path / "2").mkdir()
+    rig = VirtualRig(tmp_path / "2", hold)
+    rig.at(1.5, lambda: (setattr(rig.stimulator, "silent", True), rig.halt.set("stopped", "enough")))
+    result = rig.execute()
+    assert not result.evidence.confirmed
+    assert "no answer" in result.evidence.detail
+
+
+def test_no_torque_no_test(tmp_path: Path):
+    rig = VirtualRig(tmp_path)
+    rig.cell.silent = True
+    result = rig.execute()
+    assert result.outcome == "fault"
+    assert "no fresh torque" in result.reason
+    assert rig.stimulator.sent == []
+
+
+@pytest.mark.parametrize("n", [1, 2, 17, 60])
+def test_halting_between_pulses_sends_none_after(tmp_path: Path, n: int):
+    rig = VirtualRig(tmp_path)
+    sent_at_halt: list[int] = []
+
+    def halt_soon(count: int) -> None:
+        if count == n:
+            at = rig.clock.now_s() + 0.0249
+            rig.clock.call_at(at, lambda: (sent_at_halt.append(len(rig.stimulator.sent)), rig.halt.set("stopped", "x")))
+
+    rig.stimulator.on_send = halt_soon
+    rig.execute()
+    assert len(rig.stimulator.sent) == sent_at_halt[0] == n
