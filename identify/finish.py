@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
+from typing import Any
 from uuid import uuid4
 
 import numpy as np
 
 from identify.figures import figures, white_sd
+from identify.grid import Grid, runs
+from identify.linear import Discrete
 from identify.model import Covariance, Model, Noise
+from identify.noise import noise_evidence
 from identify.projection import Solution
 from identify.recruitment.curve import Curve
 from identify.simulate import fingerprint, predict_on
 
 
-def finish(method_id: str, solution: Solution, delta_bic: float) -> Model:
+def finish(method_id: str, solution: Solution, delta_bic: float, reasons: Sequence[str] = ()) -> Model:
     """The model of a solution, with everything that MODEL.json tells."""
     problem, grid = solution.problem, solution.problem.grid
     size = problem.basis.size
     coefficients = solution.coefficients
-    initial = (0.0, 0.0) if problem.from_rest else (float(coefficients[size + 1]), float(coefficients[size + 2]))
     block_sd = float(np.sqrt(solution.variance / (1.0 - solution.ar1**2)))
     model = Model(
         method=method_id,
@@ -28,21 +33,65 @@ def finish(method_id: str, solution: Solution, delta_bic: float) -> Model:
         pulse_rate_hz=1.0 / grid.step_s,
         sample_rate_hz=grid.record.sample_rate_hz,
         baseline_nm=float(coefficients[size]),
-        initial=initial,
+        initial=(0.0, 0.0) if problem.from_rest else (float(coefficients[size + 1]), float(coefficients[size + 2])),
         covariance=covariance(solution),
+        noise=Noise(block_sd_nm=block_sd, ar1=solution.ar1, delta_bic=delta_bic),
+        reasons=tuple(reasons),
+    )
+    return completed(model, grid, problem.rows, solution.freedom)
+
+
+def finish_discrete(
+    method_id: str,
+    grid: Grid,
+    rows: np.ndarray,
+    block: Discrete,
+    curve: Curve,
+    reasons: Sequence[str] = (),
+    extra: dict[str, Any] | None = None,
+) -> Model:
+    """The model of a method that gives a discrete block and a curve, without covariance."""
+    if extra and "narx" in extra:
+        from identify.methods.narx import run
+
+        response = run(extra["narx"], grid.pulse_width_us)
+    else:
+        response = block.filter(curve(grid.pulse_width_us))
+    residual = np.nan_to_num(grid.torque_nm) - np.nan_to_num(response, nan=1e6, posinf=1e6, neginf=-1e6)
+    baseline = float(np.mean(residual[rows]))
+    free = curve.basis.size + len(block.a) + len(block.b)
+    ar1, delta_bic = noise_evidence(residual - baseline, runs(rows))
+    spread = float(np.sum((residual - baseline)[rows] ** 2)) / max(int(rows.sum()) - free, 1)
+    model = Model(
+        method=method_id,
+        recruitment=curve,
+        linear=block,
+        pulse_rate_hz=1.0 / grid.step_s,
+        sample_rate_hz=grid.record.sample_rate_hz,
+        baseline_nm=baseline,
+        noise=Noise(block_sd_nm=float(np.sqrt(spread)), ar1=ar1, delta_bic=delta_bic),
+        reasons=tuple(reasons),
+        extra=extra or {},
+    )
+    return completed(model, grid, rows, free)
+
+
+def completed(model: Model, grid: Grid, rows: np.ndarray, freedom: float) -> Model:
+    """The model with its figures, its name and its origin."""
+    source = grid.record.source
+    model = model.with_(
         model_id=str(uuid4()),
         created=datetime.now(UTC).isoformat(timespec="seconds"),
         data={
-            "name": grid.record.source.name,
-            "recording_id": grid.record.source.recording_id,
-            "sha256": grid.record.source.sha256,
+            "name": source.name,
+            "recording_id": source.recording_id,
+            "sha256": source.sha256,
             "fingerprint": fingerprint(grid.record),
         },
     )
     predicted = predict_on(model, grid)
-    sd = white_sd(grid, predicted, block_sd, solution.freedom, solution.ar1 == 0.0)
-    noise = Noise(white_sd_nm=sd, block_sd_nm=block_sd, ar1=solution.ar1, delta_bic=delta_bic)
-    return model.with_(noise=noise, fit=figures(grid, problem.rows, predicted, sd))
+    sd = white_sd(grid, predicted, model.noise.block_sd_nm, freedom, model.noise.ar1 == 0.0)
+    return model.with_(noise=replace(model.noise, white_sd_nm=sd), fit=figures(grid, rows, predicted, sd))
 
 
 def covariance(solution: Solution) -> Covariance:

@@ -218,6 +218,11 @@ def search(
     return state.solution(taken, converged)
 
 
+def project(problem: Problem, linear: SecondOrder, *, ar1: float = 0.0, weight: float | None = None) -> Solution:
+    """Coefficients for given dynamics: the linear half of the problem alone."""
+    return _assess(problem, linear, whiten(problem.target, problem.stretches, ar1), ar1, weight).solution(0, True)
+
+
 class _State:
     """The joint linear problem at one point of the search."""
 
@@ -411,7 +416,7 @@ def pilot_curve(solution: Solution) -> tuple[np.ndarray, np.ndarray]:
 
 def begins_at_rest(grid: Grid) -> bool:
     """Whether the record opens with at least 0.1 s without stimulation and without a trend in torque."""
-    opening = max(int(round(0.1 / grid.step_s)), 2)
+    opening = max(round(0.1 / grid.step_s), 2)
     still = not np.any(grid.pulse_width_us[:opening] > 0)
     torque = grid.torque_nm[:opening]
     later = grid.torque_nm[np.isfinite(grid.torque_nm)]

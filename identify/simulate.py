@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from identify.dynamics import boundary_states, read_at
+from identify.dynamics import free_states, read_at
 from identify.grid import Grid, make_grid
 from identify.linear import SecondOrder
 from identify.model import Model
@@ -26,11 +26,11 @@ def predict(model: Model, record: Record) -> np.ndarray:
 
 def predict_on(model: Model, grid: Grid) -> np.ndarray:
     """As `predict`, for a base model and a grid that is already made."""
-    torque = model.linear.at_samples(grid, model.recruitment(grid.pulse_width_us))
     if model.extra.get("narx"):
         from identify.methods.narx import free_run
 
-        torque = free_run(model, grid)
+        return free_run(model, grid) + model.baseline_nm
+    torque = model.linear.at_samples(grid, model.recruitment(grid.pulse_width_us))
     if any(model.initial) and isinstance(model.linear, SecondOrder) and same_data(model, grid.record):
         torque = torque + initial_response(model.linear, grid) @ np.asarray(model.initial)
     return torque + model.baseline_nm
@@ -38,8 +38,6 @@ def predict_on(model: Model, grid: Grid) -> np.ndarray:
 
 def initial_response(linear: SecondOrder, grid: Grid, at_samples: bool = True) -> np.ndarray:
     """Response to a unit initial torque (column 0) and a unit initial rate (column 1), undriven."""
-    from identify.dynamics import free_states
-
     torque, rate = free_states(linear.time_constant_s, linear.damping, grid.step_s, grid.size)
     if not at_samples:
         return grid.block_mean(torque, rate, linear.delay_s)
@@ -58,8 +56,5 @@ def fingerprint(record: Record) -> str:
 
     digest = hashlib.sha256()
     for column in (record.time_s, record.pulse_width_us, record.torque_nm):
-        digest.update(np.ascontiguousarray(column))
+        digest.update(np.ascontiguousarray(column).data)
     return digest.hexdigest()
-
-
-__all__ = ["boundary_states", "fingerprint", "initial_response", "predict", "predict_on", "same_data"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from identify.errors import BadRequest, NotIdentifiable
-from identify.grid import Grid
+from identify.grid import Grid, runs
 from identify.record import HELD_OUT
 
 
@@ -50,3 +50,69 @@ def check_segments(grid: Grid, names: tuple[str, ...]) -> None:
             raise BadRequest("`validate` is never fitted on", place="fit_on", mend="Name other segments.")
         if name not in there:
             raise BadRequest(f"no segment {name!r} in the record", place="fit_on", mend=f"It has: {', '.join(there)}.")
+
+
+def segment_rows(grid: Grid, names: tuple[str, ...], method_id: str) -> np.ndarray:
+    """Rows of the named segments, without held-out ones.
+
+    Raises
+    ------
+    NotIdentifiable
+        The record has none; says what the method needs.
+    """
+    there = tuple(dict.fromkeys(grid.record.segment_names))
+    rows = grid.fitted & rows_of(grid, names)
+    if not rows.any():
+        raise NotIdentifiable(
+            f"{method_id} needs a segment {' or '.join(names)}; the record has {', '.join(there)}",
+            mend="Name the segments to use with fit_on, or use maximum-likelihood, which takes any.",
+        )
+    return rows
+
+
+def near_rest(grid: Grid, rows: np.ndarray) -> np.ndarray:
+    """The rows with the rests that touch them: they hold the baseline, the rise and the tail."""
+    result = rows.copy()
+    rest = grid.fitted & rows_of(grid, ("rest",))
+    for _ in range(2):
+        for stretch in runs(rest):
+            before, after = max(stretch.start - 1, 0), min(stretch.stop, grid.size - 1)
+            if rows[before] or rows[after]:
+                result[stretch] = True
+    return result
+
+
+def active_level(grid: Grid, rows: np.ndarray) -> float:
+    """Largest pulse width in the rows, µs.
+
+    Raises
+    ------
+    NotIdentifiable
+        There is no pulse, or the width never changes.
+    """
+    widths = grid.pulse_width_us[rows]
+    if not np.ptp(widths) > 0:
+        raise NotIdentifiable("the pulse width never changes in the segment for the dynamics", mend="Record a PRBS.")
+    return float(np.max(widths))
+
+
+def order_option(value: object) -> str | tuple[int, int, int]:
+    """`second-order`, `auto`, or (l, n, d) from `2,1,1` or a sequence.
+
+    Raises
+    ------
+    BadRequest
+    """
+    if value in ("second-order", "auto"):
+        return str(value)
+    parts = value.split(",") if isinstance(value, str) else list(value) if isinstance(value, (list, tuple)) else []
+    try:
+        poles, zeros, delay = (int(part) for part in parts)
+    except ValueError:
+        poles = -1
+        zeros = delay = 0
+    if not (1 <= poles <= 6 and 0 <= zeros <= 6 and 0 <= delay <= 40):
+        raise BadRequest(
+            f"order {value!r}", place="order", mend="Give second-order, auto, or poles,zeros,delay such as 2,1,1."
+        )
+    return poles, zeros, delay

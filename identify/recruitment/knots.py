@@ -15,7 +15,7 @@ KNOTS = 31
 PILOT_KNOTS = 12
 NARROWEST_US = 0.5
 STRAIGHTEST = 0.01
-"""Least share of the strongest bending that the penalty expects anywhere: a floor, so that no part is forced straight."""
+"""Least share of the strongest bending that the penalty expects anywhere, so that no part is forced straight."""
 
 
 def even_knots(largest_us: float, count: int) -> np.ndarray:

@@ -30,14 +30,14 @@ class Patient:
 
     def torque(self, widths_us: np.ndarray, rate_hz: float, pulse_rate_hz: float = 40.0) -> np.ndarray:
         """Clean torque sampled at rate_hz for one width a pulse."""
-        fine = int(round(FINE_HZ / pulse_rate_hz))
+        fine = round(FINE_HZ / pulse_rate_hz)
         drive = np.repeat(self.recruitment(widths_us), fine)
-        late = int(round(self.delay_s * FINE_HZ))
+        late = round(self.delay_s * FINE_HZ)
         drive = np.r_[np.zeros(late), drive][: drive.size]
         t, z = self.time_constant_s, self.damping
         b, a, _ = cont2discrete(([1.0], [t * t, 2 * z * t, 1.0]), 1 / FINE_HZ, method="zoh")
         torque = lfilter(np.ravel(b), np.ravel(a), drive)
-        at = np.round(np.arange(int(round(widths_us.size / pulse_rate_hz * rate_hz))) * FINE_HZ / rate_hz).astype(int)
+        at = np.round(np.arange(round(widths_us.size / pulse_rate_hz * rate_hz)) * FINE_HZ / rate_hz).astype(int)
         return torque[at]
 
 

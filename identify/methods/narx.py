@@ -1,0 +1,142 @@
+"""Polynomial NARX, the black box of the paper's introduction (reference 6): a rival, scored in free run.
+
+Terms are products of past torques and pulse widths up to the third degree, taken one at a time by the share of the
+error they explain (orthogonal forward regression with the error reduction ratio, Billings 1988) until BIC stops it.
+One step ahead such models look perfect; run free they may drift or run away, and only the free run counts here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import combinations_with_replacement
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from identify.finish import finish_discrete
+from identify.grid import Grid
+from identify.linear import Discrete
+from identify.methods.common import fitted_rows
+from identify.model import Model
+from identify.recruitment.curve import Curve
+from identify.recruitment.spline import SplineBasis
+
+MOST_TERMS = 14
+LIMIT = 20.0
+"""Scaled torque beyond which a free run counts as run away."""
+
+
+class Narx:
+    """The black box."""
+
+    id = "narx"
+    summary = "Polynomial NARX of degree 3 by orthogonal forward regression: a black box as a rival, in free run."
+    options: Mapping[str, str] = MappingProxyType(
+        {
+            "torque_lags": "past torques (2)",
+            "width_lags": "past pulse widths (3)",
+            "degree": "highest degree (3)",
+            "terms": f"terms at most ({MOST_TERMS})",
+        }
+    )
+
+    def fit(self, grid: Grid, fit_on: tuple[str, ...] | None, **options: Any) -> Model:
+        """Fit on the named segments, or on all that may be fitted."""
+        rows = fitted_rows(grid, fit_on)
+        torque_lags, width_lags = int(options.get("torque_lags", 2)), int(options.get("width_lags", 3))
+        still = rows & (grid.pulse_width_us == 0)
+        baseline = float(np.percentile(grid.torque_nm[still], 20)) if still.any() else 0.0
+        torque_scale = float(np.std(grid.torque_nm[rows])) or 1.0
+        width_scale = float(np.max(grid.pulse_width_us)) or 1.0
+        torque = (np.nan_to_num(grid.torque_nm) - baseline) / torque_scale
+        width = grid.pulse_width_us / width_scale
+        variables = [(0, lag) for lag in range(1, torque_lags + 1)] + [(1, lag) for lag in range(1, width_lags + 1)]
+        degree = int(options.get("degree", 3))
+        terms = [c for d in range(1, degree + 1) for c in combinations_with_replacement(range(len(variables)), d)]
+        lead = max(torque_lags, width_lags)
+        used = rows.copy()
+        for lag in range(1, lead + 1):
+            used[lag:] &= rows[:-lag]
+        used[:lead] = False
+        past = np.stack([np.roll((torque, width)[kind], lag) for kind, lag in variables], axis=1)[used]
+        candidates = np.stack([np.prod(past[:, list(term)], axis=1) for term in terms], axis=1)
+        chosen, weights = forward_regression(candidates, torque[used], int(options.get("terms", MOST_TERMS)))
+        recipe = {
+            "variables": variables,
+            "terms": [list(terms[i]) for i in chosen],
+            "weights": [float(w) for w in weights],
+            "torque_scale_nm": torque_scale,
+            "width_scale_us": width_scale,
+            "baseline_nm": baseline,
+        }
+        curve = steady_curve(recipe, float(np.max(grid.pulse_width_us)))
+        block = Discrete((1.0,), (1.0,), 1, grid.step_s, float(np.mean(grid.fraction)))
+        reasons = [f"{len(chosen)} of {len(terms)} terms: " + ", ".join(name_of(terms[i], variables) for i in chosen)]
+        return finish_discrete(self.id, grid, rows, block, curve, reasons, {"narx": recipe})
+
+
+METHOD = Narx()
+
+
+def name_of(term: tuple[int, ...], variables: list[tuple[int, int]]) -> str:
+    """As in y[k-1]·u[k-2]."""
+    return "·".join(f"{'yu'[variables[v][0]]}[k-{variables[v][1]}]" for v in term)
+
+
+def forward_regression(candidates: np.ndarray, target: np.ndarray, most: int) -> tuple[list[int], np.ndarray]:
+    """Columns in the order of what they explain, until BIC rises, and their weights."""
+    rest, left, chosen = candidates.copy(), target.copy(), []
+    size = target.size
+    best = size * np.log(max(float(left @ left) / size, 1e-300))
+    floor = 1e-10 * (rest**2).sum(axis=0)
+    for _ in range(most):
+        power = (rest**2).sum(axis=0)
+        share = np.where(power > floor, (rest.T @ left) ** 2 / np.maximum(power, 1e-300), 0.0)
+        pick = int(np.argmax(share))
+        trial = max(float(left @ left) - float(share[pick]), 1e-300)
+        bic = size * np.log(trial / size) + (len(chosen) + 1) * np.log(size)
+        if bic >= best:
+            break
+        best, direction = bic, rest[:, pick] / np.sqrt(power[pick])
+        chosen.append(pick)
+        left = left - direction * (direction @ left)
+        rest = rest - direction[:, None] * (direction @ rest)
+    weights = np.linalg.lstsq(candidates[:, chosen], target, rcond=None)[0] if chosen else np.zeros(0)
+    return chosen, weights
+
+
+def run(recipe: dict[str, Any], width_us: np.ndarray) -> np.ndarray:
+    """Free run above the baseline for one width a pulse, from rest, N·m; held where it runs away."""
+    variables, terms, weights = recipe["variables"], recipe["terms"], recipe["weights"]
+    width = (np.asarray(width_us, float) / recipe["width_scale_us"]).tolist()
+    lead = max((lag for _, lag in variables), default=1)
+    width, torque = [0.0] * lead + width, [0.0] * (lead + len(width))
+    for k in range(lead, len(width)):
+        value = [(torque if kind == 0 else width)[k - lag] for kind, lag in variables]
+        total = 0.0
+        for term, weight in zip(terms, weights, strict=True):
+            product = weight
+            for v in term:
+                product *= value[v]
+            total += product
+        torque[k] = min(max(total, -LIMIT), LIMIT)
+    return np.array(torque[lead:]) * recipe["torque_scale_nm"]
+
+
+def free_run(model: Model, grid: Grid) -> np.ndarray:
+    """Free run at the record's samples, above the model's baseline, N·m, shape (N,)."""
+    recipe = model.extra["narx"]
+    means = run(recipe, grid.pulse_width_us) + recipe["baseline_nm"] - model.baseline_nm
+    held = Discrete((1.0,), (1.0,), 0, grid.step_s, model.linear.centre if isinstance(model.linear, Discrete) else 0.0)
+    return held.at_samples(grid, means)
+
+
+def steady_curve(recipe: dict[str, Any], largest_us: float) -> Curve:
+    """Where the free run settles for each pulse width: what stands for a recruitment curve."""
+    basis = SplineBasis(np.linspace(0.0, largest_us, 13))
+    level = np.linspace(0.0, largest_us, 41)
+    torque = np.array([run(recipe, np.full(400, u))[-1] for u in level])
+    design = basis.design(level)
+    gram = design.T @ design + 1e-9 * np.eye(basis.size)
+    return Curve(basis, np.linalg.solve(gram, design.T @ torque))

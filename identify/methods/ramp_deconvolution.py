@@ -1,0 +1,112 @@
+"""Ramp deconvolution (section IV.A of the paper; Durfee & MacLean 1989): dynamics assumed, recruitment from one ramp.
+
+The linear activation dynamics are critically damped with a natural frequency from the literature, 0.85π rad/s (31).
+The torque of the triangular ramp is deconvolved with them; against pulse width that gives two recruitment curves, one
+for the rising and one for the falling half; the sigmoid (30) is fitted to both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from identify.errors import BadRequest, NotIdentifiable
+from identify.finish import completed
+from identify.grid import Grid, runs
+from identify.linear import SecondOrder
+from identify.methods.common import near_rest, segment_rows
+from identify.model import Model, Noise
+from identify.noise import noise_evidence
+from identify.recruitment.sigmoid_fit import fit_points
+from identify.recruitment.smoothing import choose_weight
+from identify.recruitment.spline import SplineBasis
+
+NATURAL_FREQUENCY_RAD_S = 0.85 * np.pi
+KNOTS_PER_S = 6.0
+
+
+class RampDeconvolution:
+    """One ramp, dynamics from the literature."""
+
+    id = "ramp-deconvolution"
+    summary = "The ramp deconvolved with critically damped dynamics of given frequency, then the sigmoid (30)."
+    options: Mapping[str, str] = MappingProxyType(
+        {"natural_frequency_rad_s": "1/Tω of the critically damped dynamics (0.85π = 2.67)"}
+    )
+
+    def fit(self, grid: Grid, fit_on: tuple[str, ...] | None, **options: Any) -> Model:
+        """Fit; `fit_on` names the ramp where it isn't called `ramp`."""
+        frequency = float(options.get("natural_frequency_rad_s", NATURAL_FREQUENCY_RAD_S))
+        if not 0.05 <= frequency <= 100.0:
+            raise BadRequest(f"{frequency:g} rad/s", place="natural_frequency_rad_s", mend="Give 0.05 to 100 rad/s.")
+        ramp = segment_rows(grid, fit_on or ("ramp",), self.id)
+        if np.unique(grid.pulse_width_us[ramp]).size < 8:
+            raise NotIdentifiable(
+                "the ramp has fewer than 8 pulse widths", mend="Record a triangular ramp over the whole range."
+            )
+        linear = SecondOrder(1.0 / frequency, 1.0)
+        drive, baseline = deconvolved(grid, ramp, linear)
+        width = grid.pulse_width_us
+        rising = ramp & (np.gradient(width) > 0)
+        falling = ramp & (np.gradient(width) < 0)
+        curve = fit_points(width[ramp], drive[ramp])
+        residual = np.nan_to_num(grid.torque_nm) - baseline - linear.on_grid(grid, curve(width))
+        rows = near_rest(grid, ramp)
+        ar1, delta_bic = noise_evidence(residual, runs(rows))
+        model = Model(
+            method=self.id,
+            recruitment=curve,
+            linear=linear,
+            pulse_rate_hz=1.0 / grid.step_s,
+            sample_rate_hz=grid.record.sample_rate_hz,
+            baseline_nm=baseline,
+            noise=Noise(block_sd_nm=float(np.std(residual[rows])), ar1=ar1, delta_bic=delta_bic),
+            reasons=(f"dynamics assumed: critically damped, {frequency:.4g} rad/s",),
+            extra={"deconvolved": {"rising": _curve(width, drive, rising), "falling": _curve(width, drive, falling)}},
+        )
+        return completed(model, grid, rows, 5.0)
+
+
+METHOD = RampDeconvolution()
+
+
+def deconvolved(grid: Grid, ramp: np.ndarray, linear: SecondOrder) -> tuple[np.ndarray, float]:
+    """The drive w(t) whose response is the measured torque, N·m, shape (K,), and the baseline.
+
+    Inverting (31) takes two derivatives of a noisy torque. Instead w is a spline in time, its smoothness chosen by
+    REML, whose response through G fits the torque: the same curve without the noise blown up.
+    """
+    rows = near_rest(grid, ramp)
+    still = grid.fitted & (grid.pulse_width_us == 0)
+    first, last = int(np.flatnonzero(ramp)[0]), int(np.flatnonzero(ramp)[-1])
+    span = (last - first + 1) * grid.step_s
+    basis = SplineBasis(np.linspace(0.0, span, max(int(KNOTS_PER_S * span), 8)))
+    # SplineBasis vanishes at zero, as w does when the ramp sets out.
+    at = np.clip((np.arange(grid.size) - first) * grid.step_s, 0.0, span)
+    columns = basis.design(at)
+    columns[last + 1 :] = 0.0
+    design = np.c_[linear.on_grid(grid, columns), np.ones(grid.size)][rows]
+    target = grid.torque_nm[rows]
+    gram, moment = design.T @ design, design.T @ target
+    outer = gram[-1:, -1:]
+    inner = gram[:-1, :-1] - gram[:-1, -1:] @ gram[-1:, :-1] / outer
+    right = moment[:-1] - gram[:-1, -1] * moment[-1] / outer[0, 0]
+    energy = float(target @ target - moment[-1] ** 2 / outer[0, 0])
+    weight = choose_weight(inner, right, energy, target.size, basis.roughness, 1).weight
+    penalty = np.zeros_like(gram)
+    penalty[:-1, :-1] = weight * basis.roughness + 1e-12 * np.trace(inner) / len(inner) * np.eye(len(inner))
+    found = np.linalg.solve(gram + penalty, moment)
+    if (still & rows).any() or not still.any():
+        return columns @ found[:-1], float(found[-1])
+    return columns @ found[:-1], float(np.mean(grid.torque_nm[still]))
+
+
+def _curve(width_us: np.ndarray, drive_nm: np.ndarray, rows: np.ndarray) -> dict[str, list[float]]:
+    order = np.argsort(width_us[rows])
+    return {
+        "pulse_width_us": [float(x) for x in width_us[rows][order]],
+        "torque_nm": [float(x) for x in drive_nm[rows][order]],
+    }

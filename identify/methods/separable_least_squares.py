@@ -1,0 +1,82 @@
+"""Separable least squares (section IV.B of the paper; Westwick & Kearney 2001): impulse response times sigmoid.
+
+The model (32) is linear in the weights of the impulse response and nonlinear in the sigmoid's shape alone; the search
+runs over the shape, the weights are solved for. The paper takes 41 taps, which at 40 Hz is 1 s: shorter than the
+muscle's memory. `memory_s` gives a memory in seconds instead.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from identify.errors import BadRequest, NotIdentifiable
+from identify.finish import finish_discrete
+from identify.grid import Grid
+from identify.linear import Discrete
+from identify.methods.common import fitted_rows
+from identify.model import Model
+from identify.output_error import shifted
+from identify.recruitment.curve import Curve
+from identify.recruitment.sigmoid import SigmoidBasis
+from identify.recruitment.sigmoid_fit import fit_shape
+
+TAPS = 41
+
+
+class SeparableLeastSquares:
+    """Taps and sigmoid."""
+
+    id = "separable-least-squares"
+    summary = "Finite impulse response (41 taps) behind the sigmoid (30), by separable least squares."
+    options: Mapping[str, str] = MappingProxyType(
+        {"taps": "length of the impulse response in pulses (41)", "memory_s": "or its length in seconds"}
+    )
+
+    def fit(self, grid: Grid, fit_on: tuple[str, ...] | None, **options: Any) -> Model:
+        """Fit on the named segments, or on all that may be fitted."""
+        if "taps" in options and "memory_s" in options:
+            raise BadRequest("both taps and memory_s are given", place="options", mend="Give one of them.")
+        taps = int(options.get("taps", TAPS))
+        if "memory_s" in options:
+            taps = round(float(options["memory_s"]) / grid.step_s) + 1
+        if not 2 <= taps <= 2000:
+            raise BadRequest(f"{taps} taps", place="taps", mend="Give 2 to 2000.")
+        rows = fitted_rows(grid, fit_on)
+        if rows.sum() <= taps + 4:
+            raise NotIdentifiable(f"{int(rows.sum())} rows for {taps} taps", mend="Record longer, or take fewer taps.")
+        seen = grid.pulse_width_us[rows]
+        if not np.ptp(seen) > 0:
+            raise NotIdentifiable("the pulse width never changes", mend="Record a PRBS and a ramp.")
+        basis, response = separate(grid, rows, taps)
+        gain = float(response.sum())
+        block = Discrete(tuple(response / gain), (1.0,), 0, grid.step_s, float(np.mean(grid.fraction)))
+        reasons = [f"{taps} taps: a memory of {(taps - 1) * grid.step_s:.3g} s"]
+        return finish_discrete(self.id, grid, rows, block, Curve(basis, np.array([gain])), reasons)
+
+
+METHOD = SeparableLeastSquares()
+
+
+def separate(grid: Grid, rows: np.ndarray, taps: int) -> tuple[SigmoidBasis, np.ndarray]:
+    """The shape, and the impulse response in N·m per unit of it, shape (taps,)."""
+    torque, width = grid.torque_nm[rows], grid.pulse_width_us
+    levels, place = np.unique(width, return_inverse=True)
+
+    def design(basis: SigmoidBasis) -> np.ndarray:
+        drive = basis.design(levels)[:, 0][place]
+        return np.stack([*(shifted(drive, lag)[rows] for lag in range(taps)), np.ones(int(rows.sum()))], axis=1)
+
+    def solve(basis: SigmoidBasis) -> tuple[np.ndarray, np.ndarray]:
+        columns = design(basis)
+        gram = columns.T @ columns
+        # A hair of ridge: a tap that the input never excites stays at zero.
+        ridge = 1e-10 * np.trace(gram) / len(gram) * np.eye(len(gram))
+        weights = np.linalg.solve(gram + ridge, columns.T @ torque)
+        return weights, torque - columns @ weights
+
+    basis = fit_shape(lambda shape: solve(shape)[1], float(np.max(width)), width[rows])
+    return basis, solve(basis)[0][:-1]

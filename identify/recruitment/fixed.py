@@ -1,0 +1,40 @@
+"""A curve whose shape is given: one coefficient, its gain. For stages that estimate dynamics alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from identify.recruitment.curve import Curve
+
+
+@dataclass(frozen=True)
+class FixedShape:
+    """A gain times a given curve."""
+
+    curve: Curve
+
+    @property
+    def size(self) -> int:
+        """Number of coefficients."""
+        return 1
+
+    @property
+    def largest_us(self) -> float:
+        """Pulse width beyond which the curve is held, µs."""
+        return self.curve.basis.largest_us
+
+    @property
+    def roughness(self) -> np.ndarray:
+        """The shape is given: no penalty."""
+        return np.zeros((1, 1))
+
+    def design(self, pulse_width_us: np.ndarray, derivative: int = 0) -> np.ndarray:
+        """Shape (..., 1)."""
+        return (self.curve.basis.design(np.asarray(pulse_width_us, float), derivative) @ self.curve.coefficients_nm)[
+            ..., None
+        ]
+
+    def to_dict(self) -> dict:
+        return self.curve.to_dict()
