@@ -24,6 +24,8 @@ from api.settings import Settings
 
 READY_S = 60.0
 END_S = 6.0
+SEAL_S = 35.0
+"""The rig may still have a test to seal."""
 RESTART_S = (0.2, 0.5, 1.0, 2.0, 5.0)
 LIBC = ctypes.CDLL(None, use_errno=True)
 PR_SET_PDEATHSIG = 1
@@ -231,7 +233,7 @@ class Services:
         """End everything: the rig first, since it stops stimulation."""
         self.rig.ask_to_end()
         self.api.ask_to_end()
-        self.rig.end()
+        self.rig.end(SEAL_S)
         self.api.end()
         if self.emulator is not None:
             self.emulator.end()

@@ -11,6 +11,15 @@ QUEUE_LENGTH = 200
 SERIES = ("time_s", "torque_min_nm", "torque_max_nm", "pulse_time_s", "pulse_width_us")
 
 
+def within_test(event: LiveEvent) -> LiveEvent:
+    """A frame without bins from before the test's own clock had begun: they would be drawn across the chart."""
+    kept = [index for index, time_s in enumerate(event.time_s) if -1.0 <= time_s <= event.elapsed_s + 1.0]
+    if len(kept) == len(event.time_s):
+        return event
+    series = {name: [getattr(event, name)[index] for index in kept] for name in SERIES[:3]}
+    return event.model_copy(update=series)
+
+
 class Hub:
     """Keeps the current test's drawn history, so that a page opened late sees all of it."""
 
@@ -28,6 +37,7 @@ class Hub:
     def live(self, event: LiveEvent) -> None:
         """Take a frame, keep it, pass it on."""
         if event.test_id == self.test_id and event.test_id is not None:
+            event = within_test(event)
             self.newest = event
             for name in SERIES:
                 self.history[name].extend(getattr(event, name))

@@ -31,7 +31,7 @@ def checked(response: httpx.Response) -> httpx.Response:
         words = f"{problem['title']}: {problem['detail']}"
     except (ValueError, KeyError, TypeError):
         words = response.text[:200]
-    code = 2 if response.status_code in (401, 403, 404, 422) else 1
+    code = 2 if response.status_code in (401, 403, 404, 422) or "rig-disconnected" in response.text else 1
     raise ReportedError(f"{response.request.method} {response.request.url.path}: {words}", code)
 
 

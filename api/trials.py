@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import logging
 import secrets
 from dataclasses import dataclass, field
@@ -24,6 +25,7 @@ from rig.messages import (
     LiveEvent,
     PreviewRequest,
     Profile,
+    RecruitmentTable,
     SegmentPlan,
     StartRequest,
     StopEvidence,
@@ -86,7 +88,7 @@ class Trials:
         plan = self._plan(body, participant)
         self.current = Current(plan.test_id, plan.participant, by)
         try:
-            preview = await self.rig.ask(PreviewRequest(plan=plan, recruitment=None))
+            preview = await self.rig.ask(PreviewRequest(plan=plan, recruitment=self._recruitment(plan.participant)))
             row = await asyncio.to_thread(self._write_intent, plan, preview, by)
             self.hub.begin(plan.test_id)
             await self._command(plan)
@@ -146,7 +148,16 @@ class Trials:
         participant = await asyncio.to_thread(self.store.get, Participant, body.participant)
         if participant is None:
             raise NotFoundError("participant", body.participant, "POST /v1/participants makes one.")
-        return await self.rig.ask(PreviewRequest(plan=self._plan(body, participant), recruitment=None))
+        plan = self._plan(body, participant)
+        return await self.rig.ask(PreviewRequest(plan=plan, recruitment=self._recruitment(plan.participant)))
+
+    def _recruitment(self, participant: str) -> RecruitmentTable | None:
+        """The approved model's recruitment curve, to estimate the torque-time of a plan with."""
+        served = self.versions.served(participant)
+        if served is None:
+            return None
+        curve = json.loads(served.body)["recruitment"]
+        return RecruitmentTable(pulse_width_us=curve["pulse_width_us"], torque_nm=curve["torque_nm"])
 
     async def stop(self, reason: str, by: str) -> StopEvidence:
         """Stop the rig; the audit entry comes after, so that nothing delays the command.
@@ -191,7 +202,7 @@ class Trials:
         self.hub.send({"type": "link", "connected": connected})
         status = self.rig.status
         if connected and self.current is not None and status is not None and status.test_id != self.current.test_id:
-            self._spawn(self._recover(self.current.test_id, "the link to the rig broke during the test"))
+            self._spawn(self._recover(self.current.test_id, "the rig's process ended during the test"))
 
     def _spawn(self, work: Any) -> None:
         task = asyncio.create_task(work)
@@ -293,11 +304,18 @@ class Trials:
         if row.recording_id is not None:
             await self.identify(test_id)
         else:
-            found = await self._find_recording(test_id)
-            event = FinishedEvent(test_id=test_id, outcome="fault", reason=why, last_sample_unix_s=None)
-            await self._finish(event.model_copy(update=found))
+            await self._finish(await self._missed_end(test_id, why))
         self._release(test_id)
         self.announce(test_id)
+
+    async def _missed_end(self, test_id: str, why: str) -> FinishedEvent:
+        """The end of a test as the rig remembers it, or as its recording tells."""
+        status = self.rig.status
+        if status is not None and status.finished is not None and status.finished.test_id == test_id:
+            return status.finished
+        found = await self._find_recording(test_id)
+        event = FinishedEvent(test_id=test_id, outcome="fault", reason=why, last_sample_unix_s=None)
+        return event.model_copy(update=found)
 
     async def _find_recording(self, test_id: str) -> dict[str, Any]:
         job = self.fitting.submit("find_recording", urgent=True, folder=str(self.recordings_dir), test_id=test_id)

@@ -33,13 +33,19 @@ def serve(
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda caught, _frame: ended.append(caught))
     with Services(settings, emulate.split()) as services:
-        say(*welcome(services, settings))
+        say(*welcome(services, settings), *rig_state(services))
         while not ended:
             time.sleep(0.2)
             if not ended:
                 for event in services.watch():
                     say(event)
         say("stopping")
+
+
+def rig_state(services: Services) -> list[str]:
+    """What keeps the rig from working, if anything does."""
+    state = services.rig.ready.get("state", "ready")
+    return [] if state == "ready" else [f"the rig is {state}: {services.rig.last_words()}"]
 
 
 def welcome(services: Services, settings: Settings) -> list[str]:

@@ -7,7 +7,7 @@ from typing import Any
 
 INK, MEASURED, MODEL, BAND, STIMULUS, GRID = (
     "#1b2733",
-    "#7a8896",
+    "#a9b4be",
     "#0b6b75",
     "rgba(11,107,117,.15)",
     "#b4690e",
@@ -19,7 +19,12 @@ FONT = {"family": "system-ui, -apple-system, 'Segoe UI', 'DejaVu Sans', sans-ser
 
 def axis(title: str, **more: Any) -> dict[str, Any]:
     """An axis with its quantity and unit."""
-    base = {"title": {"text": title, "standoff": 8}, "gridcolor": GRID, "zerolinecolor": "#c3ccd4", "automargin": True}
+    base = {
+        "title": {"text": title, "standoff": 8, "font": {"size": 12}},
+        "gridcolor": GRID,
+        "zerolinecolor": "#c3ccd4",
+        "automargin": True,
+    }
     return {**base, **more}
 
 
@@ -62,7 +67,7 @@ def measurement(curves: dict[str, Any], noise_sd_nm: float | None) -> dict[str, 
         for measured, predicted in zip(curves["torque_nm"], curves["predicted_torque_nm"], strict=True)
     ]
     data = [
-        line(time_s, curves["torque_nm"], "measured", MEASURED, 1.4),
+        line(time_s, curves["torque_nm"], "measured", MEASURED, 3.2),
         line(time_s, curves["predicted_torque_nm"], "model, free run", MODEL, 1.8),
         line(time_s, residual, "measured − model", INK, 1.0, yaxis="y2", showlegend=False),
         line(time_s, curves["pulse_width_us"], "pulse width", STIMULUS, 1.2, yaxis="y3", showlegend=False,
@@ -77,15 +82,15 @@ def measurement(curves: dict[str, Any], noise_sd_nm: float | None) -> dict[str, 
     return {
         "data": data,
         "layout": layout(
-            height=640,
+            height=720,
             shapes=shapes,
             annotations=labels,
             legend={"orientation": "h", "x": 0, "y": 1.04, "yanchor": "bottom"},
             margin={"l": 64, "r": 16, "t": 60, "b": 48},
             xaxis=axis("Time (s)", anchor="y3", range=[time_s[0], time_s[-1]]),
-            yaxis=axis("Torque (N·m)", domain=[0.46, 1.0]),
-            yaxis2=axis("Residual (N·m)", domain=[0.22, 0.41]),
-            yaxis3=axis("Pulse width (µs)", domain=[0.0, 0.17], rangemode="tozero"),
+            yaxis=axis("Torque (N·m)", domain=[0.52, 1.0]),
+            yaxis2=axis("Residual (N·m)", domain=[0.27, 0.46]),
+            yaxis3=axis("Pulse width (µs)", domain=[0.0, 0.2], rangemode="tozero"),
         ),
     }
 

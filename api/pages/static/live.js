@@ -59,7 +59,7 @@ function showTest(test) {
   const job = test.identification;
   if (test.state === "identifying") { say("left", "identifying"); say("segment", job ? job.text || job.state : "identifying"); byId("progress").value = 1; }
   if (test.reason) { say("reason", test.reason); byId("reason").hidden = false; }
-  if (test.done && wasOpen) location.replace(test.model_url && !document.hidden ? test.model_url : location.pathname);
+  if (test.done && wasOpen) location.replace(test.model_id ? "/models/" + test.model_id : location.pathname);
 }
 
 function age() {
@@ -87,14 +87,14 @@ function frame(canvas, low, high, title, unit) {
   const w = Math.round(box.width * ratio), h = Math.round(box.height * ratio);
   if (canvas.width !== w || canvas.height !== h) { canvas.width = w; canvas.height = h; }
   const pen = canvas.getContext("2d");
-  pen.setTransform(ratio, 0, 0, ratio, 0, 0);
+  pen.reset(); pen.setTransform(ratio, 0, 0, ratio, 0, 0);
   pen.clearRect(0, 0, box.width, box.height);
   const area = { left: 62, right: box.width - 10, top: 26, bottom: box.height - 34 };
   const span = Math.max(state.duration, 1);
   const x = (t) => area.left + (t / span) * (area.right - area.left);
   const y = (v) => area.bottom - ((v - low) / (high - low)) * (area.bottom - area.top);
   pen.font = "13px system-ui, 'DejaVu Sans', sans-serif"; pen.fillStyle = DIM; pen.lineWidth = 1; pen.strokeStyle = GRID;
-  const ystep = nice(high - low, 4), xstep = nice(span, box.width < 520 ? 4 : 8);
+  const ystep = nice(high - low, 5), xstep = nice(span, box.width < 520 ? 4 : 8);
   pen.textAlign = "right"; pen.textBaseline = "middle";
   for (let v = Math.ceil(low / ystep) * ystep; v <= high + 1e-9; v += ystep) {
     pen.beginPath(); pen.moveTo(area.left, y(v)); pen.lineTo(area.right, y(v)); pen.stroke();
@@ -105,6 +105,7 @@ function frame(canvas, low, high, title, unit) {
   pen.textAlign = "right"; pen.fillText("Time (s)", area.right, area.bottom + 20);
   pen.textAlign = "left"; pen.fillStyle = INK; pen.font = "600 13px system-ui, 'DejaVu Sans', sans-serif"; pen.fillText(title + " (" + unit + ")", 4, 3);
   segments(pen, area, x);
+  pen.beginPath(); pen.rect(area.left, 0, area.right - area.left + 2, area.bottom + 1); pen.clip();
   return { pen, x, y, area };
 }
 
