@@ -17,6 +17,7 @@ import sys
 from pathlib import Path
 
 from rig import config as configuration
+from rig import devices
 from rig.clock import MonotonicClock
 from rig.control.rig import Rig
 from rig.control.server import Server
@@ -33,6 +34,9 @@ def main(arguments: list[str] | None = None) -> int:
     logging.basicConfig(level=logging.DEBUG if options.verbose else logging.INFO, handlers=[_handler()], force=True)
     try:
         config = _configure(options)
+        if options.check:
+            _check(config)
+            return 0
         asyncio.run(_serve(config))
     except RigError as error:
         print(f"rig: {error}", file=sys.stderr)
@@ -58,6 +62,14 @@ def _configure(options: argparse.Namespace) -> configuration.RigConfig:
     if options.config is not None:
         return configuration.load(options.config, **overrides)
     return configuration.for_emulator(options.emulator_json, **overrides)
+
+
+def _check(config: configuration.RigConfig) -> None:
+    """Make both devices without opening them: that reads the DBC, too."""
+    clock = MonotonicClock(config.clock_speed)
+    devices.find("stimulator", config.stimulator.device).create(config.stimulator, clock)
+    devices.find("load_cell", config.load_cell.device).create(config.load_cell, clock)
+    print(json.dumps({"ok": True, "stimulator": config.stimulator.device, "load_cell": config.load_cell.device}))
 
 
 async def _serve(config: configuration.RigConfig) -> None:

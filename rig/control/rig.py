@@ -228,7 +228,8 @@ class Rig:
             if not self._both_answer():
                 self._disconnect()
                 self._connect()
-                self._wait_for_torque()
+                if not self._torque_comes():
+                    raise DeviceError("load cell: connected, but no torque comes; check its cable and start frames")
             self._latch.clear()
             log.info("re-armed by %s after: %s", by, self._trial.reason)
             self._change(following)
@@ -243,15 +244,18 @@ class Rig:
             self._gate.state()
         except DeviceError:
             return False
-        return self._receiver.age_s(self._clock.now_s()) <= FRESH_S * self._clock.speed
+        return self._torque_comes()
 
-    def _wait_for_torque(self) -> None:
+    def _torque_comes(self) -> bool:
+        """Does a sample arrive from now on, within a short time?"""
         assert self._receiver is not None
-        end_s = self._clock.now_s() + 2 * FRESH_S * self._clock.speed
-        while self._receiver.last_s is None:
+        asked_s = self._clock.now_s()
+        end_s = asked_s + FRESH_S * self._clock.speed
+        while self._receiver.age_s(asked_s) >= 0:
             if self._clock.now_s() > end_s:
-                raise DeviceError("load cell: connected, but no torque comes; check its cable and start frames")
-            self._clock.wait(self._clock.now_s() + 0.01 * self._clock.speed)
+                return False
+            self._clock.wait(self._clock.now_s() + 0.005 * self._clock.speed)
+        return True
 
     def _connect(self) -> None:
         stimulator = devices.find("stimulator", self._config.stimulator.device).create(

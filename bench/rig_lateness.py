@@ -1,0 +1,68 @@
+"""Figures of the rig over the wire: lateness of pulses, lost samples, CPU, alignment; idle and beside a busy process.
+
+    python -m bench.rig_lateness [--busy N] [--tests N] [--no-sync] [--load-cell slcan] [--json]
+
+Plays the default test in real time (38.7 s each) on the emulated rig.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from tests.wire.processes import Bench, busy_process, default_plan
+
+
+def measure(busy: int, tests: int, emulator_options: list[str]) -> list[dict[str, Any]]:
+    """Summaries of `tests` default tests with `busy` CPU-bound processes beside them."""
+    with tempfile.TemporaryDirectory(prefix="rig-bench-") as folder, contextlib.ExitStack() as stack:
+        bench = Bench(Path(folder), *emulator_options)
+        stack.callback(bench.close)
+        client = bench.start_rig()
+        client.ask("subscribe")
+        for _ in range(busy):
+            stack.enter_context(busy_process())
+        events = []
+        for number in range(tests):
+            reply = client.ask("start", plan=default_plan(f"bench{number}"))
+            if not reply["ok"]:
+                raise SystemExit(reply["problem"]["detail"])
+            events.append(client.wait_finished(f"bench{number}"))
+            if events[-1]["outcome"] != "completed":
+                print(f"test {number} ended: {events[-1]['reason']}")
+                client.ask("rearm", by="bench")
+        return [event["summary"] for event in events]
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--busy", type=int, default=0, help="CPU-bound processes beside the rig")
+    parser.add_argument("--tests", type=int, default=1)
+    parser.add_argument("--no-sync", action="store_true")
+    parser.add_argument("--load-cell", choices=["socketcand", "slcan"], default="socketcand")
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args()
+    emulator = ["--load-cell", options.load_cell, *(["--no-sync"] if options.no_sync else [])]
+    summaries = measure(options.busy, options.tests, emulator)
+    if options.json:
+        print(json.dumps(summaries))
+        return
+    print(f"{options.busy} busy processes, {options.load_cell}, {'no ' if options.no_sync else ''}sync line")
+    print("| pulses | dropped | late median ms | p99 | max | samples | lost | rig CPU % | alignment | error ms |")
+    print("|---|---|---|---|---|---|---|---|---|---|")
+    for s in summaries:
+        late, alignment = s["lateness_ms"], s["alignment"]
+        print(
+            f"| {s['pulses']} | {s['dropped_pulses']} | {late['median']:.3f} | {late['p99']:.3f} | {late['max']:.3f} "
+            f"| {s['samples']} | {s['lost_samples']} | {s['cpu_percent']:.1f} "
+            f"| {alignment['method']} | {alignment['error_ms']:.3f} |"
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,116 @@
+"""The rig file: every mistake is one line that names the key and the mend."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from rig import config
+from rig.devices import find
+from rig.errors import ConfigError
+
+GOOD = """
+data_dir = "var"
+socket = "var/rig.sock"
+[stimulator]
+device = "p24"
+port = "/dev/ttyACM0"
+[load_cell]
+device = "can_load_cell"
+bus = { interface = "socketcan", channel = "can0" }
+[limits]
+pulse_width_us = 400
+torque_nm = 25
+"""
+
+
+def load(tmp_path: Path, text: str) -> config.RigConfig:
+    path = tmp_path / "rig.toml"
+    path.write_text(text)
+    return config.load(path)
+
+
+def test_a_good_file(tmp_path: Path):
+    loaded = load(tmp_path, GOOD)
+    assert loaded.clock_speed == 1.0
+    table = loaded.limits.table()
+    assert table["pulse_width_us"].hi == 400
+    assert table["pulse_width_us"].owner == "rig file"
+    assert (table["torque_nm"].lo, table["torque_nm"].hi) == (-25, 25)
+    assert loaded.public()["stimulator"]["port"] == "/dev/ttyACM0"
+    json.dumps(loaded.public())
+
+
+def test_a_limit_is_never_widened(tmp_path: Path):
+    assert load(tmp_path, GOOD.replace("400", "4000")).limits.table()["pulse_width_us"].hi == 500
+
+
+def test_the_example_is_good():
+    path = Path(__file__).parents[2] / "deploy" / "rig.example.toml"
+    loaded = config.load(path)
+    assert find("load_cell", loaded.load_cell.device).create(loaded.load_cell, None).sample_rate_hz == 1600
+
+
+MISTAKES = {
+    "unknown device": (('"p24"', '"p42"'), "stimulator.device: unknown device 'p42'; use one of: p24"),
+    "unknown key": (("port =", "prot ="), "stimulator.p"),
+    "text in a number": (("400", '"wide"'), "limits.pulse_width_us: Input should be a valid number"),
+    "NaN": (("400", "nan"), "limits.pulse_width_us"),
+    "negative": (("400", "-4"), "limits.pulse_width_us"),
+    "no TOML": (("[limits]", "[limits"), "not TOML"),
+    "missing table": (("[load_cell]", "[cell]"), "[load_cell] is missing"),
+    "missing key": (('socket = "var/rig.sock"', ""), "socket: missing"),
+    "bad speed": (("data_dir", "clock_speed = 0\ndata_dir"), "clock_speed"),
+    "channel": (("port =", "channel = 9\nport ="), "stimulator.channel"),
+    "start frame": (("bus =", 'start_frames = ["0-0100"]\nbus ='), "write id#data in hex"),
+    "scale": (("bus =", "scale_nm = 0\nbus ="), "scale of 0"),
+}
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_mistakes_are_one_line(tmp_path: Path, name: str):
+    (old, new), words = MISTAKES[name]
+    assert old in GOOD
+    with pytest.raises(ConfigError) as caught:
+        load(tmp_path, GOOD.replace(old, new))
+    line = str(caught.value)
+    assert words in line
+    assert "rig.toml" in line
+    assert "\n" not in line
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "words"),
+    [
+        ("signal", "Torque", "has no signal 'Torque'"),
+        ("counter", "Count", "did you mean 'Counter'?"),
+        ("sync", "sink", "has no sync 'sink'"),
+        ("message", "Torqe", "did you mean 'Torque'?"),
+        ("dbc", "nowhere/cell.dbc", "no file"),
+    ],
+)
+def test_a_wrong_signal_is_named(tmp_path: Path, key: str, value: str, words: str):
+    loaded = load(tmp_path, GOOD.replace("bus =", f'{key} = "{value}"\nbus ='))
+    with pytest.raises(ConfigError, match=words) as caught:
+        find("load_cell", "can_load_cell").create(loaded.load_cell, None)
+    assert str(caught.value).startswith("load_cell.")
+
+
+def test_a_file_that_is_not_there(tmp_path: Path):
+    with pytest.raises(ConfigError, match="No such file"):
+        config.load(tmp_path / "none.toml")
+
+
+def test_the_emulators_line(tmp_path: Path):
+    line = json.dumps({"stimulator": "/dev/pts/3", "can": {"interface": "slcan", "channel": "/dev/pts/4"}, "speed": 5})
+    where = {"data_dir": tmp_path, "socket": tmp_path / "s"}
+    loaded = config.for_emulator(line, **where)
+    assert loaded.clock_speed == 5
+    assert loaded.stimulator.model_dump()["port"] == "/dev/pts/3"
+    (tmp_path / "ready.json").write_text(line)
+    assert config.for_emulator(str(tmp_path / "ready.json"), **where) == loaded
+    for wrong in ("{}", "[1]", str(tmp_path / "none")):
+        with pytest.raises(ConfigError, match="--emulator-json"):
+            config.for_emulator(wrong, **where)

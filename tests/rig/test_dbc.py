@@ -1,0 +1,58 @@
+"""Torque out of CAN frames by their DBC description."""
+
+from __future__ import annotations
+
+import math
+import struct
+from pathlib import Path
+
+import pytest
+
+from rig.errors import ConfigError, WireError
+from rig.wire.dbc import PACKAGED, TorqueFrame
+
+COUNTS = """VERSION ""
+BS_:
+BU_: Cell
+BO_ 610 Value: 8 Cell
+ SG_ First : 7|16@0- (0.01,0) [0|0] "" Cell
+ SG_ Second : 23|16@0- (0.01,0) [0|0] "" Cell
+ SG_ Third : 39|16@0- (0.01,0) [0|0] "" Cell
+ SG_ Index : 55|8@0+ (1,0) [0|0] "" Cell
+"""
+
+
+def test_the_default_frame():
+    frame = TorqueFrame(PACKAGED, None, ["Torque_Nm"], "Counter", "Sync")
+    assert (frame.frame_id, frame.counter_modulus, frame.samples_per_frame) == (0x181, 65536, 1)
+    got = frame.decode(struct.pack("<fHBB", -3.25, 65535, 1, 0))
+    assert (got.values, got.counter, got.sync) == ((-3.25,), 65535, 1)
+    assert frame.decode(struct.pack("<fHBB", 0, 0, 2, 0)).sync == 0
+    assert math.isnan(frame.decode(struct.pack("<fHBB", math.nan, 0, 0, 0)).values[0])
+
+
+def test_several_samples_of_big_endian_counts(tmp_path: Path):
+    path = tmp_path / "counts.dbc"
+    path.write_text(COUNTS)
+    frame = TorqueFrame(str(path), "Value", ["First", "Second", "Third"], "Index", None)
+    assert (frame.frame_id, frame.counter_modulus, frame.samples_per_frame) == (610, 256, 3)
+    got = frame.decode(struct.pack(">hhhBB", 100, -200, 300, 9, 0))
+    assert got.values == pytest.approx((1.0, -2.0, 3.0))
+    assert (got.counter, got.sync) == (9, 255)
+    without = TorqueFrame(str(path), None, ["Second"], None, None)
+    assert without.decode(bytes(8)).counter == -1
+    assert without.counter_modulus == 0
+
+
+def test_a_short_frame_is_told():
+    with pytest.raises(WireError, match="does not fit Torque"):
+        TorqueFrame(PACKAGED, None, ["Torque_Nm"], None, None).decode(b"\0\0")
+
+
+def test_a_file_that_is_no_dbc(tmp_path: Path):
+    path = tmp_path / "x.dbc"
+    path.write_text("BO_ hello")
+    with pytest.raises(ConfigError, match="not a DBC file"):
+        TorqueFrame(str(path), None, ["a"], None, None)
+    with pytest.raises(ConfigError, match="no file"):
+        TorqueFrame("nothing", None, ["a"], None, None)

@@ -1,0 +1,80 @@
+"""Plans: the default test, limits over the whole of it, mistakes named."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from rig import limits, plan
+from rig.errors import PlanError, RefusedError
+from rig.limits import HARD_LIMITS
+from rig.messages import Profile, RecruitmentTable, SegmentPlan, TestPlan
+
+
+def built(segments: list[SegmentPlan] | None = None, rate_hz: float = 40.0, **profile: float) -> plan.PlannedTest:
+    request = TestPlan(
+        test_id="t", participant="P", profile=Profile(**profile), segments=segments, pulse_rate_hz=rate_hz
+    )
+    return plan.build(request, limits.for_profile(HARD_LIMITS, request.profile))
+
+
+def widths(*values: float) -> list[SegmentPlan]:
+    return [SegmentPlan(name="mine", sequence="widths", settings={"pulse_width_us": list(values)})]
+
+
+def test_the_default_test():
+    test = built(max_pulse_width_us=280.0)
+    assert test.duration_s == pytest.approx(38.7)
+    assert [s.name for s in test.segments] == ["rest", "prbs", "rest", "ramp", "rest", "validate", "rest"]
+    assert test.pulse_width_us.max() == 280.0
+    for segment in test.segments:
+        part = test.pulse_width_us[segment.start : segment.end]
+        assert (part.max() == 0) == (segment.name == "rest")
+        if segment.name == "validate":
+            assert part.max() > 0.8 * 280
+    assert test.charge_uc == pytest.approx(test.pulse_width_us.sum() * 0.02)
+    assert [test.segment_at(t) for t in (-1, 0, 2, 14.69, 14.7, 38.69, 38.7)] == [
+        None, "rest", "prbs", "prbs", "rest", "rest", None,
+    ]  # fmt: skip
+
+
+def test_preview():
+    test = built()
+    shown = plan.preview(test, RecruitmentTable(pulse_width_us=[0, 300], torque_nm=[0, 6]))
+    assert shown.duration_s == pytest.approx(38.7)
+    assert shown.torque_time_nms == pytest.approx(np.sum(test.pulse_width_us) * 0.02 / 40)
+    assert plan.preview(test).torque_time_nms is None
+    assert shown.segments[1] == {"name": "prbs", "start_s": 2.0, "end_s": pytest.approx(14.7)}
+    with pytest.raises(PlanError, match="recruitment"):
+        plan.preview(test, RecruitmentTable(pulse_width_us=[0, 0], torque_nm=[0, 6]))
+
+
+@pytest.mark.parametrize(
+    ("segments", "rate_hz", "profile", "words"),
+    [
+        (widths(100, 301), 40.0, {}, "mine, pulse 2: pulse_width_us 301"),
+        (widths(100, math.nan), 40.0, {}, "widths"),
+        (widths(-5), 40.0, {}, "mine, pulse 1"),
+        (None, 61.0, {}, "pulse_rate_hz 61"),
+        (None, math.nan, {}, "pulse_rate_hz nan"),
+        (None, 40.0, {"current_ma": 120.0, "max_pulse_width_us": 400.0}, "current_ma 120"),
+        (None, 40.0, {"current_ma": 100.0, "max_pulse_width_us": 450.0}, "charge_per_phase_uc 40.05"),
+        (widths(*[390.0] * 60), 50.0, {"current_ma": 100.0, "max_pulse_width_us": 390.0}, "charge_per_second_uc"),
+        (widths(*[1.0] * 13_000), 40.0, {}, "duration_s 325"),
+        (widths(*[300.0] * 11_000), 40.0, {}, "charge_per_test_uc"),
+    ],
+)
+def test_limits_hold_over_the_whole_test(
+    segments: list[SegmentPlan] | None, rate_hz: float, profile: dict[str, float], words: str
+):
+    with pytest.raises((RefusedError, PlanError), match=words):
+        built(segments, rate_hz, **profile)
+
+
+def test_mistakes_name_the_segment():
+    with pytest.raises(PlanError, match="segments is empty"):
+        built([])
+    with pytest.raises(PlanError, match=r"segment 1 \(x\): sequence 'nope' is unknown"):
+        built([SegmentPlan(name="x", sequence="nope")])

@@ -1,0 +1,64 @@
+"""The receiver: counters that wrap, samples lost, repeated and late."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rig.acquire.receiver import CounterUnwrapper, Receiver
+from rig.clock import VirtualClock
+from rig.journal import Journal
+from rig.signals import SAMPLE, TorqueBlock
+from tests.rig.fakes import FakeCell, FakeStimulator
+
+
+@given(st.integers(0, 65535), st.lists(st.integers(1, 300), min_size=1, max_size=300), st.integers(1, 40))
+def test_a_wrapping_counter_is_unwrapped(first: int, steps: list[int], per_block: int):
+    true = first + np.cumsum(steps)
+    unwrapper, got = CounterUnwrapper(65536), []
+    for at in range(0, len(true), per_block):
+        counter, keep, repeats, late = unwrapper.unwrap(true[at : at + per_block] % 65536)
+        assert keep.all()
+        assert (repeats, late) == (0, 0)
+        got += list(counter)
+    assert np.array_equal(np.array(got) - got[0], true - true[0])
+
+
+def test_repeats_and_late_samples_are_left_out():
+    counter, keep, repeats, late = CounterUnwrapper(65536).unwrap(np.array([65534, 65535, 65535, 1, 0, 2]))
+    assert list(counter[keep]) == [65534, 65535, 65537, 65538]
+    assert (repeats, late) == (1, 1)
+
+
+def block(counters: list[int], torque_nm: float = 1.0) -> TorqueBlock:
+    samples = np.zeros(len(counters), SAMPLE)
+    samples["counter"], samples["torque_nm"], samples["host_time_s"] = counters, torque_nm, 1000.0
+    return TorqueBlock(samples, malformed=1, error_frames=2)
+
+
+def test_counts(tmp_path: Path):
+    clock = VirtualClock()
+    receiver = Receiver(FakeCell(clock, FakeStimulator(clock)), clock, lambda _: None)
+    receiver.take(block([1, 2, 5]))
+    receiver.record(Journal(tmp_path / "j"), (-10, 10), lambda _: None)
+    receiver.take(block([6, 9, 9, 8, 10]))
+    counts = receiver.release()
+    assert counts.samples == 3  # 6, 9, 10
+    assert counts.lost_samples == 2  # 7 and 8: the 8 that came late has no place any more
+    assert (counts.duplicate_samples, counts.disordered_samples) == (1, 1)
+    assert (counts.malformed_frames, counts.error_frames) == (1, 2)
+
+
+def test_what_is_told_of_the_newest_sample():
+    clock = VirtualClock()
+    receiver = Receiver(FakeCell(clock, FakeStimulator(clock)), clock, lambda _: None)
+    assert receiver.age_s(clock.now_s()) == np.inf
+    assert receiver.torque_around(1.0) is None
+    receiver.take(block([1, 2], torque_nm=3.5))
+    clock.advance(0.25)
+    assert receiver.age_s(clock.now_s()) == 0.25
+    assert receiver.torque_around(1.0) == 3.5
+    assert receiver.last_torque_nm == 3.5
