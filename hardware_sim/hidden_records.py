@@ -9,13 +9,14 @@ import argparse
 import json
 import math
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.random import Generator
 
-from hardware_sim.patients.hidden.draw import draw_scenario, effect_ids, outside_ids, rng_of
+from hardware_sim.patients.hidden.draw import draw_pair, draw_scenario, effect_ids, outside_ids, rng_of
 from hardware_sim.patients.hidden.kernels import Floats
 from hardware_sim.patients.hidden.scenario import simulate
 
@@ -70,6 +71,7 @@ def generate(
     steep: bool = False,
     moving: bool = False,
     formulation: int | None = None,
+    sampled_late_s: float = 0.0,
 ) -> dict[str, Any]:
     """One record.
 
@@ -94,6 +96,8 @@ def generate(
         The joint moves slowly, `angle_rad` and `velocity_rad_s` are recorded (always so where an effect needs it).
     formulation
         Which of the effect's formulations; drawn if None.
+    sampled_late_s
+        The load cell samples this much later than its time stamps say (negative: earlier), to a simulation step.
 
     Returns
     -------
@@ -130,6 +134,9 @@ def generate(
     fine_noise = np.zeros(width.size)
     count = len(range(0, width.size, every))
     fine_noise[::every] = draw_noise(noise, rng, count, rate_hz, noise_sd_nm, rho, slow_sd_nm)
+    shift = round(sampled_late_s / step_s)
+    if shift:  # noise is drawn at the samples, so a late sample is an early pulse
+        sequence = replace(sequence, early_s=shift * step_s)
     torque = simulate(scenario.base, scenario.stages(), sequence, step_s, fine_noise)[::every]
     held = np.minimum(np.floor(np.arange(count) / rate_hz * 40 + 1e-9).astype(int), sequence.width_us.size - 1)
     record: dict[str, Any] = {
@@ -176,6 +183,21 @@ def _seeds(text: str) -> range:
     return range(int(first), int(last)) if last else range(int(first), int(first) + 1)
 
 
+def _record_of(effect: str | None, strength: str, seed: int, settings: argparse.Namespace) -> dict[str, Any]:
+    names = list(draw_pair(rng_of(seed, "pair"))) if effect == "pairs" else effect.split("+") if effect else None
+    return generate(
+        names,
+        strength,
+        seed,
+        rate_hz=settings.rate_hz,
+        design=settings.design,
+        noise=settings.noise,
+        noise_sd_nm=settings.noise_sd_nm,
+        steep=settings.steep,
+        with_validate=not settings.no_validate,
+    )
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Write a set of records with `truth.json`."""
     parser = argparse.ArgumentParser(prog="python -m hardware_sim.hidden_records", description=main.__doc__)
@@ -184,7 +206,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--effects",
         default="all",
-        help="ids with commas; a+b for two at once; 'all', 'outside', 'none' (nothing hidden)",
+        help="ids with commas; a+b for two at once; 'all', 'outside', 'pairs' (by the seed), 'none' (nothing hidden)",
     )
     parser.add_argument("--strengths", default="weak,middle,strong")
     parser.add_argument("--rate-hz", type=float, default=400)
@@ -204,17 +226,7 @@ def main(arguments: list[str] | None = None) -> int:
             for seed in settings.seeds:
                 name = f"{effect or 'none'}-{strength}-{seed}.csv"
                 try:
-                    record = generate(
-                        effect.split("+") if effect else None,
-                        strength,
-                        seed,
-                        rate_hz=settings.rate_hz,
-                        design=settings.design,
-                        noise=settings.noise,
-                        noise_sd_nm=settings.noise_sd_nm,
-                        steep=settings.steep,
-                        with_validate=not settings.no_validate,
-                    )
+                    record = _record_of(effect, strength, seed, settings)
                 except ValueError as problem:
                     print(f"{name}: {problem}", file=sys.stderr)
                     continue

@@ -20,6 +20,7 @@ class Protocol40:
     width_us: Floats
     segment: np.ndarray
     movement: tuple[Floats, Floats, Floats] | None = None  # frequencies Hz, amplitudes rad, phases rad
+    early_s: float = 0.0  # by which the pulses come before their time
 
     @property
     def held_out(self) -> np.ndarray:
@@ -43,7 +44,9 @@ class Protocol40:
     def fine(self, step_s: float) -> tuple[Floats, Floats, Floats, Floats]:
         """Width, pulse, angle and velocity at every step. Torque at step k answers to widths before k."""
         count = round(self.duration_s / step_s)
-        held = np.floor((np.arange(count) - 1) * (step_s * PULSES_PER_S) + 1e-9).astype(int)
+        early = round(self.early_s / step_s)
+        held = np.floor((np.arange(count) - 1 + early) * (step_s * PULSES_PER_S) + 1e-9).astype(int)
+        held = np.minimum(held, self.width_us.size - 1)
         width = np.where(held >= 0, self.width_us[np.maximum(held, 0)], 0.0)
         pulse = np.zeros(count)
         pulse[1:] = (np.diff(held) > 0) & (width[1:] > 0.0)

@@ -13,10 +13,9 @@ import numpy as np
 from scipy.interpolate import BSpline
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import least_squares
-from scipy.signal import lfilter
 
 from hardware_sim.patients.hidden.base import Base
-from hardware_sim.patients.hidden.kernels import Floats
+from hardware_sim.patients.hidden.kernels import Floats, helper
 
 PULSE_RATE_HZ = 40.0
 STIFFNESS = 1e-3
@@ -52,6 +51,42 @@ def _filter(t_omega_s: float, zeta: float, step_s: float) -> tuple[Floats, Float
     return np.array([0.0, y1, b2]), np.array([1.0, -a1, a2])
 
 
+# Loops and not a linear-algebra library: its threads wait for one another where several processes share few cores.
+@helper
+def _normal_equations(basis, b, a, y, held_out):
+    """Filter each column (second order, no feed-through); Gram matrix and moments over the rows to fit."""
+    n, m = basis.shape
+    x = np.zeros((n, m))
+    gram = np.zeros((m, m))
+    moment = np.zeros(m)
+    for k in range(1, n):
+        for j in range(m):
+            value = b[1] * basis[k - 1, j] - a[1] * x[k - 1, j]
+            if k > 1:
+                value += b[2] * basis[k - 2, j] - a[2] * x[k - 2, j]
+            x[k, j] = value
+        if not held_out[k]:
+            for i in range(m):
+                xi = x[k, i]
+                moment[i] += xi * y[k]
+                for j in range(i + 1):
+                    gram[i, j] += xi * x[k, j]
+    for i in range(m):
+        for j in range(i):
+            gram[j, i] = gram[i, j]
+    return x, gram, moment
+
+
+@helper
+def _product(x, coefficients):
+    n, m = x.shape
+    out = np.zeros(n)
+    for k in range(n):
+        for j in range(m):
+            out[k] += x[k, j] * coefficients[j]
+    return out
+
+
 @dataclass
 class Yardstick:
     """The effect-free fit for one base and one design, at the pulse rate.
@@ -82,13 +117,11 @@ class Yardstick:
 
     def _predict(self, theta: Floats, torque_nm: Floats) -> Floats:
         b, a = _filter(float(np.exp(theta[0])), float(np.exp(theta[1])), 1.0 / PULSE_RATE_HZ)
-        x = np.asarray(lfilter(b, a, self._basis, axis=0))
-        train = x[~self.held_out]
-        gram = train.T @ train
+        x, gram, moment = _normal_equations(self._basis, b, a, torque_nm, self.held_out)
         weight = np.trace(gram) / len(gram)
         gram += STIFFNESS * weight * self._bend
         gram[np.diag_indices_from(gram)] += 1e-9 * weight
-        return x @ cho_solve(cho_factor(gram), train.T @ torque_nm[~self.held_out])
+        return _product(x, np.asarray(cho_solve(cho_factor(gram), moment)))
 
     def fit(self, torque_nm: Floats) -> Floats:
         """Residual of the best effect-free model over all rows, free run, N·m."""

@@ -1,4 +1,3 @@
-
 """Activation-dependent speed: the muscle is faster or slower at high activation than at low."""
 
 from __future__ import annotations

@@ -1,4 +1,3 @@
-
 """Mixed fibres: fast and slow fibres answer side by side."""
 
 from __future__ import annotations

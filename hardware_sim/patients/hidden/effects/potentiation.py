@@ -1,4 +1,3 @@
-
 """Potentiation: a muscle that has just worked gives more torque for the same recruitment."""
 
 from __future__ import annotations

@@ -1,4 +1,3 @@
-
 """Series compliance: fixture, splint or tendon ring between the muscle and the load cell."""
 
 from __future__ import annotations

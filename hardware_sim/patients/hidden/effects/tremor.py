@@ -1,4 +1,3 @@
-
 """Tremor: a rhythm of 3 to 8 Hz that the stimulation does not drive."""
 
 from __future__ import annotations

@@ -1,4 +1,3 @@
-
 """Plateau potentials: strong stimulation sets off an after-discharge that goes on by itself until it dies out."""
 
 from __future__ import annotations

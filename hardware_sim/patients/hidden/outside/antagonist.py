@@ -1,4 +1,3 @@
-
 """Antagonist cross-talk: at large pulse widths current spreads to the antagonist, which pulls back, more slowly."""
 
 from __future__ import annotations

@@ -1,4 +1,3 @@
-
 """Clonus: after a sudden change of torque the muscle beats by itself for a while."""
 
 from __future__ import annotations

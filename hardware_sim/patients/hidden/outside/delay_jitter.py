@@ -1,4 +1,3 @@
-
 """Delay that jitters: the answer comes now sooner, now later, at random."""
 
 from __future__ import annotations

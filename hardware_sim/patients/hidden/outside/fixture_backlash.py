@@ -1,4 +1,3 @@
-
 """Backlash in the fixture: the load cell follows the torque only after play has been taken up."""
 
 from __future__ import annotations

@@ -1,4 +1,3 @@
-
 """Jumps of gain: an electrode shifts at an instant and with it the share of the nerve it reaches."""
 
 from __future__ import annotations

@@ -1,4 +1,3 @@
-
 """Loose contact: for moments no current flows, though pulses are sent."""
 
 from __future__ import annotations

@@ -1,4 +1,3 @@
-
 """History-dependent force: after a high torque some of it lingers (or is missing) at the next lower one."""
 
 from __future__ import annotations

@@ -1,4 +1,3 @@
-
 """Stick-slip: the limb sticks in the splint and the reading stays, then jumps."""
 
 from __future__ import annotations

@@ -1,4 +1,3 @@
-
 """Delay that depends on the pulse width: weak pulses answer later (or earlier) than strong ones."""
 
 from __future__ import annotations

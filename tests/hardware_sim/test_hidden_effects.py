@@ -1,0 +1,140 @@
+"""Each hidden effect: at rest it is nothing, at a strength it shows as much as it says, and it is integrated finely."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hardware_sim.patients.hidden.base import Base, draw_base
+from hardware_sim.patients.hidden.chain import Chain
+from hardware_sim.patients.hidden.draw import draw_scenario, effect_ids, formulations, outside_ids, rng_of
+from hardware_sim.patients.hidden.kernels import Formulation, NotSuited
+from hardware_sim.patients.hidden.protocol import make_design
+from hardware_sim.patients.hidden.scenario import BANDS, combine, excess_nm, simulate
+from hardware_sim.patients.hidden.yardstick import Yardstick
+
+CONTRACT = {
+    "fatigue",
+    "potentiation",
+    "recruitment_hysteresis",
+    "asymmetric_relaxation",
+    "electromechanical_delay",
+    "mixed_fibres",
+    "threshold_drift",
+    "baseline_drift",
+    "voluntary_effort",
+    "tremor",
+    "mains_hum",
+    "output_saturation",
+    "sensor_clipping",
+    "series_compliance",
+    "torque_angle",
+    "torque_velocity",
+    "passive_torque",
+    "activation_dependent_speed",
+    "catch_like",
+}
+STEP_S = 1.0 / 1600.0
+NOISE_SD_NM = 0.04
+ALL = [
+    pytest.param(effect, index, id=f"{effect}-{index}")
+    for effect in (*effect_ids(), *outside_ids())
+    for index in range(len(formulations(effect)))
+]
+# random by the step, or with an instant that falls on a step and sets what follows
+BY_STEP = {"tremor", "delay_jitter", "stick_slip", "slow_converter", "clonus"}
+
+
+def written(effect: str, index: int, seed: int = 3) -> tuple[Base, Formulation]:
+    """A base muscle on which this formulation can be written."""
+    for attempt in range(30):
+        rng = rng_of(seed, effect, str(index), str(attempt))
+        base = draw_base(rng)
+        try:
+            return base, formulations(effect)[index](rng, base)
+        except NotSuited:
+            continue
+    raise AssertionError("no suitable base in 30")
+
+
+def test_every_id_of_the_contract_has_its_file_and_some_are_foreign() -> None:
+    assert set(effect_ids()) == CONTRACT
+    assert len(outside_ids()) >= 8
+    assert not set(outside_ids()) & CONTRACT
+
+
+@pytest.mark.parametrize(("effect", "index"), ALL)
+def test_magnitude_zero_is_the_base_muscle(effect: str, index: int) -> None:
+    base, formulation = written(effect, index)
+    design = make_design("full", rng_of(1), float(base.largest_width_us), moving=True)
+    plain = simulate(base, base.stages(), design, STEP_S)
+    neutral = simulate(base, combine(base, [(formulation, 0.0)]), design, STEP_S)
+    assert np.abs(neutral - plain).max() < 1e-4
+    full = simulate(base, combine(base, [(formulation, formulation.top)]), design, STEP_S)
+    assert np.abs(full - plain).max() > 0.05
+
+
+@pytest.mark.parametrize(("effect", "index"), [p for p in ALL if p.values[0] not in BY_STEP])
+def test_a_finer_step_gives_the_same_torque(effect: str, index: int) -> None:
+    base, formulation = written(effect, index)
+    design = make_design("full", rng_of(2), float(base.largest_width_us), moving=True, validate_s=4.0)
+    stages = combine(base, [(formulation, 0.4 * formulation.top)])
+    if effect == "mains_hum" and "wander" in formulation.name:
+        pytest.skip("its grid wanders at random, by the step")
+    coarse = simulate(base, stages, design, STEP_S)
+    fine = simulate(base, stages, design, STEP_S / 4.0)[::4]
+    assert np.sqrt(np.mean((coarse - fine) ** 2)) < 0.004 * base.largest_nm
+
+
+@pytest.mark.parametrize("strength", BANDS)
+@pytest.mark.parametrize("effect", [*effect_ids(), *outside_ids()])
+def test_strength_lands_in_its_band(effect: str, strength: str) -> None:
+    for seed in (200, 201):
+        scenario = draw_scenario((effect,), strength, seed, noise_sd_nm=NOISE_SD_NM)
+        low, high = BANDS[strength]
+        assert low <= scenario.hidden[0].excess["counted_nm"] / NOISE_SD_NM <= high
+        torque = simulate(scenario.base, scenario.stages(), scenario.design, STEP_S)
+        assert np.all(np.isfinite(torque))
+        assert np.abs(torque).max() < 3.0 * scenario.base.largest_nm + 2.0
+
+
+def test_the_excess_is_that_of_a_fit_made_anew() -> None:
+    scenario = draw_scenario(("fatigue",), "strong", 210, noise_sd_nm=NOISE_SD_NM)
+    torque = simulate(scenario.base, scenario.stages(), scenario.design, STEP_S)[::40]
+    held_out = scenario.design.held_out
+    residual = Yardstick(scenario.base, scenario.design.width_us, held_out).fit(torque)
+    again = excess_nm("fatigue", residual, held_out)
+    assert again["held_out_nm"] == pytest.approx(scenario.hidden[0].excess["held_out_nm"], rel=0.05)
+
+
+@pytest.mark.parametrize("steep", [False, True])
+def test_a_base_muscle_leaves_the_yardstick_almost_nothing(steep: bool) -> None:
+    left = []
+    for seed in range(220, 250):
+        scenario = draw_scenario((), "weak", seed, steep=steep)
+        torque = simulate(scenario.base, scenario.stages(), scenario.design, STEP_S)[::40]
+        held_out = scenario.design.held_out
+        left.append(
+            np.sqrt(np.mean(Yardstick(scenario.base, scenario.design.width_us, held_out).fit(torque)[held_out] ** 2))
+        )
+    assert np.median(left) < 0.5 * NOISE_SD_NM
+    # within a steep rise the ramp leaves one pulse every 1.5 µs: nobody could know the curve better
+    assert np.percentile(left, 80 if steep else 95) < 1.5 * NOISE_SD_NM
+
+
+def test_the_base_follows_the_closed_form_step_response() -> None:
+    base = draw_base(rng_of(5))
+    width = np.full(3200, float(base.largest_width_us))
+    still = np.zeros_like(width)
+    torque = Chain(base.stages(), base.largest_nm, STEP_S).run(width, still, still, still)
+    t = np.arange(1, 3201) * STEP_S
+    root = np.sqrt(complex(base.zeta**2 - 1.0))
+    s1, s2 = (-base.zeta + root) / base.t_omega_s, (-base.zeta - root) / base.t_omega_s
+    expected = base.largest_nm * (1.0 - (s2 * np.exp(s1 * t) - s1 * np.exp(s2 * t)) / (s2 - s1)).real
+    assert np.abs(torque - expected).max() < 1e-6
+
+
+def test_steep_recruitment_rises_within_25_us() -> None:
+    for seed in range(40):
+        low, high = draw_base(rng_of(seed), steep=True).rise_us()
+        assert 1.0 <= high - low <= 27.0

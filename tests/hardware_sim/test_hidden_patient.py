@@ -1,0 +1,93 @@
+"""The hidden patient on the wire's side: same muscle as off line, jitter does not tear holes, the secret is kept."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from hardware_sim.patients import hidden
+from hardware_sim.patients.hidden.draw import Scenario, draw_scenario
+from hardware_sim.patients.hidden.live import HiddenMuscle
+from hardware_sim.patients.hidden.scenario import simulate
+
+RATE_HZ = 1600
+
+
+def play(muscle: HiddenMuscle, scenario: Scenario, seconds: float, late_s: np.ndarray | None = None) -> np.ndarray:
+    """Torque at 1600 Hz while the scenario's design is sent, pulse by pulse."""
+    width = scenario.design.width_us
+    at = np.arange(width.size) * 0.025 + (0.0 if late_s is None else late_s)
+    torque = np.empty(round(seconds * RATE_HZ))
+    pulse = 0
+    for k in range(torque.size):
+        while pulse < width.size and at[pulse] <= k / RATE_HZ:
+            if width[pulse] > 0.0:
+                muscle.pulse(float(at[pulse]), float(width[pulse]), 20.0)
+            pulse += 1
+        torque[k] = muscle.torque_nm(k / RATE_HZ)
+    return torque
+
+
+@pytest.mark.parametrize("effect", [None, "fatigue", "recruitment_hysteresis", "catch_like", "sensor_clipping"])
+def test_live_and_off_line_are_one_muscle(effect: str | None) -> None:
+    scenario = draw_scenario((effect,) if effect else (), "strong", 400)
+    off_line = simulate(scenario.base, scenario.stages(), scenario.design, 1.0 / RATE_HZ)
+    live = play(HiddenMuscle(scenario), scenario, 12.0)
+    assert off_line[: live.size].max() > 0.2 * scenario.base.largest_nm
+    assert np.abs(live - off_line[: live.size]).max() < 1e-3
+
+
+def test_jitter_delays_but_tears_no_holes() -> None:
+    scenario = draw_scenario(("fatigue",), "middle", 401)
+    late = np.random.default_rng(1).uniform(0.0, 0.004, scenario.design.width_us.size)
+    steady = play(HiddenMuscle(scenario), scenario, 12.0, np.full_like(late, 0.002))
+    jittered = play(HiddenMuscle(scenario), scenario, 12.0, late)
+    assert np.sqrt(np.mean((jittered - steady) ** 2)) < 0.01 * scenario.base.largest_nm
+    assert jittered.max() == pytest.approx(steady.max(), rel=0.01)
+
+
+def test_torque_dies_away_once_pulses_stop_and_less_current_recruits_less() -> None:
+    scenario = draw_scenario((), "weak", 402)
+    full, weak = HiddenMuscle(scenario), HiddenMuscle(scenario)
+    for k in range(80):
+        for muscle, current_ma in ((full, 20.0), (weak, 10.0)):
+            muscle.torque_nm(k * 0.025)
+            muscle.pulse(k * 0.025, scenario.base.largest_width_us, current_ma)
+    assert full.torque_nm(2.0) == pytest.approx(scenario.base.largest_nm, rel=0.15)
+    assert weak.torque_nm(2.0) < full.torque_nm(2.0)
+    assert abs(full.torque_nm(12.0)) < 0.01 * scenario.base.largest_nm
+
+
+def test_a_clipped_reading_stays_clipped_after_the_noise() -> None:
+    scenario = draw_scenario(("sensor_clipping",), "strong", 403)
+    muscle = HiddenMuscle(scenario)
+    rail = muscle.sensor(10.0 * scenario.base.largest_nm, 0.0)
+    assert rail < scenario.base.largest_nm
+    assert play(muscle, scenario, 12.0).max() <= rail
+
+
+def test_reveal_tells_of_the_muscle_that_make_gives() -> None:
+    kinds = set()
+    for seed in range(40, 52):
+        told = hidden.reveal(seed)
+        json.dumps(told)
+        assert told == hidden.reveal(seed)
+        assert len(told["effects"]) == len(told["formulation"]) == len(told["parameters"])
+        kinds.add((len(told["effects"]), told["outside_library"]))
+        assert not any(effect in repr(hidden.make(seed)) for effect in told["effects"])
+    assert len(kinds) >= 3  # nothing, one, two, foreign
+
+    seed = next(seed for seed in range(40, 80) if len(hidden.reveal(seed)["effects"]) == 1)
+    largest_us, torque = hidden.reveal(seed)["base"]["largest_width_us"], []
+    for muscle in (hidden.make(seed), hidden.make(seed)):
+        for k in range(40):
+            muscle.pulse(k * 0.025, largest_us, 20.0)
+        torque.append(muscle.torque_nm(1.0))
+    assert torque[0] == torque[1] != 0.0
+
+
+def test_making_a_patient_prints_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    hidden.make(60)
+    assert capsys.readouterr() == ("", "")
