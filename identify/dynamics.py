@@ -9,7 +9,7 @@ states of its own: it shifts the times at which the curve is read.
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg.lapack import dtbtrs
+from scipy.linalg import lapack
 
 
 def transition(time_constant_s: float, damping: float, step_s: float) -> tuple[np.ndarray, np.ndarray]:
@@ -64,7 +64,9 @@ def recursion(a: np.ndarray, forced: np.ndarray) -> np.ndarray:
     """
     bands = np.empty((len(a), forced.shape[0]), order="F")
     bands[:] = np.asarray(a, float)[:, None]
-    solved, _ = dtbtrs(bands, forced if forced.ndim == 2 else forced[:, None], uplo="L", overwrite_b=True)
+    solved, _ = lapack.dtbtrs(  # pyright: ignore[reportAttributeAccessIssue]
+        bands, forced if forced.ndim == 2 else forced[:, None], uplo="L", overwrite_b=True
+    )
     return solved if forced.ndim == 2 else solved[:, 0]
 
 

@@ -60,8 +60,13 @@ def ceiling_percent(measured_nm: np.ndarray, sd_nm: float) -> float:
     return 100.0 * (1.0 - sd_nm * float(np.sqrt(measured_nm.size)) / spread)
 
 
-def figures(grid: Grid, rows: np.ndarray, predicted_nm: np.ndarray, sd_nm: float) -> dict[str, Any]:
-    """What MODEL.json tells under `fit`, at the record's own rate."""
+def figures(
+    grid: Grid, rows: np.ndarray, predicted_nm: np.ndarray, sd_nm: float, held_out_change: np.ndarray | None = None
+) -> dict[str, Any]:
+    """What MODEL.json tells under `fit`, at the record's own rate.
+
+    Without `validate`, `held_out_change` (N·m, shape (K,)) turns the fit into that of blocked cross-validation.
+    """
     record = grid.record
     measured = record.torque_nm
     used = rows[grid.interval] & ~record.held_out
@@ -85,6 +90,15 @@ def figures(grid: Grid, rows: np.ndarray, predicted_nm: np.ndarray, sd_nm: float
             "held_out_ceiling_percent": ceiling_percent(measured[held], sd_nm),
             "held_out_rms_nm": rms((measured - predicted_nm)[held]),
             "held_out_by": "validate",
+        }
+    elif held_out_change is not None:
+        left_out = predicted_nm[used] + held_out_change[grid.interval[used]]
+        result |= {
+            "held_out_fit_percent": best_fit_percent(measured[used], left_out),
+            "held_out_ceiling_percent": result["ceiling_percent"],
+            "held_out_rms_nm": rms(measured[used] - left_out),
+            "held_out_by": "cross-validation",
+            "held_out_samples": int(used.sum()),
         }
     return result
 

@@ -10,6 +10,7 @@ from uuid import uuid4
 
 import numpy as np
 
+from identify.crossvalidation import held_out_change
 from identify.figures import figures, white_sd
 from identify.grid import Grid, runs
 from identify.linear import Discrete
@@ -17,7 +18,10 @@ from identify.model import Covariance, Model, Noise
 from identify.noise import noise_evidence
 from identify.projection import Solution
 from identify.recruitment.curve import Curve
+from identify.residual_tests import residual_tests
 from identify.simulate import fingerprint, predict_on
+from identify.uncertainty import bands
+from identify.validity import quality, valid_for
 
 
 def finish(method_id: str, solution: Solution, delta_bic: float, reasons: Sequence[str] = ()) -> Model:
@@ -38,7 +42,8 @@ def finish(method_id: str, solution: Solution, delta_bic: float, reasons: Sequen
         noise=Noise(block_sd_nm=block_sd, ar1=solution.ar1, delta_bic=delta_bic),
         reasons=tuple(reasons),
     )
-    return completed(model, grid, problem.rows, solution.freedom)
+    model = completed(model, grid, problem.rows, solution.freedom, solution)
+    return model.with_(bands=bands(model))
 
 
 def finish_discrete(
@@ -76,8 +81,8 @@ def finish_discrete(
     return completed(model, grid, rows, free)
 
 
-def completed(model: Model, grid: Grid, rows: np.ndarray, freedom: float) -> Model:
-    """The model with its figures, its name and its origin."""
+def completed(model: Model, grid: Grid, rows: np.ndarray, freedom: float, solution: Solution | None = None) -> Model:
+    """The model with its figures, its tests, its validity, its name and its origin."""
     source = grid.record.source
     model = model.with_(
         model_id=str(uuid4()),
@@ -91,7 +96,14 @@ def completed(model: Model, grid: Grid, rows: np.ndarray, freedom: float) -> Mod
     )
     predicted = predict_on(model, grid)
     sd = white_sd(grid, predicted, model.noise.block_sd_nm, freedom, model.noise.ar1 == 0.0)
-    return model.with_(noise=replace(model.noise, white_sd_nm=sd), fit=figures(grid, rows, predicted, sd))
+    change = None if solution is None or grid.record.has_held_out else held_out_change(solution)
+    model = model.with_(
+        noise=replace(model.noise, white_sd_nm=sd),
+        fit=figures(grid, rows, predicted, sd, change),
+        residual_tests={} if solution is None else residual_tests(solution),
+        valid_for=valid_for(model, grid, rows),
+    )
+    return model.with_(quality=quality(model, grid, rows, solution is None or solution.converged))
 
 
 def covariance(solution: Solution) -> Covariance:

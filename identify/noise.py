@@ -64,12 +64,12 @@ def best_ar1(residual: np.ndarray, stretches: list[slice]) -> float:
         squares = np.maximum(lead - 2 * ar1 * lag + ar1 * ar1 * inner, 1e-24 * rows)
         return -0.5 * rows * np.log(squares) + 0.5 * len(stretches) * np.log1p(-ar1 * ar1)
 
-    low, high = -0.5, LARGEST_AR1
+    low, high, found = -0.5, LARGEST_AR1, 0.0
     for _ in range(3):  # the score has one peak there: three ever finer scans find it to 1e-5
         trial = np.linspace(low, high, 61)
         best = int(np.argmax(score(trial)))
-        low, high = trial[max(best - 1, 0)], trial[min(best + 1, 60)]
-    return float((low + high) / 2) if 0 < best < 60 else float(trial[best])
+        low, high, found = float(trial[max(best - 1, 0)]), float(trial[min(best + 1, 60)]), float(trial[best])
+    return found
 
 
 def noise_evidence(residual: np.ndarray, stretches: list[slice]) -> tuple[float, float]:

@@ -17,6 +17,9 @@ def predict(model: Model, record: Record) -> np.ndarray:
     No measured torque is used: this is what the controller would have seen. A model with effects is run by the
     engine of the effects.
     """
+    from identify.validity import refuse_rate
+
+    refuse_rate(model, record)
     if model.effects:
         from identify import engine  # type: ignore[attr-defined]
 

@@ -35,7 +35,7 @@ class Patient:
         late = round(self.delay_s * FINE_HZ)
         drive = np.r_[np.zeros(late), drive][: drive.size]
         t, z = self.time_constant_s, self.damping
-        b, a, _ = cont2discrete(([1.0], [t * t, 2 * z * t, 1.0]), 1 / FINE_HZ, method="zoh")
+        b, a = cont2discrete(([1.0], [t * t, 2 * z * t, 1.0]), 1 / FINE_HZ, method="zoh")[:2]  # pyright: ignore
         torque = lfilter(np.ravel(b), np.ravel(a), drive)
         at = np.round(np.arange(round(widths_us.size / pulse_rate_hz * rate_hz)) * FINE_HZ / rate_hz).astype(int)
         return torque[at]
