@@ -163,7 +163,9 @@ class Grid:
         y = _padded(torque_nm, before, after, hold=True)
         v = _padded(rate_nm_s, before, after, hold=False)
         size = self.size
-        result = np.zeros((size, *torque_nm.shape[1:]))
+        result = np.zeros(
+            (size, *torque_nm.shape[1:]), order="F"
+        )  # as the states come: columns are filtered one by one
         lift = (slice(None),) + (None,) * (torque_nm.ndim - 1)
         for b in range(weights.shape[1]):
             rows = slice(before + first + b, before + first + b + size)

@@ -25,6 +25,9 @@ def whiten(rows: np.ndarray, stretches: list[slice], ar1: float) -> np.ndarray:
         Fitted rows only, in order; the first of each stretch is scaled by sqrt(1 - ar1²), so that the determinant of
         the likelihood is that of the stationary process.
     """
+    if ar1 == 0.0:
+        parts = [rows[stretch] for stretch in stretches]
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
     parts = []
     for stretch in stretches:
         block = rows[stretch]

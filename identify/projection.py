@@ -12,6 +12,7 @@ from functools import cached_property
 
 import numpy as np
 
+from identify.dynamics import boundary_states
 from identify.errors import NotIdentifiable
 from identify.grid import Grid
 from identify.linear import SecondOrder
@@ -24,7 +25,7 @@ from identify.recruitment.spline import SplineBasis
 T_BOUNDS_S = (0.012, 4.0)
 ZETA_BOUNDS = (0.15, 4.0)
 LONGEST_DELAY_S = 0.2
-STARTS_S = (0.06, 0.15, 0.35, 0.8)
+STARTS_S = (0.08, 0.22, 0.55)
 
 
 @dataclass
@@ -91,13 +92,6 @@ class Problem:
 
         return [baseline, initial_response(linear, self.grid, at_samples=False)]
 
-    def single(self, linear: SecondOrder, coefficients: np.ndarray) -> np.ndarray:
-        """Block means for one set of coefficients, shape (K,)."""
-        size = self.basis.size
-        response = linear.on_grid(self.grid, self.drive @ coefficients[:size])
-        extra = np.concatenate(self._extra_columns(linear), axis=1)
-        return response + extra @ coefficients[size:]
-
     @property
     def searched(self) -> int:
         """How many numbers of the dynamics are searched."""
@@ -105,11 +99,22 @@ class Problem:
 
     def slopes(self, linear: SecondOrder, coefficients: np.ndarray) -> np.ndarray:
         """Derivatives of the block means by log T, log ζ and (if searched) the delay, shape (K, 2 or 3)."""
-        step = 1e-6
+        step, size = 1e-6, self.basis.size
         t, z, d = linear.time_constant_s, linear.damping, linear.delay_s
-        here = self.single(linear, coefficients)
-        near = [SecondOrder(t * np.exp(step), z, d), SecondOrder(t, z * np.exp(step), d), SecondOrder(t, z, d + step)]
-        return np.stack([(self.single(at, coefficients) - here) / step for at in near[: self.searched]], axis=1)
+        held, grid = self.drive @ coefficients[:size], self.grid
+        # The delay shifts only where the curve is read: the states are those of the other two's base.
+        torque, rate = boundary_states(t, z, grid.step_s, held)
+        near = [SecondOrder(t * np.exp(step), z, d), SecondOrder(t, z * np.exp(step), d)]
+        values = [at.on_grid(grid, held) for at in near]
+        if self.delay_s is None:
+            near.append(SecondOrder(t, z, d + step))
+            values.append(grid.block_mean(torque, rate, d + step))
+        change = np.stack(values, axis=1) - grid.block_mean(torque, rate, d)[:, None]
+        if not self.from_rest:
+            here = self._extra_columns(linear)[1]
+            tails = [(self._extra_columns(at)[1] - here) @ coefficients[size + 1 :] for at in near]
+            change += np.stack(tails, axis=1)
+        return change / step
 
 
 @dataclass(frozen=True)
@@ -173,7 +178,7 @@ def search(
     ar1: float = 0.0,
     weight: float | None = None,
     most: int = 25,
-    tolerance: float = 1e-3,
+    tolerance: float = 0.01,
 ) -> Solution:
     """Gauss-Newton on the dynamics with the coefficients projected out, damped where a step fails.
 
@@ -387,7 +392,7 @@ def pilot_solution(grid: Grid, rows: np.ndarray, from_rest: bool, delay_s: float
     delay = 0.02 if delay_s is None else delay_s
     starts = [_assess(problem, _bounded(problem, SecondOrder(t, 0.9, delay)), target, 0.0, None) for t in STARTS_S]
     best = min(starts, key=lambda state: state.cost)
-    return search(problem, best.linear, most=12, tolerance=0.1)
+    return search(problem, best.linear, most=12, tolerance=0.5)
 
 
 def designed(first: Solution, count: int = KNOTS) -> tuple[Problem, SecondOrder]:
@@ -402,9 +407,17 @@ def designed(first: Solution, count: int = KNOTS) -> tuple[Problem, SecondOrder]
     rough = search(
         Problem(grid, basis, spline_roughness(basis), rows, from_rest, delay_s), first.linear, most=3, tolerance=0.3
     )
-    final = SplineBasis(adapted_knots(pilot_curve(rough), largest, count))
-    roughness = spline_roughness(final, (basis, rough.coefficients[: basis.size]))
-    return Problem(grid, final, roughness, rows, from_rest, delay_s), rough.linear
+    again = _redesigned(rough, largest, count)
+    return _redesigned(project(again, rough.linear), largest, count), rough.linear
+
+
+def _redesigned(solution: Solution, largest_us: float, count: int) -> Problem:
+    """The problem with knots and penalty from a solution's own curve."""
+    old = solution.problem
+    basis = SplineBasis(adapted_knots(pilot_curve(solution), largest_us, count))
+    assert isinstance(old.basis, SplineBasis)
+    roughness = spline_roughness(basis, (old.basis, solution.coefficients[: old.basis.size]))
+    return Problem(old.grid, basis, roughness, old.rows, old.from_rest, old.delay_s)
 
 
 def pilot_curve(solution: Solution) -> tuple[np.ndarray, np.ndarray]:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 KNOTS = 31
 PILOT_KNOTS = 12
 NARROWEST_US = 0.5
-STRAIGHTEST = 0.01
+STRAIGHTEST = 0.003
 """Least share of the strongest bending that the penalty expects anywhere, so that no part is forced straight."""
 
 
