@@ -53,6 +53,8 @@ def _run(emulator: Emulator, options: argparse.Namespace) -> int:
     signals: list[int] = []
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda caught, _frame: signals.append(caught))
+    # before the ready line: a parent may die as soon as it has read it
+    orphaned = _orphan_watch() if options.die_with_parent else lambda: False
     ready = emulator.ready()
     if options.no_json:
         print(*(f"{key}: {value}" for key, value in ready.items()), sep="\n", flush=True)
@@ -60,7 +62,6 @@ def _run(emulator: Emulator, options: argparse.Namespace) -> int:
         print(json.dumps(ready), flush=True)
     if options.speed <= FASTEST_AT_PRIORITY:
         _take_priority()
-    orphaned = _orphan_watch() if options.die_with_parent else lambda: False
     emulator.run(lambda: bool(signals) or orphaned())
     return 0
 

@@ -27,11 +27,13 @@ class FiredPulse:
 class Electrodes:
     """One pair on one muscle, at one of the stimulator's outputs.
 
-    `raise_sync` is called for each pulse that flows.
+    `raise_sync` is called for each pulse that flows. `cut` is the emergency switch: a device that watches it says
+    so, to any other it looks like an open electrode.
     """
 
     def __init__(self, muscle: Muscle, raise_sync: Callable[[], None] = lambda: None) -> None:
         self.attached = True
+        self.cut = False
         self.output = (0, 0)
         self.unbalanced_pulses = 0
         self.delivered_pulses = 0
@@ -41,7 +43,7 @@ class Electrodes:
 
     def closed_circuit(self, output: tuple[int, int]) -> bool:
         """Whether current can flow at this (connector, channel)."""
-        return self.attached and output == self.output
+        return self.attached and not self.cut and output == self.output
 
     def fire(self, time_s: float, points: Sequence[Point], output: tuple[int, int], source: str) -> bool:
         """One pulse of this shape; True if it flowed through the muscle."""

@@ -14,8 +14,10 @@ from typing import Any
 from hardware_sim import stimulators
 from hardware_sim.control import Control
 from hardware_sim.electrodes import Electrodes
+from hardware_sim.errors import SettingsError
 from hardware_sim.faults.registry import Faults
 from hardware_sim.load_cells import cells, transports
+from hardware_sim.load_cells.frames import CellProtocol
 from hardware_sim.load_cells.sampler import LoadCell, Noise, deliver
 from hardware_sim.patients.muscle import Muscle
 from hardware_sim.pseudo_terminal import PseudoTerminal
@@ -43,7 +45,7 @@ class Emulator:
         self.timeline = Timeline()
         self._reactor = Reactor()
         self._folder = Path(tempfile.mkdtemp(prefix="stimrig-emulator-"))
-        cell = pick(cells, "Cell", settings.cell, "load cell")()
+        cell = self._cell = _cell(settings)
         noise = Noise(settings.noise_nm, settings.noise_seed)
         self.load_cell = LoadCell(
             muscle,
@@ -52,12 +54,13 @@ class Emulator:
             settings.rate_hz,
             offset_nm=settings.torque_offset_nm,
             clock_ppm=settings.clock_ppm,
+            jitter_s=settings.clock_jitter_us * 1e-6,
             has_sync=settings.sync,
             epoch_us=time.time_ns() // 1000,
         )
         self.timeline.followers.append(self.load_cell.produce)
         self.electrodes = Electrodes(muscle, self.load_cell.raise_sync)
-        self.board = Board(self.timeline, self.electrodes, self._write)
+        self.board = Board(self.timeline, self.electrodes, self._write, lambda: self.port.unread_bytes())
         self.firmware = pick(stimulators, "Firmware", settings.stimulator, "stimulator")(self.board)
         self.faults = Faults(self)
         self._received = cell.received
@@ -75,12 +78,17 @@ class Emulator:
             "can": self.transport.can,
             "control": str(self._control.path),
             "pid": os.getpid(),
+            "stimulator_device": self.settings.stimulator,
+            "load_cell_transport": self.settings.transport,
+            "cell": self.settings.cell,
+            "samples_per_frame": self._cell.samples_per_frame,
+            "has_counter": self._cell.has_counter,
             "sample_rate_hz": self.settings.rate_hz,
             "speed": self.settings.speed,
             "patient": self.settings.patient,
             "noise_nm": self.settings.noise_nm,
             "noise_seed": self.settings.noise_seed,
-            "sync": self.settings.sync,
+            "sync": self.settings.sync and self._cell.has_sync,
         }
 
     def run(self, stopping: Callable[[], bool]) -> None:
@@ -174,3 +182,20 @@ class Emulator:
 
     def _write(self, frame: bytes) -> None:
         self.port.write(frame)
+
+
+def _cell(settings: Settings) -> CellProtocol:
+    """The cell of these settings.
+
+    Raises
+    ------
+    SettingsError
+        It has no frame for so many samples.
+    """
+    kind = pick(cells, "Cell", settings.cell, "load cell")
+    if settings.samples_per_frame not in kind.layouts:
+        takes = " or ".join(map(str, kind.layouts))
+        raise SettingsError(
+            f"--samples-per-frame must be {takes} with --cell {settings.cell}, not {settings.samples_per_frame}"
+        )
+    return kind(settings.samples_per_frame)

@@ -59,6 +59,8 @@ def settings(options: argparse.Namespace, patient: str) -> Settings:
         rate_hz=options.rate_hz,
         speed=options.speed,
         clock_ppm=options.clock_ppm,
+        clock_jitter_us=options.clock_jitter_us,
+        samples_per_frame=options.samples_per_frame,
         sync=not options.no_sync,
         faults=tuple(options.fault),
     )
@@ -111,11 +113,23 @@ def _devices(group: argparse._ArgumentGroup) -> None:
         help="samples per second (default: %(default)g)",
     )
     group.add_argument(
-        "--samples-per-frame", type=int, default=1, choices=(1,), help="samples in each frame (default: 1)"
+        "--samples-per-frame",
+        type=int,
+        default=1,
+        metavar="N",
+        help="samples in each frame: plain takes 1 or 3 (16-bit counts of 2 mN·m and a counter of frames), "
+        "counts takes 1 to 4 (default: 1)",
     )
     group.add_argument("--no-sync", action="store_true", help="no sync line from the stimulator to the cell")
     group.add_argument(
         "--clock-ppm", type=float, default=0.0, metavar="PPM", help="drift of the cell's clock (default: 0)"
+    )
+    group.add_argument(
+        "--clock-jitter-us",
+        type=float,
+        default=0.0,
+        metavar="SD",
+        help="standard deviation of each sample's own time, never more than 0.45 of a period (default: 0)",
     )
     group.add_argument(
         "--fault",

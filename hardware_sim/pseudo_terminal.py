@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
+import struct
+import termios
 import tty
 
 
@@ -34,6 +37,13 @@ class PseudoTerminal:
             return os.read(self._master, 65536)
         except OSError:
             return b""
+
+    def unread_bytes(self) -> int:
+        """How much the client has yet to read."""
+        if not self.is_open:
+            return 0
+        (queued,) = struct.unpack("i", fcntl.ioctl(self._slave, termios.FIONREAD, bytes(4)))
+        return queued + len(self._pending)
 
     def write(self, message: bytes) -> None:
         """Queue one message for the client and hand over what fits."""

@@ -13,6 +13,7 @@ RANGES = {
     "rate_hz": (10.0, 10000.0),
     "speed": (0.01, 100.0),
     "clock_ppm": (-10000.0, 10000.0),
+    "clock_jitter_us": (0.0, 100000.0),
 }
 
 
@@ -30,6 +31,8 @@ class Settings:
     rate_hz: float = 1600.0
     speed: float = 1.0
     clock_ppm: float = 0.0
+    clock_jitter_us: float = 0.0
+    samples_per_frame: int = 1
     sync: bool = True
     faults: tuple[str, ...] = field(default=())
 

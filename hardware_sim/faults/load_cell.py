@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
+from hardware_sim.errors import FaultError
 from hardware_sim.faults.registry import Undo, fault, hooked
 from hardware_sim.load_cells.frames import Frame
 
@@ -140,7 +142,7 @@ def error_frames(emulator: Emulator, probability: float = 0.1) -> Undo:
 @fault
 def counter_jump(emulator: Emulator, step: int = 1000) -> Undo:
     """The counter jumps once; no sample is lost."""
-    emulator.load_cell.counter = (emulator.load_cell.counter + int(step)) & 0xFFFF
+    emulator.load_cell.counter += int(step)
     return lambda: None
 
 
@@ -149,3 +151,41 @@ def rate_off(emulator: Emulator, percent: float = 5.0) -> Undo:
     """The cell samples faster (or slower, below zero) than it says."""
     emulator.load_cell.set_rate_factor(1.0 + percent / 100.0)
     return lambda: emulator.load_cell.set_rate_factor(1.0)
+
+
+@fault
+def clock_jitter(emulator: Emulator, sd_us: float = 100.0) -> Undo:
+    """Each sample is taken off its time at random, never by more than 0.45 of a period."""
+    if not 0 <= sd_us < math.inf:
+        raise FaultError(f"setting 'sd_us' of fault 'clock_jitter' must be a number from 0 on, not {sd_us:g}")
+    emulator.load_cell.set_jitter(sd_us * 1e-6)
+    return lambda: emulator.load_cell.set_jitter(emulator.settings.clock_jitter_us * 1e-6)
+
+
+@fault
+def delivery_jitter(emulator: Emulator, largest_s: float = 0.02) -> Undo:
+    """Frames come late by up to `largest_s` at random, in order and with their own stamps: a busy adapter."""
+    if not 0 <= largest_s < math.inf:
+        raise FaultError(f"setting 'largest_s' of fault 'delivery_jitter' must be from 0 on, not {largest_s:g}")
+    kept: deque[Frame] = deque()
+    last_s = 0.0
+
+    def release() -> None:
+        if kept:
+            emulator.load_cell.add_frame(kept.popleft())
+
+    def keep_back(frame: Frame) -> Iterable[Frame]:
+        nonlocal last_s
+        last_s = max(last_s, emulator.timeline.now_s + emulator.random.uniform(0.0, largest_s))
+        kept.append(frame)
+        emulator.timeline.at(last_s, release)
+        return ()
+
+    unhook = hooked(emulator.load_cell.frame_hooks, keep_back)
+
+    def undo() -> None:
+        unhook()
+        while kept:  # else they would come after younger ones
+            release()
+
+    return undo

@@ -61,8 +61,19 @@ def electrode_error(emulator: Emulator) -> Undo:
 
 
 @fault
+def emergency_switch(emulator: Emulator) -> Undo:
+    """The emergency switch is pressed: a RehaStim 2 says so, a P24 sees open electrodes."""
+
+    def back() -> None:
+        emulator.electrodes.cut = False
+
+    emulator.electrodes.cut = True
+    return back
+
+
+@fault
 def high_voltage_error(emulator: Emulator) -> Undo:
-    """The high-voltage source fails."""
+    """The high-voltage source fails; of a RehaStim 2, the stimulation module."""
 
     def back() -> None:
         emulator.board.high_voltage_works = True
@@ -72,8 +83,10 @@ def high_voltage_error(emulator: Emulator) -> Undo:
 
 
 @fault
-def device_reset(emulator: Emulator) -> Undo:
+def device_reset(emulator: Emulator, mid_frame: bool = False) -> Undo:
     """The stimulator starts anew, once, with its port staying; nothing is initialised any more."""
+    if mid_frame:
+        emulator.board.write(HALF_A_FRAME)
     emulator.firmware.reset()
     return lambda: None
 

@@ -9,7 +9,7 @@ LARGEST_STANDARD_ID = 0x7FF
 
 
 class Sample(NamedTuple):
-    """One reading of the cell; `time_us` is on the cell's own clock."""
+    """One reading of the cell; `time_us` is on the cell's own clock; `counter` never wraps, a cell's layout does."""
 
     torque_nm: float
     counter: int
@@ -31,9 +31,15 @@ FrameHandler = Callable[[int, bytes], None]
 
 
 class CellProtocol(Protocol):
-    """A load cell's electronics: how samples become frames, and what starts and stops them."""
+    """A load cell's electronics: how samples become frames, and what starts and stops them.
 
+    Its constructor takes the samples a frame, one of `layouts`. A frame's time is that of its last sample.
+    """
+
+    layouts: tuple[int, ...]
     samples_per_frame: int
+    has_counter: bool
+    has_sync: bool
 
     def running(self) -> bool:
         """Whether it is sending."""

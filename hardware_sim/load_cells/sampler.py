@@ -1,4 +1,4 @@
-"""Samples of the muscle's torque at exact multiples of the cell's own period, and the frames they travel in."""
+"""Samples of the muscle's torque at multiples of the cell's own period, and the frames they travel in."""
 
 from __future__ import annotations
 
@@ -12,10 +12,13 @@ from hardware_sim.patients.muscle import Muscle
 TorqueHook = Callable[[float], float]
 FrameHook = Callable[[Frame], Iterable[Frame]]
 NOISE_BLOCK = 4096
+LARGEST_JITTER_PERIODS = 0.45
+"""A sample never comes before the one in front of it."""
+JITTER_SEED = 0x7177E2
 
 
 class Noise:
-    """White noise of the sensor, the same for the same seed, drawn in blocks to be cheap."""
+    """White noise, the same for the same seed, drawn in blocks to be cheap."""
 
     def __init__(self, sd_nm: float, seed: int) -> None:
         self._sd_nm = sd_nm
@@ -23,7 +26,7 @@ class Noise:
         self._block: list[float] = []
 
     def next_nm(self) -> float:
-        """Noise of the next sample, N·m."""
+        """Noise of the next sample, in the unit of its standard deviation."""
         if not self._block:
             self._block = (self._sd_nm * self._random.standard_normal(NOISE_BLOCK))[::-1].tolist()
         return self._block.pop()
@@ -35,6 +38,9 @@ class LoadCell:
     `torque_hooks` and `frame_hooks` are where faults enter: a torque hook changes a reading, a frame hook gives
     the frames that are sent in place of one. A muscle may bring the last stage of its cell along, a method
     `converted_nm(reading_nm)` that comes after noise and offset (a converter that clips).
+
+    With `jitter_s` each sample is taken, and its frame stamped, off its time by that standard deviation. Samples
+    come at exact multiples of the period without it.
     """
 
     def __init__(
@@ -45,6 +51,7 @@ class LoadCell:
         rate_hz: float,
         offset_nm: float = 0.0,
         clock_ppm: float = 0.0,
+        jitter_s: float = 0.0,
         has_sync: bool = True,
         epoch_us: int = 0,
     ) -> None:
@@ -65,6 +72,8 @@ class LoadCell:
         self._held: list[Sample] = []
         self._frames: list[Frame] = []
         self._anchor_s, self._anchor_sample, self._period_s = 0.0, 0, 1.0 / (rate_hz * self._clock_rate)
+        self._off_s = 0.0
+        self.set_jitter(jitter_s)
 
     def raise_sync(self) -> None:
         """The stimulator's sync line: seen in the first sample from now on."""
@@ -72,8 +81,12 @@ class LoadCell:
 
     def set_rate_factor(self, factor: float) -> None:
         """Sample `factor` times as fast as nominal from the next sample on."""
-        self._anchor_s, self._anchor_sample = self._next_s(), self.samples
+        self._anchor_s, self._anchor_sample = self._next_s() - self._off_s, self.samples
         self._period_s = 1.0 / (self._nominal_hz * self._clock_rate * factor)
+
+    def set_jitter(self, sd_s: float) -> None:
+        """Standard deviation of each sample's own time, from the next sample but one on."""
+        self._jitter = Noise(sd_s, JITTER_SEED) if sd_s else None
 
     def produce(self, until_s: float) -> None:
         """All samples that are due before `until_s`, in emulated seconds."""
@@ -96,7 +109,11 @@ class LoadCell:
         return self._epoch_us + round(time_s * self._clock_rate * 1e6)
 
     def _next_s(self) -> float:
-        return self._anchor_s + (self.samples - self._anchor_sample) * self._period_s
+        return self._anchor_s + (self.samples - self._anchor_sample) * self._period_s + self._off_s
+
+    def _draw_jitter(self) -> None:
+        largest_s = LARGEST_JITTER_PERIODS * self._period_s
+        self._off_s = min(max(self._jitter.next_nm(), -largest_s), largest_s) if self._jitter else 0.0
 
     def _sample(self, time_s: float) -> None:
         self.torque_nm = self._muscle.torque_nm(time_s)
@@ -106,7 +123,8 @@ class LoadCell:
         sample = Sample(reading_nm, self.counter, self._sync, self.time_us(time_s))
         self._sync = False
         self.samples += 1
-        self.counter = (self.counter + 1) & 0xFFFF
+        self.counter += 1
+        self._draw_jitter()
         if not self._cell.running():
             self._held.clear()
             return

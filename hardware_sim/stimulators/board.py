@@ -13,12 +13,22 @@ FrameHook = Callable[[bytes], bytes | None]
 
 
 class Board:
-    """The hardware under a firmware; faults hook in here, so that a firmware knows nothing of them."""
+    """The hardware under a firmware; faults hook in here, so that a firmware knows nothing of them.
 
-    def __init__(self, timeline: Timeline, electrodes: Electrodes, write: Callable[[bytes], None]) -> None:
+    `unread` counts bytes on the line that the host has not read.
+    """
+
+    def __init__(
+        self,
+        timeline: Timeline,
+        electrodes: Electrodes,
+        write: Callable[[bytes], None],
+        unread: Callable[[], int] = lambda: 0,
+    ) -> None:
         self.timeline = timeline
         self.electrodes = electrodes
         self.write = write
+        self.unread = unread
         self.high_voltage_works = True
         self.outgoing: list[FrameHook] = []
         self.incoming: list[FrameHook] = []

@@ -21,9 +21,11 @@ LEAVE = (0x02, 0x80, 0x81, 0x82)
 class Cell:
     """The default cell's layout behind a start command."""
 
-    samples_per_frame = 1
+    layouts: tuple[int, ...] = (1,)
+    has_counter = has_sync = True
 
-    def __init__(self) -> None:
+    def __init__(self, samples_per_frame: int = 1) -> None:
+        self.samples_per_frame = samples_per_frame
         self._operational = False
 
     def running(self) -> bool:

@@ -1,6 +1,6 @@
 """A cell like ME's GSV-4: id 610, 16-bit counts, big endian, no counter and no sync line. Always on.
 
-Counts are offset binary: 32768 is zero, full scale 50 N·m.
+Counts are offset binary: 32768 is zero, full scale 50 N·m. Several samples a frame stand one after another.
 """
 
 from __future__ import annotations
@@ -16,19 +16,27 @@ COUNTS_PER_NM = 32767 / 50.0
 
 
 class Cell:
-    """One sample a frame of 2 bytes."""
+    """2 bytes a sample."""
 
-    samples_per_frame = 1
+    layouts: tuple[int, ...] = (1, 2, 3, 4)
+    has_counter = has_sync = False
+
+    def __init__(self, samples_per_frame: int = 1) -> None:
+        self.samples_per_frame = samples_per_frame
 
     def running(self) -> bool:
         """From power-on."""
         return True
 
     def encode(self, samples: Sequence[Sample]) -> Frame:
-        """The frame of one sample; a value beyond full scale, or none, sits at the stop."""
-        torque_nm = samples[0].torque_nm
-        counts = ZERO_COUNTS + round(torque_nm * COUNTS_PER_NM) if math.isfinite(torque_nm) else 0
-        return Frame(CAN_ID, min(max(counts, 0), 0xFFFF).to_bytes(2, "big"), samples[0].time_us)
+        """The frame of its samples; a value beyond full scale, or none, sits at the stop."""
+        data = b"".join(_counts(sample.torque_nm).to_bytes(2, "big") for sample in samples)
+        return Frame(CAN_ID, data, samples[-1].time_us)
 
     def received(self, can_id: int, data: bytes) -> None:
         """Takes no commands."""
+
+
+def _counts(torque_nm: float) -> int:
+    counts = ZERO_COUNTS + round(torque_nm * COUNTS_PER_NM) if math.isfinite(torque_nm) else 0
+    return min(max(counts, 0), 0xFFFF)

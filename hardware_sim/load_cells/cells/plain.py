@@ -1,7 +1,11 @@
-"""The default cell: id 0x181, torque in N·m as float32, 16-bit counter, status with the sync line. Always on."""
+"""The default cell: id 0x181, torque in N·m as float32, 16-bit counter, status with the sync line. Always on.
+
+With three samples a frame: three int16 counts of 2 mN·m and a 16-bit counter of frames; no room for the sync line.
+"""
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Sequence
 
@@ -10,23 +14,40 @@ from hardware_sim.load_cells.frames import Frame, Sample
 CAN_ID = 0x181
 LAYOUT = struct.Struct("<fHBB")
 SYNC_BIT = 0x01
+PACKED = struct.Struct("<hhhH")
+PACKED_SAMPLES = 3
+COUNTS_PER_NM = 500
+LARGEST_COUNTS = 32767
 
 
 class Cell:
-    """One sample a frame, little endian: torque, counter, status (bit 0 sync), spare."""
+    """Little endian: torque, counter, status (bit 0 sync), spare; or three counts and a counter."""
 
-    samples_per_frame = 1
+    layouts: tuple[int, ...] = (1, PACKED_SAMPLES)
+    has_counter = True
+
+    def __init__(self, samples_per_frame: int = 1) -> None:
+        self.samples_per_frame = samples_per_frame
+        self.has_sync = samples_per_frame == 1
 
     def running(self) -> bool:
         """From power-on."""
         return True
 
     def encode(self, samples: Sequence[Sample]) -> Frame:
-        """The frame of one sample."""
-        sample = samples[0]
-        status = SYNC_BIT if sample.sync else 0
-        data = LAYOUT.pack(sample.torque_nm, sample.counter & 0xFFFF, status, 0)
-        return Frame(CAN_ID, data, sample.time_us)
+        """The frame of its samples."""
+        last = samples[-1]
+        if len(samples) == PACKED_SAMPLES:
+            counter = last.counter // PACKED_SAMPLES & 0xFFFF
+            return Frame(CAN_ID, PACKED.pack(*(_counts(sample.torque_nm) for sample in samples), counter), last.time_us)
+        status = SYNC_BIT if last.sync else 0
+        return Frame(CAN_ID, LAYOUT.pack(last.torque_nm, last.counter & 0xFFFF, status, 0), last.time_us)
 
     def received(self, can_id: int, data: bytes) -> None:
         """Takes no commands."""
+
+
+def _counts(torque_nm: float) -> int:
+    """Counts between the stops; a value that is none sits at the lower."""
+    counts = round(torque_nm * COUNTS_PER_NM) if math.isfinite(torque_nm) else -LARGEST_COUNTS
+    return min(max(counts, -LARGEST_COUNTS), LARGEST_COUNTS)

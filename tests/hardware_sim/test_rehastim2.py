@@ -1,0 +1,375 @@
+"""The RehaStim 2's firmware on a virtual clock."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import pytest
+
+from hardware_sim.electrodes import Electrodes
+from hardware_sim.stimulators.board import Board
+from hardware_sim.stimulators.rehastim2 import Firmware
+from hardware_sim.stimulators.sciencemode2 import Decoder, Packet, encode
+from hardware_sim.timeline import Timeline
+from tests.hardware_sim.bench_board import NotingMuscle
+
+INIT, INIT_ACK, UNKNOWN, WATCHDOG, GET_MODE, INIT_LIST, START, STOP, SINGLE, ERROR = 1, 2, 3, 4, 10, 30, 32, 34, 36, 38
+OK, TRANSFER, PARAMETER, WRONG_MODE, BUSY = 0, -1, -2, -3, -8
+START_MODE, INITIALISED, STARTED = 0, 1, 2
+
+
+class Bench:
+    def __init__(self) -> None:
+        self.timeline = Timeline()
+        self.muscle = NotingMuscle()
+        self.electrodes = Electrodes(self.muscle)
+        self.sent: list[tuple[float, Packet]] = []
+        self.unread = 0
+        self._decoder = Decoder()
+        self.board = Board(self.timeline, self.electrodes, self._take, lambda: self.unread)
+        self.firmware = Firmware(self.board)
+
+    def _take(self, frame: bytes) -> None:
+        self.sent += [(self.timeline.now_s, packet) for packet in self._decoder.feed(frame, self.timeline.now_s)]
+
+    def packets(self, command: int) -> list[Packet]:
+        return [packet for _, packet in self.sent if packet.command == command]
+
+    def run(self, seconds: float) -> None:
+        self.timeline.run_until(self.timeline.now_s + seconds)
+
+    def send(self, command: int, data: bytes = b"", number: int = 9) -> None:
+        self.firmware.received(encode(Packet(number, command, data)))
+
+    def ask(self, command: int, data: bytes = b"", number: int = 9) -> int:
+        """The result of a command, whose ack must be the first thing that comes, at once."""
+        before = len(self.sent)
+        self.send(command, data, number)
+        _, ack = self.sent[before]
+        assert (ack.number, ack.command) == (number, command + 1)
+        return int.from_bytes(ack.data[:1], "big", signed=True)
+
+    def mode(self) -> int:
+        assert self.ask(GET_MODE) == OK
+        return self.sent[-1][1].data[1]
+
+    def widths(self) -> list[float]:
+        return [width for _, width, _ in self.muscle.pulses]
+
+    def times(self) -> list[float]:
+        return [time for time, _, _ in self.muscle.pulses]
+
+
+def pulse(width_us: int, current_ma: int, mode: int = 0) -> bytes:
+    return bytes((mode,)) + width_us.to_bytes(2, "big") + bytes((current_ma,))
+
+
+def setup(active: int = 1, low: int = 0, factor: int = 0, interpulse: int = 13, period: int = 48, execute: int = 0):
+    return bytes((factor, active, low, interpulse)) + period.to_bytes(2, "big") + bytes((execute,))
+
+
+@pytest.fixture
+def bench() -> Bench:
+    return Bench()
+
+
+@pytest.fixture
+def connected(bench: Bench) -> Bench:
+    bench.run(0.5)
+    bench.send(INIT_ACK, b"\x00", number=bench.sent[-1][1].number)
+    assert bench.mode() == START_MODE
+    return bench
+
+
+@pytest.fixture
+def running(connected: Bench) -> Bench:
+    assert connected.ask(INIT_LIST, setup()) == OK
+    assert connected.ask(START, pulse(250, 20)) == OK
+    return connected
+
+
+class TestConnection:
+    def test_init_comes_every_500_ms_until_the_ack(self, bench: Bench) -> None:
+        bench.run(2.2)
+        assert [time for time, _ in bench.sent] == pytest.approx([0.5, 1.0, 1.5, 2.0])
+        assert [packet.command for _, packet in bench.sent] == [INIT] * 4
+        assert bench.sent[0][1] == Packet(0, INIT, b"\x01")
+        bench.send(INIT_ACK, b"\x00", number=bench.sent[-1][1].number)
+        bench.run(1.1)
+        assert len(bench.sent) == 4
+
+    def test_a_refused_version_or_another_number_is_no_connection(self, bench: Bench) -> None:
+        bench.run(0.6)
+        bench.send(INIT_ACK, b"\xfb", number=0)
+        bench.send(INIT_ACK, b"\x00", number=77)
+        bench.send(GET_MODE)
+        bench.send(SINGLE, pulse(300, 24))
+        assert bench.packets(GET_MODE + 1) == []
+        bench.run(1.0)
+        assert len(bench.packets(INIT)) == 3
+        assert bench.muscle.pulses == []
+
+    def test_no_init_piles_up_where_nobody_reads(self, bench: Bench) -> None:
+        bench.unread = 9
+        bench.run(60.0)
+        assert bench.sent == []
+        bench.unread = 0
+        bench.run(0.5)
+        assert len(bench.packets(INIT)) == 1
+
+    def test_watchdog_command_keeps_the_connection_without_an_ack(self, connected: Bench) -> None:
+        have = len(connected.sent)
+        for _ in range(5):
+            connected.run(1.19)
+            connected.send(WATCHDOG)
+        assert len(connected.sent) == have
+        assert connected.mode() == START_MODE
+
+    def test_silence_of_1200_ms_ends_modes_and_connection(self, connected: Bench) -> None:
+        assert connected.ask(INIT_LIST, setup()) == OK
+        silent_s = connected.timeline.now_s
+        connected.run(1.19)
+        assert connected.firmware.state()["mode"] == "initialised"
+        connected.run(0.02)
+        assert connected.firmware.state()["mode"] == "none"
+        connected.run(0.5)
+        assert connected.sent[-1][0] == pytest.approx(silent_s + 1.7)
+        assert connected.sent[-1][1].command == INIT
+        connected.send(INIT_ACK, b"\x00", number=connected.sent[-1][1].number)
+        assert connected.mode() == START_MODE  # not where it was
+
+    @pytest.mark.parametrize("command", [GET_MODE, WATCHDOG, INIT_LIST])
+    def test_any_valid_command_is_a_sign_of_life_a_damaged_one_is_not(self, connected: Bench, command: int) -> None:
+        connected.run(1.0)
+        connected.send(command, setup() if command == INIT_LIST else b"")
+        connected.run(1.0)
+        assert connected.firmware.state()["mode"] != "none"
+        connected.firmware.received(encode(Packet(1, WATCHDOG, b""))[:2] + b"\x00\x81\x57\x01\x04\x0f")
+        connected.run(0.3)
+        assert connected.firmware.state()["mode"] == "none"
+
+    def test_unknown_command(self, connected: Bench) -> None:
+        connected.send(99, number=5)
+        assert connected.sent[-1][1] == Packet(5, UNKNOWN, b"")
+
+    def test_a_damaged_command_is_a_transfer_error(self, connected: Bench) -> None:
+        frame = bytearray(encode(Packet(6, SINGLE, pulse(300, 24))))
+        frame[-2] ^= 0x40
+        connected.firmware.received(bytes(frame))
+        assert connected.sent[-1][1] == Packet(6, SINGLE + 1, bytes((TRANSFER & 0xFF,)))
+        assert connected.muscle.pulses == []
+        assert connected.firmware.state()["corrupt_frames"] == 1
+
+
+class TestSinglePulse:
+    def test_a_pulse_is_balanced_and_flows_at_receipt(self, connected: Bench) -> None:
+        now_s = connected.timeline.now_s
+        assert connected.ask(SINGLE, pulse(300, 24)) == OK
+        assert connected.muscle.pulses == [(now_s, 300.0, 24.0)]
+        assert connected.electrodes.unbalanced_pulses == 0
+        connected.run(1.0)
+        assert len(connected.muscle.pulses) == 1
+
+    @pytest.mark.parametrize(
+        ("asked", "given"), [((300, 25), (300, 24)), ((20, 126), (20, 126)), ((500, 2), (500, 2)), ((21, 3), (21, 2))]
+    )
+    def test_limits_are_inclusive_and_odd_currents_sink(
+        self, connected: Bench, asked: tuple[int, int], given: tuple[int, int]
+    ) -> None:
+        assert connected.ask(SINGLE, pulse(*asked)) == OK
+        assert connected.muscle.pulses[0][1:] == given
+
+    @pytest.mark.parametrize("asked", [(0, 20), (19, 20), (501, 20), (65535, 20), (250, 127), (250, 255)])
+    def test_beyond_the_limits(self, connected: Bench, asked: tuple[int, int]) -> None:
+        assert connected.ask(SINGLE, pulse(*asked)) == PARAMETER
+        assert connected.ask(SINGLE, pulse(250, 20)[1:]) == PARAMETER
+        assert connected.ask(SINGLE, pulse(250, 20, mode=8)) == PARAMETER
+        assert connected.muscle.pulses == []
+
+    def test_no_current_is_no_pulse(self, connected: Bench) -> None:
+        assert connected.ask(SINGLE, pulse(300, 1)) == OK
+        assert connected.electrodes.log == []
+
+    def test_start_mode_only(self, running: Bench) -> None:
+        assert running.ask(SINGLE, pulse(300, 24)) == WRONG_MODE
+        assert running.ask(STOP) == OK
+        assert running.ask(SINGLE, pulse(300, 24)) == OK
+        assert running.ask(INIT_LIST, setup()) == OK
+        assert running.ask(SINGLE, pulse(300, 24)) == WRONG_MODE
+
+    def test_busy_while_one_flows(self, connected: Bench) -> None:
+        assert connected.ask(SINGLE, pulse(300, 24)) == OK
+        connected.run(690e-6)
+        assert connected.ask(SINGLE, pulse(300, 24)) == BUSY
+        connected.run(20e-6)
+        assert connected.ask(SINGLE, pulse(300, 24)) == OK
+        assert len(connected.muscle.pulses) == 2
+
+    def test_the_muscle_hangs_on_channel_1(self, connected: Bench) -> None:
+        assert connected.ask(SINGLE, pulse(300, 24, mode=1)) == OK
+        assert connected.muscle.pulses == []
+        assert connected.packets(ERROR) == [Packet(1, ERROR, b"\xfe")]
+
+
+class TestChannelList:
+    def test_pulses_on_its_own_grid_and_beyond_the_hosts_silence_until_1200_ms(self, running: Bench) -> None:
+        start_s = running.timeline.now_s
+        running.run(0.010)
+        assert running.mode() == STARTED
+        running.run(10.0)
+        assert running.times() == pytest.approx([start_s + 0.025 * k for k in range(49)])
+        assert running.times()[-1] - start_s == pytest.approx(1.2)  # 1.19 s after the last command
+        assert running.packets(ERROR) == []
+        assert running.firmware.state()["mode"] == "none"
+
+    def test_watchdog_keeps_it_pulsing(self, running: Bench) -> None:
+        for _ in range(5):
+            running.run(1.0)
+            running.send(WATCHDOG)
+        running.run(0.01)
+        assert len(running.muscle.pulses) == 201
+
+    def test_update_waits_for_the_devices_grid(self, running: Bench) -> None:
+        start_s = running.timeline.now_s
+        running.run(0.030)
+        assert running.ask(START, pulse(100, 10)) == OK
+        running.run(0.050)
+        assert running.widths() == [250, 250, 100, 100]
+        assert running.times()[-1] == pytest.approx(start_s + 0.075)
+
+    @pytest.mark.parametrize(("host_period_s", "repeated", "lost"), [(0.026, (3, 5), (0, 0)), (0.024, (0, 1), (3, 5))])
+    def test_the_hosts_and_the_devices_grids_slip(
+        self, running: Bench, host_period_s: float, repeated: tuple[int, int], lost: tuple[int, int]
+    ) -> None:
+        """A slower host has a level repeated now and then, a faster one has a level left out."""
+        for k in range(100):
+            running.run(host_period_s)
+            running.send(START, pulse(100 + k, 20))
+        widths = running.widths()
+        assert repeated[0] <= sum(a == b for a, b in pairwise(widths)) <= repeated[1]
+        last = round(widths[-1]) - 100
+        assert lost[0] <= sum(100 + k not in widths for k in range(last)) <= lost[1]
+
+    def test_stop_ends_it_and_the_mode(self, running: Bench) -> None:
+        running.run(0.1)
+        assert running.ask(STOP) == OK
+        fired = len(running.muscle.pulses)
+        running.run(1.0)
+        assert len(running.muscle.pulses) == fired
+        assert running.mode() == START_MODE
+        assert running.ask(START, pulse(250, 20)) == WRONG_MODE
+        assert running.ask(STOP) == OK
+
+    def test_init_while_running_is_the_wrong_mode(self, running: Bench) -> None:
+        assert running.ask(INIT_LIST, setup()) == WRONG_MODE
+        running.run(0.03)
+        assert len(running.muscle.pulses) == 2
+
+    def test_a_bad_update_changes_nothing(self, running: Bench) -> None:
+        for data in (b"", pulse(501, 20), pulse(250, 127), pulse(250, 20, mode=3), pulse(250, 20) * 2, pulse(19, 20)):
+            assert running.ask(START, data) == PARAMETER
+        running.run(0.06)
+        assert running.widths() == [250, 250, 250]
+
+    @pytest.mark.parametrize(
+        "data",
+        [
+            b"",
+            setup()[:-1],
+            setup(active=0),
+            setup(factor=8),
+            setup(interpulse=12),
+            setup(period=13),
+            setup(execute=1),
+        ],
+    )
+    def test_a_bad_list_is_refused(self, connected: Bench, data: bytes) -> None:
+        assert connected.ask(INIT_LIST, data) == PARAMETER
+        assert connected.mode() == START_MODE
+
+    def test_doublets_and_triplets(self, connected: Bench) -> None:
+        assert connected.ask(INIT_LIST, setup()) == OK
+        start_s = connected.timeline.now_s
+        assert connected.ask(START, pulse(250, 20, mode=2)) == OK
+        connected.run(0.049)
+        expected = [0.0, 0.008, 0.016, 0.025, 0.033, 0.041]
+        assert [time - start_s for time in connected.times()] == pytest.approx(expected)
+        connected.send(STOP)
+        assert connected.ask(INIT_LIST, setup(period=46)) == OK  # 24 ms hold just three of 8 ms
+        assert connected.ask(START, pulse(250, 20, mode=2)) == OK
+        connected.send(STOP)
+        assert connected.ask(INIT_LIST, setup(period=45)) == OK
+        assert connected.ask(START, pulse(250, 20, mode=2)) == PARAMETER
+
+    def test_one_shot(self, connected: Bench) -> None:
+        assert connected.ask(INIT_LIST, setup(period=0)) == OK
+        assert connected.ask(START, pulse(250, 20, mode=1)) == OK
+        assert connected.ask(START, pulse(250, 20)) == BUSY
+        connected.run(0.1)
+        assert len(connected.muscle.pulses) == 2
+        assert connected.ask(START, pulse(300, 20)) == OK
+        connected.run(0.1)
+        assert connected.widths() == [250, 250, 300]
+
+    def test_a_low_frequency_channel_leaves_groups_out(self, connected: Bench) -> None:
+        connected.send(INIT_LIST, setup(low=1, factor=3))
+        start_s = connected.timeline.now_s
+        connected.send(START, pulse(250, 20))
+        connected.run(0.25)
+        assert [time - start_s for time in connected.times()] == pytest.approx([0.0, 0.1, 0.2])
+
+    def test_several_channels_come_in_the_order_of_the_mask(self, connected: Bench) -> None:
+        assert connected.ask(INIT_LIST, setup(active=0b101)) == OK
+        assert connected.ask(START, pulse(250, 20)) == PARAMETER
+        assert connected.ask(START, pulse(250, 20) + pulse(100, 0)) == OK
+        connected.run(0.03)
+        assert connected.widths() == [250, 250]
+        assert connected.packets(ERROR) == []
+
+
+class TestErrors:
+    @pytest.mark.parametrize(
+        ("break_it", "error"),
+        [
+            (lambda bench: setattr(bench.electrodes, "cut", True), -1),
+            (lambda bench: setattr(bench.electrodes, "attached", False), -2),
+            (lambda bench: setattr(bench.board, "high_voltage_works", False), -3),
+        ],
+        ids=["emergency switch", "electrode", "module"],
+    )
+    def test_the_device_stops_by_itself_and_says_why_once(self, running: Bench, break_it, error: int) -> None:
+        running.run(0.05)
+        delivered = len(running.muscle.pulses)
+        break_it(running)
+        running.run(0.5)
+        assert running.packets(ERROR) == [Packet(1, ERROR, bytes((error & 0xFF,)))]
+        assert len(running.muscle.pulses) == delivered
+        assert running.mode() == START_MODE
+        assert running.ask(SINGLE, pulse(300, 24)) == OK  # taken, then failed
+        assert running.sent[-1][1] == Packet(2, ERROR, bytes((error & 0xFF,)))
+        assert len(running.muscle.pulses) == delivered
+
+    def test_it_does_not_resume_when_the_electrode_is_back(self, running: Bench) -> None:
+        running.electrodes.attached = False
+        running.run(0.05)
+        running.electrodes.attached = True
+        running.run(0.5)
+        assert len(running.muscle.pulses) == 1
+        assert running.ask(START, pulse(250, 20)) == WRONG_MODE
+
+    def test_a_failing_first_pulse_takes_its_doublet_along(self, connected: Bench) -> None:
+        connected.electrodes.attached = False
+        connected.send(INIT_LIST, setup())
+        assert connected.ask(START, pulse(250, 20, mode=1)) == OK
+        connected.electrodes.attached = True
+        connected.run(0.5)
+        assert len(connected.packets(ERROR)) == 1
+        assert connected.muscle.pulses == []
+
+    def test_reset_forgets_everything_and_offers_a_connection_anew(self, running: Bench) -> None:
+        running.firmware.reset()
+        fired, have = len(running.muscle.pulses), len(running.sent)
+        running.send(START, pulse(250, 20))
+        running.run(0.6)
+        assert len(running.muscle.pulses) == fired
+        assert [packet for _, packet in running.sent[have:]] == [Packet(0, INIT, b"\x01")]
