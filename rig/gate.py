@@ -28,11 +28,17 @@ class Gate:
         The device; nothing else keeps a reference to it.
     clock
         The rig's clock.
-    on_fault
-        Called with the reason when the device reports an error or is lost; from any thread.
+    on_fault, on_lost
+        Called with the reason when the device reports an error, and when its line is gone; from any thread.
     """
 
-    def __init__(self, stimulator: Stimulator, clock: Clock, on_fault: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        stimulator: Stimulator,
+        clock: Clock,
+        on_fault: Callable[[str], None],
+        on_lost: Callable[[str], None],
+    ) -> None:
         self._stimulator = stimulator
         self._clock = clock
         self._on_fault = on_fault
@@ -47,7 +53,7 @@ class Gate:
         self.lateness_s: list[float] = []
         self.charge_uc = 0.0
         self.dropped = 0
-        stimulator.listen(self._acknowledged, on_fault)
+        stimulator.listen(self._acknowledged, on_lost)
 
     @property
     def is_open(self) -> bool:

@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import logging
 import os
 import threading
 import time
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
@@ -25,6 +27,8 @@ from rig.limits import Limit
 from rig.messages import StopEvidence
 from rig.plan import PlannedTest
 from rig.signals import Pulse, Recorded
+
+log = logging.getLogger("rig.run")
 
 LEAD_S = 0.1
 """Real seconds between arming and the first deadline."""
@@ -118,11 +122,23 @@ class TestRun:
                     self._play()
         except (DeviceError, JournalError) as error:
             self._fault(str(error))
+        except Exception as error:  # a mistake in this program must stop the stimulation, too
+            log.exception("the test broke")
+            self._fault(f"internal: {type(error).__name__}: {error}")
         evidence = self._stop()
         elapsed_s = max(time.monotonic() - wall_s, 1e-9)
         cpu_percent = 100 * (time.process_time() - cpu_s) / elapsed_s
         syncing.end()
         return self._result(evidence, cpu_percent)
+
+    @property
+    def journal_path(self) -> Path:
+        """Where its journal lies."""
+        return self._journal.path
+
+    def segment(self) -> str | None:
+        """Name of the segment that is playing, None before the start and after the end."""
+        return None if self.t0_s is None else self.test.segment_at(self.elapsed_s())
 
     @property
     def dropped(self) -> int:

@@ -43,7 +43,7 @@ def live_event(
     elapsed_s = run.elapsed_s() if run else 0.0
     return LiveEvent(
         test_id=run.test.plan.test_id if run else None,
-        segment=run.test.segment_at(elapsed_s) if run and run.t0_s is not None else None,
+        segment=run.segment() if run else None,
         elapsed_s=elapsed_s,
         duration_s=run.test.duration_s if run else 0.0,
         time_s=np.round(bins[starts] * BIN_S, 4).tolist(),

@@ -3,25 +3,21 @@
 from __future__ import annotations
 
 import logging
+import math
 import re
 import threading
-import uuid
 from collections.abc import Callable
-from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
-from typing import Any
 
-from rig import archive, devices, journal, limits, plan
-from rig.acquire.halt import Halt
-from rig.acquire.receiver import Receiver
-from rig.acquire.run import FRESH_S, RunResult, TestRun, lateness_ms
+from rig import limits, plan
+from rig.acquire.halt import Cause, Halt
+from rig.acquire.run import TestRun
 from rig.clock import Clock
 from rig.config import RigConfig
 from rig.control.latch import Latch, lock_folder
 from rig.control.live import live_event
-from rig.errors import DeviceError, PlanError, RecordingError
-from rig.gate import Gate
-from rig.journal import Journal, Kind
+from rig.control.pair import Pair
+from rig.control.sealing import Shelf
+from rig.errors import ConfigError, DeviceError, JournalError, PlanError
 from rig.messages import (
     Event,
     FinishedEvent,
@@ -49,22 +45,28 @@ class Rig:
     ----------
     publish
         Takes every event but the live ones; called from any thread, must not block.
+
+    Raises
+    ------
+    ConfigError, BusyError
+        The data folder cannot be used, or another rig uses it.
     """
 
     def __init__(self, config: RigConfig, clock: Clock, publish: Callable[[Event], None]) -> None:
-        self._config = config
+        self._watch = config.watch.watch()
         self._clock = clock
         self._publish = publish
         self._table = config.limits.table()
-        for folder in (config.data_dir, self.journals, self.recordings):
-            folder.mkdir(parents=True, exist_ok=True)
-        self._folder_lock = lock_folder(config.data_dir)
+        self._shelf = Shelf(config, clock)
+        try:
+            self._shelf.make_folders()
+            self._folder_lock = lock_folder(config.data_dir)
+        except OSError as error:
+            raise ConfigError(f"data_dir: {error.filename or config.data_dir}: {error.strerror}") from None
         self._latch = Latch(config.data_dir)
         self._lock = threading.RLock()
         self._trial = Trial()
-        self._gate: Gate | None = None
-        self._receiver: Receiver | None = None
-        self._identity: dict[str, dict[str, Any]] = {"stimulator": {}, "load_cell": {}}
+        self._pair = Pair(config, clock, self._fault, self._lost)
         self._halt: Halt | None = None
         self._run: TestRun | None = None
         self._thread: threading.Thread | None = None
@@ -74,34 +76,25 @@ class Rig:
         self._born_s = clock.now_s()
         self.finished: FinishedEvent | None = None
 
-    @property
-    def journals(self) -> Path:
-        """Where unfinished journals lie."""
-        return self._config.data_dir / "journals"
-
-    @property
-    def recordings(self) -> Path:
-        """Where sealed recordings lie."""
-        return self._config.data_dir / "recordings"
-
     def open(self) -> None:
         """Recover what a crash left, then connect; a device that is not there is told, not raised."""
         remembered, reason = self._latch.read()
-        recovered = self._recover()
-        if remembered == "running" or recovered:
-            before, reason = "uncertain", f"the rig died during a test ({reason or 'a journal was left'})"
-        else:
-            before = "latched" if remembered == "latched" else None
+        for event in self._shelf.recover():
+            remembered = "running"
+            self.finished = event
+            self._publish(event)
+        before = None
+        if remembered == "running":
+            before, reason = "uncertain", f"the rig died during a test ({reason or 'its journal was left'})"
+        elif remembered == "latched":
+            before = "latched"
+        trial = Trial().connected(before, reason)
         try:
-            self._connect()
+            self._pair.connect()
         except DeviceError as error:
-            if before is not None:  # the latch outlives the missing device
-                self._change(Trial().connected(before, reason).disconnected(str(error)))
-            else:
-                self._change(Trial("disconnected", str(error)))
             log.error("%s", error)
-            return
-        self._change(Trial().connected(before, reason))
+            trial = trial.disconnected(str(error))  # a latch outlives the missing device
+        self._change(trial)
 
     def close(self) -> None:
         """Stop what runs, wait until it is sealed, disconnect."""
@@ -109,30 +102,31 @@ class Rig:
         thread = self._thread
         if thread is not None:
             thread.join(timeout=30)
-        self._disconnect()
+        self._pair.disconnect()
         self._folder_lock.close()
 
     def status(self) -> Status:
         """How things stand now."""
         with self._lock:
-            trial, run, receiver = self._trial, self._run, self._receiver
+            trial, run, receiver = self._trial, self._run, self._pair.receiver
         elapsed_s = run.elapsed_s() if run else 0.0
-        age_s = receiver.age_s(self._clock.now_s()) if receiver and receiver.last_s is not None else None
-        cell = dict(self._identity["load_cell"])
+        seen = receiver is not None and receiver.last_s is not None
+        torque_nm = receiver.last_torque_nm if receiver else None
+        cell = dict(self._pair.identity["load_cell"])
         if receiver and (measured_hz := receiver.measured_rate_hz()) is not None:
             cell["measured_rate_hz"] = round(measured_hz, 2)
         return Status(
             state=trial.state,
-            reason=trial.reason + (f"; {trial.lost}" if trial.lost else ""),
+            reason=trial.reason if trial.lost in trial.reason else f"{trial.reason}; {trial.lost}".lstrip("; "),
             test_id=trial.test_id,
             participant=trial.participant,
-            segment=run.test.segment_at(elapsed_s) if run and run.t0_s is not None else None,
+            segment=run.segment() if run else None,
             elapsed_s=elapsed_s,
             duration_s=run.test.duration_s if run else 0.0,
-            stimulator=self._identity["stimulator"],
+            stimulator=self._pair.identity["stimulator"],
             load_cell=cell,
-            torque_age_s=age_s,
-            torque_nm=_finite(receiver.last_torque_nm) if receiver else None,
+            torque_age_s=receiver.age_s(self._clock.now_s()) if receiver and seen else None,
+            torque_nm=torque_nm if torque_nm is not None and math.isfinite(torque_nm) else None,
             finished=self.finished,
         )
 
@@ -144,7 +138,7 @@ class Rig:
     def live(self) -> LiveEvent | None:
         """The newest torque and pulses; None where nothing came since the last call."""
         with self._lock:
-            run, receiver, now_s = self._run, self._receiver, self._clock.now_s()
+            run, receiver, now_s = self._run, self._pair.receiver, self._clock.now_s()
             if receiver is None:
                 return None
             origin_s = run.t0_s if run and run.t0_s is not None else self._born_s
@@ -172,38 +166,39 @@ class Rig:
                     raise PlanError(f"plan.{name}: {value!r} must be letters, digits, '.', '_' or '-', at most 100")
             table = limits.for_profile(self._table, request.profile)
             test = plan.build(request, table)
-            assert self._gate is not None and self._receiver is not None
-            file = self.journals / f"{request.test_id}.journal"
-            if file.exists() or any(self.recordings.glob(f"*Z_{request.test_id}.h5")):
-                raise PlanError(f"plan.test_id: {request.test_id!r} was used before; give each test a new id")
+            self._shelf.check_room(request.test_id)
             self._latch.write("running", f"test {request.test_id} of participant {request.participant}")
-            book = self._journal(file, test)
-            self._halt = Halt(self._clock)
-            self._evidence = None
-            self._told.clear()
-            self._run = TestRun(
-                test, table, book, self._gate, self._receiver, self._clock, self._halt, self._config.watch.watch()
-            )
-            self._next_live_pulse = 0
-            self._halt.on_set(self._halting)
+            try:
+                self._begin(test, table)
+            except JournalError:
+                self._latch.clear()
+                raise
             self._change(self._trial.start(request.test_id, request.participant))
-            self._thread = threading.Thread(target=self._execute, args=(self._run, book), name="test", daemon=True)
+            assert self._thread is not None
             self._thread.start()
         return self.status()
+
+    def _begin(self, test: plan.PlannedTest, table: dict[str, limits.Limit]) -> None:
+        gate, receiver = self._pair.gate, self._pair.receiver
+        assert gate is not None
+        assert receiver is not None
+        journal = self._shelf.begin(test, self._pair.identity)
+        halt = Halt(self._clock)
+        run = TestRun(test, table, journal, gate, receiver, self._clock, halt, self._watch)
+        halt.on_set(lambda: self._halted(halt.reason))
+        self._halt, self._run, self._evidence = halt, run, None
+        self._told.clear()
+        self._next_live_pulse = 0
+        self._thread = threading.Thread(target=self._execute, args=(run,), name="test", daemon=True)
 
     def stop(self, reason: str, by: str, latch_idle: bool = True) -> StopEvidence:
         """Stop stimulation now, latch, and say what the device and the torque tell of it."""
         words = f"{reason} (by {by})" if by else reason
-        with self._lock:
-            busy, halt, gate = self._trial.busy, self._halt, self._gate
-        if busy and halt is not None:
-            halt.set("stopped", words)
+        if self._end("stopped", words, latch_idle):
             self._told.wait(STOP_TIMEOUT_S)
-            return self._evidence or StopEvidence(
-                confirmed=False, detail="no pulse leaves; the device did not answer in time"
-            )
-        if latch_idle:
-            self._halted(words)
+            late = StopEvidence(confirmed=False, detail="no pulse leaves; the device did not answer in time")
+            return self._evidence or late
+        gate = self._pair.gate
         if gate is None:
             return StopEvidence(confirmed=False, detail="the stimulator is not connected; no pulse can leave")
         try:
@@ -225,74 +220,39 @@ class Rig:
         """
         with self._lock:
             following = self._trial.rearm()
-            if not self._both_answer():
-                self._disconnect()
-                self._connect()
-                if not self._torque_comes():
+            if self._trial.lost or not self._pair.both_answer():
+                self._pair.disconnect()
+                self._pair.connect()
+                if not self._pair.torque_comes():
                     raise DeviceError("load cell: connected, but no torque comes; check its cable and start frames")
             self._latch.clear()
             log.info("re-armed by %s after: %s", by, self._trial.reason)
             self._change(following)
         return self.status()
 
-    def _both_answer(self) -> bool:
-        """Stop the stimulator anew and ask its state; is torque coming?"""
-        if self._gate is None or self._receiver is None or self._trial.lost:
-            return False
-        try:
-            self._gate.stop()
-            self._gate.state()
-        except DeviceError:
-            return False
-        return self._torque_comes()
-
-    def _torque_comes(self) -> bool:
-        """Does a sample arrive from now on, within a short time?"""
-        assert self._receiver is not None
-        asked_s = self._clock.now_s()
-        end_s = asked_s + FRESH_S * self._clock.speed
-        while self._receiver.age_s(asked_s) >= 0:
-            if self._clock.now_s() > end_s:
-                return False
-            self._clock.wait(self._clock.now_s() + 0.005 * self._clock.speed)
-        return True
-
-    def _connect(self) -> None:
-        stimulator = devices.find("stimulator", self._config.stimulator.device).create(
-            self._config.stimulator, self._clock
-        )
-        cell = devices.find("load_cell", self._config.load_cell.device).create(self._config.load_cell, self._clock)
-        gate = Gate(stimulator, self._clock, self._fault)
-        self._identity["stimulator"] = gate.identify()
-        try:
-            self._identity["load_cell"] = cell.open()
-        except DeviceError:
-            gate.disconnect()
-            raise
-        with self._lock:
-            self._gate = gate
-            self._receiver = Receiver(cell, self._clock, self._fault)
-            self._receiver.start()
-
-    def _disconnect(self) -> None:
-        if self._gate is not None:
-            self._gate.disconnect()
-        if self._receiver is not None:
-            self._receiver.close()
-        self._gate = self._receiver = None
-
     def _fault(self, reason: str) -> None:
         """A device says that something is wrong, from one of its threads."""
-        halt = self._halt
-        if halt is not None and self._trial.busy:
-            halt.set("fault", reason)
+        log.error("%s", reason)
+        self._end("fault", reason)
+
+    def _lost(self, reason: str) -> None:
+        """A device is gone, from one of its threads."""
+        log.error("%s", reason)
+        self._end("fault", reason, latch_idle=False)
         with self._lock:
             self._change(self._trial.disconnected(reason))
-        log.error("%s", reason)
 
-    def _halting(self) -> None:
-        assert self._halt is not None
-        self._halted(self._halt.reason)
+    def _end(self, cause: Cause, reason: str, latch_idle: bool = True) -> bool:
+        """End the test that runs, or latch; True if one runs. Takes the lock only when idle: a stop must not wait."""
+        halt = self._halt
+        if not (self._trial.busy and halt is not None):
+            with self._lock:  # a start may be on its way, and must then be ended, too
+                halt = self._halt if self._trial.busy else None
+                if halt is None and latch_idle:
+                    self._halted(reason)
+        if halt is not None:
+            halt.set(cause, reason)
+        return halt is not None
 
     def _halted(self, reason: str) -> None:
         with self._lock:
@@ -309,33 +269,14 @@ class Rig:
             log.info("state %s %s", trial.state, trial.reason, extra={"test_id": trial.test_id})
             self._publish(StateEvent(status=self.status()))
 
-    def _journal(self, path: Path, test: plan.PlannedTest) -> Journal:
-        book = Journal(path)
-        book.append_json(
-            Kind.HEADER,
-            {
-                "recording_id": uuid.uuid4().hex,
-                "plan": test.plan.model_dump(mode="json"),
-                "segments": [{"name": s.name, "start": s.start, "end": s.end} for s in test.segments],
-                "current_ma": test.plan.profile.current_ma,
-                "sample_rate_hz": self._config.load_cell.model_dump().get("sample_rate_hz", 0.0),
-                "software": software(),
-                "configuration": {**self._config.public(), "devices": self._identity},
-                "time_s": self._clock.now_s(),
-                "unix_s": self._clock.unix_s(),
-            },
-        )
-        book.append(Kind.PLAN, test.pulse_width_us.astype("<f8").tobytes())
-        book.sync()
-        return book
-
-    def _execute(self, run: TestRun, book: Journal) -> None:
+    def _execute(self, run: TestRun) -> None:
         threading.Thread(target=self._announce, args=(run,), name="announce", daemon=True).start()
         result = run.execute()
         self._evidence = result.evidence
         self._told.set()
-        self._change(self._trial.ended())
-        finished = self._seal(run, book.path, result)
+        with self._lock:
+            self._change(self._trial.ended())
+        finished = self._shelf.finish(run.journal_path, run.test.plan.test_id, result)
         with self._lock:
             self._run = None
             self.finished = finished
@@ -355,86 +296,3 @@ class Rig:
         with self._lock:
             if self._trial.state == "arming":
                 self._change(self._trial.armed())
-
-    def _seal(self, run: TestRun, path: Path, result: RunResult) -> FinishedEvent:
-        summary: dict[str, Any] = {
-            "duration_s": result.duration_s,
-            "samples": result.counts.samples,
-            "lost_samples": result.counts.lost_samples,
-            "duplicate_samples": result.counts.duplicate_samples,
-            "disordered_samples": result.counts.disordered_samples,
-            "malformed_frames": result.counts.malformed_frames,
-            "error_frames": result.counts.error_frames,
-            "pulses": len(result.lateness_s),
-            "dropped_pulses": result.dropped,
-            "lateness_ms": lateness_ms([s / self._clock.speed for s in result.lateness_s]),
-            "charge_uc": result.charge_uc,
-            "torque_peak_nm": result.peak_nm,
-            "cpu_percent": round(result.cpu_percent, 2),
-            "stop": result.evidence.model_dump(),
-        }
-        return self._finish(
-            path, run.test.plan.test_id, result.outcome, result.reason, summary, result.last_sample_unix_s
-        )
-
-    def _finish(
-        self, path: Path, test_id: str, outcome: str, reason: str, summary: dict[str, Any], unix_s: float | None
-    ) -> FinishedEvent:
-        """Seal a journal and remove it; where that fails the journal stays and the event says why."""
-        sealed = None
-        try:
-            sealed = archive.seal(journal.read(path), self.recordings, outcome, reason)
-            path.unlink()
-        except RecordingError as error:
-            log.error("%s", error, extra={"test_id": test_id})
-            reason = "; ".join(part for part in (reason, str(error)) if part)
-        if sealed is not None:
-            attributes, alignment = sealed.recording.attributes, sealed.recording.alignment
-            outcome, reason = attributes["outcome"], attributes["reason"]
-            summary = {
-                **summary,
-                "samples": len(sealed.recording.columns["torque/time_s"]),
-                "sample_rate_hz": attributes["sample_rate_measured_hz"],
-                "alignment": {
-                    "method": alignment.method,
-                    "error_ms": _finite(alignment.error_ms),
-                    "delay_ms": alignment.delay_ms,
-                    "rate_ppm": alignment.rate_ppm,
-                },
-            }
-        return FinishedEvent.model_validate(
-            {
-                "test_id": test_id,
-                "outcome": outcome,
-                "reason": reason,
-                "recording_path": str(sealed.path) if sealed else None,
-                "recording_id": sealed.recording.attributes["recording_id"] if sealed else None,
-                "file_sha256": sealed.file_sha256 if sealed else None,
-                "last_sample_unix_s": unix_s,
-                "summary": summary,
-            }
-        )
-
-    def _recover(self) -> bool:
-        """Seal the journals that a crash left; True if there were any."""
-        left = sorted(self.journals.glob("*.journal"))
-        for path in left:
-            log.warning("recovering %s", path.name)
-            reason = "the rig process died during the test"
-            self.finished = self._finish(path, path.stem, "fault", reason, {"recovered": True}, None)
-            if path.exists():
-                path.rename(path.with_suffix(".unsealed"))
-            self._publish(self.finished)
-        return bool(left)
-
-
-def software() -> str:
-    """Name and version, as recordings carry it."""
-    try:
-        return f"stimrig {version('stimrig')}"
-    except PackageNotFoundError:
-        return "stimrig (not installed)"
-
-
-def _finite(value: float | None) -> float | None:
-    return None if value is None or value != value or abs(value) == float("inf") else value

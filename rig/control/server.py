@@ -6,18 +6,21 @@ import asyncio
 import contextlib
 import json
 import logging
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from rig.control.rig import Rig
-from rig.errors import RigError
+from rig.errors import ConfigError, RigError
 from rig.messages import Event, LiveEvent, Problem, Reply, Request, StateEvent
 
 log = logging.getLogger("rig.socket")
 
 LIVE_PERIOD_S = 0.05
+WORKERS = 32
+"""Requests that may wait at the same time: those who wait for a stop's evidence must not hold up another stop."""
 SLOW_BYTES = 1_000_000
 """A subscriber that lets this much wait gets no live events until it has caught up."""
 DEAD_BYTES = 8_000_000
@@ -45,10 +48,16 @@ class Server:
         """Listen on `path`; only this user and group may connect."""
         self._loop = asyncio.get_running_loop()
         self.rig = rig
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.unlink(missing_ok=True)
-        self._server = await asyncio.start_unix_server(self._serve, path, limit=MAX_LINE_BYTES)
-        path.chmod(0o660)
+        self._loop.set_default_executor(ThreadPoolExecutor(WORKERS, "request"))
+        if await _answers(path):
+            raise ConfigError(f"socket: {path}: another rig listens there; stop it or give another path")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.unlink(missing_ok=True)
+            self._server = await asyncio.start_unix_server(self._serve, path, limit=MAX_LINE_BYTES)
+            path.chmod(0o660)
+        except OSError as error:
+            raise ConfigError(f"socket: {path}: {error.strerror or error}; a short path in a writable folder") from None
         self._keep(self._loop.create_task(self._live()))
 
     async def close(self) -> None:
@@ -138,6 +147,16 @@ class Server:
                 return self.rig.rearm(request.by)
             case _:
                 return self.rig.status()
+
+
+async def _answers(path: Path) -> bool:
+    """Does a live process listen on that socket?"""
+    try:
+        _, writer = await asyncio.open_unix_connection(path)
+    except OSError:
+        return False
+    writer.close()
+    return True
 
 
 def problem_of(error: RigError) -> Problem:

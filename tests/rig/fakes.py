@@ -139,8 +139,12 @@ class VirtualRig:
         self.stimulator = FakeStimulator(self.clock)
         self.cell = FakeCell(self.clock, self.stimulator)
         self.halt = Halt(self.clock)
-        self.gate = Gate(self.stimulator, self.clock, lambda reason: void(self.halt.set("fault", reason)))
-        self.receiver = Receiver(self.cell, self.clock, lambda reason: void(self.halt.set("fault", reason)))
+
+        def fault(reason: str) -> None:
+            self.halt.set("fault", reason)
+
+        self.gate = Gate(self.stimulator, self.clock, fault, fault)
+        self.receiver = Receiver(self.cell, self.clock, fault)
         segments = segments or [
             SegmentPlan(name="rest", sequence="rest", settings={"duration_s": 0.5}),
             SegmentPlan(name="ramp", sequence="ramp", settings={"up_s": 1.0, "down_s": 1.0}),

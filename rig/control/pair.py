@@ -1,0 +1,80 @@
+"""The two devices of a rig: connected together, asked together, given back together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from rig import devices
+from rig.acquire.receiver import Receiver
+from rig.acquire.run import FRESH_S
+from rig.clock import Clock
+from rig.config import RigConfig
+from rig.errors import DeviceError
+from rig.gate import Gate
+
+
+class Pair:
+    """A stimulator behind its gate and a load cell behind its receiver; both None while not connected.
+
+    Parameters
+    ----------
+    on_fault, on_lost
+        Called with the reason from the devices' threads.
+    """
+
+    def __init__(
+        self, config: RigConfig, clock: Clock, on_fault: Callable[[str], None], on_lost: Callable[[str], None]
+    ) -> None:
+        self._config = config
+        self._clock = clock
+        self._on_fault, self._on_lost = on_fault, on_lost
+        self.gate: Gate | None = None
+        self.receiver: Receiver | None = None
+        self.identity: dict[str, dict[str, Any]] = {"stimulator": {}, "load_cell": {}}
+
+    def connect(self) -> None:
+        """Open both. Raises DeviceError (neither stays open then) and ConfigError (a DBC without the signal)."""
+        settings = self._config.stimulator, self._config.load_cell
+        stimulator = devices.find("stimulator", settings[0].device).create(settings[0], self._clock)
+        cell = devices.find("load_cell", settings[1].device).create(settings[1], self._clock)
+        gate = Gate(stimulator, self._clock, self._on_fault, self._on_lost)
+        self.identity["stimulator"] = gate.identify()
+        try:
+            self.identity["load_cell"] = cell.open()
+        except DeviceError:
+            gate.disconnect()
+            raise
+        receiver = Receiver(cell, self._clock, self._on_lost)
+        receiver.start()
+        self.gate, self.receiver = gate, receiver
+
+    def disconnect(self) -> None:
+        """Stop stimulation and give both back; never raises."""
+        if self.gate is not None:
+            self.gate.disconnect()
+        if self.receiver is not None:
+            self.receiver.close()
+        self.gate = self.receiver = None
+
+    def both_answer(self) -> bool:
+        """Stop the stimulator anew and ask its state; does torque come?"""
+        if self.gate is None or self.receiver is None:
+            return False
+        try:
+            self.gate.stop()
+            self.gate.state()
+        except DeviceError:
+            return False
+        return self.torque_comes()
+
+    def torque_comes(self) -> bool:
+        """Does a sample arrive from now on, within a short time?"""
+        assert self.receiver is not None
+        asked_s = self._clock.now_s()
+        end_s = asked_s + FRESH_S * self._clock.speed
+        while self.receiver.age_s(asked_s) >= 0:
+            if self._clock.now_s() > end_s:
+                return False
+            self._clock.wait(self._clock.now_s() + 0.005 * self._clock.speed)
+        return True

@@ -1,0 +1,156 @@
+"""Around one test's journal: beginning it, sealing it, and sealing what a crash left."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import uuid
+from collections.abc import Iterator
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from rig import archive, journal
+from rig.acquire.run import RunResult, lateness_ms
+from rig.clock import Clock
+from rig.config import RigConfig
+from rig.errors import JournalError, PlanError, RecordingError
+from rig.journal import Journal, Kind
+from rig.messages import FinishedEvent
+from rig.plan import PlannedTest
+
+log = logging.getLogger("rig.sealing")
+
+MIN_FREE_BYTES = 64 * 2**20
+"""A test of the longest duration makes 25 MB of journal and as much of recording at 1600 samples/s."""
+
+
+class Shelf:
+    """The folders of unfinished journals and sealed recordings in the data folder."""
+
+    def __init__(self, config: RigConfig, clock: Clock) -> None:
+        self._config = config
+        self._clock = clock
+        self.journals = config.data_dir / "journals"
+        self.recordings = config.data_dir / "recordings"
+
+    def make_folders(self) -> None:
+        """Create what is missing. Raises OSError."""
+        for folder in (self.journals, self.recordings):
+            folder.mkdir(parents=True, exist_ok=True)
+
+    def check_room(self, test_id: str) -> None:
+        """Is there place for a test of that id?
+
+        Raises
+        ------
+        PlanError
+            The id was used before.
+        JournalError
+            The disk is nearly full.
+        """
+        used = (self.journals / f"{test_id}.journal").exists() or any(self.recordings.glob(f"*Z_{test_id}.h5"))
+        if used:
+            raise PlanError(f"plan.test_id: {test_id!r} was used before; give each test a new id")
+        free = shutil.disk_usage(self._config.data_dir).free
+        if free < MIN_FREE_BYTES:
+            raise JournalError(
+                f"data_dir {self._config.data_dir}: {free // 2**20} MB free, a test needs {MIN_FREE_BYTES // 2**20}; "
+                "move old recordings away"
+            )
+
+    def begin(self, test: PlannedTest, identity: dict[str, Any]) -> Journal:
+        """A journal with its header and plan, on the disk. Raises JournalError."""
+        book = Journal(self.journals / f"{test.plan.test_id}.journal")
+        header = {
+            "recording_id": uuid.uuid4().hex,
+            "plan": test.plan.model_dump(mode="json"),
+            "segments": [{"name": s.name, "start": s.start, "end": s.end} for s in test.segments],
+            "current_ma": test.plan.profile.current_ma,
+            "sample_rate_hz": self._config.load_cell.model_dump().get("sample_rate_hz", 0.0),
+            "software": software(),
+            "configuration": {**self._config.public(), "devices": identity},
+            "time_s": self._clock.now_s(),
+            "unix_s": self._clock.unix_s(),
+        }
+        book.append_json(Kind.HEADER, header)
+        book.append(Kind.PLAN, test.pulse_width_us.astype("<f8").tobytes())
+        book.sync()
+        return book
+
+    def finish(self, path: Path, test_id: str, result: RunResult) -> FinishedEvent:
+        """Seal a test that has just ended."""
+        summary: dict[str, Any] = {
+            "duration_s": result.duration_s,
+            "samples": result.counts.samples,
+            "lost_samples": result.counts.lost_samples,
+            "duplicate_samples": result.counts.duplicate_samples,
+            "disordered_samples": result.counts.disordered_samples,
+            "malformed_frames": result.counts.malformed_frames,
+            "error_frames": result.counts.error_frames,
+            "pulses": len(result.lateness_s),
+            "dropped_pulses": result.dropped,
+            "lateness_ms": lateness_ms([s / self._clock.speed for s in result.lateness_s]),
+            "charge_uc": result.charge_uc,
+            "torque_peak_nm": result.peak_nm,
+            "cpu_percent": round(result.cpu_percent, 2),
+            "stop": result.evidence.model_dump(),
+        }
+        return self._seal(path, test_id, result.outcome, result.reason, summary, result.last_sample_unix_s)
+
+    def recover(self) -> Iterator[FinishedEvent]:
+        """Seal the journals that a crash left; one that cannot be sealed is set aside, never deleted."""
+        for path in sorted(self.journals.glob("*.journal")):
+            log.warning("recovering %s", path.name)
+            reason = "the rig process died during the test"
+            event = self._seal(path, path.stem, "fault", reason, {"recovered": True}, None)
+            if path.exists():
+                path.rename(path.with_suffix(".unsealed"))
+            yield event
+
+    def _seal(
+        self, path: Path, test_id: str, outcome: str, reason: str, summary: dict[str, Any], unix_s: float | None
+    ) -> FinishedEvent:
+        """Seal a journal and remove it; where that fails the journal stays and the event says why."""
+        sealed = None
+        try:
+            sealed = archive.seal(journal.read(path), self.recordings, outcome, reason)
+            path.unlink()
+        except (RecordingError, OSError) as error:
+            log.error("%s", error, extra={"test_id": test_id})
+            reason = "; ".join(part for part in (reason, str(error)) if part)
+        event = {"test_id": test_id, "outcome": outcome, "reason": reason, "last_sample_unix_s": unix_s}
+        if sealed is None:
+            return FinishedEvent.model_validate({**event, "summary": summary})
+        attributes = sealed.recording.attributes
+        event |= {
+            "outcome": attributes["outcome"],
+            "reason": attributes["reason"],
+            "recording_path": str(sealed.path),
+            "recording_id": attributes["recording_id"],
+            "file_sha256": sealed.file_sha256,
+            "summary": summary | _of_recording(sealed.recording),
+        }
+        return FinishedEvent.model_validate(event)
+
+
+def _of_recording(recording: archive.Recording) -> dict[str, Any]:
+    alignment = recording.alignment
+    return {
+        "samples": len(recording.columns["torque/time_s"]),
+        "sample_rate_hz": recording.attributes["sample_rate_measured_hz"],
+        "alignment": {
+            "method": alignment.method,
+            "error_ms": None if alignment.error_ms != alignment.error_ms else alignment.error_ms,
+            "delay_ms": alignment.delay_ms,
+            "rate_ppm": alignment.rate_ppm,
+        },
+    }
+
+
+def software() -> str:
+    """Name and version, as recordings carry it."""
+    try:
+        return f"stimrig {version('stimrig')}"
+    except PackageNotFoundError:
+        return "stimrig (not installed)"
