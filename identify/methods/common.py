@@ -82,6 +82,26 @@ def near_rest(grid: Grid, rows: np.ndarray) -> np.ndarray:
     return result
 
 
+QUIET_AFTER_S = 4.0
+
+
+def quiet_level(grid: Grid) -> float:
+    """Zero-torque baseline from the rests, N·m: before the first pulse, else long after one, else the lowest torques.
+
+    Two seconds after a pulse don't do: an underdamped muscle of 0.5 s then swings through below zero.
+    """
+    still = grid.pulse_width_us == 0
+    before = grid.fitted & np.logical_and.accumulate(still)
+    if before.sum() >= 4:
+        return float(np.mean(grid.torque_nm[before]))
+    last_pulse = np.maximum.accumulate(np.where(still, -grid.size, np.arange(grid.size)))
+    quiet = still & grid.fitted & ((np.arange(grid.size) - last_pulse) * grid.step_s > QUIET_AFTER_S)
+    if quiet.sum() >= 4:
+        return float(np.mean(grid.torque_nm[quiet]))
+    some = grid.fitted & still if (grid.fitted & still).any() else grid.fitted
+    return float(np.percentile(grid.torque_nm[some], 5))
+
+
 def active_level(grid: Grid, rows: np.ndarray) -> float:
     """Largest pulse width in the rows, µs.
 

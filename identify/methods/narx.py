@@ -17,7 +17,7 @@ import numpy as np
 from identify.finish import finish_discrete
 from identify.grid import Grid
 from identify.linear import Discrete
-from identify.methods.common import fitted_rows
+from identify.methods.common import fitted_rows, quiet_level
 from identify.model import Model
 from identify.recruitment.curve import Curve
 from identify.recruitment.spline import SplineBasis
@@ -45,8 +45,7 @@ class Narx:
         """Fit on the named segments, or on all that may be fitted."""
         rows = fitted_rows(grid, fit_on)
         torque_lags, width_lags = int(options.get("torque_lags", 2)), int(options.get("width_lags", 3))
-        still = rows & (grid.pulse_width_us == 0)
-        baseline = float(np.percentile(grid.torque_nm[still], 20)) if still.any() else 0.0
+        baseline = quiet_level(grid)
         torque_scale = float(np.std(grid.torque_nm[rows])) or 1.0
         width_scale = float(np.max(grid.pulse_width_us)) or 1.0
         torque = (np.nan_to_num(grid.torque_nm) - baseline) / torque_scale

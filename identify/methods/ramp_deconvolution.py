@@ -13,11 +13,12 @@ from typing import Any
 
 import numpy as np
 
+from identify.dynamics import free_states
 from identify.errors import BadRequest, NotIdentifiable
 from identify.finish import completed
 from identify.grid import Grid, runs
 from identify.linear import SecondOrder
-from identify.methods.common import near_rest, segment_rows
+from identify.methods.common import near_rest, quiet_level, segment_rows
 from identify.model import Model, Noise
 from identify.noise import noise_evidence
 from identify.recruitment.sigmoid_fit import fit_points
@@ -79,29 +80,29 @@ def deconvolved(grid: Grid, ramp: np.ndarray, linear: SecondOrder) -> tuple[np.n
     Inverting (31) takes two derivatives of a noisy torque. Instead w is a spline in time, its smoothness chosen by
     REML, whose response through G fits the torque: the same curve without the noise blown up.
     """
-    rows = near_rest(grid, ramp)
-    still = grid.fitted & (grid.pulse_width_us == 0)
     first, last = int(np.flatnonzero(ramp)[0]), int(np.flatnonzero(ramp)[-1])
+    rows = near_rest(grid, ramp) & (np.arange(grid.size) >= first)
     span = (last - first + 1) * grid.step_s
     basis = SplineBasis(np.linspace(0.0, span, max(int(KNOTS_PER_S * span), 8)))
     # SplineBasis vanishes at zero, as w does when the ramp sets out.
-    at = np.clip((np.arange(grid.size) - first) * grid.step_s, 0.0, span)
-    columns = basis.design(at)
+    columns = basis.design(np.clip((np.arange(grid.size) - first) * grid.step_s, 0.0, span))
     columns[last + 1 :] = 0.0
-    design = np.c_[linear.on_grid(grid, columns), np.ones(grid.size)][rows]
-    target = grid.torque_nm[rows]
+    # What earlier stimulation left in the muscle when the ramp sets out decays by the same dynamics.
+    left = np.zeros((grid.size, 2))
+    left[first:] = free_states(linear.time_constant_s, linear.damping, grid.step_s, grid.size - first)[0][:-1]
+    baseline = quiet_level(grid)
+    design = np.c_[linear.on_grid(grid, columns), left][rows]
+    target = grid.torque_nm[rows] - baseline
+    size = basis.size
     gram, moment = design.T @ design, design.T @ target
-    outer = gram[-1:, -1:]
-    inner = gram[:-1, :-1] - gram[:-1, -1:] @ gram[-1:, :-1] / outer
-    right = moment[:-1] - gram[:-1, -1] * moment[-1] / outer[0, 0]
-    energy = float(target @ target - moment[-1] ** 2 / outer[0, 0])
-    weight = choose_weight(inner, right, energy, target.size, basis.roughness, 1).weight
+    outer = np.linalg.solve(gram[size:, size:], np.c_[gram[size:, :size], moment[size:]])
+    inner = gram[:size, :size] - gram[:size, size:] @ outer[:, :-1]
+    right = moment[:size] - gram[:size, size:] @ outer[:, -1]
+    energy = float(target @ target - moment[size:] @ outer[:, -1])
+    weight = choose_weight(inner, right, energy, target.size, basis.roughness, 2).weight
     penalty = np.zeros_like(gram)
-    penalty[:-1, :-1] = weight * basis.roughness + 1e-12 * np.trace(inner) / len(inner) * np.eye(len(inner))
-    found = np.linalg.solve(gram + penalty, moment)
-    if (still & rows).any() or not still.any():
-        return columns @ found[:-1], float(found[-1])
-    return columns @ found[:-1], float(np.mean(grid.torque_nm[still]))
+    penalty[:size, :size] = weight * basis.roughness + 1e-12 * np.trace(inner) / size * np.eye(size)
+    return columns @ np.linalg.solve(gram + penalty, moment)[:size], baseline
 
 
 def _curve(width_us: np.ndarray, drive_nm: np.ndarray, rows: np.ndarray) -> dict[str, list[float]]:

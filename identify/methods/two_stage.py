@@ -23,7 +23,7 @@ from identify.errors import BadRequest
 from identify.finish import finish, finish_discrete
 from identify.grid import Grid
 from identify.linear import Discrete, SecondOrder
-from identify.methods.common import active_level, near_rest, order_option, segment_rows
+from identify.methods.common import active_level, near_rest, order_option, quiet_level, segment_rows
 from identify.model import Model
 from identify.noise import noise_evidence
 from identify.output_error import OutputError, choose_order, equation_error, output_error, stable
