@@ -175,8 +175,11 @@ class TestRun:
         self.t0_s = t0_s
         self.started.set()
         late_s = self._watch.late_pulse_periods * period_s
+        first = int(np.argmax(self.test.pulse_width_us > 0))
         for index, width_us in enumerate(self.test.pulse_width_us.tolist()):
             due_s = t0_s + index * period_s
+            if index == first:
+                self._baseline_nm = self._receiver.torque_around(0.1 * clock.speed)  # at rest, if ever
             if clock.wait(due_s, self.halt.event):
                 return
             self._look_after_health(clock.now_s(), due_s)
@@ -234,13 +237,14 @@ class TestRun:
             return True, "no pulse had been sent"
         if at_stop_nm is None or self._baseline_nm is None:
             return False, "no torque to confirm the stop by"
-        above_nm = abs(at_stop_nm - self._baseline_nm)
+        above_nm = at_stop_nm - self._baseline_nm
+        side = 1.0 if above_nm >= 0 else -1.0
         deadline_s = clock.now_s() + DECAY_S
         while True:
             now_nm = self._receiver.torque_around(0.05 * clock.speed)
             if now_nm is None:
                 return False, "no torque to confirm the stop by"
-            if abs(now_nm - self._baseline_nm) <= max(NEAR_REST_NM, 0.5 * above_nm):
+            if side * (now_nm - self._baseline_nm) <= max(NEAR_REST_NM, 0.5 * abs(above_nm)):
                 return True, f"torque fell from {at_stop_nm:.2f} to {now_nm:.2f} N·m"
             if clock.now_s() >= deadline_s:
                 return False, f"torque is still {now_nm:.2f} N·m {DECAY_S:g} s after the stop"
