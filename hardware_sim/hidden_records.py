@@ -70,6 +70,7 @@ def generate(
     validate_s: float = 16.0,
     steep: bool = False,
     moving: bool = False,
+    pulsed: bool = False,
     formulation: int | None = None,
     sampled_late_s: float = 0.0,
 ) -> dict[str, Any]:
@@ -94,6 +95,8 @@ def generate(
         Recruitment that rises within 5 to 25 µs.
     moving
         The joint moves slowly, `angle_rad` and `velocity_rad_s` are recorded (always so where an effect needs it).
+    pulsed
+        Each pulse drives the muscle in a burst of 3 to 12 ms about the middle of its period, not over all of it.
     formulation
         Which of the effect's formulations; drawn if None.
     sampled_late_s
@@ -120,6 +123,7 @@ def generate(
         noise_sd_nm=noise_sd_nm,
         steep=steep,
         moving=moving,
+        pulsed=pulsed,
         formulation=formulation,
         design=design,
         validate_s=validate_s,

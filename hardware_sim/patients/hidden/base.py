@@ -15,6 +15,7 @@ from hardware_sim.patients.hidden.kernels import (
     ACTIVATION,
     FORCE,
     LARGEST_NM,
+    PULSE,
     SPEED,
     STEP_S,
     Floats,
@@ -23,6 +24,7 @@ from hardware_sim.patients.hidden.kernels import (
     kernel,
 )
 
+PERIOD_S = 0.025
 TABLE_SIZE = 512
 """Recruitment is a table with one entry a µs."""
 
@@ -78,11 +80,32 @@ def second_order(x, p, s, c):
     return y
 
 
+@kernel
+def as_pulses(x, p, s, c):
+    """p: length of a pulse's drive s, latency s, period s. s[0]: place in a ring, then drives to come.
+
+    The recruited torque of a period comes in one short burst per pulse, its middle where that of a held width is.
+    """
+    size = 256
+    i = int(s[0])
+    s[0] = (i + 1) % size
+    if c[PULSE] > 0.0:
+        first = p[1] / c[STEP_S]
+        last = first + p[0] / c[STEP_S]
+        for k in range(int(first), int(last) + 1):
+            part = min(k + 1.0, last) - max(float(k), first)
+            s[1 + (i + k) % size] += x * part * p[2] / p[0]
+    out = s[1 + i]
+    s[1 + i] = 0.0
+    return out
+
+
 @dataclass(frozen=True)
 class Base:
     """A muscle with nothing hidden in it.
 
-    `lags_s` are the two time constants where the dynamics are two first-order lags in a row, else None.
+    `lags_s` are the two time constants where the dynamics are two first-order lags in a row, else None. Where
+    `burst_s` is not 0, each pulse drives the muscle in a burst of that length, so that torque ripples at 40 Hz.
     """
 
     shape: str
@@ -93,6 +116,7 @@ class Base:
     lags_s: tuple[float, float] | None
     dynamics: str
     numbers: dict[str, float]
+    burst_s: float = 0.0
 
     @property
     def largest_nm(self) -> float:
@@ -106,10 +130,13 @@ class Base:
 
     def stages(self) -> list[Stage]:
         """Recruitment and dynamics."""
-        return [
+        stages = [
             Stage("recruitment", recruit, self.table_nm),
             Stage("dynamics", second_order, (1.0 / self.t_omega_s, self.zeta)),
         ]
+        if self.burst_s > 0.0:
+            stages.append(Stage("delay", as_pulses, (self.burst_s, 0.5 * (PERIOD_S - self.burst_s), PERIOD_S)))
+        return stages
 
     def describe(self) -> dict[str, Any]:
         """What `reveal` tells of it."""
@@ -121,6 +148,7 @@ class Base:
             "rise_10_90_us": list(self.rise_us()),
             "t_omega_s": round(self.t_omega_s, 5),
             "zeta": round(self.zeta, 5),
+            "burst_s": self.burst_s,
             **self.numbers,
         }
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib import import_module
 from pkgutil import iter_modules
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.random import Generator
 
-from hardware_sim.patients.hidden import effects, outside
+from hardware_sim.patients.hidden import effects, kept_back, outside
 from hardware_sim.patients.hidden.base import Base, draw_base
 from hardware_sim.patients.hidden.kernels import Formulation, NotSuited, Stage
 from hardware_sim.patients.hidden.protocol import Protocol40, make_design
@@ -21,6 +21,9 @@ from hardware_sim.patients.hidden.scenario import BANDS, Hidden, combine, jsonab
 
 ATTEMPTS = 40
 CALIBRATION_STEP_S = 1.0 / 1600.0
+
+KEPT_BACK_FROM = 1000
+"""Seeds from here on may draw formulations that no lower seed draws."""
 
 MOVING = frozenset({"torque_angle", "torque_velocity", "passive_torque"})
 """Show only where the joint moves."""
@@ -40,18 +43,22 @@ def outside_ids() -> tuple[str, ...]:
     return tuple(sorted(module.name for module in iter_modules(outside.__path__)))
 
 
-def formulations(effect: str) -> tuple[Writer, ...]:
-    """The ways an effect is written here.
+def formulations(effect: str, seed: int = KEPT_BACK_FROM) -> tuple[Writer, ...]:
+    """The ways an effect is written here; under seed 1000 without those kept back from development.
 
     Raises
     ------
     ValueError
         No effect of that name.
     """
-    for package, names in ((effects, effect_ids()), (outside, outside_ids())):
-        if effect in names:
-            return import_module(f"{package.__name__}.{effect}").FORMULATIONS
-    raise ValueError(f"effect {effect!r}: one of {', '.join((*effect_ids(), *outside_ids()))}")
+    if effect in outside_ids():
+        return import_module(f"{outside.__name__}.{effect}").FORMULATIONS
+    if effect not in effect_ids():
+        raise ValueError(f"effect {effect!r}: one of {', '.join((*effect_ids(), *outside_ids()))}")
+    written = import_module(f"{effects.__name__}.{effect}").FORMULATIONS
+    if seed < KEPT_BACK_FROM or effect not in {module.name for module in iter_modules(kept_back.__path__)}:
+        return written
+    return (*written, *import_module(f"{kept_back.__name__}.{effect}").FORMULATIONS)
 
 
 @dataclass(frozen=True)
@@ -97,6 +104,7 @@ def draw_scenario(
     noise_sd_nm: float = 0.04,
     steep: bool = False,
     moving: bool = False,
+    pulsed: bool = False,
     formulation: int | None = None,
     design: str = "full",
     **design_settings: Any,
@@ -117,11 +125,13 @@ def draw_scenario(
     for attempt in range(ATTEMPTS):
         rng = rng_of(seed, *names, strength, str(attempt))
         base = draw_base(rng, steep)
+        if pulsed:
+            base = replace(base, burst_s=float(rng.uniform(0.003, 0.012)))
         sequence = make_design(design, rng, float(base.largest_width_us), moving=moving, **design_settings)
         hidden: list[Hidden] = []
         try:
             for name in names:
-                writers = formulations(name)
+                writers = formulations(name, seed)
                 choice = int(rng.integers(len(writers))) if formulation is None else formulation
                 written = writers[choice](rng, base)
                 target = noise_sd_nm * float(np.exp(rng.uniform(np.log(low * 1.08), np.log(min(high, 20.0) * 0.92))))

@@ -126,15 +126,21 @@ class Yardstick:
     def fit(self, torque_nm: Floats) -> Floats:
         """Residual of the best effect-free model over all rows, free run, N·m."""
         train = ~self.held_out
-        result = least_squares(
-            lambda theta: (torque_nm - self._predict(theta, torque_nm))[train],
-            self._start,
-            bounds=(np.log([0.004, 0.08]), np.log([4.0, 12.0])),
-            x_scale=(0.3, 0.3),
-            diff_step=1e-4,
-            max_nfev=14,
-            xtol=1e-4,
-            ftol=1e-5,
-        )
-        self._start = result.x
-        return torque_nm - self._predict(result.x, torque_nm)
+        own = np.log([self.base.t_omega_s, self.base.zeta])
+        starts = [own] if np.array_equal(own, self._start) else [self._start, own]
+        results = [
+            least_squares(
+                lambda theta: (torque_nm - self._predict(theta, torque_nm))[train],
+                start,
+                bounds=(np.log([0.004, 0.08]), np.log([4.0, 12.0])),
+                x_scale=(0.3, 0.3),
+                diff_step=1e-4,
+                max_nfev=20,
+                xtol=1e-4,
+                ftol=1e-5,
+            )
+            for start in starts  # the last fit's end may be a trap for the next
+        ]
+        best = min(results, key=lambda result: result.cost)
+        self._start = best.x
+        return torque_nm - self._predict(best.x, torque_nm)

@@ -61,7 +61,9 @@ def _events(rng: Generator, between_s: tuple[float, float]) -> np.ndarray:
     return float(rng.uniform(0.0, 5.0)) + np.cumsum(gaps) - gaps[0] * float(rng.uniform(0.0, 0.8))
 
 
-def _formulation(name: str, source: str, stage: object, table: np.ndarray, top: float) -> Formulation:
+def _formulation(rng: Generator, name: str, source: str, stage: object, table: np.ndarray, top: float) -> Formulation:
+    if rng.random() < 0.15:  # the antagonist's
+        table[:, 2] *= -1.0
     return Formulation(
         name,
         source,
@@ -81,7 +83,7 @@ def bumps(rng: Generator, _base: Base) -> Formulation:
             np.exp(rng.normal(0.0, 0.25, EVENTS)),
         ]
     )
-    return _formulation("smooth bumps", "bell-shaped efforts, Flash and Hogan 1985", _bumps, table, 12.0)
+    return _formulation(rng, "smooth bumps", "bell-shaped efforts, Flash and Hogan 1985", _bumps, table, 12.0)
 
 
 def ramps(rng: Generator, _base: Base) -> Formulation:
@@ -93,7 +95,7 @@ def ramps(rng: Generator, _base: Base) -> Formulation:
             rng.uniform(0.15, 0.45, EVENTS),
         ]
     )
-    return _formulation("held efforts with ramps", "no law", _ramps, table, 12.0)
+    return _formulation(rng, "held efforts with ramps", "no law", _ramps, table, 12.0)
 
 
 def spasms(rng: Generator, _base: Base) -> Formulation:
@@ -105,7 +107,7 @@ def spasms(rng: Generator, _base: Base) -> Formulation:
             rng.uniform(0.04, 0.12, EVENTS),
         ]
     )
-    return _formulation("spasms that burst and decay", "no law", _spasms, table, 12.0)
+    return _formulation(rng, "spasms that burst and decay", "no law", _spasms, table, 12.0)
 
 
 FORMULATIONS = (bumps, ramps, spasms)
