@@ -12,7 +12,7 @@ import h5py
 import numpy as np
 import pytest
 
-from rig import archive
+from rig import align, archive
 from tests.wire.processes import Bench, control, default_plan, short_plan
 
 pytestmark = pytest.mark.wire
@@ -110,6 +110,12 @@ def test_aligned_times_are_those_of_the_muscle(make_bench: Callable[..., Bench])
     since_first = (felt_s - felt_s[0]) - (edges_s - edges_s[0])
     assert np.median(np.abs(since_first)) < 1e-3
     assert np.median(np.abs(edges_s - written_s)) < 1e-3
+    with h5py.File(event["recording_path"]) as file:
+        counter, host_s, time_s = (file[f"torque/{name}"][:] for name in ("counter", "host_time_s", "time_s"))
+    no_sync = np.full(len(counter), 255, np.uint8)
+    without, found = align.align(counter / 1600, host_s, no_sync, written_s, 1600.0)
+    assert found.method == "regression"
+    assert np.max(np.abs(without - time_s)) < 1.5e-3  # 0.3 ms when the machine is not shared
 
 
 def test_two_tests_one_after_the_other(bench: Bench):
