@@ -99,6 +99,7 @@ class Emulator:
             self.catch_up()
             deliver(self.load_cell, self.transport)
             self.port.flush()
+            self.port.forget_speed()
             now_s = time.monotonic()
             next_tick_s = max(next_tick_s + tick_s, now_s)
             while (left_s := self._wait_s(next_tick_s)) > 0 and not stopping():

@@ -8,6 +8,9 @@ import struct
 import termios
 import tty
 
+INPUT_SPEED, OUTPUT_SPEED = 4, 5
+"""Places in what `tcgetattr` gives."""
+
 
 class PseudoTerminal:
     """A raw pseudo-terminal that outlives its clients and never blocks.
@@ -15,6 +18,10 @@ class PseudoTerminal:
     The emulator keeps the slave side open itself: else the master would report EIO each time the rig closes
     the port. What nobody reads waits in `pending` like in a device's FIFO, and beyond `fifo_bytes` whole
     messages are dropped.
+
+    A pseudo-terminal knows no parity, and the C library reports a setting that changed nothing but parity as
+    invalid. A second client could therefore not open the port with even parity, as a port on hardware lets it.
+    `forget_speed` sets the speed back, so that each client changes something.
     """
 
     def __init__(self, fifo_bytes: int = 65536) -> None:
@@ -26,6 +33,7 @@ class PseudoTerminal:
         self.is_open = True
         self._fifo_bytes = fifo_bytes
         self._pending = bytearray()
+        self._seen_speed = self._own_speed = termios.tcgetattr(self._slave)[OUTPUT_SPEED]
 
     def fileno(self) -> int:
         """The master's descriptor, for select."""
@@ -37,6 +45,16 @@ class PseudoTerminal:
             return os.read(self._master, 65536)
         except OSError:
             return b""
+
+    def forget_speed(self) -> None:
+        """Set back a speed that a client set before the last call; not at once, in the middle of its opening."""
+        if not self.is_open:
+            return
+        settings = termios.tcgetattr(self._slave)
+        seen, self._seen_speed = self._seen_speed, settings[OUTPUT_SPEED]
+        if seen == self._seen_speed != self._own_speed:
+            settings[INPUT_SPEED] = settings[OUTPUT_SPEED] = self._own_speed
+            termios.tcsetattr(self._slave, termios.TCSANOW, settings)
 
     def unread_bytes(self) -> int:
         """How much the client has yet to read."""

@@ -22,11 +22,11 @@ MOST_PULSES = 3
 
 
 class Pulse(NamedTuple):
-    """One phase of a symmetric biphasic pulse; `count` of them an interpulse interval apart."""
+    """One phase of a symmetric biphasic pulse; `pulses` of them an interpulse interval apart."""
 
     width_us: int
     current_ma: int
-    count: int = 1
+    pulses: int = 1
 
     @property
     def duration_s(self) -> float:
@@ -81,7 +81,7 @@ def parse_start(data: bytes, setup: Setup) -> dict[int, Pulse] | None:
         count, pulse = data[4 * place] + 1, parse_pulse(data[4 * place + 1 : 4 * place + 4])
         if pulse is None or count > MOST_PULSES or 0 < setup.period_s < count * setup.interpulse_s:
             return None
-        pulses[channel] = pulse._replace(count=count)
+        pulses[channel] = pulse._replace(pulses=count)
     return pulses
 
 
@@ -124,7 +124,7 @@ class ChannelList:
         self._pulses = pulses
         if self.setup.period_s == 0:
             self._one_shot_ends_s = self._board.timeline.now_s + max(
-                (pulse.count - 1) * self.setup.interpulse_s + pulse.duration_s for pulse in pulses.values()
+                (pulse.pulses - 1) * self.setup.interpulse_s + pulse.duration_s for pulse in pulses.values()
             )
         if self._next_group is None:
             self._fire_group(self._board.timeline.now_s)
@@ -149,7 +149,7 @@ class ChannelList:
         self._group += 1
         for index in range(1, MOST_PULSES):
             at_s = time_s + index * self.setup.interpulse_s
-            channels = [channel for channel in due if self._pulses[channel].count > index]
+            channels = [channel for channel in due if self._pulses[channel].pulses > index]
             if channels:
                 self._rest.append(self._board.timeline.at(at_s, lambda c=channels, t=at_s: self._fire(c, t)))
         self._fire(due, time_s)  # last: if it fails, all that has been planned is cancelled

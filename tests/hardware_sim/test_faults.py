@@ -121,10 +121,15 @@ def test_corrupt_both_ways(host: Host) -> None:
 def test_electrode_high_voltage_and_reset(host: Host) -> None:
     with broken(host, "electrode_error"):
         assert host.result(LL_CONFIG, PULSE) == 10
+    with broken(host, "emergency_switch"):
+        assert host.result(LL_CONFIG, PULSE) == 10
     with broken(host, "high_voltage_error"):
         assert host.result(LL_CONFIG, PULSE) == 8
     assert host.result(LL_CONFIG, PULSE) == 0
     with broken(host, "device_reset"):
+        assert host.result(LL_CONFIG, PULSE) == 7
+    with broken(host, "device_reset", mid_frame=True):
+        assert host.line.read(4) == bytes.fromhex("f0815581")
         assert host.result(LL_CONFIG, PULSE) == 7
 
 

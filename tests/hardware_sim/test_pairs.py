@@ -22,22 +22,24 @@ pytestmark = pytest.mark.wire
 SPEED = 4.0
 PULSES = 12
 PERIOD_S = 0.025
+ENOUGH_NM = 1.0
 Play = Callable[[serial.Serial], None]
 Decode = Callable[[bytes], tuple[list[float], int | None]]
 
 
-def paced(send: Callable[[int], None]) -> None:
-    start_s = time.monotonic()
-    for k in range(PULSES):
-        time.sleep(max(0.0, start_s + k * PERIOD_S / SPEED - time.monotonic()))
-        send(k)
+def paced(line: serial.Serial, frames: list[bytes], ack_bytes: int) -> None:
+    """Never in a burst, however busy the machine: a RehaStim 2 refuses a pulse during another."""
+    for frame in frames:
+        line.write(frame)
+        assert len(line.read(ack_bytes)) == ack_bytes
+        time.sleep(PERIOD_S / SPEED)
 
 
 def p24(line: serial.Serial) -> None:
     line.write(sciencemode4.encode(sciencemode4.Packet(1, LL_INIT, b"\x00")))
     assert line.read(13)[-2:] == b"\x00\x0f"
     frames = [sciencemode4.encode(sciencemode4.Packet(k, LL_CONFIG, config(*biphasic(300, 20)))) for k in range(PULSES)]
-    paced(lambda k: line.write(frames[k]))
+    paced(line, frames, 15)
 
 
 def rehastim2(line: serial.Serial) -> None:
@@ -46,7 +48,7 @@ def rehastim2(line: serial.Serial) -> None:
     line.write(sciencemode2.encode(sciencemode2.Packet(init.number, 2, b"\x00")))
     pulse = bytes.fromhex("00012c14")
     frames = [sciencemode2.encode(sciencemode2.Packet(k, 36, pulse)) for k in range(PULSES)]
-    paced(lambda k: line.write(frames[k]))
+    paced(line, frames, 9)
 
 
 def plain(data: bytes) -> tuple[list[float], int | None]:
@@ -68,7 +70,6 @@ CELLS: dict[str, tuple[list[str], int, int, Decode]] = {
     "plain": (["--cell", "plain"], 0x181, 1, plain),
     "plain of 3": (["--cell", "plain", "--samples-per-frame", "3"], 0x181, 3, packed),
     "counts": (["--cell", "counts"], 610, 1, counts),
-    "counts of 4": (["--cell", "counts", "--samples-per-frame", "4"], 610, 4, counts),
     "canopen": (["--cell", "canopen"], 0x181, 1, plain),
 }
 
@@ -108,10 +109,10 @@ def test_it_starts_and_plays(stimulator: str, cell: str, transport: str) -> None
         assert first is not None
         with serial.Serial(rig.ready["stimulator"], baud, parity=parity, timeout=2) as line:
             play(line)
-            end_s = time.monotonic() + 0.12
+            end_s = time.monotonic() + 5
             messages = [first]
-            while time.monotonic() < end_s:
-                messages += [message for message in [bus.recv(0.01)] if message is not None]
+            while decode(bytes(messages[-1].data))[0][-1] <= ENOUGH_NM and time.monotonic() < end_s:
+                messages += [message for message in [bus.recv(0.1)] if message is not None]
         pulses = rig.ask(cmd="pulses")["pulses"]
         state = rig.ask(cmd="state")
         assert rig.ready["stimulator_device"] == stimulator
@@ -133,6 +134,6 @@ def test_it_starts_and_plays(stimulator: str, cell: str, transport: str) -> None
     offsets = range(torque_nm.size - values.size)
     errors_nm = [np.abs(torque_nm[k : k + values.size] - values).max() for k in offsets]
     assert min(errors_nm) < 2e-3  # one count of the coarsest cell
-    assert values.max() > 1.0
+    assert values.max() > ENOUGH_NM
     if counters and samples_per_frame == 1:
         assert int(np.argmin(errors_nm)) == pytest.approx(counters[0], abs=1)

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from hardware_sim.__main__ import main
 from tests.hardware_sim.emulated import ROOT, Emulated, emulated, wait_for
 
 pytestmark = pytest.mark.wire
@@ -101,15 +102,24 @@ def test_patient_file_and_readable_lines(tmp_path: Path) -> None:
         (["--fault", "late_ack,delay_s=long"], "SETTING=NUMBER"),
         (["--fault", "late_ack,delay=1"], "no setting 'delay'; it has delay_s"),
         (["--hidden", "x"], "--hidden"),
+        (["--samples-per-frame", "2"], "--samples-per-frame must be 1 or 3 with --cell plain, not 2"),
+        (["--cell", "canopen", "--samples-per-frame", "3"], "must be 1 with --cell canopen"),
+        (["--clock-jitter-us", "-1"], "--clock-jitter-us must be between"),
+        (["--stimulator", "rehastim3"], "rehastim2"),
         (["--wrong"], "--wrong"),
     ],
 )
-def test_bad_input_is_one_line_and_exit_2(arguments: list[str], told: str) -> None:
-    done = run(*arguments)
-    assert done.returncode == 2
-    assert done.stdout == ""
-    assert done.stderr.count("\n") == 1
-    assert told in done.stderr
+def test_bad_input_is_one_line_and_exit_2(arguments: list[str], told: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(arguments) == 2
+    output, errors = capsys.readouterr()
+    assert output == ""
+    assert errors.count("\n") == 1
+    assert told in errors
+
+
+def test_bad_input_ends_the_process_with_2() -> None:
+    done = run("--wrong")
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
 
 
 def test_help() -> None:

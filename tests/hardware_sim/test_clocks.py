@@ -1,0 +1,165 @@
+"""The cell's clock: drift, jitter of its samples, jitter of their delivery, several samples a frame."""
+
+from __future__ import annotations
+
+import math
+import struct
+import time
+from collections.abc import Iterator
+from itertools import pairwise
+
+import can
+import numpy as np
+import pytest
+
+from hardware_sim.errors import FaultError, SettingsError
+from hardware_sim.load_cells.cells import canopen, counts, plain
+from hardware_sim.load_cells.frames import Sample
+from hardware_sim.load_cells.sampler import LoadCell, Noise
+from hardware_sim.settings import Settings
+from tests.hardware_sim.emulated import Emulated, emulated
+from tests.hardware_sim.test_load_cells import Ramp
+
+RATE_HZ = 1600.0
+PERIOD_S = 1 / RATE_HZ
+PACKED = struct.Struct("<hhhH")
+
+
+def recorded(made: LoadCell, until_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """True times (the muscle's torque is the time) and stamps, s."""
+    made.produce(until_s)
+    frames = made.take_frames()
+    times_s = [struct.unpack("<fHBB", frame.data)[0] for frame in frames]
+    return np.array(times_s), np.array([1e-6 * frame.time_us for frame in frames])
+
+
+def cell(**settings) -> LoadCell:
+    return LoadCell(Ramp(), plain.Cell(), Noise(0.0, 0), RATE_HZ, **settings)
+
+
+@pytest.mark.parametrize("clock_ppm", [-200.0, 200.0])
+def test_a_drifting_clock_is_off_by_its_parts_per_million(clock_ppm: float) -> None:
+    times_s, stamps_s = recorded(cell(clock_ppm=clock_ppm), 10.0)
+    slope = np.polyfit(times_s, stamps_s, 1)[0]
+    assert 1e6 * (slope - 1) == pytest.approx(clock_ppm, abs=1)
+    assert np.allclose(np.diff(stamps_s), PERIOD_S, atol=2e-6)  # it does not know
+
+
+def test_jitter_moves_each_sample_and_none_overtakes() -> None:
+    times_s, stamps_s = recorded(cell(jitter_s=100e-6), 4.0)
+    off_s = times_s - PERIOD_S * np.arange(times_s.size)
+    assert off_s.std() == pytest.approx(100e-6, rel=0.05)
+    assert abs(off_s.mean()) < 5e-6
+    assert np.allclose(stamps_s, times_s, atol=2e-6)
+    assert abs(np.corrcoef(off_s[1:], off_s[:-1])[0, 1]) < 0.05
+    wild_s, _ = recorded(cell(jitter_s=0.01), 4.0)
+    assert np.diff(wild_s).min() > 0.05 * PERIOD_S
+    assert wild_s.size == pytest.approx(6400, abs=1)
+
+
+def test_jitter_can_be_switched_and_leaves_the_grid_where_it_was() -> None:
+    made = cell()
+    recorded(made, 1.0)
+    made.set_jitter(100e-6)
+    made.set_rate_factor(1.0)  # a new anchor takes no jitter over
+    recorded(made, 2.0)
+    made.set_jitter(0.0)
+    recorded(made, 2.01)
+    times_s, _ = recorded(made, 3.0)
+    off_s = (times_s + PERIOD_S / 2) % PERIOD_S - PERIOD_S / 2
+    assert np.abs(off_s).max() < 1e-6
+
+
+@pytest.mark.parametrize("jitter_s", [0.0, 50e-6])
+def test_three_samples_a_frame(jitter_s: float) -> None:
+    made = LoadCell(Ramp(), plain.Cell(3), Noise(0.0, 0), RATE_HZ, jitter_s=jitter_s)
+    made.counter = 3 * 65534
+    made.produce(8.0)
+    frames = made.take_frames()
+    rows = [PACKED.unpack(frame.data) for frame in frames]
+    assert [row[3] for row in rows[:4]] == [65534, 65535, 0, 1]
+    values = np.array([row[:3] for row in rows]).ravel() / 500
+    assert values == pytest.approx(PERIOD_S * np.arange(values.size), abs=1e-3 + 3 * 50e-6)
+    last_s = np.array([frame.time_us for frame in frames]) * 1e-6
+    assert last_s == pytest.approx(PERIOD_S * (3 * np.arange(len(frames)) + 2), abs=1e-6 if not jitter_s else 3e-4)
+
+
+def test_packed_values_have_stops_and_a_counter_jump_shows() -> None:
+    def frame(*torques_nm: float, counter: int = 0) -> tuple[int, ...]:
+        samples = [Sample(t, counter + k, True, 0) for k, t in enumerate(torques_nm)]
+        return PACKED.unpack(plain.Cell(3).encode(samples).data)
+
+    assert frame(1.0, -70.0, 70.0) == (500, -32767, 32767, 0)
+    assert frame(math.nan, 0.001, 0.0, counter=1003) == (-32767, 0, 0, 335)
+    assert counts.Cell(2).encode([Sample(50.0, 0, False, 1), Sample(-60.0, 1, False, 2)])[1:3] == (b"\xff\xff\0\0", 2)
+
+
+def test_what_the_cells_carry() -> None:
+    carried = {made: (made.has_counter, made.has_sync) for made in (plain.Cell(), plain.Cell(3), canopen.Cell())}
+    assert list(carried.values()) == [(True, True), (True, False), (True, True)]
+    assert not counts.Cell().has_counter
+
+
+def test_settings_out_of_range() -> None:
+    for value in (-1.0, math.nan, math.inf):
+        with pytest.raises(SettingsError, match="--clock-jitter-us must be between"):
+            Settings(clock_jitter_us=value)
+
+
+@pytest.fixture(scope="module")
+def rig() -> Iterator[Emulated]:
+    with emulated("--clock-ppm", "-200", "--noise-nm", "0") as running:
+        yield running
+
+
+@pytest.mark.wire
+class TestOverTheWire:
+    def record(self, rig: Emulated, seconds: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Counters, stamps and host times."""
+        with can.Bus(**rig.ready["can"]) as bus:
+            assert bus.recv(1.0) is not None
+            rows, end_s = [], time.monotonic() + seconds
+            while time.monotonic() < end_s:
+                message = bus.recv(0.05)
+                if message is not None:
+                    rows.append((struct.unpack("<fHBB", message.data)[1], message.timestamp, time.monotonic()))
+        counters, stamps_s, host_s = np.array(rows).T
+        return np.unwrap(counters, period=65536), stamps_s, host_s
+
+    def test_delivery_jitter_keeps_order_and_stamps(self, rig: Emulated) -> None:
+        assert rig.ask(cmd="fault", name="delivery_jitter", largest_s=0.03)["ok"]
+        counters, stamps_s, host_s = self.record(rig, 0.6)
+        assert rig.ask(cmd="fault", name="delivery_jitter", on=False)["ok"]
+        assert set(np.diff(counters)) == {1}
+        assert np.allclose(np.diff(stamps_s), PERIOD_S, atol=2e-6)
+        late_s = host_s - PERIOD_S * counters
+        assert np.percentile(late_s, 99) - np.percentile(late_s, 1) > 0.008
+        assert rig.ask(cmd="state")["frames_overrun"] == 0
+
+    def test_no_frame_is_lost_or_late_when_it_ends(self, rig: Emulated) -> None:
+        with can.Bus(**rig.ready["can"]) as bus:
+            assert bus.recv(1.0) is not None
+            rig.ask(cmd="fault", name="delivery_jitter", largest_s=0.05, for_s=0.2)
+            counters, end_s = [], time.monotonic() + 0.5
+            while time.monotonic() < end_s:
+                message = bus.recv(0.05)
+                if message is not None:
+                    counters.append(struct.unpack("<fHBB", message.data)[1])
+        assert {(b - a) & 0xFFFF for a, b in pairwise(counters)} == {1}
+
+    def test_clock_jitter(self, rig: Emulated) -> None:
+        _, before_s, _ = self.record(rig, 0.2)
+        assert rig.ask(cmd="fault", name="clock_jitter", sd_us=100)["ok"]
+        _, stamps_s, _ = self.record(rig, 0.5)
+        assert rig.ask(cmd="fault", name="clock_jitter", on=False)["ok"]
+        assert np.diff(before_s).std() < 2e-6
+        assert np.diff(stamps_s).std() == pytest.approx(math.sqrt(2) * 100e-6, rel=0.15)
+
+    @pytest.mark.parametrize(("name", "setting"), [("clock_jitter", "sd_us"), ("delivery_jitter", "largest_s")])
+    def test_nonsense_is_told(self, rig: Emulated, name: str, setting: str) -> None:
+        for value in (-1, math.nan):
+            answer = rig.ask(cmd="fault", name=name, **{setting: value})
+            assert not answer["ok"]
+            assert setting in answer["error"]
+        assert rig.ask(cmd="state")["faults"] == []
+        assert issubclass(FaultError, Exception)
