@@ -75,6 +75,7 @@ class Worker:
             job.progress, job.text = message["progress"], message["text"]
             if job.on_progress is not None:
                 job.on_progress(job)
+        await process.wait()
         if job.state == "cancelled":
             raise ApiError(409, "cancelled", "The job was cancelled", "Start it again if it is still wanted.")
         raise ApiError(500, "worker-died", "The worker process died", "The data are safe; ask again. See logs/api.log.")

@@ -39,6 +39,7 @@ class Service:
 
     def client(self, token: str | None = TOKEN, **more: Any) -> httpx.Client:
         headers = {"Authorization": f"Bearer {token}"} if token else {}
+        headers |= more.pop("headers", {})
         return httpx.Client(base_url=self.url, headers=headers, timeout=20, **more)
 
     def token(self, name: str, *scopes: str) -> str:

@@ -314,6 +314,8 @@ class RigThread:
         return self
 
     def __exit__(self, *_: object) -> None:
+        if not self.thread.is_alive():
+            return
         asyncio.run_coroutine_threadsafe(self.rig.close(), self.loop).result(5)
         self.loop.call_soon_threadsafe(self.loop.stop)
         self.thread.join(5)

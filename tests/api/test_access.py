@@ -1,0 +1,234 @@
+"""Who may do what: tokens, scopes, sessions, forms."""
+
+from __future__ import annotations
+
+import re
+import sqlite3
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import httpx
+import pytest
+
+from api.auth import Scope
+from api.settings import Settings
+from tests.api.conftest import TOKEN, Service, run_test
+
+HTML = {"Accept": "text/html,application/xhtml+xml"}
+
+
+@contextmanager
+def signed_in(service: Service, token: str = TOKEN) -> Iterator[httpx.Client]:
+    with service.client(token=None, headers=HTML, follow_redirects=False) as browser:
+        answer = browser.post("/sign-in", data={"token": token, "next": "/"})
+        assert answer.status_code == 303, answer.text
+        cookie = answer.headers["set-cookie"]
+        assert "HttpOnly" in cookie and "SameSite=strict" in cookie
+        yield browser
+
+
+def csrf(browser: httpx.Client) -> str:
+    return re.findall(r'name="csrf" value="([^"]+)"', browser.get("/").text)[0]
+
+
+ROUTES = [
+    ("GET", "/v1/participants", Scope.RUN_TEST),
+    ("POST", "/v1/participants", Scope.RUN_TEST),
+    ("POST", "/v1/tests", Scope.RUN_TEST),
+    ("POST", "/v1/preview", Scope.RUN_TEST),
+    ("POST", "/v1/rearm", Scope.RUN_TEST),
+    ("GET", "/v1/tests", Scope.READ_LIVE),
+    ("GET", "/v1/tests/x", Scope.READ_LIVE),
+    ("GET", "/v1/rig", Scope.READ_LIVE),
+    ("GET", "/v1/participants/P1/model", Scope.READ_MODEL),
+    ("GET", "/v1/participants/P1/models", Scope.READ_MODEL),
+    ("GET", "/v1/models/x", Scope.READ_MODEL),
+    ("GET", "/v1/models/x/comparison", Scope.READ_MODEL),
+    ("GET", "/v1/models/x/diagnosis", Scope.READ_MODEL),
+    ("GET", "/v1/recordings/x", Scope.READ_MODEL),
+    ("GET", "/v1/effects", Scope.READ_MODEL),
+    ("POST", "/v1/models/x/approve", Scope.APPROVE_MODEL),
+    ("POST", "/v1/models/x/reject", Scope.APPROVE_MODEL),
+    ("POST", "/v1/models/x/effects", Scope.RUN_TEST),
+    ("GET", "/v1/tokens", Scope.ADMINISTER),
+    ("GET", "/v1/audit", Scope.ADMINISTER),
+]
+
+
+def test_each_route_wants_its_scope_and_no_other(service: Service) -> None:
+    tokens = {scope: service.token(scope.value, scope.value) for scope in Scope}
+    with service.client(token=None) as nobody:
+        for method, path, needed in ROUTES:
+            answer = nobody.request(method, path)
+            assert answer.status_code == 401, path
+            assert answer.headers["www-authenticate"].startswith("Bearer")
+            for scope, token in tokens.items():
+                answer = nobody.request(method, path, headers={"Authorization": f"Bearer {token}"})
+                allowed = scope in (needed, Scope.ADMINISTER)
+                assert (answer.status_code != 403) == allowed, (path, scope, answer.text)
+
+
+def test_every_v1_route_is_closed_to_strangers(service: Service) -> None:
+    with service.client(token=None) as nobody:
+        paths = nobody.get("/openapi.json").json()["paths"]
+        assert len(paths) > 20
+        for path, methods in paths.items():
+            for method in methods:
+                if path.startswith("/v1"):
+                    assert nobody.request(method.upper(), re.sub(r"\{.*?\}", "x", path)).status_code == 401, path
+
+
+def test_controller_key_reads_its_model_and_nothing_else(
+    client: httpx.Client, service: Service, participant: str
+) -> None:
+    document = run_test(client, participant)
+    client.post(f"{document['model_url']}/approve")
+    controller = service.client(service.token("controller", "read-model"))
+    assert controller.get(f"/v1/participants/{participant}/model").status_code == 200
+    assert controller.post("/v1/tests", json={"participant": participant}).status_code == 403
+
+
+def test_wrong_revoked_and_expired_tokens_are_refused(client: httpx.Client, service: Service) -> None:
+    assert service.client("wrong").get("/v1/rig").status_code == 401
+    assert service.client(None).get("/v1/rig", headers={"Authorization": "Basic eDp5"}).status_code == 401
+    token = service.token("leaver", "read-live")
+    assert service.client(token).get("/v1/rig").status_code == 200
+    entry = next(row for row in client.get("/v1/tokens").json() if row["name"] == "leaver")
+    assert client.delete(f"/v1/tokens/{entry['id']}").status_code == 204
+    assert service.client(token).get("/v1/rig").status_code == 401
+    body = {"name": "late", "scopes": ["read-live"], "expires_utc": "2020-01-01T00:00:00Z"}
+    late = client.post("/v1/tokens", json=body).json()["token"]
+    assert "expired" in service.client(late).get("/v1/rig").json()["detail"]
+
+
+def test_database_holds_no_token(service: Service) -> None:
+    token = service.token("someone", "read-live")
+    with signed_in(service, token):
+        pass
+    with sqlite3.connect(service.data / "stimrig.db") as database:
+        dump = "\n".join(database.iterdump())
+    assert token not in dump and TOKEN not in dump
+
+
+def test_first_start_draws_a_token_once(tmp_path) -> None:
+    from api.context import build
+
+    settings = Settings(data_dir=tmp_path)
+    first, second = build(settings), build(settings)
+    assert first.drawn_token is not None and len(first.drawn_token) > 40
+    assert second.drawn_token is None
+    assert second.auth.bearer(first.drawn_token).may(Scope.ADMINISTER)
+
+
+def test_changing_the_set_token_withdraws_the_old_one(tmp_path) -> None:
+    from api.context import build
+    from api.errors import ApiError
+
+    build(Settings(data_dir=tmp_path, admin_token="first-one"))  # pyright: ignore[reportArgumentType]
+    later = build(Settings(data_dir=tmp_path, admin_token="second-one"))  # pyright: ignore[reportArgumentType]
+    assert later.auth.bearer("second-one").may(Scope.ADMINISTER)
+    with pytest.raises(ApiError, match="revoked"):
+        later.auth.bearer("first-one")
+
+
+def test_forms_want_the_csrf_token(service: Service) -> None:
+    with signed_in(service) as browser:
+        refused = browser.post("/participants", data={"code": "P1"})
+        assert refused.status_code == 403 and "out of date" in refused.text
+        done = browser.post("/participants", data={"code": "P1", "csrf": csrf(browser)})
+        assert done.status_code == 303 and done.headers["location"] == "/participants/P1"
+        assert browser.post("/v1/participants", json={"code": "P2"}).status_code == 403
+        header = {"X-CSRF-Token": csrf(browser)}
+        assert browser.post("/v1/participants", json={"code": "P2"}, headers=header).status_code == 201
+
+
+def test_signing_out_ends_the_session(service: Service) -> None:
+    with signed_in(service) as browser:
+        cookie = dict(browser.cookies)
+        browser.post("/sign-out", data={"csrf": csrf(browser)})
+        answer = service.client(None, cookies=cookie).get("/v1/rig")
+        assert answer.status_code == 401
+
+
+def test_sign_in_leads_nowhere_else(service: Service) -> None:
+    with service.client(None, headers=HTML) as browser:
+        for target in ("//evil.example", "https://evil.example", "/\\evil.example"):
+            answer = browser.post("/sign-in", data={"token": TOKEN, "next": target})
+            assert answer.headers["location"] == "/"
+        wrong = browser.post("/sign-in", data={"token": "wrong"})
+        assert wrong.status_code == 401 and "unknown" in wrong.text
+    with service.client(None, headers=HTML) as stranger:
+        led = stranger.get("/participants/P1")
+        assert led.status_code == 303 and led.headers["location"] == "/sign-in?next=/participants/P1"
+
+
+# ---- stop ---------------------------------------------------------------------------------------------------
+
+
+def test_stop_by_json_and_without_a_body_says_the_rigs_evidence(
+    client: httpx.Client, service: Service, participant: str
+) -> None:
+    service.rig.speed = 4.0
+    client.post("/v1/tests", json={"participant": participant})
+    answer = client.post("/v1/stop", json={"reason": "pain"}).json()
+    assert answer["stopped"] and answer["evidence"]["device_state"] == "stopped"
+    assert client.post("/v1/stop").json()["stopped"]
+    assert client.post("/v1/stop", content=b"{not json", headers={"content-type": "application/json"}).json()["stopped"]
+
+
+def test_stop_is_open_to_anyone_signed_in_and_to_nobody_else(service: Service) -> None:
+    assert service.client(service.token("reader", "read-model")).post("/v1/stop").status_code == 200
+    assert service.client(None).post("/v1/stop").status_code == 401
+
+
+def test_stop_by_plain_form_works_without_csrf_and_after_the_session_ran_out(
+    service: Service, participant: str
+) -> None:
+    service.rig.speed = 4.0
+    with signed_in(service) as browser:
+        with service.client() as client:
+            client.post("/v1/tests", json={"participant": participant})
+        with service.app.state.context.store.write() as session:
+            session.connection().exec_driver_sql("UPDATE page_sessions SET expires_unix_s = 0")
+        assert browser.get("/v1/rig").status_code in (303, 401)
+        page = browser.post("/v1/stop", data={"reason": "stop pressed on the page"})
+        assert page.status_code == 200
+        assert "The rig confirms that stimulation is off" in page.text
+    assert service.rig.stopped_by == "administrator"
+
+
+def test_unconfirmed_stop_is_never_called_stopped(client: httpx.Client, service: Service) -> None:
+    service.rig.confirms_stop = False
+    answer = client.post("/v1/stop")
+    assert answer.status_code == 503
+    assert answer.json()["title"] == "The stop is not confirmed" and "emergency switch" in answer.json()["detail"]
+    with signed_in(service) as browser:
+        page = browser.post("/v1/stop", data={})
+        assert page.status_code == 503 and "not confirmed" in page.text and "confirms" not in page.text
+
+
+def test_stop_says_so_when_the_rig_is_gone(client: httpx.Client, service: Service) -> None:
+    service.rig_thread.__exit__()
+    answer = client.post("/v1/stop")
+    assert answer.status_code == 503 and "emergency switch" in answer.json()["detail"]
+
+
+def test_after_a_stop_the_rig_waits_for_a_person(client: httpx.Client, service: Service, participant: str) -> None:
+    client.post("/v1/stop")
+    refused = client.post("/v1/tests", json={"participant": participant})
+    assert refused.status_code == 409 and refused.json()["type"] == "/problems/rig-latched"
+    assert client.post("/v1/rearm").json()["state"] == "ready"
+    assert client.post("/v1/tests", json={"participant": participant}).status_code == 202
+
+
+def test_stopped_test_keeps_its_recording_and_makes_no_model(
+    client: httpx.Client, service: Service, participant: str
+) -> None:
+    from tests.api.conftest import wait_done
+
+    service.rig.speed = 6.0
+    test_id = client.post("/v1/tests", json={"participant": participant}).json()["id"]
+    client.post("/v1/stop", json={"reason": "pain"})
+    document = wait_done(client, test_id)
+    assert document["state"] == "stopped" and document["model_id"] is None
+    assert client.get(document["recording_url"]).status_code == 200

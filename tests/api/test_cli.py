@@ -1,0 +1,179 @@
+"""The verbs: what they print, what they refuse, and with which exit code."""
+
+from __future__ import annotations
+
+import csv
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from api import cli
+from tests.api.test_worker import made_up_csv
+
+GOOD = ["time_s,pulse_width_us,torque_nm,segment"] + [
+    f"{k / 40},{100 * (k // 20 % 2)},{k % 7 / 10},prbs" for k in range(400)
+]
+
+
+def edited(line: int, text: str) -> list[str]:
+    return [*GOOD[: line - 1], text, *GOOD[line:]]
+
+
+@pytest.fixture(scope="module")
+def record(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return made_up_csv(tmp_path_factory.mktemp("cli") / "record.csv")
+
+
+@pytest.fixture(scope="module")
+def model(record: Path) -> Path:
+    path = record.parent / "MODEL.json"
+    assert cli.run(["fit", str(record), "-o", str(path)]) == 0
+    return path
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
+    capsys.readouterr()
+    code = cli.run(list(arguments))
+    out, err = capsys.readouterr()
+    return code, out, err
+
+
+def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """One line on standard error, nothing on standard output, exit 2."""
+    code, out, err = run(capsys, *arguments)
+    assert code == 2, (out, err)
+    assert out == ""
+    assert err.count("\n") == 1 and "Traceback" not in err, err
+    return err
+
+
+def test_fit_reports_and_writes_a_model(capsys: pytest.CaptureFixture[str], record: Path, model: Path) -> None:
+    code, out, _ = run(capsys, "fit", str(record))
+    assert code == 0 and "Tω" in out and "ceiling" in out and "threshold" in out
+    assert json.loads(model.read_text())["recruitment"]["pulse_width_us"]
+
+
+def test_fit_json_is_one_object_and_nothing_else(capsys: pytest.CaptureFixture[str], record: Path) -> None:
+    code, out, err = run(capsys, "fit", str(record), "--json")
+    assert code == 0 and err == "" and out.count("\n") == 1
+    assert json.loads(out)["linear"]["b"]
+
+
+def test_predict_writes_the_three_columns(
+    capsys: pytest.CaptureFixture[str], record: Path, model: Path, tmp_path: Path
+) -> None:
+    target = tmp_path / "out.csv"
+    code, out, _ = run(capsys, "predict", str(model), str(record), "-o", str(target), "--json")
+    assert code == 0 and json.loads(out)["rows"] == 1000
+    with target.open() as file:
+        rows = list(csv.DictReader(file))
+    assert list(rows[0]) == ["time_s", "torque_nm", "predicted_torque_nm"] and len(rows) == 1000
+    worst = max(abs(float(row["torque_nm"]) - float(row["predicted_torque_nm"])) for row in rows)
+    assert 0 < worst < 0.5
+
+
+BAD_CSV: list[tuple[str, list[str], tuple[str, ...]]] = [
+    ("missing column", ["time_s,pulse_width_us,segment", "0,0,prbs"], ("torque_nm",)),
+    ("text in a number", edited(7, "0.125,abc,0.1,prbs"), ("7", "abc")),
+    ("NaN", edited(9, "0.175,100,nan,prbs"), ("9", "torque_nm")),
+    ("time backwards", edited(12, "0.1,0,0.1,prbs"), ("12",)),
+    ("uneven sampling", GOOD[:100] + GOOD[101:], ("101",)),
+    ("too few fields", edited(5, "0.075,0"), ("5",)),
+    ("empty", [], ()),
+    ("header only", GOOD[:1], ()),
+]
+
+
+@pytest.mark.parametrize(("name", "lines", "named"), BAD_CSV, ids=[case[0].replace(" ", "-") for case in BAD_CSV])
+@pytest.mark.parametrize("verb", ["fit", "diagnose"])
+def test_bad_csv_is_one_line_naming_the_place(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, verb: str, name: str, lines: list[str], named: tuple[str, ...]
+) -> None:
+    path = tmp_path / "bad.csv"
+    path.write_text("\n".join(lines) + "\n" if lines else "")
+    err = refused(capsys, verb, str(path), "--json")
+    assert "bad.csv" in err
+    for word in named:
+        assert word in err, err
+
+
+def test_half_written_recording(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    from rig.messages import Profile, TestPlan
+    from tests.api.fake_rig import write_recording
+
+    plan = TestPlan(test_id="T1", participant="P1", profile=Profile(), segments=None)  # pyright: ignore[reportCallIssue]
+    path, _ = write_recording(
+        tmp_path, plan, [100.0] * 400, [1.0] * 4000, [{"name": "prbs", "start_s": 0, "end_s": 10}], 400.0, "completed"
+    )
+    half = tmp_path / "half.h5"
+    half.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    assert "half.h5" in refused(capsys, "fit", str(half))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["fit", "nowhere.csv"], "nowhere.csv"),
+        (["fit", "."], "."),
+        (["fit", "{record}", "--method", "magic"], "magic"),
+        (["fit", "{record}", "--effects", "phlogiston"], "phlogiston"),
+        (["fit", "{record}", "--fit-on", "polka"], "polka"),
+        (["fit", "{record}", "-o", "/nowhere/at/all/M.json"], "/nowhere/at/all/M.json"),
+        (["predict", "nowhere.json", "{record}", "-o", "x.csv"], "nowhere.json"),
+        (["predict", "{record}", "{record}", "-o", "x.csv"], "record.csv"),
+        (["predict", "{model}", "{record}", "-o", "/nowhere/x.csv"], "/nowhere/x.csv"),
+        (["compare", "{model}", "nowhere.csv"], "nowhere.csv"),
+        (["table1", "--trials", "0"], "--trials"),
+        (["fit"], "DATA"),
+        (["fit", "{record}", "--nonsense"], "--nonsense"),
+        (["polka"], "polka"),
+        (["serve", "--port", "99999"], "--port"),
+    ],
+)
+def test_bad_arguments_are_one_line(
+    capsys: pytest.CaptureFixture[str], record: Path, model: Path, arguments: list[str], named: str
+) -> None:
+    filled = [part.format(record=record, model=model) for part in arguments]
+    assert named in refused(capsys, *filled)
+
+
+def test_unforeseen_error_is_one_line_and_a_log(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, record: Path
+) -> None:
+    import identify
+
+    def broken(*_: Any, **__: Any) -> None:
+        raise ZeroDivisionError("odd")
+
+    monkeypatch.setattr(identify, "fit", broken, raising=False)
+    code, out, err = run(capsys, "fit", str(record))
+    assert code == 1 and out == "" and err.count("\n") == 1
+    log = Path(err.rsplit("(log: ", 1)[1].rstrip(")\n"))
+    assert "ZeroDivisionError" in log.read_text()
+    log.unlink()
+
+
+def test_every_verb_of_the_contract_is_there_and_helps() -> None:
+    done = subprocess.run([sys.executable, "-m", "api.cli", "--help"], capture_output=True, text=True, check=True)
+    for verb in ("serve", "emulate", "test", "fit", "predict", "compare", "diagnose", "improve", "effects", "table1"):
+        assert f"\n  {verb}" in done.stdout
+
+
+def test_bad_input_as_a_process() -> None:
+    done = subprocess.run([sys.executable, "-m", "api.cli", "fit", "nowhere.csv"], capture_output=True, text=True)
+    assert done.returncode == 2 and done.stdout == "" and done.stderr.count("\n") == 1
+
+
+def test_emulate_hands_everything_on() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "api.cli", "emulate", "--patient", "nobody"], capture_output=True, text=True
+    )
+    assert done.returncode == 2 and "nobody" in done.stderr and done.stderr.count("\n") == 1
+    helped = subprocess.run(
+        [sys.executable, "-m", "api.cli", "emulate", "--help"], capture_output=True, text=True, check=True
+    )
+    assert "--hidden SEED" in helped.stdout

@@ -1,0 +1,159 @@
+"""Everything that goes wrong comes as RFC 9457 problem+json that names the place and the mend."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import httpx
+import pytest
+
+from tests.api.conftest import Service, run_test, wait_done
+
+GOOD_HEADER = "time_s,pulse_width_us,torque_nm,segment\n"
+
+
+def problem(answer: httpx.Response, status: int) -> dict[str, Any]:
+    assert answer.status_code == status, answer.text
+    assert answer.headers["content-type"] == "application/problem+json"
+    body = answer.json()
+    assert body["status"] == status and body["title"] and body["type"].startswith("/problems/")
+    assert "Traceback" not in answer.text
+    return body
+
+
+@pytest.mark.parametrize(
+    ("body", "field"),
+    [
+        ({"code": "Anna Schmidt"}, "code"),
+        ({"code": "x" * 33}, "code"),
+        ({"code": ""}, "code"),
+        ({"code": "P1\n"}, "code"),
+        ({}, "code"),
+        ({"code": "P1", "name": "Anna"}, "name"),
+        ({"code": "P1", "profile": {"current_ma": -1}}, "profile.current_ma"),
+        ({"code": "P1", "profile": {"max_pulse_width_us": "wide"}}, "profile.max_pulse_width_us"),
+    ],
+)
+def test_participant_that_does_not_hold(client: httpx.Client, body: dict[str, Any], field: str) -> None:
+    found = problem(client.post("/v1/participants", json=body), 422)
+    assert field in [error["field"] for error in found["errors"]]
+    assert client.get("/v1/participants").json() == []
+
+
+def test_nan_is_refused_as_a_limit(client: httpx.Client) -> None:
+    content = '{"code": "P1", "profile": {"current_ma": NaN}}'
+    answer = client.post("/v1/participants", content=content, headers={"content-type": "application/json"})
+    assert "profile.current_ma" in problem(answer, 422)["detail"]
+
+
+def test_same_code_twice(client: httpx.Client, participant: str) -> None:
+    assert "Take another" in problem(client.post("/v1/participants", json={"code": participant}), 409)["detail"]
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "status"),
+    [
+        ("GET", "/nowhere", 404),
+        ("DELETE", "/v1/participants", 405),
+        ("GET", "/v1/tests/T1", 404),
+        ("GET", "/v1/models/M1", 404),
+        ("POST", "/v1/models/M1/approve", 404),
+        ("GET", "/v1/models/M1/comparison", 404),
+        ("GET", "/v1/recordings/R1", 404),
+        ("GET", "/v1/participants/P404", 404),
+        ("GET", "/v1/participants/P404/model", 404),
+        ("GET", "/v1/participants/P404/models", 404),
+        ("GET", "/static/../app.py", 404),
+        ("GET", "/static/app.py", 404),
+    ],
+)
+def test_what_is_not_there(client: httpx.Client, method: str, path: str, status: int) -> None:
+    problem(client.request(method, path), status)
+
+
+def test_body_that_is_no_json(client: httpx.Client) -> None:
+    answer = client.post("/v1/tests", content=b"{", headers={"content-type": "application/json"})
+    problem(answer, 422)
+
+
+def test_test_of_nobody(client: httpx.Client) -> None:
+    found = problem(client.post("/v1/tests", json={"participant": "P404"}), 404)
+    assert "POST /v1/participants" in found["detail"]
+
+
+def test_no_model_approved_says_how_to_approve(client: httpx.Client, participant: str) -> None:
+    found = problem(client.get(f"/v1/participants/{participant}/model"), 404)
+    assert found["type"] == "/problems/no-approved-model" and "approve" in found["detail"]
+
+
+def test_unknown_scope(client: httpx.Client) -> None:
+    found = problem(client.post("/v1/tokens", json={"name": "x", "scopes": ["everything"]}), 422)
+    assert "everything" in found["detail"] and "read-model" in found["detail"]
+
+
+def test_rig_that_is_gone_and_comes_back(client: httpx.Client, service: Service, participant: str) -> None:
+    service.rig_thread.__exit__()
+    time.sleep(0.3)
+    found = problem(client.post("/v1/tests", json={"participant": participant}), 503)
+    assert found["title"] == "The rig cannot be reached"
+    health = client.get("/health").json()
+    assert health["status"] == "degraded" and health["rig"]["state"] == "disconnected"
+    service.rig_thread.__enter__()
+    service.rig.speed = 30.0
+    end = time.monotonic() + 5
+    while client.get("/health").json()["status"] != "ok":
+        assert time.monotonic() < end
+        time.sleep(0.05)
+    assert run_test(client, participant)["state"] == "completed"
+
+
+def test_rig_that_dies_in_a_test_ends_the_test(client: httpx.Client, service: Service, participant: str) -> None:
+    service.rig.speed = 2.0
+    test_id = client.post("/v1/tests", json={"participant": participant}).json()["id"]
+    time.sleep(0.3)
+    service.rig_thread.__exit__()
+    time.sleep(0.2)
+    service.rig_thread.__enter__()
+    document = wait_done(client, test_id)
+    assert document["state"] == "fault" and "rig's process ended" in document["reason"]
+    assert client.get("/v1/rig").json()["holder"] is None
+
+
+def test_rig_that_does_not_answer_a_start_is_stopped(client: httpx.Client, service: Service, participant: str) -> None:
+    service.app.state.context.rig.patience_s = 0.5
+    service.rig.mute = True
+    problem(client.post("/v1/tests", json={"participant": participant}), 503)
+    service.rig.mute = False
+    assert client.get("/v1/rig").json()["holder"] is None
+
+
+def test_upload_of_another_tools_csv(client: httpx.Client, participant: str) -> None:
+    rows = "".join(f"{k / 40},{100 * (k // 20 % 2)},{k % 7},prbs\n" for k in range(400))
+    answer = client.post(f"/v1/participants/{participant}/recordings", content=GOOD_HEADER + rows)
+    assert answer.status_code == 201, answer.text
+    assert client.get(answer.headers["location"]).text == GOOD_HEADER + rows
+    assert answer.json()["model"]["participant"] == participant
+
+
+def test_upload_too_large_or_empty(client: httpx.Client, service: Service, participant: str) -> None:
+    service.app.state.context.settings.max_upload_mb = 0.001
+    problem(client.post(f"/v1/participants/{participant}/recordings", content=b"x" * 2000), 413)
+    problem(client.post(f"/v1/participants/{participant}/recordings", content=b""), 422)
+    assert list((service.data / "recordings").glob("upload-*")) == []
+
+
+def test_page_shows_a_problem_in_words(client: httpx.Client) -> None:
+    answer = client.get("/models/M404", headers={"Accept": "text/html"})
+    assert answer.status_code == 404 and "There is no model" in answer.text and "<h1>" in answer.text
+
+
+def test_unforeseen_error_is_a_problem_too(
+    client: httpx.Client, service: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: object) -> None:
+        raise RuntimeError("secret detail")
+
+    monkeypatch.setattr(service.app.state.context.versions, "get", broken)
+    found = problem(client.get("/v1/models/M1"), 500)
+    assert "secret detail" not in str(found)
