@@ -5,10 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from identify.grid import make_grid
+import numpy as np
+
+from identify.errors import BadRequest, NotIdentifiable
+from identify.grid import Grid, make_grid
 from identify.methods import known_options, method_of
 from identify.model import Model
 from identify.record import Record
+
+LEAST_ROWS = 8
 
 
 def fit(
@@ -44,4 +49,36 @@ def fit(
         return fit_with_effects(record, list(effects), fit_on=names, **options)
     chosen = method_of(method)
     known_options(chosen, options)
-    return chosen.fit(make_grid(record), names, **options)
+    try:
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            grid = make_grid(record)
+            refuse_stillness(grid)
+            return chosen.fit(grid, names, **options)
+    except np.linalg.LinAlgError as error:
+        raise NotIdentifiable(
+            f"{method} finds no solution on this record ({error})", mend="Check that torque follows the pulses."
+        ) from error
+    except (TypeError, ValueError) as error:
+        if options:
+            given = ", ".join(f"{key}={value}" for key, value in options.items())
+            raise BadRequest(f"unusable option ({error})", place=given, mend="See `identify.methods()`.") from error
+        raise
+
+
+def refuse_stillness(grid: Grid) -> None:
+    """Refuse a record in which nothing happens.
+
+    Raises
+    ------
+    NotIdentifiable
+        Nothing may be fitted, there is no pulse, or the torque never changes.
+    """
+    if grid.fitted.sum() < LEAST_ROWS:
+        raise NotIdentifiable(
+            f"only {int(grid.fitted.sum())} pulse intervals may be fitted",
+            mend="Give rows of segments other than `validate`.",
+        )
+    if not np.max(grid.pulse_width_us[grid.fitted]) > 0:
+        raise NotIdentifiable("no pulse is in the record", mend="Record a PRBS and a ramp.")
+    if not np.ptp(grid.torque_nm[grid.fitted]) > 0:
+        raise NotIdentifiable("the torque never changes", mend="Check the load cell and the electrodes.")

@@ -205,6 +205,7 @@ def make_grid(record: Record) -> Grid:
     BadRecord
         Fewer than eight pulse intervals, or sampled more slowly than the pulses.
     """
+    refuse_nonsense(record)
     step_s = 1.0 / record.pulse_rate_hz
     rate_hz = record.sample_rate_hz
     if not rate_hz >= 0.999 * record.pulse_rate_hz:
@@ -231,6 +232,8 @@ def make_grid(record: Record) -> Grid:
     first_of = np.searchsorted(interval, np.arange(size))
     # The middle sample of an interval: not touched by a pulse that came a sample early or late.
     middle = np.minimum(first_of + count // 2, record.time_s.size - 1)
+    # Where samples are missing the last width seen is taken to be in force still.
+    middle = np.where(count > 0, middle, np.maximum(first_of - 1, 0))
     return Grid(
         record=record,
         start_s=start_s,
@@ -245,6 +248,36 @@ def make_grid(record: Record) -> Grid:
         angle_rad=None if record.angle_rad is None else mean(record.angle_rad),
         velocity_rad_s=None if record.velocity_rad_s is None else mean(record.velocity_rad_s),
     )
+
+
+LONGEST_S = 24 * 3600.0
+
+
+def refuse_nonsense(record: Record) -> None:
+    """Refuse arrays that no measurement gives, whatever front door they came through.
+
+    Raises
+    ------
+    BadRecord
+        Not finite, negative widths, time that doesn't rise, a pulse rate that is none, or more than a day.
+    """
+    if not 1.0 <= record.pulse_rate_hz <= 200.0:
+        raise BadRecord(f"{record.pulse_rate_hz:g} pulses a second", place="pulse_rate_hz", mend="Give 1 to 200 Hz.")
+    columns = {"time_s": record.time_s, "pulse_width_us": record.pulse_width_us, "torque_nm": record.torque_nm}
+    for name, column in columns.items():
+        finite = np.isfinite(column)
+        if not finite.all():
+            raise BadRecord(
+                "not finite", place=f"{name}, sample {int(np.argmin(finite))}", mend="Cut the record there."
+            )
+    if np.any(record.pulse_width_us < 0):
+        place = f"pulse_width_us, sample {int(np.argmax(record.pulse_width_us < 0))}"
+        raise BadRecord("negative", place=place, mend="A pulse width is 0 (no pulse) or positive.")
+    if np.any(np.diff(record.time_s) <= 0):
+        place = f"time_s, sample {int(np.argmax(np.diff(record.time_s) <= 0)) + 1}"
+        raise BadRecord("time doesn't rise", place=place, mend="Sort the samples by time, once each.")
+    if record.time_s[-1] - record.time_s[0] > LONGEST_S:
+        raise BadRecord("longer than a day", place="time_s", mend="Give time in seconds.")
 
 
 def pulse_phase_s(record: Record) -> float:

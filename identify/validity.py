@@ -15,6 +15,7 @@ from identify.record import Record
 UNDER_CEILING_POINTS = 1.0
 LARGEST_RATE_CHANGE = 0.25
 LARGEST_DIP = 0.05
+LEAST_FIT_PERCENT = 30.0
 
 
 def valid_for(model: Model, grid: Grid, rows: np.ndarray) -> dict[str, Any]:
@@ -150,8 +151,8 @@ def _ceiling(model: Model) -> dict[str, Any]:
     fit, ceiling = model.fit.get("fit_percent"), model.fit.get("ceiling_percent")
     if fit is None or ceiling is None or not np.isfinite(fit) or not np.isfinite(ceiling):
         return _gate(False, "care", "the fit can't be compared with its ceiling")
-    if not fit > 50.0 and ceiling > 60.0:
-        return _gate(False, "refuse", f"the fit, {fit:.1f} %, is far below the {ceiling:.1f} % that the noise allows")
+    if fit < LEAST_FIT_PERCENT or (fit < 50.0 and ceiling > 60.0):
+        return _gate(False, "refuse", f"the fit, {fit:.1f} %, is too poor: torque hardly follows the pulses")
     return _gate(
         fit >= ceiling - UNDER_CEILING_POINTS,
         "care",

@@ -154,8 +154,7 @@ def _general(
         reasons.extend(why)
         return best
 
-    still = grid.fitted & (grid.pulse_width_us == 0)
-    baseline = float(np.percentile(torque[still], 20)) if still.any() else 0.0
+    baseline = quiet_level(grid)
     found = linear_part(drive, fitted, order)
     chosen = (len(found.a) - 1, len(found.b) - 1, found.delay_samples)
     rows = near_rest(grid, ramp)
