@@ -41,18 +41,22 @@ class PseudoTerminal:
 
     def read(self) -> bytes:
         """What the client has written since; empty where there is nothing."""
+        self.forget_speed(settled=True)
         try:
             return os.read(self._master, 65536)
         except OSError:
             return b""
 
-    def forget_speed(self) -> None:
-        """Set back a speed that a client set before the last call; not at once, in the middle of its opening."""
+    def forget_speed(self, settled: bool = False) -> None:
+        """Set back a speed that a client set before the last call; not at once, in the middle of its opening.
+
+        At once where it is `settled`: who writes has opened.
+        """
         if not self.is_open:
             return
         settings = termios.tcgetattr(self._slave)
         seen, self._seen_speed = self._seen_speed, settings[OUTPUT_SPEED]
-        if seen == self._seen_speed != self._own_speed:
+        if self._seen_speed != self._own_speed and (settled or seen == self._seen_speed):
             settings[INPUT_SPEED] = settings[OUTPUT_SPEED] = self._own_speed
             termios.tcsetattr(self._slave, termios.TCSANOW, settings)
 

@@ -270,5 +270,9 @@ def test_a_port_opens_with_even_parity_again_and_again() -> None:
         with serial.Serial(port.path, 460_800, parity=serial.PARITY_EVEN):
             for _ in range(2):
                 port.forget_speed()
+    for _ in range(3):
+        with serial.Serial(port.path, 460_800, parity=serial.PARITY_EVEN) as line:
+            line.write(b"x")
+            assert port.read() == b"x"
     port.close()
     port.forget_speed()
