@@ -101,16 +101,17 @@ def assemble(contents: JournalContents, outcome: str = "fault", reason: str = ""
     planned = next((np.frombuffer(p, "<f8") for k, p in contents.blocks if k == Kind.PLAN), None)
     if header is None or planned is None:
         raise RecordingError(f"journal {contents.path}: ends before the plan, no pulse was sent; nothing to seal")
-    start = contents.first_json(Kind.START) or {"t0_s": header["time_s"], "unix_s": header["unix_s"]}
+    started = contents.first_json(Kind.START)
+    start = started or {"t0_s": header["time_s"], "unix_s": header["unix_s"]}
     t0_s = float(start["t0_s"])
     end = contents.first_json(Kind.END) or {"outcome": outcome, "reason": reason, "time_s": _last_time(contents)}
     rate_hz = float(header["plan"]["pulse_rate_hz"])
     end_s = float(end["time_s"]) - t0_s
-    played_s = min(end_s, float(end.get("stimulation_end_s", end["time_s"])) - t0_s)
+    played_s = min(end_s, float(end.get("stimulation_end_s", end["time_s"])) - t0_s) if started else 0.0
     columns, pulse_times = _pulses(contents, planned, rate_hz, t0_s, played_s)
     torque, alignment, measured_hz = _torque(contents, t0_s, end_s, pulse_times, float(header["sample_rate_hz"]))
     columns.update(torque)
-    names = [s["name"] for s in header["segments"] if s["start"] / rate_hz < max(played_s, 1e-9)]
+    names = [s["name"] for s in header["segments"] if s["start"] / rate_hz < played_s]
     columns["segments/start_s"] = np.array([s["start"] / rate_hz for s in header["segments"][: len(names)]])
     ends = np.array([s["end"] / rate_hz for s in header["segments"][: len(names)]])
     columns["segments/end_s"] = np.minimum(ends, max(played_s, 0.0))
@@ -176,7 +177,8 @@ def _pulses(
                 failed = len(payload) > journal.ACKED.size
                 status[i] = PulseStatus.DEVICE_ERROR if failed else PulseStatus.ACKNOWLEDGED
     sent_us[status == PulseStatus.REST] = 0.0
-    reached = int(np.clip(np.ceil(played_s * rate_hz - 1e-6), 0, n))
+    tried = np.flatnonzero(np.nan_to_num(current) > 0)
+    reached = max(int(np.clip(np.ceil(played_s * rate_hz - 1e-6), 0, n)), int(tried[-1]) + 1 if len(tried) else 0)
     columns: dict[str, NDArray[Any]] = {
         "pulses/planned_time_s": np.arange(n) / rate_hz,
         "pulses/pulse_width_us": planned.astype(np.float64),

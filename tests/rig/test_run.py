@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 
 from rig import archive, journal
+from rig.errors import RecordingError
+from rig.journal import Kind
 from rig.messages import SegmentPlan
 from rig.signals import Pulse, PulseStatus
 from tests.rig.fakes import VirtualRig
@@ -139,6 +141,37 @@ def test_no_torque_no_test(tmp_path: Path):
     assert result.outcome == "fault"
     assert "no fresh torque" in result.reason
     assert rig.stimulator.sent == []
+    recording = archive.assemble(journal.read(rig.path))
+    assert recording.names == []
+    assert all(len(column) == 0 for column in recording.columns.values())
+
+
+def test_a_journal_cut_anywhere_seals_what_it_holds(tmp_path: Path):
+    rig = VirtualRig(tmp_path)
+    rig.execute()
+    whole = rig.path.read_bytes()
+    cut = tmp_path / "cut.journal"
+    acknowledged = []
+    for length in np.linspace(len(whole), 0, 60).astype(int):
+        cut.write_bytes(whole[:length])
+        try:
+            contents = journal.read(cut)
+            recording = archive.assemble(contents, "fault", "killed")
+        except RecordingError as error:
+            assert length < 6000, error  # header and plan
+            continue
+        columns = recording.columns
+        assert recording.attributes["outcome"] == ("completed" if contents.ended else "fault")
+        told = sum(kind == Kind.ACKED for kind, _ in contents.blocks)
+        intents = sum(kind == Kind.INTENT for kind, _ in contents.blocks)
+        assert np.sum(columns["pulses/status"] == PulseStatus.ACKNOWLEDGED) == told
+        assert np.sum(np.nan_to_num(columns["pulses/current_ma"]) > 0) == intents
+        assert np.all(np.isfinite(columns["torque/time_s"]))
+        assert len({len(c) for p, c in columns.items() if p.startswith("pulses/")}) == 1
+        acknowledged.append(told)
+        archive.to_bytes(recording)
+    assert acknowledged[0] > 70
+    assert acknowledged == sorted(acknowledged, reverse=True)
 
 
 @pytest.mark.parametrize("n", [1, 2, 17, 60])
