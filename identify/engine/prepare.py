@@ -9,7 +9,7 @@ import numpy as np
 from identify.effects.mains_hum import HARMONICS
 from identify.engine.fit import Fitted, base_fit
 from identify.engine.setup import Setup, refined_basis, uniform_basis
-from identify.grid import Grid, make_grid
+from identify.grid import Grid, make_grid, runs
 from identify.record import Record
 
 LEAST_LINE = 30.0
@@ -45,13 +45,15 @@ class Raw:
 
 
 def inspect(record: Record) -> Raw:
-    """Hum, clipping and white noise of a record."""
+    """Hum, clipping and white noise of a record; held-out rows are left out, as everywhere."""
+    kept = ~record.held_out
     torque = record.torque_nm
-    ceiling, floor = _flat(torque), _flat(-torque)
-    hum, ratio = _find_hum(record)
+    ceiling, floor = _flat(torque[kept]), _flat(-torque[kept])
+    hum, ratio = _find_hum(record, kept)
     if hum is not None:
-        torque = torque - hum_at(hum, record.time_s)
-    return Raw(torque, white_noise(record, torque), hum, ratio, ceiling, None if floor is None else -floor)
+        torque = torque - hum_at(hum, record.time_s - record.time_s[0])
+    noise = white_noise(record, torque[kept])
+    return Raw(torque, noise, hum, ratio, ceiling, None if floor is None else -floor)
 
 
 def _flat(torque: np.ndarray) -> float | None:
@@ -91,13 +93,14 @@ def hum_at(hum: dict[str, float], time_s: np.ndarray) -> np.ndarray:
     return total
 
 
-def _find_hum(record: Record) -> tuple[dict[str, float] | None, float]:
+def _find_hum(record: Record, kept: np.ndarray) -> tuple[dict[str, float] | None, float]:
     """A line at 50 or 60 Hz that stands out of its neighbours, with its harmonics."""
     rate_hz = record.sample_rate_hz
-    if rate_hz < 99.0:
+    if rate_hz < 99.0 or kept.sum() < 4 * rate_hz:
         return None, 0.0
+    longest = max(runs(kept), key=lambda run: run.stop - run.start)
     # Differences whiten the muscle's own spectrum, so that neighbours are comparable.
-    signal = np.diff(record.torque_nm, 2)
+    signal = np.diff(record.torque_nm[longest], 2)
     window = np.hanning(signal.size)
     power = np.abs(np.fft.rfft((signal - signal.mean()) * window)) ** 2
     frequency = np.fft.rfftfreq(signal.size, 1.0 / rate_hz)
@@ -112,7 +115,7 @@ def _find_hum(record: Record) -> tuple[dict[str, float] | None, float]:
     ratio, mains = best
     if ratio < LEAST_LINE or mains > 0.5 * rate_hz + 1e-6:
         return None, ratio
-    return _fit_hum(record, mains), ratio
+    return _fit_hum(record, mains, kept), ratio
 
 
 def _line(power: np.ndarray, frequency: np.ndarray, centre_hz: float, reach_hz: float) -> float:
@@ -124,9 +127,9 @@ def _line(power: np.ndarray, frequency: np.ndarray, centre_hz: float, reach_hz: 
     return float(power[inside].max() / max(np.mean(power[around]), 1e-30))
 
 
-def _fit_hum(record: Record, mains_hz: float) -> dict[str, float]:
+def _fit_hum(record: Record, mains_hz: float, kept: np.ndarray) -> dict[str, float]:
     """Frequency and amplitudes by least squares on the high-passed torque."""
-    rate_hz, time_s = record.sample_rate_hz, record.time_s
+    rate_hz, time_s = record.sample_rate_hz, record.time_s - record.time_s[0]
     width = max(int(round(rate_hz / record.pulse_rate_hz)), 2)
     harmonics = [h for h in range(1, HARMONICS + 1) if h * mains_hz <= 0.5 * rate_hz + 1e-6]
 
@@ -134,14 +137,14 @@ def _fit_hum(record: Record, mains_hz: float) -> dict[str, float]:
         box = np.ones(2 * width + 1) / (2 * width + 1)
         return values - np.apply_along_axis(lambda c: np.convolve(np.convolve(c, box, "same"), box, "same"), 0, values)
 
-    target = smooth_out(record.torque_nm)
+    target = smooth_out(record.torque_nm)[kept]
 
     def design(frequency_hz: float) -> np.ndarray:
         turn = 2 * np.pi * frequency_hz * time_s[:, None] * np.array(harmonics)
         return np.concatenate([np.cos(turn), np.sin(turn)], axis=1)
 
     def remaining(frequency_hz: float) -> tuple[float, np.ndarray]:
-        columns = smooth_out(design(frequency_hz))
+        columns = smooth_out(design(frequency_hz))[kept]
         solution = np.linalg.lstsq(columns, target, rcond=1e-6)[0]
         return float(np.sum((target - columns @ solution) ** 2)), solution
 

@@ -1,0 +1,156 @@
+"""From a record to a chain of models: the base, then one effect after the other while the evidence lasts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from identify.diagnosis.candidates import Candidate, Progress, fit_form, scan
+from identify.diagnosis.structure import Left, left_over, quiet_rows
+from identify.effects import registry
+from identify.effects.base import Effect
+from identify.engine.fit import Fitted, solve, start_from
+from identify.engine.prepare import Raw, inspect, prepare
+from identify.engine.problem import Problem
+from identify.record import Record
+
+FIRST_MARGIN = 6.0
+"""Log evidence that the first effect must gain."""
+NEXT_MARGIN = 10.0
+"""Log evidence that a further effect must gain."""
+MOST = 4
+
+
+@dataclass
+class Analysis:
+    """What was tried on a record, and what came of it.
+
+    Parameters
+    ----------
+    record : Record
+        As given.
+    raw : Raw
+        What was seen before averaging.
+    base : Fitted
+        The model without effects.
+    given : list of str
+        Effects seen in the raw samples.
+    rounds : list of list of Candidate
+        Candidates of each round, best first; round i starts from chain[i].
+    chain : list of Fitted
+        The base (with what was given), then with one effect more each time.
+    added : list of str
+        Effects added, in order.
+    quiet : ndarray of bool
+        Intervals in which the muscle rests.
+    left : list of Left
+        What is left after each model of the chain.
+    """
+
+    record: Record
+    raw: Raw
+    base: Fitted
+    given: list[str] = field(default_factory=list)
+    rounds: list[list[Candidate]] = field(default_factory=list)
+    chain: list[Fitted] = field(default_factory=list)
+    added: list[str] = field(default_factory=list)
+    quiet: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
+    left: list[Left] = field(default_factory=list)
+
+    @property
+    def last(self) -> Fitted:
+        """The model with all that was found."""
+        return self.chain[-1]
+
+
+def analyse(
+    record: Record,
+    progress: Progress | None = None,
+    *,
+    most: int = MOST,
+    effects: Iterable[Effect] | None = None,
+    fitted: np.ndarray | None = None,
+) -> Analysis:
+    """Try all effects on a record, add the best, and go on while the evidence lasts."""
+    listed = list(registry().values() if effects is None else effects)
+    raw = inspect(record)
+    setup, base = prepare(record, raw, fitted)
+    work = Analysis(record, raw, base)
+    start = _with_given(work, base)
+    work.chain, work.quiet = [start], quiet_rows(start)
+    work.left = [left_over(start, work.quiet, raw.noise_sd_nm)]
+    for number in range(most):
+        if number and _exhausted(work):
+            break
+        candidates = scan(work.last, listed, progress, (0.1 + 0.3 * number, 0.1 + 0.3 * (number + 1)))
+        work.rounds.append(candidates)
+        margin = NEXT_MARGIN if work.added else FIRST_MARGIN
+        if not candidates or candidates[0].gain < margin:
+            break
+        _take(work, candidates[0].fitted, candidates[0].effect.id)
+        if number:
+            _exchange(work)
+    return work
+
+
+def _take(work: Analysis, fitted: Fitted, effect: str) -> None:
+    work.added.append(effect)
+    work.chain.append(fitted)
+    work.left.append(left_over(fitted, work.quiet, work.raw.noise_sd_nm))
+
+
+def _exhausted(work: Analysis) -> bool:
+    """Whether the residual is already as white and small as noise can be."""
+    left, last = work.left[-1], work.last
+    return left.ideal - last.log_likelihood < NEXT_MARGIN and left.ratio < NEXT_MARGIN
+
+
+def _with_given(work: Analysis, base: Fitted) -> Fitted:
+    """The base model with what the raw samples show beyond doubt."""
+    raw, setup, present = work.raw, base.problem.setup, []
+    effects = registry()
+    values: dict[int, dict[str, float]] = {}
+    if raw.hum is not None and "mains_hum" in effects:
+        values[len(present)] = raw.hum
+        present.append(("mains_hum", effects["mains_hum"].forms[0]))
+    for level, name, key in ((raw.ceiling_nm, "ceiling", "ceiling_nm"), (raw.floor_nm, "floor", "floor_nm")):
+        if level is not None and "sensor_clipping" in effects and not any(e == "sensor_clipping" for e, _ in present):
+            values[len(present)] = {key: level}
+            present.append(("sensor_clipping", effects["sensor_clipping"].form(name)))
+    if not present:
+        return base
+    work.given = [effect for effect, _ in present]
+    problem = Problem(setup, present)
+    return solve(problem, start_from(problem, base, values), base.noise)
+
+
+def _exchange(work: Analysis) -> None:
+    """After a further effect: would a rival of an earlier one now do better, or can an earlier one go?"""
+    last = work.last
+    for index, effect in enumerate(list(work.added[:-1])):
+        rivals = [c for c in work.rounds[index] if c.effect.id not in work.added][:2]
+        others = [(e, f) for e, f in last.effects if e != effect]
+        without = _refit(last, others)
+        if without is not None and without.log_evidence > work.last.log_evidence - 1.0:
+            work.added.remove(effect)
+            work.chain[-1] = without
+            work.left[-1] = left_over(without, work.quiet, work.raw.noise_sd_nm)
+            return
+        if without is None:
+            continue
+        for rival in rivals:
+            if rival.gain < 0.5 * work.rounds[index][0].gain:
+                continue
+            found = fit_form(rival.effect, rival.form, without, without.residual_nm, {})
+            if found is not None and found.log_evidence > work.last.log_evidence + 2.0:
+                work.added[index] = rival.effect.id
+                work.chain[-1] = found
+                work.left[-1] = left_over(found, work.quiet, work.raw.noise_sd_nm)
+                return
+
+
+def _refit(fitted: Fitted, effects: list) -> Fitted | None:
+    problem = Problem(fitted.problem.setup, effects)
+    return solve(problem, start_from(problem, fitted, {}), fitted.noise)

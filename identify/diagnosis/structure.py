@@ -1,0 +1,134 @@
+"""Is anything left? The residual while the muscle works against the residual while it rests, and against the noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from identify.engine.core import profile_noise
+from identify.engine.fit import Fitted
+from identify.grid import runs
+from identify.record import Record
+
+QUIET = 0.025
+"""Share of the largest torque below which the muscle counts as resting."""
+
+
+@dataclass(frozen=True)
+class Left:
+    """What is left of the residual of one model.
+
+    Parameters
+    ----------
+    white_nm : float
+        Standard deviation of an interval's mean from the samples' white noise alone, N·m.
+    quiet_nm, busy_nm : float
+        Residual while the muscle rests and while it works, N·m.
+    quiet_seconds : float
+        Length of the rests, s.
+    ratio : float
+        Log-likelihood gained by giving rests and work a noise of their own: large where structure goes with work.
+    ideal : float
+        Log-likelihood that noise as in the rests would have everywhere.
+    slow_nm : float
+        Standard deviation of the slow part of the residual, N·m.
+    ar1 : float
+        Correlation of neighbours of the residual as a whole.
+    """
+
+    white_nm: float
+    quiet_nm: float
+    busy_nm: float
+    quiet_seconds: float
+    ratio: float
+    ideal: float
+    slow_nm: float
+    ar1: float
+
+
+def left_over(fitted: Fitted, quiet: np.ndarray, noise_sd_nm: float) -> Left:
+    """Weigh a model's residual.
+
+    Parameters
+    ----------
+    fitted : Fitted
+        The model.
+    quiet : ndarray of bool, shape (K,)
+        Intervals in which the muscle rests.
+    noise_sd_nm : float
+        White noise of a sample, N·m.
+    """
+    setup, residual = fitted.problem.setup, fitted.residual_nm
+    count = float(np.median(setup.grid.count[setup.fitted]))
+    white = noise_sd_nm / np.sqrt(count)
+    rests, works = _long(setup.fitted & quiet, 8), _long(setup.fitted & ~quiet, 4)
+    together = _profile(residual, rests + works)
+    resting, working = _profile(residual, rests), _profile(residual, works)
+    ratio = resting[3] + working[3] - together[3] if rests and works else 0.0
+    lag = _lag_one(residual, setup.fitted)
+    return Left(
+        white_nm=white,
+        quiet_nm=_rms(residual, rests),
+        busy_nm=_rms(residual, works),
+        quiet_seconds=sum(r.stop - r.start for r in rests) * setup.grid.step_s,
+        ratio=ratio,
+        ideal=_ideal(residual, setup.fitted, resting, white, sum(r.stop - r.start for r in rests)),
+        slow_nm=fitted.noise.sd_nm * float(np.sqrt(fitted.noise.share)),
+        ar1=lag,
+    )
+
+
+def _ideal(residual: np.ndarray, fitted: np.ndarray, resting: tuple, white: float, size: int) -> float:
+    """Log-likelihood a record of this length would have, were its noise that of the rests throughout."""
+    total = int(fitted.sum())
+    at_white = -0.5 * total * (np.log(2 * np.pi * white * white) + 1.0)
+    if size < 40:
+        return at_white
+    return min(at_white, resting[3] / size * total)
+
+
+def _long(flags: np.ndarray, least: int) -> list[slice]:
+    return [run for run in runs(flags) if run.stop - run.start >= least]
+
+
+def _profile(residual: np.ndarray, parts: list[slice]) -> tuple[float, float, float, float]:
+    if not parts:
+        return (0.0, 0.0, 0.0, 0.0)
+    start = np.array([p.start for p in parts], np.int64)
+    stop = np.array([p.stop for p in parts], np.int64)
+    return profile_noise(residual, start, stop, 0.5, 0.5)
+
+
+def _rms(residual: np.ndarray, parts: list[slice]) -> float:
+    if not parts:
+        return 0.0
+    return float(np.sqrt(np.mean(np.concatenate([residual[p] for p in parts]) ** 2)))
+
+
+def _lag_one(residual: np.ndarray, fitted: np.ndarray) -> float:
+    pairs = fitted[1:] & fitted[:-1]
+    a, b = residual[1:][pairs], residual[:-1][pairs]
+    return float(a @ b / max(a @ a, 1e-30))
+
+
+def quiet_rows(fitted: Fitted) -> np.ndarray:
+    """bool, shape (K,): the muscle rests, as the model sees it."""
+    setup = fitted.problem.setup
+    torque = fitted.problem.run(fitted.theta)[0] - fitted.physical[3]
+    drive = fitted.physical[fitted.problem.coefficients] @ setup.design
+    level = QUIET * setup.scale_nm
+    still = (np.abs(torque) < level) & (np.abs(drive) < level)
+    # Half a second after the last torque: slow tails belong to work.
+    tail = int(round(0.5 / setup.grid.step_s))
+    busy = np.convolve(~still, np.r_[np.zeros(tail), np.ones(tail + 1)], "same") > 0
+    return still & ~busy
+
+
+def held_readings(record: Record) -> float:
+    """Share of samples that repeat the one before exactly, above what its number of distinct values explains."""
+    torque = record.torque_nm
+    inside = torque[(torque > torque.min()) & (torque < torque.max())]
+    if inside.size < 100:
+        return 0.0
+    return float(np.mean(np.diff(inside) == 0.0))

@@ -1,0 +1,171 @@
+"""Between fits and MODEL.json: a fitted candidate as a Model, and a Model with effects run on any record."""
+
+from __future__ import annotations
+
+import math
+import uuid
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+
+from identify.effects import get
+from identify.engine.fit import Fitted
+from identify.engine.prepare import block_means
+from identify.engine.problem import Problem
+from identify.engine.setup import Setup
+from identify.errors import BadModel
+from identify.grid import make_grid
+from identify.linear import SecondOrder
+from identify.model import Covariance, Model, Noise
+from identify.record import Record
+from identify.recruitment.curve import Curve
+from identify.recruitment.spline import SplineBasis
+from identify.simulate import fingerprint, same_data
+
+METHOD = "maximum-likelihood"
+
+
+def to_model(fitted: Fitted, record: Record, fit: dict[str, Any] | None = None, **changes: Any) -> Model:
+    """A fitted candidate as a model.
+
+    Parameters
+    ----------
+    fitted : Fitted
+        The candidate.
+    record : Record
+        What it was fitted on.
+    fit : dict
+        Figures for the model's `fit`.
+    """
+    problem, values = fitted.problem, fitted.physical
+    setup = problem.setup
+    names = tuple(p.name for p in problem.table[: problem.coefficients.stop])
+    listed = list(names)
+    for chosen in problem.chosen:
+        listed += [f"{chosen.effect}.{p.name}" for p in chosen.parameters]
+    matrix = fitted.covariance()
+    width = setup.grid.pulse_width_us[setup.fitted]
+    model = Model(
+        method=METHOD,
+        recruitment=Curve(setup.basis, values[problem.coefficients].copy()),
+        linear=SecondOrder(float(values[0]), float(values[1]), float(values[2])),
+        pulse_rate_hz=record.pulse_rate_hz,
+        sample_rate_hz=record.sample_rate_hz,
+        baseline_nm=float(values[3]),
+        noise=Noise(
+            white_sd_nm=setup.noise_sd_nm,
+            block_sd_nm=fitted.noise.sd_nm,
+            ar1=fitted.noise.ar1 if fitted.noise.share > 0.05 else 0.0,
+        ),
+        effects=tuple(_effect(fitted, index, matrix) for index in range(len(problem.chosen))),
+        covariance=Covariance(tuple(listed), values, matrix),
+        fit=dict(fit or {}) | {"log_evidence": fitted.log_evidence, "log_likelihood": fitted.log_likelihood},
+        valid_for={
+            "pulse_width_us": [float(width.min()), float(width.max())],
+            "torque_nm": [float(np.nanmin(setup.target_nm)), float(np.nanmax(setup.target_nm))],
+            "sample_rate_hz": [record.pulse_rate_hz, 2000.0],
+        },
+        data={
+            "fingerprint": fingerprint(record),
+            "recording_id": record.source.recording_id,
+            "sha256": record.source.sha256,
+            "name": record.source.name,
+        },
+        model_id=uuid.uuid4().hex,
+        created=datetime.now(UTC).isoformat(timespec="seconds"),
+    )
+    return model.with_(**changes) if changes else model
+
+
+def _effect(fitted: Fitted, index: int, matrix: np.ndarray) -> dict[str, Any]:
+    chosen = fitted.problem.chosen[index]
+    setup = fitted.problem.setup
+    return {
+        "id": chosen.effect,
+        "form": chosen.form.name,
+        "stage": chosen.form.stage,
+        "equation": chosen.form.equation,
+        "parameters": describe_parameters(fitted, index, matrix),
+        "settings": {
+            "scale_nm": setup.scale_nm,
+            "largest_us": float(setup.basis.knots_us[-1]),
+            "noise_sd_nm": setup.noise_sd_nm,
+        },
+    }
+
+
+def describe_parameters(fitted: Fitted, index: int, matrix: np.ndarray | None = None) -> dict[str, dict[str, Any]]:
+    """Value, sd and unit of an effect's parameters by name."""
+    chosen = fitted.problem.chosen[index]
+    matrix = fitted.covariance() if matrix is None else matrix
+    values = fitted.physical
+    return {
+        p.name: {"value": float(values[i]), "sd": float(np.sqrt(max(matrix[i, i], 0.0))), "unit": p.unit}
+        for i, p in zip(chosen.places, chosen.parameters, strict=True)
+    }
+
+
+def predict(model: Model, record: Record) -> np.ndarray:
+    """Free-run torque of a model with effects at a record's samples, N·m, shape (N,).
+
+    What can't be foreseen (bumps, tremor) is given back on the rows it was fitted on alone.
+
+    Raises
+    ------
+    BadModel
+        An effect or its form is unknown here, or the record lacks a column that it needs.
+    """
+    problem, theta = _problem(model, record)
+    unforeseen = frozenset(e["id"] for e in model.effects if not get(e["id"]).foreseeable)
+    foreseen = problem.at_samples(theta, unforeseen)
+    if not unforeseen or not same_data(model, record):
+        return foreseen
+    return np.where(record.held_out, foreseen, problem.at_samples(theta))
+
+
+def predict_fitted(fitted: Fitted, record: Record) -> np.ndarray:
+    """As `predict`, for a candidate on its own record."""
+    unforeseen = frozenset(e for e, _ in fitted.effects if not get(e).foreseeable)
+    foreseen = fitted.problem.at_samples(fitted.theta, unforeseen)
+    if not unforeseen:
+        return foreseen
+    return np.where(record.held_out, foreseen, fitted.problem.at_samples(fitted.theta))
+
+
+def _problem(model: Model, record: Record) -> tuple[Problem, np.ndarray]:
+    basis = model.recruitment.basis
+    if not isinstance(basis, SplineBasis) or not isinstance(model.linear, SecondOrder):
+        raise BadModel("effects stand on a spline and a second order only", mend="Fit with maximum-likelihood.")
+    grid = make_grid(record)
+    settings = model.effects[0]["settings"] if model.effects else {}
+    setup = Setup(
+        grid=grid,
+        target_nm=block_means(grid, record.torque_nm),
+        fitted=grid.fitted,
+        basis=basis,
+        stiffness=1.0,
+        scale_nm=float(settings.get("scale_nm", 1.0)),
+        noise_sd_nm=float(settings.get("noise_sd_nm", 0.0)),
+        delay_bounds_s=(-math.inf, math.inf),
+    )
+    effects = []
+    values = [model.linear.time_constant_s, model.linear.damping, model.linear.delay_s, model.baseline_nm]
+    values += list(model.recruitment.coefficients_nm)
+    for entry in model.effects:
+        try:
+            effect = get(entry["id"])
+            form = effect.form(entry.get("form", ""))
+            values += [float(_value(entry["parameters"][p.name])) for p in form.parameters]
+        except Exception as error:
+            raise BadModel(f"{error}", place=f"effects.{entry.get('id')}", mend="Install the effect's file.") from error
+        for need in effect.needs:
+            if getattr(record, need) is None:
+                raise BadModel(f"{effect.id} needs the column {need}", place=need, mend="Record it, or leave it out.")
+        effects.append((effect.id, form))
+    problem = Problem(setup, effects)
+    return problem, problem.from_physical(np.asarray(values, float))
+
+
+def _value(entry: Any) -> float:
+    return entry["value"] if isinstance(entry, dict) else entry
