@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.wire.processes import Bench
+from tests.wire.processes import Bench, RigClient
 
 SPEED = 4.0
 
@@ -25,6 +25,14 @@ def make_bench(tmp_path: Path) -> Iterator[Callable[..., Bench]]:
     yield make
     for bench in benches:
         bench.close()
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Bench, RigClient]]:
+    """One emulator and one rig for a whole file: each test also shows that the rig came back from the one before."""
+    bench = Bench(tmp_path_factory.mktemp("shared"), "--noise-seed", "7", speed=SPEED)
+    yield bench, bench.start_rig()
+    bench.close()
 
 
 @pytest.fixture

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import signal
+import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from rig import archive
-from tests.wire.conftest import SPEED
 from tests.wire.processes import Bench, RigClient, control, default_plan, kill_hard, short_plan
 
 pytestmark = pytest.mark.wire
@@ -27,7 +26,6 @@ FAULTS = {
     "counter_jump": "jumped",
     "stimulator_unplugged": "stimulator",
     "device_reset": "not initialised",
-    "cell_unplugged": "load cell",
 }
 
 
@@ -50,14 +48,6 @@ def start(bench: Bench, test_id: str = "t", client: RigClient | None = None) -> 
         assert time.monotonic() < end
         time.sleep(0.02)
     return client
-
-
-@pytest.fixture(scope="module")
-def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Bench, RigClient]]:
-    """One emulator and one rig for all faults: each test also shows that the rig came back from the one before."""
-    bench = Bench(tmp_path_factory.mktemp("shared"), "--noise-seed", "7", speed=SPEED)
-    yield bench, bench.start_rig()
-    bench.close()
 
 
 def state(bench: Bench) -> dict[str, Any]:
@@ -98,15 +88,42 @@ def test_a_fault_stops_is_told_and_latches(shared: tuple[Bench, RigClient], faul
     bench.fault(cmd="fault", name=fault, on=False)
     time.sleep(0.1)
     rearmed = client.ask("rearm", by="nurse")
-    if fault == "cell_unplugged":  # the emulated adapter comes back under another port
-        assert rearmed["problem"]["code"] == "disconnected"
-    else:
-        assert rearmed["ok"], rearmed
-        assert rearmed["body"]["state"] == "ready"
+    assert rearmed["ok"], rearmed
+    assert rearmed["body"]["state"] == "ready"
 
 
-def test_stop_is_confirmed_by_device_and_torque(bench: Bench):
-    client = start(bench)
+def test_a_load_cell_that_is_unplugged_and_comes_back_elsewhere(bench: Bench):
+    client = start(bench, "unplugged")
+    assert bench.fault(cmd="fault", name="cell_unplugged", on=True)["ok"]
+    check_kept(client.wait_finished("unplugged"), "fault")
+    bench.fault(cmd="fault", name="cell_unplugged", on=False)  # under another port
+    assert client.ask("rearm", by="nurse")["problem"]["code"] == "disconnected"
+    assert client.ask("start", plan=short_plan("refused"))["problem"]["code"] == "latched"
+
+
+@pytest.mark.parametrize("fault", ["frames_duplicated", "frames_out_of_order", "error_frames"])
+def test_disorder_on_the_bus_is_counted_and_harmless(shared: tuple[Bench, RigClient], fault: str):
+    bench, client = shared
+    client.ask("subscribe")
+    assert bench.fault(cmd="fault", name=fault, on=True, probability=0.05)["ok"]
+    assert client.ask("start", plan=short_plan(fault))["ok"]
+    event = client.wait_finished(fault)
+    bench.fault(cmd="fault", name=fault, on=False)
+    assert event["outcome"] == "completed", event
+    counted = {
+        "frames_duplicated": "duplicate_samples",
+        "frames_out_of_order": "disordered_samples",
+        "error_frames": "error_frames",
+    }[fault]
+    assert event["summary"][counted] > 50
+    with h5py.File(event["recording_path"]) as file:
+        assert np.all(np.diff(file["torque/counter"][:]) >= 1)
+        assert np.all(np.diff(file["torque/time_s"][:]) > 0)
+
+
+def test_stop_is_confirmed_by_device_and_torque(shared: tuple[Bench, RigClient]):
+    bench, client = shared
+    start(bench, "t", client)
     other = bench.client()
     evidence = other.ask("stop", reason="participant asks", by="nurse")["body"]
     assert evidence["confirmed"], evidence
@@ -122,10 +139,32 @@ def test_stop_is_confirmed_by_device_and_torque(bench: Bench):
     assert client.ask("rearm", by="nurse")["body"]["state"] == "ready"
 
 
-def test_stop_while_idle_latches_too(bench: Bench):
-    client = bench.start_rig()
+def test_stop_while_idle_latches_too(shared: tuple[Bench, RigClient]):
+    client = shared[1]
+    assert client.status()["state"] == "ready"
     assert client.ask("stop", reason="check", by="nurse")["body"]["confirmed"]
     assert client.status()["state"] == "latched"
+    assert client.ask("rearm", by="nurse")["ok"]
+
+
+def test_a_stop_in_the_moment_of_starting_wins(shared: tuple[Bench, RigClient]):
+    bench, client = shared
+    other = bench.client()
+    for attempt in range(8):
+        started: list[dict[str, Any]] = []
+        plan = default_plan(f"race{attempt}", segments=STEPS[1:])
+        thread = threading.Thread(target=lambda plan=plan: started.append(client.ask("start", plan=plan)))
+        thread.start()
+        time.sleep(attempt * 0.004)
+        other.ask("stop", reason="race", by="nurse")
+        count = state(bench)["pulses_received"]
+        thread.join()
+        status = client.wait_state("latched")
+        assert "race" in status["reason"]
+        time.sleep(0.05)
+        assert state(bench)["pulses_received"] == count
+        assert started[0]["ok"] or started[0]["problem"]["code"] == "latched"
+        assert client.ask("rearm", by="nurse")["ok"]
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
@@ -171,12 +210,13 @@ def test_a_killed_rig_sends_no_more_and_comes_back_uncertain(bench: Bench):
     assert client.wait_finished("next")["outcome"] == "completed"
 
 
-def test_lost_samples_are_found_and_marked(bench: Bench):
-    client = bench.start_rig()
+def test_lost_samples_are_found_and_marked(shared: tuple[Bench, RigClient]):
+    bench, client = shared
     client.ask("subscribe")
     assert bench.fault(cmd="fault", name="frames_dropped", on=True, probability=0.02)["ok"]
     assert client.ask("start", plan=short_plan("gaps"))["ok"]
     event = client.wait_finished("gaps")
+    bench.fault(cmd="fault", name="frames_dropped", on=False)
     assert event["outcome"] == "completed"
     with h5py.File(event["recording_path"]) as file:
         gaps, counter = file["torque/gaps"][:], file["torque/counter"][:]

@@ -7,16 +7,16 @@ import time
 
 import pytest
 
-from tests.wire.processes import Bench, default_plan, short_plan
+from tests.wire.processes import Bench, RigClient, default_plan, short_plan
 
 pytestmark = pytest.mark.wire
 
 
-def test_a_page_sees_torque_before_and_during_a_test(bench: Bench):
-    client = bench.start_rig()
+def test_a_page_sees_torque_before_and_during_a_test(shared: tuple[Bench, RigClient]):
+    _bench, client = shared
     client.ask("subscribe")
-    first = client.events.get(timeout=5)
-    assert first["event"] == "state"
+    while client.events.get(timeout=5)["event"] != "state":
+        pass
     live = client.events.get(timeout=5)
     assert live["event"] == "live"
     assert live["test_id"] is None
@@ -37,8 +37,8 @@ def test_a_page_sees_torque_before_and_during_a_test(bench: Bench):
     assert client.status()["finished"]["test_id"] == "live"
 
 
-def test_refusals_name_the_reason(bench: Bench):
-    client = bench.start_rig()
+def test_refusals_name_the_reason(shared: tuple[Bench, RigClient]):
+    _bench, client = shared
     wide = default_plan("w")
     wide["profile"]["max_pulse_width_us"] = 250.0
     wide["segments"] = [{"name": "ramp", "sequence": "ramp", "settings": {"max_pulse_width_us": 300}}]
@@ -53,8 +53,8 @@ def test_refusals_name_the_reason(bench: Bench):
     assert client.status()["state"] == "ready"
 
 
-def test_malformed_requests_are_answered_not_fatal(bench: Bench):
-    client = bench.start_rig()
+def test_malformed_requests_are_answered_not_fatal(shared: tuple[Bench, RigClient]):
+    bench, client = shared
     for line in ("not json", '{"kind": "dance"}', '{"kind": "start", "plan": {"test_id": 5}}', "[]"):
         raw = bench.client()
         raw._replies[0] = client.events.__class__()
@@ -65,8 +65,8 @@ def test_malformed_requests_are_answered_not_fatal(bench: Bench):
     assert client.status()["state"] == "ready"
 
 
-def test_preview_gives_duration_and_dose(bench: Bench):
-    client = bench.start_rig()
+def test_preview_gives_duration_and_dose(shared: tuple[Bench, RigClient]):
+    _bench, client = shared
     table = {"pulse_width_us": [0.0, 100.0, 300.0], "torque_nm": [0.0, 0.0, 8.0]}
     body = client.ask("preview", plan=default_plan("p"), recruitment=table)["body"]
     assert body["duration_s"] == pytest.approx(38.7)
@@ -76,18 +76,21 @@ def test_preview_gives_duration_and_dose(bench: Bench):
     assert len(body["pulse_width_us"]) == 1548
 
 
-def test_a_second_start_is_refused_and_names_the_holder(bench: Bench):
-    client, other = bench.start_rig(), bench.client()
+def test_a_second_start_is_refused_and_names_the_holder(shared: tuple[Bench, RigClient]):
+    bench, client = shared
+    other = bench.client()
     assert client.ask("start", plan=default_plan("mine"))["ok"]
     reply = other.ask("start", plan=default_plan("yours"))
     assert reply["problem"]["code"] == "busy"
     assert "mine" in reply["problem"]["detail"]
     evidence = other.ask("stop", reason="enough", by="somebody else")["body"]
     assert evidence["confirmed"], evidence
+    client.wait_state("latched")
+    assert client.ask("rearm", by="nurse")["ok"]
 
 
-def test_status_is_answered_in_milliseconds_while_a_test_runs(bench: Bench):
-    client = bench.start_rig()
+def test_status_is_answered_in_milliseconds_while_a_test_runs(shared: tuple[Bench, RigClient]):
+    _bench, client = shared
     client.ask("start", plan=default_plan("s"))
     waits = []
     for _ in range(20):
@@ -98,3 +101,6 @@ def test_status_is_answered_in_milliseconds_while_a_test_runs(bench: Bench):
     assert status["participant"] == "P01"
     assert sorted(waits)[10] < 0.1
     assert json.dumps(status)
+    client.ask("stop", reason="done", by="nurse")
+    client.wait_state("latched")
+    assert client.ask("rearm", by="nurse")["ok"]

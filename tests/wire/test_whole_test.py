@@ -82,9 +82,9 @@ def test_default_test_in_real_time(make_bench: Callable[..., Bench]):
         assert file["segments/end_s"][-1] == pytest.approx(38.7)
 
 
-def test_sped_up_default_test_over_slcan(make_bench: Callable[..., Bench]):
+def test_sped_up_test_over_slcan(make_bench: Callable[..., Bench]):
     bench = make_bench("--load-cell", "slcan", "--noise-seed", "5")
-    event = play(bench, default_plan("fast"))
+    event = play(bench, short_plan("fast"))
     check_recording(bench, event)
 
 
