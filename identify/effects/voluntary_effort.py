@@ -9,7 +9,7 @@ import numpy as np
 
 from identify.effects.base import Effect, Form, Parameter, Scene
 
-MOST = 7
+MOST = 6
 """Bumps at most: with more, they imitate anything."""
 
 
@@ -52,12 +52,12 @@ def _propose(count: int) -> Callable[..., list[dict[str, float]]]:
 
 
 def _parameters(count: int) -> tuple[Parameter, ...]:
-    listed = [Parameter("flatness", "1", 1.3, 6.0, 2.0, (2.0,), "log", about="2 is a Gaussian, more is flatter")]
+    listed = [Parameter("flatness", "1", 1.6, 6.0, 2.0, (2.0,), "log", about="2 is a Gaussian, more is flatter")]
     for i in range(count):
         listed += [
             Parameter(f"centre_{i}_s", "s", 0.0, 600.0, 0.0, (1.0,), about="middle"),
-            Parameter(f"width_{i}_s", "s", 0.08, 3.0, 0.5, (0.5,), "log", about="half-width"),
-            Parameter(f"height_{i}_nm", "N·m", 0.0, 1.2, 0.0, (0.1,), relative="torque", about="peak torque"),
+            Parameter(f"width_{i}_s", "s", 0.14, 3.0, 0.5, (0.5,), "log", about="half-width"),
+            Parameter(f"height_{i}_nm", "N·m", 0.0, 0.9, 0.0, (0.1,), relative="torque", about="peak torque"),
         ]
     return tuple(listed)
 

@@ -1,0 +1,136 @@
+"""A verdict in the contract's words, and in a clinician's."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from identify.diagnosis.analysis import Analysis
+from identify.diagnosis.verdict import Verdict
+from identify.diagnosis.where import worst_places
+from identify.effects import get
+from identify.engine.export import describe_parameters, predict_fitted
+from identify.engine.figures import figures
+from identify.engine.fit import Fitted
+
+RIVAL = 0.04
+"""Probability from which an effect is named as one that the record can't tell from the best."""
+
+
+def report(work: Analysis, verdict: Verdict) -> dict[str, Any]:
+    """The contract's JSON."""
+    record, raw = work.record, work.raw
+    base_prediction = predict_fitted(work.base, record)
+    base = figures(work.base, record, base_prediction)
+    models = _models(work)
+    missing = [_missing(work, verdict, effect, base, models) for effect in _ranked(verdict)]
+    final = models.get(len(work.added), base) if work.chain[-1] is not work.base else base
+    residual = record.torque_nm - (predict_fitted(work.last, record) if verdict.kind == "unexplained_structure" else base_prediction)
+    where = worst_places(record, residual, raw.noise_sd_nm, rows=~record.held_out)
+    return {
+        "noise_sd_nm": raw.noise_sd_nm,
+        "slow_noise": {"sd_nm": work.last.noise.sd_nm * float(np.sqrt(work.last.noise.share)), "ar1": work.last.noise.ar1},
+        "base": {key: base[key] for key in ("fit_percent", "held_out_fit_percent", "rms_nm", "held_out_rms_nm", "ceiling_percent", "held_out_ceiling_percent", "held_out")},
+        "verdict": verdict.kind,
+        "probability": verdict.probability,
+        "missing": missing,
+        "where": where,
+        "with_all": final,
+        "explained": verdict.explained,
+        "structure_left": verdict.structure,
+        "candidates": _candidates(work),
+        "notes": verdict.notes,
+        "plain": _plain(work, verdict, base, final, missing, where),
+    }
+
+
+def _ranked(verdict: Verdict) -> list[str]:
+    return sorted(verdict.found, key=lambda effect: -verdict.found[effect])
+
+
+def _models(work: Analysis) -> dict[int, dict[str, Any]]:
+    return {i: figures(fitted, work.record) for i, fitted in enumerate(work.chain) if i or work.given}
+
+
+def _missing(
+    work: Analysis, verdict: Verdict, effect: str, base: dict[str, Any], models: dict[int, dict[str, Any]]
+) -> dict[str, Any]:
+    number = work.added.index(effect) if effect in work.added else -1
+    before = base if number <= 0 and 0 not in models else models[max(number, 0)]
+    before = base if number < 0 else before
+    after = models.get(number + 1, base)
+    fitted = work.last
+    index = [e for e, _ in fitted.effects].index(effect)
+    rivals = verdict.rivals.get(effect, {})
+    confused = [name for name, p in sorted(rivals.items(), key=lambda item: -item[1]) if name and name != effect and p >= RIVAL]
+    described = get(effect)
+    return {
+        "effect": effect,
+        "name": described.name,
+        "probability": verdict.found[effect],
+        "rms_before_nm": before["rms_nm"],
+        "rms_after_nm": after["rms_nm"],
+        "held_out_rms_before_nm": before["held_out_rms_nm"],
+        "held_out_rms_after_nm": after["held_out_rms_nm"],
+        "confused_with": confused,
+        "next_experiment": described.separated_by,
+        "form": fitted.effects[index][1].name,
+        "equation": fitted.effects[index][1].equation,
+        "parameters": describe_parameters(fitted, index),
+        "rival_probabilities": {name: p for name, p in rivals.items() if name and p >= 0.005},
+        "plain": described.plain,
+    }
+
+
+def _candidates(work: Analysis) -> list[list[dict[str, Any]]]:
+    return [
+        [
+            {
+                "effect": c.effect.id,
+                "form": c.form.name,
+                "log_evidence_gain": c.gain,
+                "rms_nm": c.fitted.rms_nm,
+                "forms": c.forms,
+            }
+            for c in found
+        ]
+        for found in work.rounds
+    ]
+
+
+def _plain(
+    work: Analysis, verdict: Verdict, base: dict[str, Any], final: dict[str, Any], missing: list, where: list
+) -> list[str]:
+    noise = work.raw.noise_sd_nm
+    lines = [
+        f"The model without effects fits {base['fit_percent']:.1f} % where noise of {noise:.3g} N·m allows "
+        f"{base['ceiling_percent']:.1f} %; on rows not fitted it errs by {base['held_out_rms_nm']:.3g} N·m."
+    ]
+    if verdict.kind == "nothing_missing":
+        lines.append("Nothing is missing: what is left looks like noise, at work and at rest alike.")
+    if verdict.kind == "unexplained_structure":
+        lines.append(
+            "There is structure left that no effect of the library explains: the error goes with the muscle's work, and "
+            "isn't noise of the measurement."
+        )
+        if where:
+            lines.append(f"It sits mostly here: {where[0]['text']}.")
+    for entry in missing:
+        sure = "very probably" if entry["probability"] > 0.9 else "probably" if entry["probability"] > 0.6 else "possibly"
+        text = f"{entry['name']} is {sure} missing ({100 * entry['probability']:.0f} %). {entry['plain']}"
+        if entry["confused_with"]:
+            others = ", ".join(get(name).name.lower() for name in entry["confused_with"])
+            text += f" This record can't quite tell it from: {others}. To decide: {entry['next_experiment']}"
+        lines.append(text)
+    if missing and verdict.kind == "effect_missing":
+        lines.append(
+            f"With {'it' if len(missing) == 1 else 'them'} the error falls from {base['held_out_rms_nm']:.3g} to "
+            f"{final['held_out_rms_nm']:.3g} N·m on rows not fitted."
+        )
+    return lines + verdict.notes
+
+
+def last_of(work: Analysis) -> Fitted:
+    """The model with all that was found."""
+    return work.last

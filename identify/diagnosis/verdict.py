@@ -1,0 +1,99 @@
+"""From evidence to a verdict with probabilities, calibrated on development records (docs/diagnosis.md)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from identify.diagnosis.analysis import Analysis
+from identify.diagnosis.candidates import Candidate
+from identify.diagnosis.structure import held_readings
+
+TEMPERATURE = 2.0
+"""Spread, in log evidence, that the best form of a rival may lose by chance."""
+RELATIVE = 0.03
+"""And in proportion to the gain: a form close to the truth explains most, not all."""
+LEAST_EXPLAINED = 0.55
+"""Share of the explicable log-likelihood below which the rest counts as structure of another kind."""
+STRUCTURE = 12.0
+"""Log-likelihood by which work and rest must differ for structure to be left."""
+HELD = 0.3
+"""Share of repeated samples that no noisy converter gives."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What a record says.
+
+    Parameters
+    ----------
+    kind : str
+        "effect_missing", "nothing_missing" or "unexplained_structure".
+    found : dict
+        Probability by effect, of those added.
+    rivals : dict
+        Probability by effect of all that were tried in the round in which each was added.
+    explained : float
+        Share of the explicable log-likelihood that the effects took.
+    structure : float
+        Log-likelihood by which work and rest still differ.
+    probability : float
+        Of the verdict as a whole.
+    notes : list of str
+        Reasons, for people.
+    """
+
+    kind: str
+    found: dict[str, float]
+    rivals: dict[str, dict[str, float]]
+    explained: float
+    structure: float
+    probability: float
+    notes: list[str] = field(default_factory=list)
+
+
+def shares(candidates: list[Candidate]) -> dict[str, float]:
+    """Probability of each candidate, given that one of them is there, and of none ("")."""
+    if not candidates:
+        return {"": 1.0}
+    top = candidates[0].gain
+    spread = TEMPERATURE + RELATIVE * max(top, 0.0)
+    weights = {c.effect.id: float(np.exp(max((c.gain - top) / spread, -60.0))) for c in candidates}
+    weights[""] = float(np.exp(np.clip(-top, -60.0, 60.0)))
+    total = sum(weights.values())
+    return {name: weight / total for name, weight in weights.items()}
+
+
+def judge(work: Analysis) -> Verdict:
+    """The verdict on an analysis."""
+    first, last = work.chain[0], work.last
+    left = work.left[-1]
+    possible = max(left.ideal - first.log_likelihood, 1.0)
+    explained = (last.log_likelihood - first.log_likelihood) / possible if work.added else 0.0
+    held = held_readings(work.record)
+    notes: list[str] = []
+    found: dict[str, float] = dict.fromkeys(work.given, 0.99)
+    rivals: dict[str, dict[str, float]] = {}
+    for number, effect in enumerate(work.added):
+        if number >= len(work.rounds):
+            break
+        rivals[effect] = shares([c for c in work.rounds[number] if c.effect.id == effect or c.effect.id not in work.added])
+        found[effect] = rivals[effect].get(effect, 0.5)
+    structure = left.ratio
+    strange = held > HELD
+    if strange:
+        notes.append(f"{100 * held:.0f} % of the readings repeat the one before exactly: the converter holds or steps.")
+    if work.added:
+        strange = strange or (explained < LEAST_EXPLAINED and structure > STRUCTURE)
+    else:
+        strange = strange or structure > STRUCTURE
+    if strange:
+        found = {effect: min(p, 0.45) for effect, p in found.items()}
+        kind = "unexplained_structure"
+        probability = 0.9
+    elif found:
+        kind, probability = "effect_missing", max(found.values())
+    else:
+        kind, probability = "nothing_missing", 1.0 - sum(p for n, p in shares(work.rounds[0] if work.rounds else []).items() if n)
+    return Verdict(kind, found, rivals, float(explained), float(structure), float(probability), notes)
