@@ -26,6 +26,7 @@ T_BOUNDS_S = (0.012, 4.0)
 ZETA_BOUNDS = (0.15, 4.0)
 LONGEST_DELAY_S = 0.2
 STARTS_S = (0.08, 0.22, 0.55)
+CURVE_POINTS = 201
 
 
 @dataclass
@@ -398,32 +399,31 @@ def pilot_solution(grid: Grid, rows: np.ndarray, from_rest: bool, delay_s: float
 def designed(first: Solution, count: int = KNOTS) -> tuple[Problem, SecondOrder]:
     """The problem with its final spline, in two steps from a pilot, and where to begin its search.
 
-    The pilot's few knots say roughly where the curve bends; a first fit with all knots says it well, and how much.
+    The pilot's few knots say roughly where the curve bends; a curve with all knots says it better, and how much; a
+    second such look sharpens a steep rise.
     """
-    grid, rows = first.problem.grid, first.problem.rows
-    from_rest, delay_s = first.problem.from_rest, first.problem.delay_s
-    largest = float(np.max(grid.pulse_width_us))
-    basis = SplineBasis(adapted_knots(pilot_curve(first), largest, count))
-    rough = search(
-        Problem(grid, basis, spline_roughness(basis), rows, from_rest, delay_s), first.linear, most=3, tolerance=0.3
-    )
-    again = _redesigned(rough, largest, count)
-    return _redesigned(project(again, rough.linear), largest, count), rough.linear
+    old = first.problem
+    basis = SplineBasis(adapted_knots(pilot_curve(first), float(np.max(old.grid.pulse_width_us)), count))
+    problem = Problem(old.grid, basis, spline_roughness(basis), old.rows, old.from_rest, old.delay_s)
+    target = whiten(problem.target, problem.stretches, 0.0)
+    for _ in range(2):
+        coefficients = _assess(problem, first.linear, target, 0.0, None).coefficients[: basis.size]
+        problem, basis = _redesigned(problem, basis, coefficients, count)
+    return problem, first.linear
 
 
-def _redesigned(solution: Solution, largest_us: float, count: int) -> Problem:
-    """The problem with knots and penalty from a solution's own curve."""
-    old = solution.problem
-    basis = SplineBasis(adapted_knots(pilot_curve(solution), largest_us, count))
-    assert isinstance(old.basis, SplineBasis)
-    roughness = spline_roughness(basis, (old.basis, solution.coefficients[: old.basis.size]))
-    return Problem(old.grid, basis, roughness, old.rows, old.from_rest, old.delay_s)
+def _redesigned(old: Problem, basis: SplineBasis, coefficients: np.ndarray, count: int) -> tuple[Problem, SplineBasis]:
+    """The problem with knots and penalty from a first curve."""
+    u = np.linspace(0.0, basis.largest_us, CURVE_POINTS)
+    new = SplineBasis(adapted_knots((u, basis.design(u) @ coefficients), basis.largest_us, count))
+    roughness = spline_roughness(new, (basis, coefficients))
+    return Problem(old.grid, new, roughness, old.rows, old.from_rest, old.delay_s), new
 
 
 def pilot_curve(solution: Solution) -> tuple[np.ndarray, np.ndarray]:
     """The curve of a solution on 201 pulse widths."""
     basis = solution.problem.basis
-    u = np.linspace(0.0, basis.largest_us, 201)
+    u = np.linspace(0.0, basis.largest_us, CURVE_POINTS)
     return u, basis.design(u) @ solution.coefficients[: basis.size]
 
 

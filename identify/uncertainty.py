@@ -17,11 +17,11 @@ from identify.record import Record
 from identify.recruitment.curve import Basis
 
 POINTWISE = 1.959964
-DRAWS = 512
+DRAWS = 400
 DYNAMICS = ("time_constant_s", "damping", "delay_s")
 
 
-def bands(model: Model, points: int = 61) -> dict[str, Any]:
+def bands(model: Model, points: int = 41) -> dict[str, Any]:
     """Bands on both curves, as MODEL.json carries them; empty where the method gives no covariance."""
     covariance, linear = model.covariance, model.linear
     if covariance is None or not isinstance(linear, SecondOrder):

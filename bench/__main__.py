@@ -1,0 +1,34 @@
+"""`python -m bench [NAME …]`: peers, table1, goals, drawings; all of them without a name."""
+
+from __future__ import annotations
+
+import os
+import sys
+
+# Before numpy is loaded: one core, so that times mean something and don't depend on what else runs.
+for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(name, "1")
+os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+
+NAMES = ("goals", "table1", "drawings", "peers")
+
+
+def main() -> int:
+    from importlib import import_module
+
+    names = sys.argv[1:] or list(NAMES)
+    unknown = [name for name in names if name not in NAMES]
+    if unknown:
+        print(f"no bench {unknown[0]!r}; there are {', '.join(NAMES)}", file=sys.stderr)
+        return 2
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    for name in names:
+        print(f"== {name}", flush=True)
+        import_module(f"bench.{name}").run()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
