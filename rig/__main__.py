@@ -26,6 +26,7 @@ from rig.errors import RigError
 SWITCH_INTERVAL_S = 0.0005
 """How long a thread may hold the interpreter while the sender waits; Python's default is 5 ms."""
 PROCESS_PRIORITY = 10
+PARENT_PERIOD_S = 0.5
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -37,7 +38,7 @@ def main(arguments: list[str] | None = None) -> int:
         if options.check:
             _check(config)
             return 0
-        asyncio.run(_serve(config))
+        asyncio.run(_serve(config, os.getppid() if options.die_with_parent else None))
     except RigError as error:
         print(f"rig: {error}", file=sys.stderr)
         return 2
@@ -53,6 +54,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--data", type=Path, help="folder for journals and recordings; wins over the rig file")
     parser.add_argument("--clock-speed", type=float, help="rig seconds a real second, for an emulator that runs faster")
     parser.add_argument("--check", action="store_true", help="check the rig file and the DBC, then exit")
+    parser.add_argument("--die-with-parent", action="store_true", help="end, as by SIGTERM, when the parent has died")
     parser.add_argument("--verbose", action="store_true")
     return parser
 
@@ -72,7 +74,7 @@ def _check(config: configuration.RigConfig) -> None:
     print(json.dumps({"ok": True, "stimulator": config.stimulator.device, "load_cell": config.load_cell.device}))
 
 
-async def _serve(config: configuration.RigConfig) -> None:
+async def _serve(config: configuration.RigConfig, parent: int | None) -> None:
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     with contextlib.suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(PROCESS_PRIORITY))
@@ -85,7 +87,9 @@ async def _serve(config: configuration.RigConfig) -> None:
     await asyncio.to_thread(rig.open)
     await server.start(rig, config.socket)
     print(json.dumps({"socket": str(config.socket), "state": rig.status().state}), flush=True)
-    await stop.wait()
+    while not stop.is_set() and parent in (None, os.getppid()):
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(stop.wait(), PARENT_PERIOD_S)
     logging.getLogger("rig").info("asked to end")
     await asyncio.to_thread(rig.close)
     await server.close()

@@ -203,7 +203,7 @@ def _torque(
     inside = np.flatnonzero((time_s >= 0) & (time_s < end_s))
     steps = np.diff(counter)
     after = np.flatnonzero((steps > 1) & (counter[:-1] >= 0)) + 1
-    after = after[np.isin(after, inside)]
+    after = after[np.isin(after, inside) & np.isin(after - 1, inside)]
     gaps = np.column_stack([np.searchsorted(inside, after), steps[after - 1] - 1])
     measured_hz = sample_rate_hz / (1 + alignment.rate_ppm * 1e-6)
     columns: dict[str, NDArray[Any]] = {

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
+from rig.acquire.evidence import AROUND_S, evidence, stop_device, watch_decay
 from rig.acquire.halt import Cause, Halt
 from rig.acquire.receiver import Receiver
 from rig.clock import Clock
@@ -24,7 +25,7 @@ from rig.errors import DeviceError, JournalError
 from rig.gate import Gate
 from rig.journal import Journal, Kind
 from rig.limits import Limit
-from rig.messages import StopEvidence
+from rig.messages import StopEvidence, TestOutcome
 from rig.plan import PlannedTest
 from rig.signals import Pulse, Recorded
 
@@ -35,8 +36,6 @@ LEAD_S = 0.1
 SENDER_PRIORITY = 50
 FRESH_S = 0.5
 """Real seconds to wait for a fresh torque before arming."""
-DECAY_S = 3.0
-NEAR_REST_NM = 0.5
 SYNC_PERIOD_S = 1.0
 STALL_S = 0.25
 """Real seconds of lateness that are no hiccup any more: a test with such a hole ends."""
@@ -55,7 +54,7 @@ class Watch:
 class RunResult:
     """How a test went; lateness of the written pulses in s."""
 
-    outcome: Cause | str
+    outcome: TestOutcome
     reason: str
     evidence: StopEvidence
     counts: Recorded = field(default_factory=Recorded)
@@ -105,7 +104,9 @@ class TestRun:
         self._receiver = receiver
         self._clock = clock
         self._watch = watch
-        self._baseline_nm: float | None = None
+        self._rest_nm: float | None = None
+        self._outcome: TestOutcome = "fault"
+        self._duration_s = 0.0
         self._counts = Recorded()
         halt.on_set(gate.shut)
 
@@ -125,11 +126,11 @@ class TestRun:
         except Exception as error:  # a mistake in this program must stop the stimulation, too
             log.exception("the test broke")
             self._fault(f"internal: {type(error).__name__}: {error}")
-        evidence = self._stop()
+        found = self._stop()
         elapsed_s = max(time.monotonic() - wall_s, 1e-9)
         cpu_percent = 100 * (time.process_time() - cpu_s) / elapsed_s
         syncing.end()
-        return self._result(evidence, cpu_percent)
+        return self._result(found, cpu_percent)
 
     @property
     def journal_path(self) -> Path:
@@ -160,7 +161,7 @@ class TestRun:
                 self._fault("load cell: no fresh torque before the test; check its cable and supply")
             if self._clock.wait(self._clock.now_s() + 0.005 * speed, self.halt.event):
                 return False
-        self._baseline_nm = self._receiver.torque_around(0.1 * speed)
+        self._rest_nm = self._receiver.torque_around(0.1 * speed)
         self._gate.open(self._journal, self._table)
         if self.halt.event.is_set():
             self._gate.shut()  # halted while arming: the gate was opened after the halt had shut it
@@ -179,7 +180,7 @@ class TestRun:
         for index, width_us in enumerate(self.test.pulse_width_us.tolist()):
             due_s = t0_s + index * period_s
             if index == first:
-                self._baseline_nm = self._receiver.torque_around(0.1 * clock.speed)  # at rest, if ever
+                self._rest_nm = self._receiver.torque_around(0.1 * clock.speed)  # at rest, if ever
             if clock.wait(due_s, self.halt.event):
                 return
             self._look_after_health(clock.now_s(), due_s)
@@ -200,85 +201,54 @@ class TestRun:
             self._fault(f"stimulator: a pulse was not acknowledged within {self._watch.missing_ack_s * 1e3:.0f} ms")
 
     def _stop(self) -> StopEvidence:
-        """Stop the device, ask its state, watch the torque fall."""
-        clock = self._clock
-        at_stop_nm = self._receiver.torque_around(0.05 * clock.speed)
-        said, state, safe = "", None, False
-        try:
-            self._gate.stop()
-        except DeviceError as error:
-            said = str(error)
-        try:
-            safe, state = self._gate.state()
-        except DeviceError as error:
-            said = said or str(error)
+        """Stop the device, ask its state, watch the torque fall, end the journal."""
+        clock, cause = self._clock, self.halt.cause
+        at_stop_nm = self._receiver.torque_around(AROUND_S * clock.speed)
+        device = stop_device(self._gate)
         self.stimulation_ended.set()
-        end_s = clock.now_s()
-        if self.halt.cause is None:
-            clock.wait(end_s + 0.05 * clock.speed)  # samples on their way still belong to the test
-            falling, words = True, "the test ended by itself"
+        if cause is None:
+            clock.wait(clock.now_s() + AROUND_S * clock.speed)  # samples on their way still belong to the test
+            torque = True, "the test ended by itself"
         else:
-            falling, words = self._watch_decay(at_stop_nm)
-        last_s = self._gate.last_pulse_s
-        if self.halt.cause is None and self.t0_s is not None:
-            end_s = self.t0_s + self.test.duration_s
-        self._end_journal(end_s if self.halt.cause is None else clock.now_s())
-        return StopEvidence(
-            confirmed=safe and falling,
-            detail="; ".join(part for part in (f"device: {state or 'did not answer'}", said, words) if part),
-            last_pulse_age_s=None if last_s is None else clock.now_s() - last_s,
-            device_state=state,
-        )
+            torque = watch_decay(self._gate, self._receiver, clock, self._rest_nm, at_stop_nm)
+        now_s, last_s = clock.now_s(), self._gate.last_pulse_s
+        planned_end_s = (self.t0_s or now_s) + self.test.duration_s
+        self._end_journal(cause, planned_end_s if cause is None else now_s)
+        return evidence(device, torque, None if last_s is None else now_s - last_s)
 
-    def _watch_decay(self, at_stop_nm: float | None) -> tuple[bool, str]:
-        """Wait until the torque has fallen to half, or close to where it was before the test."""
-        clock = self._clock
-        if self._gate.last_pulse_s is None:
-            return True, "no pulse had been sent"
-        if at_stop_nm is None or self._baseline_nm is None:
-            return False, "no torque to confirm the stop by"
-        above_nm = at_stop_nm - self._baseline_nm
-        side = 1.0 if above_nm >= 0 else -1.0
-        deadline_s = clock.now_s() + DECAY_S
-        while True:
-            now_nm = self._receiver.torque_around(0.05 * clock.speed)
-            if now_nm is None:
-                return False, "no torque to confirm the stop by"
-            if side * (now_nm - self._baseline_nm) <= max(NEAR_REST_NM, 0.5 * abs(above_nm)):
-                return True, f"torque fell from {at_stop_nm:.2f} to {now_nm:.2f} N·m"
-            if clock.now_s() >= deadline_s:
-                return False, f"torque is still {now_nm:.2f} N·m {DECAY_S:g} s after the stop"
-            clock.wait(clock.now_s() + 0.01 * clock.speed)
-
-    def _end_journal(self, end_s: float) -> None:
+    def _end_journal(self, cause: Cause | None, end_s: float) -> None:
+        self._outcome = cause or "completed"
+        stimulation_end_s = end_s if cause is None else self.halt.time_s
+        if self.t0_s is not None:
+            self._duration_s = max(0.0, stimulation_end_s - self.t0_s)
         content = {
-            "outcome": self.halt.cause or "completed",
-            "reason": self.halt.reason,
+            "outcome": self._outcome,
+            "reason": self.halt.reason if cause else "",
             "time_s": end_s,
-            "stimulation_end_s": end_s if self.halt.cause is None else self.halt.time_s,
+            "stimulation_end_s": stimulation_end_s,
         }
         self._gate.release()
         self._counts = self._receiver.release()
         # An end that cannot be written leaves a journal without one, which is recovered as such.
         with contextlib.suppress(JournalError):
-            if self.halt.cause is not None:
-                event = {"event": self.halt.cause, "reason": self.halt.reason, "time_s": self.halt.time_s}
+            if cause is not None:
+                event = {"event": cause, "reason": self.halt.reason, "time_s": self.halt.time_s}
                 self._journal.append_json(Kind.EVENT, event)
             self._journal.append_json(Kind.END, content)
 
-    def _result(self, evidence: StopEvidence, cpu_percent: float) -> RunResult:
+    def _result(self, found: StopEvidence, cpu_percent: float) -> RunResult:
         self._journal.close()
         return RunResult(
-            outcome=self.halt.cause or "completed",
-            reason=self.halt.reason,
-            evidence=evidence,
+            outcome=self._outcome,
+            reason=self.halt.reason if self._outcome != "completed" else "",
+            evidence=found,
             counts=self._counts,
             lateness_s=list(self._gate.lateness_s),
             dropped=self._gate.dropped,
             charge_uc=self._gate.charge_uc,
             peak_nm=self._receiver.peak_nm,
             cpu_percent=cpu_percent,
-            duration_s=min(self.elapsed_s(), self.test.duration_s),
+            duration_s=self._duration_s,
             last_sample_unix_s=self._receiver.last_unix_s,
         )
 

@@ -57,6 +57,13 @@ class Pair:
             self.receiver.close()
         self.gate = self.receiver = None
 
+    def reconnect(self) -> None:
+        """Give both back, open them anew and see that torque comes. Raises DeviceError."""
+        self.disconnect()
+        self.connect()
+        if not self.torque_comes():
+            raise DeviceError("load cell: connected, but no torque comes; check its cable and start frames")
+
     def both_answer(self) -> bool:
         """Stop the stimulator anew and ask its state; does torque come?"""
         if self.gate is None or self.receiver is None:

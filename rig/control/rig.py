@@ -221,10 +221,11 @@ class Rig:
         with self._lock:
             following = self._trial.rearm()
             if self._trial.lost or not self._pair.both_answer():
-                self._pair.disconnect()
-                self._pair.connect()
-                if not self._pair.torque_comes():
-                    raise DeviceError("load cell: connected, but no torque comes; check its cable and start frames")
+                try:
+                    self._pair.reconnect()
+                except DeviceError as error:
+                    self._change(self._trial.disconnected(str(error)))
+                    raise
             self._latch.clear()
             log.info("re-armed by %s after: %s", by, self._trial.reason)
             self._change(following)
@@ -271,12 +272,17 @@ class Rig:
 
     def _execute(self, run: TestRun) -> None:
         threading.Thread(target=self._announce, args=(run,), name="announce", daemon=True).start()
-        result = run.execute()
-        self._evidence = result.evidence
-        self._told.set()
-        with self._lock:
-            self._change(self._trial.ended())
-        finished = self._shelf.finish(run.journal_path, run.test.plan.test_id, result)
+        try:
+            result = run.execute()
+            self._evidence = result.evidence
+            self._told.set()
+            with self._lock:
+                self._change(self._trial.ended())
+            finished = self._shelf.finish(run.journal_path, run.test.plan.test_id, result)
+        except Exception as error:  # a mistake in this program: stay stopped, keep the journal for the next start
+            log.exception("the test could not be ended in order")
+            self._broken(f"internal: {type(error).__name__}: {error}")
+            return
         with self._lock:
             self._run = None
             self.finished = finished
@@ -287,6 +293,13 @@ class Rig:
                 self._latch.clear()
             self._change(following)
         self._publish(finished)
+
+    def _broken(self, reason: str) -> None:
+        with self._lock:
+            self._run = None
+            self._latch.write("running", reason)
+            self._change(Trial("latched", reason, lost=reason))
+        self._told.set()
 
     def _announce(self, run: TestRun) -> None:
         """Tell that the test runs, from outside the thread that must be on time."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -59,6 +60,21 @@ def test_check_reads_the_file_and_the_dbc_only(tmp_path: Path):
     ended = run("--config", str(path), "--check")
     assert ended.returncode == 0
     assert json.loads(ended.stdout)["stimulator"] == "p24"
+
+
+def test_the_rig_ends_with_its_parent_where_asked(bench: Bench, tmp_path: Path):
+    launcher = (
+        "import subprocess, sys; p = subprocess.Popen(sys.argv[1:], stdout=subprocess.PIPE); "
+        "print(p.stdout.readline()); print(p.pid)"
+    )
+    options = ["--data", str(tmp_path / "data"), "--socket", str(tmp_path / "rig.sock"), "--die-with-parent"]
+    rig = [sys.executable, "-m", "rig", "--emulator-json", json.dumps(bench.emulator.ready), *options]
+    done = subprocess.run([sys.executable, "-c", launcher, *rig], cwd=ROOT, capture_output=True, text=True, timeout=30)
+    pid = int(done.stdout.split()[-1])
+    end = time.monotonic() + 10
+    while Path(f"/proc/{pid}").exists() and " Z " not in Path(f"/proc/{pid}/stat").read_text():
+        assert time.monotonic() < end
+        time.sleep(0.05)
 
 
 def test_a_port_that_is_not_there_is_told_until_it_is(bench: Bench, tmp_path: Path):

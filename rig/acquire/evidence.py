@@ -1,0 +1,72 @@
+"""A stop is confirmed by its effect: what the device says of itself, and the torque falling."""
+
+from __future__ import annotations
+
+from rig.acquire.receiver import Receiver
+from rig.clock import Clock
+from rig.errors import DeviceError
+from rig.gate import Gate
+from rig.messages import StopEvidence
+
+DECAY_S = 3.0
+"""Rig seconds in which the torque must have halved; the slowest muscle of the paper takes about 1 s."""
+NEAR_REST_NM = 0.5
+AROUND_S = 0.05
+"""Real seconds over which a torque's median is taken."""
+ATTEMPTS = 2
+
+
+def stop_device(gate: Gate) -> tuple[bool, str | None, str]:
+    """Stop and ask: (the device says that it cannot stimulate, its state, what went wrong). Never raises."""
+    said = ""
+    for _ in range(ATTEMPTS):  # the first answer may have been damaged on its way
+        try:
+            gate.stop()
+            safe, state = gate.state()
+        except DeviceError as error:
+            said = str(error)
+            continue
+        return safe, state, ""
+    return False, None, said
+
+
+def watch_decay(
+    gate: Gate, receiver: Receiver, clock: Clock, rest_nm: float | None, at_stop_nm: float | None
+) -> tuple[bool, str]:
+    """Wait until the torque has fallen to half, or close to where it rested, or has clearly not.
+
+    Parameters
+    ----------
+    rest_nm, at_stop_nm
+        Torque right before the first pulse and at the stop, N·m; None where there was none.
+    """
+    if gate.last_pulse_s is None:
+        return True, "no pulse had been sent"
+    if at_stop_nm is None or rest_nm is None:
+        return False, "no torque to confirm the stop by"
+    above_nm = at_stop_nm - rest_nm
+    side = 1.0 if above_nm >= 0 else -1.0
+    deadline_s = clock.now_s() + DECAY_S
+    while True:
+        now_nm = receiver.torque_around(AROUND_S * clock.speed)
+        if now_nm is None:
+            return False, "no torque to confirm the stop by"
+        if side * (now_nm - rest_nm) <= max(NEAR_REST_NM, 0.5 * abs(above_nm)):
+            return True, f"torque fell from {at_stop_nm:.2f} to {now_nm:.2f} N·m"
+        if clock.now_s() >= deadline_s:
+            return False, f"torque is still {now_nm:.2f} N·m {DECAY_S:g} s after the stop"
+        clock.wait(clock.now_s() + 0.01 * clock.speed)
+
+
+def evidence(
+    device: tuple[bool, str | None, str], torque: tuple[bool, str], last_pulse_age_s: float | None
+) -> StopEvidence:
+    """Both findings in one answer."""
+    safe, state, said = device
+    falling, words = torque
+    return StopEvidence(
+        confirmed=safe and falling,
+        detail="; ".join(part for part in (f"device: {state or 'did not answer'}", said, words) if part),
+        last_pulse_age_s=last_pulse_age_s,
+        device_state=state,
+    )
