@@ -37,7 +37,7 @@ class LoadCell:
 
     `torque_hooks` and `frame_hooks` are where faults enter: a torque hook changes a reading, a frame hook gives
     the frames that are sent in place of one. A muscle may bring the last stage of its cell along, a method
-    `converted_nm(reading_nm)` that comes after noise and offset (a converter that clips).
+    `converted_nm(reading_nm, time_s)` that comes after noise and offset (a converter that clips).
 
     With `jitter_s` each sample is taken, and its frame stamped, off its time by that standard deviation. Samples
     come at exact multiples of the period without it.
@@ -61,9 +61,7 @@ class LoadCell:
         self.samples = 0
         self.torque_nm = 0.0
         self._muscle, self._cell, self._noise = muscle, cell, noise
-        converted_nm: TorqueHook | None = getattr(muscle, "converted_nm", None)
-        if converted_nm is not None:
-            self.torque_hooks.append(converted_nm)
+        self._converted_nm: Callable[[float, float], float] | None = getattr(muscle, "converted_nm", None)
         self._offset_nm, self._has_sync = offset_nm, has_sync
         self._nominal_hz = rate_hz
         self._clock_rate = 1.0 + clock_ppm * 1e-6
@@ -118,6 +116,8 @@ class LoadCell:
     def _sample(self, time_s: float) -> None:
         self.torque_nm = self._muscle.torque_nm(time_s)
         reading_nm = self.torque_nm + self._offset_nm + self._noise.next_nm()
+        if self._converted_nm is not None:
+            reading_nm = self._converted_nm(reading_nm, time_s)
         for hook in self.torque_hooks:
             reading_nm = hook(reading_nm)
         sample = Sample(reading_nm, self.counter, self._sync, self.time_us(time_s))

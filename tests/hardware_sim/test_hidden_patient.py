@@ -7,6 +7,8 @@ import json
 import numpy as np
 import pytest
 
+from hardware_sim.load_cells.cells.plain import Cell
+from hardware_sim.load_cells.sampler import LoadCell, Noise
 from hardware_sim.patients import hidden
 from hardware_sim.patients.hidden.draw import Scenario, draw_scenario
 from hardware_sim.patients.hidden.live import HiddenMuscle
@@ -26,7 +28,7 @@ def play(muscle: HiddenMuscle, scenario: Scenario, seconds: float, late_s: np.nd
             if width[pulse] > 0.0:
                 muscle.pulse(float(at[pulse]), float(width[pulse]), 20.0)
             pulse += 1
-        torque[k] = muscle.torque_nm(k / RATE_HZ)
+        torque[k] = muscle.converted_nm(muscle.torque_nm(k / RATE_HZ), k / RATE_HZ)
     return torque
 
 
@@ -63,9 +65,24 @@ def test_torque_dies_away_once_pulses_stop_and_less_current_recruits_less() -> N
 def test_a_clipped_reading_stays_clipped_after_the_noise() -> None:
     scenario = draw_scenario(("sensor_clipping",), "strong", 403)
     muscle = HiddenMuscle(scenario)
-    rail = muscle.sensor(10.0 * scenario.base.largest_nm, 0.0)
+    rail = muscle.converted_nm(10.0 * scenario.base.largest_nm, 0.0)
     assert rail < scenario.base.largest_nm
     assert play(muscle, scenario, 12.0).max() <= rail
+
+
+def test_the_emulated_cell_converts_after_its_noise() -> None:
+    """Flat tops on the wire: many samples exactly at the rail, none above it, whatever the noise."""
+    scenario = draw_scenario(("sensor_clipping",), "strong", 403)
+    muscle = HiddenMuscle(scenario)
+    rail = muscle.converted_nm(10.0 * scenario.base.largest_nm, 0.0)
+    cell = LoadCell(muscle, Cell(), Noise(0.05, 1), RATE_HZ)
+    readings: list[float] = []
+    cell.torque_hooks.append(lambda reading_nm: readings.append(reading_nm) or reading_nm)
+    for k in range(80):
+        muscle.pulse(k * 0.025, scenario.base.largest_width_us, 20.0)
+        cell.produce((k + 1) * 0.025)
+    assert max(readings) <= rail
+    assert sum(reading == max(readings) for reading in readings) > 20
 
 
 def test_reveal_tells_of_the_muscle_that_make_gives() -> None:

@@ -33,7 +33,7 @@ class HiddenMuscle:
         before, after = split(scenario.stages())
         largest_nm = scenario.base.largest_nm
         self._muscle = Chain(before, largest_nm, 1.0 / STEPS_PER_S)
-        self._converters = [Chain(after, largest_nm, 1.0 / STEPS_PER_S) for _ in range(2)] if after else []
+        self._converter = Chain(after, largest_nm, 1.0 / STEPS_PER_S) if after else None
         self._done = 0  # steps made; the state is that at `_done` / STEPS_PER_S
         self._values = (0.0, 0.0)  # at the last two steps
         self._edges: list[tuple[float, float]] = []  # times in steps from which a width holds, not yet passed
@@ -58,16 +58,15 @@ class HiddenMuscle:
         self._hold_end = at + PULSE_PERIOD_S * STEPS_PER_S
 
     def torque_nm(self, time_s: float) -> float:
-        """Advance to `time_s` and give the torque the load cell would read there, N·m, before its noise."""
+        """Advance to `time_s` and give the torque on the load cell there, N·m: neither noise nor converter."""
         at = time_s * STEPS_PER_S
         self._run_to(math.floor(at + 1e-6))
         before, last = self._values
-        torque = last + (last - before) * (at - self._done) if at > self._done + 1e-6 else last
-        return self._converters[0].step(torque, 0.0, at) if self._converters else torque
+        return last + (last - before) * (at - self._done) if at > self._done + 1e-6 else last
 
-    def sensor(self, reading_nm: float, time_s: float) -> float:
+    def converted_nm(self, reading_nm: float, time_s: float) -> float:
         """What the converter makes of a reading that has its noise already: rails and steps come after noise."""
-        return self._converters[1].step(reading_nm, 0.0, time_s * STEPS_PER_S) if self._converters else reading_nm
+        return self._converter.step(reading_nm, 0.0, time_s * STEPS_PER_S) if self._converter else reading_nm
 
     def _close_gap(self, at: float) -> None:
         """Hold the last width up to `at`, though its hold had run out."""
