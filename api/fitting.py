@@ -197,7 +197,8 @@ class Fitting:
             self._dispatch()
 
     async def close(self) -> None:
-        """End all workers."""
+        """End all workers; what is queued is left."""
+        self.queue.clear()
         for task in list(self._tasks):
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)

@@ -86,8 +86,11 @@ class Child:
             self.process.wait(2)
         code = self.process.poll()
         self.end()
-        words = self.last_words() or f"it ended with code {code}" if code is not None else "it did not get ready"
-        return LaunchError(f"{self.name}: {words} (log: {self.log})", 2 if code == 2 else 1)
+        words = self.last_words() or (f"it ended with code {code}" if code is not None else "it did not get ready")
+        words = words.removeprefix(f"{self.name}: ").removeprefix("stimrig: ").removeprefix("stimrig emulate: ")
+        if code == 2:  # bad input: the words name the place and the mend
+            return LaunchError(words, 2)
+        return LaunchError(f"{self.name}: {words} (log: {self.log})")
 
     def last_words(self) -> str:
         """The last line of its log that is meant for people."""
@@ -193,7 +196,7 @@ class Services:
         else:
             source = ["--config", str(self.settings.rig_file)]
         self.rig.command += [*source, "--socket", str(self.socket), "--data", data]
-        self.rig.start()
+        self._start_rig()
         self.api.environment = {
             "STIMRIG_DATA_DIR": data,
             "STIMRIG_RIG_SOCKET": str(self.socket),
@@ -204,6 +207,15 @@ class Services:
             self.api.environment["STIMRIG_ADMIN_TOKEN"] = self.admin_token
         self.api.start()
         self.api.environment["STIMRIG_PORT"] = str(self.api.ready["port"])  # the same one after a restart
+
+    def _start_rig(self) -> None:
+        try:
+            self.rig.start()
+        except LaunchError as error:
+            place = str(self.settings.rig_file)
+            if error.code == 2 and self.settings.rig_file is not None and place not in str(error):
+                raise LaunchError(f"{place}: {error}", 2) from error
+            raise
 
     def watch(self) -> list[str]:
         """Start again what died; what happened, in words.

@@ -50,6 +50,7 @@ class RigClient:
 
     def __init__(self, path: Path | None, clock: Clock) -> None:
         self.path, self.clock = path, clock
+        self.patience_s = 5.0
         self.status: Status | None = None
         self.connected = False
         self.listeners: list[Callable[[AnyEvent], None]] = []
@@ -77,7 +78,7 @@ class RigClient:
         """Seconds since the rig last spoke; None: never."""
         return None if self._heard_s is None else self.clock.monotonic_s() - self._heard_s
 
-    async def request(self, message: Any, timeout_s: float = 5.0) -> Reply:
+    async def request(self, message: Any, timeout_s: float | None = None) -> Reply:
         """Ask the rig; its answer, whatever it is.
 
         Raises
@@ -85,6 +86,7 @@ class RigClient:
         ApiError
             503: no rig, or it does not answer in time.
         """
+        timeout_s = self.patience_s if timeout_s is None else timeout_s
         if self._writer is None:
             return await self._request_apart(message, timeout_s)
         message = message.model_copy(update={"id": next(self._numbers)})
@@ -100,7 +102,7 @@ class RigClient:
         finally:
             self._waiting.pop(message.id, None)
 
-    async def ask(self, message: Any, timeout_s: float = 5.0) -> dict[str, Any]:
+    async def ask(self, message: Any, timeout_s: float | None = None) -> dict[str, Any]:
         """Ask the rig; its body, or its refusal raised as an `ApiError`."""
         reply = await self.request(message, timeout_s)
         if not reply.ok:

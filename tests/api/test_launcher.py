@@ -1,0 +1,171 @@
+"""The whole house as processes: emulator, rig, service; sped up where the clock allows it."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import httpx
+import pytest
+
+from api.launcher import LaunchError, Services
+from api.session import run_test
+from api.settings import Settings
+from tests.api.conftest import TOKEN
+
+pytestmark = pytest.mark.wire
+FAST = ["--speed", "6"]
+
+
+def settings(tmp_path: Path, **more: object) -> Settings:
+    return Settings(data_dir=tmp_path, port=0, **more)  # pyright: ignore[reportArgumentType]
+
+
+def client(services: Services) -> httpx.Client:
+    return httpx.Client(base_url=services.url, headers={"Authorization": f"Bearer {TOKEN}"}, timeout=30)
+
+
+def test_a_test_on_the_wire_ends_in_a_served_model(tmp_path: Path) -> None:
+    with Services(settings(tmp_path), FAST, TOKEN) as services, client(services) as http:
+        assert http.post("/v1/participants", json={"code": "P1"}).status_code == 201
+        document = run_test(http, "P1")
+        assert document["summary"]["lost_samples"] == 0
+        fit = document["fit"]
+        # A busy machine's stalls count six times at this speed; the figure at the speed of the world is the demo's.
+        assert fit["ceiling_percent"] > 95 and fit["fit_percent"] > 80
+        curves = http.get(f"{document['model_url']}/curves").json()
+        assert {part["name"] for part in curves["segments"]} >= {"rest", "prbs", "ramp", "validate"}
+        preview = http.post("/v1/preview", json={"participant": "P1"}).json()
+        assert preview["torque_time_nms"] is None
+        http.post(f"{document['model_url']}/approve")
+        assert http.post("/v1/preview", json={"participant": "P1"}).json()["torque_time_nms"] > 5
+    assert [child.alive() for child in (services.rig, services.api)] == [False, False]
+
+
+def test_killed_rig_comes_back_uncertain_and_the_test_is_a_fault(tmp_path: Path) -> None:
+    with Services(settings(tmp_path), ["--speed", "2"], TOKEN) as services, client(services) as http:
+        http.post("/v1/participants", json={"code": "P1"})
+        test_id = http.post("/v1/tests", json={"participant": "P1"}).json()["id"]
+        time.sleep(2)
+        assert services.rig.process is not None
+        services.rig.process.kill()
+        services.rig.process.wait()
+        end = time.monotonic() + 1.0
+        while http.get("/v1/rig").json()["connected"]:
+            assert time.monotonic() < end
+        assert any("rig had ended" in event for event in services.watch())
+        end = time.monotonic() + 15
+        while not (document := http.get(f"/v1/tests/{test_id}").json())["done"]:
+            assert time.monotonic() < end, document
+            time.sleep(0.1)
+        assert document["state"] == "fault"
+        assert document["recording_id"], "the journal of the killed rig was sealed and adopted"
+        rig = http.get("/v1/rig").json()
+        assert rig["state"] == "uncertain"
+        assert http.post("/v1/tests", json={"participant": "P1"}).status_code == 409
+        assert http.post("/v1/rearm").json()["state"] == "ready"
+
+
+def test_killed_service_comes_back_at_the_same_place_with_everything(tmp_path: Path) -> None:
+    with Services(settings(tmp_path), FAST, TOKEN) as services, client(services) as http:
+        http.post("/v1/participants", json={"code": "P1"})
+        test_id = http.post("/v1/tests", json={"participant": "P1"}).json()["id"]
+        time.sleep(1.5)
+        assert services.api.process is not None
+        services.api.process.kill()
+        services.api.process.wait()
+        assert any("api had ended" in event for event in services.watch())
+        end = time.monotonic() + 40
+        while not (document := http.get(f"/v1/tests/{test_id}").json())["done"]:
+            assert time.monotonic() < end, document
+            time.sleep(0.1)
+        assert document["state"] == "completed" and document["model_id"]
+
+
+def test_everything_dies_with_the_launcher(tmp_path: Path) -> None:
+    environment = {**os.environ, "STIMRIG_ADMIN_TOKEN": TOKEN}
+    command = [sys.executable, "-m", "api.cli", "serve", "--port", "0", "--data", str(tmp_path)]
+    launcher = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
+    assert launcher.stdout is not None and "stimrig serves http://127.0.0.1:" in launcher.stdout.readline()
+    children = subprocess.run(
+        ["ps", "-o", "pid=", "--ppid", str(launcher.pid)], capture_output=True, text=True
+    ).stdout.split()
+    assert len(children) == 3
+    launcher.send_signal(signal.SIGKILL)
+    launcher.wait()
+    end = time.monotonic() + 10
+    while any(Path(f"/proc/{pid}").exists() and "Z" not in state(pid) for pid in children):
+        assert time.monotonic() < end
+        time.sleep(0.1)
+
+
+def state(pid: str) -> str:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return "Z"
+
+
+RIG_FILE = """
+[stimulator]
+device = "{device}"
+port = "{port}"
+[load_cell]
+device = "can_load_cell"
+signal = "{signal}"
+[load_cell.bus]
+interface = "socketcand"
+host = "127.0.0.1"
+port = 1
+channel = "can0"
+"""
+
+
+@pytest.mark.parametrize(
+    ("device", "signal_name", "named"),
+    [("p99", "Torque_Nm", "p99"), ("p24", "Nonsense", "Nonsense")],
+    ids=["unknown-device", "wrong-DBC-signal"],
+)
+def test_rig_file_that_does_not_hold_is_one_line(tmp_path: Path, device: str, signal_name: str, named: str) -> None:
+    path = tmp_path / "rig.toml"
+    path.write_text(RIG_FILE.format(device=device, port="/dev/ttyUSB77", signal=signal_name))
+    for verb in (["serve", "--port", "0"], ["test"]):
+        done = subprocess.run(
+            [sys.executable, "-m", "api.cli", *verb, "--rig", str(path), "--data", str(tmp_path)],
+            capture_output=True, text=True, timeout=60,
+        )  # fmt: skip
+        assert done.returncode == 2, done
+        assert done.stderr.count("\n") == 1 and named in done.stderr and "rig.toml" in done.stderr
+        assert "Traceback" not in done.stderr
+
+
+def test_port_that_is_not_there_is_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "rig.toml"
+    path.write_text(RIG_FILE.format(device="p24", port="/dev/ttyUSB77", signal="Torque_Nm"))
+    command = [sys.executable, "-m", "api.cli", "test", "--rig", str(path), "--data", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2, done
+    assert "/dev/ttyUSB77" in done.stderr and done.stderr.count("\n") == 1
+
+
+def test_taken_port_is_one_line(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        second = settings(tmp_path, rig_file=None)
+        second.port = taken.getsockname()[1]
+        with pytest.raises(LaunchError, match="another port") as caught, Services(second, [], TOKEN):
+            pass
+    assert caught.value.code == 2
+
+
+def test_json_of_test_verb_is_one_object(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "api.cli", "test", "--data", str(tmp_path), "--emulate", "--speed 8", "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert found["test"]["state"] == "completed" and found["model"]["model_id"] == found["test"]["model_id"]

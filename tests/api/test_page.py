@@ -1,0 +1,232 @@
+"""The page in a real browser: a clinician's way, stop in every state, stale data, nothing from elsewhere."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import pytest
+
+from tests.api.conftest import STUB, TOKEN, Service, run_service
+
+pytestmark = pytest.mark.browser
+
+CHROMIUM = next((path for path in map(Path, ("/usr/bin/chromium", "/usr/bin/chromium-browser")) if path.exists()), None)
+ARGUMENTS = [
+    "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
+    "--disable-component-update", "--disable-sync",
+]  # fmt: skip
+WIDE, NARROW, PHONE = (1280, 860), (1024, 768), (390, 844)
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
+    yield from run_service(tmp_path_factory.mktemp("page"), short_dir, STUB, speed=8.0)
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    playwright = pytest.importorskip("playwright.sync_api")
+    if CHROMIUM is None:
+        pytest.skip("Debian's chromium is not installed (apt-get install chromium)")
+    with playwright.sync_playwright() as driver:
+        chromium = driver.chromium.launch(executable_path=str(CHROMIUM), args=ARGUMENTS)
+        yield chromium
+        chromium.close()
+
+
+@pytest.fixture
+def tab(browser: Any, service: Service) -> Iterator[Any]:
+    """A signed-in tab that takes down every request, error and console message."""
+    yield from open_tab(browser, service)
+
+
+def open_tab(browser: Any, service: Service, **options: Any) -> Iterator[Any]:
+    """A tab, signed in."""
+    service.rig.confirms_stop = True
+    context = browser.new_context(viewport={"width": WIDE[0], "height": WIDE[1]}, **options)
+    page = context.new_page()
+    page.requests, page.errors = [], []
+    page.on("request", lambda request: page.requests.append(request.url))
+    page.on("pageerror", lambda error: page.errors.append(str(error)))
+    page.on("console", lambda message: page.errors.append(message.text) if message.type == "error" else None)
+    sign_in(page, service)
+    yield page
+    context.close()
+    with service.client() as http:
+        http.post("/v1/stop")
+        end = time.monotonic() + 5
+        while http.get("/v1/rig").json()["holder"]:
+            assert time.monotonic() < end
+            time.sleep(0.05)
+        http.post("/v1/rearm")
+
+
+def sign_in(page: Any, service: Service) -> None:
+    page.goto(service.url + "/")
+    page.get_by_label("Access token").fill(TOKEN)
+    page.get_by_role("button", name="Sign in").click()
+    page.get_by_role("heading", name="Participants").wait_for()
+
+
+def participant(page: Any, service: Service, code: str) -> None:
+    page.goto(service.url + "/")
+    page.get_by_label("Code").fill(code)
+    page.get_by_role("button", name="Create").click()
+    page.get_by_role("heading", name=code).wait_for()
+
+
+def start(page: Any) -> None:
+    page.get_by_role("button", name="Start the pre-session test").click()
+    page.wait_for_url("**/tests/T*")
+
+
+def painted(page: Any, canvas: str) -> int:
+    """How many pixels of a canvas are not empty."""
+    script = """(id) => { const c = document.getElementById(id);
+      const d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data;
+      let n = 0; for (let i = 3; i < d.length; i += 4) if (d[i]) n++; return n; }"""
+    return page.evaluate(script, canvas)
+
+
+def test_a_clinicians_whole_way(tab: Any, service: Service) -> None:
+    participant(tab, service, "P100")
+    assert tab.get_by_text("No model yet.").is_visible() and tab.get_by_text("No test yet.").is_visible()
+    start(tab)
+    tab.locator("#segment", has_text="ramp").wait_for(timeout=10000)
+    assert painted(tab, "torque-chart") > 3000 and painted(tab, "width-chart") > 2000
+    assert float(tab.locator("#progress").get_attribute("value") or 0) >= 0
+    left = int(tab.locator("#left").inner_text().split()[0])
+    assert 0 < left < 25
+    assert not tab.locator("#stale").is_visible()
+    tab.wait_for_url("**/models/M-*", timeout=15000)
+    tab.locator(".figure-box .main-svg").first.wait_for()
+    assert tab.locator(".figure-box:has(.main-svg)").count() == 3
+    for words in ("Torque (N·m)", "Residual (N·m)", "Pulse width (µs)", "Time (s)"):
+        assert tab.locator(".figure-box").get_by_text(words).first.is_visible(), words
+    assert "ceiling 98.60 %" in tab.inner_text("main")
+    tab.get_by_label("Reason").fill("close to its ceiling")
+    tab.get_by_role("button", name="Approve").click()
+    tab.get_by_text("the controller gets this model").wait_for()
+    tab.get_by_role("link", name="P100").click()
+    assert tab.get_by_text("the controller gets this one").is_visible()
+    with service.client() as http:
+        assert http.get("/v1/participants/P100/model").status_code == 200
+    assert {urlsplit(url).netloc for url in tab.requests if url.startswith("http")} == {urlsplit(service.url).netloc}
+    assert tab.errors == []
+
+
+@pytest.mark.parametrize("size", [WIDE, NARROW, PHONE], ids=["wide", "1024", "phone"])
+def test_stop_is_on_every_page_uncovered_and_nothing_sticks_out(
+    tab: Any, service: Service, size: tuple[int, int]
+) -> None:
+    with service.client() as http:
+        http.post("/v1/participants", json={"code": "P101"})
+    tab.set_viewport_size({"width": size[0], "height": size[1]})
+    for path in ("/", "/participants/P101", "/models/none"):
+        tab.goto(service.url + path)
+        script = """() => { const b = document.getElementById('stop').getBoundingClientRect();
+          const at = (x, y) => document.elementFromPoint(b.left + b.width * x, b.top + b.height * y);
+          return [[.5, .5], [.03, .1], [.97, .9]].every(([x, y]) => at(x, y)?.id === 'stop'); }"""
+        for scroll in ("0", "document.body.scrollHeight"):
+            tab.evaluate(f"window.scrollTo(0, {scroll})")
+            assert tab.evaluate(script), path
+        assert tab.evaluate("document.documentElement.scrollWidth <= window.innerWidth"), path
+    height = tab.locator("#stop").bounding_box()["height"]
+    assert height >= 44
+
+
+def test_stop_is_confirmed_and_the_rig_waits_for_a_person(tab: Any, service: Service) -> None:
+    participant(tab, service, f"S{time.time_ns() % 10**9}")
+    start(tab)
+    tab.wait_for_timeout(300)
+    tab.get_by_role("button", name="Stop stimulation").click()
+    tab.get_by_text("The rig confirms that stimulation is off.").wait_for()
+    tab.get_by_role("link", name="To the participants").click()
+    assert tab.get_by_text("stays stopped").is_visible()
+    tab.get_by_role("button", name="I have looked: re-arm").click()
+    tab.get_by_role("heading", name="Participants").wait_for()
+    assert not tab.get_by_text("stays stopped").is_visible()
+
+
+def test_stop_works_while_the_live_channel_is_cut(tab: Any, service: Service) -> None:
+    participant(tab, service, f"C{time.time_ns() % 10**9}")
+    tab.route_web_socket("**/live", lambda socket: socket.close())
+    start(tab)
+    tab.locator("#stale").wait_for(timeout=3000)
+    tab.get_by_role("button", name="Stop stimulation").click()
+    tab.get_by_text("The rig confirms that stimulation is off.").wait_for()
+
+
+def test_everything_needed_works_without_scripts(browser: Any, service: Service) -> None:
+    for page in open_tab(browser, service, java_script_enabled=False):
+        participant(page, service, f"N{time.time_ns() % 10**9}")
+        start(page)
+        assert "Scripts are off" in page.content() and 'http-equiv="refresh"' in page.content()
+        page.get_by_role("button", name="Stop stimulation").click()
+        page.get_by_text("The rig confirms that stimulation is off.").wait_for()
+
+
+def test_unconfirmed_stop_is_told(tab: Any, service: Service) -> None:
+    service.rig.confirms_stop = False
+    tab.get_by_role("button", name="Stop stimulation").click()
+    tab.get_by_role("heading", name="The stop is not confirmed").wait_for()
+    assert tab.get_by_text("emergency switch").first.is_visible()
+    service.rig.confirms_stop = True
+
+
+def test_data_grow_stale_within_a_second_when_the_rig_dies(tab: Any, service: Service) -> None:
+    service.rig.speed = 1.5
+    participant(tab, service, f"R{time.time_ns() % 10**9}")
+    start(tab)
+    tab.locator("#age", has_text="ms").wait_for()
+    service.rig_thread.__exit__()
+    tab.locator("#stale").wait_for(timeout=1000)
+    assert tab.locator("#live.is-stale").count() == 1
+    service.rig_thread.__enter__()
+    tab.get_by_text("rig's process ended").first.wait_for(timeout=10000)
+
+
+def test_keyboard_alone_reaches_stop_and_start(tab: Any, service: Service) -> None:
+    participant(tab, service, f"K{time.time_ns() % 10**9}")
+    reached: list[str] = []
+    for _ in range(12):
+        tab.keyboard.press("Tab")
+        reached.append(tab.evaluate("document.activeElement.textContent.trim()"))
+    assert reached[0] == "Skip to content"
+    assert "Stop stimulation" in reached and "Start the pre-session test" in reached
+
+
+def test_two_browsers_see_the_same_test(browser: Any, tab: Any, service: Service) -> None:
+    service.rig.speed = 6.0
+    participant(tab, service, f"T{time.time_ns() % 10**9}")
+    start(tab)
+    for second in open_tab(browser, service):
+        second.get_by_role("link", name="test running").click()
+        second.locator("#segment", has_text=re.compile("prbs|ramp|rest|validate")).wait_for()
+        assert painted(second, "torque-chart") > 1500
+
+
+def test_a_name_is_refused_politely(tab: Any, service: Service) -> None:
+    tab.evaluate("document.getElementById('code').removeAttribute('pattern')")
+    tab.get_by_label("Code").fill("Anna Schmidt")
+    tab.get_by_role("button", name="Create").click()
+    assert tab.get_by_text("Please no names").is_visible()
+
+
+def test_every_control_has_a_name_and_every_page_a_title(tab: Any, service: Service) -> None:
+    with service.client() as http:
+        http.post("/v1/participants", json={"code": "P102"})
+    for path in ("/", "/participants/P102", "/sign-in"):
+        tab.goto(service.url + path)
+        nameless = tab.evaluate(
+            """() => [...document.querySelectorAll('button, a, input:not([type=hidden])')].filter((e) =>
+              !(e.textContent.trim() || e.getAttribute('aria-label') || e.labels?.length))
+              .map((e) => e.outerHTML)"""
+        )
+        assert nameless == [] and tab.title().endswith("stimrig")
+        assert tab.locator("h1").count() == 1 or path == "/sign-in"
