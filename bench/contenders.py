@@ -1,4 +1,4 @@
-"""Who is compared: ours, peers from PyPI, and the oracle. Each fits the same rows and predicts the same record free-run."""
+"""Who is compared: ours, peers from PyPI, and the oracle. Each fits the same rows and predicts free-run."""
 
 from __future__ import annotations
 

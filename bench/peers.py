@@ -86,8 +86,9 @@ def document(results: dict[tuple[str, float, float], dict[str, float] | str]) ->
     lines = [
         "# Identification beside its peers",
         "",
-        "Written by `make bench` (`python -m bench peers`); don't edit. One run, one core, the same records: the paper's",
-        "muscle, PRBS of 15.9 s and ramp of 10 s with rests, output noise; fitted on what comes before the unseen part.",
+        "Written by `make bench` (`python -m bench peers`); don't edit. One run, one core, the same records: the",
+        "paper's muscle, PRBS of 15.9 s and ramp of 10 s with rests, output noise; fitted on what comes before the",
+        "unseen part.",
         "Best fit in free run against the torque without noise, %: on the ramp / on an unseen multi-level input; time",
         "of one warm fit, median. Seeds " + ", ".join(str(s) for s in SEEDS[40.0]) + " (at 1600 Hz the first two).",
         f"Machine: {platform.processor() or platform.machine()}, Python {platform.python_version()}.",
@@ -114,7 +115,7 @@ def speed(results: dict[tuple[str, float, float], dict[str, float] | str]) -> li
             lines.append(f"At {rate:g} Hz and 0.02 N·m ours takes 1/{b['ms'] / a['ms']:.0f} of jax-sysid's time.")
     lines += [
         "",
-        "The peers take the recruitment as eight spline inputs and choose memory in samples; at 1600 samples a second the same",
-        "number of samples is a fortieth of the time. Ours works on the grid of pulses, at any sampling rate.",
+        "The peers take the recruitment as eight spline inputs and choose memory in samples; at 1600 samples a second",
+        "the same number of samples is a fortieth of the time. Ours works on the grid of pulses, at any sampling rate.",
     ]
     return lines

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     )
     from identify.estimate import fit
     from identify.improve import improve
-    from identify.methods import methods
     from identify.model import Model
     from identify.record import Record
     from identify.records import read
@@ -33,7 +32,6 @@ _PLACES = {
     "fit": "identify.estimate",
     "predict": "identify.simulate",
     "Model": "identify.model",
-    "methods": "identify.methods",
     "compare": "identify.criticism",
     "diagnose": "identify.diagnosis",
     "improve": "identify.improve",
@@ -44,7 +42,7 @@ _PLACES = {
     "IdentifyError": "identify.errors",
     "NotIdentifiable": "identify.errors",
 }
-_MODULES = {"effects", "table1"}
+_MODULES = {"effects", "methods", "table1"}
 
 __all__ = [
     "BadModel",
@@ -59,7 +57,6 @@ __all__ = [
     "diagnose",
     "fit",
     "improve",
-    "methods",
     "predict",
     "read",
 ]

@@ -36,7 +36,7 @@ def fit(
     fit_on : sequence of str, optional
         Names of the segments to fit on; by default all but `validate`, or what the method needs.
     **options
-        Of the method; `identify.methods()[id].options` tells.
+        Of the method; `identify.methods.methods()[id].options` tells.
 
     Raises
     ------
@@ -61,7 +61,7 @@ def fit(
     except (TypeError, ValueError) as error:
         if options:
             given = ", ".join(f"{key}={value}" for key, value in options.items())
-            raise BadRequest(f"unusable option ({error})", place=given, mend="See `identify.methods()`.") from error
+            raise BadRequest(f"unusable option ({error})", place=given, mend="See `identify.methods.methods()[id].options`.") from error
         raise
 
 

@@ -91,7 +91,7 @@ def quality(model: Model, grid: Grid, rows: np.ndarray, converged: bool = True) 
         "ceiling": _ceiling(model),
         "held_out": _held_out(model),
         "residual": _residual(model),
-        "sensor": _sensor(grid),
+        "sensor": _sensor(grid, model.baseline_nm),
     }
     failed = [gate for gate in gates.values() if not gate["passed"]]
     bad = any(gate["severity"] == "refuse" for gate in failed)
@@ -178,7 +178,7 @@ def _residual(model: Model) -> dict[str, Any]:
     return _gate(not failed, "care", f"the residual is not noise ({', '.join(failed)} test): run diagnose")
 
 
-def _sensor(grid: Grid) -> dict[str, Any]:
+def _sensor(grid: Grid, baseline_nm: float) -> dict[str, Any]:
     """Flat tops: many samples at exactly the largest (or smallest) torque."""
     torque = grid.record.torque_nm
     span = float(np.ptp(torque))
@@ -188,6 +188,6 @@ def _sensor(grid: Grid) -> dict[str, Any]:
         at_edge = torque == edge
         in_a_row = np.max(np.diff(np.flatnonzero(np.r_[True, ~at_edge, True])) - 1, initial=0)
         driven = at_edge & (grid.pulse_width_us[grid.interval] > 0)
-        if in_a_row >= 20 and driven.any() and abs(edge - float(np.median(torque))) > 0.2 * span:
+        if in_a_row >= 20 and driven.any() and abs(edge - baseline_nm) > 0.2 * span:
             return _gate(False, "care", f"the load cell is clipped at {edge:.3g} N·m ({int(at_edge.sum())} samples)")
     return _gate(True, "care", "")

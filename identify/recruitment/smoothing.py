@@ -29,8 +29,20 @@ class Choice:
     variance: float
 
 
+def straight_lines(roughness: np.ndarray) -> int:
+    """Dimension of the shapes that a penalty leaves alone."""
+    values = np.linalg.eigvalsh(roughness)
+    return int(np.sum(values <= 1e-13 * max(float(values[-1]), 1e-300)))
+
+
 def choose_weight(
-    gram: np.ndarray, moment: np.ndarray, energy: float, rows: int, roughness: np.ndarray, free: int = 0
+    gram: np.ndarray,
+    moment: np.ndarray,
+    energy: float,
+    rows: int,
+    roughness: np.ndarray,
+    free: int = 0,
+    null: int | None = None,
 ) -> Choice:
     """The weight that makes the data most likely, coefficients integrated out (REML).
 
@@ -47,6 +59,8 @@ def choose_weight(
         R.
     free : int
         How many columns were projected out.
+    null : int, optional
+        Dimension of what R leaves alone, where it is known already.
     """
     balance = float(np.trace(gram)) / max(float(np.trace(roughness)), 1e-300)
     floor = 1e-11 * balance
@@ -54,7 +68,8 @@ def choose_weight(
     half = np.linalg.solve(root, np.linalg.solve(root, roughness).T)
     bent, turn = np.linalg.eigh((half + half.T) / 2)
     bent = np.clip(bent, 0.0, None)
-    straight = bent <= 1e-10 * bent[-1]
+    # What the penalty leaves alone is a property of it, not of the data: where no data are, every shape looks bent.
+    straight = np.arange(bent.size) < (straight_lines(roughness) if null is None else null)
     part = turn.T @ np.linalg.solve(root, moment)
     freedom_left = max(rows - free - int(straight.sum()), 1)
     weight = np.geomspace(LOWEST, HIGHEST, 73) * balance

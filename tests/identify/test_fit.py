@@ -1,0 +1,202 @@
+"""The default method: certified constants, metamorphic relations, noise, ceilings."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import identify
+from identify.crossvalidation import BLOCK_S, FOLDS
+from identify.figures import best_fit_percent
+from identify.grid import make_grid
+from identify.linear import SecondOrder
+from identify.methods.maximum_likelihood import estimate
+from identify.projection import Problem, search
+from identify.record import Record
+from tests.identify.patients import Patient, make_record
+
+NOISY = 0.05
+
+
+def fitted(record: Record, **options) -> tuple[identify.Model, np.ndarray]:
+    model = identify.fit(record, **options)
+    return model, identify.predict(model, record)
+
+
+def rows(record: Record, name: str) -> np.ndarray:
+    return np.array(record.segment_names)[record.segment] == name
+
+
+@pytest.mark.parametrize("rate_hz", [40, 100, 400, 1000, 1600])
+def test_recovers_the_papers_muscle_without_noise(rate_hz):
+    record, clean = make_record(Patient(), np.random.default_rng(11), rate_hz=rate_hz, noise_nm=0.0)
+    model, predicted = fitted(record)
+    assert isinstance(model.linear, SecondOrder)
+    assert model.linear.time_constant_s == pytest.approx(0.5284, rel=1e-4)
+    assert model.linear.damping == pytest.approx(0.6369, rel=1e-4)
+    assert model.linear.delay_s == pytest.approx(0.0, abs=2e-5)
+    width = np.linspace(0, 300, 61)
+    assert np.max(np.abs(model.recruitment(width) - Patient().recruitment(width))) < 0.01
+    assert best_fit_percent(clean[rows(record, "ramp")], predicted[rows(record, "ramp")]) >= 99.98
+    assert best_fit_percent(clean[rows(record, "validate")], predicted[rows(record, "validate")]) >= 99.9
+
+
+@pytest.mark.parametrize("delay_s", [0.01, 0.025, 0.043])
+@pytest.mark.parametrize("rate_hz", [40, 1600])
+def test_recovers_a_delay_that_is_no_whole_number_of_samples(delay_s, rate_hz):
+    record, _ = make_record(
+        Patient(delay_s=delay_s, time_constant_s=0.2), np.random.default_rng(5), rate_hz=rate_hz, noise_nm=0.0
+    )
+    assert identify.fit(record).linear.delay_s == pytest.approx(delay_s, abs=2e-4)
+
+
+def test_scaling_torque_scales_the_recruitment_alone():
+    record, _ = make_record(Patient(), np.random.default_rng(2), noise_nm=NOISY)
+    model, other = identify.fit(record), identify.fit(record.with_torque(3.0 * record.torque_nm))
+    width = np.linspace(0, 300, 31)
+    assert other.linear.time_constant_s == pytest.approx(model.linear.time_constant_s, rel=1e-6)
+    assert other.linear.damping == pytest.approx(model.linear.damping, rel=1e-6)
+    assert other.recruitment(width) == pytest.approx(3.0 * model.recruitment(width), rel=1e-5, abs=1e-5)
+    assert other.fit["fit_percent"] == pytest.approx(model.fit["fit_percent"], abs=1e-6)
+
+
+def test_shifting_time_changes_nothing():
+    record, _ = make_record(Patient(), np.random.default_rng(3), noise_nm=NOISY)
+    model, predicted = fitted(record)
+    later, shifted = fitted(replace(record, time_s=record.time_s + 123.0))
+    assert later.linear.time_constant_s == pytest.approx(model.linear.time_constant_s, rel=1e-6)
+    assert np.max(np.abs(shifted - predicted)) < 1e-5
+
+
+def test_an_offset_goes_into_the_baseline_alone():
+    record, _ = make_record(Patient(), np.random.default_rng(3), noise_nm=NOISY)
+    model, other = identify.fit(record), identify.fit(record.with_torque(record.torque_nm + 7.0))
+    assert other.baseline_nm - model.baseline_nm == pytest.approx(7.0, abs=1e-6)
+    assert other.linear.damping == pytest.approx(model.linear.damping, rel=1e-6)
+
+
+def test_splitting_and_joining_segments_changes_nothing():
+    record, _ = make_record(Patient(), np.random.default_rng(4), noise_nm=NOISY, validate=False)
+    names = np.array(record.segment_names)[record.segment]
+    whole = Record.from_arrays(record.time_s, record.pulse_width_us, record.torque_nm, ["all"] * names.size)
+    split = np.where(np.arange(names.size) % 1111 < 500, "one", "two")
+    pieces = Record.from_arrays(record.time_s, record.pulse_width_us, record.torque_nm, split)
+    model, predicted = fitted(record)
+    for other in (whole, pieces):
+        again, same = fitted(other)
+        assert again.linear.time_constant_s == model.linear.time_constant_s
+        assert np.array_equal(same, predicted)
+
+
+def test_resampling_changes_predictions_by_less_than_the_noise():
+    record, _ = make_record(Patient(delay_s=0.02), np.random.default_rng(6), rate_hz=1600, noise_nm=NOISY)
+    every = slice(None, None, 4)
+    names = np.array(record.segment_names)[record.segment]
+    coarse = Record.from_arrays(
+        record.time_s[every], record.pulse_width_us[every], record.torque_nm[every], names[every]
+    )
+    _, fine = fitted(record)
+    _, thin = fitted(coarse)
+    assert np.sqrt(np.mean((fine[every] - thin) ** 2)) < 0.2 * NOISY
+
+
+def test_held_out_rows_are_never_used():
+    record, _ = make_record(Patient(), np.random.default_rng(7), noise_nm=NOISY)
+    spoiled = record.with_torque(np.where(record.held_out, -50.0, record.torque_nm))
+    model, other = identify.fit(record), identify.fit(spoiled)
+    assert other.linear == model.linear
+    assert np.array_equal(other.recruitment.coefficients_nm, model.recruitment.coefficients_nm)
+    assert other.noise == model.noise
+    assert other.fit["held_out_rms_nm"] > 10 * model.fit["held_out_rms_nm"]
+
+
+def test_without_validate_the_held_out_error_is_cross_validated():
+    record, _ = make_record(Patient(), np.random.default_rng(8), noise_nm=NOISY, validate=False)
+    model = identify.fit(record)
+    assert model.fit["held_out_by"] == "cross-validation"
+    assert model.fit["held_out_rms_nm"] >= model.fit["rms_nm"]
+    assert model.fit["held_out_rms_nm"] < 1.2 * NOISY
+
+
+def test_cross_validation_agrees_with_refits_of_the_same_design():
+    record, _ = make_record(Patient(), np.random.default_rng(9), rate_hz=40, noise_nm=0.2, validate=False)
+    grid = make_grid(record)
+    solution, _ = estimate(grid, grid.fitted)
+    fold = (np.cumsum(grid.fitted) // round(BLOCK_S * 40)) % FOLDS
+    squares = 0.0
+    for number in range(FOLDS):
+        out = grid.fitted & (fold == number)
+        part = Problem(grid, solution.problem.basis, solution.problem.roughness, grid.fitted & ~out)
+        again = search(part, solution.linear, weight=solution.weight, tolerance=1e-3)
+        squares += float(np.sum(again.residual_nm[out] ** 2))
+    honest = np.sqrt(squares / grid.fitted.sum())
+    assert identify.fit(record).fit["held_out_rms_nm"] == pytest.approx(honest, rel=1e-3)
+
+
+def test_a_record_that_starts_in_mid_contraction():
+    record, clean = make_record(Patient(), np.random.default_rng(12), rate_hz=400, noise_nm=0.0)
+    cut = int(np.argmax(clean[: 400 * 14] * (np.arange(400 * 14) > 2000)))
+    names = np.array(record.segment_names)[record.segment]
+    late = Record.from_arrays(record.time_s[cut:], record.pulse_width_us[cut:], record.torque_nm[cut:], names[cut:])
+    model, predicted = fitted(late)
+    assert any(model.initial)
+    assert model.linear.time_constant_s == pytest.approx(0.5284, rel=2e-3)
+    assert best_fit_percent(clean[cut:], predicted) > 99.8
+
+
+@pytest.mark.parametrize("noise_nm", [0.02, 0.1])
+@pytest.mark.parametrize("rate_hz", [40, 1600])
+def test_fit_reaches_its_ceiling_and_the_noise_is_estimated(noise_nm, rate_hz):
+    for seed in range(3):
+        record, _ = make_record(Patient(), np.random.default_rng(300 + seed), rate_hz=rate_hz, noise_nm=noise_nm)
+        model = identify.fit(record)
+        assert model.fit["fit_percent"] >= model.fit["ceiling_percent"] - 0.1
+        assert model.noise.white_sd_nm == pytest.approx(noise_nm, rel=0.08)
+
+
+def test_white_and_correlated_noise_are_told_apart():
+    told = []
+    for seed in range(6):
+        for ar1 in (0.0, 0.7):
+            # Correlated from sample to sample of 40 a second.
+            record, _ = make_record(
+                Patient(), np.random.default_rng(40 + seed), rate_hz=40, noise_nm=NOISY, ar1=ar1, validate=False
+            )
+            found = identify.fit(record).noise
+            told.append((found.ar1 > 0) == (ar1 > 0))
+            if ar1:
+                assert found.ar1 == pytest.approx(ar1, abs=0.15)
+    assert sum(told) >= 11
+
+
+@pytest.mark.parametrize("rise_us", [5, 25])
+def test_steep_recruitment_leaves_no_structure(rise_us):
+    for seed in range(3):
+        steep = 4.4 / rise_us
+        patient = Patient(a2=steep, a3=float(np.exp(min(steep * 150, 600))), time_constant_s=0.3)
+        record, clean = make_record(patient, np.random.default_rng(60 + seed), noise_nm=NOISY)
+        model, predicted = fitted(record)
+        used = ~record.held_out
+        assert best_fit_percent(clean[used], predicted[used]) > 99.5
+        assert model.noise.ar1 == 0.0
+
+
+def test_a_curve_that_falls_with_torque_of_the_other_sign():
+    record, _ = make_record(Patient(), np.random.default_rng(13), noise_nm=NOISY)
+    model = identify.fit(record.with_torque(-record.torque_nm))
+    assert model.quality["verdict"] == "usable"
+    level, width = model.recruitment.inverse()
+    assert level[-1] < -5
+    assert np.all(np.diff(width) >= 0)
+
+
+def test_fit_on_names_the_segments():
+    record, _ = make_record(Patient(), np.random.default_rng(14), noise_nm=0.0)
+    model = identify.fit(record, fit_on=("ramp",))
+    assert model.fit["samples"] < (~record.held_out).sum()
+    with pytest.raises(identify.BadRequest, match="no segment 'sprint'"):
+        identify.fit(record, fit_on=("sprint",))
+    with pytest.raises(identify.BadRequest, match="never fitted"):
+        identify.fit(record, fit_on=("validate",))
