@@ -158,6 +158,10 @@ class RigClient:
         for listener in list(self.link_listeners):
             listener(self.connected)
 
+    def _tell(self, event: AnyEvent) -> None:
+        for listener in list(self.listeners):
+            listener(event)
+
     async def _listen(self, reader: asyncio.StreamReader) -> None:
         assert self._writer is not None
         subscription = SubscribeRequest(id=next(self._numbers))
@@ -174,16 +178,18 @@ class RigClient:
         """Ask for the state now and then, so that its age says whether the rig still answers."""
         while True:
             await asyncio.sleep(STATUS_EVERY_S)
+            before = self.status.state if self.status else None
             with contextlib.suppress(ApiError):
-                await self.fresh_status()
+                status = await self.fresh_status()
+                if status.state != before:  # a change that no event told
+                    self._tell(StateEvent(status=status))
 
     def _take(self, message: dict[str, Any], subscription_id: int) -> None:
         if "event" in message:
             event = _events.validate_python(message)
             if isinstance(event, StateEvent):
                 self.status = event.status
-            for listener in list(self.listeners):
-                listener(event)
+            self._tell(event)
             return
         reply = Reply.model_validate(message)
         if reply.id == subscription_id and reply.ok:

@@ -26,6 +26,7 @@ def test(
     rig: Annotated[Path | None, typer.Option(help="rig file (TOML); default: the emulated rig")] = None,
     url: Annotated[str, typer.Option(help="a running service; default: one is started", envvar="STIMRIG_URL")] = "",
     data: Annotated[Path | None, typer.Option(help="data folder; default ./var, or STIMRIG_DATA_DIR")] = None,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="write the recording (HDF5) here")] = None,
     emulate: Annotated[str, typer.Option(help='options for the emulator, e.g. "--patient calcium"')] = "",
     as_json: Json = False,
 ) -> None:
@@ -37,11 +38,29 @@ def test(
         found = through(url, token, participant)
     else:
         found = on_own_services(rig, data, emulate, participant)
+    recording = found.pop("recording")
+    if output is not None:
+        save(output, recording)
     if as_json:
         say_json(found)
         return
     say(*report_lines(found["test"], found["model"]))
-    say(f"recording      {found['test']['recording_url']}", f"model          {found['test']['model_url']}")
+    say(f"recording      {output or found['test']['recording_url']}")
+
+
+def save(path: Path, recording: bytes) -> None:
+    """Write the recording.
+
+    Raises
+    ------
+    InputError
+        The place cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(recording)
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror}. Give a file in a folder that can be written.") from error
 
 
 def on_own_services(rig: Path | None, data: Path | None, emulate: str, participant: str) -> dict[str, Any]:
@@ -73,7 +92,8 @@ def through(url: str, token: str, participant: str, watch: Any = lambda: None) -
             ensure_participant(client, participant)
             document = run_test(client, participant, watch)
             model = checked(client.get(document["model_url"])).json()["model"]
-            return {"test": document, "model": model}
+            recording = checked(client.get(document["recording_url"])).content
+            return {"test": document, "model": model, "recording": recording}
     except (httpx.TransportError, httpx.UnsupportedProtocol, httpx.InvalidURL) as error:
         words = f"{url}: the service cannot be reached ({error}). Is `stimrig serve` running there?"
         raise ReportedError(words, 2) from error

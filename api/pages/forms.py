@@ -33,6 +33,29 @@ async def create_participant(context: Ctx, who: Tester, code: Annotated[str, For
     return RedirectResponse(f"/participants/{row.code}", 303)
 
 
+@router.post("/participants/{code}/profile")
+async def set_limits(
+    context: Ctx,
+    who: Tester,
+    code: str,
+    current_ma: Annotated[str, Form()] = "",
+    max_pulse_width_us: Annotated[str, Form()] = "",
+    max_torque_nm: Annotated[str, Form()] = "",
+) -> Response:
+    """The limits for the day."""
+    given = {"current_ma": current_ma, "max_pulse_width_us": max_pulse_width_us, "max_torque_nm": max_torque_nm}
+    try:
+        body = ProfileIn.model_validate(given)
+    except ValidationError as error:
+        first = error.errors()[0]
+        detail = (
+            f"{str(first['loc'][0]).replace('_', ' ')}: {first['msg']}, not {first['input']!r}. Nothing was changed."
+        )
+        raise ApiError(422, "invalid-input", "These limits cannot be used", detail) from None
+    await asyncio.to_thread(participants.change_profile, context, code, body, who.name)
+    return RedirectResponse(f"/participants/{code}", 303)
+
+
 @router.post("/participants/{code}/tests")
 async def start_test(context: Ctx, who: Tester, code: str) -> Response:
     """Start the default pre-session test."""

@@ -36,6 +36,17 @@ def find(context: Context, code: str) -> Participant:
     return row
 
 
+def change_profile(context: Context, code: str, body: ProfileIn, by: str) -> Participant:
+    """New limits for a participant; 404 where there is none."""
+    with context.store.write() as session:
+        row = session.get(Participant, code)
+        if row is None:
+            raise NotFoundError("participant", code)
+        row.profile = body.model_dump()
+        audit.write(session, context.clock.utc(), by, "set profile", code, profile=row.profile)
+    return row
+
+
 @router.post("", status_code=201)
 def make_participant(context: Ctx, who: Tester, body: ParticipantIn, response: Response) -> dict[str, Any]:
     """Make a participant: a code, never a name."""
@@ -59,14 +70,7 @@ def one_participant(context: Ctx, _who: Tester, code: str) -> dict[str, Any]:
 @router.put("/{code}/profile")
 def set_profile(context: Ctx, who: Tester, code: str, body: ProfileIn) -> dict[str, Any]:
     """Set the limits for the day."""
-    now = context.clock.utc()
-    with context.store.write() as session:
-        row = session.get(Participant, code)
-        if row is None:
-            raise NotFoundError("participant", code)
-        row.profile = body.model_dump()
-        audit.write(session, now, who.name, "set profile", code, profile=row.profile)
-    return row.as_dict()
+    return change_profile(context, code, body, who.name).as_dict()
 
 
 @router.get("/{code}/tests")

@@ -211,6 +211,19 @@ def test_two_browsers_see_the_same_test(browser: Any, tab: Any, service: Service
         assert painted(second, "torque-chart") > 1500
 
 
+def test_limits_for_today_are_set_and_checked(tab: Any, service: Service) -> None:
+    participant(tab, service, f"L{time.time_ns() % 10**9}")
+    tab.get_by_text("Limits for today").click()
+    tab.get_by_label("Current of every pulse").fill("17.5")
+    tab.get_by_role("button", name="Set").click()
+    tab.get_by_text("17.5 mA").wait_for()
+    tab.get_by_text("Limits for today").click()
+    tab.evaluate("document.querySelectorAll('.limits input').forEach((i) => i.removeAttribute('max'))")
+    tab.get_by_label("Comfort maximum").fill("5000")
+    tab.get_by_role("button", name="Set").click()
+    tab.get_by_text("Nothing was changed").wait_for()
+
+
 def test_a_name_is_refused_politely(tab: Any, service: Service) -> None:
     tab.evaluate("document.getElementById('code').removeAttribute('pattern')")
     tab.get_by_label("Code").fill("Anna Schmidt")
