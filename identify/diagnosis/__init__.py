@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-
 from identify.diagnosis.analysis import Analysis, analyse
 from identify.diagnosis.candidates import Progress
 from identify.diagnosis.report import report

@@ -12,6 +12,7 @@ from identify.diagnosis.structure import Left, left_over, quiet_rows
 from identify.effects import registry
 from identify.effects.base import Effect
 from identify.engine.fit import Fitted, solve, start_from
+from identify.engine.noise_level import NoiseLevel
 from identify.engine.prepare import Raw, inspect, prepare
 from identify.engine.problem import Problem
 from identify.record import Record
@@ -131,8 +132,7 @@ def _exchange(work: Analysis) -> None:
     last = work.last
     for index, effect in enumerate(list(work.added[:-1])):
         rivals = [c for c in work.rounds[index] if c.effect.id not in work.added][:2]
-        others = [(e, f) for e, f in last.effects if e != effect]
-        without = _refit(last, others)
+        without = _without(last, effect)
         if without is not None and without.log_evidence > work.last.log_evidence - 1.0:
             work.added.remove(effect)
             work.chain[-1] = without
@@ -143,6 +143,8 @@ def _exchange(work: Analysis) -> None:
         for rival in rivals:
             if rival.gain < 0.5 * work.rounds[index][0].gain:
                 continue
+            if rival.effect.band:
+                continue
             found = fit_form(rival.effect, rival.form, without, without.residual_nm, {})
             if found is not None and found.log_evidence > work.last.log_evidence + 2.0:
                 work.added[index] = rival.effect.id
@@ -151,6 +153,11 @@ def _exchange(work: Analysis) -> None:
                 return
 
 
-def _refit(fitted: Fitted, effects: list) -> Fitted | None:
-    problem = Problem(fitted.problem.setup, effects)
-    return solve(problem, start_from(problem, fitted, {}), fitted.noise)
+def _without(fitted: Fitted, effect: str) -> Fitted | None:
+    """The model refitted without one of its effects."""
+    noise = fitted.noise
+    others = [(e, f) for e, f in fitted.effects if e != effect]
+    if len(others) == len(fitted.effects):
+        noise = NoiseLevel(noise.ar1, noise.share, noise.sd_nm)
+    problem = Problem(fitted.problem.setup, others)
+    return solve(problem, start_from(problem, fitted, {}), noise)

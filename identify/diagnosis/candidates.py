@@ -7,10 +7,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from identify.effects import registry
 from identify.effects.base import Effect, Form, Scene
 from identify.engine.fit import Fitted, solve, start_from
+from identify.engine.noise_level import find_band
 from identify.engine.problem import Problem
 from identify.engine.setup import Setup
+
+PATIENCE = 2
+"""Steps of a chain (one bump, two bumps, …) without a gain after which it ends: of four bumps, one alone hardly helps."""
+BAND_COST = 9.0
+"""Log evidence that a narrow band's three numbers cost."""
 
 Progress = Callable[[float, str], None]
 
@@ -43,25 +50,29 @@ class Candidate:
 def applicable(effect: Effect, setup: Setup, present: Iterable[str]) -> bool:
     """Whether an effect can be considered: its columns are there, it isn't sought elsewhere, it isn't in already."""
     record = setup.grid.record
-    return not effect.raw and effect.id not in present and all(getattr(record, need) is not None for need in effect.needs)
+    if effect.raw or effect.id in present:
+        return False
+    return all(getattr(record, need) is not None for need in effect.needs)
 
 
 def try_effect(effect: Effect, base: Fitted, forms: Iterable[Form] | None = None) -> Candidate | None:
     """The effect's best form added to a model; None where there is nothing to start from."""
+    if effect.band:
+        return try_band(effect, base)
     best: Fitted | None = None
     best_form: Form | None = None
     gains: dict[str, float] = {}
     previous: dict[str, float] = {}
-    chain_gain = 0.0
+    idle = 0
     residual = base.residual_nm
     for form in forms or effect.forms:
-        if form.grows and (not gains or chain_gain <= 0.0):
+        if form.grows and (not gains or idle >= PATIENCE):
             break
         found = fit_form(effect, form, base, residual, previous)
         if found is None:
             continue
         gain = found.log_evidence - base.log_evidence + effect.prior
-        chain_gain = gain - (max(gains.values()) if gains else 0.0)
+        idle = 0 if gain > max(gains.values(), default=0.0) else idle + 1
         gains[form.name] = gain
         if form.propose is not None:
             previous, residual = found.parameters_of(effect.id), found.residual_nm
@@ -70,6 +81,17 @@ def try_effect(effect: Effect, base: Fitted, forms: Iterable[Form] | None = None
     if best is None or best_form is None:
         return None
     return Candidate(effect, best_form, best, gains[best_form.name], gains)
+
+
+def try_band(effect: Effect, base: Fitted) -> Candidate | None:
+    """A narrow band added to the noise."""
+    setup = base.problem.setup
+    noise, log_likelihood = find_band(base.residual_nm, setup.stretches, setup.grid.step_s)
+    if log_likelihood - base.log_likelihood < BAND_COST:
+        return None
+    found = solve(base.problem, base.theta, noise)
+    gain = found.log_evidence - base.log_evidence - BAND_COST + effect.prior
+    return Candidate(effect, effect.forms[0], found, gain, {"narrow_band": gain})
 
 
 def fit_form(
@@ -91,11 +113,19 @@ def fit_form(
     return best
 
 
+def names(fitted: Fitted) -> list[str]:
+    """Effects in a model, tremor included where the noise has a narrow band."""
+    listed = [name for name, _ in fitted.effects]
+    if fitted.noise.band > 0.0:
+        listed += [effect.id for effect in registry().values() if effect.band and effect.id not in listed]
+    return listed
+
+
 def scan(
     base: Fitted, effects: Iterable[Effect], progress: Progress | None = None, share: tuple[float, float] = (0.0, 1.0)
 ) -> list[Candidate]:
     """Every applicable effect added to a model, best first."""
-    present = {name for name, _ in base.effects}
+    present = set(names(base))
     listed = [effect for effect in effects if applicable(effect, base.problem.setup, present)]
     found = []
     for index, effect in enumerate(listed):

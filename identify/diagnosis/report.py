@@ -26,12 +26,28 @@ def report(work: Analysis, verdict: Verdict) -> dict[str, Any]:
     models = _models(work)
     missing = [_missing(work, verdict, effect, base, models) for effect in _ranked(verdict)]
     final = models.get(len(work.added), base) if work.chain[-1] is not work.base else base
-    residual = record.torque_nm - (predict_fitted(work.last, record) if verdict.kind == "unexplained_structure" else base_prediction)
+    residual = record.torque_nm - (
+        predict_fitted(work.last, record) if verdict.kind == "unexplained_structure" else base_prediction
+    )
     where = worst_places(record, residual, raw.noise_sd_nm, rows=~record.held_out)
     return {
         "noise_sd_nm": raw.noise_sd_nm,
-        "slow_noise": {"sd_nm": work.last.noise.sd_nm * float(np.sqrt(work.last.noise.share)), "ar1": work.last.noise.ar1},
-        "base": {key: base[key] for key in ("fit_percent", "held_out_fit_percent", "rms_nm", "held_out_rms_nm", "ceiling_percent", "held_out_ceiling_percent", "held_out")},
+        "slow_noise": {
+            "sd_nm": work.last.noise.sd_nm * float(np.sqrt(work.last.noise.share)),
+            "ar1": work.last.noise.ar1,
+        },
+        "base": {
+            key: base[key]
+            for key in (
+                "fit_percent",
+                "held_out_fit_percent",
+                "rms_nm",
+                "held_out_rms_nm",
+                "ceiling_percent",
+                "held_out_ceiling_percent",
+                "held_out",
+            )
+        },
         "verdict": verdict.kind,
         "probability": verdict.probability,
         "missing": missing,
@@ -63,7 +79,9 @@ def _missing(
     fitted = work.last
     index = [e for e, _ in fitted.effects].index(effect)
     rivals = verdict.rivals.get(effect, {})
-    confused = [name for name, p in sorted(rivals.items(), key=lambda item: -item[1]) if name and name != effect and p >= RIVAL]
+    confused = [
+        name for name, p in sorted(rivals.items(), key=lambda item: -item[1]) if name and name != effect and p >= RIVAL
+    ]
     described = get(effect)
     return {
         "effect": effect,
@@ -117,7 +135,9 @@ def _plain(
         if where:
             lines.append(f"It sits mostly here: {where[0]['text']}.")
     for entry in missing:
-        sure = "very probably" if entry["probability"] > 0.9 else "probably" if entry["probability"] > 0.6 else "possibly"
+        sure = (
+            "very probably" if entry["probability"] > 0.9 else "probably" if entry["probability"] > 0.6 else "possibly"
+        )
         text = f"{entry['name']} is {sure} missing ({100 * entry['probability']:.0f} %). {entry['plain']}"
         if entry["confused_with"]:
             others = ", ".join(get(name).name.lower() for name in entry["confused_with"])

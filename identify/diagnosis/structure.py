@@ -8,6 +8,7 @@ import numpy as np
 
 from identify.engine.core import profile_noise
 from identify.engine.fit import Fitted
+from identify.engine.noise_level import band_part
 from identify.grid import runs
 from identify.record import Record
 
@@ -59,7 +60,8 @@ def left_over(fitted: Fitted, quiet: np.ndarray, noise_sd_nm: float) -> Left:
     noise_sd_nm : float
         White noise of a sample, N·m.
     """
-    setup, residual = fitted.problem.setup, fitted.residual_nm
+    setup = fitted.problem.setup
+    residual = fitted.residual_nm - band_part(fitted.residual_nm, setup.stretches, fitted.noise)
     count = float(np.median(setup.grid.count[setup.fitted]))
     white = noise_sd_nm / np.sqrt(count)
     rests, works = _long(setup.fitted & quiet, 8), _long(setup.fitted & ~quiet, 4)

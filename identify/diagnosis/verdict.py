@@ -78,7 +78,9 @@ def judge(work: Analysis) -> Verdict:
     for number, effect in enumerate(work.added):
         if number >= len(work.rounds):
             break
-        rivals[effect] = shares([c for c in work.rounds[number] if c.effect.id == effect or c.effect.id not in work.added])
+        rivals[effect] = shares(
+            [c for c in work.rounds[number] if c.effect.id == effect or c.effect.id not in work.added]
+        )
         found[effect] = rivals[effect].get(effect, 0.5)
     structure = left.ratio
     strange = held > HELD
@@ -95,5 +97,8 @@ def judge(work: Analysis) -> Verdict:
     elif found:
         kind, probability = "effect_missing", max(found.values())
     else:
-        kind, probability = "nothing_missing", 1.0 - sum(p for n, p in shares(work.rounds[0] if work.rounds else []).items() if n)
+        kind, probability = (
+            "nothing_missing",
+            1.0 - sum(p for n, p in shares(work.rounds[0] if work.rounds else []).items() if n),
+        )
     return Verdict(kind, found, rivals, float(explained), float(structure), float(probability), notes)

@@ -61,7 +61,9 @@ def worst_places(
         return []
     merged = _merge(pieces, record)
     merged.sort(key=lambda piece: -piece[2])
-    return [_place(record, residual_nm, piece, excess_total) for piece in merged[:most] if piece[2] > 0.02 * excess_total]
+    return [
+        _place(record, residual_nm, piece, excess_total) for piece in merged[:most] if piece[2] > 0.02 * excess_total
+    ]
 
 
 def _merge(pieces: list[list[Any]], record: Record) -> list[list[Any]]:

@@ -107,6 +107,7 @@ def _describe(effect: Effect) -> dict[str, Any]:
                 "source": form.source or effect.source,
             }
             for form in effect.forms
+            if len(form.parameters) < 40
         ],
         "source": effect.source,
         "signature": effect.signature,

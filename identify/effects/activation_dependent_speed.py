@@ -19,6 +19,8 @@ EFFECT = Effect(
         _form("exponential", "T exp(slope·y/y_max)", 4, -2.0, 2.0),
         _form("inverse_torque", "T/(1 + slope·y/y_max)", 5),
         _form("inverse_drive", "T/(1 + slope·w/y_max)", 6),
+        _form("damping", "ζ (1 + slope·y/y_max): the slower of two lags", 7),
+        _form("inverse_damping", "ζ/(1 + slope·w/y_max)", 9),
     ),
     signature="Small torques come faster (or slower) than large ones: the error's sign goes with level and time.",
     resembles=("asymmetric_relaxation", "voluntary_effort", "mixed_fibres", "output_saturation"),

@@ -37,6 +37,14 @@ EFFECT = Effect(
             log_law=True,
         ),
         Form(
+            "damping",
+            "speed",
+            "as by_drive, on the damping alone: the slower of two lags",
+            (_RATIO,),
+            law={"ratio": 8},
+            log_law=True,
+        ),
+        Form(
             "kinetics",
             "gain",
             "a' = (w - a)/τ, τ = rise where w > a, else fall; the second order follows a",

@@ -214,6 +214,9 @@ class Effect:
         Whether it can be predicted for rows not fitted (bumps and tremor can't).
     raw : bool
         Whether it is sought at the record's own rate, before averaging.
+    band : bool
+        Whether it is a narrow band of noise: sought in the residual's spectrum, and part of the noise while others are
+        weighed.
     experiment : tuple of str
         Kinds of sequence that show it best.
     prior : float
@@ -231,6 +234,7 @@ class Effect:
     needs: tuple[str, ...] = ()
     foreseeable: bool = True
     raw: bool = False
+    band: bool = False
     experiment: Sequence[str] = ()
     prior: float = 0.0
 

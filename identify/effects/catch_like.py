@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from identify.effects.base import Effect, Form, Parameter, Scene
-from identify.effects.kernels import adapt, since_onset
+from identify.effects.kernels import adapt, since_onset, train
 
 _GAIN = Parameter("gain", "1", 0.0, 2.5, 0.0, (0.3, 0.8), about="extra torque at the onset")
 _DECAY = Parameter("decay_s", "s", 0.12, 1.2, 0.3, (0.25, 0.5), "log", about="time constant with which it fades")
@@ -20,13 +20,27 @@ def _depletes(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
     return drive * (1.0 + p["gain"] * (1.0 - x))
 
 
-def _since(least_gap_s: float) -> Any:
+def _by_level(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+    level = np.minimum(np.abs(drive) / scene.scale_nm, 1.0)
+    x = adapt(level, p["decay_s"][:, 0], p["recovery_s"][:, 0], True, scene.step_s)
+    return drive * (1.0 + p["gain"] * (1.0 - x))
+
+
+def _after_silence(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+    """The longer the silence before a train, the larger the boost at its onset."""
+    since, gap = train(scene.on, scene.step_s)
+    return drive * (1.0 + p["gain"] * -np.expm1(-gap / p["recovery_s"]) * np.exp(-since / p["decay_s"]))
+
+
+def _burst(length_s: float, least_gap_s: float) -> Any:
     def apply(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
-        since = since_onset(scene.on, least_gap_s, scene.step_s)
-        return drive * (1.0 + p["gain"] * np.exp(-since / p["decay_s"]))
+        since = since_onset(scene.on, least_gap_s - 0.004, scene.step_s)
+        return drive * (1.0 + p["gain"] * np.exp(-((since / length_s) ** 4)))
 
     return apply
 
+
+_QUICK = Parameter("decay_s", "s", 0.05, 1.2, 0.3, (0.12, 0.4), "log", about="time constant with which it fades")
 
 EFFECT = Effect(
     id="catch_like",
@@ -40,16 +54,32 @@ EFFECT = Effect(
             _depletes,
             batched=True,
         ),
+        Form(
+            "by_level",
+            "gain",
+            "w = (1 + gain (1 - x)) f(u); x' = a (1 - x)/decay - x/recovery; a = |f|/f_max",
+            (_GAIN, _DECAY, _RECOVERY),
+            _by_level,
+            batched=True,
+        ),
+        Form(
+            "after_silence",
+            "gain",
+            "w = (1 + gain (1 - exp(-silence/recovery)) exp(-t/decay)) f(u), t since the onset of the train",
+            (_GAIN, _QUICK, _RECOVERY),
+            _after_silence,
+            batched=True,
+        ),
         *(
             Form(
-                f"after_{gap * 1000:.0f}_ms",
+                f"burst_{length * 1000:.0f}_ms",
                 "gain",
-                f"w = (1 + gain·exp(-t/decay)) f(u), t since the first pulse after a silence of {gap:g} s or more",
-                (_GAIN, _DECAY),
-                _since(gap - 0.004),
+                f"w = (1 + gain·exp(-(t/{length:g} s)^4)) f(u), t since the first pulse after {gap:g} s of silence or more",
+                (_GAIN,),
+                _burst(length, gap),
                 batched=True,
             )
-            for gap in (0.025, 0.1, 0.25)
+            for length, gap in ((0.06, 0.1), (0.12, 0.1), (0.24, 0.25))
         ),
     ),
     signature="Torque above the model in the first tenths of a second after every silence.",

@@ -180,3 +180,22 @@ def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:  # pragma: no cover
             for j in range(size):
                 out[i, j] += a[i, k] * b[k, j]
     return out
+
+
+@njit(cache=True, nogil=True)
+def train(on: np.ndarray, step_s: float) -> tuple[np.ndarray, np.ndarray]:  # pragma: no cover
+    """Time since the onset of the present train and the silence before it, s; a train is pulses without a gap."""
+    since = np.full(on.size, 1e9)
+    before = np.zeros(on.size)
+    gap, length, silence = 1e3, 0.0, 1e3
+    for k in range(on.size):
+        if on[k] > 0:
+            if gap > 0.0:
+                silence, length = gap, 0.0
+            gap = 0.0
+            since[k] = length + 0.5 * step_s
+            before[k] = silence
+            length += step_s
+        else:
+            gap += step_s
+    return since, before

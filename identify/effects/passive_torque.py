@@ -46,7 +46,14 @@ EFFECT = Effect(
     id="passive_torque",
     name="Passive torque of the joint",
     forms=(
-        Form("linear", "additive", "y + stiffness·Δ + viscosity·velocity, Δ = angle - angle at the start", (_STIFF, _VISCOUS), _linear, True),
+        Form(
+            "linear",
+            "additive",
+            "y + stiffness·Δ + viscosity·velocity, Δ = angle - angle at the start",
+            (_STIFF, _VISCOUS),
+            _linear,
+            True,
+        ),
         Form(
             "exponential",
             "additive",

@@ -30,9 +30,9 @@ def _hill(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
 def _marion(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
     assert scene.angle_rad is not None and scene.velocity_rad_s is not None
     angle = np.abs(scene.angle_rad)
-    return y + p["gain_nm_s_per_rad2"] * angle * np.exp(-p["decay_per_rad"] * angle) * scene.velocity_rad_s * np.minimum(
-        np.abs(y) / (0.2 * scene.scale_nm), 1.0
-    )
+    return y + p["gain_nm_s_per_rad2"] * angle * np.exp(
+        -p["decay_per_rad"] * angle
+    ) * scene.velocity_rad_s * np.minimum(np.abs(y) / (0.2 * scene.scale_nm), 1.0)
 
 
 EFFECT = Effect(

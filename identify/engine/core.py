@@ -9,12 +9,12 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-LAWS = 8
+LAWS = 10
 """Columns of the speed law: see `factor`."""
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _transition(time_constant_s, damping, step_s):  # noqa: ANN001, ANN202  # pragma: no cover
+def _transition(time_constant_s, damping, step_s):  # pragma: no cover
     h = step_s / time_constant_s
     decay = np.exp(-damping * h)
     gap = damping * damping - 1.0
@@ -35,12 +35,13 @@ def _transition(time_constant_s, damping, step_s):  # noqa: ANN001, ANN202  # pr
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _factor(law, w, y, v, scale_nm):  # noqa: ANN001, ANN202  # pragma: no cover
-    """Factor on T. `law` holds, each neutral at 0:
+def _factor(law, w, y, v, scale_nm):  # pragma: no cover
+    """Factors on T and on the damping. `law` holds, each neutral at 0:
 
     0 log ratio where the drive is below the torque (relaxing), 1 log ratio where torque falls,
-    2 linear in torque, 3 linear in drive, 4 exponential in torque, 5 linear in the square root of torque,
-    6 log ratio for a drive below half the torque and above alike, by how far it is from the torque, 7 unused.
+    2 linear in torque, 3 linear in drive, 4 exponential in torque, 5 inverse linear in torque,
+    6 inverse linear in drive; on the damping alone, which is the slower lag where the muscle is overdamped:
+    7 linear in torque, 8 log ratio where the drive is below the torque, 9 inverse linear in drive.
     """
     m = 1.0
     if law[0] != 0.0:
@@ -60,11 +61,19 @@ def _factor(law, w, y, v, scale_nm):  # noqa: ANN001, ANN202  # pragma: no cover
         m *= 1.0 / max(1.0 + law[5] * level, 0.08)
     if law[6] != 0.0:
         m *= 1.0 / max(1.0 + law[6] * abs(w) / scale_nm, 0.08)
-    return min(max(m, 0.02), 50.0)
+    d = 1.0
+    if law[7] != 0.0:
+        d *= max(1.0 + law[7] * level, 0.08)
+    if law[8] != 0.0:
+        gap = (w - y) / (0.02 * scale_nm)
+        d *= np.exp(law[8] * 0.5 * (1.0 - gap / np.sqrt(1.0 + gap * gap)))
+    if law[9] != 0.0:
+        d *= 1.0 / max(1.0 + law[9] * abs(w) / scale_nm, 0.08)
+    return min(max(m, 0.02), 50.0), min(max(d, 0.02), 50.0)
 
 
 @njit(cache=True, nogil=True)
-def run_core(drive, time_constant_s, damping, law, multiplier, scale_nm, step_s):  # noqa: ANN001, ANN201  # pragma: no cover
+def run_core(drive, time_constant_s, damping, law, multiplier, scale_nm, step_s):  # pragma: no cover
     """Boundary states of rows of drives.
 
     Parameters
@@ -99,15 +108,15 @@ def run_core(drive, time_constant_s, damping, law, multiplier, scale_nm, step_s)
         y, v = 0.0, 0.0
         for k in range(size):
             w = drive[m, k]
-            f = 1.0
+            f, d = 1.0, 1.0
             if lawful:
-                f = _factor(law[m], w, y, v, scale_nm)
+                f, d = _factor(law[m], w, y, v, scale_nm)
             if given > 0:
                 f *= multiplier[m if given > 1 else 0, k]
-            if f == 1.0:
+            if f == 1.0 and d == 1.0:
                 p11, p12, p21, p22 = b11, b12, b21, b22
             else:
-                p11, p12, p21, p22 = _transition(base * f, damping[m], step_s)
+                p11, p12, p21, p22 = _transition(base * f, damping[m] * d, step_s)
             gap = y - w
             y, v = w + p11 * gap + p12 * v, p21 * gap + p22 * v
             torque[m, k + 1] = y
@@ -116,7 +125,7 @@ def run_core(drive, time_constant_s, damping, law, multiplier, scale_nm, step_s)
 
 
 @njit(cache=True, nogil=True)
-def mean_weights(fraction, interval, count, shift):  # noqa: ANN001, ANN201  # pragma: no cover
+def mean_weights(fraction, interval, count, shift):  # pragma: no cover
     """Weights of the boundary states in each interval's mean of samples read `shift` steps late.
 
     Returns
@@ -146,7 +155,7 @@ def mean_weights(fraction, interval, count, shift):  # noqa: ANN001, ANN201  # p
 
 
 @njit(cache=True, nogil=True)
-def read_means(torque, rate, first, weights, step_s):  # noqa: ANN001, ANN201  # pragma: no cover
+def read_means(torque, rate, first, weights, step_s):  # pragma: no cover
     """Means over intervals, shape (M, K), from boundary states of shape (M, K + 1)."""
     rows, size = torque.shape[0], weights.shape[0]
     out = np.zeros((rows, size))
@@ -166,7 +175,7 @@ def read_means(torque, rate, first, weights, step_s):  # noqa: ANN001, ANN201  #
 
 
 @njit(cache=True, nogil=True)
-def whiten_rows(rows, start, stop, ar1, share):  # noqa: ANN001, ANN201  # pragma: no cover
+def whiten_rows(rows, start, stop, ar1, share):  # pragma: no cover
     """Innovations of white plus AR(1) noise, scaled to equal variance, by an exact Kalman filter.
 
     Parameters
@@ -219,7 +228,7 @@ def whiten_rows(rows, start, stop, ar1, share):  # noqa: ANN001, ANN201  # pragm
 
 
 @njit(cache=True, nogil=True)
-def _squares(row, start, stop, ar1, share):  # noqa: ANN001, ANN202  # pragma: no cover
+def _squares(row, start, stop, ar1, share):  # pragma: no cover
     """Sum of squared innovations, half the log determinant, count; the filter's gain settles within some steps."""
     total, squares, logdet = 0, 0.0, 0.0
     noise = (1.0 - ar1 * ar1) * share
@@ -250,14 +259,14 @@ def _squares(row, start, stop, ar1, share):  # noqa: ANN001, ANN202  # pragma: n
 
 
 @njit(cache=True, nogil=True)
-def _minus_log_likelihood(row, start, stop, ar1, share):  # noqa: ANN001, ANN202  # pragma: no cover
+def _minus_log_likelihood(row, start, stop, ar1, share):  # pragma: no cover
     """Minus the profiled log-likelihood of one residual, up to a constant."""
     squares, logdet, total = _squares(row, start, stop, ar1, share)
     return 0.5 * total * np.log(max(squares / max(total, 1), 1e-24)) + logdet
 
 
 @njit(cache=True, nogil=True)
-def profile_noise(row, start, stop, ar1, share):  # noqa: ANN001, ANN201  # pragma: no cover
+def profile_noise(row, start, stop, ar1, share):  # pragma: no cover
     """Correlation and slow share that make a residual most likely, by a pattern search from where it stands.
 
     Returns
@@ -298,7 +307,7 @@ def profile_noise(row, start, stop, ar1, share):  # noqa: ANN001, ANN201  # prag
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def gram(rows):  # noqa: ANN001, ANN201  # pragma: no cover
+def gram(rows):  # pragma: no cover
     """rows @ rows.T for few long rows, on one core: a library's threads cost more than they give here."""
     count, size = rows.shape
     out = np.empty((count, count))

@@ -18,7 +18,7 @@ def fit_percent(torque_nm: np.ndarray, predicted_nm: np.ndarray) -> float:
     return float(100.0 * (1.0 - np.linalg.norm(torque_nm - predicted_nm) / max(spread, 1e-12)))
 
 
-def figures(fitted: Fitted, record: Record, predicted_nm: np.ndarray | None = None) -> dict[str, float | None | str]:
+def figures(fitted: Fitted, record: Record, predicted_nm: np.ndarray | None = None) -> dict[str, float | str | None]:
     """Fit and error on fitted and on held-out rows, and the ceiling that noise sets."""
     predicted = predict_fitted(fitted, record) if predicted_nm is None else predicted_nm
     used = fitted.problem.setup.fitted[fitted.problem.setup.grid.interval] & ~record.held_out

@@ -8,28 +8,10 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from identify.effects.base import Form
-from identify.engine.core import gram, profile_noise, whiten_rows
+from identify.engine.core import gram
+from identify.engine.noise_level import NoiseLevel, profile, whitened
 from identify.engine.problem import FIRST_COEFFICIENT, Problem
 from identify.engine.setup import Setup
-
-
-@dataclass(frozen=True)
-class NoiseLevel:
-    """White plus slow noise on the grid.
-
-    Parameters
-    ----------
-    ar1 : float
-        Correlation of neighbours of the slow part.
-    share : float
-        Share of the variance that is slow.
-    sd_nm : float
-        Total standard deviation of an interval's mean, N·m.
-    """
-
-    ar1: float
-    share: float
-    sd_nm: float
 
 
 @dataclass(frozen=True)
@@ -96,14 +78,11 @@ class Fitted:
 
 
 def _noise(problem: Problem, residual: np.ndarray, near: NoiseLevel) -> tuple[NoiseLevel, float]:
-    start, stop = problem.setup.stretches
-    ar1, share, sd, log_likelihood = profile_noise(residual, start, stop, near.ar1, near.share)
-    return NoiseLevel(ar1, share, max(sd, 1e-9)), log_likelihood
+    return profile(residual, problem.setup.stretches, near)
 
 
 def _whiten(problem: Problem, rows: np.ndarray, noise: NoiseLevel) -> np.ndarray:
-    start, stop = problem.setup.stretches
-    return whiten_rows(rows, start, stop, noise.ar1, noise.share)[0] / noise.sd_nm
+    return whitened(rows, problem.setup.stretches, noise)
 
 
 def _residual(problem: Problem, mean: np.ndarray) -> np.ndarray:

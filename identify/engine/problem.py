@@ -226,7 +226,7 @@ class _Walk:
 
     def dynamics(self, drive: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         setup = self.setup
-        rows, core = self.join(range(0, 2))
+        rows, core = self.join(range(2))
         drive = drive[rows]
         law = np.zeros((drive.shape[0], LAWS))
         given: list[tuple[Chosen, np.ndarray]] = []
@@ -303,7 +303,7 @@ class _Walk:
             mean[row] = read_means(torque[row : row + 1], rate[row : row + 1], first, weights, step_s)[0]
         return mean
 
-    def add(self, value: np.ndarray, scene=None, skip: frozenset[str] = frozenset()) -> np.ndarray:  # noqa: ANN001
+    def add(self, value: np.ndarray, scene=None, skip: frozenset[str] = frozenset()) -> np.ndarray:
         at_samples = scene is not None
         scene = scene or self.setup.scene
         rows, values = self.join(range(3, 4))
@@ -316,7 +316,7 @@ class _Walk:
             value = value + np.asarray(chosen.form.call(None, self.named(chosen, values), scene))
         return value
 
-    def sense(self, value: np.ndarray, scene=None) -> np.ndarray:  # noqa: ANN001
+    def sense(self, value: np.ndarray, scene=None) -> np.ndarray:
         for chosen in self.forms("sensor"):
             rows, values = self.join(chosen.places)
             value = np.asarray(chosen.form.call(value[rows], self.named(chosen, values), scene or self.setup.scene))
