@@ -61,7 +61,7 @@ def fit(
     except (TypeError, ValueError) as error:
         if options:
             given = ", ".join(f"{key}={value}" for key, value in options.items())
-            raise BadRequest(f"unusable option ({error})", place=given, mend="See `identify.methods.methods()[id].options`.") from error
+            raise BadRequest(f"unusable option ({error})", place=given, mend="See the method's options.") from error
         raise
 
 

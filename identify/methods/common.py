@@ -136,3 +136,16 @@ def order_option(value: object) -> str | tuple[int, int, int]:
             f"order {value!r}", place="order", mend="Give second-order, auto, or poles,zeros,delay such as 2,1,1."
         )
     return poles, zeros, delay
+
+
+def flag(value: object, name: str) -> bool:
+    """true or false, from a bool or from text.
+
+    Raises
+    ------
+    BadRequest
+    """
+    text = str(value).lower()
+    if text not in {"true", "false", "1", "0", "yes", "no"}:
+        raise BadRequest(f"{name}={value!r}", place=name, mend="Give true or false.")
+    return text in {"true", "1", "yes"}

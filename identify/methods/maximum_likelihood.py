@@ -12,9 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from identify.errors import BadRequest
 from identify.finish import finish
 from identify.grid import Grid
-from identify.methods.common import fitted_rows
+from identify.methods.common import fitted_rows, flag, order_option
 from identify.model import Model
 from identify.noise import noise_evidence
 from identify.projection import Solution, begins_at_rest, designed, pilot_solution, search
@@ -26,15 +27,68 @@ class MaximumLikelihood:
 
     id = "maximum-likelihood"
     summary = "Joint estimate of recruitment spline and second-order dynamics by variable projection on all segments."
-    options: Mapping[str, str] = MappingProxyType({"knots": "how many knots the spline has (31)"})
+    options: Mapping[str, str] = MappingProxyType(
+        {
+            "recruitment": "spline (default, (8)), power-series (6) or sigmoid (30)",
+            "monotone": "true: the spline never falls (false)",
+            "knots": "how many knots the spline has (31)",
+            "power": "order of the power series (by BIC)",
+            "delay_s": "a delay that is known, s (estimated)",
+            "order": "second-order (default), auto, or l,n,d of equations (1) to (3)",
+        }
+    )
 
     def fit(self, grid: Grid, fit_on: tuple[str, ...] | None, **options: Any) -> Model:
         """Fit; see `identify.fit`."""
-        solution, delta_bic = estimate(grid, fitted_rows(grid, fit_on), knots=int(options.get("knots", KNOTS)))
-        return finish(self.id, solution, delta_bic)
+        rows = fitted_rows(grid, fit_on)
+        order = order_option(options.get("order", "second-order"))
+        knots = int(options.get("knots", KNOTS))
+        if order != "second-order":
+            from identify.methods.two_stage import general
+
+            return general(self.id, grid, rows, rows, 8, knots, order)
+        delay_s = float(options["delay_s"]) if "delay_s" in options else None
+        kind = str(options.get("recruitment", "spline"))
+        solution, delta_bic = estimate(grid, rows, knots, delay_s)
+        reasons = []
+        if kind == "spline":
+            reasons.append(
+                f"spline of {solution.problem.basis.size} coefficients, smoothed to {solution.freedom:.1f} effective"
+            )
+            if flag(options.get("monotone", False), "monotone"):
+                from identify.alternatives import monotone
+
+                solution = monotone(solution)
+                reasons.append("recruitment held monotone")
+        else:
+            solution, reason = _other(kind, solution, options)
+            delta_bic = noise_evidence(solution.residual_nm, solution.problem.stretches)[1]
+            reasons.append(reason)
+        return finish(self.id, solution, delta_bic, [*reasons, *_why(solution, delta_bic)])
 
 
 METHOD = MaximumLikelihood()
+
+
+def _other(kind: str, solution: Solution, options: Mapping[str, Any]) -> tuple[Solution, str]:
+    from identify.alternatives import power_series, sigmoid
+
+    if kind == "power-series":
+        return power_series(solution, int(options["power"]) if "power" in options else None)
+    if kind == "sigmoid":
+        return sigmoid(solution), "sigmoid (30)"
+    raise BadRequest(f"recruitment {kind!r}", place="recruitment", mend="Give spline, power-series or sigmoid.")
+
+
+def _why(solution: Solution, delta_bic: float) -> list[str]:
+    linear = solution.linear
+    noise = "AR(1)" if delta_bic > 0 else "white"
+    enough = "a white residual" if delta_bic <= 0 else "but the residual isn't white: try order=auto, or diagnose"
+    return [
+        f"second order: T {linear.time_constant_s:.4g} s, damping {linear.damping:.3g}, "
+        f"delay {1e3 * linear.delay_s:.1f} ms; {enough}",
+        f"noise taken as {noise}: BIC of AR(1) is {abs(delta_bic):.1f} {'better' if delta_bic > 0 else 'worse'}",
+    ]
 
 
 def estimate(grid: Grid, rows: np.ndarray, knots: int = KNOTS, delay_s: float | None = None) -> tuple[Solution, float]:

@@ -23,11 +23,11 @@ from identify.errors import BadRequest
 from identify.finish import finish, finish_discrete
 from identify.grid import Grid
 from identify.linear import Discrete, SecondOrder
-from identify.methods.common import active_level, near_rest, order_option, quiet_level, segment_rows
+from identify.methods.common import active_level, flag, near_rest, order_option, quiet_level, segment_rows
 from identify.model import Model
 from identify.noise import noise_evidence
 from identify.output_error import OutputError, choose_order, equation_error, output_error, stable
-from identify.projection import Problem, Solution, begins_at_rest, pilot_curve, project, search
+from identify.projection import Problem, Solution, begins_at_rest, pilot_curve, pilot_solution, project, search
 from identify.recruitment.curve import Curve
 from identify.recruitment.fixed import FixedShape
 from identify.recruitment.knots import KNOTS, PILOT_KNOTS, adapted_knots, even_knots, spline_roughness
@@ -66,13 +66,13 @@ class TwoStage:
         iterations = int(options.get("iterations", 1))
         knots = int(options.get("knots", KNOTS))
         literal = options.get("linear", "output-error") == "equation-error"
-        inverse = str(options.get("inverse", False)).lower() == "true"
+        inverse = flag(options.get("inverse", False), "inverse")
         order = order_option(options.get("order", "second-order"))
         if order == "second-order" and not literal and not inverse:
             solution, reasons = physical(grid, prbs, ramp, iterations, knots)
             delta_bic = noise_evidence(solution.residual_nm, solution.problem.stretches)[1]
             return finish(self.id, solution, delta_bic, reasons)
-        return _general(self.id, grid, prbs, ramp, iterations, knots, order, literal, inverse)
+        return general(self.id, grid, prbs, ramp, iterations, knots, order, literal, inverse)
 
 
 METHOD = TwoStage()
@@ -124,7 +124,7 @@ def _recruitment(grid: Grid, rows: np.ndarray, linear: SecondOrder, from_rest: b
     return project(Problem(grid, basis, roughness, rows, from_rest), linear)
 
 
-def _general(
+def general(
     method_id: str,
     grid: Grid,
     prbs: np.ndarray,
@@ -132,14 +132,14 @@ def _general(
     iterations: int,
     knots: int,
     order: str | tuple[int, int, int],
-    literal: bool,
-    inverse: bool,
+    literal: bool = False,
+    inverse: bool = False,
 ) -> Model:
     """Two stages with the linear part of equations (1) to (3)."""
     centre = float(np.mean(grid.fraction))
     earliest = 1 if centre < 1e-6 else 0
     torque, reasons = np.nan_to_num(grid.torque_nm), []
-    drive = grid.pulse_width_us / active_level(grid, prbs)
+    drive = straight_drive(grid, prbs) if prbs is not ramp else joint_drive(grid, prbs)
     fitted = near_rest(grid, prbs)
 
     def linear_part(drive: np.ndarray, rows: np.ndarray, asked: str | tuple[int, int, int]) -> OutputError:
@@ -167,6 +167,18 @@ def _general(
     block = found.block(grid.step_s, centre)
     reasons.append(f"linear part (l, n, d) = {chosen}")
     return finish_discrete(method_id, grid, both, block, curve, reasons)
+
+
+def straight_drive(grid: Grid, prbs: np.ndarray) -> np.ndarray:
+    """Drive of the preliminary experiment: proportional to the pulse width (15)."""
+    return grid.pulse_width_us / active_level(grid, prbs)
+
+
+def joint_drive(grid: Grid, rows: np.ndarray) -> np.ndarray:
+    """Drive where all segments are used at once: the curve of a pilot fit of second order, unit range."""
+    u, curve = pilot_curve(pilot_solution(grid, rows, begins_at_rest(grid)))
+    drive = np.interp(grid.pulse_width_us, u, curve)
+    return drive / max(float(np.ptp(curve)), 1e-300)
 
 
 def _curve_through(

@@ -1,0 +1,194 @@
+"""Reading: CSV and sealed recordings, and every way in which they can be wrong."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+import identify
+from identify.records import read
+from tests.identify.patients import Patient, make_record
+
+HEADER = "time_s,pulse_width_us,torque_nm,segment"
+ROWS = [f"{i / 40:.4f},{100 * (i % 3)},{0.1 * i:.3f},prbs" for i in range(20)]
+
+
+def write(folder: Path, *lines: str, header: str = HEADER) -> Path:
+    path = folder / "data.csv"
+    path.write_text("\n".join([header, *lines]) + "\n")
+    return path
+
+
+def changed(line: int, column: int, value: str) -> list[str]:
+    """ROWS with one cell changed; `line` counts from 1 as an editor does, the header being 1."""
+    rows = [row.split(",") for row in ROWS]
+    rows[line - 2][column] = value
+    return [",".join(row) for row in rows]
+
+
+def test_reads_csv(tmp_path):
+    record = read(write(tmp_path, *ROWS))
+    assert record.time_s.size == 20
+    assert record.sample_rate_hz == pytest.approx(40)
+    assert record.segment_names == ("prbs",)
+    assert record.torque_nm[3] == 0.3
+    assert record.source.name == "data.csv"
+    assert len(record.source.sha256) == 64
+
+
+def test_columns_in_any_order_with_angle_blank_lines_and_a_byte_order_mark(tmp_path):
+    path = tmp_path / "x.csv"
+    rows = [f"prbs,{0.1 * i},{i / 40},{5 * i},1.5,0.1" for i in range(12)]
+    text = "segment,torque_nm,time_s,pulse_width_us,angle_rad,velocity_rad_s\r\n" + "\r\n".join(rows) + "\r\n\r\n"
+    path.write_bytes(b"\xef\xbb\xbf" + text.encode())
+    record = read(path)
+    assert record.pulse_width_us[2] == 10
+    assert record.angle_rad is not None
+    assert record.angle_rad[0] == 1.5
+
+
+def test_rounded_times_become_even(tmp_path):
+    rows = [f"{i / 1600:.4f},{100 * (i // 40 % 2)},0.5,prbs" for i in range(4000)]
+    record = read(write(tmp_path, *rows))
+    assert record.sample_rate_hz == pytest.approx(1600, rel=1e-4)
+    assert np.ptp(np.diff(record.time_s)) < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("lines", "header", "says"),
+    [
+        (ROWS, "time_s,pulse_width_us,torque_nm", r"line 1: no column segment\. The first line must be"),
+        (ROWS, HEADER.replace(",", ";"), "Separate with commas"),
+        (ROWS, HEADER + ",torque_nm", "torque_nm is there twice"),
+        (changed(7, 2, "strong"), HEADER, r"line 7, column torque_nm: 'strong' is no number"),
+        (changed(7, 2, ""), HEADER, r"line 7, column torque_nm: empty"),
+        (changed(9, 2, "nan"), HEADER, r"line 9, column torque_nm: nan is no measurement"),
+        (changed(9, 0, "inf"), HEADER, r"line 9, column time_s: inf is no measurement"),
+        (changed(5, 1, "-3"), HEADER, r"line 5, column pulse_width_us: -3 µs is negative"),
+        (changed(5, 1, "1e9"), HEADER, r"line 5, column pulse_width_us: 1e9 is no measurement"),
+        (changed(12, 0, "0.1"), HEADER, r"line 12, column time_s: time runs backwards"),
+        (changed(12, 0, "0.2250"), HEADER, r"line 12, column time_s: time stands still"),
+        (changed(21, 0, "0.95"), HEADER, r"line 21, column time_s: uneven sampling"),
+        (changed(4, 3, " "), HEADER, r"line 4, column segment: empty"),
+        ([*ROWS[:10], "0.25,1"], HEADER, r"line 12, column torque_nm: only 2 cells"),
+        ([*ROWS[:10], "0.25,1,2"], HEADER, r"line 12, column segment: only 3 cells"),
+        ([], HEADER, "no row under the header"),
+        (ROWS[:3], HEADER, "only 3 samples"),
+        ([f"{i},0,0,rest" for i in range(20)], HEADER, "sampled at 1 Hz"),
+    ],
+)
+def test_bad_csv_names_line_and_column(tmp_path, lines, header, says):
+    with pytest.raises(identify.BadRecord, match=says) as caught:
+        read(write(tmp_path, *lines, header=header))
+    assert "data.csv" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_files_that_are_none(tmp_path):
+    (tmp_path / "empty.csv").write_bytes(b"")
+    (tmp_path / "latin.csv").write_bytes(HEADER.encode() + b"\n0,0,0,r\xe9st\n")
+    (tmp_path / "half.h5").write_bytes(b"\x89HDF\r\n\x1a\n" + b"\0" * 100)
+    for name, says in (
+        ("absent.csv", "no such file"),
+        ("", "a directory"),
+        ("empty.csv", "line 1: empty"),
+        ("latin.csv", "line 2: not UTF-8"),
+        ("half.h5", "half-written"),
+    ):
+        with pytest.raises(identify.BadRecord, match=says):
+            read(tmp_path / name)
+    with pytest.raises(identify.BadRecord, match="1 to 200 Hz"):
+        read(write(tmp_path, *ROWS), pulse_rate_hz=float("nan"))
+
+
+def seal(path: Path, *, drop: int | None = None, lag_s: float = 0.004) -> tuple[np.ndarray, np.ndarray]:
+    """A recording as docs/recording.md lays it out, written apart from the rig; widths and clean torque."""
+    record, clean = make_record(Patient(), np.random.default_rng(0), rate_hz=1600, noise_nm=0.02)
+    widths = record.pulse_width_us[::40].copy()
+    planned = np.arange(widths.size) / 40.0
+    names = list(record.segment_names)
+    starts = record.time_s[np.searchsorted(record.segment, np.arange(len(names)))]
+    ends = np.r_[starts[1:], record.time_s[-1] + 1 / 1600]
+    status = np.where(widths > 0, 0, 1).astype(np.uint8)
+    sent = widths.copy()
+    if drop is not None:
+        sent[drop], status[drop] = np.nan, 2
+    jitter = np.random.default_rng(1).uniform(-1e-4, 1e-4, widths.size)
+    written = np.where(status == 0, planned + lag_s + jitter, np.nan)
+    with h5py.File(path, "w") as file:
+        file.attrs.update(
+            format="stimrig-recording", format_version=1, recording_id="rec-1", pulse_rate_hz=40.0, content_sha256="ab"
+        )
+        file["/torque/time_s"] = record.time_s + lag_s
+        file["/torque/torque_nm"] = record.torque_nm
+        file["/pulses/planned_time_s"] = planned
+        file["/pulses/pulse_width_us"] = widths
+        file["/pulses/sent_pulse_width_us"] = sent
+        file["/pulses/written_time_s"] = written
+        file["/pulses/status"] = status
+        file["/segments/name"] = names
+        file["/segments/start_s"] = starts
+        file["/segments/end_s"] = ends + 0.1
+    return widths, clean
+
+
+def test_reads_a_sealed_recording(tmp_path):
+    widths, clean = seal(tmp_path / "r.h5")
+    record = read(tmp_path / "r.h5")
+    assert record.pulse_rate_hz == 40
+    assert record.source.recording_id == "rec-1"
+    assert set(record.segment_names) == {"rest", "prbs", "ramp", "validate"}
+    assert np.mean(record.pulse_width_us == np.repeat(widths, 40)[: record.time_s.size]) > 0.97
+    model = identify.fit(record)
+    assert model.linear.time_constant_s == pytest.approx(0.5284, rel=5e-3)
+    # All pulses were late together, and so was the torque: no delay between them.
+    assert model.linear.delay_s == pytest.approx(0.0, abs=1.5e-3)
+    assert model.data["recording_id"] == "rec-1"
+
+
+def test_a_dropped_pulse_counts_as_none(tmp_path):
+    widths, _ = seal(tmp_path / "r.h5")
+    drop = int(np.flatnonzero(widths > 0)[30])
+    seal(tmp_path / "r.h5", drop=drop)
+    record = read(tmp_path / "r.h5")
+    at = int(np.searchsorted(record.time_s, drop / 40 + 0.004 + 0.01))
+    assert record.pulse_width_us[at] == 0
+    assert record.pulse_width_us[at + 40] == widths[drop + 1]
+
+
+def test_gaps_in_the_torque_are_bridged(tmp_path):
+    _, clean = seal(tmp_path / "r.h5")
+    with h5py.File(tmp_path / "r.h5", "a") as file:
+        keep = np.ones(clean.size, bool)
+        keep[30_000:30_400] = False
+        keep[12_345] = False
+        for name in ("time_s", "torque_nm"):
+            kept = file[f"/torque/{name}"][:][keep]
+            del file[f"/torque/{name}"]
+            file[f"/torque/{name}"] = kept
+    record = read(tmp_path / "r.h5")
+    model = identify.fit(record)
+    assert model.linear.time_constant_s == pytest.approx(0.5284, rel=5e-3)
+    assert np.sqrt(np.mean((identify.predict(model, record) - clean[keep][: record.time_s.size]) ** 2)) < 0.02
+
+
+@pytest.mark.parametrize(
+    ("spoil", "says"),
+    [
+        (lambda file: file.attrs.update(format="other"), "no stimrig recording"),
+        (lambda file: file.attrs.update(format_version=9), "format version 9"),
+        (lambda file: file.__delitem__("/pulses/status"), "incomplete recording"),
+        (lambda file: file.__delitem__("/torque"), "incomplete recording"),
+        (lambda file: file["/torque/torque_nm"].__setitem__(5000, np.nan), "torque is not finite"),
+        (lambda file: file["/torque/time_s"].__setitem__(5000, -1.0), "time runs backwards|not finite"),
+    ],
+)
+def test_spoiled_recordings_are_refused(tmp_path, spoil, says):
+    seal(tmp_path / "r.h5")
+    with h5py.File(tmp_path / "r.h5", "a") as file:
+        spoil(file)
+    with pytest.raises(identify.BadRecord, match=says):
+        read(tmp_path / "r.h5")

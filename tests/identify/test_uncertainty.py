@@ -1,0 +1,130 @@
+"""Bands that cover as often as they say, tests that alarm as often as they say, verdicts that don't keep silent."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import identify
+from identify.linear import SecondOrder
+from identify.noise import best_ar1, log_likelihood, noise_evidence, whiten
+from identify.residual_tests import chi_square_p
+from identify.uncertainty import prediction_band
+from tests.identify.patients import Patient, make_record
+
+RECORDS = 60
+"""Enough to see a band that is off by a tenth; `python -m bench goals` counts 300."""
+
+
+@pytest.fixture(scope="module")
+def trials():
+    found = []
+    for seed in range(RECORDS):
+        rng = np.random.default_rng(7000 + seed)
+        patient = Patient(
+            time_constant_s=rng.uniform(0.1, 0.6), damping=rng.uniform(0.6, 1.2), delay_s=rng.uniform(0, 0.06)
+        )
+        record, clean = make_record(patient, rng, rate_hz=100, noise_nm=0.05)
+        found.append((patient, record, clean, identify.fit(record)))
+    return found
+
+
+def test_bands_cover_the_truth(trials):
+    inside = {"curve": [], "whole": [], "step": [], "prediction": []}
+    for patient, record, clean, model in trials:
+        band = model.bands["recruitment"]
+        truth = patient.recruitment(band["pulse_width_us"])
+        inside["curve"].append(np.mean((truth >= band["lower"]) & (truth <= band["upper"])))
+        inside["whole"].append(np.all((truth >= band["whole_lower"] - 1e-9) & (truth <= band["whole_upper"] + 1e-9)))
+        step = model.bands["step_response"]
+        truth = SecondOrder(patient.time_constant_s, patient.damping, patient.delay_s).step_response(step["time_s"])
+        inside["step"].append(np.mean(((truth >= step["lower"]) & (truth <= step["upper"]))[4:]))
+        low, high = prediction_band(model, record)
+        inside["prediction"].append(np.mean((clean >= low) & (clean <= high)))
+    for name, share in inside.items():
+        assert 0.88 <= np.mean(share) <= 1.0, name
+    assert np.mean(inside["curve"]) <= 0.985
+
+
+def test_standard_deviations_of_the_constants_are_right(trials):
+    for name, value in (("time_constant_s", "time_constant_s"), ("damping", "damping"), ("delay_s", "delay_s")):
+        z = [
+            (model.covariance.values[model.covariance.names.index(name)] - getattr(patient, value))
+            / model.covariance.sd(name)
+            for patient, _, _, model in trials
+        ]
+        assert 0.75 < np.std(z) < 1.3, name
+        assert abs(np.mean(z)) < 0.5, name
+
+
+def test_false_alarms_are_rare(trials):
+    for name in ("whiteness", "structure"):
+        failed = sum(not model.residual_tests[name]["passed"] for *_, model in trials)
+        assert failed <= 4, name
+        p = np.array([model.residual_tests[name]["p_value"] for *_, model in trials])
+        assert 0.35 < np.mean(p) < 0.65, name
+
+
+def test_what_is_missing_is_not_silent():
+    record, clean = make_record(Patient(), np.random.default_rng(5), rate_hz=100, noise_nm=0.05)
+    tired = record.with_torque(record.torque_nm - clean * 0.3 * np.linspace(0, 1, clean.size))
+    model = identify.fit(tired)
+    assert model.quality["verdict"] == "usable with care"
+    assert not model.quality["gates"]["ceiling"]["passed"]
+    assert not model.quality["gates"]["residual"]["passed"]
+    assert any("diagnose" in reason for reason in model.quality["reasons"])
+
+
+def test_correlated_noise_widens_the_bands():
+    width = {}
+    for ar1 in (0.0, 0.8):
+        record, _ = make_record(Patient(), np.random.default_rng(5), rate_hz=40, noise_nm=0.05, ar1=ar1, validate=False)
+        band = identify.fit(record).bands["recruitment"]
+        width[ar1] = np.mean(np.asarray(band["upper"]) - band["lower"])
+    assert width[0.8] > 1.8 * width[0.0]
+
+
+def test_whitening_is_exact():
+    rng = np.random.default_rng(0)
+    ar1, size = 0.7, 50
+    lag = np.abs(np.arange(size)[:, None] - np.arange(size)[None, :])
+    covariance = 2.5 * ar1**lag / (1 - ar1**2)
+    residual = np.linalg.cholesky(covariance) @ rng.standard_normal(size)
+    white = whiten(residual, [slice(0, size)], ar1)
+    assert white @ white / 2.5 == pytest.approx(residual @ np.linalg.solve(covariance, residual))
+    variance = white @ white / size
+    exact = -0.5 * (size * np.log(2 * np.pi) + np.linalg.slogdet(covariance / 2.5 * variance)[1] + size)
+    assert log_likelihood(residual, [slice(0, size)], ar1) == pytest.approx(exact)
+
+
+def test_noise_evidence_finds_the_correlation():
+    rng = np.random.default_rng(1)
+    white = rng.standard_normal(3000)
+    slow = np.zeros(3000)
+    for k in range(1, 3000):
+        slow[k] = 0.9 * slow[k - 1] + white[k]
+    pieces = [slice(0, 1000), slice(1200, 3000)]
+    assert best_ar1(slow, pieces) == pytest.approx(0.9, abs=0.03)
+    assert noise_evidence(slow, pieces)[1] > 100
+    assert noise_evidence(white, pieces)[0] == 0.0
+
+
+def test_chi_square_tail_against_scipy():
+    from scipy.stats import chi2
+
+    for freedom in (1, 3, 6, 20):
+        for p in (0.5, 0.1, 0.01, 0.001):
+            assert chi_square_p(chi2.isf(p, freedom), freedom) == pytest.approx(p, rel=0.12, abs=2e-4)
+
+
+def test_starting_is_cheap():
+    code = (
+        "import sys, identify; assert 'numpy' not in sys.modules;"
+        "import identify.estimate, identify.records, identify.csv_record, identify.methods.maximum_likelihood, identify.finish;"
+        "slow = [m for m in ('scipy.signal', 'scipy.optimize', 'scipy.stats', 'scipy.interpolate', 'numba', 'h5py')"
+        " if m in sys.modules]; assert not slow, slow"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
