@@ -70,6 +70,7 @@ class Child:
                 stdout=subprocess.PIPE,
                 stderr=log,
                 env={**os.environ, **self.environment},
+                start_new_session=True,  # Ctrl-C reaches the launcher only, which ends them in order
                 preexec_fn=die_with_parent,
             )
         line = read_line(self.process, READY_S)
@@ -242,9 +243,7 @@ class Services:
         return f"{child.name} had ended ({words or 'without a word'}) and was started again"
 
     def stop(self) -> None:
-        """End everything: the rig first, since it stops stimulation."""
-        self.rig.ask_to_end()
-        self.api.ask_to_end()
+        """End everything: the rig first, since it stops stimulation; the service hears how its test ended."""
         self.rig.end(SEAL_S)
         self.api.end()
         if self.emulator is not None:

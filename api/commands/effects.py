@@ -34,6 +34,8 @@ def effect_lines(entry: dict[str, Any]) -> list[str]:
             continue
         if key == "parameters":
             lines += [f"  {line}" for line in parameter_lines(value)]
+        elif key == "forms":
+            lines += [f"  {'form':14} {form['name']}: {form['equation']}" for form in value]
         else:
             shown = ", ".join(str(item) for item in value) if isinstance(value, list | tuple) else str(value)
             lines.append(f"  {key.replace('_', ' '):14} {shown}")
@@ -45,6 +47,8 @@ def parameter_lines(parameters: Any) -> list[str]:
     items = parameters.items() if isinstance(parameters, dict) else [(item.get("name"), item) for item in parameters]
     lines = []
     for name, item in items:
-        facts = ", ".join(f"{key} {value}" for key, value in item.items() if key != "name" and value is not None)
+        facts = ", ".join(
+            f"{key.replace('_', ' ')} {value}" for key, value in item.items() if key != "name" and value is not None
+        )
         lines.append(f"{name}: {facts}")
     return lines

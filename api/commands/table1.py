@@ -34,9 +34,6 @@ def lines(found: dict[str, Any]) -> list[str]:
     if not isinstance(rows, list) or not rows:
         return [f"{key}: {value}" for key, value in found.items()]
     header = list(rows[0])
-    body = [
-        [number(row.get(key), 2) if isinstance(row.get(key), float) else str(row.get(key, "–")) for key in header]
-        for row in rows
-    ]
+    body = [[str(row[key]) if isinstance(row[key], str) else number(row[key]) for key in header] for row in rows]
     rest = [f"{key}: {value}" for key, value in found.items() if key != "rows"]
     return [*table(header, body), "", *rest]

@@ -76,6 +76,14 @@ def short_dir() -> Iterator[Path]:
     shutil.rmtree(path, ignore_errors=True)
 
 
+@pytest.fixture(scope="module")
+def shared_client(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[httpx.Client]:
+    """The administrator's client of a service that a module's tests share: for tests that leave nothing behind."""
+    for service in run_service(tmp_path_factory.mktemp("shared"), short_dir, STUB):
+        with service.client() as client:
+            yield client
+
+
 @pytest.fixture
 def service(tmp_path: Path, short_dir: Path) -> Iterator[Service]:
     """A fresh service with the stub worker."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import socket
@@ -20,7 +19,7 @@ from api.settings import Settings
 from tests.api.conftest import TOKEN
 
 pytestmark = pytest.mark.wire
-FAST = ["--speed", "6"]
+FAST = ["--speed", "8"]
 
 
 def settings(tmp_path: Path, **more: object) -> Settings:
@@ -37,8 +36,8 @@ def test_a_test_on_the_wire_ends_in_a_served_model(tmp_path: Path) -> None:
         document = run_test(http, "P1")
         assert document["summary"]["lost_samples"] == 0
         fit = document["fit"]
-        # A busy machine's stalls count six times at this speed; the figure at the speed of the world is the demo's.
-        assert fit["ceiling_percent"] > 95 and fit["fit_percent"] > 80
+        # A busy machine's stalls count eight times at this speed; the figure at the speed of the world is the demo's.
+        assert fit["ceiling_percent"] > 95 and fit["fit_percent"] > 75
         curves = http.get(f"{document['model_url']}/curves").json()
         assert {part["name"] for part in curves["segments"]} >= {"rest", "prbs", "ramp", "validate"}
         preview = http.post("/v1/preview", json={"participant": "P1"}).json()
@@ -163,9 +162,12 @@ def test_taken_port_is_one_line(tmp_path: Path) -> None:
     assert caught.value.code == 2
 
 
-def test_json_of_test_verb_is_one_object(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "api.cli", "test", "--data", str(tmp_path), "--emulate", "--speed 8", "--json"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr
-    found = json.loads(done.stdout)
-    assert found["test"]["state"] == "completed" and found["model"]["model_id"] == found["test"]["model_id"]
+def test_ending_the_service_in_a_test_stops_it_and_keeps_its_record(tmp_path: Path) -> None:
+    with Services(settings(tmp_path), [], TOKEN) as services, client(services) as http:
+        http.post("/v1/participants", json={"code": "P1"})
+        test_id = http.post("/v1/tests", json={"participant": "P1"}).json()["id"]
+        time.sleep(3)
+    with Services(settings(tmp_path), [], TOKEN) as services, client(services) as http:
+        document = http.get(f"/v1/tests/{test_id}").json()
+        assert document["state"] == "stopped" and "shutting down" in document["reason"]
+        assert http.get(document["recording_url"]).content.startswith(b"\x89HDF")

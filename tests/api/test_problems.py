@@ -35,15 +35,15 @@ def problem(answer: httpx.Response, status: int) -> dict[str, Any]:
         ({"code": "P1", "profile": {"max_pulse_width_us": "wide"}}, "profile.max_pulse_width_us"),
     ],
 )
-def test_participant_that_does_not_hold(client: httpx.Client, body: dict[str, Any], field: str) -> None:
-    found = problem(client.post("/v1/participants", json=body), 422)
+def test_participant_that_does_not_hold(shared_client: httpx.Client, body: dict[str, Any], field: str) -> None:
+    found = problem(shared_client.post("/v1/participants", json=body), 422)
     assert field in [error["field"] for error in found["errors"]]
-    assert client.get("/v1/participants").json() == []
+    assert shared_client.get("/v1/participants").json() == []
 
 
-def test_nan_is_refused_as_a_limit(client: httpx.Client) -> None:
+def test_nan_is_refused_as_a_limit(shared_client: httpx.Client) -> None:
     content = '{"code": "P1", "profile": {"current_ma": NaN}}'
-    answer = client.post("/v1/participants", content=content, headers={"content-type": "application/json"})
+    answer = shared_client.post("/v1/participants", content=content, headers={"content-type": "application/json"})
     assert "profile.current_ma" in problem(answer, 422)["detail"]
 
 
@@ -68,17 +68,17 @@ def test_same_code_twice(client: httpx.Client, participant: str) -> None:
         ("GET", "/static/app.py", 404),
     ],
 )
-def test_what_is_not_there(client: httpx.Client, method: str, path: str, status: int) -> None:
-    problem(client.request(method, path), status)
+def test_what_is_not_there(shared_client: httpx.Client, method: str, path: str, status: int) -> None:
+    problem(shared_client.request(method, path), status)
 
 
-def test_body_that_is_no_json(client: httpx.Client) -> None:
-    answer = client.post("/v1/tests", content=b"{", headers={"content-type": "application/json"})
+def test_body_that_is_no_json(shared_client: httpx.Client) -> None:
+    answer = shared_client.post("/v1/tests", content=b"{", headers={"content-type": "application/json"})
     problem(answer, 422)
 
 
-def test_test_of_nobody(client: httpx.Client) -> None:
-    found = problem(client.post("/v1/tests", json={"participant": "P404"}), 404)
+def test_test_of_nobody(shared_client: httpx.Client) -> None:
+    found = problem(shared_client.post("/v1/tests", json={"participant": "P404"}), 404)
     assert "POST /v1/participants" in found["detail"]
 
 
@@ -87,8 +87,8 @@ def test_no_model_approved_says_how_to_approve(client: httpx.Client, participant
     assert found["type"] == "/problems/no-approved-model" and "approve" in found["detail"]
 
 
-def test_unknown_scope(client: httpx.Client) -> None:
-    found = problem(client.post("/v1/tokens", json={"name": "x", "scopes": ["everything"]}), 422)
+def test_unknown_scope(shared_client: httpx.Client) -> None:
+    found = problem(shared_client.post("/v1/tokens", json={"name": "x", "scopes": ["everything"]}), 422)
     assert "everything" in found["detail"] and "read-model" in found["detail"]
 
 
@@ -143,8 +143,8 @@ def test_upload_too_large_or_empty(client: httpx.Client, service: Service, parti
     assert list((service.data / "recordings").glob("upload-*")) == []
 
 
-def test_page_shows_a_problem_in_words(client: httpx.Client) -> None:
-    answer = client.get("/models/M404", headers={"Accept": "text/html"})
+def test_page_shows_a_problem_in_words(shared_client: httpx.Client) -> None:
+    answer = shared_client.get("/models/M404", headers={"Accept": "text/html"})
     assert answer.status_code == 404 and "There is no model" in answer.text and "<h1>" in answer.text
 
 

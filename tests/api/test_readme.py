@@ -13,7 +13,7 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text("utf-8")
-SPEED = "--speed 6"
+SPEED = "--speed 8"
 
 
 def blocks(language: str) -> list[str]:
@@ -48,7 +48,7 @@ def test_commands_do_what_they_are_said_to(tmp_path: Path) -> None:
     for command in commands:
         words = shlex.split(command)
         assert words[0] == "stimrig"
-        if words[1] == "test":  # the same test, at six times the speed of the world
+        if words[1] == "test":  # the same test, at eight times the speed of the world
             place = words.index("--emulate") + 1 if "--emulate" in words else None
             words = (
                 [*words[:place], f"{words[place]} {SPEED}", *words[place + 1 :]]
