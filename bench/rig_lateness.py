@@ -56,6 +56,8 @@ def main() -> None:
     print("| pulses | dropped | late median ms | p99 | max | samples | lost | rig CPU % | alignment | error ms |")
     print("|---|---|---|---|---|---|---|---|---|---|")
     for s in summaries:
+        if not s["lateness_ms"]:
+            continue  # ended before its first pulse; said above
         late, alignment = s["lateness_ms"], s["alignment"]
         print(
             f"| {s['pulses']} | {s['dropped_pulses']} | {late['median']:.3f} | {late['p99']:.3f} | {late['max']:.3f} "

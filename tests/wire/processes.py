@@ -142,6 +142,8 @@ class Bench:
         self.socket = Path(self._socket_folder.name) / "rig.sock"
         self.data = folder / "data"
         self.emulator = Process("hardware_sim", "--speed", f"{speed:g}", *emulator_options, log=folder / "emulator.log")
+        with contextlib.suppress(OSError):  # hardware does not wait for a processor, so neither should its stand-in
+            os.sched_setscheduler(self.emulator.popen.pid, os.SCHED_RR, os.sched_param(10))
         self.rig: Process | None = None
         self._clients: list[RigClient] = []
 
