@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,8 +15,9 @@ from identify.engine.noise_level import find_band
 from identify.engine.problem import Problem
 from identify.engine.setup import Setup
 
+WORKERS = 2
 PATIENCE = 2
-"""Steps of a chain (one bump, two bumps, …) without a gain after which it ends: of four bumps, one alone hardly helps."""
+"""Steps of a chain (one bump, two bumps, …) without a gain after which it ends: one of four bumps hardly helps."""
 BAND_COST = 9.0
 """Log evidence that a narrow band's three numbers cost."""
 
@@ -63,16 +65,19 @@ def try_effect(effect: Effect, base: Fitted, forms: Iterable[Form] | None = None
     best_form: Form | None = None
     gains: dict[str, float] = {}
     previous: dict[str, float] = {}
-    idle = 0
+    idle, top = 0, -np.inf
     residual = base.residual_nm
     for form in forms or effect.forms:
-        if form.grows and (not gains or idle >= PATIENCE):
-            break
+        if not form.grows:
+            previous, residual, idle, top = {}, base.residual_nm, 0, -np.inf
+        elif idle >= PATIENCE:
+            continue
         found = fit_form(effect, form, base, residual, previous)
         if found is None:
+            idle = PATIENCE
             continue
         gain = found.log_evidence - base.log_evidence + effect.prior
-        idle = 0 if gain > max(gains.values(), default=0.0) else idle + 1
+        idle, top = (0, gain) if gain > max(top, 0.0) else (idle + 1, top)
         gains[form.name] = gain
         if form.propose is not None:
             previous, residual = found.parameters_of(effect.id), found.residual_nm
@@ -127,11 +132,22 @@ def scan(
     """Every applicable effect added to a model, best first."""
     present = set(names(base))
     listed = [effect for effect in effects if applicable(effect, base.problem.setup, present)]
-    found = []
-    for index, effect in enumerate(listed):
-        if progress is not None:
-            progress(share[0] + (share[1] - share[0]) * index / len(listed), f"trying {effect.name.lower()}")
-        candidate = try_effect(effect, base)
-        if candidate is not None:
-            found.append(candidate)
+    done = 0
+    found: list[Candidate] = []
+    # Costly ones first, so that both workers end together; the compiled parts release the interpreter.
+    listed.sort(key=lambda effect: -len(effect.forms))
+    with ThreadPoolExecutor(WORKERS) as pool:
+        waiting = {pool.submit(try_effect, effect, base): effect for effect in listed}
+        try:
+            for future in as_completed(waiting):
+                done += 1
+                if progress is not None:
+                    text = f"tried {waiting[future].name.lower()}"
+                    progress(share[0] + (share[1] - share[0]) * done / len(listed), text)
+                candidate = future.result()
+                if candidate is not None:
+                    found.append(candidate)
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
     return sorted(found, key=lambda candidate: -candidate.gain)

@@ -21,6 +21,8 @@ EFFECT = Effect(
         _form("inverse_drive", "T/(1 + slope·w/y_max)", 6),
         _form("damping", "ζ (1 + slope·y/y_max): the slower of two lags", 7),
         _form("inverse_damping", "ζ/(1 + slope·w/y_max)", 9),
+        _form("activation", "T (1 + slope·a/y_max), a the state between the two lags", 11),
+        _form("activation_damping", "ζ (1 + slope·a/y_max), a the state between the two lags", 10),
     ),
     signature="Small torques come faster (or slower) than large ones: the error's sign goes with level and time.",
     resembles=("asymmetric_relaxation", "voluntary_effort", "mixed_fibres", "output_saturation"),

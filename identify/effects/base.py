@@ -31,7 +31,8 @@ class Parameter:
     scale : str
         "linear" or "log": how the parameter is varied, and on which scale the prior is flat-ish.
     relative : str
-        "torque" or "width": bounds, start and neutral are in units of the record's largest torque or pulse width.
+        "torque", "width" or "span": bounds, start and neutral are in units of the record's largest torque, its largest
+        pulse width or its length.
     about : str
         One line for the page.
     """
@@ -48,7 +49,7 @@ class Parameter:
 
     def on(self, scene: Scene) -> Parameter:
         """The parameter with its bounds in absolute units."""
-        unit = {"torque": scene.scale_nm, "width": scene.largest_us}.get(self.relative, 1.0)
+        unit = {"torque": scene.scale_nm, "width": scene.largest_us, "span": scene.span_s}.get(self.relative, 1.0)
         if unit == 1.0:
             return self
         return replace(

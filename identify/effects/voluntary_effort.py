@@ -24,11 +24,11 @@ def _bumps(count: int) -> Callable[..., np.ndarray]:
     return apply
 
 
-def _propose(count: int) -> Callable[..., list[dict[str, float]]]:
+def _propose(count: int, sign: float) -> Callable[..., list[dict[str, float]]]:
     def propose(residual_nm: np.ndarray, scene: Scene, previous: dict[str, float]) -> list[dict[str, float]]:
         """The bump that best matches the residual, at each of a few widths."""
         known = np.isfinite(residual_nm)
-        value = np.where(known, residual_nm, 0.0)
+        value = sign * np.where(known, residual_nm, 0.0)
         found = []
         for width_s in (0.2, 0.5, 1.2):
             half = int(np.ceil(3 * width_s / scene.step_s))
@@ -44,20 +44,21 @@ def _propose(count: int) -> Callable[..., list[dict[str, float]]]:
                 continue
             start = {"flatness": 2.0} | dict(previous)
             i = count - 1
-            start |= {f"centre_{i}_s": float(scene.time_s[at]), f"width_{i}_s": width_s, f"height_{i}_nm": height}
+            start |= {f"centre_{i}_s": float(scene.time_s[at]), f"width_{i}_s": width_s, f"height_{i}_nm": sign * height}
             starts.append(start)
         return starts
 
     return propose
 
 
-def _parameters(count: int) -> tuple[Parameter, ...]:
+def _parameters(count: int, sign: float) -> tuple[Parameter, ...]:
+    low, high = (0.0, 0.9) if sign > 0 else (-0.9, 0.0)
     listed = [Parameter("flatness", "1", 1.6, 6.0, 2.0, (2.0,), "log", about="2 is a Gaussian, more is flatter")]
     for i in range(count):
         listed += [
-            Parameter(f"centre_{i}_s", "s", 0.0, 600.0, 0.0, (1.0,), about="middle"),
+            Parameter(f"centre_{i}_s", "s", 0.0, 1.0, 0.0, (0.5,), relative="span", about="middle"),
             Parameter(f"width_{i}_s", "s", 0.14, 3.0, 0.5, (0.5,), "log", about="half-width"),
-            Parameter(f"height_{i}_nm", "N·m", 0.0, 0.9, 0.0, (0.1,), relative="torque", about="peak torque"),
+            Parameter(f"height_{i}_nm", "N·m", low, high, 0.0, (0.1 * sign,), relative="torque", about="peak torque"),
         ]
     return tuple(listed)
 
@@ -67,15 +68,16 @@ EFFECT = Effect(
     name="Voluntary effort or spasm",
     forms=tuple(
         Form(
-            f"bumps_{count}",
+            f"{name}_{count}",
             "additive",
-            f"y + Σ height·exp(-|t - centre|^flatness/(2 width^flatness)), {count} of them",
-            _parameters(count),
+            f"y + Σ height·exp(-|t - centre|^flatness/(2 width^flatness)), {count} of them, {words}",
+            _parameters(count, sign),
             _bumps(count),
             batched=True,
-            propose=_propose(count),
+            propose=_propose(count, sign),
             grows=count > 1,
         )
+        for name, words, sign in (("bumps", "helping", 1.0), ("resisting", "resisting", -1.0))
         for count in range(1, MOST + 1)
     ),
     signature="Isolated bumps, in rests as well, at times that have nothing to do with the stimulation.",

@@ -25,6 +25,7 @@ _BASE = (
 )
 FIRST_COEFFICIENT = len(_BASE)
 _NONE = np.zeros((0, 1))
+SHARED = True
 
 
 @dataclass(frozen=True)
@@ -275,6 +276,7 @@ class _Walk:
                 multiplier,
                 setup.scale_nm,
                 setup.grid.step_s,
+                SHARED,
             )
             torque = one if torque is None else torque + one
             rate = two if rate is None else rate + two
