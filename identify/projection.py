@@ -25,8 +25,10 @@ from identify.recruitment.spline import SplineBasis
 T_BOUNDS_S = (0.012, 4.0)
 ZETA_BOUNDS = (0.15, 4.0)
 LONGEST_DELAY_S = 0.2
-STARTS_S = (0.08, 0.22, 0.55)
+STARTS_S = (0.12, 0.4)
 CURVE_POINTS = 201
+REWEIGHTED = 2
+"""Steps of a search after which the penalty's weight stays: a moving target has no minimum."""
 
 
 @dataclass
@@ -217,7 +219,7 @@ def search(
         if size < tolerance or np.max(np.abs(moved)) < 1e-9:
             converged = True
             break
-        keep = None if (weight is None and taken <= 4) else state.weight
+        keep = None if (weight is None and taken <= REWEIGHTED) else state.weight
         attempt = _assess(problem, trial, target, ar1, keep)
         against = state.cost if keep is not None else state.cost_at(attempt.weight)
         if attempt.cost <= against * (1 + 1e-9):

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from identify.grid import Grid
 
 KNOTS = 31
-PILOT_KNOTS = 12
+PILOT_KNOTS = 9
 NARROWEST_US = 0.5
 STRAIGHTEST = 0.003
 """Least share of the strongest bending that the penalty expects anywhere, so that no part is forced straight."""
@@ -61,7 +61,7 @@ def design_spline(grid: Grid, rows: np.ndarray | None = None, count: int = KNOTS
 def adapted_knots(pilot_curve: tuple[np.ndarray, np.ndarray], largest_us: float, count: int = KNOTS) -> np.ndarray:
     """Knots from a pilot curve (pulse widths, torques): half by length, half by how it bends."""
     u, torque = pilot_curve
-    bend = np.abs(np.gradient(np.gradient(torque, u), u)) ** (1 / 4)
+    bend = np.abs(np.gradient(np.gradient(torque, u), u)) ** 0.5
     # Smoothed, since a pilot knows only roughly where the bend is.
     width = max(u.size // 40, 1)
     bend = np.convolve(np.pad(bend, width, mode="edge"), np.ones(2 * width + 1) / (2 * width + 1), mode="valid")

@@ -65,12 +65,13 @@ def choose_weight(
     balance = float(np.trace(gram)) / max(float(np.trace(roughness)), 1e-300)
     floor = 1e-11 * balance
     root = np.linalg.cholesky(gram + floor * roughness + 1e-13 * np.trace(gram) / len(gram) * np.eye(len(gram)))
-    half = np.linalg.solve(root, np.linalg.solve(root, roughness).T)
+    inverse = np.linalg.inv(root)
+    half = inverse @ roughness @ inverse.T
     bent, turn = np.linalg.eigh((half + half.T) / 2)
     bent = np.clip(bent, 0.0, None)
     # What the penalty leaves alone is a property of it, not of the data: where no data are, every shape looks bent.
     straight = np.arange(bent.size) < (straight_lines(roughness) if null is None else null)
-    part = turn.T @ np.linalg.solve(root, moment)
+    part = turn.T @ (inverse @ moment)
     freedom_left = max(rows - free - int(straight.sum()), 1)
     weight = np.geomspace(LOWEST, HIGHEST, 73) * balance
     bottom = np.maximum(1.0 + (weight[:, None] - floor) * bent, 1e-12)

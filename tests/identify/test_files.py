@@ -136,7 +136,7 @@ def seal(path: Path, *, drop: int | None = None, lag_s: float = 0.004) -> tuple[
 
 
 def test_reads_a_sealed_recording(tmp_path):
-    widths, clean = seal(tmp_path / "r.h5")
+    widths, _clean = seal(tmp_path / "r.h5")
     record = read(tmp_path / "r.h5")
     assert record.pulse_rate_hz == 40
     assert record.source.recording_id == "rec-1"

@@ -39,7 +39,7 @@ def test_methods_are_found_by_scanning():
     assert tuple(found) == ALL
     assert all(isinstance(m, Method) and m.summary for m in found.values())
     assert method_of("two-stage") is found["two-stage"]
-    with pytest.raises(identify.BadRequest, match="unknown method 'magic'. Known: maximum-likelihood, narx"):
+    with pytest.raises(identify.BadRequest, match=r"unknown method 'magic'\. Known: maximum-likelihood, narx"):
         method_of("magic")
 
 
@@ -156,7 +156,7 @@ def test_monotone_curves_never_fall():
 def test_order_is_chosen_from_the_data():
     rng = np.random.default_rng(0)
     drive = np.r_[np.zeros(40), prbs(30, 1.0, rng)]
-    record, _ = make_record(Patient(), rng, rate_hz=40)
+    _record, _ = make_record(Patient(), rng, rate_hz=40)
     for patient, poles in ((Patient(time_constant_s=0.2, damping=0.7), 2),):
         torque = patient.torque(drive * 300, 40) / patient.gain
         noisy = torque + 0.01 * rng.standard_normal(torque.size)
