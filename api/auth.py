@@ -62,6 +62,7 @@ class Auth:
 
     def __init__(self, store: Store, clock: Clock, session_hours: float = 12.0) -> None:
         self.store, self.clock, self.session_s = store, clock, session_hours * 3600
+        self._known: dict[str, Token] = {}
 
     def issue(self, name: str, scopes: list[Scope], by: str, *, text: str | None = None, origin: str = "issued",
               expires_utc: str | None = None) -> str:  # fmt: skip
@@ -74,7 +75,18 @@ class Auth:
             row.expires_utc, row.revoked = expires_utc, False
             session.merge(row)
             audit.write(session, now, by, "issue token", name, scopes=row.scopes)
+        self._known.clear()
         return text
+
+    def revoke(self, token_id: str, by: str) -> bool:
+        """Revoke a token by its public id; False where there is none."""
+        with self.store.write() as session:
+            found = [row for row in session.scalars(select(Token)) if row.hash[:16] == token_id]
+            for row in found:
+                row.revoked = True
+                audit.write(session, self.clock.utc(), by, "revoke token", row.name)
+        self._known.clear()
+        return bool(found)
 
     def first_administrator(self, configured: str | None) -> str | None:
         """See that an administrator exists; return the new token's text if one was drawn.
@@ -94,6 +106,7 @@ class Auth:
         with self.store.write() as session:
             for token in session.scalars(select(Token).where(Token.origin == "settings", Token.hash != keep)):
                 token.revoked = True
+        self._known.clear()
 
     def bearer(self, text: str) -> Principal:
         """The holder of a bearer token.
@@ -103,7 +116,16 @@ class Auth:
         ApiError
             401: unknown, revoked or expired.
         """
-        return self._principal(self.store.get(Token, digest(text)))
+        return self._principal(self._token(digest(text)))
+
+    def _token(self, token_hash: str) -> Token | None:
+        """A token's row; kept in memory, since a controller asks often, and forgotten at every change."""
+        found = self._known.get(token_hash)
+        if found is None:
+            found = self.store.get(Token, token_hash)
+            if found is not None:
+                self._known[token_hash] = found
+        return found
 
     def _principal(self, token: Token | None, csrf: str | None = None) -> Principal:
         if token is None or token.revoked:
@@ -141,7 +163,7 @@ class Auth:
         row = self.store.get(PageSession, digest(cookie))
         if row is None or (row.expires_unix_s <= self.clock.unix_s() and not forgive_age):
             raise unauthorized("The session has ended. Sign in again.")
-        return self._principal(self.store.get(Token, row.token_hash), row.csrf)
+        return self._principal(self._token(row.token_hash), row.csrf)
 
     def identify(self, connection: HTTPConnection, *, forgive_age: bool = False) -> Principal:
         """Who stands behind a request or a WebSocket."""

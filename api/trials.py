@@ -196,7 +196,7 @@ class Trials:
         elif isinstance(event, FinishedEvent):
             self._spawn(self._finish(event))
         else:
-            self.hub.send({"type": "state", "rig": event.status.model_dump()})
+            self.hub.send({"type": "state", "rig": event.status.model_dump(exclude={"finished"})})
 
     def _on_link(self, connected: bool) -> None:
         self.hub.send({"type": "link", "connected": connected})

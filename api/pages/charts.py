@@ -55,7 +55,7 @@ def of_model(document: dict[str, Any], curves: dict[str, Any] | None) -> dict[st
     if curves is not None:
         noise_sd_nm = (document.get("fit") or {}).get("noise_sd_nm")
         figures["comparison"] = measurement(curves, noise_sd_nm)
-        figures["step"] = step(curves["step_response"])
+        figures["step"] = step(document, curves["step_response"])
     return figures
 
 
@@ -111,41 +111,37 @@ def segment_marks(segments: list[dict[str, Any]]) -> tuple[list[dict[str, Any]],
     return shapes, labels
 
 
+def band_of(document: dict[str, Any], curve: str) -> dict[str, Any]:
+    """A curve's band in MODEL.json; empty where the method gives none."""
+    return ((document.get("uncertainty") or {}).get("bands") or {}).get(curve) or {}
+
+
+def band(x: Sequence[float], lower: Sequence[float], upper: Sequence[float]) -> list[dict[str, Any]]:
+    """Two traces with the band between them filled."""
+    quiet = {"hoverinfo": "skip"}
+    return [
+        line(x, upper, "", MODEL, 0, showlegend=False, **quiet),
+        line(x, lower, "95 % band of the whole curve", MODEL, 0, fill="tonexty", fillcolor=BAND, **quiet),
+    ]
+
+
 def recruitment(document: dict[str, Any]) -> dict[str, Any]:
     """The recruitment curve with its band."""
-    curve = document["recruitment"]
-    data = []
-    band = ((document.get("uncertainty") or {}).get("bands") or {}).get("recruitment") or {}
-    low, high = band.get("lower_nm"), band.get("upper_nm")
-    if low and high:
-        width = band.get("pulse_width_us") or curve["pulse_width_us"]
-        data += [
-            line(width, high, "", MODEL, 0, showlegend=False, hoverinfo="skip"),
-            line(width, low, "95 % band", MODEL, 0, fill="tonexty", fillcolor=BAND, hoverinfo="skip"),
-        ]
+    curve, known = document["recruitment"], band_of(document, "recruitment")
+    data = band(known["pulse_width_us"], known["whole_lower"], known["whole_upper"]) if known else []
     data.append(line(curve["pulse_width_us"], curve["torque_nm"], "recruitment curve", MODEL, 2.2))
-    return {
-        "data": data,
-        "layout": layout(
-            height=340,
-            xaxis=axis("Pulse width (µs)"),
-            yaxis=axis("Steady torque (N·m)", rangemode="tozero"),
-            showlegend=len(data) > 1,
-        ),
-    }
+    x, y = axis("Pulse width (µs)"), axis("Steady torque (N·m)")
+    return {"data": data, "layout": layout(height=340, xaxis=x, yaxis=y, showlegend=bool(known))}
 
 
-def step(response: dict[str, list[float]]) -> dict[str, Any]:
-    """The linear part's step response."""
-    return {
-        "data": [line(response["time_s"], response["response"], "step response", MODEL, 2.2)],
-        "layout": layout(
-            height=340,
-            xaxis=axis("Time (s)"),
-            yaxis=axis("Share of the final torque (1)", rangemode="tozero"),
-            showlegend=False,
-        ),
-    }
+def step(document: dict[str, Any], response: dict[str, list[float]]) -> dict[str, Any]:
+    """The linear part's step response with its band."""
+    known = band_of(document, "step_response")
+    data = band(known["time_s"], known["whole_lower"], known["whole_upper"]) if known else []
+    data.append(line(response["time_s"], response["response"], "step response", MODEL, 2.2))
+    x = axis("Time (s)", range=[0, response["time_s"][-1]])
+    y = axis("Share of the final torque (1)")
+    return {"data": data, "layout": layout(height=340, xaxis=x, yaxis=y, showlegend=bool(known))}
 
 
 def steps(found: dict[str, Any]) -> dict[str, Any]:

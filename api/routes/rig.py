@@ -25,7 +25,11 @@ def rig_state(context: Context) -> dict[str, Any]:
     return {
         "connected": context.rig.connected,
         "age_s": context.rig.age_s,
-        **(status.model_dump() if status else {"state": "disconnected", "reason": "the rig has not spoken yet"}),
+        **(
+            status.model_dump(exclude={"finished"})
+            if status
+            else {"state": "disconnected", "reason": "the rig has not spoken yet"}
+        ),
         "holder": {"test_id": current.test_id, "participant": current.participant, "by": current.by}
         if current
         else None,

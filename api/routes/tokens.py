@@ -41,13 +41,8 @@ def list_tokens(context: Ctx, _who: Administrator) -> list[dict[str, Any]]:
 @router.delete("/tokens/{token_id}", status_code=204)
 def revoke_token(context: Ctx, who: Administrator, token_id: str) -> None:
     """Revoke a token."""
-    found = [row for row in context.store.all(Token) if row.hash[:16] == token_id]
-    if not found:
-        raise NotFoundError("token", token_id)
-    with context.store.write() as session:
-        row = session.merge(found[0])
-        row.revoked = True
-        audit.write(session, context.clock.utc(), who.name, "revoke token", row.name)
+    if not context.auth.revoke(token_id, who.name):
+        raise NotFoundError("token", token_id, "GET /v1/tokens lists them.")
 
 
 @router.get("/audit")

@@ -121,7 +121,7 @@ def test_a_clinicians_whole_way(tab: Any, service: Service) -> None:
     tab.get_by_role("button", name="Approve").click()
     tab.get_by_text("the controller gets this model").wait_for()
     tab.get_by_role("link", name="P100").click()
-    assert tab.get_by_text("the controller gets this one").is_visible()
+    assert tab.get_by_text("in use", exact=True).is_visible()
     with service.client() as http:
         assert http.get("/v1/participants/P100/model").status_code == 200
     assert {urlsplit(url).netloc for url in tab.requests if url.startswith("http")} == {urlsplit(service.url).netloc}
