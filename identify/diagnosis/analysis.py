@@ -10,7 +10,7 @@ import numpy as np
 from identify.diagnosis.candidates import Candidate, Progress, fit_form, scan
 from identify.diagnosis.structure import Left, left_over, quiet_rows
 from identify.effects import registry
-from identify.effects.base import Effect
+from identify.effects.base import Effect, Form
 from identify.engine.fit import Fitted, solve, start_from
 from identify.engine.noise_level import NoiseLevel
 from identify.engine.prepare import Raw, inspect, prepare
@@ -21,7 +21,10 @@ FIRST_MARGIN = 6.0
 """Log evidence that the first effect must gain."""
 NEXT_MARGIN = 10.0
 """Log evidence that a further effect must gain."""
-MOST = 4
+PATCH = 0.05
+"""And in proportion to what the first gained."""
+MOST = 3
+"""Effects at most."""
 
 
 @dataclass
@@ -44,6 +47,8 @@ class Analysis:
         The base (with what was given), then with one effect more each time.
     added : list of str
         Effects added, in order.
+    margins : list of float
+        Log evidence asked for in each round.
     quiet : ndarray of bool
         Intervals in which the muscle rests.
     left : list of Left
@@ -57,6 +62,7 @@ class Analysis:
     rounds: list[list[Candidate]] = field(default_factory=list)
     chain: list[Fitted] = field(default_factory=list)
     added: list[str] = field(default_factory=list)
+    margins: list[float] = field(default_factory=list)
     quiet: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
     left: list[Left] = field(default_factory=list)
 
@@ -77,7 +83,7 @@ def analyse(
     """Try all effects on a record, add the best, and go on while the evidence lasts."""
     listed = list(registry().values() if effects is None else effects)
     raw = inspect(record)
-    setup, base = prepare(record, raw, fitted)
+    base = prepare(record, raw, fitted)[1]
     work = Analysis(record, raw, base)
     start = _with_given(work, base)
     work.chain, work.quiet = [start], quiet_rows(start)
@@ -87,13 +93,21 @@ def analyse(
             break
         candidates = scan(work.last, listed, progress, (0.1 + 0.3 * number, 0.1 + 0.3 * (number + 1)))
         work.rounds.append(candidates)
-        margin = NEXT_MARGIN if work.added else FIRST_MARGIN
+        margin = _margin(work)
+        work.margins.append(margin)
         if not candidates or candidates[0].gain < margin:
             break
         _take(work, candidates[0].fitted, candidates[0].effect.id)
         if number:
             _exchange(work)
     return work
+
+
+def _margin(work: Analysis) -> float:
+    """Log evidence that the next effect must gain: a patch on the first one's imperfect form isn't an effect."""
+    if not work.added:
+        return FIRST_MARGIN
+    return max(NEXT_MARGIN, PATCH * work.rounds[0][0].gain)
 
 
 def _take(work: Analysis, fitted: Fitted, effect: str) -> None:
@@ -110,21 +124,26 @@ def _exhausted(work: Analysis) -> bool:
 
 def _with_given(work: Analysis, base: Fitted) -> Fitted:
     """The base model with what the raw samples show beyond doubt."""
-    raw, setup, present = work.raw, base.problem.setup, []
-    effects = registry()
-    values: dict[int, dict[str, float]] = {}
+    for effect, form, values in given_by_samples(work.raw):
+        effects = [*base.effects, (effect, form)]
+        problem = Problem(base.problem.setup, effects)
+        base = solve(problem, start_from(problem, base, {len(effects) - 1: values}), base.noise)
+        work.given.append(effect)
+    return base
+
+
+def given_by_samples(raw: Raw) -> list[tuple[str, Form, dict[str, float]]]:
+    """Effects that the samples show before any fit: a line of the mains, a ceiling; with their parameters."""
+    effects, found = registry(), []
     if raw.hum is not None and "mains_hum" in effects:
-        values[len(present)] = raw.hum
-        present.append(("mains_hum", effects["mains_hum"].forms[0]))
-    for level, name, key in ((raw.ceiling_nm, "ceiling", "ceiling_nm"), (raw.floor_nm, "floor", "floor_nm")):
-        if level is not None and "sensor_clipping" in effects and not any(e == "sensor_clipping" for e, _ in present):
-            values[len(present)] = {key: level}
-            present.append(("sensor_clipping", effects["sensor_clipping"].form(name)))
-    if not present:
-        return base
-    work.given = [effect for effect, _ in present]
-    problem = Problem(setup, present)
-    return solve(problem, start_from(problem, base, values), base.noise)
+        found.append(("mains_hum", effects["mains_hum"].forms[0], raw.hum))
+    if "sensor_clipping" in effects:
+        levels = {"ceiling": raw.ceiling_nm, "floor": raw.floor_nm}
+        seen = {name: value for name, value in levels.items() if value is not None}
+        if seen:
+            form = effects["sensor_clipping"].form("both" if len(seen) == 2 else next(iter(seen)))
+            found.append(("sensor_clipping", form, {f"{name}_nm": value for name, value in seen.items()}))
+    return found
 
 
 def _exchange(work: Analysis) -> None:

@@ -7,12 +7,11 @@ from typing import Any
 import numpy as np
 
 from identify.diagnosis.analysis import Analysis
+from identify.diagnosis.steps import Step, steps
 from identify.diagnosis.verdict import Verdict
 from identify.diagnosis.where import worst_places
 from identify.effects import get
-from identify.engine.export import describe_parameters, predict_fitted
-from identify.engine.figures import figures
-from identify.engine.fit import Fitted
+from identify.engine.export import describe_parameters, predict_fitted, with_band
 
 RIVAL = 0.04
 """Probability from which an effect is named as one that the record can't tell from the best."""
@@ -22,10 +21,10 @@ def report(work: Analysis, verdict: Verdict) -> dict[str, Any]:
     """The contract's JSON."""
     record, raw = work.record, work.raw
     base_prediction = predict_fitted(work.base, record)
-    base = figures(work.base, record, base_prediction)
-    models = _models(work)
-    missing = [_missing(work, verdict, effect, base, models) for effect in _ranked(verdict)]
-    final = models.get(len(work.added), base) if work.chain[-1] is not work.base else base
+    row = steps(work)
+    base = row[0].figures
+    missing = [_missing(work, verdict, effect, row) for effect in _ranked(verdict)]
+    final = row[-1].figures
     residual = record.torque_nm - (
         predict_fitted(work.last, record) if verdict.kind == "unexplained_structure" else base_prediction
     )
@@ -65,18 +64,10 @@ def _ranked(verdict: Verdict) -> list[str]:
     return sorted(verdict.found, key=lambda effect: -verdict.found[effect])
 
 
-def _models(work: Analysis) -> dict[int, dict[str, Any]]:
-    return {i: figures(fitted, work.record) for i, fitted in enumerate(work.chain) if i or work.given}
-
-
-def _missing(
-    work: Analysis, verdict: Verdict, effect: str, base: dict[str, Any], models: dict[int, dict[str, Any]]
-) -> dict[str, Any]:
-    number = work.added.index(effect) if effect in work.added else -1
-    before = base if number <= 0 and 0 not in models else models[max(number, 0)]
-    before = base if number < 0 else before
-    after = models.get(number + 1, base)
-    fitted = work.last
+def _missing(work: Analysis, verdict: Verdict, effect: str, row: list[Step]) -> dict[str, Any]:
+    number = next(i for i, step in enumerate(row) if step.added == effect)
+    before, after = row[number - 1].figures, row[number].figures
+    fitted = with_band(work.last)
     index = [e for e, _ in fitted.effects].index(effect)
     rivals = verdict.rivals.get(effect, {})
     confused = [
@@ -95,10 +86,15 @@ def _missing(
         "next_experiment": described.separated_by,
         "form": fitted.effects[index][1].name,
         "equation": fitted.effects[index][1].equation,
-        "parameters": describe_parameters(fitted, index),
+        "parameters": _few(describe_parameters(fitted, index)),
         "rival_probabilities": {name: p for name, p in rivals.items() if name and p >= 0.005},
         "plain": described.plain,
     }
+
+
+def _few(parameters: dict[str, Any]) -> dict[str, Any]:
+    """The first two dozen: a tremor's wave has hundreds."""
+    return dict(list(parameters.items())[:24])
 
 
 def _candidates(work: Analysis) -> list[list[dict[str, Any]]]:
@@ -149,8 +145,3 @@ def _plain(
             f"{final['held_out_rms_nm']:.3g} N·m on rows not fitted."
         )
     return lines + verdict.notes
-
-
-def last_of(work: Analysis) -> Fitted:
-    """The model with all that was found."""
-    return work.last

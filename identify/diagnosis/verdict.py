@@ -83,6 +83,10 @@ def judge(work: Analysis) -> Verdict:
         )
         found[effect] = rivals[effect].get(effect, 0.5)
     structure = left.ratio
+    if last.noise.band > 0.0:
+        # The band's own surprise isn't structure: what counts is what remains beside it.
+        before = max(work.left[0].busy_nm ** 2 - left.white_nm**2, 1e-12)
+        explained = 1.0 - max(left.busy_nm**2 - left.white_nm**2, 0.0) / before
     strange = held > HELD
     if strange:
         notes.append(f"{100 * held:.0f} % of the readings repeat the one before exactly: the converter holds or steps.")

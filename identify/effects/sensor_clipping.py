@@ -24,26 +24,20 @@ def _floored(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
     return -_clipped(-y, {"ceiling_nm": -p["floor_nm"]}, scene)
 
 
+def _both(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+    return _floored(_clipped(y, p, scene), p, scene)
+
+
+_CEILING = Parameter("ceiling_nm", "N·m", 0.1, 1.5, np.inf, (0.9,), "log", "torque", "largest torque shown")
+_FLOOR = Parameter("floor_nm", "N·m", -1.5, 0.9, -np.inf, (-0.5,), "linear", "torque", "smallest torque shown")
+
 EFFECT = Effect(
     id="sensor_clipping",
     name="Clipping of the sensor",
     forms=(
-        Form(
-            "ceiling",
-            "sensor",
-            "min(y + noise, ceiling)",
-            (Parameter("ceiling_nm", "N·m", 0.1, 1.5, np.inf, (0.9,), "log", "torque", "largest torque shown"),),
-            _clipped,
-            True,
-        ),
-        Form(
-            "floor",
-            "sensor",
-            "max(y + noise, floor)",
-            (Parameter("floor_nm", "N·m", -1.5, 0.9, -np.inf, (-0.5,), "linear", "torque", "smallest torque shown"),),
-            _floored,
-            True,
-        ),
+        Form("ceiling", "sensor", "min(y + noise, ceiling)", (_CEILING,), _clipped, True),
+        Form("floor", "sensor", "max(y + noise, floor)", (_FLOOR,), _floored, True),
+        Form("both", "sensor", "min(max(y + noise, floor), ceiling)", (_CEILING, _FLOOR), _both, True),
     ),
     signature="Flat tops: many samples at exactly the same greatest value.",
     resembles=("output_saturation",),

@@ -44,7 +44,11 @@ def _propose(count: int, sign: float) -> Callable[..., list[dict[str, float]]]:
                 continue
             start = {"flatness": 2.0} | dict(previous)
             i = count - 1
-            start |= {f"centre_{i}_s": float(scene.time_s[at]), f"width_{i}_s": width_s, f"height_{i}_nm": sign * height}
+            start |= {
+                f"centre_{i}_s": float(scene.time_s[at]),
+                f"width_{i}_s": width_s,
+                f"height_{i}_nm": sign * height,
+            }
             starts.append(start)
         return starts
 

@@ -9,6 +9,7 @@ import numpy as np
 from identify.effects import get
 from identify.engine.export import predict, to_model
 from identify.engine.figures import figures
+from identify.engine.noise_level import find_band
 from identify.engine.fit import Fitted, solve, start_from
 from identify.engine.prepare import inspect, prepare
 from identify.engine.problem import Problem
@@ -62,6 +63,8 @@ def fit_candidate(record: Record, effects: Sequence[str], fit_on: Sequence[str] 
 
 def _add(base: Fitted, identifier: str, forms: list, known: dict[str, float] | None) -> Fitted:
     setup = base.problem.setup
+    if get(identifier).band:
+        return solve(base.problem, base.theta, find_band(base.residual_nm, setup.stretches, setup.grid.step_s)[0])
     best: Fitted | None = None
     previous: dict[str, float] = {}
     residual = base.residual_nm
@@ -77,7 +80,7 @@ def _add(base: Fitted, identifier: str, forms: list, known: dict[str, float] | N
             previous, residual = top.parameters_of(identifier), top.residual_nm
         if best is None or top.log_evidence > best.log_evidence:
             best = top
-        elif form.grows:
+        elif form.grows and top.log_evidence < best.log_evidence - 20.0:
             break
     assert best is not None
     return best

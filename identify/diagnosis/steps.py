@@ -1,0 +1,56 @@
+"""The models of an analysis one after the other, each with one effect more, and their errors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from identify.diagnosis.analysis import Analysis
+from identify.effects import get
+from identify.engine.figures import figures
+from identify.engine.fit import Fitted, solve, start_from
+from identify.engine.problem import Problem
+
+
+@dataclass(frozen=True)
+class Step:
+    """One model of the row.
+
+    Parameters
+    ----------
+    added : str or None
+        The effect that this model has more than the one before; None for the base.
+    fitted : Fitted
+        The model.
+    figures : dict
+        See `identify.engine.figures.figures`.
+    """
+
+    added: str | None
+    fitted: Fitted
+    figures: dict[str, Any]
+
+
+def steps(work: Analysis) -> list[Step]:
+    """Base, what the samples gave, what was found, in this order."""
+    record, last = work.record, work.last
+    result = [Step(None, work.base, figures(work.base, record))]
+    previous = work.base
+    names = [*work.given, *work.added]
+    for number, name in enumerate(names):
+        if number == len(names) - 1:
+            fitted = last
+        else:
+            fitted = _part(last, previous, names[: number + 1])
+        result.append(Step(name, fitted, figures(fitted, record)))
+        previous = fitted
+    return result
+
+
+def _part(last: Fitted, previous: Fitted, names: list[str]) -> Fitted:
+    """The last model with only some of its effects, from where they stand in it."""
+    effects = [(effect, form) for effect, form in last.effects if effect in names]
+    problem = Problem(last.problem.setup, effects)
+    banded = any(get(name).band for name in names)
+    noise = last.noise if banded else previous.noise
+    return solve(problem, start_from(problem, last, {}), noise)
