@@ -136,9 +136,8 @@ def accuracy() -> list[str]:
             seeds = ACCURACY_SEEDS if noise else ACCURACY_SEEDS[:1]
             with ProcessPoolExecutor() as pool:
                 found = np.array(list(pool.map(one_accuracy, [(rate, noise, seed) for seed in seeds])))
-            for column in (0, 1):
-                cells.append(f"{found[:, column].mean():.3f} ({found[:, column].min():.2f})")
-            cells.append(f"{found[:, 2].min():+.3f}")
+            cells += [f"{found[:, column].mean():.3f} ({found[:, column].min():.2f})" for column in (0, 1)]
+            cells += [f"{found[:, 2].min():+.3f}"]
         lines.append(f"| {noise:.2f} | " + " | ".join(cells) + " |")
     return lines
 
