@@ -18,7 +18,7 @@ from identify.grid import Grid
 from identify.linear import SecondOrder
 from identify.noise import whiten
 from identify.recruitment.curve import Basis
-from identify.recruitment.knots import KNOTS, PILOT_KNOTS, adapted_knots, even_knots, spline_roughness
+from identify.recruitment.knots import KNOTS, PILOT_KNOTS, adapted_knots, bending_order, even_knots, spline_roughness
 from identify.recruitment.smoothing import choose_weight, straight_lines
 from identify.recruitment.spline import SplineBasis
 
@@ -316,11 +316,15 @@ class _State:
         return self.energy - float(self.zy @ _solve(self.zz + weight * self.penalty, self.zy))
 
     def step(self, damping: float) -> np.ndarray:
-        """Step in (log T, log ζ, delay)."""
-        scale = np.diag(np.diag(self.information)) * damping
+        """Step in (log T, log ζ, delay), along the bounds where it would leave them."""
         cross, _, moment = self._bent
         gradient = moment - self._inner[:, : cross.shape[1]].T @ self.zy
-        return _solve(self.information + scale, gradient)
+        free = ~_held(self.problem, self.linear, gradient)
+        step = np.zeros(gradient.size)
+        if free.any():
+            information = self.information[np.ix_(free, free)]
+            step[free] = _solve(information + damping * np.diag(np.diag(information)), gradient[free])
+        return step
 
     def solution(self, taken: int, converged: bool) -> Solution:
         return Solution(
@@ -368,10 +372,25 @@ def _difference(before: SecondOrder, after: SecondOrder) -> np.ndarray:
     )
 
 
-def _bounded(problem: Problem, linear: SecondOrder) -> SecondOrder:
+def _held(problem: Problem, linear: SecondOrder, gradient: np.ndarray) -> np.ndarray:
+    """Which of the searched numbers stand at a bound and are pulled beyond it."""
+    values = np.array([linear.time_constant_s, linear.damping, linear.delay_s])[: gradient.size]
+    lower = np.array([T_BOUNDS_S[0], ZETA_BOUNDS[0], _earliest(problem)])[: gradient.size]
+    upper = np.array([T_BOUNDS_S[1], ZETA_BOUNDS[1], LONGEST_DELAY_S])[: gradient.size]
+    return ((values <= lower) & (gradient < 0)) | ((values >= upper) & (gradient > 0))
+
+
+def _earliest(problem: Problem) -> float:
     # A record's first sample after a pulse is off by up to one sample, so the delay may be negative by as much.
-    earliest = -min(1.0 / problem.grid.record.sample_rate_hz, problem.grid.step_s)
-    delay = float(np.clip(linear.delay_s, earliest, LONGEST_DELAY_S)) if problem.delay_s is None else problem.delay_s
+    return -min(1.0 / problem.grid.record.sample_rate_hz, problem.grid.step_s)
+
+
+def _bounded(problem: Problem, linear: SecondOrder) -> SecondOrder:
+    delay = (
+        float(np.clip(linear.delay_s, _earliest(problem), LONGEST_DELAY_S))
+        if problem.delay_s is None
+        else problem.delay_s
+    )
     return SecondOrder(
         float(np.clip(linear.time_constant_s, *T_BOUNDS_S)), float(np.clip(linear.damping, *ZETA_BOUNDS)), delay
     )
@@ -395,7 +414,8 @@ def pilot_solution(grid: Grid, rows: np.ndarray, from_rest: bool, delay_s: float
     if np.ptp(grid.torque_nm[rows]) <= 0:
         raise NotIdentifiable("the torque never changes", mend="Check the load cell and the electrodes.")
     basis = SplineBasis(even_knots(largest, PILOT_KNOTS))
-    problem = Problem(grid, basis, spline_roughness(basis), rows, from_rest, delay_s)
+    order = bending_order(grid.pulse_width_us[rows])
+    problem = Problem(grid, basis, spline_roughness(basis, order=order), rows, from_rest, delay_s)
     target = whiten(problem.target, problem.stretches, 0.0)
     delay = 0.02 if delay_s is None else delay_s
     starts = [_assess(problem, _bounded(problem, SecondOrder(t, 0.9, delay)), target, 0.0, None) for t in STARTS_S]
@@ -411,7 +431,8 @@ def designed(first: Solution, count: int = KNOTS) -> tuple[Problem, SecondOrder]
     """
     old = first.problem
     basis = SplineBasis(adapted_knots(pilot_curve(first), float(np.max(old.grid.pulse_width_us)), count))
-    problem = Problem(old.grid, basis, spline_roughness(basis), old.rows, old.from_rest, old.delay_s)
+    order = bending_order(old.grid.pulse_width_us[old.rows])
+    problem = Problem(old.grid, basis, spline_roughness(basis, order=order), old.rows, old.from_rest, old.delay_s)
     target = whiten(problem.target, problem.stretches, 0.0)
     for _ in range(2):
         coefficients = _assess(problem, first.linear, target, 0.0, None).coefficients[: basis.size]
@@ -423,7 +444,8 @@ def _redesigned(old: Problem, basis: SplineBasis, coefficients: np.ndarray, coun
     """The problem with knots and penalty from a first curve."""
     u = np.linspace(0.0, basis.largest_us, CURVE_POINTS)
     new = SplineBasis(adapted_knots((u, basis.design(u) @ coefficients), basis.largest_us, count))
-    roughness = spline_roughness(new, (basis, coefficients))
+    order = bending_order(old.grid.pulse_width_us[old.rows])
+    roughness = spline_roughness(new, (basis, coefficients), order)
     return Problem(old.grid, new, roughness, old.rows, old.from_rest, old.delay_s), new
 
 

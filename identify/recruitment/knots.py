@@ -73,8 +73,20 @@ def adapted_knots(pilot_curve: tuple[np.ndarray, np.ndarray], largest_us: float,
     return knots
 
 
-def spline_roughness(basis: SplineBasis, pilot: tuple[SplineBasis, np.ndarray] | None = None) -> np.ndarray:
-    """∫ω f'''² over the knots, scaled to be free of units.
+FEW_LEVELS = 6
+
+
+def bending_order(widths_us: np.ndarray) -> int:
+    """Which derivative to keep small: the third, or the second where so few widths were applied that a parabola would
+    be free to do anything between them.
+    """
+    return 3 if np.unique(widths_us).size > FEW_LEVELS else 2
+
+
+def spline_roughness(
+    basis: SplineBasis, pilot: tuple[SplineBasis, np.ndarray] | None = None, order: int = 3
+) -> np.ndarray:
+    """∫ω f'''² over the knots (or ∫ω f''²), scaled to be free of units.
 
     The third derivative, since a recruitment curve is a smooth bend and not a straight line; ω lets it bend where it
     does bend: from a pilot's own third derivative where there is one, else from the spacing of the knots. A rise
@@ -86,7 +98,11 @@ def spline_roughness(basis: SplineBasis, pilot: tuple[SplineBasis, np.ndarray] |
         The spline that is penalised.
     pilot : tuple of SplineBasis and ndarray, optional
         A first estimate: basis and coefficients.
+    order : int
+        Derivative that is kept small, 3 or 2 (see `bending_order`).
     """
+    if order == 2:
+        return basis.roughness * basis.largest_us**3
     gaps = np.diff(basis.knots_us)
     middle = basis.knots_us[:-1] + gaps / 2
     third = basis.design(middle, derivative=3)
