@@ -201,7 +201,7 @@ def _read_only(path: Path) -> sqlite3.Connection:
 def _kept(rig_data: Path, api_data: Path) -> Iterator[tuple[Path, Path]]:
     """What is copied beside the database, and its name in the backup: journals first, since they become recordings.
 
-    One folder for both (`stimrig serve`) counts as the rig's. In the service's recordings, `rig` is the rig's own folder.
+    One folder for both (`stimrig serve`) counts as the rig's. `rig` in the service's recordings is the rig's own.
     """
     places = [(rig_data, "rig", "journals", ""), (rig_data, "rig", "recordings", "")]
     if api_data.resolve() != rig_data.resolve():
@@ -287,7 +287,7 @@ def _holds_data(folder: Path) -> bool:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run a verb; the exit code."""
-    parser = argparse.ArgumentParser(prog="backup.py", description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(prog="backup.py", description=(__doc__ or "").partition("\n")[0])
     verbs = parser.add_subparsers(dest="verb", required=True)
     folders = argparse.ArgumentParser(add_help=False)
     folders.add_argument("--rig-data", type=Path, default=RIG_DATA, help=f"default {RIG_DATA}")
