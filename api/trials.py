@@ -13,12 +13,13 @@ from typing import Any
 from api import audit
 from api.clock import Clock
 from api.errors import ApiError, NotFoundError
-from api.fitting import Fitting, Job
+from api.fitting import Fitting
 from api.live import Hub
+from api.outcomes import OPEN_STATES, Outcomes
 from api.rig_client import AnyEvent, RigClient
 from api.schemas import TestIn
 from api.store import Store
-from api.store.tables import Participant, Recording, Test
+from api.store.tables import Participant, Test
 from api.versions import Versions
 from rig.messages import (
     FinishedEvent,
@@ -34,8 +35,6 @@ from rig.messages import (
 )
 
 log = logging.getLogger("stimrig.trials")
-
-OPEN_STATES = ("requested", "running", "sealing", "identifying")
 
 
 @dataclass
@@ -54,11 +53,10 @@ class Trials:
     def __init__(
         self, store: Store, clock: Clock, rig: RigClient, fitting: Fitting, versions: Versions, recordings_dir: Path
     ) -> None:
-        self.store, self.clock, self.rig, self.fitting, self.versions = store, clock, rig, fitting, versions
-        self.recordings_dir = recordings_dir
+        self.store, self.clock, self.rig, self.versions = store, clock, rig, versions
         self.hub = Hub()
         self.current: Current | None = None
-        self.jobs: dict[str, Job] = {}
+        self.outcomes = Outcomes(store, clock, rig, fitting, versions, recordings_dir, self.announce)
         self._lock = asyncio.Lock()
         self._tasks: set[asyncio.Task[Any]] = set()
         rig.listeners.append(self._on_event)
@@ -95,13 +93,15 @@ class Trials:
         except BaseException:
             self.current = None
             raise
-        return await asyncio.to_thread(self._update, row.id, state="running")
+        return await asyncio.to_thread(self.outcomes.update, row.id, state="running")
 
     async def _command(self, plan: TestPlan) -> None:
         try:
             await self.rig.ask(StartRequest(plan=plan), timeout_s=15.0)
         except ApiError as error:
-            await asyncio.to_thread(self._update, plan.test_id, state="refused", reason=error.detail or error.title)
+            await asyncio.to_thread(
+                self.outcomes.update, plan.test_id, state="refused", reason=error.detail or error.title
+            )
             if error.code == "rig-unreachable":  # it may have heard us all the same
                 await self._stop_quietly(f"start of {plan.test_id} was not answered")
             status = self.rig.status
@@ -212,16 +212,18 @@ class Trials:
     async def _finish(self, event: FinishedEvent) -> None:
         """Take over a finished test: store the recording, identify, store the model."""
         try:
-            row = await asyncio.to_thread(self._take_recording, event)
+            row = await asyncio.to_thread(self.outcomes.take_recording, event)
             if row is None:
                 return
             self.announce(row.id)
             if event.outcome == "completed" and row.recording_id:
                 self._release(event.test_id)
-                await self.identify(row.id, event.last_sample_unix_s)
+                await self.outcomes.identify(row.id, event.last_sample_unix_s)
         except Exception as error:
             log.exception("test %s could not be taken over", event.test_id)
-            await asyncio.to_thread(self._update, event.test_id, state="failed", reason=one_line(error))
+            await asyncio.to_thread(
+                self.outcomes.update, event.test_id, state="failed", reason=" ".join(str(error).split())
+            )
         finally:
             self._release(event.test_id)
             self.announce(event.test_id)
@@ -231,56 +233,6 @@ class Trials:
         if self.current is not None and self.current.test_id == test_id:
             self.current.finished.set()
             self.current = None
-
-    def _take_recording(self, event: FinishedEvent) -> Test | None:
-        with self.store.write() as session:
-            row = session.get(Test, event.test_id)
-            if row is None or row.recording_id is not None:
-                return None
-            if event.recording_path and event.recording_id:
-                recording = Recording(
-                    id=event.recording_id,
-                    participant=row.participant,
-                    test_id=row.id,
-                    path=event.recording_path,
-                    file_sha256=event.file_sha256 or "",
-                    origin="rig",
-                    created_utc=self.clock.utc(),
-                )
-                session.add(recording)
-                session.flush()
-                row.recording_id = event.recording_id
-            identifies = event.outcome == "completed" and row.recording_id is not None
-            row.state = "identifying" if identifies else event.outcome
-            row.reason = event.reason
-            row.summary = dict(event.summary)
-            row.finished_utc = now = self.clock.utc()
-            audit.write(session, now, "rig", f"test {event.outcome}", row.id, reason=event.reason)
-        return row
-
-    async def identify(self, test_id: str, last_sample_unix_s: float | None = None) -> None:
-        """Identify a test's recording in a worker and store the model."""
-        row: Test = await asyncio.to_thread(self.store.get, Test, test_id)
-        recording: Recording = await asyncio.to_thread(self.store.get, Recording, row.recording_id)
-        job = self.fitting.submit(
-            "fit", urgent=True, data=recording.path, on_progress=lambda _job: self.announce(test_id)
-        )
-        self.jobs[test_id] = job
-        try:
-            found = await job.result
-        except ApiError as error:
-            reason = f"identification: {error.detail or error.title}"
-            await asyncio.to_thread(self._update, test_id, state="failed", reason=reason)
-            return
-        finally:
-            self.jobs.pop(test_id, None)
-        model = await asyncio.to_thread(
-            self.versions.add, found["json"], row.participant, recording.id, f"test {test_id}"
-        )
-        summary = dict(row.summary)
-        if last_sample_unix_s is not None:
-            summary["last_sample_to_model_s"] = round(self.clock.unix_s() - last_sample_unix_s, 3)
-        await asyncio.to_thread(self._update, test_id, state="completed", model_id=model.id, summary=summary)
 
     # ---- after a restart ------------------------------------------------------------------------------------
 
@@ -302,28 +254,11 @@ class Trials:
         """A test whose end was not heard: its recording, if the rig sealed one, is adopted."""
         row: Test = await asyncio.to_thread(self.store.get, Test, test_id)
         if row.recording_id is not None:
-            await self.identify(test_id)
+            await self.outcomes.identify(test_id)
         else:
-            await self._finish(await self._missed_end(test_id, why))
+            await self._finish(await self.outcomes.missed_end(test_id, why))
         self._release(test_id)
         self.announce(test_id)
-
-    async def _missed_end(self, test_id: str, why: str) -> FinishedEvent:
-        """The end of a test as the rig remembers it, or as its recording tells."""
-        status = self.rig.status
-        if status is not None and status.finished is not None and status.finished.test_id == test_id:
-            return status.finished
-        found = await self._find_recording(test_id)
-        event = FinishedEvent(test_id=test_id, outcome="fault", reason=why, last_sample_unix_s=None)
-        return event.model_copy(update=found)
-
-    async def _find_recording(self, test_id: str) -> dict[str, Any]:
-        job = self.fitting.submit("find_recording", urgent=True, folder=str(self.recordings_dir), test_id=test_id)
-        try:
-            return (await job.result).get("found") or {}
-        except ApiError as error:
-            log.warning("looking for the recording of %s: %s", test_id, error)
-            return {}
 
     # ---- what clients see -----------------------------------------------------------------------------------
 
@@ -340,7 +275,7 @@ class Trials:
         start = (0.0, planned.get("duration_s", 0.0), None)
         end = (row.summary.get("duration_s", 0.0), row.summary.get("duration_s", 0.0), None)
         elapsed_s, duration_s, segment = (self.hub.position(row.id) or start) if running else end
-        job, rig = self.jobs.get(row.id), self.rig.status
+        job, rig = self.outcomes.jobs.get(row.id), self.rig.status
         sealing = running and rig is not None and rig.test_id == row.id and rig.state == "sealing"
         model = self.versions.get(row.model_id) if row.model_id else None
         return {
@@ -368,18 +303,6 @@ class Trials:
             "fit": self.versions.public(model) if model else None,
         }
 
-    def _update(self, test_id: str, **fields: Any) -> Test:
-        with self.store.write() as session:
-            row = session.get(Test, test_id)
-            assert row is not None
-            if fields.get("state") == "running" and row.state != "requested":
-                fields.pop("state")  # the rig was done before we wrote that it had begun
-            for name, value in fields.items():
-                setattr(row, name, value)
-            if row.state not in OPEN_STATES and row.finished_utc is None:
-                row.finished_utc = self.clock.utc()
-        return row
-
     async def close(self) -> None:
         """Leave what runs to the next start of the service."""
         for task in list(self._tasks):
@@ -395,8 +318,3 @@ def busy(current: Current) -> ApiError:
     )
     holder = {"test_id": current.test_id, "participant": current.participant, "by": current.by}
     return ApiError(409, "rig-busy", "Another test is running", detail, holder=holder)
-
-
-def one_line(error: Exception) -> str:
-    """An error's message on one line."""
-    return " ".join(str(error).split())
