@@ -34,11 +34,17 @@ class LimitSettings(_Table):
     torque_nm: float | None = Field(None, gt=0)
     duration_s: float | None = Field(None, gt=0)
     charge_per_test_uc: float | None = Field(None, ge=0)
+    width_rise_us: float | None = Field(None, gt=0)
+    rest_between_tests_s: float | None = Field(None, ge=0)
+    rest_between_trains_s: float | None = Field(None, ge=0)
 
     def table(self) -> dict[str, Limit]:
         """The hard limits, tightened."""
         table = limits.HARD_LIMITS
         for name, value in self.model_dump(exclude_none=True).items():
+            if name.startswith("rest_"):
+                table = limits.at_least(table, name, value, "rig file")
+                continue
             lo = -value if name == "torque_nm" else None
             table = limits.tightened(table, name, value, "rig file", lo)
         return table
@@ -62,6 +68,7 @@ class RigConfig(_Table):
     data_dir: Path
     socket: Path
     clock_speed: float = Field(1.0, gt=0, le=100)
+    require_calibration: bool = True
     stimulator: DeviceSettings
     load_cell: DeviceSettings
     limits: LimitSettings = LimitSettings.model_validate({})
@@ -121,6 +128,7 @@ def for_emulator(ready: str, **overrides: Any) -> RigConfig:
         raise ConfigError(f"--emulator-json: not the line that `stimrig emulate` prints ({error})") from None
     content: dict[str, Any] = {
         "clock_speed": line.get("speed", 1.0),
+        "require_calibration": False,  # nobody sits at an emulator
         "stimulator": {"device": "p24", "port": stimulator},
         "load_cell": {
             "device": "can_load_cell",

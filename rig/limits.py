@@ -78,6 +78,33 @@ HARD_LIMITS: dict[str, Limit] = {
             "ten default tests' dose (300 µs, 20 mA: about 4 mC)",
             "house rule",
         ),
+        Limit(
+            "width_rise_us", -math.inf, 50.0, "µs/pulse",
+            "a width that rises faster than 0 to 300 µs in 150 ms startles; falling is always allowed. Sequences that "
+            "jump between levels by design (PRBS and its like) say so and are exempt",
+            "house rule; the paper's ramp rises by 1.5 µs a pulse",
+        ),
+        Limit(
+            "rest_between_tests_s", 1.0, math.inf, "s",
+            "from a test's last pulse to the next one's first: the torque must have fallen to its rest, or the next "
+            "baseline lies; against fatigue the rig file and the profile ask for more",
+            "paper: slowest muscle about 1 s",
+        ),
+        Limit(
+            "rest_between_trains_s", 0.5, math.inf, "s",
+            "between two trains of a calibration: a person must be able to tell them apart",
+            "house rule",
+        ),
+        Limit(
+            "calibration_step_us", 1.0, 25.0, "µs",
+            "small steps: from the sensory threshold to discomfort are often 100 µs",
+            "house rule",
+        ),
+        Limit(
+            "calibration_train_s", 0.1, 2.0, "s",
+            "long enough to be felt, short enough to be borne once too much",
+            "house rule",
+        ),
     )
 }  # fmt: skip
 
@@ -148,7 +175,17 @@ def tightened(table: dict[str, Limit], name: str, hi: float, owner: str, lo: flo
     return {**table, name: bounds}
 
 
-def for_profile(table: dict[str, Limit], profile: Profile) -> dict[str, Limit]:
+def at_least(table: dict[str, Limit], name: str, lo: float, owner: str) -> dict[str, Limit]:
+    """The table with one row's lower bound raised, never lowered. Raises RefusedError for no number."""
+    row = table[name]
+    if not (lo <= row.hi):
+        raise RefusedError(f"{owner}: {name} {lo:g} {row.unit} must be at most {row.hi:g} {row.unit}")
+    if lo <= row.lo:
+        return table
+    return {**table, name: Limit(name, lo, row.hi, row.unit, row.reason, row.source, owner)}
+
+
+def for_profile(table: dict[str, Limit], profile: Profile, owner: str = "participant's profile") -> dict[str, Limit]:
     """The table as this participant's profile narrows it.
 
     Raises
@@ -156,11 +193,12 @@ def for_profile(table: dict[str, Limit], profile: Profile) -> dict[str, Limit]:
     RefusedError
         The profile holds a number that makes no sense (negative, NaN).
     """
-    owner = "participant's profile"
     table = tightened(table, "pulse_width_us", profile.max_pulse_width_us, owner)
     table = tightened(table, "current_ma", profile.current_ma, owner)
     if not (profile.max_torque_nm > 0):
         raise RefusedError(f"{owner}: max_torque_nm {profile.max_torque_nm:g} N·m must be above 0")
+    if profile.rest_between_tests_s is not None:
+        table = at_least(table, "rest_between_tests_s", profile.rest_between_tests_s, owner)
     return tightened(table, "torque_nm", profile.max_torque_nm, owner, lo=-profile.max_torque_nm)
 
 

@@ -11,9 +11,14 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-RigState = Literal["disconnected", "uncertain", "ready", "arming", "running", "sealing", "stopping", "latched"]
+RigState = Literal[
+    "disconnected", "uncertain", "ready", "calibrating", "arming", "running", "sealing", "stopping", "latched"
+]
 """`uncertain`: started after a crash, the device has been asked but no person has re-armed.
+`calibrating`: a guided calibration is open and nothing is being sent; its trains pass through arming, running, sealing.
 `latched`: stopped after a fault or a stop; stays so until a person re-arms."""
+
+Threshold = Literal["sensory", "motor", "comfort"]
 
 TestOutcome = Literal["completed", "stopped", "fault"]
 
@@ -33,11 +38,20 @@ class SegmentPlan(Message):
 
 
 class Profile(Message):
-    """A participant's limits for the day; the tighter of these and the hard limits wins."""
+    """A participant's limits for the day; the tighter of these and the hard limits wins.
+
+    What a guided calibration adds (both thresholds and both times, or none of them) is checked at every start:
+    0 < sensory <= motor <= comfort, set not in the future, not expired, valid for a day at most.
+    """
 
     current_ma: float = Field(20.0, description="fixed current of every pulse, mA")
     max_pulse_width_us: float = Field(300.0, description="comfort maximum, µs")
     max_torque_nm: float = Field(30.0, description="torque at which the test stops, N·m")
+    sensory_pulse_width_us: float | None = Field(default=None, description="width at which it is first felt, µs")
+    motor_pulse_width_us: float | None = Field(default=None, description="width at which the muscle first moves, µs")
+    set_at_utc: str | None = Field(default=None, description="when the calibration was finished, ISO 8601")
+    expires_at_utc: str | None = Field(default=None, description="end of that day where the rig stands, ISO 8601")
+    rest_between_tests_s: float | None = Field(default=None, description="least rest from the last pulse of a test, s")
 
 
 class TestPlan(Message):
@@ -98,8 +112,61 @@ class RearmRequest(Message):
     by: str
 
 
+class CalibrateStartRequest(Message):
+    """Open a guided calibration; nothing is sent yet. Reply: `Status` with `calibration`."""
+
+    kind: Literal["calibrate-start"] = "calibrate-start"
+    id: int = 0
+    calibration_id: str
+    participant: str
+    by: str
+    current_ma: float = Field(20.0, description="the fixed current of all pulses, mA")
+    step_us: float = Field(10.0, description="how much wider one step up is, µs")
+    train_s: float = Field(1.0, description="length of the pulse train at each step, s")
+    pulse_rate_hz: float = 40.0
+    max_pulse_width_us: float | None = Field(None, description="never wider than this, µs; None: the hard limits alone")
+    max_torque_nm: float = Field(30.0, description="torque at which a train stops, N·m")
+
+
+class CalibrateStepRequest(Message):
+    """Play one train: a step wider, a step narrower, or the same again. Reply: `Status`, at once (state arming).
+
+    The train is over when the state is `calibrating` again; a fault or a stop latches and ends the calibration.
+    """
+
+    kind: Literal["calibrate-step"] = "calibrate-step"
+    id: int = 0
+    direction: Literal["up", "down", "repeat"] = "up"
+
+
+class CalibrateMarkRequest(Message):
+    """Mark the width of the last train as a threshold; marking again replaces it. Reply: `Status`."""
+
+    kind: Literal["calibrate-mark"] = "calibrate-mark"
+    id: int = 0
+    threshold: Threshold
+
+
+class CalibrateFinishRequest(Message):
+    """Close the calibration. Reply: `CalibrationResult`, with the profile unless `discard`."""
+
+    kind: Literal["calibrate-finish"] = "calibrate-finish"
+    id: int = 0
+    by: str
+    discard: bool = False
+
+
 Request = Annotated[
-    StatusRequest | SubscribeRequest | PreviewRequest | StartRequest | StopRequest | RearmRequest,
+    StatusRequest
+    | SubscribeRequest
+    | PreviewRequest
+    | StartRequest
+    | StopRequest
+    | RearmRequest
+    | CalibrateStartRequest
+    | CalibrateStepRequest
+    | CalibrateMarkRequest
+    | CalibrateFinishRequest,
     Field(discriminator="kind"),
 ]
 
@@ -117,7 +184,40 @@ class Reply(Message):
     ok: bool
     problem: Problem | None = None
     body: dict[str, Any] = Field(default_factory=dict)
-    """status, subscribe: a `Status`; preview: a `Preview`; stop: a `StopEvidence`."""
+    """status, subscribe, start, rearm, calibrate-start, -step and -mark: a `Status`; preview: a `Preview`;
+    stop: a `StopEvidence`; calibrate-finish: a `CalibrationResult`."""
+
+
+class CalibrationTrain(Message):
+    """One train of a calibration that was played."""
+
+    number: int
+    pulse_width_us: float
+    pulses: int = Field(description="how many were sent")
+    torque_rise_nm: float | None = Field(None, description="highest torque above rest, either way, N·m")
+
+
+class CalibrationStatus(Message):
+    """Where a guided calibration stands."""
+
+    calibration_id: str
+    participant: str
+    by: str
+    current_ma: float
+    step_us: float
+    train_s: float
+    max_torque_nm: float
+    pulse_width_us: float = Field(description="width of the last train, µs; 0 before the first")
+    ceiling_us: float = Field(description="the widest that limits and a marked comfort maximum allow, µs")
+    ceiling_owner: str = Field(description="whose bound that is")
+    marks_us: dict[Threshold, float] = Field(default_factory=dict, description="marked widths, µs")
+    missing: list[Threshold] = Field(default_factory=list, description="what has to be marked before finishing")
+    trains: list[CalibrationTrain] = Field(default_factory=list)
+
+
+class CalibrationResult(Message):
+    profile: Profile | None = Field(None, description="valid until the end of the day; None: discarded")
+    recordings: list[str] = Field(default_factory=list, description="a sealed recording for each train")
 
 
 class Status(Message):
@@ -132,6 +232,7 @@ class Status(Message):
     load_cell: dict[str, Any] = Field(default_factory=dict, description="device, rate measured, bus")
     torque_age_s: float | None = Field(None, description="age of the newest torque sample; None: never seen")
     torque_nm: float | None = None
+    calibration: CalibrationStatus | None = Field(None, description="while a guided calibration is open")
     finished: FinishedEvent | None = Field(
         None, description="the newest FinishedEvent since the rig started, a recovered one included: for who came late"
     )

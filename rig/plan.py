@@ -108,6 +108,8 @@ def build(plan: TestPlan, table: dict[str, Limit]) -> PlannedTest:
         start += len(widths)
     test = PlannedTest(plan, np.concatenate(parts), tuple(segments))
     _check(test, table)
+    for segment, of in zip(segments, chosen, strict=True):
+        _check_rise(test.pulse_width_us, segment, of, table)
     return test
 
 
@@ -133,6 +135,19 @@ def _check(test: PlannedTest, table: dict[str, Limit]) -> None:
     _refuse(check(table["charge_per_second_uc"], worst_uc), "plan")
     _refuse(check(table["charge_per_test_uc"], test.charge_uc), "plan")
     _refuse(check(table["duration_s"], test.duration_s), "plan")
+
+
+def _check_rise(
+    widths_us: NDArray[np.float64], segment: PlannedSegment, of: SegmentPlan, table: dict[str, Limit]
+) -> None:
+    """No rise of the width from one pulse to the next beyond the limit, unless the sequence jumps by design."""
+    if sequences.jumps(of.sequence, of.settings):
+        return
+    before_us = widths_us[segment.start - 1] if segment.start else 0.0
+    rises_us = np.diff(widths_us[segment.start : segment.end], prepend=before_us)
+    first = int(np.argmax(rises_us))
+    refusal = check(table["width_rise_us"], float(rises_us[first]))
+    _refuse(refusal, f"segment {segment.name}, pulse {first + 1}")
 
 
 def _refuse(refusal: Refusal | None, place: str) -> None:

@@ -3,6 +3,7 @@
     disconnected -> ready -> arming -> running -> sealing -> ready
                               |          |
                               +-> stopping -> sealing -> latched -> (a person) -> ready
+    ready -> calibrating -> arming … sealing -> calibrating -> … -> ready
 
 Every method gives a new `Trial` or raises the reason why not. Nothing but a person's `rearm` leads out of
 `latched` and `uncertain`.
@@ -32,6 +33,7 @@ class Trial:
     participant: str | None = None
     latch: bool = False
     lost: str = ""
+    calibrating: bool = False
 
     @property
     def busy(self) -> bool:
@@ -64,10 +66,22 @@ class Trial:
         self.may_start()
         return Trial("arming", "", test_id, participant)
 
+    def calibrate(self, participant: str) -> Trial:
+        """A person opens a guided calibration. Raises as `start` does."""
+        self.may_start()
+        return Trial("calibrating", "", None, participant, calibrating=True)
+
+    def train(self, test_id: str) -> Trial:
+        """One train of the open calibration."""
+        self._only("calibrating")
+        return replace(self, state="arming", test_id=test_id)
+
     def may_start(self) -> None:
         """Raise what forbids a start now (see `start`)."""
         if self.busy:
             raise BusyError(f"test {self.test_id} of participant {self.participant} is {self.state}; wait or stop it")
+        if self.state == "calibrating":
+            raise BusyError(f"a calibration of participant {self.participant} is open; finish or discard it")
         if self.state == "latched":
             raise LatchedError(f"{self.reason}; look at the participant and the rig, then re-arm")
         if self.state == "uncertain":
@@ -86,7 +100,7 @@ class Trial:
             return replace(self, state="stopping", reason=reason, latch=True)
         if self.busy:
             return replace(self, reason=self.reason or reason, latch=True)
-        if self.state == "ready":
+        if self.state in ("ready", "calibrating"):
             return Trial("latched", reason)
         return self
 
@@ -102,6 +116,13 @@ class Trial:
             return Trial("latched", self.reason, lost=self.lost)
         if self.lost:
             return Trial("disconnected", self.lost)
+        if self.calibrating:
+            return replace(self, state="calibrating", test_id=None)
+        return Trial("ready", "")
+
+    def calibrated(self) -> Trial:
+        """The calibration is closed."""
+        self._only("calibrating")
         return Trial("ready", "")
 
     def rearm(self) -> Trial:
@@ -114,6 +135,8 @@ class Trial:
         """
         if self.busy:
             raise BusyError(f"test {self.test_id} is {self.state}; nothing to re-arm")
+        if self.state == "calibrating":
+            raise BusyError(f"a calibration of participant {self.participant} is open; nothing to re-arm")
         return Trial("ready", "")
 
     def _only(self, *states: RigState) -> None:

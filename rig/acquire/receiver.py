@@ -86,6 +86,7 @@ class Receiver:
         self.last_unix_s: float | None = None
         self.last_torque_nm: float | None = None
         self.peak_nm = 0.0
+        self.range_nm = (np.inf, -np.inf)
         self.live: deque[NDArray[Any]] = deque(maxlen=LIVE_BLOCKS)
         self.recent: deque[tuple[float, float]] = deque(maxlen=400)
 
@@ -105,7 +106,7 @@ class Receiver:
         """From here on every sample goes to the journal and is checked; faults are told at once."""
         with self._lock:
             self._journal, self._limits_nm, self._on_fault = journal, limits_nm, on_fault
-            self.counts, self.peak_nm = Recorded(), 0.0
+            self.counts, self.peak_nm, self.range_nm = Recorded(), 0.0, (np.inf, -np.inf)
 
     def release(self) -> Recorded:
         """Stop recording; what was counted since `record`."""
@@ -196,6 +197,8 @@ class Receiver:
                 self._on_fault(f"torque {worst:.2f} N·m is outside {lo:g} … {hi:g} N·m")
         elif self._journal is not None:
             self.peak_nm = max(self.peak_nm, float(np.max(np.abs(torque_nm))))
+            mean_nm = float(np.mean(torque_nm))  # of a few ms: less of the noise
+            self.range_nm = min(self.range_nm[0], mean_nm), max(self.range_nm[1], mean_nm)
 
     def _run(self) -> None:
         last_heard_s = self._clock.now_s()

@@ -62,6 +62,8 @@ class RunResult:
     dropped: int = 0
     charge_uc: float = 0.0
     peak_nm: float = 0.0
+    rise_nm: float | None = None
+    last_pulse_s: float | None = None
     cpu_percent: float = 0.0
     duration_s: float = 0.0
     last_sample_unix_s: float | None = None
@@ -247,10 +249,19 @@ class TestRun:
             dropped=self._gate.dropped,
             charge_uc=self._gate.charge_uc,
             peak_nm=self._receiver.peak_nm,
+            rise_nm=self._rise_nm(),
+            last_pulse_s=self._gate.last_pulse_s,
             cpu_percent=cpu_percent,
             duration_s=self._duration_s,
             last_sample_unix_s=self._receiver.last_unix_s,
         )
+
+    def _rise_nm(self) -> float | None:
+        """Furthest that the torque went from where it rested, N·m."""
+        lo_nm, hi_nm = self._receiver.range_nm
+        if self._rest_nm is None or not (lo_nm <= hi_nm):
+            return None
+        return max(hi_nm - self._rest_nm, self._rest_nm - lo_nm)
 
 
 class _Syncing:

@@ -10,15 +10,18 @@ from collections.abc import Callable
 
 from rig import limits, plan
 from rig.acquire.halt import Cause, Halt
-from rig.acquire.run import TestRun
+from rig.acquire.run import LEAD_S, TestRun
 from rig.clock import Clock
 from rig.config import RigConfig
+from rig.control.calibration import Calibration, check_profile
 from rig.control.latch import Latch, lock_folder
 from rig.control.live import live_event
 from rig.control.pair import Pair
 from rig.control.sealing import Shelf
-from rig.errors import ConfigError, DeviceError, JournalError, PlanError
+from rig.errors import BusyError, ConfigError, DeviceError, JournalError, PlanError, RefusedError
 from rig.messages import (
+    CalibrateStartRequest,
+    CalibrationResult,
     Event,
     FinishedEvent,
     LiveEvent,
@@ -28,6 +31,7 @@ from rig.messages import (
     Status,
     StopEvidence,
     TestPlan,
+    Threshold,
 )
 from rig.trial import Trial
 
@@ -57,6 +61,7 @@ class Rig:
         self._clock = clock
         self._publish = publish
         self._table = config.limits.table()
+        self._require_calibration = config.require_calibration
         self._shelf = Shelf(config, clock)
         try:
             self._shelf.make_folders()
@@ -73,6 +78,8 @@ class Rig:
         self._evidence: StopEvidence | None = None
         self._told = threading.Event()
         self._next_live_pulse = 0
+        self._calibration: Calibration | None = None
+        self._last_pulse_s: float | None = None
         self._born_s = clock.now_s()
         self.finished: FinishedEvent | None = None
 
@@ -109,6 +116,7 @@ class Rig:
         """How things stand now."""
         with self._lock:
             trial, run, receiver = self._trial, self._run, self._pair.receiver
+            calibration = self._calibration.status() if self._calibration else None
         elapsed_s = run.elapsed_s() if run else 0.0
         seen = receiver is not None and receiver.last_s is not None
         torque_nm = receiver.last_torque_nm if receiver else None
@@ -127,11 +135,13 @@ class Rig:
             load_cell=cell,
             torque_age_s=receiver.age_s(self._clock.now_s()) if receiver and seen else None,
             torque_nm=torque_nm if torque_nm is not None and math.isfinite(torque_nm) else None,
+            calibration=calibration,
             finished=self.finished,
         )
 
     def preview(self, request: PreviewRequest) -> Preview:
         """Duration, dose and pulses of a plan. Raises PlanError, RefusedError."""
+        check_profile(request.plan.profile, self._clock.unix_s(), required=False)
         table = limits.for_profile(self._table, request.plan.profile)
         return plan.preview(plan.build(request.plan, table), request.recruitment)
 
@@ -161,22 +171,97 @@ class Rig:
         """
         with self._lock:
             self._trial.may_start()
-            for name, value in (("test_id", request.test_id), ("participant", request.participant)):
-                if not _NAME.match(value):
-                    raise PlanError(f"plan.{name}: {value!r} must be letters, digits, '.', '_' or '-', at most 100")
+            _check_names("plan", test_id=request.test_id, participant=request.participant)
+            check_profile(request.profile, self._clock.unix_s(), self._require_calibration)
             table = limits.for_profile(self._table, request.profile)
             test = plan.build(request, table)
+            self._check_rest(test, table["rest_between_tests_s"])
             self._shelf.check_room(request.test_id)
-            self._latch.write("running", f"test {request.test_id} of participant {request.participant}")
-            try:
-                self._begin(test, table)
-            except JournalError:
-                self._latch.clear()
-                raise
-            self._change(self._trial.start(request.test_id, request.participant))
-            assert self._thread is not None
-            self._thread.start()
+            self._launch(test, table, self._trial.start(request.test_id, request.participant))
         return self.status()
+
+    def calibrate(self, request: CalibrateStartRequest) -> Status:
+        """Open a guided calibration; nothing is sent yet.
+
+        Raises
+        ------
+        BusyError, LatchedError, UncertainError, DeviceError
+            As for a test.
+        PlanError, RefusedError
+            A wrong name or id; a step, train, current or rate outside the limits.
+        """
+        with self._lock:
+            following = self._trial.calibrate(request.participant)
+            _check_names("calibration", calibration_id=request.calibration_id, participant=request.participant)
+            calibration = Calibration(request, self._table)
+            self._shelf.check_room(f"{request.calibration_id}.001")
+            self._calibration = calibration
+            self._change(following)
+        return self.status()
+
+    def calibrate_step(self, direction: str) -> Status:
+        """Play one train: a step up, a step down, or the same again; returns when it has begun.
+
+        Raises
+        ------
+        PlanError, BusyError, RefusedError
+            No calibration is open; a train is on its way; above a limit or the marked comfort maximum.
+        """
+        with self._lock:
+            calibration = self._open_calibration()
+            request = calibration.train(calibration.next_width_us(direction))
+            test = plan.build(request, calibration.table)
+            self._check_rest(test, calibration.table["rest_between_trains_s"])
+            self._shelf.check_room(request.test_id)
+            self._launch(test, calibration.table, self._trial.train(request.test_id))
+        return self.status()
+
+    def calibrate_mark(self, threshold: Threshold) -> Status:
+        """Mark the last train's width as a threshold. Raises PlanError, BusyError."""
+        with self._lock:
+            self._open_calibration().mark(threshold)
+            self._publish(StateEvent(status=self.status()))
+        return self.status()
+
+    def calibrate_finish(self, by: str, discard: bool) -> CalibrationResult:
+        """Close the calibration and give its profile. Raises PlanError (a threshold is missing), BusyError."""
+        with self._lock:
+            calibration = self._open_calibration()
+            profile = None if discard else calibration.profile(self._clock.unix_s())
+            log.info(
+                "calibration %s %s by %s", calibration.request.calibration_id, "discarded" if discard else "done", by
+            )
+            self._change(self._trial.calibrated())
+        return CalibrationResult(profile=profile, recordings=calibration.recordings)
+
+    def _open_calibration(self) -> Calibration:
+        if self._calibration is None:
+            raise PlanError("calibration: none is open (a stop or a fault closes it); begin with calibrate-start")
+        if self._trial.state != "calibrating":
+            raise BusyError(f"calibration: train {self._trial.test_id} is {self._trial.state}; wait or stop it")
+        return self._calibration
+
+    def _check_rest(self, test: plan.PlannedTest, limit: limits.Limit) -> None:
+        """Time enough between the last pulse that was sent and the first that is planned?"""
+        if self._last_pulse_s is None or not (test.pulse_width_us > 0).any():
+            return
+        first_s = float((test.pulse_width_us > 0).argmax()) / test.plan.pulse_rate_hz + LEAD_S * self._clock.speed
+        rest_s = self._clock.now_s() + first_s - self._last_pulse_s
+        refusal = limits.check(limit, rest_s)
+        if refusal is not None:
+            raise RefusedError(f"plan: {refusal}; wait {limit.lo - rest_s:.1f} s")
+
+    def _launch(self, test: plan.PlannedTest, table: dict[str, limits.Limit], following: Trial) -> None:
+        """Journal, latch file, thread: what every test and every train of a calibration goes through."""
+        self._latch.write("running", f"test {following.test_id} of participant {following.participant}")
+        try:
+            self._begin(test, table)
+        except JournalError:
+            self._latch.clear()
+            raise
+        self._change(following)
+        assert self._thread is not None
+        self._thread.start()
 
     def _begin(self, test: plan.PlannedTest, table: dict[str, limits.Limit]) -> None:
         gate, receiver = self._pair.gate, self._pair.receiver
@@ -266,6 +351,8 @@ class Rig:
         with self._lock:
             changed = trial != self._trial
             self._trial = trial
+            if not trial.calibrating:
+                self._calibration = None  # a stop, a fault or a lost device closes it
         if changed:
             log.info("state %s %s", trial.state, trial.reason, extra={"test_id": trial.test_id})
             self._publish(StateEvent(status=self.status()))
@@ -285,14 +372,20 @@ class Rig:
             return
         with self._lock:
             self._run = None
-            self.finished = finished
+            self._last_pulse_s = result.last_pulse_s or self._last_pulse_s
+            train = self._trial.calibrating
+            if train and self._calibration is not None:
+                self._calibration.played(run.test.plan.profile.max_pulse_width_us, result.rise_nm, finished)
+            if not train:
+                self.finished = finished
             following = self._trial.sealed()
             if following.state == "latched":
                 self._latch.write("latched", following.reason)
             else:
                 self._latch.clear()
             self._change(following)
-        self._publish(finished)
+        if not train:
+            self._publish(finished)
 
     def _broken(self, reason: str) -> None:
         with self._lock:
@@ -309,3 +402,9 @@ class Rig:
         with self._lock:
             if self._trial.state == "arming":
                 self._change(self._trial.armed())
+
+
+def _check_names(place: str, **names: str) -> None:
+    for name, value in names.items():
+        if not _NAME.match(value):
+            raise PlanError(f"{place}.{name}: {value!r} must be letters, digits, '.', '_' or '-', at most 100")

@@ -145,6 +145,14 @@ class Server:
                 return self.rig.stop(request.reason, request.by)
             case "rearm":
                 return self.rig.rearm(request.by)
+            case "calibrate-start":
+                return self.rig.calibrate(request)
+            case "calibrate-step":
+                return self.rig.calibrate_step(request.direction)
+            case "calibrate-mark":
+                return self.rig.calibrate_mark(request.threshold)
+            case "calibrate-finish":
+                return self.rig.calibrate_finish(request.by, request.discard)
             case _:
                 return self.rig.status()
 

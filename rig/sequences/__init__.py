@@ -2,7 +2,8 @@
 
 A sequence is a module with `Settings` (a pydantic model, units in the names) and
 `pulse_widths(settings, pulse_rate_hz) -> ndarray`, a pure function giving one pulse width in µs for each pulse.
-The module's name is the sequence's id. Adding one is adding a file.
+The module's name is the sequence's id. Adding one is adding a file. A sequence that jumps between levels by design
+says so: `JUMPS = True` in the module, or a setting `jumps` where the caller decides.
 """
 
 from __future__ import annotations
@@ -82,6 +83,12 @@ def build(sequence_id: str, settings: dict[str, Any], pulse_rate_hz: float) -> N
         return find(sequence_id).pulse_widths(checked, pulse_rate_hz)
     except ValueError as error:
         raise PlanError(f"{sequence_id}: {error}") from None
+
+
+def jumps(sequence_id: str, settings: dict[str, Any]) -> bool:
+    """May the width rise in one pulse to any level that is allowed?"""
+    checked = settings_of(sequence_id, settings)
+    return bool(getattr(find(sequence_id), "JUMPS", False) or getattr(checked, "jumps", False))
 
 
 def pulses_in(duration_s: float, pulse_rate_hz: float) -> int:

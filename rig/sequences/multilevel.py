@@ -12,6 +12,8 @@ from pydantic import Field, model_validator
 
 from rig.sequences import SequenceSettings, pulses_in
 
+JUMPS = True
+
 
 class Settings(SequenceSettings):
     max_pulse_width_us: float = Field(300.0, description="highest level c, µs")

@@ -12,6 +12,8 @@ from pydantic import Field
 
 from rig.sequences import SequenceSettings
 
+JUMPS = True
+
 FEEDBACK_TAPS = {
     3: (3, 2),
     4: (4, 3),

@@ -8,6 +8,8 @@ from pydantic import Field
 
 from rig.sequences import SequenceSettings, pulses_in
 
+JUMPS = True
+
 
 class Settings(SequenceSettings):
     max_pulse_width_us: float = Field(300.0, description="level while on, µs")

@@ -11,6 +11,7 @@ from rig.sequences import SequenceSettings
 
 class Settings(SequenceSettings):
     pulse_width_us: list[float] = Field(min_length=1, max_length=100_000, description="µs, one for each pulse")
+    jumps: bool = Field(False, description="the list jumps between levels on purpose, as a PRBS does")
 
 
 def pulse_widths(settings: Settings, pulse_rate_hz: float) -> NDArray[np.float64]:

@@ -1,0 +1,248 @@
+"""Guided calibration: one short train for each step that a person asks for, thresholds marked, a profile for the day.
+
+Nothing here sends: it decides what the next train may be. The rig plays it as it plays every test.
+"""
+
+from __future__ import annotations
+
+import itertools
+from datetime import UTC, datetime, timedelta
+
+from rig import limits
+from rig.clock import utc_text
+from rig.errors import PlanError, RefusedError
+from rig.limits import Limit
+from rig.messages import (
+    CalibrateStartRequest,
+    CalibrationStatus,
+    CalibrationTrain,
+    FinishedEvent,
+    Profile,
+    SegmentPlan,
+    TestPlan,
+    Threshold,
+)
+
+ORDER: tuple[Threshold, ...] = ("sensory", "motor", "comfort")
+REST_S = 0.25
+"""Before and after each train: the torque's level at rest, and its fall."""
+CLOCK_SLIP_S = 300.0
+"""How far in the future a profile may have been set: clocks of two computers differ."""
+LONGEST_VALID_S = 25 * 3600.0
+"""A day, and the hour that is added to one in autumn."""
+OWNER = "calibration request"
+
+
+class Calibration:
+    """One calibration that is open.
+
+    Parameters
+    ----------
+    request
+        As the client sent it.
+    table
+        The rig's limits, hard ones narrowed by the rig file.
+
+    Raises
+    ------
+    RefusedError
+        A step, train, current or rate outside the limits.
+    """
+
+    def __init__(self, request: CalibrateStartRequest, table: dict[str, Limit]) -> None:
+        self.request = request
+        for name, value in (
+            ("current_ma", request.current_ma),
+            ("calibration_step_us", request.step_us),
+            ("calibration_train_s", request.train_s),
+            ("pulse_rate_hz", request.pulse_rate_hz),
+        ):
+            refusal = limits.check(table[name], value)
+            if refusal is not None:
+                raise RefusedError(f"calibration: {refusal}")
+        if int(request.current_ma / limits.STEP_CURRENT_MA) == 0:
+            raise RefusedError(f"calibration: current_ma {request.current_ma:g} mA stimulates nothing; give at least 1")
+        most_us = table["pulse_width_us"].hi if request.max_pulse_width_us is None else request.max_pulse_width_us
+        wanted = Profile(current_ma=request.current_ma, max_pulse_width_us=most_us, max_torque_nm=request.max_torque_nm)
+        self.table = limits.for_profile(table, wanted, OWNER)
+        self._width_us = 0.0
+        self._marks_us: dict[Threshold, float] = {}
+        self._trains: list[CalibrationTrain] = []
+        self._charge_uc = 0.0
+        self.recordings: list[str] = []
+
+    def next_width_us(self, direction: str) -> float:
+        """Width of the train that is asked for.
+
+        Raises
+        ------
+        RefusedError
+            Above what limits, request or the marked comfort maximum allow; says whose bound and by how much.
+        PlanError
+            A step down from the lowest.
+        """
+        change_us = {"up": self.request.step_us, "down": -self.request.step_us}.get(direction, 0.0)
+        width_us = self._width_us + change_us
+        if not (width_us >= limits.STEP_PULSE_WIDTH_US):
+            raise PlanError(f"calibration: no train is narrower than {self._width_us:g} µs; the first step goes up")
+        refusal = limits.check(self._ceiling(), width_us)
+        if refusal is not None:
+            raise RefusedError(f"calibration: {refusal}")
+        return width_us
+
+    def train(self, width_us: float) -> TestPlan:
+        """The plan of one train at that width. Raises RefusedError when the calibration's dose is used up."""
+        request = self.request
+        pulses = round(request.train_s * request.pulse_rate_hz)
+        dose_uc = self._charge_uc + pulses * width_us * request.current_ma * 1e-3
+        refusal = limits.check(self.table["charge_per_test_uc"], dose_uc)
+        if refusal is not None:
+            raise RefusedError(f"calibration, all trains together: {refusal}")
+        rest = SegmentPlan(name="rest", sequence="rest", settings={"duration_s": REST_S})
+        steps = {"max_pulse_width_us": width_us, "on_s": request.train_s, "off_s": 0.0, "repeats": 1}
+        return TestPlan(
+            test_id=f"{request.calibration_id}.{len(self._trains) + 1:03d}",
+            participant=request.participant,
+            kind="calibration",
+            profile=Profile(
+                current_ma=request.current_ma, max_pulse_width_us=width_us, max_torque_nm=request.max_torque_nm
+            ),
+            segments=[rest, SegmentPlan(name="train", sequence="steps", settings=steps), rest],
+            pulse_rate_hz=request.pulse_rate_hz,
+        )
+
+    def played(self, width_us: float, torque_rise_nm: float | None, finished: FinishedEvent) -> None:
+        """A train is over."""
+        self._width_us = width_us
+        self._charge_uc += float(finished.summary.get("charge_uc", 0.0))
+        pulses = int(finished.summary.get("pulses", 0))
+        number = len(self._trains) + 1
+        self._trains.append(
+            CalibrationTrain(number=number, pulse_width_us=width_us, pulses=pulses, torque_rise_nm=torque_rise_nm)
+        )
+        if finished.recording_path is not None:
+            self.recordings.append(finished.recording_path)
+
+    def mark(self, threshold: Threshold) -> None:
+        """The last train's width is that threshold.
+
+        Raises
+        ------
+        PlanError
+            Nothing was played yet, or the order sensory <= motor <= comfort would be broken.
+        """
+        if not self._trains:
+            raise PlanError("calibration: nothing was played yet; step up first, then mark")
+        marks: dict[Threshold, float] = {**self._marks_us, threshold: self._width_us}
+        known = [(name, marks[name]) for name in ORDER if name in marks]
+        for (low, low_us), (high, high_us) in itertools.pairwise(known):
+            if not (low_us <= high_us):
+                raise PlanError(
+                    f"calibration: {low} at {low_us:g} µs is above {high} at {high_us:g} µs; mark {high} again first"
+                )
+        self._marks_us = marks
+
+    def profile(self, unix_s: float) -> Profile:
+        """What was found, valid until the end of the day. Raises PlanError naming what is not marked."""
+        if missing := self._missing():
+            raise PlanError(f"calibration: not marked yet: {', '.join(missing)}; mark, or finish with discard")
+        return Profile(
+            current_ma=self.request.current_ma,
+            max_pulse_width_us=self._marks_us["comfort"],
+            max_torque_nm=self.request.max_torque_nm,
+            sensory_pulse_width_us=self._marks_us["sensory"],
+            motor_pulse_width_us=self._marks_us["motor"],
+            set_at_utc=utc_text(unix_s),
+            expires_at_utc=utc_text(end_of_day_s(unix_s)),
+        )
+
+    def status(self) -> CalibrationStatus:
+        """As clients see it."""
+        request, ceiling = self.request, self._ceiling()
+        return CalibrationStatus(
+            calibration_id=request.calibration_id,
+            participant=request.participant,
+            by=request.by,
+            current_ma=request.current_ma,
+            step_us=request.step_us,
+            train_s=request.train_s,
+            max_torque_nm=request.max_torque_nm,
+            pulse_width_us=self._width_us,
+            ceiling_us=ceiling.hi,
+            ceiling_owner=ceiling.owner,
+            marks_us=dict(self._marks_us),
+            missing=self._missing(),
+            trains=list(self._trains),
+        )
+
+    def _missing(self) -> list[Threshold]:
+        return [name for name in ORDER if name not in self._marks_us]
+
+    def _ceiling(self) -> Limit:
+        """The tightest bound of the width, with its owner."""
+        width, phase, second = (
+            self.table[n] for n in ("pulse_width_us", "charge_per_phase_uc", "charge_per_second_uc")
+        )
+        by_phase_us = phase.hi / (self.request.current_ma * 1e-3)
+        by_second_us = second.hi / (self.request.current_ma * 1e-3 * self.request.pulse_rate_hz)
+        bounds = [(width.hi, width.owner), (by_phase_us, f"{phase.owner} of {phase.name}")]
+        bounds.append((by_second_us, f"{second.owner} of {second.name}"))
+        if "comfort" in self._marks_us:
+            bounds.append((self._marks_us["comfort"], "marked comfort maximum"))
+        most_us, owner = min(bounds)
+        return Limit(width.name, 0.0, most_us, width.unit, width.reason, width.source, owner)
+
+
+def end_of_day_s(unix_s: float) -> float:
+    """The next midnight where the rig stands, s since 1970."""
+    here = datetime.fromtimestamp(unix_s, UTC).astimezone()
+    tomorrow = (here.replace(tzinfo=None) + timedelta(days=1)).replace(hour=0, minute=0, second=0, microsecond=0)
+    return tomorrow.astimezone().timestamp()
+
+
+def check_profile(profile: Profile, unix_s: float, required: bool) -> None:
+    """Is what a calibration found consistent and still valid?
+
+    Parameters
+    ----------
+    unix_s
+        Now. The one decision that rests on UTC: a day ends by the calendar.
+    required
+        Refuse a profile without a calibration.
+
+    Raises
+    ------
+    RefusedError
+        Saying what is wrong with it.
+    """
+    sensory_us, motor_us = profile.sensory_pulse_width_us, profile.motor_pulse_width_us
+    found = (sensory_us, motor_us, profile.set_at_utc, profile.expires_at_utc)
+    if all(value is None for value in found):
+        if required:
+            raise RefusedError("participant's profile: not calibrated; no test without a calibration of the day")
+        return
+    if sensory_us is None or motor_us is None or profile.set_at_utc is None or profile.expires_at_utc is None:
+        raise RefusedError("participant's profile: calibrated in part only; calibrate anew")
+    comfort_us = profile.max_pulse_width_us
+    if not (0 < sensory_us <= motor_us <= comfort_us):
+        raise RefusedError(
+            f"participant's profile: sensory {sensory_us:g}, motor {motor_us:g} and comfort {comfort_us:g} µs "
+            "must rise from above 0; calibrate anew"
+        )
+    set_s, expires_s = _time("set_at_utc", profile.set_at_utc), _time("expires_at_utc", profile.expires_at_utc)
+    if not (set_s <= unix_s + CLOCK_SLIP_S):
+        raise RefusedError(f"participant's profile: set at {profile.set_at_utc}, which is in the future; check clocks")
+    if not (0 < expires_s - set_s <= LONGEST_VALID_S):
+        raise RefusedError("participant's profile: must expire after it was set, within a day; calibrate anew")
+    if not (unix_s < expires_s):
+        raise RefusedError(f"participant's profile: expired at {profile.expires_at_utc}; calibrate anew")
+
+
+def _time(name: str, text: str) -> float:
+    try:
+        parsed = datetime.fromisoformat(text)
+    except ValueError:
+        raise RefusedError(f"participant's profile: {name} {text!r} is no time in ISO 8601") from None
+    if parsed.tzinfo is None:
+        raise RefusedError(f"participant's profile: {name} {text!r} lacks its time zone (end it with Z)")
+    return parsed.timestamp()

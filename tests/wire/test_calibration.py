@@ -1,0 +1,86 @@
+"""A guided calibration over the wire: the electrodes feel what was asked for, and nothing between the steps."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+from tests.wire.processes import Bench, RigClient, control, short_plan
+
+pytestmark = pytest.mark.wire
+
+
+def felt(bench: Bench) -> list[dict[str, Any]]:
+    return control(bench.emulator.ready["control"], {"cmd": "pulses", "since": 0})["pulses"]
+
+
+def step(client: RigClient, direction: str = "up") -> dict[str, Any]:
+    reply = client.ask("calibrate-step", direction=direction)
+    assert reply["ok"], reply
+    status = client.wait_state("calibrating", "latched")
+    assert status["state"] == "calibrating", status
+    return status["calibration"]
+
+
+def start(client: RigClient, name: str, **fields: Any) -> dict[str, Any]:
+    return client.ask("calibrate-start", calibration_id=name, participant="P01", by="therapist", **fields)
+
+
+def test_a_calibration_from_start_to_a_test(shared: tuple[Bench, RigClient]):
+    bench, client = shared
+    before = len(felt(bench))
+    reply = start(client, "cal", step_us=25.0, train_s=0.5, max_pulse_width_us=130.0)
+    assert reply["ok"], reply
+    assert reply["body"]["state"] == "calibrating"
+    assert len(felt(bench)) == before  # opening sends nothing
+    refused = client.ask("start", plan=short_plan("no"))["problem"]
+    assert refused["code"] == "busy"
+    assert "finish or discard" in refused["detail"]
+    for threshold, steps in (("sensory", 1), ("motor", 3), ("comfort", 1)):
+        for _ in range(steps):
+            shown = step(client)
+        reply = client.ask("calibrate-mark", threshold=threshold)
+        assert reply["body"]["calibration"]["marks_us"][threshold] == shown["pulse_width_us"]
+    over = client.ask("calibrate-step", direction="up")["problem"]
+    assert over["code"] == "refused"
+    assert "marked comfort maximum" in over["detail"]
+    pulses = felt(bench)[before:]
+    assert [t["pulses"] for t in shown["trains"]] == [20] * 5
+    assert [round(p["width_us"]) for p in pulses] == [width for width in (25, 50, 75, 100, 125) for _ in range(20)]
+    assert shown["trains"][-1]["torque_rise_nm"] > 3 * shown["trains"][0]["torque_rise_nm"]
+    result = client.ask("calibrate-finish", by="therapist")["body"]
+    profile = result["profile"]
+    assert profile["max_pulse_width_us"] == 125.0
+    assert profile["expires_at_utc"] > profile["set_at_utc"]
+    assert len(result["recordings"]) == 5
+    with h5py.File(result["recordings"][-1]) as file:
+        assert file.attrs["kind"] == "calibration"
+        assert np.nanmax(file["pulses/sent_pulse_width_us"][:]) == 125
+    client.ask("subscribe")
+    assert client.ask("start", plan=short_plan("calibrated", profile=profile))["ok"]
+    assert client.wait_finished("calibrated")["outcome"] == "completed"
+    assert client.status()["calibration"] is None
+    old = profile | {"expires_at_utc": profile["set_at_utc"]}
+    assert client.ask("start", plan=short_plan("old", profile=old))["problem"]["code"] == "refused"
+
+
+def test_a_stop_closes_the_calibration(shared: tuple[Bench, RigClient]):
+    bench, client = shared
+    assert start(client, "stopped", train_s=2.0)["ok"]
+    assert client.ask("calibrate-step")["ok"]
+    client.wait_state("running")
+    assert client.ask("calibrate-step")["problem"]["code"] == "busy"
+    assert client.ask("stop", reason="ouch", by="participant")["body"]["confirmed"]
+    count = len(felt(bench))
+    assert client.wait_state("latched")["calibration"] is None
+    assert client.ask("calibrate-step")["problem"]["code"] == "bad-plan"
+    assert client.ask("rearm", by="therapist")["ok"]
+    assert len(felt(bench)) == count
+    assert start(client, "again")["ok"]
+    assert client.ask("rearm", by="therapist")["problem"]["code"] == "busy"
+    assert client.ask("calibrate-finish", by="therapist", discard=True)["body"]["profile"] is None
+    assert client.status()["state"] == "ready"
+    assert start(client, "../up")["problem"]["code"] == "bad-plan"
