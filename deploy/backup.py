@@ -60,7 +60,8 @@ def make(rig_data: Path, api_data: Path, to: Path) -> Path:
         raise BackupError(f"{to}: {free // 2**20} MB free, {need // 2**20} MB needed; move old backups away")
     name = f"stimrig-{datetime.now(UTC):%Y%m%dT%H%M%S.%fZ}"
     partial = to / f"{name}.partial"
-    (partial / "api").mkdir(parents=True, mode=0o700)
+    partial.mkdir(mode=0o700)
+    (partial / "api").mkdir()
     _copy_database(source, partial / DATABASE)
     for path, name_inside in _kept(rig_data, api_data):
         _copy(path, partial / name_inside)

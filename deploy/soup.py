@@ -1,0 +1,99 @@
+#!/usr/bin/env python3
+"""Software of unknown provenance (SOUP): docs/safety/soup.md from requirements/run.txt and deploy/soup.toml.
+
+soup.py           write the list
+soup.py --check   exit 1 and one line where it is out of date
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+import tomllib
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+LOCK = ROOT / "requirements" / "run.txt"
+NOTES = ROOT / "deploy" / "soup.toml"
+LIST = ROOT / "docs" / "safety" / "soup.md"
+PIN = re.compile(r"^(?P<name>[A-Za-z0-9._-]+)==(?P<version>[^\s;]+)(?:\s*;\s*(?P<marker>.*?))?\s*\\?$")
+CLASSES = ("rig", "model", "service", "none")
+
+
+class SoupError(Exception):
+    """One line: what does not hold."""
+
+
+def pins(text: str) -> list[tuple[str, str, str]]:
+    """Name, version and marker of each package in a locked list.
+
+    Raises
+    ------
+    SoupError
+        A line that is neither a pin, a hash nor a comment.
+    """
+    found = []
+    for number, line in enumerate(text.splitlines(), 1):
+        stripped = line.strip()
+        if not stripped or stripped.startswith(("#", "--hash=")):
+            continue
+        match = PIN.match(stripped)
+        if match is None:
+            raise SoupError(f"{LOCK.name}:{number}: not a pin: {stripped}")
+        found.append((match["name"], match["version"], match["marker"] or ""))
+    return found
+
+
+def notes() -> dict[str, Any]:
+    """What a person wrote of each package, and of what lies below them."""
+    return tomllib.loads(NOTES.read_text("utf-8"))
+
+
+def render() -> str:
+    """The list as Markdown.
+
+    Raises
+    ------
+    SoupError
+        A package without a note, a note without a package, or an unknown class.
+    """
+    written, locked = notes(), pins(LOCK.read_text("utf-8"))
+    names, packages = {name for name, _, _ in locked}, written["package"]
+    for what, missing in (("no note for", names - packages.keys()), ("no longer locked", packages.keys() - names)):
+        if missing:
+            raise SoupError(f"deploy/soup.toml: {what}: {', '.join(sorted(missing))}")
+    for name, note in (packages | written["below"]).items():
+        if note["class"] not in CLASSES or not note["for"].strip():
+            raise SoupError(f"deploy/soup.toml: {name}: class must be one of {', '.join(CLASSES)}, with a purpose")
+    lines = [
+        written["head"],
+        f"## Locked packages ({len(names)})\n",
+        "| package | version | class | what for |",
+        "|---|---|---|---|",
+    ]
+    for name, version, marker in sorted(locked, key=lambda pin: (CLASSES.index(packages[pin[0]]["class"]), pin)):
+        where = f" ({marker})" if marker else ""
+        lines.append(f"| {name} | {version}{where} | {packages[name]['class']} | {packages[name]['for']} |")
+    lines += ["", "## Below them", "", "| software | version | class | what for |", "|---|---|---|---|"]
+    lines += [f"| {name} | {n['version']} | {n['class']} | {n['for']} |" for name, n in written["below"].items()]
+    return "\n".join(lines) + "\n"
+
+
+def main(arguments: list[str]) -> int:
+    """Write or check; the exit code."""
+    try:
+        text = render()
+    except (SoupError, OSError, KeyError, tomllib.TOMLDecodeError) as error:
+        print(f"soup.py: {error}", file=sys.stderr)
+        return 1
+    if "--check" not in arguments:
+        LIST.write_text(text, "utf-8")
+    elif not LIST.exists() or LIST.read_text("utf-8") != text:
+        print("soup.py: docs/safety/soup.md is out of date: run deploy/soup.py", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

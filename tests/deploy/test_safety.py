@@ -1,0 +1,140 @@
+"""The risk file keeps its word: every hazard has controls, every control names tests and places that are there."""
+
+from __future__ import annotations
+
+import ast
+import importlib.metadata
+import json
+import re
+import subprocess
+import sys
+import tomllib
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from deploy import soup
+
+ROOT = Path(__file__).parents[2]
+HAZARDS = ROOT / "docs" / "safety" / "hazards.toml"
+SEVERITIES = {"critical", "serious", "minor"}
+
+
+@cache
+def names_in(path: Path) -> frozenset[str]:
+    """Names of the tests in a file as pytest would find them, without running it."""
+    names = set()
+    for node in ast.parse(path.read_text("utf-8")).body:
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            names.add(node.name)
+        elif isinstance(node, ast.ClassDef) and node.name.startswith("Test"):
+            inside = (n for n in node.body if isinstance(n, ast.FunctionDef | ast.AsyncFunctionDef))
+            names |= {f"{node.name}::{n.name}" for n in inside}
+    return frozenset(name for name in names if name.rpartition("::")[2].startswith("test_"))
+
+
+def faults(hazards: list[dict[str, Any]]) -> list[str]:
+    """What does not hold in a list of hazards, a line each."""
+    found = []
+    ids = [hazard.get("id", "?") for hazard in hazards]
+    found += [f"{name}: twice" for name in sorted({name for name in ids if ids.count(name) > 1})]
+    for hazard, name in zip(hazards, ids, strict=True):
+        found += [f"{name}: no {key}" for key in ("title", "harm", "causes") if not hazard.get(key)]
+        if hazard.get("severity") not in SEVERITIES:
+            found.append(f"{name}: severity {hazard.get('severity')!r}")
+        if not hazard.get("control"):
+            found.append(f"{name}: no control")
+        for control in hazard.get("control", []):
+            found += [f"{name}: {fault}" for fault in control_faults(control)]
+    return found
+
+
+def control_faults(control: dict[str, Any]) -> list[str]:
+    what = control.get("what") or "a control without words"
+    found = [f"{what}: no {key}" for key in ("what", "where", "tests") if not control.get(key)]
+    found += [f"{what}: {place} is not there" for place in control.get("where", []) if not (ROOT / place).exists()]
+    for test in control.get("tests", []):
+        path, _, name = test.partition("::")
+        if not (path.startswith("tests/") and (ROOT / path).is_file() and name in names_in(ROOT / path)):
+            found.append(f"{what}: no such test: {test}")
+    return found
+
+
+def hazards() -> list[dict[str, Any]]:
+    return tomllib.loads(HAZARDS.read_text("utf-8"))["hazard"]
+
+
+def test_every_hazard_has_controls_and_every_control_tests_that_are_there() -> None:
+    assert faults(hazards()) == []
+
+
+@pytest.mark.parametrize(
+    ("spoil", "told"),
+    [
+        (lambda h: h.pop("control"), "no control"),
+        (lambda h: h["control"][0].pop("tests"), "no tests"),
+        (lambda h: h["control"][0].update(tests=[]), "no tests"),
+        (lambda h: h["control"][0]["tests"].append("tests/rig/test_limits.py::test_that_is_not_there"), "no such test"),
+        (lambda h: h["control"][0]["tests"].append("tests/rig/test_nothing.py::test_x"), "no such test"),
+        (lambda h: h["control"][0]["tests"].append("tests/rig/test_limits.py"), "no such test"),
+        (lambda h: h["control"][0]["where"].append("rig/nowhere.py"), "is not there"),
+        (lambda h: h.update(severity="harmless"), "severity"),
+        (lambda h: h.update(causes=[]), "no causes"),
+        (lambda h: h.update(id="H02"), "twice"),
+    ],
+)
+def test_what_does_not_hold_is_found(spoil: Any, told: str) -> None:
+    spoiled = hazards()
+    spoil(spoiled[0])
+    assert any(told in fault for fault in faults(spoiled))
+
+
+def test_it_says_plainly_that_it_is_no_certified_device() -> None:
+    for name in ("README.md", "intended-use.md"):
+        assert "not a certified medical device" in (ROOT / "docs" / "safety" / name).read_text("utf-8")
+
+
+def test_the_list_of_others_software_is_up_to_date() -> None:
+    assert soup.LIST.read_text("utf-8") == soup.render(), "run deploy/soup.py"
+
+
+def test_an_outdated_list_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    lock = soup.LOCK.read_text("utf-8")
+    changed = tmp_path / "run.txt"
+    monkeypatch.setattr(soup, "LOCK", changed)
+    changed.write_text(re.sub(r"^pyserial==\S+", "pyserial==99.0", lock, flags=re.M))
+    assert soup.main(["--check"]) == 1
+    changed.write_text(lock + "leftpad==1.0 \\\n    --hash=sha256:00\n")
+    with pytest.raises(soup.SoupError, match="no note for: leftpad"):
+        soup.render()
+    changed.write_text(re.sub(r"^pyserial==.*$", "", lock, flags=re.M))
+    with pytest.raises(soup.SoupError, match="no longer locked: pyserial"):
+        soup.render()
+    changed.write_text("git+https://somewhere/x\n")
+    with pytest.raises(soup.SoupError, match=r"run.txt:1: not a pin"):
+        soup.render()
+
+
+LOADED = """
+import importlib, json, pkgutil, sys
+import rig.__main__, rig.devices, rig.sequences
+for package in (rig.devices, rig.sequences):
+    for module in pkgutil.iter_modules(package.__path__):
+        importlib.import_module(f"{package.__name__}.{module.name}")
+for interface in ("socketcan", "socketcand", "slcan"):
+    importlib.import_module(f"can.interfaces.{interface}")
+print(json.dumps(sorted({name.partition(".")[0] for name in sys.modules})))
+"""
+
+
+def test_what_the_rig_loads_is_classed_as_such() -> None:
+    answer = subprocess.run([sys.executable, "-c", LOADED], cwd=ROOT, capture_output=True, text=True, check=True)
+    owners = importlib.metadata.packages_distributions()
+    normal = {re.sub(r"[-_.]+", "-", d).lower() for name in json.loads(answer.stdout) for d in owners.get(name, [])}
+    classes = {name: note["class"] for name, note in soup.notes()["package"].items()}
+    loaded = {name for name in normal if name in classes}
+    assert {"numpy", "pyserial", "python-can", "pydantic", "h5py"} <= loaded
+    assert {name: classes[name] for name in loaded if classes[name] != "rig"} == {}
+    assert not {"numba", "scipy", "fastapi", "sqlalchemy"} & loaded
