@@ -18,7 +18,14 @@ from identify.grid import Grid
 from identify.linear import SecondOrder
 from identify.noise import whiten
 from identify.recruitment.curve import Basis
-from identify.recruitment.knots import KNOTS, PILOT_KNOTS, adapted_knots, bending_order, even_knots, spline_roughness
+from identify.recruitment.knots import (
+    PILOT_KNOTS,
+    adapted_knots,
+    bending_order,
+    even_knots,
+    knots_for,
+    spline_roughness,
+)
 from identify.recruitment.smoothing import choose_weight, straight_lines
 from identify.recruitment.spline import SplineBasis
 
@@ -205,9 +212,13 @@ def search(
     tolerance : float
         Converged once a step is this small in standard errors.
     """
-    linear = _bounded(problem, start)
     target = whiten(problem.target, problem.stretches, ar1)
-    state = _assess(problem, linear, target, ar1, weight)
+    state = _assess(problem, _bounded(problem, start), target, ar1, weight)
+    return _descend(state, weight, most, tolerance)
+
+
+def _descend(state: _State, weight: float | None, most: int, tolerance: float) -> Solution:
+    problem, linear, target, ar1 = state.problem, state.linear, state.target, state.ar1
     damping, taken, converged = 0.0, 0, False
     while taken < most:
         taken += 1
@@ -215,7 +226,7 @@ def search(
         trial = _bounded(problem, _moved(linear, step))
         moved = _difference(linear, trial)[: problem.searched]
         # Steps in units of standard errors, from the information itself.
-        size = float(np.sqrt(max(moved @ state.information @ moved, 0.0) / max(state.variance, 1e-300)))
+        size = float(np.sqrt(max(moved @ state.information @ moved, 0.0) * target.size / state.squares))
         if size < tolerance or np.max(np.abs(moved)) < 1e-9:
             converged = True
             break
@@ -270,8 +281,7 @@ class _State:
 
     @cached_property
     def _inner(self) -> np.ndarray:
-        cross = self._bent[0]
-        return _solve(self.zz + self.weight * self.penalty, np.concatenate([cross, self.zz], axis=1))
+        return _solve(self.zz + self.weight * self.penalty, self._bent[0])
 
     @cached_property
     def full(self) -> np.ndarray:
@@ -283,25 +293,29 @@ class _State:
     def information(self) -> np.ndarray:
         """That of the searched numbers, coefficients projected out."""
         cross, square, _ = self._bent
-        return square - cross.T @ self._inner[:, : cross.shape[1]]
+        return square - cross.T @ self._inner
 
     @cached_property
     def freedom(self) -> float:
         """Effective number of parameters."""
-        searched = self.slopes.shape[1]
-        return float(np.trace(self._inner[:, searched:])) + searched
+        return float(np.trace(_solve(self.zz + self.weight * self.penalty, self.zz))) + self.slopes.shape[1]
+
+    @cached_property
+    def squares(self) -> float:
+        """Sum of squared innovations, not below what rounding leaves."""
+        c = self.coefficients
+        left = self.energy - 2 * float(self.zy @ c) + float(c @ self.zz @ c)
+        return max(left, 1e-14 * self.energy, 1e-24 * self.target.size)
 
     @cached_property
     def variance(self) -> float:
         """Innovation variance, N²m²."""
-        c = self.coefficients
-        squares = self.energy - 2 * float(self.zy @ c) + float(c @ self.zz @ c)
-        rows = self.target.size
-        return max(squares / max(rows - self.freedom, 1.0), 1e-14 * self.energy / rows, 1e-24)
+        return self.squares / max(self.target.size - self.freedom, 1.0)
 
     def _chosen(self, size: int) -> float:
         outer = self.zz[size:, size:]
-        inner = _solve(outer, np.c_[self.zz[size:, :size], self.zy[size:]])
+        right = np.concatenate([self.zz[size:, :size], self.zy[size:, None]], axis=1)
+        inner = right / outer if self.extras == 1 else _solve(outer, right)
         gram = self.zz[:size, :size] - self.zz[:size, size:] @ inner[:, :-1]
         moment = self.zy[:size] - self.zz[:size, size:] @ inner[:, -1]
         energy = self.energy - float(self.zy[size:] @ inner[:, -1])
@@ -317,8 +331,8 @@ class _State:
 
     def step(self, damping: float) -> np.ndarray:
         """Step in (log T, log ζ, delay), along the bounds where it would leave them."""
-        cross, _, moment = self._bent
-        gradient = moment - self._inner[:, : cross.shape[1]].T @ self.zy
+        moment = self._bent[2]
+        gradient = moment - self._inner.T @ self.zy
         free = ~_held(self.problem, self.linear, gradient)
         step = np.zeros(gradient.size)
         if free.any():
@@ -420,17 +434,19 @@ def pilot_solution(grid: Grid, rows: np.ndarray, from_rest: bool, delay_s: float
     delay = 0.02 if delay_s is None else delay_s
     starts = [_assess(problem, _bounded(problem, SecondOrder(t, 0.9, delay)), target, 0.0, None) for t in STARTS_S]
     best = min(starts, key=lambda state: state.cost)
-    return search(problem, best.linear, most=12, tolerance=0.5)
+    return _descend(best, None, most=12, tolerance=0.5)
 
 
-def designed(first: Solution, count: int = KNOTS) -> tuple[Problem, SecondOrder]:
+def designed(first: Solution, count: int | None = None) -> tuple[Problem, SecondOrder]:
     """The problem with its final spline, in two steps from a pilot, and where to begin its search.
 
     The pilot's few knots say roughly where the curve bends; a curve with all knots says it better, and how much; a
     second such look sharpens a steep rise.
     """
     old = first.problem
-    basis = SplineBasis(adapted_knots(pilot_curve(first), float(np.max(old.grid.pulse_width_us)), count))
+    curve = pilot_curve(first)
+    count = knots_for(curve) if count is None else count
+    basis = SplineBasis(adapted_knots(curve, float(np.max(old.grid.pulse_width_us)), count))
     order = bending_order(old.grid.pulse_width_us[old.rows])
     problem = Problem(old.grid, basis, spline_roughness(basis, order=order), old.rows, old.from_rest, old.delay_s)
     target = whiten(problem.target, problem.stretches, 0.0)

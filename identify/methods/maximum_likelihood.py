@@ -31,7 +31,7 @@ class MaximumLikelihood:
         {
             "recruitment": "spline (default, (8)), power-series (6) or sigmoid (30)",
             "monotone": "true: the spline never falls (false)",
-            "knots": "how many knots the spline has (31)",
+            "knots": "how many knots the spline has (19, or 31 where the curve is steep)",
             "power": "order of the power series (by BIC)",
             "delay_s": "a delay that is known, s (estimated)",
             "order": "second-order (default), auto, or l,n,d of equations (1) to (3)",
@@ -42,11 +42,11 @@ class MaximumLikelihood:
         """Fit; see `identify.fit`."""
         rows = fitted_rows(grid, fit_on)
         order = order_option(options.get("order", "second-order"))
-        knots = int(options.get("knots", KNOTS))
+        knots = int(options["knots"]) if "knots" in options else None
         if order != "second-order":
             from identify.methods.two_stage import general
 
-            return general(self.id, grid, rows, rows, 8, knots, order)
+            return general(self.id, grid, rows, rows, 8, knots or KNOTS, order)
         delay_s = float(options["delay_s"]) if "delay_s" in options else None
         kind = str(options.get("recruitment", "spline"))
         solution, delta_bic = estimate(grid, rows, knots, delay_s)
@@ -91,11 +91,19 @@ def _why(solution: Solution, delta_bic: float) -> list[str]:
     ]
 
 
-def estimate(grid: Grid, rows: np.ndarray, knots: int = KNOTS, delay_s: float | None = None) -> tuple[Solution, float]:
+def estimate(
+    grid: Grid, rows: np.ndarray, knots: int | None = None, delay_s: float | None = None
+) -> tuple[Solution, float]:
     """The solution, and the evidence for AR(1) over white noise (ΔBIC)."""
-    problem, start = designed(pilot_solution(grid, rows, begins_at_rest(grid), delay_s), knots)
+    first = pilot_solution(grid, rows, begins_at_rest(grid), delay_s)
+    problem, start = designed(first, knots)
     solution = search(problem, start)
     ar1, delta_bic = noise_evidence(solution.residual_nm, problem.stretches)
+    if delta_bic > 0 and knots is None and problem.basis.size < KNOTS:
+        # Structure may be a bend that few knots can't follow: look again with all before calling it noise.
+        problem, start = designed(first, KNOTS)
+        solution = search(problem, start)
+        ar1, delta_bic = noise_evidence(solution.residual_nm, problem.stretches)
     for _ in range(3):
         if delta_bic <= 0:
             break
