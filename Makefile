@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 export PYTHONUNBUFFERED = 1
 
-.PHONY: demo test serve bench check lint lock clean help setup setup-test
+.PHONY: demo test serve bench faults lint lock clean help setup setup-test
 
 help:
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -26,6 +26,9 @@ lint: setup-test ## style, types, layers
 
 bench: $(VENV)-bench/.bench ## the figures in docs/, measured on this machine
 	@$(VENV)-bench/bin/python -m bench
+
+faults: setup-test ## the fault campaign on the emulated rig (docs/faults.md)
+	@$(BIN)/python -m bench.faults
 
 setup: $(VENV)/.run ## the virtual environment from the hash-locked list
 
