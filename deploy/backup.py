@@ -264,7 +264,7 @@ def _manifest(backup: Path) -> dict[str, str]:
 
 def _rig_runs(rig_data: Path) -> bool:
     try:
-        with (rig_data / "rig.lock").open("a") as file:
+        with (rig_data / "rig.lock").open() as file:  # never made here: it would be of another owner
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except FileNotFoundError:
         return False

@@ -183,6 +183,7 @@ def test_what_is_there_is_not_overwritten(machine: Machine, tmp_path: Path) -> N
     with pytest.raises(backup.BackupError, match="--force"):
         backup.restore(kept, machine.rig, machine.api, force=False)
     assert machine.contents() == before
+    assert not (machine.rig / "rig.lock").exists()  # it would belong to the one who restores, and keep the rig out
     words = backup.restore(kept, machine.rig, machine.api, force=True)
     assert not later.exists()
     [aside] = machine.rig.parent.glob("rig.before-*")
