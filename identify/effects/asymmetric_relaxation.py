@@ -7,13 +7,24 @@ from typing import Any
 import numpy as np
 
 from identify.effects.base import Effect, Form, Parameter, Scene
-from identify.effects.kernels import activate
+from identify.effects.kernels import activate, activate_by_level
 
+_LAGS = (
+    Parameter("rise_s", "s", 0.0, 0.35, 0.0, (0.02, 0.1), about="activation"),
+    Parameter("fall_s", "s", 0.0, 0.35, 0.0, (0.08, 0.03), about="deactivation"),
+)
 _RATIO = Parameter("ratio", "1", 0.12, 8.0, 1.0, (1.6, 0.6), "log", about="time constant of decay over development")
 
 
 def _kinetics(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
     return activate(np.ascontiguousarray(drive), p["rise_s"][:, 0], p["fall_s"][:, 0], scene.step_s)
+
+
+def _kinetics_by_level(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+    lags = p["rise_s"][:, 0], p["fall_s"][:, 0]
+    if not np.any(lags[0]) and not np.any(lags[1]):
+        return drive
+    return activate_by_level(np.ascontiguousarray(drive), *lags, scene.scale_nm, scene.step_s)
 
 
 EFFECT = Effect(
@@ -26,7 +37,7 @@ EFFECT = Effect(
             "T·ratio while the drive is below the torque, T above",
             (_RATIO,),
             law={"ratio": 0},
-            log_law=True,
+            log_law=("ratio",),
         ),
         Form(
             "by_rate",
@@ -34,27 +45,56 @@ EFFECT = Effect(
             "T·ratio while the torque falls, T while it rises",
             (_RATIO,),
             law={"ratio": 1},
-            log_law=True,
+            log_law=("ratio",),
         ),
         Form(
-            "damping",
+            "slow_lag",
             "speed",
-            "as by_drive, on the damping alone: the slower of two lags",
+            "as by_drive, on the slower of the two lags alone",
             (_RATIO,),
             law={"ratio": 8},
-            log_law=True,
+            log_law=("ratio",),
+        ),
+        *(
+            Form(name, "speed", words, (_RATIO,), law={"ratio": column}, log_law=("ratio",))
+            for name, words, column in (
+                ("slow_lag_by_rate", "as by_rate, on the slower of the two lags alone", 17),
+                ("quick_lag", "as by_drive, on the quicker of the two lags alone", 16),
+                ("quick_lag_by_rate", "as by_rate, on the quicker of the two lags alone", 15),
+            )
+        ),
+        *(
+            Form(
+                name,
+                "speed",
+                f"{lag}·ratio·c^-power while the drive is below the torque, ·c^power above; c = 0.5 + 1.5 y/y_max",
+                (_RATIO, Parameter("power", "1", 0.1, 2.0, 0.0, (0.5, 1.0), about="how much the level counts")),
+                law={"ratio": first, "power": second},
+                log_law=("ratio",),
+                source="Winters 1995; Thelen 2003",
+            )
+            for name, lag, first, second in (
+                ("by_level", "T", 0, 12),
+                ("slow_lag_by_level", "slower lag", 8, 20),
+            )
         ),
         Form(
             "kinetics",
             "gain",
             "a' = (w - a)/τ, τ = rise where w > a, else fall; the second order follows a",
-            (
-                Parameter("rise_s", "s", 0.0, 0.35, 0.0, (0.02, 0.1), about="activation"),
-                Parameter("fall_s", "s", 0.0, 0.35, 0.0, (0.08, 0.03), about="deactivation"),
-            ),
+            _LAGS,
             _kinetics,
             True,
             source="Winters, Stark 1985; Thelen 2003: activation 10 ms, deactivation 40 ms",
+        ),
+        Form(
+            "kinetics_by_level",
+            "gain",
+            "a' = (w - a)/τ, τ = rise (0.5 + 1.5 a) where w > a, else fall/(0.5 + 1.5 a)",
+            _LAGS,
+            _kinetics_by_level,
+            True,
+            source="Winters 1995; Thelen 2003",
         ),
     ),
     signature="Torque above the model on the way up and below it on the way down, or the reverse, at every switch.",

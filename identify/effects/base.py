@@ -139,8 +139,8 @@ class Form:
         Whether `apply` takes x of shape (M, K) and parameters of shape (M, 1); if not, it is called row by row.
     law : dict
         For "speed" alone: column of the compiled law by parameter; `apply` is then not called.
-    log_law : bool
-        The law takes the parameter's logarithm.
+    log_law : tuple of str
+        Parameters of which the law takes the logarithm.
     propose : callable or None
         `propose(residual_nm, scene, previous)` gives starting values found in the data: a list of dicts, none where
         there is nothing to start from. `previous` holds the parameters of the form before in a chain.
@@ -157,7 +157,7 @@ class Form:
     apply: Apply | None = None
     batched: bool = False
     law: dict[str, int] = field(default_factory=dict)
-    log_law: bool = False
+    log_law: tuple[str, ...] = ()
     propose: Callable[[np.ndarray, Scene, dict[str, float]], list[dict[str, float]]] | None = None
     grows: bool = False
     source: str = ""

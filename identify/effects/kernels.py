@@ -49,14 +49,19 @@ def adapt(
 
 
 @njit(cache=True, nogil=True)
-def play(width_us: np.ndarray, half_us: np.ndarray) -> np.ndarray:  # pragma: no cover
-    """Play operator: the output follows the input at a distance of at most `half_us`; from 0. Shapes (M, K), (M,)."""
+def play(width_us: np.ndarray, half_us: np.ndarray, growth_per_us: np.ndarray) -> np.ndarray:  # pragma: no cover
+    """Play operator: the output follows the input at a distance of at most half (1 + growth·input); from 0.
+
+    Shapes (M, K), (M,), (M,).
+    """
     rows, size = width_us.shape
     out = np.empty((rows, size))
     for m in range(rows):
         p = 0.0
         for k in range(size):
-            p = max(width_us[m, k] - half_us[m], min(width_us[m, k] + half_us[m], p))
+            u = width_us[m, k]
+            half = half_us[m] * max(1.0 + growth_per_us[m] * u, 0.0)
+            p = max(u - half, min(u + half, p))
             out[m, k] = p
     return out
 
@@ -199,3 +204,72 @@ def train(on: np.ndarray, step_s: float) -> tuple[np.ndarray, np.ndarray]:  # pr
         else:
             gap += step_s
     return since, before
+
+
+@njit(cache=True, nogil=True)
+def activate_by_level(
+    drive: np.ndarray, rise_s: np.ndarray, fall_s: np.ndarray, scale: float, step_s: float
+) -> np.ndarray:  # pragma: no cover
+    """As `activate`, slower to rise and quicker to fall at high levels: rise (0.5 + 1.5 a), fall/(0.5 + 1.5 a)."""
+    rows, size = drive.shape
+    parts = 5
+    out = np.empty((rows, size))
+    for m in range(rows):
+        a = 0.0
+        for k in range(size):
+            w = drive[m, k]
+            total = 0.0
+            for _ in range(parts):
+                level = 0.5 + 1.5 * min(max(abs(a) / scale, 0.0), 1.2)
+                tau = rise_s[m] * level if w > a else fall_s[m] / level
+                if tau <= 1e-9:
+                    a = w
+                    total += w
+                else:
+                    h = step_s / parts
+                    decay = np.exp(-h / tau)
+                    total += w + (a - w) * (1.0 - decay) * tau / h
+                    a = w + (a - w) * decay
+            out[m, k] = total / parts
+    return out
+
+
+@njit(cache=True, nogil=True)
+def follow_stiffening(
+    torque: np.ndarray,
+    slope: np.ndarray,
+    omega: np.ndarray,
+    damping: np.ndarray,
+    stiffening: np.ndarray,
+    scale: float,
+    step_s: float,
+) -> tuple[np.ndarray, np.ndarray]:  # pragma: no cover
+    """z'' = ω² (1 + β |z|/scale)(x - z) - 2 ζ ω z', x the cubic through boundary states; twelve leapfrog steps each."""
+    rows, size = torque.shape
+    parts = 12
+    h = step_s / parts
+    out = np.zeros((rows, size))
+    rate = np.zeros((rows, size))
+    for m in range(rows):
+        z, v = torque[m, 0], 0.0
+        out[m, 0] = z
+        w2, c = omega[m] * omega[m], damping[m] * omega[m] * h
+        for k in range(size - 1):
+            a, b, d, e = torque[m, k], slope[m, k], torque[m, k + 1], slope[m, k + 1]
+            for i in range(parts):
+                z += 0.5 * h * v
+                s = (i + 0.5) / parts
+                x = (
+                    (1 + 2 * s) * (1 - s) * (1 - s) * a
+                    + s * (1 - s) * (1 - s) * b
+                    + s * s * (3 - 2 * s) * d
+                    + s * s * (s - 1) * e
+                )
+                force = w2 * (1.0 + stiffening[m] * abs(z) / scale) * (x - z)
+                v = (v * (1.0 - c) + h * force) / (1.0 + c)
+                z += 0.5 * h * v
+            if not abs(z) < 1e6:
+                z, v = 0.0, 0.0
+            out[m, k + 1] = z
+            rate[m, k + 1] = v
+    return out, rate

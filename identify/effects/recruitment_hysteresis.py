@@ -11,12 +11,28 @@ from identify.effects.kernels import dahl, play
 
 
 def _play(width: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
-    return play(np.ascontiguousarray(width), p["half_width_us"][:, 0])
+    half = p["half_width_us"][:, 0]
+    growth = p["growth"][:, 0] / scene.largest_us if "growth" in p else np.zeros_like(half)
+    return play(np.ascontiguousarray(width), half, growth)
+
+
+def _distributed(width: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+    half, rows = p["half_width_us"], np.ascontiguousarray(width)
+    even = np.zeros(rows.shape[0])
+    plays = (play(rows, share * half[:, 0], even) for share in (0.2, 0.4, 0.6, 0.8, 1.0))
+    return rows + p["share"] * (sum(plays, np.zeros_like(rows)) / 5.0 - rows)
 
 
 def _memory(width: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
     z = dahl(np.ascontiguousarray(width), p["reach_us"][:, 0])
     return np.where(width > 0, width - p["half_width_us"] * z, width)
+
+
+def _two_curves(width: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+    z = dahl(np.ascontiguousarray(width), p["reach_us"][:, 0])
+    part = width / scene.largest_us
+    half = p["half_width_us"] + p["tilt_us"] * (part - 0.5) + p["bend_us"] * (part - 0.5) ** 2
+    return np.where(width > 0, width - half * z, width)
 
 
 def _gain(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
@@ -40,6 +56,26 @@ EFFECT = Effect(
             True,
         ),
         Form(
+            "widening",
+            "pulse_width",
+            "as play, with r = half_width (1 + growth·u/u_max)",
+            (_HALF, Parameter("growth", "1", -0.9, 4.0, 0.0, (1.0, 0.0), about="wider at larger widths")),
+            _play,
+            True,
+        ),
+        Form(
+            "distributed",
+            "pulse_width",
+            "w = f(u + share (mean of five play operators, r up to half_width, - u))",
+            (
+                Parameter("share", "1", 0.0, 1.6, 0.0, (0.4, 0.9), about="share of the units that remember"),
+                Parameter("half_width_us", "µs", 3.0, 150.0, 20.0, (50.0, 15.0), "log", about="widest play"),
+            ),
+            _distributed,
+            True,
+            source="Prandtl and Ishlinskii; Preisach's plane with units spread evenly",
+        ),
+        Form(
             "memory",
             "pulse_width",
             "w = f(u - half_width·z); dz = (du - z|du|)/reach",
@@ -47,6 +83,20 @@ EFFECT = Effect(
             _memory,
             True,
             source="Dahl's friction as direction memory; Bouc, Wen",
+        ),
+        Form(
+            "two_curves",
+            "pulse_width",
+            "w = f(u - z (half_width + tilt (s - 1/2) + bend (s - 1/2)²)), s = u/u_max; dz = (du - z|du|)/reach",
+            (
+                Parameter("half_width_us", "µs", -45.0, 45.0, 0.0, (8.0,), about="half the distance in the middle"),
+                Parameter("tilt_us", "µs", -60.0, 60.0, 0.0, (0.0,), about="wider towards large widths"),
+                Parameter("bend_us", "µs", -120.0, 120.0, 0.0, (0.0,), about="wider at both ends"),
+                _REACH,
+            ),
+            _two_curves,
+            True,
+            source="Durfee, MacLean 1989: a curve for each direction",
         ),
         Form(
             "gain",

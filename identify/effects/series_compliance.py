@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from identify.effects.base import Effect, Form, Parameter, Scene
-from identify.effects.kernels import exponential, follow
+from identify.effects.kernels import exponential, follow, follow_stiffening
 
 _RESONANCE = (
     Parameter("resonance_hz", "Hz", 1.2, 16.0, np.inf, (3.0, 6.0, 10.0), "log", about="of the series spring"),
@@ -46,6 +46,16 @@ def _partly(x: tuple[np.ndarray, np.ndarray], p: dict[str, Any], scene: Scene) -
     return x[0] + share * (torque - x[0]), x[1] + share * (rate - x[1])
 
 
+def _stiffening(x: tuple[np.ndarray, np.ndarray], p: dict[str, Any], scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    frequency = p["resonance_hz"][:, 0]
+    if np.all(np.isinf(frequency)):
+        return x
+    omega = 2 * np.pi * frequency
+    return follow_stiffening(
+        x[0], x[1] * scene.step_s, omega, p["damping"][:, 0], p["stiffening"][:, 0], scene.scale_nm, scene.step_s
+    )
+
+
 EFFECT = Effect(
     id="series_compliance",
     name="Compliance in series",
@@ -57,6 +67,17 @@ EFFECT = Effect(
             "y + share (z - y), z as in series",
             (*_RESONANCE, Parameter("share", "1", 0.0, 1.0, 0.0, (0.5,), about="share of torque through the spring")),
             _partly,
+            True,
+        ),
+        Form(
+            "stiffening",
+            "filter",
+            "z'' + 2 ζ ω z' + ω² (1 + stiffening·|z|/y_max) (z - y) = 0",
+            (
+                *_RESONANCE,
+                Parameter("stiffening", "1", -0.6, 12.0, 0.0, (1.0,), about="rise of stiffness to full torque"),
+            ),
+            _stiffening,
             True,
         ),
     ),

@@ -21,6 +21,10 @@ def _scaling(width: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
     return width * (1.0 - p["slope_per_s"] * scene.time_s)
 
 
+def _fading(width: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+    return width * (1.0 + p["share"] * np.expm1(-scene.time_s / p["time_constant_s"]))
+
+
 def _charge(width: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
     used = np.cumsum(scene.pulse_width_us) * scene.step_s / scene.largest_us
     return np.where(width > 0, width - p["slope_us_per_s"] * used, width)
@@ -51,6 +55,18 @@ EFFECT = Effect(
             (Parameter("slope_per_s", "1/s", -0.02, 0.02, 0.0, (0.003, -0.003), about="share lost in a second"),),
             _scaling,
             True,
+        ),
+        Form(
+            "fading",
+            "pulse_width",
+            "w = f(u (1 - share (1 - exp(-t/time_constant))))",
+            (
+                Parameter("share", "1", -0.7, 0.7, 0.0, (0.1, -0.1), about="share lost in the end"),
+                Parameter("time_constant_s", "s", 3.0, 90.0, 15.0, (12.0,), "log", about="how fast it settles"),
+            ),
+            _fading,
+            True,
+            source="Lapicque: widths at threshold scale as the current falls",
         ),
         Form(
             "by_charge",

@@ -91,5 +91,6 @@ EFFECT = Effect(
     "the instruction to relax, and leave these stretches out.",
     source="Additive torque unrelated to the stimulation",
     foreseeable=False,
+    prior=-5.0,
     experiment=("rest",),
 )

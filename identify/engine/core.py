@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-LAWS = 12
+LAWS = 21
 """Columns of the speed law: see `factor`."""
 
 
@@ -35,14 +35,19 @@ def _transition(time_constant_s, damping, step_s):  # pragma: no cover
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _factor(law, w, y, v, scale_nm, slow_s):  # pragma: no cover
-    """Factors on T and on the damping. `law` holds, each neutral at 0:
+def _factor(law, w, y, v, scale_nm, slow_s, quick_s, bound):  # pragma: no cover
+    """Factors on T, on the slower and on the quicker lag. `law` holds, each neutral at 0:
 
     0 log ratio where the drive is below the torque (relaxing), 1 log ratio where torque falls,
     2 linear in torque, 3 linear in drive, 4 exponential in torque, 5 inverse linear in torque,
-    6 inverse linear in drive; on the damping alone, which is the slower lag where the muscle is overdamped:
+    6 inverse linear in drive; on the slower of the two lags alone:
     7 linear in torque, 8 log ratio where the drive is below the torque, 9 inverse linear in drive,
-    10 linear in activation (the state between the two lags); 11 on both, linear in activation.
+    10 linear in activation (the state between the two lags), 11 on T, linear in activation, 12 on T, power of
+    0.5 + 1.5 a: slower to rise and quicker to fall at high levels, 13 linear in a drive that saturates;
+    on the quicker lag: 14 linear in activation, 15 log ratio where torque falls, 16 log ratio where the drive is
+    below the torque; 17 as 15 on the slower lag; 18 slower lag, linear in bound calcium c (c follows whether there is
+    drive at all, with the quicker lag), 19 quicker lag, linear in c (with the slower lag);
+    20 as 12 on the slower lag.
     """
     m = 1.0
     if law[0] != 0.0:
@@ -74,7 +79,31 @@ def _factor(law, w, y, v, scale_nm, slow_s):  # pragma: no cover
         between = min(max((y + slow_s * v) / scale_nm, 0.0), 1.2)
         d *= max(1.0 + law[10] * between, 0.08)
         m *= max(1.0 + law[11] * between, 0.08)
-    return min(max(m, 0.02), 50.0), min(max(d, 0.02), 50.0)
+    if law[12] != 0.0 or law[20] != 0.0:
+        gap = (w - y) / (0.02 * scale_nm)
+        side = np.log(0.5 + 1.5 * min(level, 1.2)) * gap / np.sqrt(1.0 + gap * gap)
+        m *= np.exp(law[12] * side)
+        d *= np.exp(law[20] * side)
+    if law[13] != 0.0:
+        part = abs(w) / scale_nm
+        d *= max(1.0 + law[13] * 1.15 * part / (part + 0.15), 0.08)
+    q = 1.0
+    if law[14] != 0.0:
+        between = min(max((y + quick_s * v) / scale_nm, 0.0), 1.2)
+        q *= max(1.0 + law[14] * between, 0.08)
+    if law[15] != 0.0 or law[17] != 0.0:
+        gap = v / (0.1 * scale_nm)
+        side = 0.5 * (1.0 - gap / np.sqrt(1.0 + gap * gap))
+        q *= np.exp(law[15] * side)
+        d *= np.exp(law[17] * side)
+    if law[16] != 0.0:
+        gap = (w - y) / (0.02 * scale_nm)
+        q *= np.exp(law[16] * 0.5 * (1.0 - gap / np.sqrt(1.0 + gap * gap)))
+    if law[18] != 0.0:
+        d *= max(1.0 + law[18] * bound, 0.08)
+    if law[19] != 0.0:
+        q *= max(1.0 + law[19] * bound, 0.08)
+    return min(max(m, 0.02), 50.0), min(max(d, 0.02), 50.0), min(max(q, 0.02), 50.0)
 
 
 @njit(cache=True, nogil=True)
@@ -113,13 +142,15 @@ def run_core(drive, time_constant_s, damping, law, multiplier, scale_nm, step_s,
         base = time_constant_s[m]
         b11, b12, b21, b22 = _transition(base, damping[m], step_s)
         slow_s = base * (damping[m] + np.sqrt(max(damping[m] * damping[m] - 1.0, 0.0)))
+        quick_s = 2.0 * damping[m] * base - slow_s
         lawful = False
         for j in range(law.shape[1]):
             lawful = lawful or law[m, j] != 0.0
         alike = shared and m > 0 and base == time_constant_s[0] and damping[m] == damping[0]
         for j in range(law.shape[1]):
             alike = alike and law[m, j] == law[0, j]
-        y, v = 0.0, 0.0
+        y, v, bound = 0.0, 0.0, 0.0
+        forget = np.exp(-step_s / max(quick_s if law[m, 18] != 0.0 else slow_s, 1e-4))
         if alike and varied:
             for k in range(size):
                 w = drive[m, k]
@@ -138,15 +169,20 @@ def run_core(drive, time_constant_s, damping, law, multiplier, scale_nm, step_s,
             continue
         for k in range(size):
             w = drive[m, k]
-            f, d = 1.0, 1.0
+            f, d, q = 1.0, 1.0, 1.0
             if lawful:
-                f, d = _factor(law[m], w, y, v, scale_nm, slow_s)
+                f, d, q = _factor(law[m], w, y, v, scale_nm, slow_s, quick_s, bound)
             if given > 0:
                 f *= multiplier[m if given > 1 else 0, k]
-            if f == 1.0 and d == 1.0:
+            if f == 1.0 and d == 1.0 and q == 1.0:
                 p11, p12, p21, p22 = b11, b12, b21, b22
             else:
-                p11, p12, p21, p22 = _transition(base * f, damping[m] * d, step_s)
+                # The slower lag times d, the quicker times q: T² = quick·slow, 2 ζ T = quick + slow.
+                t = base * f * np.sqrt(d * q)
+                z = 0.5 * f * (quick_s * q + slow_s * d) / t
+                p11, p12, p21, p22 = _transition(t, z, step_s)
+            goal = abs(w) / (abs(w) + 0.05 * scale_nm)
+            bound = goal + (bound - goal) * forget
             if m == 0:
                 varied = True
                 first[0, k], first[1, k], first[2, k], first[3, k] = p11, p12, p21, p22

@@ -239,7 +239,7 @@ class _Walk:
                 names = [p.name for p in chosen.parameters]
                 for name, column in chosen.form.law.items():
                     value = values[:, names.index(name)]
-                    law[:, column] += np.log(value) if chosen.form.log_law else value
+                    law[:, column] += np.log(value) if name in chosen.form.log_law else value
             else:
                 given.append((chosen, values))
         branches = [(drive, np.ones((drive.shape[0], 1)))]
