@@ -180,6 +180,10 @@ class Gate:
             refusal = check(self._table["pulse_interval_s"], now_s - self._recent[-1][0])
             if refusal is not None:
                 return refusal
+            # those of the last second; the window that ends on a pulse may begin on one, too
+            refusal = check(self._table["pulse_rate_hz"], len(self._recent))
+            if refusal is not None:
+                return refusal
         return check(self._table["charge_per_second_uc"], charge_uc + sum(c for _, c in self._recent))
 
     def _acknowledged(self, ack: Ack) -> None:

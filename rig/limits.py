@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 
 from rig.errors import RefusedError
-from rig.messages import Profile
+from rig.messages import Profile, TestPlan
 from rig.signals import Pulse
 
 STEP_PULSE_WIDTH_US = 1.0
@@ -200,6 +200,25 @@ def for_profile(table: dict[str, Limit], profile: Profile, owner: str = "partici
     if profile.rest_between_tests_s is not None:
         table = at_least(table, "rest_between_tests_s", profile.rest_between_tests_s, owner)
     return tightened(table, "torque_nm", profile.max_torque_nm, owner, lo=-profile.max_torque_nm)
+
+
+def for_plan(table: dict[str, Limit], request: TestPlan) -> dict[str, Limit]:
+    """The table as profile and request narrow it: of hard limit, rig file, profile and request the tightest wins.
+
+    Raises
+    ------
+    RefusedError
+        A bound that makes no sense.
+    """
+    table = for_profile(table, request.profile)
+    owner = "request"
+    if request.max_pulse_width_us is not None:
+        table = tightened(table, "pulse_width_us", request.max_pulse_width_us, owner)
+    if request.max_torque_nm is not None:
+        if not (request.max_torque_nm > 0):
+            raise RefusedError(f"{owner}: max_torque_nm {request.max_torque_nm:g} N·m must be above 0")
+        table = tightened(table, "torque_nm", request.max_torque_nm, owner, lo=-request.max_torque_nm)
+    return table
 
 
 def admit(pulse: Pulse, table: dict[str, Limit]) -> Admitted | Refusal:

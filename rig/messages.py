@@ -65,6 +65,8 @@ class TestPlan(Message):
     profile: Profile
     segments: list[SegmentPlan] | None = Field(None, description="None: the default pre-session test")
     pulse_rate_hz: float = 40.0
+    max_pulse_width_us: float | None = Field(default=None, description="for this test alone, if tighter, µs")
+    max_torque_nm: float | None = Field(default=None, description="for this test alone, if tighter, N·m")
 
 
 class RecruitmentTable(Message):

@@ -14,7 +14,7 @@ from rig.messages import Preview, RecruitmentTable, SegmentPlan, TestPlan
 from rig.signals import Pulse
 
 MAX_WIDTH_SETTING = "max_pulse_width_us"
-"""Where a sequence has this setting and the plan does not give it, it becomes the profile's comfort maximum."""
+"""Where a sequence has this setting and the plan does not give it: the comfort maximum, or the request's if less."""
 
 
 def default_segments() -> list[SegmentPlan]:
@@ -116,7 +116,8 @@ def build(plan: TestPlan, table: dict[str, Limit]) -> PlannedTest:
 def _settings(segment: SegmentPlan, plan: TestPlan) -> dict[str, object]:
     settings = dict(segment.settings)
     if MAX_WIDTH_SETTING in sequences.find(segment.sequence).Settings.model_fields:
-        settings.setdefault(MAX_WIDTH_SETTING, plan.profile.max_pulse_width_us)
+        comfort_us, asked_us = plan.profile.max_pulse_width_us, plan.max_pulse_width_us
+        settings.setdefault(MAX_WIDTH_SETTING, comfort_us if asked_us is None else min(comfort_us, asked_us))
     return settings
 
 

@@ -142,7 +142,7 @@ class Rig:
     def preview(self, request: PreviewRequest) -> Preview:
         """Duration, dose and pulses of a plan. Raises PlanError, RefusedError."""
         check_profile(request.plan.profile, self._clock.unix_s(), required=False)
-        table = limits.for_profile(self._table, request.plan.profile)
+        table = limits.for_plan(self._table, request.plan)
         return plan.preview(plan.build(request.plan, table), request.recruitment)
 
     def live(self) -> LiveEvent | None:
@@ -173,7 +173,7 @@ class Rig:
             self._trial.may_start()
             _check_names("plan", test_id=request.test_id, participant=request.participant)
             check_profile(request.profile, self._clock.unix_s(), self._require_calibration)
-            table = limits.for_profile(self._table, request.profile)
+            table = limits.for_plan(self._table, request)
             test = plan.build(request, table)
             self._check_rest(test, table["rest_between_tests_s"])
             self._shelf.check_room(request.test_id)

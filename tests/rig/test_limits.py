@@ -8,10 +8,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from bench.rig_fuzz import fuzz
 from rig import limits
 from rig.errors import RefusedError
 from rig.limits import HARD_LIMITS, Admitted, Refusal, admit
-from rig.messages import Profile
+from rig.messages import Profile, TestPlan
 from rig.signals import Pulse
 
 anything = st.one_of(
@@ -21,7 +22,7 @@ anything = st.one_of(
 )
 
 
-@settings(max_examples=5000, deadline=None)
+@settings(max_examples=2000, deadline=None)
 @given(anything, anything, st.floats(0, 500), st.floats(0, 100))
 def test_no_pulse_outside_passes(width_us: float, current_ma: float, most_us: float, most_ma: float):
     profile = Profile(current_ma=most_ma, max_pulse_width_us=most_us)
@@ -90,3 +91,55 @@ def test_every_limit_has_its_reason_and_source():
         assert row.reason
         assert row.source
         assert row.lo < row.hi
+
+
+def test_a_million_mad_requests_at_the_gate():
+    """On a seed of its own; `python -m bench.rig_fuzz` runs others."""
+    found = fuzz(1_000_000, seed=20)
+    assert found.outside == 0, found.example
+    assert found.sent > 50_000  # it is no wall
+    assert found.refused_profiles > 10
+
+
+@pytest.mark.parametrize("name", sorted({r.name for r in HARD_LIMITS.values()}))
+def test_each_row_refuses_just_beside_its_bounds_and_says_by_how_much(name: str):
+    row = HARD_LIMITS[name]
+    for bound, beside in ((row.hi, math.inf), (row.lo, -math.inf)):
+        if math.isfinite(bound):
+            assert limits.check(row, bound) is None
+            assert limits.check(row, math.nextafter(bound, beside)) is not None
+            words = str(limits.check(row, bound + math.copysign(1.0, beside)))
+            assert f"{name} " in words
+            assert ("over by 1" if beside > 0 else "under by 1") in words
+            assert "hard limit" in words
+    for nonsense in (math.nan, math.inf if math.isfinite(row.hi) else math.nan):
+        assert limits.check(row, nonsense) is not None
+
+
+def request(profile: Profile, **fields: float) -> TestPlan:
+    return TestPlan(test_id="t", participant="P", profile=profile, **fields)
+
+
+def test_of_hard_limit_rig_file_profile_and_request_the_tightest_wins():
+    file = limits.tightened(HARD_LIMITS, "pulse_width_us", 250.0, "rig file")
+    for profile_us, request_us, owner, most_us in (
+        (300.0, None, "rig file", 250.0),
+        (200.0, None, "participant's profile", 200.0),
+        (200.0, 150.0, "request", 150.0),
+        (200.0, 400.0, "participant's profile", 200.0),
+    ):
+        plan = request(
+            Profile(max_pulse_width_us=profile_us), **({"max_pulse_width_us": request_us} if request_us else {})
+        )
+        row = limits.for_plan(file, plan)["pulse_width_us"]
+        assert (row.owner, row.hi) == (owner, most_us)
+        assert owner in str(limits.check(row, most_us + 3))
+        assert "over by 3" in str(limits.check(row, most_us + 3))
+    tight = limits.for_plan(HARD_LIMITS, request(Profile(rest_between_tests_s=60), max_torque_nm=7))
+    assert (tight["torque_nm"].lo, tight["torque_nm"].hi, tight["torque_nm"].owner) == (-7, 7, "request")
+    assert "under by 50" in str(limits.check(tight["rest_between_tests_s"], 10.0))
+    for wrong in ({"max_torque_nm": math.nan}, {"max_torque_nm": -1.0}, {"max_pulse_width_us": math.nan}):
+        with pytest.raises(RefusedError, match="request"):
+            limits.for_plan(HARD_LIMITS, request(Profile(), **wrong))
+    with pytest.raises(RefusedError, match="rest_between_tests_s"):
+        limits.for_plan(HARD_LIMITS, request(Profile(rest_between_tests_s=math.nan)))

@@ -73,6 +73,39 @@ def test_limits_hold_over_the_whole_test(
         built(segments, rate_hz, **profile)
 
 
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"pulse_width_us": [50.0, 100.0, 0.0, 50.0]}, None),
+        ({"pulse_width_us": [50.0, 100.5]}, "mine, pulse 2: width_rise_us 50.5 µs/pulse is outside .* over by 0.5"),
+        ({"pulse_width_us": [60.0]}, "mine, pulse 1: width_rise_us 60"),
+        ({"pulse_width_us": [60.0, 0.0, 300.0], "jumps": True}, None),
+    ],
+)
+def test_a_width_rises_slowly_where_the_sequence_does_not_jump_by_design(
+    settings: dict[str, object], words: str | None
+):
+    segments = [SegmentPlan(name="mine", sequence="widths", settings=settings)]
+    if words is None:
+        assert built(segments).pulse_width_us.max() > 0
+        return
+    with pytest.raises(RefusedError, match=words):
+        built(segments)
+
+
+def test_a_steep_ramp_is_refused_and_a_rise_counts_from_the_segment_before():
+    steep = SegmentPlan(name="ramp", sequence="ramp", settings={"up_s": 0.1, "down_s": 1.0})
+    with pytest.raises(RefusedError, match="ramp, pulse 1: width_rise_us 75"):
+        built([steep])
+    step = SegmentPlan(name="hold", sequence="steps", settings={"on_s": 0.5, "off_s": 0.0, "repeats": 1})
+    assert built([step, *widths(310.0)], max_pulse_width_us=310.0).duration_s > 0.5
+
+
+def test_the_requests_own_maximum_scales_the_sequences():
+    plan_of = TestPlan(test_id="t", participant="P", profile=Profile(), max_pulse_width_us=120.0)
+    assert plan.build(plan_of, limits.for_plan(HARD_LIMITS, plan_of)).pulse_width_us.max() == 120.0
+
+
 def test_mistakes_name_the_segment():
     with pytest.raises(PlanError, match="segments is empty"):
         built([])

@@ -1,0 +1,161 @@
+"""A million requests at the gate, most of them mad: how many pulses outside the limits came out? There must be none.
+
+    python -m bench.rig_fuzz [--requests N] [--seed N]
+
+Widths and currents are NaN, infinite, negative, huge, tiny, at and beside every bound and every rounding step; times
+come too close, too late and at random; profiles change every 500 requests. What reaches the stimulator is judged by
+this file's own arithmetic, not by the rig's.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import math
+import sys
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from rig import limits
+from rig.clock import VirtualClock
+from rig.errors import RefusedError
+from rig.gate import Gate
+from rig.limits import HARD_LIMITS, Admitted
+from rig.messages import Profile, TestPlan
+from rig.signals import Pulse
+from tests.rig.fakes import FakeStimulator
+
+MOST = {"width_us": 500.0, "current_ma": 100.0, "charge_uc": 40.0, "charge_per_s_uc": 1600.0, "pulses_per_s": 61}
+"""What no table may exceed, written down here again on purpose."""
+BLOCK = 500
+
+
+class NoJournal:
+    """Takes what the gate writes and forgets it: this bench is about limits."""
+
+    def append(self, kind: object, payload: bytes) -> None:
+        """Forget."""
+
+    def append_json(self, kind: object, content: object) -> None:
+        """Forget."""
+
+
+@dataclass
+class Found:
+    """What came of it."""
+
+    requests: int = 0
+    sent: int = 0
+    outside: int = 0
+    refused_profiles: int = 0
+    example: str = ""
+
+
+def values(rng: np.random.Generator, n: int, most: float) -> np.ndarray:
+    """Numbers around a bound, and numbers that are none."""
+    mad = [
+        math.nan,
+        math.inf,
+        -math.inf,
+        -0.0,
+        0.0,
+        5e-324,
+        -5e-324,
+        1e308,
+        -1e308,
+        2.0**31,
+        2.0**63,
+        0.4999,
+        0.5,
+        -1.0,
+    ]
+    edges = [most, np.nextafter(most, np.inf), np.nextafter(most, -np.inf), most + 0.5, most - 0.5, most + 1, 2 * most]
+    near = np.floor(rng.uniform(0, most, n)) + rng.choice([0.0, 0.5, 1e-9, -1e-9, 0.999999999], n)
+    bits = rng.integers(0, 2**63, n, dtype=np.int64).view(np.float64)
+    kinds = [rng.choice(mad, n), rng.choice(edges, n), near, bits, rng.uniform(-most, 3 * most, n), near]
+    return np.choose(rng.integers(0, len(kinds), n), kinds)
+
+
+def fuzz(requests: int, seed: int) -> Found:
+    """Fire and judge."""
+    rng = np.random.default_rng(seed)
+    found = Found()
+    while found.requests < requests:
+        most_us, most_ma = rng.choice([500.0, 300.0, 123.4, 9999.0, math.nan]), rng.choice([100.0, 20.0, 60.5, 500.0])
+        asked_us = None if rng.random() < 0.5 else float(rng.uniform(0, 600))
+        profile = Profile(current_ma=most_ma, max_pulse_width_us=most_us)
+        try:
+            table = limits.for_plan(
+                HARD_LIMITS, TestPlan(test_id="f", participant="f", profile=profile, max_pulse_width_us=asked_us)
+            )
+        except RefusedError:
+            found.refused_profiles += 1
+            found.requests += 1
+            continue
+        tightest = (min(most_us, 500.0, 500.0 if asked_us is None else asked_us), min(most_ma, 100.0))
+        _block(rng, table, tightest, found)
+    return found
+
+
+def _block(
+    rng: np.random.Generator, table: dict[str, limits.Limit], tightest: tuple[float, float], found: Found
+) -> None:
+    clock = VirtualClock()
+    stimulator = FakeStimulator(clock)
+    stimulator.ack_delay_s = None
+    gate = Gate(stimulator, clock, lambda _: None, lambda _: None)
+    gate.open(NoJournal(), table)  # pyright: ignore[reportArgumentType]
+    widths, currents = values(rng, BLOCK, tightest[0]), values(rng, BLOCK, tightest[1])
+    steady = rng.random(BLOCK) < 0.5  # half of them sane, so that doses and rates are reached
+    widths[steady], currents[steady] = tightest[0] * rng.random(np.sum(steady)) ** 0.1, tightest[1]
+    pauses = rng.choice([0.0, 1e-4, 0.0079, 0.008, 0.0081, 0.0125, 0.0166, 0.025, 0.5], BLOCK)
+    for index, (width_us, current_ma, pause_s) in enumerate(zip(widths, currents, pauses, strict=True)):
+        now_s = clock.now_s()
+        latest_s = now_s + (-0.001 if index % 97 == 0 else 1.0)
+        gate.fire(index, Pulse(float(width_us), float(current_ma)), now_s, latest_s)
+        clock.advance(float(pause_s))
+    found.requests += BLOCK
+    found.sent += len(stimulator.sent)
+    for words in _judge(stimulator.sent, tightest):
+        found.outside += 1
+        found.example = found.example or words
+
+
+def _judge(sent: list[tuple[float, Admitted]], tightest: tuple[float, float]) -> list[str]:
+    """One line for each pulse that should not have been sent."""
+    wrong: list[str] = []
+    for time_s, pulse in sent:
+        width_us, current_ma = pulse.pulse_width_us, pulse.current_ma
+        fine = 0 < width_us <= tightest[0] and 0 < current_ma <= tightest[1] and width_us * current_ma <= 40_000
+        if not (fine and isinstance(width_us, int) and float(2 * current_ma).is_integer()):
+            wrong.append(f"{width_us} µs {current_ma} mA at {time_s}")
+    times = np.array([t for t, _ in sent])
+    charges_uc = np.array([p.pulse_width_us * p.current_ma * 1e-3 for _, p in sent])
+    wrong += [f"{b - a} s apart" for a, b in itertools.pairwise(times) if b - a < 0.008 - 1e-9]
+    first = np.searchsorted(times, times - 1.0, side="right")
+    total = np.concatenate([[0.0], np.cumsum(charges_uc)])
+    here = np.arange(len(times))
+    wrong += ["charge per second"] * int(np.sum(total[here + 1] - total[first] > MOST["charge_per_s_uc"] + 1e-6))
+    wrong += ["pulses per second"] * int(np.sum(here + 1 - first > MOST["pulses_per_s"]))
+    return wrong
+
+
+def main() -> None:
+    """Fuzz and print; exit 1 if a pulse came out that should not have."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--requests", type=int, default=1_000_000)
+    parser.add_argument("--seed", type=int, default=1)
+    options = parser.parse_args()
+    began_s = time.monotonic()
+    found = fuzz(options.requests, options.seed)
+    print(
+        f"seed {options.seed}: {found.requests} requests, {found.sent} pulses sent, {found.outside} outside, "
+        f"{found.refused_profiles} mad profiles refused, {time.monotonic() - began_s:.0f} s {found.example}"
+    )
+    sys.exit(1 if found.outside else 0)
+
+
+if __name__ == "__main__":
+    main()
