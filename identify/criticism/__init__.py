@@ -1,0 +1,124 @@
+"""Measurement against model: where it errs, how much of that is noise, and whether the residual is only noise."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from identify.criticism.correlation import correlation_tests
+from identify.criticism.shares import by_direction, by_frequency, by_level, by_segment, by_time
+from identify.diagnosis.where import worst_places
+from identify.engine.prepare import inspect
+from identify.figures import best_fit_percent, ceiling_percent, rms
+from identify.grid import make_grid
+from identify.model import Model
+from identify.record import Record
+
+POINTS = 4000
+"""Points of a plotted series at most."""
+BAND = 1.959964
+
+
+def compare(model: Model, record: Record) -> dict[str, Any]:
+    """A model against a measurement.
+
+    Parameters
+    ----------
+    model : Model
+        With effects or without.
+    record : Record
+        The one it was fitted on, or any other.
+
+    Returns
+    -------
+    dict
+        `fit_percent`, `ceiling_percent` (what the true system would reach on this noise), `rms_nm`, `noise_sd_nm`;
+        `fitted` and `held_out` the same for those rows; `by` segment, level, direction, time and frequency;
+        `tests` (correlations with bands); `where` (worst places in words); `series` for plots; `plain`.
+    """
+    predicted = np.asarray(model.predict(record))
+    raw = inspect(record)
+    residual = record.torque_nm - predicted
+    noise = raw.noise_sd_nm
+    grid = make_grid(record)
+    tests = correlation_tests(grid, residual)
+    everything = np.ones(record.time_s.size, bool)
+    places = worst_places(record, residual, noise)
+    result: dict[str, Any] = _figures(record, predicted, noise, everything) | {
+        "noise_sd_nm": noise,
+        "fitted": _figures(record, predicted, noise, ~record.held_out),
+        "held_out": _figures(record, predicted, noise, record.held_out) if record.has_held_out else None,
+        "by": {
+            "segment": by_segment(record, residual, noise),
+            "level": by_level(record, residual, noise),
+            "direction": by_direction(record, residual, noise),
+            "time": by_time(record, residual, noise),
+            "frequency": by_frequency(record, residual, noise),
+        },
+        "tests": tests,
+        "where": places,
+        "series": _series(model, record, predicted, noise),
+    }
+    result["plain"] = _plain(result, tests, places)
+    return result
+
+
+def _figures(record: Record, predicted: np.ndarray, noise: float, rows: np.ndarray) -> dict[str, float | None]:
+    measured, guess = record.torque_nm[rows], predicted[rows]
+    return {
+        "fit_percent": best_fit_percent(measured, guess),
+        "ceiling_percent": ceiling_percent(measured, noise),
+        "rms_nm": rms(measured - guess),
+        "excess_rms_nm": float(np.sqrt(max(rms(measured - guess) ** 2 - noise**2, 0.0))),
+        "samples": int(rows.sum()),
+    }
+
+
+def _series(model: Model, record: Record, predicted: np.ndarray, noise: float) -> dict[str, Any]:
+    lower, upper = _band(model, record, predicted, noise)
+    pick = slice(None, None, max(1, -(-record.time_s.size // POINTS)))
+    names = np.array(record.segment_names)[record.segment]
+    return {
+        "time_s": record.time_s[pick],
+        "pulse_width_us": record.pulse_width_us[pick],
+        "torque_nm": record.torque_nm[pick],
+        "predicted_torque_nm": predicted[pick],
+        "lower_nm": lower[pick],
+        "upper_nm": upper[pick],
+        "residual_nm": (record.torque_nm - predicted)[pick],
+        "noise_band_nm": BAND * noise,
+        "segment": names[pick].tolist(),
+    }
+
+
+def _band(model: Model, record: Record, predicted: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray]:
+    """95 % band for a measured sample: the model's uncertainty, where it carries one, and the noise."""
+    half = np.full(predicted.size, BAND * noise)
+    if model.covariance is not None and not model.effects:
+        from identify.uncertainty import prediction_band
+
+        lower, upper = prediction_band(model, record)
+        half = np.hypot(half, 0.5 * (upper - lower))
+    return predicted - half, predicted + half
+
+
+def _plain(result: dict[str, Any], tests: dict[str, Any], places: list[dict[str, Any]]) -> list[str]:
+    lines = [
+        f"The model fits {result['fit_percent']:.1f} %; noise of {result['noise_sd_nm']:.3g} N·m allows "
+        f"{result['ceiling_percent']:.1f} %."
+    ]
+    if result["held_out"] is not None:
+        held = result["held_out"]
+        lines.append(
+            f"On rows it was not fitted on it errs by {held['rms_nm']:.3g} N·m ({held['fit_percent']:.1f} %, at most "
+            f"{held['ceiling_percent']:.1f} %)."
+        )
+    alarms = [test["words"] for test in tests["tests"] if not test["passed"]]
+    lines.append(" ".join(alarms) if alarms else "What is left looks like noise: none of the correlations stands out.")
+    if alarms:
+        lines += [f"{place['text']}." for place in places[:3]]
+    return lines
+
+
+__all__ = ["compare"]

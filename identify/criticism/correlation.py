@@ -1,0 +1,127 @@
+"""Is the residual noise? Correlations with itself, u, u² and y, with bands whose false-alarm rate is what it says.
+
+A band of 1.96/√N at each lag alarms far more often than 5 % over all lags. Here the band of a function is the 95 %
+quantile of its largest value over all lags, found by drawing noise for this very record: its length, its gaps, its input.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from identify.engine.core import profile_noise
+from identify.engine.prepare import block_means
+from identify.grid import Grid, runs
+
+LAGS = 25
+DRAWS = 1500
+LEVEL = 0.95
+WORDS = {
+    "residual": "The residual is correlated with itself: slow noise, or dynamics that the model lacks.",
+    "u": "The residual goes with the pulse width: delay, threshold or dynamics are off.",
+    "u2": "The residual goes with the square of the pulse width: the recruitment curve or what follows it is off.",
+    "y": "The residual goes with the torque itself: gain, speed or saturation change with level.",
+}
+
+
+def correlation_tests(grid: Grid, residual_nm: np.ndarray) -> dict[str, Any]:
+    """Correlation functions of a residual on the grid of pulses, with bands.
+
+    Parameters
+    ----------
+    grid : Grid
+        Of the record.
+    residual_nm : ndarray, shape (N,)
+        At the record's samples.
+
+    Returns
+    -------
+    dict
+        `lags_s`; `tests`: one for each of residual, u, u2, y with `values`, `band`, `passed`, `largest`, `words`;
+        `false_alarm_rate`: what the bands are made for; `innovations`: whether the cross-correlations were taken on
+        the residual freed of its slow noise.
+    """
+    known = grid.count > 0
+    residual = np.where(known, block_means(grid, residual_nm), 0.0)
+    residual = residual - residual[known].mean()
+    torque = np.where(known, grid.torque_nm, 0.0)
+    white, ar1 = _innovations(residual, known)
+    signals = {"u": grid.pulse_width_us, "u2": grid.pulse_width_us**2, "y": torque - residual}
+    functions = {"residual": _auto(residual, known)} | {
+        name: _cross(white, _filtered(signal, ar1, known), known) for name, signal in signals.items()
+    }
+    bands = _bands({name: _filtered(signal, ar1, known) for name, signal in signals.items()}, known)
+    tests = []
+    for name, values in functions.items():
+        largest = float(np.max(np.abs(values)))
+        tests.append(
+            {
+                "with": name,
+                "values": values,
+                "band": bands[name],
+                "largest": largest,
+                "at_lag_s": float(np.argmax(np.abs(values)) + (name == "residual")) * grid.step_s,
+                "passed": largest <= bands[name],
+                "words": WORDS[name],
+            }
+        )
+    return {
+        "lags_s": np.arange(LAGS + 1) * grid.step_s,
+        "tests": tests,
+        "false_alarm_rate": 1.0 - LEVEL,
+        "innovations": ar1 > 0.0,
+    }
+
+
+def _innovations(residual: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, float]:
+    """The residual freed of slow noise: cross-correlations of coloured noise wander without any cause."""
+    parts = runs(known)
+    start = np.array([p.start for p in parts], np.int64)
+    stop = np.array([p.stop for p in parts], np.int64)
+    ar1, share, _, _ = profile_noise(residual, start, stop, 0.5, 0.5)
+    lag_one = ar1 * share
+    if abs(lag_one) < 0.08:
+        return residual, 0.0
+    return _filtered(residual, ar1 * share, known), lag_one
+
+
+def _filtered(signal: np.ndarray, ar1: float, known: np.ndarray) -> np.ndarray:
+    values = np.where(known, signal - signal[known].mean(), 0.0)
+    out = values.copy()
+    out[1:] -= ar1 * values[:-1]
+    return np.where(known, out - out[known].mean(), 0.0)
+
+
+def _auto(residual: np.ndarray, known: np.ndarray) -> np.ndarray:
+    del known
+    power = max(float(residual @ residual), 1e-30)
+    return np.array([residual[lag:] @ residual[:-lag] / power for lag in range(1, LAGS + 1)])
+
+
+def _cross(residual: np.ndarray, signal: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Correlation of the residual with the signal `lag` steps earlier, lags 0 to LAGS."""
+    del known
+    size = max(float(np.linalg.norm(residual) * np.linalg.norm(signal)), 1e-30)
+    return np.array([residual[lag:] @ signal[: residual.size - lag] / size for lag in range(LAGS + 1)])
+
+
+def _bands(signals: dict[str, np.ndarray], known: np.ndarray) -> dict[str, float]:
+    """95 % quantile of the largest value over lags, on white noise drawn for this record (always the same draws)."""
+    rng = np.random.default_rng(20240229)
+    size = known.size
+    padded = 1 << int(np.ceil(np.log2(size + LAGS + 1)))
+    spectra = {name: np.conj(np.fft.rfft(signal, padded)) for name, signal in signals.items()}
+    norms = {name: np.linalg.norm(signal) for name, signal in signals.items()}
+    largest: dict[str, list[np.ndarray]] = {name: [] for name in ["residual", *signals]}
+    for _ in range(DRAWS // 100):
+        noise = np.where(known, rng.standard_normal((100, size)), 0.0)
+        noise -= np.where(known, noise.sum(axis=1, keepdims=True) / known.sum(), 0.0)
+        spectrum = np.fft.rfft(noise, padded, axis=1)
+        length = np.linalg.norm(noise, axis=1, keepdims=True)
+        auto = np.fft.irfft(np.abs(spectrum) ** 2, padded, axis=1)[:, 1 : LAGS + 1] / length**2
+        largest["residual"].append(np.max(np.abs(auto), axis=1))
+        for name, other in spectra.items():
+            cross = np.fft.irfft(spectrum * other, padded, axis=1)[:, : LAGS + 1] / (length * max(norms[name], 1e-30))
+            largest[name].append(np.max(np.abs(cross), axis=1))
+    return {name: float(np.quantile(np.concatenate(values), LEVEL)) for name, values in largest.items()}

@@ -1,0 +1,153 @@
+"""Which sequence tells two rival effects apart: the shortest, of those the rig can play."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import permutations
+from typing import Any
+
+import numpy as np
+
+from identify.effects import get
+from identify.engine import fit_candidate
+from identify.engine.fit import Fitted
+from identify.engine.noise_level import whitened
+from identify.engine.problem import Problem
+from identify.errors import BadRequest
+from identify.experiments.designs import Design, designs
+from identify.grid import make_grid
+from identify.record import Record
+
+ENOUGH = 7.0
+"""Expected log evidence that decides: odds of a thousand to one."""
+PER_PULSE = 4
+"""Samples a pulse of the simulated test."""
+
+
+def next_experiment(record: Record, rivals: Sequence[str]) -> dict[str, Any]:
+    """The shortest safe test that separates rivals, found by simulating each as it was fitted on this record.
+
+    Parameters
+    ----------
+    record : Record
+        On which the rivals can't be told apart.
+    rivals : sequence of str
+        Ids of effects, two or more; one alone is set against no effect at all.
+
+    Returns
+    -------
+    dict
+        `segments` for the rig (`name`, `sequence`, `settings`), `duration_s`, `dose`, `expected_log_evidence` (of the
+        worst-separated pair), `decides`, `text`, `alternatives` (every design tried, best first).
+
+    Raises
+    ------
+    BadRequest
+        An unknown effect, or none.
+    """
+    names = list(dict.fromkeys(rivals))
+    if not names:
+        raise BadRequest("no rival was named", place="rivals", mend="Name two effects.")
+    for name in names:
+        get(name)
+    fits = {name: fit_candidate(record, [name]) for name in names}
+    if len(names) == 1:
+        fits["nothing"] = fit_candidate(record, [])
+    largest_us = float(record.pulse_width_us.max())
+    rows = [_row(design, record, fits) for design in designs(largest_us)]
+    enough = [row for row in rows if row["expected_log_evidence"] >= ENOUGH]
+    rows.sort(key=lambda row: -row["expected_log_evidence"] / row["duration_s"])
+    best = min(enough, key=lambda row: row["duration_s"]) if enough else rows[0]
+    return best | {
+        "rivals": names,
+        "decides": best["expected_log_evidence"] >= ENOUGH,
+        "text": _text(best, names),
+        "alternatives": [{key: row[key] for key in ("design", "duration_s", "expected_log_evidence")} for row in rows],
+    }
+
+
+def _text(best: dict[str, Any], names: list[str]) -> str:
+    those = " from ".join(get(name).name.lower() for name in names[:2])
+    lead = f"{best['words']} ({best['duration_s']:.0f} s) "
+    if best["expected_log_evidence"] >= ENOUGH:
+        return lead + f"should tell {those}: expected log evidence {best['expected_log_evidence']:.0f}."
+    return lead + f"is the best there is to tell {those}, but may not decide: {best['expected_log_evidence']:.1f}."
+
+
+def _row(design: Design, record: Record, fits: dict[str, Fitted]) -> dict[str, Any]:
+    width = design.pulse_widths(record.pulse_rate_hz)
+    simulated = _blank(record, width)
+    pairs = {}
+    for one, other in permutations(fits, 2):
+        pairs[f"{one} against {other}"] = separation(fits[one], fits[other], simulated)
+    first = next(iter(fits.values()))
+    table = first.physical[first.problem.coefficients] @ first.problem.setup.basis.design(width).T
+    return {
+        "design": design.name,
+        "words": design.words,
+        "segments": [{"name": s.name, "sequence": s.sequence, "settings": s.settings} for s in design.segments],
+        "duration_s": width.size / record.pulse_rate_hz,
+        "dose": {
+            "pulses": int(np.sum(width > 0)),
+            "pulse_width_sum_us": float(width.sum()),
+            "torque_time_nm_s": float(np.abs(table).sum() / record.pulse_rate_hz),
+        },
+        "expected_log_evidence": float(min(pairs.values())),
+        "pairs": pairs,
+    }
+
+
+def _blank(record: Record, width: np.ndarray) -> Record:
+    rate = PER_PULSE * record.pulse_rate_hz
+    held = np.repeat(width, PER_PULSE)
+    time_s = np.arange(held.size) / rate
+    angle = None if record.angle_rad is None else np.full(held.size, float(record.angle_rad[0]))
+    still = None if record.velocity_rad_s is None else np.zeros(held.size)
+    return Record.from_arrays(
+        time_s,
+        held,
+        np.zeros(held.size),
+        angle_rad=angle,
+        velocity_rad_s=still,
+        pulse_rate_hz=record.pulse_rate_hz,
+    )
+
+
+def separation(truth: Fitted, rival: Fitted, record: Record) -> float:
+    """Log evidence by which a rival is expected to lose on a new test, were the other one true.
+
+    The rival may adapt within what the old record left open: its parameters' covariance is the prior of the new fit.
+    """
+    true_mean = _simulate(truth, record, False)[0]
+    rival_mean, slopes = _simulate(rival, record, True)
+    assert slopes is not None
+    size = true_mean.size
+    stretch = (np.array([0], np.int64), np.array([size], np.int64))
+    white = whitened(np.vstack([true_mean - rival_mean, slopes]), stretch, truth.noise)
+    gap, slopes = white[0], white[1:]
+    hessian = rival.hessian
+    b = slopes @ gap
+    gain = b @ np.linalg.lstsq(hessian + slopes @ slopes.T, b, rcond=None)[0]
+    return max(0.5 * float(gap @ gap - gain), 0.0)
+
+
+def _simulate(fitted: Fitted, record: Record, derivatives: bool) -> tuple[np.ndarray, np.ndarray | None]:
+    """Interval means of a fitted candidate on another record; what can't be foreseen stays out."""
+    grid = make_grid(record)
+    setup = fitted.problem.setup.with_(grid=grid, target_nm=np.zeros(grid.size), fitted=np.ones(grid.size, bool))
+    kept = [(effect, form) for effect, form in fitted.effects if get(effect).foreseeable]
+    problem = Problem(setup, kept)
+    theta = np.zeros(problem.size)
+    take = [np.arange(problem.coefficients.stop)]
+    take += [np.arange(c.first, c.first + len(c.parameters)) for c in fitted.problem.chosen if get(c.effect).foreseeable]
+    place = np.concatenate(take)
+    theta[:] = fitted.theta[place]
+    mean, slopes = problem.run(theta, derivatives=derivatives)
+    if slopes is None:
+        return mean, None
+    full = np.zeros((fitted.theta.size, mean.size))
+    full[place] = slopes
+    return mean, full
+
+
+__all__ = ["Design", "designs", "next_experiment", "separation"]

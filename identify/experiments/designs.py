@@ -1,0 +1,143 @@
+"""Tests that the rig can play, as segments with settings; and their pulse widths, for simulation.
+
+`identify` knows no rig: these shapes follow the settings' meaning in `docs/sequences.md`, and a test holds both to each
+other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Segment:
+    """One sequence with its settings.
+
+    Parameters
+    ----------
+    name : str
+        Of the segment in the recording.
+    sequence : str
+        rest, prbs, ramp, multilevel, staircase or steps.
+    settings : dict
+        As the rig takes them.
+    """
+
+    name: str
+    sequence: str
+    settings: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Design:
+    """A test: segments in order.
+
+    Parameters
+    ----------
+    name : str
+        Short.
+    words : str
+        For people.
+    segments : tuple of Segment
+        In order.
+    """
+
+    name: str
+    words: str
+    segments: tuple[Segment, ...]
+
+    def pulse_widths(self, pulse_rate_hz: float) -> np.ndarray:
+        """One width a pulse, µs."""
+        return np.concatenate([SHAPES[s.sequence](s.settings, pulse_rate_hz) for s in self.segments])
+
+
+def _pulses(seconds: float, rate: float) -> int:
+    return round(seconds * rate)
+
+
+def _rest(s: dict[str, Any], rate: float) -> np.ndarray:
+    return np.zeros(_pulses(s["duration_s"], rate))
+
+
+def _ramp(s: dict[str, Any], rate: float) -> np.ndarray:
+    up, down = _pulses(s["up_s"], rate), _pulses(s["down_s"], rate)
+    shape = np.r_[np.arange(1, up + 1) / up, np.arange(down - 1, -1, -1) / down]
+    return shape * s["max_pulse_width_us"]
+
+
+def _steps(s: dict[str, Any], rate: float) -> np.ndarray:
+    on = np.full(_pulses(s["on_s"], rate), s["max_pulse_width_us"])
+    return np.tile(np.r_[on, np.zeros(_pulses(s["off_s"], rate))], s["repeats"])
+
+
+def _staircase(s: dict[str, Any], rate: float) -> np.ndarray:
+    up = np.arange(1, s["levels"] + 1) / s["levels"]
+    shape = np.r_[up, up[-2::-1], 0.0] if s.get("down", True) else up
+    return np.repeat(shape * s["max_pulse_width_us"], _pulses(s["hold_s"], rate))
+
+
+def _prbs(s: dict[str, Any], rate: float) -> np.ndarray:
+    del rate
+    taps = {5: (5, 3), 6: (6, 5), 7: (7, 6)}[s["bits"]]
+    state = (s["seed"] - 1) % (2 ** s["bits"] - 1) + 1
+    bits = []
+    for _ in range(s.get("chips") or 2 ** s["bits"] - 1):
+        bits.append(state >> (s["bits"] - 1) & 1)
+        feedback = 0
+        for tap in taps:
+            feedback ^= state >> (tap - 1) & 1
+        state = (state << 1 | feedback) & (2 ** s["bits"] - 1)
+    return np.repeat(np.array(bits, float) * s["max_pulse_width_us"], s["clock_pulses"])
+
+
+SHAPES = {"rest": _rest, "ramp": _ramp, "steps": _steps, "staircase": _staircase, "prbs": _prbs}
+
+
+def designs(largest_us: float) -> list[Design]:
+    """Designs up to a largest pulse width, µs; none goes above what was applied before."""
+    top = float(largest_us)
+
+    def rest(seconds: float, name: str = "rest") -> Segment:
+        return Segment(name, "rest", {"duration_s": seconds})
+
+    def ramp(seconds: float, name: str = "ramp") -> Segment:
+        return Segment(name, "ramp", {"max_pulse_width_us": top, "up_s": seconds, "down_s": seconds})
+
+    def steps(on: float, off: float, repeats: int, share: float = 1.0) -> Segment:
+        settings = {"max_pulse_width_us": round(share * top, 1), "on_s": on, "off_s": off, "repeats": repeats}
+        return Segment("steps", "steps", settings)
+
+    def prbs(share: float, chips: int = 40) -> Segment:
+        settings = {"max_pulse_width_us": round(share * top, 1), "bits": 7, "clock_pulses": 4, "chips": chips, "seed": 3}
+        return Segment("prbs", "prbs", settings)
+
+    stairs = Segment("staircase", "staircase", {"max_pulse_width_us": top, "levels": 6, "hold_s": 1.0, "down": True})
+    return [
+        Design("ramp", "One more ramp", (rest(2), ramp(5), rest(2))),
+        Design("fast ramp", "A fast ramp", (rest(2), ramp(1.5), rest(2))),
+        Design("repeated ramp", "Two ramps with a short rest between", (rest(2), ramp(4), rest(2), ramp(4), rest(2))),
+        Design("two speeds", "A fast ramp and a slow one", (rest(2), ramp(1.5), rest(2), ramp(6), rest(2))),
+        Design("ramps and rest", "A ramp, a long rest, a ramp", (rest(2), ramp(4), rest(15), ramp(4), rest(2))),
+        Design("steps", "Steps on and off", (rest(2), steps(1.0, 1.5, 4), rest(2))),
+        Design(
+            "steps at levels",
+            "Steps on and off at three levels",
+            (rest(2), steps(0.8, 1.2, 2, 0.45), steps(0.8, 1.2, 2, 0.7), steps(0.8, 1.2, 2), rest(2)),
+        ),
+        Design(
+            "prbs at levels",
+            "A short random sequence at each of three levels",
+            (rest(2), prbs(0.45), rest(1), prbs(0.7), rest(1), prbs(1.0), rest(2)),
+        ),
+        Design("staircase", "A staircase up and down", (rest(2), stairs, rest(2))),
+        Design("long step", "One long step and its tail", (rest(2), steps(6.0, 5.0, 1))),
+        Design(
+            "conditioning",
+            "A ramp, ten seconds of work, a ramp, a rest, a ramp",
+            (rest(2), ramp(3), steps(10.0, 1.0, 1), ramp(3), rest(15), ramp(3), rest(2)),
+        ),
+        Design("sham", "A sham test without stimulation", (rest(10, "sham"),)),
+    ]
