@@ -13,6 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
+from identify.dynamics import hermite
 from identify.errors import BadRecord
 from identify.record import Record
 
@@ -93,8 +94,34 @@ class Grid:
             Weights of (y, y') at boundaries first, first + 1, … relative to each interval: the mean of interval k is
             sum over b of weights[k, b, 0] * y[k + first + b] + weights[k, b, 1] * y'[k + first + b].
         """
-        if delay_s in self._weights:
-            return self._weights[delay_s]
+        if delay_s not in self._weights:
+            if len(self._weights) >= 4:  # a search asks for the same delay several times, then never again
+                self._weights.clear()
+            self._weights[delay_s] = self._even_weights(delay_s) if self._pattern.size else self._any_weights(delay_s)
+        return self._weights[delay_s]
+
+    @cached_property
+    def _pattern(self) -> np.ndarray:
+        """Places of the samples in every interval, where all intervals are sampled alike; else empty."""
+        each = int(self.count[0])
+        if not each or np.any(self.count != each):
+            return np.zeros(0)
+        places = self.fraction.reshape(-1, each)
+        return places[0] if np.max(np.abs(places - places[0])) < 1e-9 else np.zeros(0)
+
+    def _even_weights(self, delay_s: float) -> tuple[int, np.ndarray]:
+        """Weights where every interval has the same: one row, standing for all."""
+        shifted = self._pattern - delay_s / self.step_s
+        offset = np.floor(shifted).astype(np.int64)
+        cubic = hermite(shifted - offset, self.step_s)
+        first = int(offset.min())
+        row = np.zeros((int(offset.max()) - first + 2, 2))
+        np.add.at(row, offset - first, cubic[:, :2])
+        np.add.at(row, offset - first + 1, cubic[:, 2:])
+        return first, np.broadcast_to(row / self._pattern.size, (self.size, *row.shape))
+
+    def _any_weights(self, delay_s: float) -> tuple[int, np.ndarray]:
+        """Weights from running sums, whatever the samples' places."""
         shift = delay_s / self.step_s
         whole = int(np.floor(shift))
         part = shift - whole
@@ -108,17 +135,12 @@ class Grid:
         ):
             if np.any(stop > start):
                 groups.append((offset, _mean_hermite(self._powers[:, stop] - self._powers[:, start], lag, self.step_s)))
-        if not groups:
-            groups.append((-whole, np.zeros((self.size, 4))))
         first = groups[0][0]
         weights = np.zeros((self.size, groups[-1][0] - first + 2, 2))
         for offset, cubic in groups:
             weights[:, offset - first] += cubic[:, :2]
             weights[:, offset - first + 1] += cubic[:, 2:]
-        if len(self._weights) >= 4:  # a search asks for the same delay several times, then never again
-            self._weights.clear()
-        self._weights[delay_s] = first, weights / np.maximum(self.count, 1)[:, None, None]
-        return self._weights[delay_s]
+        return first, weights / np.maximum(self.count, 1)[:, None, None]
 
     @cached_property
     def _weights(self) -> dict[float, tuple[int, np.ndarray]]:
@@ -163,13 +185,17 @@ class Grid:
         y = _padded(torque_nm, before, after, hold=True)
         v = _padded(rate_nm_s, before, after, hold=False)
         size = self.size
-        result = np.zeros(
-            (size, *torque_nm.shape[1:]), order="F"
-        )  # as the states come: columns are filtered one by one
+        # As the states come, column by column; and in place, since fresh arrays of this size cost more than the sums.
+        result = np.zeros((size, *torque_nm.shape[1:]), order="F")
+        term = np.empty_like(result)
         lift = (slice(None),) + (None,) * (torque_nm.ndim - 1)
         for b in range(weights.shape[1]):
             rows = slice(before + first + b, before + first + b + size)
-            result += weights[:, b, 0][lift] * y[rows] + weights[:, b, 1][lift] * v[rows]
+            for state, weight in ((y, weights[:, b, 0]), (v, weights[:, b, 1])):
+                factor = weight[0] if weight.strides == (0,) else weight[lift]
+                if np.any(factor):
+                    np.multiply(state[rows], factor, out=term)
+                    result += term
         return result
 
 

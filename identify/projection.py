@@ -77,7 +77,7 @@ class Problem:
     def drive(self) -> np.ndarray:
         """Basis functions of each interval's width, shape (K, P)."""
         widths, place = np.unique(self.grid.pulse_width_us, return_inverse=True)
-        return self.basis.design(widths)[place]
+        return np.asfortranarray(self.basis.design(widths)[place])
 
     @cached_property
     def null(self) -> int:

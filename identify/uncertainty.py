@@ -17,7 +17,7 @@ from identify.record import Record
 from identify.recruitment.curve import Basis
 
 POINTWISE = 1.959964
-DRAWS = 300
+DRAWS = 256
 DYNAMICS = ("time_constant_s", "damping", "delay_s")
 
 

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 KNOTS = 31
 SMOOTH_KNOTS = 19
-"""Enough where a pilot's curve takes more than a third of the range to rise: less to compute, nothing lost."""
+"""Enough where a pilot's curve takes more than a quarter of the range to rise: less to compute, nothing lost."""
 PILOT_KNOTS = 9
 NARROWEST_US = 0.5
 STRAIGHTEST = 0.003
@@ -30,7 +30,7 @@ def knots_for(pilot_curve: tuple[np.ndarray, np.ndarray]) -> int:
     u, torque = pilot_curve
     level = np.abs(torque) / max(float(np.max(np.abs(torque))), 1e-300)
     rise = u[np.argmax(level >= 0.9)] - u[np.argmax(level >= 0.1)]
-    return SMOOTH_KNOTS if rise > u[-1] / 3 else KNOTS
+    return SMOOTH_KNOTS if rise > u[-1] / 4 else KNOTS
 
 
 def design_knots(grid: Grid, count: int = KNOTS) -> np.ndarray:
