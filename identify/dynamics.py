@@ -94,16 +94,22 @@ def boundary_states(
     torque = _forced(a, gamma[0], lead[0], drive_nm)
     if phi[0, 1] < 1e-3 * step_s:  # y' can't be had from y: a slow pulse rate, near a whole number of oscillations
         return torque, _forced(a, gamma[1], lead[1], drive_nm)
+    # In place: fresh arrays of this size cost more than the sums.
     rate = np.empty_like(torque)
-    rate[:-1] = (torque[1:] - phi[0, 0] * torque[:-1] - gamma[0] * drive_nm) / phi[0, 1]
+    inner = rate[:-1]
+    np.multiply(torque[:-1], -phi[0, 0], out=inner)
+    inner += torque[1:]
+    inner -= np.multiply(drive_nm, gamma[0], out=np.empty_like(inner))
+    inner /= phi[0, 1]
     rate[-1] = phi[1, 0] * torque[-2] + phi[1, 1] * rate[-2] + gamma[1] * drive_nm[-1]
     return torque, rate
 
 
 def _forced(a: np.ndarray, gain: float, lead: float, drive_nm: np.ndarray) -> np.ndarray:
-    right = np.zeros((drive_nm.shape[0] + 1, *drive_nm.shape[1:]), order="F")
-    right[1:] = gain * drive_nm
-    right[2:] += lead * drive_nm[:-1]
+    right = np.empty((drive_nm.shape[0] + 1, *drive_nm.shape[1:]), order="F")
+    right[:2] = 0.0
+    np.multiply(drive_nm[:-1], lead, out=right[2:])
+    right[1:] += np.multiply(drive_nm, gain, out=np.empty_like(right[1:]))
     return recursion(a, right)
 
 
