@@ -13,7 +13,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from rig import devices, limits
-from rig.acquire.run import Watch
+from rig.acquire.health import Watch
 from rig.devices import DeviceSettings, Kind
 from rig.errors import ConfigError, RefusedError
 from rig.limits import Limit
@@ -56,6 +56,7 @@ class WatchSettings(_Table):
     stale_torque_s: float = Field(0.1, gt=0, le=0.5)
     missing_ack_s: float = Field(0.1, gt=0, le=0.5)
     late_pulse_periods: float = Field(0.4, gt=0, le=0.6)
+    stale_disk_s: float = Field(3.0, gt=0.5, le=10)
 
     def watch(self) -> Watch:
         """As `rig.acquire` takes it."""

@@ -110,6 +110,18 @@ HARD_LIMITS: dict[str, Limit] = {
 
 
 @dataclass(frozen=True, slots=True)
+class Steps:
+    """What a stimulator can tell apart: pulses are rounded toward zero to it, shorter ones are no pulse."""
+
+    pulse_width_us: float = STEP_PULSE_WIDTH_US
+    current_ma: float = STEP_CURRENT_MA
+    shortest_us: float = STEP_PULSE_WIDTH_US
+
+
+FINEST = Steps()
+
+
+@dataclass(frozen=True, slots=True)
 class Refusal:
     """Why a pulse was not admitted: which limit, the value, the bound, whose bound it is."""
 
@@ -221,7 +233,7 @@ def for_plan(table: dict[str, Limit], request: TestPlan) -> dict[str, Limit]:
     return table
 
 
-def admit(pulse: Pulse, table: dict[str, Limit]) -> Admitted | Refusal:
+def admit(pulse: Pulse, table: dict[str, Limit], steps: Steps = FINEST) -> Admitted | Refusal:
     """Admit one pulse or say why not. Pure.
 
     Parameters
@@ -230,11 +242,13 @@ def admit(pulse: Pulse, table: dict[str, Limit]) -> Admitted | Refusal:
         Width of one phase (µs) and current (mA) as asked for.
     table
         `HARD_LIMITS`, narrowed by `tightened` and `for_profile`.
+    steps
+        The stimulator's.
 
     Returns
     -------
     Admitted
-        Width in whole µs, current in steps of 0.5 mA, both rounded toward zero.
+        Width (whole µs) and current in the stimulator's steps, both rounded toward zero.
     Refusal
         The first limit that the pulse breaks.
     """
@@ -246,7 +260,6 @@ def admit(pulse: Pulse, table: dict[str, Limit]) -> Admitted | Refusal:
         refusal = check(table[name], value)
         if refusal is not None:
             return refusal
-    return Admitted(
-        int(pulse.pulse_width_us / STEP_PULSE_WIDTH_US),
-        int(pulse.current_ma / STEP_CURRENT_MA) * STEP_CURRENT_MA,
-    )
+    width_us = int(int(pulse.pulse_width_us / steps.pulse_width_us) * steps.pulse_width_us)
+    current_ma = int(pulse.current_ma / steps.current_ma) * steps.current_ma
+    return Admitted(width_us if width_us >= steps.shortest_us else 0, current_ma)

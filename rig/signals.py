@@ -33,6 +33,10 @@ class Pulse:
         return self.pulse_width_us * self.current_ma * 1e-3
 
 
+class LateError(Exception):
+    """A pulse's time had passed right before it would have been written; nothing was."""
+
+
 @dataclass(frozen=True, slots=True)
 class Ack:
     """A stimulator's answer to one pulse. `error` is None when the pulse was delivered."""

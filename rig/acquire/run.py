@@ -19,6 +19,7 @@ import numpy as np
 
 from rig.acquire.evidence import AROUND_S, evidence, stop_device, watch_decay
 from rig.acquire.halt import Cause, Halt
+from rig.acquire.health import DEFAULT_WATCH, Disk, Health, Watch
 from rig.acquire.receiver import Receiver
 from rig.clock import Clock
 from rig.errors import DeviceError, JournalError
@@ -36,18 +37,6 @@ LEAD_S = 0.1
 SENDER_PRIORITY = 50
 FRESH_S = 0.5
 """Real seconds to wait for a fresh torque before arming."""
-SYNC_PERIOD_S = 1.0
-STALL_S = 0.25
-"""Real seconds of lateness that are no hiccup any more: a test with such a hole ends."""
-
-
-@dataclass(frozen=True, slots=True)
-class Watch:
-    """When silence counts as a fault, real seconds, and when a pulse is too late, as a share of the period."""
-
-    stale_torque_s: float = 0.1
-    missing_ack_s: float = 0.1
-    late_pulse_periods: float = 0.4
 
 
 @dataclass(slots=True)
@@ -93,7 +82,7 @@ class TestRun:
         receiver: Receiver,
         clock: Clock,
         halt: Halt,
-        watch: Watch = Watch(),
+        watch: Watch = DEFAULT_WATCH,
     ) -> None:
         self.test = test
         self.halt = halt
@@ -118,7 +107,8 @@ class TestRun:
         self._gate.reset()
         torque = self._table["torque_nm"]
         self._receiver.record(self._journal, (torque.lo, torque.hi), lambda reason: self._fault(reason))
-        syncing = _Syncing(self._journal)
+        disk = Disk(self._journal)
+        self._health = Health(self._gate, self._receiver, disk, self._clock, self._watch)
         try:
             if self._arm():
                 with _undisturbed():
@@ -131,7 +121,7 @@ class TestRun:
         found = self._stop()
         elapsed_s = max(time.monotonic() - wall_s, 1e-9)
         cpu_percent = 100 * (time.process_time() - cpu_s) / elapsed_s
-        syncing.end()
+        disk.end()
         return self._result(found, cpu_percent)
 
     @property
@@ -185,22 +175,13 @@ class TestRun:
                 self._rest_nm = self._receiver.torque_around(0.1 * clock.speed)  # at rest, if ever
             if clock.wait(due_s, self.halt.event):
                 return
-            self._look_after_health(clock.now_s(), due_s)
-            if self.halt.event.is_set():
+            wrong = self._health.wrong(due_s)
+            if wrong is not None:
+                self._fault(wrong)
                 return
+            self._gate.feed()
             self._gate.fire(index, Pulse(width_us, plan.profile.current_ma), due_s, due_s + late_s)
         clock.wait(t0_s + self.test.duration_s, self.halt.event)
-
-    def _look_after_health(self, now_s: float, due_s: float) -> None:
-        speed = self._clock.speed
-        if not (now_s - due_s <= STALL_S * speed):
-            self._fault(f"the computer stood still for {(now_s - due_s) / speed:.1f} s; what else runs on it?")
-        age_s = self._receiver.age_s(now_s)
-        if not (age_s <= self._watch.stale_torque_s * speed):
-            self._fault(f"load cell: torque is stale, the newest sample is {age_s / speed * 1e3:.0f} ms old")
-        oldest_s = self._gate.oldest_unacknowledged_s()
-        if oldest_s is not None and not (now_s - oldest_s <= self._watch.missing_ack_s * speed):
-            self._fault(f"stimulator: a pulse was not acknowledged within {self._watch.missing_ack_s * 1e3:.0f} ms")
 
     def _stop(self) -> StopEvidence:
         """Stop the device, ask its state, watch the torque fall, end the journal."""
@@ -262,24 +243,6 @@ class TestRun:
         if self._rest_nm is None or not (lo_nm <= hi_nm):
             return None
         return max(hi_nm - self._rest_nm, self._rest_nm - lo_nm)
-
-
-class _Syncing:
-    """Brings the journal to the disk once a second, outside the threads that must be on time."""
-
-    def __init__(self, journal: Journal) -> None:
-        self._journal = journal
-        self._done = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="journal-sync", daemon=True)
-        self._thread.start()
-
-    def _run(self) -> None:
-        while not self._done.wait(SYNC_PERIOD_S):
-            self._journal.sync()
-
-    def end(self) -> None:
-        self._done.set()
-        self._thread.join()
 
 
 @contextlib.contextmanager

@@ -16,7 +16,7 @@ from typing import Any, Literal, Protocol
 from pydantic import BaseModel, ConfigDict
 
 from rig.errors import ConfigError
-from rig.limits import Admitted
+from rig.limits import Admitted, Steps
 from rig.signals import Ack, TorqueBlock
 
 Kind = Literal["stimulator", "load_cell"]
@@ -33,6 +33,11 @@ class DeviceSettings(BaseModel):
 class Stimulator(Protocol):
     """Delivers single pulses. Only `rig.gate` may hold one."""
 
+    steps: Steps
+    """What it can tell apart; the gate rounds to it."""
+    silence_s: float
+    """Device seconds for which it may go on pulsing by itself after the host's last word; 0: a command a pulse."""
+
     def open(self) -> dict[str, Any]:
         """Open the line and ask who answers; returns identity for people (device, serial number, firmware, port).
 
@@ -48,8 +53,18 @@ class Stimulator(Protocol):
         """Make the device ready for pulses. Raises DeviceError."""
         ...
 
-    def send(self, pulse: Admitted) -> int:
-        """Hand one pulse to the line and return its number; does not wait for the ack. Raises DeviceError."""
+    def send(self, pulse: Admitted, latest_s: float) -> int:
+        """Hand one pulse to the line and return its number; does not wait for the ack.
+
+        Raises LateError where the clock has passed `latest_s` right before the write, and DeviceError.
+        """
+        ...
+
+    def feed(self) -> None:
+        """Health has just been proven: a device with a watchdog may be kept alive, by this call alone.
+
+        Called before each pulse and through rests while a test runs. Raises DeviceError.
+        """
         ...
 
     def stop(self) -> None:

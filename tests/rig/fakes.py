@@ -17,9 +17,9 @@ from rig.clock import VirtualClock
 from rig.errors import DeviceError
 from rig.gate import Gate
 from rig.journal import Journal, Kind
-from rig.limits import Admitted
+from rig.limits import Admitted, Steps
 from rig.messages import Profile, SegmentPlan, TestPlan
-from rig.signals import SAMPLE, Ack, TorqueBlock
+from rig.signals import SAMPLE, Ack, LateError, TorqueBlock
 
 RATE_HZ = 1600.0
 
@@ -27,9 +27,13 @@ RATE_HZ = 1600.0
 class FakeStimulator:
     """Acknowledges each pulse `ack_delay_s` later; its faults are plain attributes."""
 
+    steps = Steps()
+    silence_s = 0.0
+
     def __init__(self, clock: VirtualClock) -> None:
         self.clock = clock
         self.sent: list[tuple[float, Admitted]] = []
+        self.fed_s: list[float] = []
         self.armed = False
         self.stops = 0
         self.ack_delay_s: float | None = 0.001
@@ -49,7 +53,12 @@ class FakeStimulator:
         self._answer()
         self.armed = True
 
-    def send(self, pulse: Admitted) -> int:
+    def feed(self) -> None:
+        self.fed_s.append(self.clock.now_s())
+
+    def send(self, pulse: Admitted, latest_s: float) -> int:
+        if not (self.clock.now_s() <= latest_s):
+            raise LateError
         if self.send_error:
             raise DeviceError(self.send_error)
         assert self.armed

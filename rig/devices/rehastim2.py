@@ -1,0 +1,171 @@
+"""Hasomed RehaStim 2 in ScienceMode 2, single pulses: one command a pulse, so silence is no stimulation.
+
+The channel list, which the device goes on playing by itself for up to 1200 ms after the host's last word, is never
+used. The device's own watchdog still counts: after 1200 ms without a command it drops the connection and offers a new
+one. It is kept alive by `feed` alone, which the rig calls only upon proof of health: there is no keep-alive thread.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import serial
+from pydantic import Field
+
+from rig.clock import Clock
+from rig.devices import DeviceSettings
+from rig.devices._line import PacketLine
+from rig.errors import DeviceError
+from rig.limits import Admitted, Steps
+from rig.signals import Ack
+from rig.wire import sciencemode2 as wire
+from rig.wire.sciencemode2 import Command
+from rig.wire.sciencemode4 import Packet
+
+KIND = "stimulator"
+
+BAUD_RATE = 460_800
+FEED_S = 0.3
+"""Rig seconds after the last command at which a keep-alive goes out, a quarter of the device's watchdog."""
+OFFER_S = 1.5
+"""Real seconds to wait for the device to offer a connection; it does so every 500 ms."""
+START_MODE = 0
+
+
+class Settings(DeviceSettings):
+    port: str = Field(description="serial port, e.g. /dev/serial/by-id/usb-FTDI_RehaStim2-if00-port0")
+    channel: int = Field(1, ge=1, le=8, description="1 to 4 on side A, 5 to 8 on side B")
+    reply_timeout_s: float = Field(0.3, gt=0, le=5, description="for commands other than pulses, real seconds")
+
+
+class RehaStim2:
+    """Driver of one RehaStim 2 on one serial port; see `rig.devices.Stimulator` for what the methods promise."""
+
+    steps = Steps(pulse_width_us=1.0, current_ma=2.0, shortest_us=20.0)
+    silence_s = 0.0
+
+    def __init__(self, settings: Settings, clock: Clock) -> None:
+        self._settings = settings
+        self._clock = clock
+        self._line = PacketLine(
+            settings.port,
+            clock,
+            wire.NUMBERS,
+            wire.FrameReader,
+            self._take,
+            baudrate=BAUD_RATE,
+            parity=serial.PARITY_EVEN,
+        )
+        self._armed = False
+        self._offers = threading.Condition()
+        self._offer: Packet | None = None
+        self._on_ack: Callable[[Ack], None] = lambda _: None
+
+    def listen(self, on_ack: Callable[[Ack], None], on_lost: Callable[[str], None]) -> None:
+        self._on_ack = on_ack
+        self._line.on_lost(on_lost)
+
+    def open(self) -> dict[str, Any]:
+        self._offer = None
+        self._line.open()
+        try:
+            _, state = self.state()
+        except DeviceError:
+            self.close()
+            raise
+        return {
+            "device": "rehastim2",
+            "id": "",
+            "firmware": f"ScienceMode 2, protocol {wire.VERSION}",
+            "port": self._settings.port,
+            "channel": self._settings.channel,
+            "state": state,
+        }
+
+    def arm(self) -> None:
+        self.stop()  # back to the start mode, whatever was
+        safe, state = self.state()
+        if not safe:
+            raise DeviceError(f"stimulator {self._settings.port}: cannot be armed, it is in {state}")
+        self._armed = True
+
+    def send(self, pulse: Admitted, latest_s: float) -> int:
+        channel = self._settings.channel - 1
+        return self._line.tell(
+            lambda number: wire.single_pulse(number, channel, pulse.pulse_width_us, pulse.current_ma), latest_s
+        )
+
+    def feed(self) -> None:
+        if self._armed and self._clock.now_s() - self._line.last_written_s >= FEED_S:
+            self._line.tell(lambda number: wire.encode(Packet(number, Command.WATCHDOG)))
+
+    def stop(self) -> None:
+        self._armed = False
+        result = wire.result_of(self._ask(Command.STOP).data)
+        if result != 0:
+            raise DeviceError(f"stimulator {self._settings.port}: stop: {wire.result_text(result)}")
+
+    def state(self) -> tuple[bool, str]:
+        data = self._ask(Command.GET_MODE).data
+        result = wire.result_of(data)
+        if result != 0 or len(data) < 2:
+            raise DeviceError(f"stimulator {self._settings.port} answered its mode with {wire.result_text(result)}")
+        return data[1] == START_MODE, wire.MODES.get(data[1], f"mode {data[1]}")
+
+    def close(self) -> None:
+        self._armed = False
+        self._line.close()
+
+    def _ask(self, command: Command) -> Packet:
+        """Ask; where the device has dropped the connection meanwhile, take its next offer and ask once more."""
+        try:
+            return self._ask_once(command)
+        except DeviceError:
+            if not self._take_offer():
+                raise
+        return self._ask_once(command)
+
+    def _ask_once(self, command: Command) -> Packet:
+        name = command.name.lower().replace("_", " ")
+        timeout_s = self._settings.reply_timeout_s
+        return self._line.ask(lambda number: wire.encode(Packet(number, command)), name, command + 1, timeout_s)
+
+    def _take_offer(self) -> bool:
+        """Accept a connection that the device offers; False where it offers none."""
+        with self._offers:
+            if not self._offers.wait_for(lambda: self._offer is not None, OFFER_S):
+                return False
+            offer, self._offer = self._offer, None
+        assert offer is not None
+        accepted = offer.data[:1] == bytes((wire.VERSION,))
+        result = 0 if accepted else -5
+        self._line.tell(lambda _: wire.encode(Packet(offer.number, Command.INIT_ACK, bytes((result & 0xFF,)))))
+        if not accepted:
+            raise DeviceError(f"stimulator {self._settings.port}: speaks protocol {offer.data.hex()}, this driver 1")
+        return True
+
+    def _take(self, packet: Packet, time_s: float) -> None:
+        if packet.command == Command.SINGLE_PULSE + 1:
+            result = wire.result_of(packet.data)
+            self._on_ack(Ack(packet.number, time_s, wire.result_text(result) if result else None))
+        elif packet.command == Command.STIMULATION_ERROR:
+            error = wire.result_of(packet.data)
+            self._on_ack(Ack(-1, time_s, wire.ERRORS.get(error, f"stimulation error {error}")))
+        elif packet.command == Command.UNKNOWN:
+            self._on_ack(Ack(packet.number, time_s, "unknown command"))
+        elif packet.command == Command.INIT:
+            self._offered(packet, time_s)
+
+    def _offered(self, packet: Packet, time_s: float) -> None:
+        with self._offers:
+            self._offer = packet
+            self._offers.notify_all()
+        if self._armed:
+            self._on_ack(Ack(-1, time_s, "it started anew in a test (reset, power, or its watchdog)"))
+
+
+def create(settings: Settings, clock: Clock) -> RehaStim2:
+    """The device, not yet opened."""
+    return RehaStim2(settings, clock)
