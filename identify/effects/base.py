@@ -144,6 +144,9 @@ class Form:
     propose : callable or None
         `propose(residual_nm, scene, previous)` gives starting values found in the data: a list of dicts, none where
         there is nothing to start from. `previous` holds the parameters of the form before in a chain.
+    restarts : tuple of dict
+        Further starts that also set the base's T and ζ (`base.time_constant_s`, `base.damping`): where the base has
+        bent its own dynamics to imitate the effect.
     grows : bool
         The form is the next in a chain: it is tried only while the form before it gained.
     source : str
@@ -160,6 +163,7 @@ class Form:
     log_law: tuple[str, ...] = ()
     propose: Callable[[np.ndarray, Scene, dict[str, float]], list[dict[str, float]]] | None = None
     grows: bool = False
+    restarts: tuple[dict[str, float], ...] = ()
     source: str = ""
 
     def neutral(self) -> dict[str, float]:
@@ -170,7 +174,8 @@ class Form:
         """Starting values, one dict a run."""
         on = [p.on(scene) for p in self.parameters]
         runs = max((len(p.start) for p in on), default=1)
-        return [{p.name: p.start[min(i, len(p.start) - 1)] for p in on} for i in range(runs)]
+        listed = [{p.name: p.start[min(i, len(p.start) - 1)] for p in on} for i in range(runs)]
+        return listed + [dict(start) for start in self.restarts]
 
     def call(self, x: Any, p: dict[str, np.ndarray], scene: Scene) -> Any:
         """`apply` for rows of parameters: x of shape (M, K) (or a tuple of such, or None), p of shape (M, 1)."""

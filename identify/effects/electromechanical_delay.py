@@ -21,6 +21,25 @@ def _lag(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
     return activate(np.ascontiguousarray(drive), tau, tau, scene.step_s)
 
 
+def _chain(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+    tau = p["lag_s"][:, 0] / 3.0
+    for _ in range(3):
+        drive = activate(np.ascontiguousarray(drive), tau, tau, scene.step_s)
+    return drive
+
+
+def _spread(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+    """A delay, in whole and broken pulse intervals, then a lag: fibres with delays of their own."""
+    steps = p["delay_s"] / scene.step_s
+    late = drive
+    for _ in range(6):
+        part = np.clip(steps, 0.0, 1.0)
+        late = late - part * (late - np.concatenate([np.zeros_like(late[:, :1]), late[:, :-1]], axis=1))
+        steps = steps - part
+    tau = p["lag_s"][:, 0]
+    return activate(np.ascontiguousarray(late), tau, tau, scene.step_s)
+
+
 EFFECT = Effect(
     id="electromechanical_delay",
     name="Electromechanical delay",
@@ -32,6 +51,25 @@ EFFECT = Effect(
             "a' = (w - a)/lag: a spread-out delay, one more pole",
             (Parameter("lag_s", "s", 0.0, 0.12, 0.0, (0.03,), about="mean of the spread-out delay"),),
             _lag,
+            True,
+        ),
+        Form(
+            "chain",
+            "gain",
+            "three equal lags, lag in all",
+            (Parameter("lag_s", "s", 0.0, 0.2, 0.0, (0.06,), about="mean of the delay"),),
+            _chain,
+            True,
+        ),
+        Form(
+            "spread",
+            "gain",
+            "a' = (w(t - delay) - a)/lag: fibres with delays of their own",
+            (
+                Parameter("delay_s", "s", 0.0, 0.13, 0.0, (0.03,), about="least delay"),
+                Parameter("lag_s", "s", 0.0, 0.12, 0.0, (0.02,), about="spread of the delays"),
+            ),
+            _spread,
             True,
         ),
     ),

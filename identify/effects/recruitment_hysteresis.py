@@ -40,6 +40,20 @@ def _gain(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
     return drive * (1.0 - p["share"] * dahl(np.ascontiguousarray(width), p["reach_us"][:, 0]))
 
 
+_LEVELS = (0.1, 0.25, 0.4, 0.55, 0.7, 0.85)
+
+
+def _difference(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+    """Two curves whose difference is free at six levels of torque: units that join and leave each at its own width."""
+    width = np.broadcast_to(scene.pulse_width_us, drive.shape)
+    z = dahl(np.ascontiguousarray(width), p["reach_us"][:, 0])
+    level = drive / scene.scale_nm
+    gap = np.zeros_like(drive)
+    for i, centre in enumerate(_LEVELS):
+        gap = gap + p[f"gap_{i}_nm"] * np.maximum(1.0 - np.abs(level - centre) / 0.15, 0.0)
+    return drive - z * gap
+
+
 _HALF = Parameter("half_width_us", "µs", 0.0, 45.0, 0.0, (8.0, 20.0), about="half the distance of the two curves")
 _REACH = Parameter("reach_us", "µs", 1.0, 80.0, 10.0, (4.0, 25.0), "log", about="change of width that turns it over")
 
@@ -95,6 +109,21 @@ EFFECT = Effect(
                 _REACH,
             ),
             _two_curves,
+            True,
+            source="Durfee, MacLean 1989: a curve for each direction",
+        ),
+        Form(
+            "difference",
+            "gain",
+            "w = f(u) - z·gap(f), gap linear between six levels of torque; dz = (du - z|du|)/reach",
+            (
+                *(
+                    Parameter(f"gap_{i}_nm", "N·m", -0.2, 0.2, 0.0, (0.02,), "linear", "torque", f"at {level:.0%}")
+                    for i, level in enumerate(_LEVELS)
+                ),
+                _REACH,
+            ),
+            _difference,
             True,
             source="Durfee, MacLean 1989: a curve for each direction",
         ),

@@ -9,6 +9,10 @@ import numpy as np
 from identify.effects.base import Effect, Form, Parameter, Scene
 from identify.effects.kernels import exponential, follow, follow_stiffening
 
+_RESTARTS = tuple(
+    {"resonance_hz": hz, "damping": 0.15, "share": 0.4, "base.time_constant_s": t, "base.damping": 1.0}
+    for hz, t in ((1.6, 0.1), (3.0, 0.15))
+)
 _RESONANCE = (
     Parameter("resonance_hz", "Hz", 1.2, 16.0, np.inf, (3.0, 6.0, 10.0), "log", about="of the series spring"),
     Parameter("damping", "1", 0.02, 0.7, 0.2, (0.15,), "log", about="of the resonance, 1 is critical"),
@@ -60,7 +64,7 @@ EFFECT = Effect(
     id="series_compliance",
     name="Compliance in series",
     forms=(
-        Form("series", "filter", "z'' + 2 ζ ω z' + ω² z = ω² y", _RESONANCE, _series, True),
+        Form("series", "filter", "z'' + 2 ζ ω z' + ω² z = ω² y", _RESONANCE, _series, True, restarts=_RESTARTS),
         Form(
             "partly",
             "filter",
@@ -68,6 +72,7 @@ EFFECT = Effect(
             (*_RESONANCE, Parameter("share", "1", 0.0, 1.0, 0.0, (0.5,), about="share of torque through the spring")),
             _partly,
             True,
+            restarts=_RESTARTS,
         ),
         Form(
             "stiffening",

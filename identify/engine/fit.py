@@ -225,7 +225,13 @@ def start_from(problem: Problem, base: Fitted, values: dict[int, dict[str, float
         known = values.get(index) or old.get(chosen.effect) or {}
         for place, p in zip(chosen.places, chosen.parameters, strict=True):
             physical[place] = np.clip(known.get(p.name, p.start[0]), p.lower, p.upper)
-    return problem.from_physical(physical)
+    for known in values.values():
+        physical[0] = known.get("base.time_constant_s", physical[0])
+        physical[1] = known.get("base.damping", physical[1])
+    theta = problem.from_physical(physical)
+    if any("base.time_constant_s" in known for known in values.values()):
+        return linear_start(problem, theta, base.noise)
+    return theta
 
 
 def base_fit(setup: Setup, noise: NoiseLevel | None = None, starts: tuple[float, ...] = (0.06, 0.2, 0.5)) -> Fitted:
