@@ -6,6 +6,7 @@ python -m bench goals
 from __future__ import annotations
 
 import csv
+import os
 import subprocess
 import sys
 import tempfile
@@ -234,7 +235,8 @@ def calibration() -> list[str]:
 
 def speed() -> list[str]:
     """Time of a fit, warm, one core; and of the command as a whole."""
-    lines = ["## Time (one core, uncertainty included)", ""]
+    load = f", load average {os.getloadavg()[0]:.1f} meanwhile" if hasattr(os, "getloadavg") else ""
+    lines = [f"## Time (one core, uncertainty included{load})", ""]
     for rate in (40.0, 1600.0):
         record, _ = simulate(0.05, 1, rate)
         times = []
