@@ -21,7 +21,6 @@ from identify.noise import noise_evidence
 from identify.projection import Solution, begins_at_rest, designed, pilot_solution, search
 from identify.recruitment.knots import KNOTS
 
-
 ROUNDING = 2e-5
 """Share of the torque's range below which a residual is not noise."""
 
