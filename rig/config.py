@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -110,6 +111,18 @@ def load(path: Path, **overrides: Any) -> RigConfig:
     return check(content, str(path), **overrides)
 
 
+def _packed(dbc: str, samples: int, counter: str) -> dict[str, Any]:
+    return {"dbc": dbc, "signal": [f"Torque{i + 1}_Nm" for i in range(samples)], "counter": counter, "sync": ""}
+
+
+EMULATED_CELLS: dict[str, Callable[[int], dict[str, Any]]] = {
+    "plain": lambda samples: _packed("torque_packed3", samples, "Counter") if samples > 1 else {},
+    "counts": lambda samples: _packed("counts_be16", samples, ""),
+    "canopen": lambda _: {"start_frames": ["000#0101"], "stop_frames": ["000#0201"]},
+}
+"""How a rig file describes the emulator's cells, by their names and samples a frame."""
+
+
 def for_emulator(ready: str, **overrides: Any) -> RigConfig:
     """A rig on the emulator's devices, from the JSON line that it prints (or a file holding that line).
 
@@ -123,6 +136,7 @@ def for_emulator(ready: str, **overrides: Any) -> RigConfig:
         line = json.loads(text)
         # the link, like udev's names by id, outlives a replugging
         stimulator, can = line.get("stimulator_link", line["stimulator"]), line["can"]
+        cell = EMULATED_CELLS[line.get("cell", "plain")](int(line.get("samples_per_frame", 1)))
     except OSError as error:
         raise ConfigError(f"--emulator-json {ready}: {error.strerror}") from None
     except (ValueError, KeyError, TypeError) as error:
@@ -130,12 +144,13 @@ def for_emulator(ready: str, **overrides: Any) -> RigConfig:
     content: dict[str, Any] = {
         "clock_speed": line.get("speed", 1.0),
         "require_calibration": False,  # nobody sits at an emulator
-        "stimulator": {"device": "p24", "port": stimulator},
+        "stimulator": {"device": line.get("stimulator_device", "p24"), "port": stimulator},
         "load_cell": {
             "device": "can_load_cell",
             "bus": can,
             "sample_rate_hz": line.get("sample_rate_hz", 1600.0),
             "sync": "Sync" if line.get("sync", True) else "",
+            **cell,
         },
     }
     return check(content, "--emulator-json", **overrides)

@@ -159,11 +159,12 @@ class CanLoadCell:
 
     def _append(self, rows: list[tuple[float, float, float, int, int]], message: can.Message) -> None:
         host_time_s = self._clock.now_s()
-        stamp_s = message.timestamp if self._stamped else math.nan
+        last_s = message.timestamp if self._stamped else math.nan
         frame = self._frame.decode(bytes(message.data))
         n = len(frame.values)
         for i, value in enumerate(frame.values):
             counter = frame.counter * n + i if frame.counter >= 0 else -1
+            stamp_s = last_s - (n - 1 - i) / self.sample_rate_hz  # a frame is sent with its last sample
             rows.append((host_time_s, stamp_s, value * self._settings.scale_nm, counter, frame.sync))
 
     def _bus_arguments(self) -> dict[str, Any]:

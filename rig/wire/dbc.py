@@ -123,12 +123,13 @@ class TorqueFrame:
         try:
             values = cast(
                 "dict[str, float]",
-                self.message.decode(data, decode_choices=False, scaling=True, allow_truncated=False),
+                # a shorter frame may carry fewer samples; what this rig needs must be there all the same
+                self.message.decode(data, decode_choices=False, scaling=True, allow_truncated=True),
+            )
+            return FrameSamples(
+                tuple(float(values[s]) for s in self._signals),
+                int(values[self._counter]) if self._counter else -1,
+                int(values[self._sync]) if self._sync else 255,
             )
         except Exception as error:
             raise WireError(f"frame {data.hex(' ')} does not fit {self.message.name}: {error}") from None
-        return FrameSamples(
-            tuple(float(values[s]) for s in self._signals),
-            int(values[self._counter]) if self._counter else -1,
-            int(values[self._sync]) if self._sync else 255,
-        )

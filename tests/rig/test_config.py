@@ -114,3 +114,29 @@ def test_the_emulators_line(tmp_path: Path):
     for wrong in ("{}", "[1]", str(tmp_path / "none")):
         with pytest.raises(ConfigError, match="--emulator-json"):
             config.for_emulator(wrong, **where)
+
+
+CELLS = {
+    ("plain", 1): ("torque_default", ["Torque_Nm"], "Counter", "Sync"),
+    ("plain", 3): ("torque_packed3", ["Torque1_Nm", "Torque2_Nm", "Torque3_Nm"], "Counter", ""),
+    ("counts", 1): ("counts_be16", ["Torque1_Nm"], "", ""),
+    ("counts", 4): ("counts_be16", [f"Torque{i}_Nm" for i in (1, 2, 3, 4)], "", ""),
+    ("canopen", 1): ("torque_default", ["Torque_Nm"], "Counter", "Sync"),
+}
+
+
+@pytest.mark.parametrize("cell", CELLS)
+@pytest.mark.parametrize("stimulator", ["p24", "rehastim2"])
+def test_every_emulated_device_has_its_description(tmp_path: Path, stimulator: str, cell: tuple[str, int]):
+    line = {
+        "stimulator": "/dev/pts/3", "stimulator_device": stimulator, "can": {"interface": "slcan", "channel": "x"},
+        "cell": cell[0], "samples_per_frame": cell[1],
+    }  # fmt: skip
+    loaded = config.for_emulator(json.dumps(line), data_dir=tmp_path, socket=tmp_path / "s")
+    assert loaded.stimulator.device == stimulator
+    found = loaded.load_cell.model_dump()
+    signals = found["signal"] if isinstance(found["signal"], list) else [found["signal"]]
+    assert (found["dbc"], signals, found["counter"], found["sync"]) == CELLS[cell]
+    assert bool(found["start_frames"]) == (cell[0] == "canopen")
+    device = find("load_cell", "can_load_cell").create(loaded.load_cell, None)
+    assert (device.counter_modulus > 0) == (cell[0] != "counts")

@@ -56,3 +56,22 @@ def test_a_file_that_is_no_dbc(tmp_path: Path):
         TorqueFrame(str(path), None, ["a"], None, None)
     with pytest.raises(ConfigError, match="no file"):
         TorqueFrame("nothing", None, ["a"], None, None)
+
+
+def test_counts_like_those_of_a_gsv_4():
+    for n in (1, 2, 4):
+        frame = TorqueFrame("counts_be16", None, [f"Torque{i + 1}_Nm" for i in range(n)], None, None)
+        assert (frame.frame_id, frame.samples_per_frame, frame.counter_modulus) == (610, n, 0)
+        data = b"".join(counts.to_bytes(2, "big") for counts in (32768, 65535, 1, 32768 + 655)[:n])
+        found = frame.decode(data)
+        assert found.values == pytest.approx((0.0, 50.0, -50.0, 655 * 50 / 32767)[:n], abs=1e-6)
+        assert (found.counter, found.sync) == (-1, 255)
+        with pytest.raises(WireError):
+            frame.decode(data[:-1])
+
+
+def test_three_samples_a_frame_with_a_counter_of_frames():
+    frame = TorqueFrame("torque_packed3", None, ["Torque1_Nm", "Torque2_Nm", "Torque3_Nm"], "Counter", None)
+    found = frame.decode(struct.pack("<hhhH", 500, -250, 1, 40_000))
+    assert found.values == pytest.approx((1.0, -0.5, 0.002))
+    assert (found.counter, frame.counter_modulus) == (40_000, 65536)

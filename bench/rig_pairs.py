@@ -1,0 +1,42 @@
+"""The behaviour suite on every pair: 2 stimulators x 5 cells x 2 transports, through the emulator.
+
+python -m bench.rig_pairs [--speed N]
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import sys
+import tempfile
+from pathlib import Path
+
+from tests.wire.behaviour import CELLS, STIMULATORS, TRANSPORTS, check_all, options
+from tests.wire.processes import Bench
+
+
+def main() -> None:
+    """Run and print one line for each pair; exit 1 if one fails."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--speed", type=float, default=2.0)
+    speed = parser.parse_args().speed
+    failed = 0
+    print("| stimulator | cell | transport | alignment ms | stop ms | unheard ms | host killed ms |")
+    print("|---|---|---|---|---|---|---|")
+    for pair in itertools.product(STIMULATORS, CELLS, TRANSPORTS):
+        with tempfile.TemporaryDirectory(prefix="rig-pairs-") as folder:
+            bench = Bench(Path(folder), *options(*pair), speed=speed)
+            try:
+                found = check_all(bench)
+                cells = [f"{found[k]:.2f}" for k in ("align_ms", "stop_ms", "fault_ms", "silence_ms")]
+            except (AssertionError, TimeoutError, RuntimeError) as error:
+                failed += 1
+                cells = ["FAILED: " + " ".join(str(error).split())[:200]]
+            finally:
+                bench.close()
+        print("| " + " | ".join([*pair, *cells]) + " |", flush=True)
+    sys.exit(1 if failed else 0)
+
+
+if __name__ == "__main__":
+    main()

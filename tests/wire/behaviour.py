@@ -1,0 +1,133 @@
+"""What every pair of devices must do, whatever its protocol: one suite for tests (some pairs) and bench (all)."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from rig import archive
+from tests.wire.processes import Bench, RigClient, control, kill_hard, short_plan
+
+STIMULATORS = ("p24", "rehastim2")
+CELLS = {
+    "plain": ("--cell", "plain"),
+    "plain x3": ("--cell", "plain", "--samples-per-frame", "3"),
+    "counts": ("--cell", "counts"),
+    "counts x4": ("--cell", "counts", "--samples-per-frame", "4"),
+    "canopen": ("--cell", "canopen"),
+}
+TRANSPORTS = ("socketcand", "slcan")
+HOLD = [
+    {"name": "rest", "sequence": "rest", "settings": {"duration_s": 0.5}},
+    {"name": "hold", "sequence": "steps", "settings": {"on_s": 8.0, "off_s": 0.0, "repeats": 1}},
+]
+
+
+def options(stimulator: str, cell: str, transport: str) -> list[str]:
+    """Of the emulator."""
+    return ["--stimulator", stimulator, "--load-cell", transport, *CELLS[cell], "--noise-seed", "7"]
+
+
+def felt(bench: Bench) -> list[dict[str, Any]]:
+    """Every pulse that the emulated electrodes felt."""
+    return control(bench.emulator.ready["control"], {"cmd": "pulses", "since": 0})["pulses"]
+
+
+def check_all(bench: Bench) -> dict[str, float]:
+    """The whole suite on one pair; a few figures."""
+    client = bench.start_rig()
+    client.ask("subscribe")
+    figures = plays_and_records(bench, client)
+    figures["stop_ms"] = stops_when_asked(bench, client)
+    figures["fault_ms"] = stops_when_unheard(bench, client)
+    figures["silence_ms"] = says_nothing_when_killed(bench, client)
+    return figures
+
+
+def plays_and_records(bench: Bench, client: RigClient) -> dict[str, float]:
+    """A test ends well, and the file holds what the electrodes felt and the muscle gave."""
+    reply = client.ask("start", plan=short_plan("plays"))
+    assert reply["ok"], reply
+    event = client.wait_finished("plays")
+    assert event["outcome"] == "completed", event
+    with h5py.File(event["recording_path"]) as file:
+        assert archive.verify(Path(event["recording_path"])) == file.attrs["content_sha256"]
+        status, sent = file["pulses/status"][:], file["pulses/sent_pulse_width_us"][:]
+        torque_nm, time_s = file["torque/torque_nm"][:], file["torque/time_s"][:]
+    fired = felt(bench)
+    assert [p["width_us"] for p in fired] == sent[status == 0].tolist()
+    assert {p["current_ma"] for p in fired} == {20.0}
+    assert all(p["balanced"] for p in fired)
+    assert set(np.unique(status)) <= {0, 1, 2}  # a dropped one is the machine's, not the pair's
+    assert len(time_s) > 0.95 * 1600 * event["summary"]["duration_s"]
+    assert np.all(np.diff(time_s) > 0)
+    assert event["summary"]["lost_samples"] == 0
+    assert np.max(torque_nm) > 1.0
+    assert abs(np.median(torque_nm[time_s < 0.4])) < 0.2
+    error_ms = event["summary"]["alignment"]["error_ms"]
+    assert error_ms is not None
+    assert error_ms < 1.0
+    return {"align_ms": error_ms, "dropped": float(np.sum(status == 2))}
+
+
+def holding(bench: Bench, client: RigClient, name: str) -> None:
+    """A test that stimulates steadily."""
+    before = len(felt(bench))
+    reply = client.ask("start", plan=short_plan(name, segments=HOLD))
+    assert reply["ok"], reply
+    end_s = time.monotonic() + 15
+    while len(felt(bench)) < before + 20:
+        assert time.monotonic() < end_s, client.status()
+        time.sleep(0.02)
+
+
+def stops_when_asked(bench: Bench, client: RigClient) -> float:
+    """Confirmed by device and torque, latched, re-armed; milliseconds from request to last pulse."""
+    holding(bench, client, "asked")
+    asked_s = time.monotonic()
+    evidence = client.ask("stop", reason="enough", by="nurse")["body"]
+    assert evidence["confirmed"], evidence
+    assert client.wait_finished("asked")["outcome"] == "stopped"
+    assert client.wait_state("latched")["reason"] == "enough (by nurse)"
+    assert client.ask("rearm", by="nurse")["ok"]
+    return 1e3 * (felt(bench)[-1]["monotonic_s"] - asked_s)
+
+
+def stops_when_unheard(bench: Bench, client: RigClient) -> float:
+    """No acks: stopped, told, kept; milliseconds from the fault to the last pulse."""
+    holding(bench, client, "unheard")
+    injected = bench.fault(cmd="fault", name="no_ack", on=True)
+    event = client.wait_finished("unheard")
+    assert event["outcome"] == "fault"
+    assert "not acknowledged" in event["reason"]
+    last_ms = 1e3 * (felt(bench)[-1]["monotonic_s"] - injected["monotonic_s"])
+    assert last_ms < 250
+    bench.fault(cmd="fault", name="no_ack", on=False)
+    client.wait_state("latched")
+    time.sleep(0.1)
+    rearmed = client.ask("rearm", by="nurse")
+    assert rearmed["ok"], rearmed
+    return last_ms
+
+
+def says_nothing_when_killed(bench: Bench, client: RigClient) -> float:
+    """The host's death ends stimulation at once: each pulse was a command. Then uncertain, asked, not resumed."""
+    holding(bench, client, "killed")
+    assert bench.rig is not None
+    died_s = time.monotonic()
+    kill_hard(bench.rig)
+    time.sleep(1.5 / bench.speed)  # longer than any device's own watchdog
+    after = felt(bench)
+    assert after[-1]["monotonic_s"] - died_s < 0.03
+    again = bench.start_rig()
+    assert again.status()["state"] == "uncertain"
+    again.ask("subscribe")
+    assert len(felt(bench)) == len(after)
+    assert again.ask("rearm", by="nurse")["ok"]
+    assert again.ask("start", plan=short_plan("next"))["ok"]
+    assert again.wait_finished("next")["outcome"] == "completed"
+    return 1e3 * (after[-1]["monotonic_s"] - died_s)
