@@ -17,7 +17,7 @@ from identify.engine.prepare import Raw, inspect, prepare
 from identify.engine.problem import Problem
 from identify.record import Record
 
-FIRST_MARGIN = 6.0
+FIRST_MARGIN = 4.5
 """Log evidence that the first effect must gain."""
 NEXT_MARGIN = 10.0
 """Log evidence that a further effect must gain."""

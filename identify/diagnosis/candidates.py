@@ -18,7 +18,7 @@ from identify.engine.setup import Setup
 WORKERS = 2
 PATIENCE = 2
 """Steps of a chain (one bump, two bumps, …) without a gain after which it ends: one of four bumps hardly helps."""
-BAND_COST = 9.0
+BAND_COST = 16.0
 """Log evidence that a narrow band's three numbers cost."""
 
 Progress = Callable[[float, str], None]

@@ -12,6 +12,7 @@ from identify.diagnosis.verdict import Verdict
 from identify.diagnosis.where import worst_places
 from identify.effects import get
 from identify.engine.export import describe_parameters, predict_fitted, with_band
+from identify.experiments import plan
 
 RIVAL = 0.04
 """Probability from which an effect is named as one that the record can't tell from the best."""
@@ -74,6 +75,7 @@ def _missing(work: Analysis, verdict: Verdict, effect: str, row: list[Step]) -> 
         name for name, p in sorted(rivals.items(), key=lambda item: -item[1]) if name and name != effect and p >= RIVAL
     ]
     described = get(effect)
+    experiment = _experiment(work, effect, confused)
     return {
         "effect": effect,
         "name": described.name,
@@ -83,13 +85,26 @@ def _missing(work: Analysis, verdict: Verdict, effect: str, row: list[Step]) -> 
         "held_out_rms_before_nm": before["held_out_rms_nm"],
         "held_out_rms_after_nm": after["held_out_rms_nm"],
         "confused_with": confused,
-        "next_experiment": described.separated_by,
+        "next_experiment": experiment["text"] if experiment else described.separated_by,
+        "next_experiment_plan": experiment,
         "form": fitted.effects[index][1].name,
         "equation": fitted.effects[index][1].equation,
         "parameters": _few(describe_parameters(fitted, index)),
         "rival_probabilities": {name: p for name, p in rivals.items() if name and p >= 0.005},
         "plain": described.plain,
     }
+
+
+def _experiment(work: Analysis, effect: str, confused: list[str]) -> dict[str, Any] | None:
+    """The shortest test that tells an effect from its first rival, both as fitted in the same round."""
+    if not confused or effect not in work.added:
+        return None
+    found = {c.effect.id: c.fitted for c in work.rounds[work.added.index(effect)]}
+    rivals = {name: found[name] for name in (effect, confused[0]) if name in found and not get(name).band}
+    if len(rivals) < 2:
+        return None
+    best = plan(work.record, rivals)
+    return {key: best[key] for key in ("segments", "duration_s", "dose", "expected_log_evidence", "decides", "text")}
 
 
 def _few(parameters: dict[str, Any]) -> dict[str, Any]:

@@ -9,8 +9,8 @@ import numpy as np
 from identify.effects import get
 from identify.engine.export import predict, to_model
 from identify.engine.figures import figures
-from identify.engine.noise_level import find_band
 from identify.engine.fit import Fitted, solve, start_from
+from identify.engine.noise_level import find_band
 from identify.engine.prepare import inspect, prepare
 from identify.engine.problem import Problem
 from identify.errors import BadRequest, NotIdentifiable

@@ -53,6 +53,12 @@ def next_experiment(record: Record, rivals: Sequence[str]) -> dict[str, Any]:
     fits = {name: fit_candidate(record, [name]) for name in names}
     if len(names) == 1:
         fits["nothing"] = fit_candidate(record, [])
+    return plan(record, fits)
+
+
+def plan(record: Record, fits: dict[str, Fitted]) -> dict[str, Any]:
+    """As `next_experiment`, for rivals that are fitted already, by name."""
+    names = [name for name in fits if name != "nothing"]
     largest_us = float(record.pulse_width_us.max())
     rows = [_row(design, record, fits) for design in designs(largest_us)]
     enough = [row for row in rows if row["expected_log_evidence"] >= ENOUGH]
