@@ -82,6 +82,8 @@ class Scene:
         Joint angle and velocity, where the record has them.
     noise_sd_nm : float
         White noise of a sample, N·m.
+    reference_s : float
+        Time to which the recruitment curve belongs where it drifts: the middle of the partly recruited pulses.
     """
 
     time_s: np.ndarray
@@ -92,6 +94,7 @@ class Scene:
     angle_rad: np.ndarray | None = None
     velocity_rad_s: np.ndarray | None = None
     noise_sd_nm: float = 0.0
+    reference_s: float = 0.0
 
     @property
     def on(self) -> np.ndarray:

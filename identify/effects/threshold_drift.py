@@ -9,12 +9,22 @@ import numpy as np
 from identify.effects.base import Effect, Form, Parameter, Scene
 
 
+def _moved(width: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    return np.where(width > 0, width - shift, width)
+
+
 def _linear(width: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
-    return np.where(width > 0, width - p["slope_us_per_s"] * scene.time_s, width)
+    return _moved(width, p["slope_us_per_s"] * scene.time_s)
+
+
+def _settled(p: dict[str, Any], scene: Scene) -> np.ndarray:
+    """1 - exp(-t/time_constant), less its value at the reference time: else it only relabels the curve."""
+    tau = p["time_constant_s"]
+    return np.exp(-scene.reference_s / tau) - np.exp(-scene.time_s / tau)
 
 
 def _settling(width: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
-    return np.where(width > 0, width - p["shift_us"] * (1.0 - np.exp(-scene.time_s / p["time_constant_s"])), width)
+    return _moved(width, p["shift_us"] * _settled(p, scene))
 
 
 def _scaling(width: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
@@ -22,12 +32,12 @@ def _scaling(width: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
 
 
 def _fading(width: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
-    return width * (1.0 + p["share"] * np.expm1(-scene.time_s / p["time_constant_s"]))
+    return width * (1.0 - p["share"] * _settled(p, scene))
 
 
 def _charge(width: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
     used = np.cumsum(scene.pulse_width_us) * scene.step_s / scene.largest_us
-    return np.where(width > 0, width - p["slope_us_per_s"] * used, width)
+    return _moved(width, p["slope_us_per_s"] * used)
 
 
 _SLOPE = Parameter("slope_us_per_s", "µs/s", -4.0, 4.0, 0.0, (0.5, -0.5), about="shift of the threshold in a second")
@@ -40,10 +50,10 @@ EFFECT = Effect(
         Form(
             "settling",
             "pulse_width",
-            "w = f(u - shift (1 - exp(-t/time_constant))) where u > 0",
+            "w = f(u - shift (exp(-t_ref/time_constant) - exp(-t/time_constant))) where u > 0; t_ref: middle of the ramp",
             (
                 Parameter("shift_us", "µs", -80.0, 80.0, 0.0, (15.0, -15.0), about="final shift"),
-                Parameter("time_constant_s", "s", 3.0, 90.0, 15.0, (10.0,), "log", about="how fast it settles"),
+                Parameter("time_constant_s", "s", 5.0, 90.0, 15.0, (10.0,), "log", about="how fast it settles"),
             ),
             _settling,
             True,
@@ -59,10 +69,10 @@ EFFECT = Effect(
         Form(
             "fading",
             "pulse_width",
-            "w = f(u (1 - share (1 - exp(-t/time_constant))))",
+            "w = f(u (1 - share (exp(-t_ref/time_constant) - exp(-t/time_constant))))",
             (
                 Parameter("share", "1", -0.7, 0.7, 0.0, (0.1, -0.1), about="share lost in the end"),
-                Parameter("time_constant_s", "s", 3.0, 90.0, 15.0, (12.0,), "log", about="how fast it settles"),
+                Parameter("time_constant_s", "s", 5.0, 90.0, 15.0, (12.0,), "log", about="how fast it settles"),
             ),
             _fading,
             True,

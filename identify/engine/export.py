@@ -132,6 +132,7 @@ def _effect(fitted: Fitted, index: int, matrix: np.ndarray) -> dict[str, Any]:
             "scale_nm": setup.scale_nm,
             "largest_us": float(setup.basis.knots_us[-1]),
             "noise_sd_nm": setup.noise_sd_nm,
+            "reference_s": setup.reference_s,
         },
     }
 
@@ -190,6 +191,7 @@ def _problem(model: Model, record: Record) -> tuple[Problem, np.ndarray]:
         scale_nm=float(settings.get("scale_nm", 1.0)),
         noise_sd_nm=float(settings.get("noise_sd_nm", 0.0)),
         delay_bounds_s=(-math.inf, math.inf),
+        reference_s=float(settings.get("reference_s", 0.0)),
     )
     effects = []
     values = [model.linear.time_constant_s, model.linear.damping, model.linear.delay_s, model.baseline_nm]

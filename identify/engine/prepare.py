@@ -186,7 +186,16 @@ def first_setup(record: Record, raw: Raw, grid: Grid | None = None, fitted: np.n
         scale_nm=scale,
         noise_sd_nm=raw.noise_sd_nm,
         delay_bounds_s=(-open_s, open_s),
+        reference_s=_reference(grid, rows),
     )
+
+
+def _reference(grid: Grid, rows: np.ndarray) -> float:
+    """Middle of the fitted pulses that recruit in part, s; of all pulses where there is none."""
+    width = grid.pulse_width_us
+    partly = rows & (width > 0) & (width < 0.97 * width.max())
+    at = np.flatnonzero(partly if partly.any() else rows & (width > 0))
+    return float(np.mean(at) * grid.step_s) if at.size else 0.0
 
 
 def prepare(record: Record, raw: Raw, fitted: np.ndarray | None = None) -> tuple[Setup, Fitted]:

@@ -16,6 +16,7 @@ from identify.dynamics import read_at
 from identify.effects.base import Form, Parameter
 from identify.engine.core import LAWS, mean_weights, read_means, run_core
 from identify.engine.setup import Setup
+from identify.recruitment.spline import SplineBasis
 
 _BASE = (
     Parameter("time_constant_s", "s", 0.012, 3.0, 0.3, (0.2,), "log"),
@@ -41,6 +42,17 @@ class Chosen:
     def places(self) -> range:
         """Indices of its parameters."""
         return range(self.first, self.first + len(self.parameters))
+
+
+def extended(basis: SplineBasis, width_us: np.ndarray) -> np.ndarray:
+    """Basis functions at widths that a drift may have moved beyond the largest: there straight on; (K, n)."""
+    top = basis.knots_us[-1]
+    design = basis.design(width_us)
+    over = np.clip(width_us - top, 0.0, 0.35 * top)
+    if np.any(over > 0.0):
+        end = np.array([top])
+        design = design + over[:, None] * basis.design(end, 1)
+    return design
 
 
 class Problem:
@@ -215,8 +227,8 @@ class _Walk:
             design = setup.design
             drive = (coefficients @ design)[None, :]
         else:
-            design = np.ascontiguousarray(setup.basis.design(width[0]).T)
-            others = [setup.basis.design(row) @ coefficients for row in width[1:]]
+            design = np.ascontiguousarray(extended(setup.basis, width[0]).T)
+            others = [extended(setup.basis, row) @ coefficients for row in width[1:]]
             drive = np.stack([coefficients @ design, *others])
         if self.derivatives:
             step = problem.step[problem.coefficients]

@@ -37,6 +37,8 @@ class Setup:
         White noise of a sample, N·m.
     delay_bounds_s : tuple of float
         Timing left open to every candidate: about a sample either way.
+    reference_s : float
+        Time to which the recruitment curve belongs where it drifts.
     """
 
     grid: Grid
@@ -47,6 +49,7 @@ class Setup:
     scale_nm: float
     noise_sd_nm: float
     delay_bounds_s: tuple[float, float]
+    reference_s: float = 0.0
 
     @cached_property
     def stretches(self) -> tuple[np.ndarray, np.ndarray]:
@@ -90,6 +93,7 @@ class Setup:
             angle_rad=None if angle is None else np.interp(time_s, own, angle),
             velocity_rad_s=None if velocity is None else np.interp(time_s, own, velocity),
             noise_sd_nm=self.noise_sd_nm,
+            reference_s=self.reference_s,
         )
 
     @cached_property
