@@ -19,6 +19,7 @@ MIN_EDGES = 8
 MEDIAN_EFFICIENCY = 1.2533
 """Standard error of a median over that of a mean, for normal errors (sqrt(pi / 2))."""
 MAX_POINTS = 400
+MISFIT_WINDOWS = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,10 +88,13 @@ def align(
     pairs = _edges(cell_s, sync, written_s, envelope, sample_rate_hz)
     if pairs is not None and len(pairs[0]) >= MIN_EDGES:
         line, method = _robust_line(*pairs), "sync"
+        misfit_s = _misfit(line, *pairs)
         # Pulses often keep step with the samples, so where in its sample a pulse began does not average out.
         error_s = float(np.hypot(line.error_s, 1 / sample_rate_hz / np.sqrt(12)))
+        error_s = float(np.hypot(error_s, misfit_s))
     else:
-        line, method, error_s = envelope, "regression", envelope.error_s
+        line, method = envelope, "regression"
+        error_s = float(np.hypot(envelope.error_s, _misfit(envelope, *_earliest(cell_s, host_s))))
     time_s = line.at(cell_s)
     delay_ms = float(np.median(host_s - time_s)) * 1e3
     return time_s, Alignment(method, error_s * 1e3, delay_ms, (line.rate - 1) * 1e6)
@@ -118,14 +122,33 @@ def _median_slope(x: Array, y: Array) -> float:
     return float(np.median((y[j] - y[i])[apart] / (x[j] - x[i])[apart]))
 
 
+def _misfit(line: _Line, cell_s: Array, host_s: Array) -> float:
+    """How far the line misses what changes slowly (a clock that is no line), s: the worst of windows' medians.
+
+    What medians of so few points scatter by themselves is not counted.
+    """
+    residual_s = host_s - line.at(cell_s)
+    parts = [part for part in np.array_split(residual_s, MISFIT_WINDOWS) if len(part) >= 5]
+    if len(parts) < 3:
+        return 0.0
+    worst_s = max(abs(float(np.median(part))) for part in parts)
+    scatter_s = 1.4826 * float(np.median([np.median(np.abs(part - np.median(part))) for part in parts]))
+    by_chance_s = 3.0 * MEDIAN_EFFICIENCY * scatter_s / np.sqrt(min(len(part) for part in parts))
+    return max(0.0, worst_s - by_chance_s)
+
+
 def _lower_envelope(cell_s: Array, host_s: Array) -> _Line:
     """A line under the receive times: through the earliest sample of each of many windows."""
+    return _robust_line(*_earliest(cell_s, host_s))
+
+
+def _earliest(cell_s: Array, host_s: Array) -> tuple[Array, Array]:
     windows = int(np.clip((cell_s[-1] - cell_s[0]) / 0.5, 1, MAX_POINTS))
     lead_s = host_s - cell_s
     edges = np.searchsorted(cell_s, np.linspace(cell_s[0], cell_s[-1], windows + 1)[1:-1])
     parts = [part for part in np.split(np.arange(len(cell_s)), edges) if len(part)]
     earliest = np.array([part[np.argmin(lead_s[part])] for part in parts])
-    return _robust_line(cell_s[earliest], host_s[earliest])
+    return cell_s[earliest], host_s[earliest]
 
 
 def _edges(

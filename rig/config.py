@@ -33,6 +33,7 @@ class LimitSettings(_Table):
     charge_per_second_uc: float | None = Field(None, ge=0)
     pulse_rate_hz: float | None = Field(None, ge=1)
     torque_nm: float | None = Field(None, gt=0)
+    torque_jump_nm: float | None = Field(None, gt=0)
     duration_s: float | None = Field(None, gt=0)
     charge_per_test_uc: float | None = Field(None, ge=0)
     width_rise_us: float | None = Field(None, gt=0)
@@ -57,6 +58,7 @@ class WatchSettings(_Table):
     stale_torque_s: float = Field(0.1, gt=0, le=0.5)
     missing_ack_s: float = Field(0.1, gt=0, le=0.5)
     late_pulse_periods: float = Field(0.4, gt=0, le=0.6)
+    stuck_torque_s: float = Field(0.5, gt=0.05, le=10)
     stale_disk_s: float = Field(3.0, gt=0.5, le=10)
 
     def watch(self) -> Watch:

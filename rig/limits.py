@@ -69,6 +69,11 @@ HARD_LIMITS: dict[str, Limit] = {
             "house rule; the profile's max_torque_nm is normally far below",
         ),
         Limit(
+            "torque_jump_nm", 0.0, 5.0, "N·m",
+            "no elbow changes its torque so much from one sample to the next: a knock, a loose cable, a turned sign",
+            "house rule: 1000 N·m/s, twice a strong arm's rate of rise, is 0.6 N·m a sample at 1600/s",
+        ),
+        Limit(
             "duration_s", 0.0, 300.0, "s",
             "a pre-session test must not tire the muscle that the session trains",
             "house rule: a default test takes 40 s",

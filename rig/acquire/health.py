@@ -32,6 +32,7 @@ class Watch:
     missing_ack_s: float = 0.1
     late_pulse_periods: float = 0.4
     stale_disk_s: float = 3.0
+    stuck_torque_s: float = 0.5
 
 
 DEFAULT_WATCH = Watch()

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rig.acquire.plausible import Plausible
 from rig.clock import Clock
 from rig.devices import LoadCell
 from rig.errors import DeviceError, JournalError
@@ -77,6 +78,7 @@ class Receiver:
         self._unwrapper = CounterUnwrapper(cell.counter_modulus) if cell.counter_modulus else None
         self._journal: Journal | None = None
         self._limits_nm = (-np.inf, np.inf)
+        self._plausible: Plausible | None = None
         self._on_fault: Callable[[str], None] = lambda _: None
         self._previous: tuple[int, float] | None = None
         self._rate: deque[tuple[float, int]] = deque(maxlen=2000)
@@ -90,6 +92,11 @@ class Receiver:
         self.live: deque[NDArray[Any]] = deque(maxlen=LIVE_BLOCKS)
         self.recent: deque[tuple[float, float]] = deque(maxlen=400)
 
+    @property
+    def nominal_rate_hz(self) -> float:
+        """Samples a second, as the rig file says."""
+        return self._cell.sample_rate_hz
+
     def start(self) -> None:
         """Begin to read."""
         self._thread = threading.Thread(target=self._run, name="torque-receiver", daemon=True)
@@ -102,16 +109,23 @@ class Receiver:
             self._thread.join(timeout=2.0)
         self._cell.close()
 
-    def record(self, journal: Journal, limits_nm: tuple[float, float], on_fault: Callable[[str], None]) -> None:
+    def record(
+        self,
+        journal: Journal,
+        limits_nm: tuple[float, float],
+        on_fault: Callable[[str], None],
+        plausible: Plausible | None = None,
+    ) -> None:
         """From here on every sample goes to the journal and is checked; faults are told at once."""
         with self._lock:
+            self._plausible = plausible
             self._journal, self._limits_nm, self._on_fault = journal, limits_nm, on_fault
             self.counts, self.peak_nm, self.range_nm = Recorded(), 0.0, (np.inf, -np.inf)
 
     def release(self) -> Recorded:
         """Stop recording; what was counted since `record`."""
         with self._lock:
-            self._journal = None
+            self._journal = self._plausible = None
             self._limits_nm, self._on_fault = (-np.inf, np.inf), lambda _: None
             return replace(self.counts)
 
@@ -151,6 +165,8 @@ class Receiver:
                 except JournalError as error:
                     self._on_fault(str(error))
             self._check(samples["torque_nm"])
+            if self._plausible is not None and (wrong := self._plausible.wrong(samples)):
+                self._on_fault(wrong)
 
     def _placed(self, samples: NDArray[Any]) -> NDArray[Any]:
         """The samples with unwrapped counters, without repeats and late ones; losses counted."""

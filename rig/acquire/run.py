@@ -20,6 +20,7 @@ import numpy as np
 from rig.acquire.evidence import AROUND_S, evidence, stop_device, watch_decay
 from rig.acquire.halt import Cause, Halt
 from rig.acquire.health import DEFAULT_WATCH, Disk, Health, Watch
+from rig.acquire.plausible import Plausible
 from rig.acquire.receiver import Receiver
 from rig.clock import Clock
 from rig.errors import DeviceError, JournalError
@@ -106,7 +107,13 @@ class TestRun:
         cpu_s, wall_s = time.process_time(), time.monotonic()
         self._gate.reset()
         torque = self._table["torque_nm"]
-        self._receiver.record(self._journal, (torque.lo, torque.hi), lambda reason: self._fault(reason))
+        plausible = Plausible(
+            self._table["torque_jump_nm"].hi,
+            self._watch.stuck_torque_s * self._clock.speed,
+            self._receiver.nominal_rate_hz,
+            self._clock.speed,
+        )
+        self._receiver.record(self._journal, (torque.lo, torque.hi), self._fault, plausible)
         disk = Disk(self._journal)
         self._health = Health(self._gate, self._receiver, disk, self._clock, self._watch)
         try:
@@ -189,6 +196,9 @@ class TestRun:
         at_stop_nm = self._receiver.torque_around(AROUND_S * clock.speed)
         device = stop_device(self._gate)
         self.stimulation_ended.set()
+        if cause is None and not device[0]:  # a test whose end the device does not confirm did not end well
+            self._fault(f"the end of stimulation is not confirmed: {device[2] or device[1]}")
+            cause = self.halt.cause
         if cause is None:
             clock.wait(clock.now_s() + AROUND_S * clock.speed)  # samples on their way still belong to the test
             torque = True, "the test ended by itself"

@@ -14,11 +14,11 @@ from rig.acquire.run import LEAD_S, TestRun
 from rig.clock import Clock
 from rig.config import RigConfig
 from rig.control.calibration import Calibration, check_profile
-from rig.control.latch import Latch, lock_folder
+from rig.control.latch import Latch, Remembered, lock_folder
 from rig.control.live import live_event
 from rig.control.pair import Pair
 from rig.control.sealing import Shelf
-from rig.errors import BusyError, ConfigError, DeviceError, JournalError, PlanError, RefusedError
+from rig.errors import BusyError, ConfigError, DeviceError, JournalError, PlanError, RefusedError, RigError
 from rig.messages import (
     CalibrateStartRequest,
     CalibrationResult,
@@ -86,7 +86,7 @@ class Rig:
     def open(self) -> None:
         """Recover what a crash left, then connect; a device that is not there is told, not raised."""
         remembered, reason = self._latch.read()
-        for event in self._shelf.recover():
+        for event in self._shelf.recover("the rig process died during the test"):
             remembered = "running"
             self.finished = event
             self._publish(event)
@@ -311,6 +311,9 @@ class Rig:
                 except DeviceError as error:
                     self._change(self._trial.disconnected(str(error)))
                     raise
+            for event in self._shelf.recover("its recording could not be sealed at its end"):
+                self.finished = event
+                self._publish(event)
             self._latch.clear()
             log.info("re-armed by %s after: %s", by, self._trial.reason)
             self._change(following)
@@ -340,11 +343,19 @@ class Rig:
             halt.set(cause, reason)
         return halt is not None
 
+    def _remember(self, state: Remembered, reason: str) -> None:
+        """Write the latch file; where the disk refuses, the rig stays stopped all the same, and what the file says
+        since the test's start ("running") makes the next start uncertain."""
+        try:
+            self._latch.write(state, reason)
+        except RigError as error:
+            log.error("%s", error)
+
     def _halted(self, reason: str) -> None:
         with self._lock:
             following = self._trial.halted(reason)
             if following.state == "latched":
-                self._latch.write("latched", reason)
+                self._remember("latched", reason)
             self._change(following)
 
     def _change(self, trial: Trial) -> None:
@@ -380,7 +391,7 @@ class Rig:
                 self.finished = finished
             following = self._trial.sealed()
             if following.state == "latched":
-                self._latch.write("latched", following.reason)
+                self._remember("latched", following.reason)
             else:
                 self._latch.clear()
             self._change(following)
@@ -390,7 +401,7 @@ class Rig:
     def _broken(self, reason: str) -> None:
         with self._lock:
             self._run = None
-            self._latch.write("running", reason)
+            self._remember("running", reason)
             self._change(Trial("latched", reason, lost=reason))
         self._told.set()
 

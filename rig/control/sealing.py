@@ -52,12 +52,15 @@ class Shelf:
         used = (self.journals / f"{test_id}.journal").exists() or any(self.recordings.glob(f"*Z_{test_id}.h5"))
         if used:
             raise PlanError(f"plan.test_id: {test_id!r} was used before; give each test a new id")
-        free = shutil.disk_usage(self._config.data_dir).free
+        free = self._free_bytes()
         if free < MIN_FREE_BYTES:
             raise JournalError(
                 f"data_dir {self._config.data_dir}: {free // 2**20} MB free, a test needs {MIN_FREE_BYTES // 2**20}; "
                 "move old recordings away"
             )
+
+    def _free_bytes(self) -> int:
+        return shutil.disk_usage(self._config.data_dir).free
 
     def begin(self, test: PlannedTest, identity: dict[str, Any]) -> Journal:
         """A journal with its header and plan, on the disk. Raises JournalError."""
@@ -98,13 +101,18 @@ class Shelf:
         }
         return self._seal(path, test_id, result.outcome, result.reason, summary, result.last_sample_unix_s)
 
-    def recover(self) -> Iterator[FinishedEvent]:
-        """Seal the journals that a crash left; one that cannot be sealed is set aside, never deleted."""
+    def recover(self, reason: str) -> Iterator[FinishedEvent]:
+        """Seal the journals that a crash or a full disk left; one with nothing to seal is set aside, never deleted.
+
+        Parameters
+        ----------
+        reason
+            Why it was left, for those that do not say themselves how the test ended.
+        """
         for path in sorted(self.journals.glob("*.journal")):
             log.warning("recovering %s", path.name)
-            reason = "the rig process died during the test"
             event = self._seal(path, path.stem, "fault", reason, {"recovered": True}, None)
-            if path.exists():
+            if path.exists() and self._free_bytes() >= MIN_FREE_BYTES:  # else it is the disk's fault: try again later
                 path.rename(path.with_suffix(".unsealed"))
             yield event
 

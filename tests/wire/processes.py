@@ -147,10 +147,10 @@ class Bench:
         self.rig: Process | None = None
         self._clients: list[RigClient] = []
 
-    def start_rig(self, *options: str) -> RigClient:
-        """Start the rig and connect to it."""
+    def start_rig(self, *options: str, module: str = "rig") -> RigClient:
+        """Start the rig and connect to it; `module` is what runs it, for benches that break its host."""
         self.rig = Process(
-            "rig",
+            module,
             "--emulator-json",
             json.dumps(self.emulator.ready),
             "--data",

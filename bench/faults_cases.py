@@ -1,0 +1,100 @@
+"""The faults of the campaign: what each is, what it must lead to, and when the host can know of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+Must = Literal["stop", "go on", "either"]
+
+WATCH_S = 0.1
+"""The rig's watch for torque and acks (defaults)."""
+SYNC_WATCH_S = 3.5
+"""The rig's watch for the disk, and the time from one attempt to the next."""
+PHASES = ("arming", "prbs", "rest", "ramp", "sealing")
+
+
+@dataclass(frozen=True)
+class Case:
+    """One fault.
+
+    Attributes
+    ----------
+    must
+        What it must lead to when it comes while pulses are due: stop the test, let it go on, or either by chance.
+    hidden_s
+        Real seconds from the injection to the moment at which the host can know: nothing was heard for as long as
+        the rig waits. The 50 ms count from there.
+    of
+        Where it happens.
+    resting
+        What it must lead to in a rest, where no pulse is sent that could fail.
+    """
+
+    name: str
+    must: Must
+    hidden_s: float = 0.0
+    of: Literal["emulator", "host"] = "emulator"
+    settings: dict[str, Any] = field(default_factory=dict)
+    resting: Must | None = None
+    loses_samples: bool = False
+
+
+CASES: dict[str, Case] = {
+    case.name: case
+    for case in (
+        Case("stimulator_unplugged", "stop"),
+        Case("no_ack", "stop", WATCH_S),
+        Case("late_ack", "stop", WATCH_S, settings={"delay_s": 0.8}),
+        Case("corrupt_answers", "stop", WATCH_S),
+        Case("corrupt_commands", "stop", WATCH_S),
+        Case("electrode_error", "stop", resting="either"),
+        Case("high_voltage_error", "stop", resting="either"),
+        Case("emergency_switch", "stop", resting="either"),
+        Case("device_reset", "stop", settings={"mid_frame": True}, resting="either"),
+        Case("cell_silent", "stop", WATCH_S),
+        Case("cell_unplugged", "stop", WATCH_S),
+        Case("bus_off", "stop", WATCH_S),
+        Case("torque_nan", "stop"),
+        Case("torque_step", "stop"),
+        Case("torque_stuck", "stop", 0.5),
+        Case("counter_jump", "stop", settings={"step": 9000}),
+        Case("torque_sign_flipped", "either", 1.0),
+        Case("torque_saturated", "either", 1.5),
+        Case("frames_corrupt", "either", 1.0, loses_samples=True),
+        Case("rate_off", "either", 4.0, settings={"percent": 5.0}),
+        Case("frames_dropped", "go on", loses_samples=True),
+        Case("frames_duplicated", "go on"),
+        Case("frames_out_of_order", "go on", loses_samples=True),
+        Case("error_frames", "go on"),
+        Case("clock_jitter", "go on"),
+        Case("delivery_jitter", "go on"),
+        Case("disk_full", "stop", of="host"),
+        Case("disk_slow", "stop", of="host"),
+        Case("host_killed", "stop", of="host"),
+        Case("host_stopped_2s", "stop", of="host"),
+        Case("wall_clock_an_hour_on", "go on", of="host"),
+        Case("machine_under_load", "either", 5.0, of="host"),
+    )
+}
+
+
+def plan_of(phase: str, long: bool = False) -> list[dict[str, Any]]:
+    """Segments of a test in which that phase comes soon; `long`: for faults that take seconds to be seen."""
+    rest = {"name": "rest", "sequence": "rest", "settings": {"duration_s": 0.6}}
+    prbs = {
+        "name": "prbs",
+        "sequence": "prbs",
+        "settings": {"bits": 8 if long else 7, "clock_pulses": 2 if long else 1},
+    }
+    ramp_s = 5.0 if long else 1.6
+    ramp = {"name": "ramp", "sequence": "ramp", "settings": {"up_s": ramp_s, "down_s": ramp_s}}
+    first = {"name": "steps", "sequence": "steps", "settings": {"on_s": 0.5, "off_s": 0.0, "repeats": 1}}
+    pause = {"name": "rest", "sequence": "rest", "settings": {"duration_s": 4.0 if long else 2.0}}
+    return {
+        "arming": [rest, prbs],
+        "prbs": [rest, prbs],
+        "rest": [rest, first, pause, first],
+        "ramp": [rest, ramp],
+        "sealing": [rest, first],
+    }[phase]

@@ -1,0 +1,95 @@
+"""Torque that no arm and no sound cell can give: a jump, a value that stands still, a rate that is another.
+
+A sign that was turned while the torque was near zero, or an amplifier that clips for a moment, cannot be told from a
+muscle here; the identification sees those.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+RATE_WINDOW_S = 3.0
+"""Real seconds over which the rate is taken: a hiccup of the host of 60 ms is then 2 %."""
+RATE_TOLERANCE = 0.035
+HOLE_S = 0.06
+FASTEST_NM_S = 1000.0
+
+
+class Plausible:
+    """Judges the samples of one test, block by block.
+
+    Parameters
+    ----------
+    jump_nm
+        Largest change from one sample to the next.
+    stuck_s
+        How long, in rig seconds, exactly the same value may stand in a cell that had noise before.
+    rate_hz
+        Nominal.
+    speed
+        Rig seconds a real second.
+    """
+
+    def __init__(self, jump_nm: float, stuck_s: float, rate_hz: float, speed: float) -> None:
+        self._jump_nm, self._stuck_s, self._rate_hz = jump_nm, stuck_s, rate_hz
+        self._window_s, self._hole_s = RATE_WINDOW_S * speed, HOLE_S * speed
+        self._last: tuple[float, float] | None = None
+        self._noisy = 0
+        self._same_since_s: float | None = None
+        self._arrived: deque[tuple[float, int]] = deque()
+        self._count = 0
+
+    def wrong(self, samples: NDArray[Any]) -> str | None:
+        """What is wrong with this block, None if nothing is."""
+        torque_nm, now_s = samples["torque_nm"], float(samples["host_time_s"][-1])
+        found = self._jumped(torque_nm, now_s) or self._stuck(torque_nm, now_s) or self._off_rate(samples, now_s)
+        self._last = float(torque_nm[-1]), now_s
+        return found
+
+    def _jumped(self, torque_nm: NDArray[np.float64], now_s: float) -> str | None:
+        before_nm, before_s = self._last or (float(torque_nm[0]), now_s)
+        steps_nm = np.abs(np.diff(torque_nm, prepend=before_nm))
+        steps_nm[0] -= FASTEST_NM_S * max(0.0, now_s - before_s - 0.02)  # after a gap it may have gone far
+        worst_nm = float(np.max(steps_nm))
+        if worst_nm <= self._jump_nm or np.isnan(worst_nm):  # no number is told elsewhere
+            return None
+        return (
+            f"load cell: torque_jump_nm {worst_nm:.2f} N·m from one sample to the next is outside "
+            f"0 … {self._jump_nm:g}: a knock, a loose cable, or a turned sign"
+        )
+
+    def _stuck(self, torque_nm: NDArray[np.float64], now_s: float) -> str | None:
+        before_nm = self._last[0] if self._last else torque_nm[0]
+        if not (np.all(torque_nm == torque_nm[0]) and torque_nm[0] == before_nm):
+            self._noisy += 1
+            self._same_since_s = None
+            return None
+        if self._same_since_s is None:
+            self._same_since_s = now_s
+        stood_s = now_s - self._same_since_s
+        if self._noisy < 3 or stood_s < self._stuck_s:  # one without noise may well stand still
+            return None
+        return f"load cell: its value has stood at exactly {torque_nm[0]:.3f} N·m; it is stuck, check its amplifier"
+
+    def _off_rate(self, samples: NDArray[Any], now_s: float) -> str | None:
+        self._count += len(samples)
+        number = int(samples["counter"][-1])
+        self._arrived.append((now_s, number if number >= 0 else self._count))
+        if len(self._arrived) > 1 and now_s - self._arrived[-2][0] > self._hole_s:
+            self._arrived.clear()  # the host or the line stood still: begin anew
+            return None
+        while self._arrived[0][0] < now_s - 1.5 * self._window_s:
+            self._arrived.popleft()
+        first_s, first = self._arrived[0]
+        if now_s - first_s < self._window_s:
+            return None
+        rate_hz = (self._arrived[-1][1] - first) / (now_s - first_s)
+        if abs(rate_hz / self._rate_hz - 1) <= RATE_TOLERANCE:
+            return None
+        return (
+            f"load cell: {rate_hz:.0f} samples/s come, the rig file says {self._rate_hz:g}; check its settings and bus"
+        )
