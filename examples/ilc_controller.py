@@ -1,0 +1,298 @@
+"""An iterative learning controller that knows the service by HTTP alone: fetch, plan, play, measure, learn.
+
+    STIMRIG_TOKEN=… python examples/ilc_controller.py --url http://127.0.0.1:8000 --participant P017 --svg ilc.svg
+
+It fetches the approved MODEL.json, plans the pulse widths of a trial for a reference torque by inverting the recruitment
+curve f and the linear dynamics G, plays them through `POST /v1/tests` (kind `sequence`: the rig's gate checks every
+pulse), reads the torque back from the recording, and corrects the next trial. Imports nothing of stimrig.
+
+Two laws, both on the demanded torque w before f⁻¹, e the tracking error of a trial:
+
+- norm-optimal (Amann, Owens and Rogers 1996): w ← w + (GᵀG + λI)⁻¹ Gᵀ e
+- phase lead (Freeman 2009, FES of stroke patients): w(t) ← Q[w(t) + γ e(t + τ)], with lead τ and the cut of the
+  zero-phase filter Q chosen from G
+
+If the model carries effects, no equation of theirs is needed here: the service predicts a trial
+(`POST /v1/models/{id}/prediction`), and the plan is corrected on the prediction until it follows the reference.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import os
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import h5py
+import httpx
+import numpy as np
+
+PULSE_RATE_HZ = 40.0
+BEFORE_S, AFTER_S = 1.0, 2.0
+RISE_US = 50.0
+"""The gate's bound on a rise from pulse to pulse: below the threshold it costs nothing to keep it."""
+LAMBDA = 0.02
+PLAN_STEPS = 12
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A torque to follow, N·m at the pulses, shape (N,)."""
+
+    torque_nm: np.ndarray
+
+    @classmethod
+    def reach(cls, peak_nm: float) -> Reference:
+        """Ten seconds: up to half, up to the peak, down to a seventh; minimum-jerk moves between holds (Flash 1985)."""
+        parts, level = [np.zeros(8)], 0.0
+        for target, move_s, hold_s in ((0.5, 2.3, 0.5), (1.0, 2.2, 0.7), (0.15, 3.2, 0.9)):
+            s = np.arange(1, round(move_s * PULSE_RATE_HZ) + 1) / (move_s * PULSE_RATE_HZ)
+            parts += [level + (target - level) * (10 * s**3 - 15 * s**4 + 6 * s**5)]
+            parts += [np.full(round(hold_s * PULSE_RATE_HZ), target)]
+            level = target
+        return cls(peak_nm * np.concatenate(parts))
+
+    @property
+    def rms_nm(self) -> float:
+        """Its root mean square, N·m."""
+        return float(np.sqrt(np.mean(self.torque_nm**2)))
+
+
+class Plant:
+    """What MODEL.json says: f both ways as tables, G as the response to one held pulse, on the grid of pulses."""
+
+    def __init__(self, document: dict[str, Any], size: int) -> None:
+        curve, self.document = document["recruitment"], document
+        self.width_us, self.level_nm = np.array(curve["pulse_width_us"]), np.array(curve["torque_nm"])
+        self.inverse_nm, self.inverse_us = (np.array(curve["inverse"][k]) for k in ("torque_nm", "pulse_width_us"))
+        self.widest_us = float(document["valid_for"]["pulse_width_us"][1])
+        self.largest_nm = float(self.inverse_nm[-1])
+        self.response = pulse_response(document["linear"], float(document["sample_rate_hz"]), size)
+        steps = np.subtract.outer(np.arange(size), np.arange(size))
+        self.G = np.where(steps >= 0, self.response[np.abs(steps)], 0.0)
+
+    def widths(self, demand_nm: np.ndarray) -> np.ndarray:
+        """f⁻¹ in whole µs, shape (N,): what rounding and the rise limit take is given back by the pulses after."""
+        widths, owed, last = np.zeros(demand_nm.size), 0.0, 0.0
+        for k, demand in enumerate(np.clip(demand_nm, 0.0, self.largest_nm)):
+            wanted_us = float(np.interp(demand + owed, self.inverse_nm, self.inverse_us)) if demand > 0 else 0.0
+            last = widths[k] = min(round(wanted_us), int(last + RISE_US), int(self.widest_us))
+            got = float(np.interp(last, self.width_us, self.level_nm))
+            owed = float(np.clip(owed + demand - got, -0.3, 0.3)) if demand > 0 else 0.0
+        return widths
+
+
+def pulse_response(linear: dict[str, Any], rate_hz: float, size: int) -> np.ndarray:
+    """Mean torque in each pulse's period after one held pulse of unit demand, shape (N,); B(q)/A(q) run sample by sample.
+
+    y[k] = sum_i b[i] w[k - delay - i] - sum_{j>=1} a[j] y[k - j]
+    """
+    per = max(1, round(rate_hz / PULSE_RATE_HZ))
+    b, a, delay = linear["b"], linear["a"], int(linear["delay_samples"])
+    driven = np.convolve(np.r_[np.zeros(delay), np.ones(per)], b)
+    driven = np.r_[driven, np.zeros(max(0, size * per + 1 - driven.size))]
+    y = np.zeros(size * per + 1)
+    for k in range(y.size):
+        y[k] = driven[k] - sum(a[j] * y[k - j] for j in range(1, min(len(a), k + 1)))
+    middle = (y[:-1] + y[1:]) / 2
+    return middle.reshape(size, per).mean(axis=1)
+
+
+# ---- laws -----------------------------------------------------------------------------------------------------------
+
+
+def norm_optimal(plant: Plant) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """w ← w + (GᵀG + λI)⁻¹ Gᵀ e."""
+    learn = np.linalg.solve(plant.G.T @ plant.G + LAMBDA * np.eye(len(plant.G)), plant.G.T)
+    return lambda demand_nm, error_nm: demand_nm + learn @ error_nm
+
+
+def phase_lead(plant: Plant, gain: float = 0.8) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """w(t) ← Q[w(t) + γ e(t + τ)]: the lead under which |1 - γ z^τ G| < 1 reaches furthest; Q ends a little before."""
+    size = plant.response.size
+    frequency_hz = np.fft.rfftfreq(16 * size, 1 / PULSE_RATE_HZ)
+    G = np.fft.rfft(plant.response, 16 * size)
+    reach = {}
+    for lead in range(1, 60):
+        moved = G * np.exp(2j * np.pi * frequency_hz * lead / PULSE_RATE_HZ)
+        outside = np.flatnonzero(np.abs(1 - gain * moved) >= 0.98)
+        reach[lead] = frequency_hz[outside[0]] if outside.size else PULSE_RATE_HZ / 2
+    lead = max(reach, key=lambda lead: reach[lead])
+    spread = 0.75 * PULSE_RATE_HZ / (2 * np.pi * reach[lead])  # a Gaussian, -3 dB near 1.1 of where it must end
+    taps = np.exp(-0.5 * (np.arange(-80, 81) / max(spread, 0.5)) ** 2)
+
+    def smooth(demand_nm: np.ndarray) -> np.ndarray:
+        return np.convolve(np.pad(demand_nm, 80, mode="edge"), taps / taps.sum(), mode="valid")
+
+    def law(demand_nm: np.ndarray, error_nm: np.ndarray) -> np.ndarray:
+        ahead = np.r_[error_nm[lead:], np.full(lead, error_nm[-1])]
+        return demand_nm + smooth(gain * ahead)
+
+    return law
+
+
+LAWS = {"norm-optimal": norm_optimal, "phase-lead": phase_lead}
+
+
+# ---- the service ----------------------------------------------------------------------------------------------------
+
+
+class Service:
+    """The few routes a controller needs."""
+
+    def __init__(self, url: str, token: str, participant: str) -> None:
+        self.http = httpx.Client(base_url=url, headers={"Authorization": f"Bearer {token}"}, timeout=60)
+        self.participant, self.etag, self.model = participant, "", {}
+
+    def fetch(self) -> dict[str, Any]:
+        """The approved model; asked for by its ETag, so that an unchanged one isn't sent again."""
+        answer = self.http.get(f"/v1/participants/{self.participant}/model", headers={"If-None-Match": self.etag})
+        if answer.status_code != 304:
+            self.model, self.etag = checked(answer).json(), answer.headers["etag"]
+        return self.model
+
+    def play(self, widths_us: np.ndarray) -> tuple[np.ndarray, int]:
+        """Play a trial; its torque in each pulse's period above rest, N·m, shape (N,), and how many pulses were lost."""
+        segments = [
+            {"name": "rest", "sequence": "rest", "settings": {"duration_s": BEFORE_S}},
+            {"name": "trial", "sequence": "widths", "settings": {"pulse_width_us": widths_us.tolist()}},
+            {"name": "rest", "sequence": "rest", "settings": {"duration_s": AFTER_S}},
+        ]
+        body = {"participant": self.participant, "kind": "sequence", "segments": segments}
+        patience = time.monotonic() + 90
+        while (answer := self.http.post("/v1/tests", json=body)).status_code in (409, 422) and "rest" in answer.text:
+            if time.monotonic() > patience:
+                break
+            time.sleep(0.3)  # the gate asks for a rest between tests
+        location = checked(answer).headers["location"]
+        while not (test := checked(self.http.get(location)).json())["recording_id"]:
+            if test["done"]:
+                raise SystemExit(f"the trial ended as {test['state']}: {test['reason']}")
+            time.sleep(0.1)
+        return measured(checked(self.http.get(test["recording_url"])).content, widths_us.size)
+
+    def predict(self, model_id: str, widths_us: np.ndarray) -> np.ndarray:
+        """What the model says a trial would give, N·m in each pulse's period, shape (N,)."""
+        body = {"pulse_width_us": widths_us.tolist()}
+        answer = checked(self.http.post(f"/v1/models/{model_id}/prediction", json=body))
+        return np.array(answer.json()["torque_nm"])
+
+
+def checked(answer: httpx.Response) -> httpx.Response:
+    """The answer, or the problem's own words as the end of the program."""
+    if answer.is_success:
+        return answer
+    try:
+        problem = answer.json()
+        words = f"{problem['title']}: {problem['detail']}"
+    except ValueError:
+        words = answer.text[:200]
+    raise SystemExit(f"{answer.request.method} {answer.request.url.path}: {words}")
+
+
+def measured(recording: bytes, size: int) -> tuple[np.ndarray, int]:
+    """Torque above the rest before the trial, mean in each pulse's period; and how many pulses were dropped."""
+    with h5py.File(io.BytesIO(recording)) as file:
+        time_s, torque_nm = file["torque/time_s"][:], file["torque/torque_nm"][:]
+        lost = int(np.sum(file["pulses/status"][:] >= 2))
+    baseline_nm = torque_nm[(time_s > 0.3 * BEFORE_S) & (time_s < BEFORE_S)].mean()
+    period = np.floor((time_s - BEFORE_S) * PULSE_RATE_HZ).astype(int)
+    inside = (period >= 0) & (period < size)
+    sums = np.bincount(period[inside], torque_nm[inside], size)
+    return sums / np.maximum(1, np.bincount(period[inside], minlength=size)) - baseline_nm, lost
+
+
+# ---- learning -------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Trial:
+    """One trial: what was played, what came."""
+
+    widths_us: np.ndarray
+    torque_nm: np.ndarray
+    error_percent: float
+    lost_pulses: int
+
+
+def plan(plant: Plant, reference: Reference, predict: Callable[[np.ndarray], np.ndarray] | None) -> np.ndarray:
+    """The demand of the first trial, N·m, shape (N,): G inverted, and where effects are known, the prediction corrected."""
+    size = reference.torque_nm.size
+    bend = np.diff(np.eye(size), 2, axis=0)
+    demand = np.linalg.solve(plant.G.T @ plant.G + 0.1 * bend.T @ bend, plant.G.T @ reference.torque_nm)
+    demand = np.clip(demand, 0.0, plant.largest_nm)
+    learn, best, least = norm_optimal(plant), demand, np.inf
+    for _ in range(PLAN_STEPS if predict else 0):
+        error_nm = reference.torque_nm - predict(plant.widths(demand))  # pyright: ignore[reportOptionalCall]
+        if (size_now := float(np.mean(error_nm**2))) < least:
+            best, least = demand, size_now
+        demand = np.clip(learn(demand, error_nm), 0.0, plant.largest_nm)
+    return best
+
+
+def learn(service: Service, model: dict[str, Any], reference: Reference, law: str, trials: int) -> list[Trial]:
+    """Play and correct, trial after trial."""
+    plant = Plant(model, reference.torque_nm.size)
+    predict = (lambda widths: service.predict(model["model_id"], widths)) if model["effects"] else None
+    update, demand, done = LAWS[law](plant), plan(plant, reference, predict), []
+    for _ in range(trials):
+        widths_us = plant.widths(demand)
+        torque_nm, lost = service.play(widths_us)
+        error_nm = reference.torque_nm - torque_nm
+        percent = 100 * float(np.sqrt(np.mean(error_nm**2))) / reference.rms_nm
+        done.append(Trial(widths_us, torque_nm, percent, lost))
+        print(f"  trial {len(done):2d}  {percent:6.2f} % of the reference's rms, {lost} pulses lost", file=sys.stderr)
+        demand = np.clip(update(demand, error_nm), 0.0, plant.largest_nm)
+    return done
+
+
+def draw(path: str, reference: Reference, runs: dict[str, list[Trial]]) -> None:
+    """Error over trials, and the last trial's torque beside the reference."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4), layout="constrained")
+    time_s = np.arange(reference.torque_nm.size) / PULSE_RATE_HZ
+    right.plot(time_s, reference.torque_nm, "k--", label="reference")
+    for name, trials in runs.items():
+        left.semilogy(range(1, len(trials) + 1), [trial.error_percent for trial in trials], "o-", label=name)
+        right.plot(time_s, trials[-1].torque_nm, label=f"{name}, trial {len(trials)}")
+    left.axhline(5, color="grey", lw=0.8)
+    left.set(xlabel="trial", ylabel="tracking error (% of the reference's rms)")
+    right.set(xlabel="time (s)", ylabel="torque (N·m)")
+    left.legend(), right.legend()
+    figure.savefig(path, metadata={"Date": None})
+
+
+def main() -> None:
+    """Run the laws one after the other and show how the error falls."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--url", default="http://127.0.0.1:8000")
+    parser.add_argument("--participant", required=True)
+    parser.add_argument("--law", choices=[*LAWS, "both"], default="both")
+    parser.add_argument("--trials", type=int, default=10)
+    parser.add_argument("--peak-nm", type=float, help="default: 60 %% of the largest torque the model is valid for")
+    parser.add_argument("--svg", help="draw here")
+    options = parser.parse_args()
+    token = os.environ.get("STIMRIG_TOKEN") or sys.exit("set STIMRIG_TOKEN: read-model, read-live and run-test")
+    service = Service(options.url, token, options.participant)
+    model = service.fetch()
+    reference = Reference.reach(options.peak_nm or 0.6 * float(model["recruitment"]["inverse"]["torque_nm"][-1]))
+    laws = list(LAWS) if options.law == "both" else [options.law]
+    runs = {law: learn(service, model, reference, law, options.trials) for law in laws}
+    print(f"model {model['model_id']}, reference {reference.rms_nm:.2f} N·m rms; error in % of it")
+    print("trial  " + "  ".join(f"{law:>12}" for law in runs))
+    for number in range(options.trials):
+        print(f"{number + 1:5d}  " + "  ".join(f"{run[number].error_percent:12.2f}" for run in runs.values()))
+    if options.svg:
+        draw(options.svg, reference, runs)
+
+
+if __name__ == "__main__":
+    main()
