@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -30,7 +31,7 @@ def improve(
     found = dict(identify.improve(record, progress=progress_line()))
     models = found.pop("models")
     if output is not None:
-        write(output, models[-1].to_json())
+        write(output, json.dumps(clean(models[-1]), indent=1))
     if html is not None:
         write(html, improvement_html(clean(found), data.name))
     if as_json:

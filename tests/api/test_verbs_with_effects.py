@@ -1,0 +1,59 @@
+"""From a record with something hidden in it to a better model's prediction, through the command line alone."""
+
+from __future__ import annotations
+
+import csv
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hardware_sim import hidden_records
+
+pytestmark = pytest.mark.slow
+
+
+def stimrig(*words: object) -> str:
+    """Standard output of a verb that must succeed."""
+    command = [str(Path(sys.executable).with_name("stimrig")), *map(str, words)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=240)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_improve_writes_a_model_that_predicts_better(tmp_path: Path) -> None:
+    record = hidden_records.generate("fatigue", "strong", seed=41, rate_hz=100)
+    data = tmp_path / "record.csv"
+    hidden_records.write_csv(record, data)
+    base, better = tmp_path / "base.json", tmp_path / "better.json"
+    stimrig("fit", data, "-o", base)
+    found = json.loads(stimrig("improve", data, "-o", better, "--html", tmp_path / "report.html", "--json"))
+    assert [step["added"] for step in found["steps"]][:2] == [None, "fatigue"]
+    assert found["steps"][1]["rms_nm"] < found["steps"][0]["rms_nm"]
+    assert (tmp_path / "report.html").stat().st_size > 1000
+
+    def rms_nm(model: Path) -> float:
+        out = tmp_path / f"{model.stem}.csv"
+        stimrig("predict", model, data, "-o", out)
+        with out.open(newline="") as lines:
+            rows = list(csv.DictReader(lines))
+        assert list(rows[0]) == ["time_s", "torque_nm", "predicted_torque_nm"]
+        gap = [float(row["torque_nm"]) - float(row["predicted_torque_nm"]) for row in rows]
+        return float(np.sqrt(np.mean(np.square(gap))))
+
+    assert rms_nm(better) < 0.5 * rms_nm(base)
+
+
+def test_fit_with_effects_gives_a_model_of_the_contract(tmp_path: Path) -> None:
+    record = hidden_records.generate("output_saturation", "middle", seed=42, rate_hz=100)
+    data = tmp_path / "record.csv"
+    hidden_records.write_csv(record, data)
+    model = json.loads(stimrig("fit", data, "--effects", "output_saturation", "--json"))
+    assert [effect["id"] for effect in model["effects"]] == ["output_saturation"]
+    assert {"linear", "recruitment", "valid_for", "uncertainty", "residual_tests", "data", "software"} <= set(model)
+    assert {"b", "a", "delay_samples"} <= set(model["linear"])
+    b, a = np.array(model["linear"]["b"]), np.array(model["linear"]["a"])
+    assert b.sum() / a.sum() == pytest.approx(1.0, abs=1e-6)
