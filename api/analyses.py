@@ -1,16 +1,26 @@
-"""What workers find out about a model, kept with it: comparison, diagnosis; and effects added to it."""
+"""What workers find out about a model, kept with it: comparison, curves, diagnosis; and effects added to it."""
 
 from __future__ import annotations
 
 import asyncio
+import hashlib
 import json
+import logging
+import secrets
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
+from api import audit, evidence
 from api.clock import Clock
+from api.errors import ApiError, NotFoundError
 from api.fitting import Fitting, Job
 from api.store import Store
 from api.store.tables import Analysis, Model, Recording
 from api.versions import Versions
+
+log = logging.getLogger("stimrig.analyses")
+OnJob = Callable[[Job], None]
 
 
 class Analyses:
@@ -19,39 +29,80 @@ class Analyses:
     def __init__(self, store: Store, clock: Clock, fitting: Fitting, versions: Versions) -> None:
         self.store, self.clock, self.fitting, self.versions = store, clock, fitting, versions
         self.running: dict[tuple[str, str], Job] = {}
+        self._ids: list[str] | None = None
 
-    def path(self, model: Model) -> str:
-        """Where the model's recording lies."""
-        recording: Recording = self.store.get(Recording, model.recording_id)
+    def path(self, recording_id: str) -> str:
+        """Where a recording lies."""
+        recording: Recording | None = self.store.get(Recording, recording_id)
+        if recording is None:
+            raise NotFoundError("recording", recording_id, "A model's document names its recording.")
         return recording.path
 
-    async def comparison(self, model: Model) -> dict[str, Any]:
-        """Measurement against model."""
-        return await self._kept(model, "comparison", model_json=model.document.decode())
+    async def comparison(self, model: Model, recording_id: str | None = None) -> dict[str, Any]:
+        """Measurement against model; with another recording's id, the model against that one."""
+        given = {"model_json": model.document.decode()}
+        if recording_id in (None, model.recording_id):
+            return await self._kept(model, "comparison", given)
+        digest = hashlib.sha256(str(recording_id).encode()).hexdigest()[:16]
+        return await self._kept(model, f"comparison {digest}", given, verb="comparison", recording_id=recording_id)
 
     async def curves(self, model: Model) -> dict[str, Any]:
         """Measured, predicted and commanded curves, thinned to what a screen shows."""
-        return await self._kept(model, "curves", model_json=model.document.decode())
+        return await self._kept(model, "curves", {"model_json": model.document.decode()})
 
-    async def diagnosis(self, model: Model) -> dict[str, Any]:
-        """What is missing."""
-        return await self._kept(model, "diagnosis")
+    async def diagnosis(self, model: Model, on_job: OnJob | None = None) -> dict[str, Any]:
+        """What is missing in the base model of the recording: the same for all versions made from it."""
+        eldest = await asyncio.to_thread(self.eldest, model)
+        return await self._kept(eldest, "diagnosis", {}, on_job=on_job)
+
+    def eldest(self, model: Model) -> Model:
+        """The first version made from the model's recording: what is found of the recording is kept with it."""
+        rows = self.store.all(Model, Model.recording_id == model.recording_id, order=Model.created_utc, limit=1)
+        return rows[0]
+
+    def known_diagnosis(self, model: Model) -> dict[str, Any] | None:
+        """The diagnosis if it has been made."""
+        return self.known(self.eldest(model).id, "diagnosis")
+
+    def running_diagnosis(self, model: Model) -> Job | None:
+        """The job that makes the diagnosis, while it does."""
+        return self.running.get((self.eldest(model).id, "diagnosis"))
+
+    async def foresee(self, model: Model) -> None:
+        """Diagnose before anybody asks, with low priority; a new test ends it, and nobody is told."""
+        eldest = await asyncio.to_thread(self.eldest, model)
+        try:
+            await self._kept(eldest, "diagnosis", {}, background=True)
+        except ApiError as error:
+            log.info("diagnosis of %s in the background: %s", model.id, error.title)
 
     def known(self, model_id: str, kind: str) -> dict[str, Any] | None:
         """A finding if it has been made."""
         row = self.store.get(Analysis, (model_id, kind))
         return row.document if row else None
 
-    async def _kept(self, model: Model, kind: str, **arguments: Any) -> dict[str, Any]:
+    async def _kept(
+        self,
+        model: Model,
+        kind: str,
+        given: dict[str, Any],
+        *,
+        verb: str | None = None,
+        recording_id: str | None = None,
+        background: bool = False,
+        on_job: OnJob | None = None,
+    ) -> dict[str, Any]:
         known = await asyncio.to_thread(self.known, model.id, kind)
         if known is not None:
             return known
+        path = await asyncio.to_thread(self.path, recording_id or model.recording_id)
         key = (model.id, kind)
         job = self.running.get(key)
         if job is None:
-            path = await asyncio.to_thread(self.path, model)
-            job = self.running[key] = self.fitting.submit(kind, data=path, **arguments)
+            job = self.running[key] = self.fitting.submit(verb or kind, background=background, data=path, **given)
             job.result.add_done_callback(lambda _future: self.running.pop(key, None))
+        if on_job is not None:
+            on_job(job)
         found = await asyncio.shield(job.result)
         await asyncio.to_thread(self._keep, model.id, kind, found)
         return found
@@ -60,31 +111,116 @@ class Analyses:
         with self.store.write() as session:
             session.merge(Analysis(model_id=model_id, kind=kind, document=found, created_utc=self.clock.utc()))
 
-    async def add_effects(self, model: Model, added: list[str], by: str) -> Model:
-        """A new version: the model's effects and these, fitted together anew."""
-        effects = list(dict.fromkeys([*model.effects, *added]))
-        path = await asyncio.to_thread(self.path, model)
-        job = self.fitting.submit("fit", data=path, method=model.method, effects=effects)
-        found = await asyncio.shield(job.result)
-        return await asyncio.to_thread(
-            self.versions.add, found["json"], model.participant, model.recording_id, by, model.id, ",".join(added)
-        )
+    # ---- versions -------------------------------------------------------------------------------------------
 
-    async def improve(self, model: Model, by: str) -> tuple[dict[str, Any], list[Model]]:
-        """Effects added one by one while the evidence lasts, each step a version."""
-        path = await asyncio.to_thread(self.path, model)
-        found = await asyncio.shield(self.fitting.submit("improve", data=path).result)
-        rows, parent = [], model.id
-        for step, document in zip(found["steps"], found["models"], strict=True):
-            row = await asyncio.to_thread(
-                self.versions.add,
-                json.dumps(document),
-                model.participant,
-                model.recording_id,
-                by,
-                parent,
-                step["added"],
-            )
-            rows.append(row)
-            parent = row.id
+    async def add_effects(
+        self,
+        model: Model,
+        added: list[str],
+        by: str,
+        *,
+        force: bool = False,
+        reason: str = "",
+        on_job: OnJob | None = None,
+    ) -> Model:
+        """A new version: the model's effects and these, fitted together anew.
+
+        Raises
+        ------
+        ApiError
+            409: an effect is in it already, or the recording does not ask for it and nobody forces it; 422: no such
+            effect, or the data do not allow the fit.
+        """
+        twice = [effect for effect in added if effect in model.effects]
+        if twice:
+            detail = f"{', '.join(twice)} is in {model.id} already. Name effects it does not hold."
+            raise ApiError(409, "effect-present", "The effect is in the model", detail)
+        await self.check_known(added)
+        effects = list(dict.fromkeys([*model.effects, *added]))
+        same = await asyncio.to_thread(self.versions.child_with, model, effects)
+        if same is not None:
+            return same
+        if force and not reason.strip():
+            detail = "Forcing an effect goes against the evidence; say why, it is kept in the audit trail."
+            raise ApiError(422, "reason-missing", "A forced effect wants a reason", detail)
+        if not force:
+            evidence.demand(await self.diagnosis(model, on_job), model.effects, added)
+        path = await asyncio.to_thread(self.path, model.recording_id)
+        job = self.fitting.submit("fit", data=path, method=model.method, effects=effects)
+        if on_job is not None:
+            on_job(job)
+        found = await asyncio.shield(job.result)
+        return await asyncio.to_thread(self._store_added, found["json"], model, added, by, force, reason)
+
+    async def check_known(self, effects: list[str]) -> None:
+        """Refuse effects that are not in the library."""
+        if self._ids is None:
+            found = await asyncio.shield(self.fitting.submit("effects").result)
+            self._ids = sorted(entry["id"] for entry in found["effects"])
+        unknown = [effect for effect in effects if effect not in self._ids]
+        if unknown:
+            detail = f"There is no effect {', '.join(unknown)}. Take one of {', '.join(self._ids)}."
+            raise ApiError(422, "unknown-effect", "No such effect", detail)
+
+    def _store_added(self, model_json: str, model: Model, added: list[str], by: str, force: bool, reason: str) -> Model:
+        row = self.versions.add(
+            model_json, model.participant, model.recording_id, by, parent_id=model.id, added_effect=",".join(added)
+        )
+        if force or reason:
+            with self.store.write() as session:
+                action = "force effect" if force else "add effect"
+                audit.write(session, self.clock.utc(), by, action, row.id, effects=added, reason=reason)
+        return row
+
+    async def improve(self, model: Model, by: str, on_job: OnJob | None = None) -> tuple[dict[str, Any], list[Model]]:
+        """Effects added one by one while the evidence lasts, each step a version that descends from the eldest."""
+        path = await asyncio.to_thread(self.path, model.recording_id)
+        job = self.fitting.submit("improve", data=path)
+        if on_job is not None:
+            on_job(job)
+        found = await asyncio.shield(job.result)
+        rows = await asyncio.to_thread(self._store_steps, found, await asyncio.to_thread(self.eldest, model), by)
         return {key: value for key, value in found.items() if key != "models"}, rows
+
+    def _store_steps(self, found: dict[str, Any], eldest: Model, by: str) -> list[Model]:
+        """Each step that adds something as a version; the base is the eldest version, which is there already."""
+        rows = [eldest]
+        for step, document in zip(found["steps"], found["models"], strict=True):
+            if step["added"] is None:
+                continue
+            parent = rows[-1]
+            row = self.versions.child_with(parent, [*parent.effects, step["added"]])
+            if row is None:
+                document["extra"] = {**(document.get("extra") or {}), "parent": parent.id}
+                row = self.versions.add(
+                    json.dumps(document), parent.participant, parent.recording_id, by, parent.id, step["added"]
+                )
+            rows.append(row)
+        return rows
+
+    # ---- several recordings ---------------------------------------------------------------------------------
+
+    async def join(self, older: str, newer: str, participant: str) -> Recording:
+        """Two recordings as one, itself a recording (`origin` joined), to which all else applies."""
+        paths = [await asyncio.to_thread(self.path, part) for part in (older, newer)]
+        identity = f"joined-{secrets.token_hex(8)}"
+        out = str(await asyncio.to_thread(lambda: self._beside(newer, identity)))
+        job = self.fitting.submit("join", urgent=True, parts=paths, out=out)
+        found = await asyncio.shield(job.result)
+        digest = found["file_sha256"]
+        return await asyncio.to_thread(self._store_joined, identity, out, digest, participant, older, newer)
+
+    def _beside(self, recording_id: str, identity: str) -> str:
+        return str(Path(self.path(recording_id)).with_name(f"{identity}.csv"))
+
+    def _store_joined(
+        self, identity: str, out: str, digest: str, participant: str, older: str, newer: str
+    ) -> Recording:
+        now = self.clock.utc()
+        row = Recording(id=identity, participant=participant, path=out, file_sha256=digest, origin="joined")
+        row.test_id, row.created_utc = None, now
+        with self.store.write() as session:
+            session.add(row)
+            session.flush()
+            audit.write(session, now, "service", "join recordings", identity, parts=[older, newer], sha256=digest)
+        return row

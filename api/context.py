@@ -17,6 +17,7 @@ from api.fitting import WORKER, Fitting
 from api.rig_client import RigClient
 from api.settings import Settings
 from api.store import Store
+from api.tasks import Tasks
 from api.trials import Trials
 from api.versions import Versions
 
@@ -34,6 +35,7 @@ class Context:
     versions: Versions
     trials: Trials
     analyses: Analyses
+    tasks: Tasks
     drawn_token: str | None = None
     started_s: float = field(default_factory=time.monotonic)
 
@@ -50,6 +52,7 @@ class Context:
     async def close(self) -> None:
         """Let everything go."""
         await self.trials.close()
+        await self.tasks.close()
         await self.fitting.close()
         await self.rig.close()
         self.store.close()
@@ -72,9 +75,10 @@ def build(settings: Settings, clock: Clock | None = None, worker: tuple[str, ...
     rig = RigClient(settings.rig_socket, clock)
     fitting = Fitting(settings.workers, worker)
     versions = Versions(store, clock)
-    trials = Trials(store, clock, rig, fitting, versions, settings.recordings_dir)
     analyses = Analyses(store, clock, fitting, versions)
-    return Context(settings, clock, store, auth, rig, fitting, versions, trials, analyses, drawn)
+    trials = Trials(store, clock, rig, fitting, versions, analyses, settings.recordings_dir)
+    tasks = Tasks(fitting)
+    return Context(settings, clock, store, auth, rig, fitting, versions, trials, analyses, tasks, drawn)
 
 
 def of(connection: HTTPConnection) -> Context:

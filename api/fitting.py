@@ -19,6 +19,8 @@ from api.errors import ApiError
 log = logging.getLogger("stimrig.fitting")
 
 WORKER = (sys.executable, "-m", "api.worker")
+BACKGROUND_NICE = "15"
+"""How far a worker for what nobody waits for stands back."""
 LINE_LIMIT = 64 * 1024 * 1024
 
 
@@ -30,6 +32,7 @@ class Job:
     verb: str
     arguments: dict[str, Any]
     urgent: bool = False
+    background: bool = False
     state: str = "queued"
     progress: float = 0.0
     text: str = ""
@@ -37,24 +40,45 @@ class Job:
     result: asyncio.Future[dict[str, Any]] = field(default_factory=lambda: asyncio.get_running_loop().create_future())
     on_progress: Callable[[Job], None] | None = None
 
+    @property
+    def elapsed_s(self) -> float:
+        """Time since it began, s; 0 while it is queued."""
+        return 0.0 if self.started_s is None else time.monotonic() - self.started_s
+
+    @property
+    def time_left_s(self) -> float | None:
+        """What its pace so far says, s; None before there is a pace."""
+        if self.state != "running" or self.progress < 0.05:
+            return None
+        return self.elapsed_s * (1.0 - self.progress) / self.progress
+
     def public(self) -> dict[str, Any]:
         """What a client sees of it."""
-        return {"verb": self.verb, "state": self.state, "progress": round(self.progress, 3), "text": self.text}
+        left = self.time_left_s
+        return {
+            "verb": self.verb,
+            "state": self.state,
+            "progress": round(self.progress, 3),
+            "text": self.text,
+            "elapsed_s": round(self.elapsed_s, 1),
+            "time_left_s": None if left is None else round(left, 1),
+        }
 
 
 class Worker:
     """One worker process, started when first needed and again after a job was cancelled."""
 
-    def __init__(self, command: tuple[str, ...]) -> None:
-        self.command = command
+    def __init__(self, command: tuple[str, ...], *, background: bool = False) -> None:
+        self.command, self.background = command, background
         self.process: asyncio.subprocess.Process | None = None
         self.job: Job | None = None
 
     async def start(self) -> asyncio.subprocess.Process:
         """The running process, fresh if there is none."""
         if self.process is None or self.process.returncode is not None:
+            command = ("nice", "-n", BACKGROUND_NICE, *self.command) if self.background else self.command
             self.process = await asyncio.create_subprocess_exec(
-                *self.command, stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, limit=LINE_LIMIT
+                *command, stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, limit=LINE_LIMIT
             )
         return self.process
 
@@ -105,6 +129,8 @@ def job_error(verb: str, error: dict[str, Any]) -> ApiError:
 class Fitting:
     """A few workers and a queue; the fit after a test goes before everything else.
 
+    One worker more, of low priority, does what nobody waits for yet; a new test ends what it does.
+
     Parameters
     ----------
     workers : int
@@ -115,6 +141,7 @@ class Fitting:
 
     def __init__(self, workers: int = 2, command: tuple[str, ...] = WORKER) -> None:
         self.workers = [Worker(command) for _ in range(workers)]
+        self.workers.append(Worker(command, background=True))
         self.queue: deque[Job] = deque()
         self.done_count = 0
         self.failed_count = 0
@@ -127,11 +154,12 @@ class Fitting:
         verb: str,
         *,
         urgent: bool = False,
+        background: bool = False,
         on_progress: Callable[[Job], None] | None = None,
         **arguments: Any,
     ) -> Job:
         """Queue a job; await ``job.result``."""
-        job = Job(next(self._numbers), verb, arguments, urgent=urgent, on_progress=on_progress)
+        job = Job(next(self._numbers), verb, arguments, urgent, background, on_progress=on_progress)
         job.result.add_done_callback(_retrieve)
         if urgent:
             self.queue.appendleft(job)
@@ -142,8 +170,17 @@ class Fitting:
 
     def warm(self) -> None:
         """Have every worker load identify before it is needed."""
-        for _ in self.workers:
-            self.submit("warm")
+        for worker in self.workers:
+            if not worker.background:
+                self.submit("warm")
+
+    def cancel_background(self) -> int:
+        """End what nobody waits for, so that a test has the machine to itself; how many jobs that were."""
+        open_jobs = [job for job in self.queue if job.background]
+        open_jobs += [worker.job for worker in self.workers if worker.job is not None and worker.job.background]
+        for job in open_jobs:
+            self.cancel(job)
+        return len(open_jobs)
 
     def cancel(self, job: Job) -> None:
         """Take a job off the queue, or end the process that does it."""
@@ -159,8 +196,8 @@ class Fitting:
             job.result.set_exception(ApiError(409, "cancelled", "The job was cancelled", "Start it again if wanted."))
 
     def _dispatch(self) -> None:
-        for index, worker in enumerate(self.workers):
-            job = self._next_for(index) if worker.job is None else None
+        for worker in self.workers:
+            job = self._next_for(worker) if worker.job is None else None
             if job is not None:
                 self.queue.remove(job)
                 worker.job = job
@@ -168,11 +205,12 @@ class Fitting:
                 self._tasks.add(task)
                 task.add_done_callback(self._tasks.discard)
 
-    def _next_for(self, index: int) -> Job | None:
+    def _next_for(self, worker: Worker) -> Job | None:
         """The next job for a worker; the first of several is kept free for the fit after a test."""
-        reserved = index == 0 and len(self.workers) > 1
+        reserved = worker is self.workers[0] and len(self.workers) > 2
         for job in self.queue:
-            if not reserved or job.urgent or job.verb == "warm":
+            fits = job.background == worker.background
+            if fits and (not reserved or job.urgent or job.verb == "warm"):
                 return job
         return None
 

@@ -5,11 +5,13 @@ Imported by the worker only; the web process never loads numpy, and never fits.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+from api.cleaning import clean
+from api.missing import diagnosis, improve, joined
 
 Progress = Callable[[float, str], None]
 POINTS = 2400
@@ -44,14 +46,27 @@ def drawn(data: str, progress: Progress, model_json: str) -> dict[str, Any]:
 
 
 def comparison(data: str, progress: Progress, model_json: str) -> dict[str, Any]:
-    """Measurement against model: identify's comparison."""
+    """Measurement against model: identify's comparison, its series thinned."""
     import identify
 
     progress(0.1, "reading the recording")
     record = identify.read(Path(data))
     model = identify.Model.from_json(model_json)
     progress(0.4, "comparing")
-    return clean(dict(identify.compare(model, record)))
+    return thinned(clean(dict(identify.compare(model, record))))
+
+
+def thinned(found: dict[str, Any]) -> dict[str, Any]:
+    """A comparison whose series hold no more points than a screen shows, five digits each."""
+    series = found.get("series") or {}
+    longest = max((len(values) for values in series.values() if isinstance(values, list)), default=0)
+    pick = slice(None, None, max(1, math.ceil(longest / POINTS)))
+    short = {key: _rounded(values[pick]) if isinstance(values, list) else values for key, values in series.items()}
+    return {**found, "series": short}
+
+
+def _rounded(values: list[Any]) -> list[Any]:
+    return [round(value, 5) if isinstance(value, float) else value for value in values]
 
 
 def curves(model: Any, record: Any) -> dict[str, Any]:
@@ -99,24 +114,6 @@ def step_response(document: dict[str, Any], seconds: float = 4.0) -> dict[str, l
     return {"time_s": (np.arange(count) / rate_hz)[pick].tolist(), "response": response[pick].round(6).tolist()}
 
 
-def diagnosis(data: str, progress: Progress) -> dict[str, Any]:
-    """What is missing in the model of a recording."""
-    import identify
-
-    record = identify.read(Path(data))
-    return clean(identify.diagnose(record, progress=progress))
-
-
-def improve(data: str, progress: Progress) -> dict[str, Any]:
-    """Effects added one by one while the evidence lasts, each step with its model."""
-    import identify
-
-    record = identify.read(Path(data))
-    found = dict(identify.improve(record, progress=progress))
-    models = [json.loads(model.to_json()) if hasattr(model, "to_json") else model for model in found["models"]]
-    return clean({**found, "models": models})
-
-
 def effects(progress: Progress) -> dict[str, Any]:
     """The library of effects."""
     from identify import effects as library
@@ -154,19 +151,6 @@ def _warm_csv() -> str:
     return "\n".join(rows) + "\n"
 
 
-def clean(value: Any) -> Any:
-    """A value as JSON holds it: arrays as lists, numbers that are none as null."""
-    if isinstance(value, dict):
-        return {str(key): clean(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [clean(item) for item in value]
-    if hasattr(value, "tolist"):
-        return clean(value.tolist())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
-
-
 def find_recording(progress: Progress, folder: str, test_id: str) -> dict[str, Any]:
     """The sealed recording of a test, when the service did not hear of its end."""
     import hashlib
@@ -193,6 +177,7 @@ VERBS: dict[str, Callable[..., dict[str, Any]]] = {
     "curves": drawn,
     "diagnosis": diagnosis,
     "improve": improve,
+    "join": joined,
     "effects": effects,
     "warm": warm,
     "find_recording": find_recording,

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from api import audit
+from api.analyses import Analyses
 from api.clock import Clock
 from api.errors import ApiError
 from api.fitting import Fitting, Job
@@ -33,12 +34,14 @@ class Outcomes:
     """
 
     def __init__(
-        self, store: Store, clock: Clock, rig: RigClient, fitting: Fitting, versions: Versions, recordings_dir: Path,
+        self, store: Store, clock: Clock, rig: RigClient, fitting: Fitting, versions: Versions,
+        analyses: Analyses, recordings_dir: Path,
         on_progress: Callable[[str], None],
     ) -> None:  # fmt: skip
         self.store, self.clock, self.rig, self.fitting, self.versions = store, clock, rig, fitting, versions
-        self.recordings_dir, self.on_progress = recordings_dir, on_progress
+        self.analyses, self.recordings_dir, self.on_progress = analyses, recordings_dir, on_progress
         self.jobs: dict[str, Job] = {}
+        self._foreseen: set[asyncio.Task[None]] = set()
 
     def update(self, test_id: str, **fields: Any) -> Test:
         """Change a test's row."""
@@ -86,7 +89,13 @@ class Outcomes:
     async def identify(self, test_id: str, last_sample_unix_s: float | None = None) -> None:
         """Identify a test's recording in a worker and store the model."""
         row: Test = await asyncio.to_thread(self.store.get, Test, test_id)
-        recording: Recording = await asyncio.to_thread(self.store.get, Recording, row.recording_id)
+        parent = None
+        try:
+            recording, parent = await self._record_of(row)
+        except ApiError as error:
+            reason = f"joining the recordings: {error.detail or error.title}"
+            await asyncio.to_thread(self.update, test_id, state="failed", reason=reason)
+            return
         job = self.fitting.submit(
             "fit", urgent=True, data=recording.path, on_progress=lambda _job: self.on_progress(test_id)
         )
@@ -100,12 +109,24 @@ class Outcomes:
         finally:
             self.jobs.pop(test_id, None)
         model = await asyncio.to_thread(
-            self.versions.add, found["json"], row.participant, recording.id, f"test {test_id}"
+            self.versions.add, found["json"], row.participant, recording.id, f"test {test_id}", parent
         )
         summary = dict(row.summary)
         if last_sample_unix_s is not None:
             summary["last_sample_to_model_s"] = round(self.clock.unix_s() - last_sample_unix_s, 3)
         await asyncio.to_thread(self.update, test_id, state="completed", model_id=model.id, summary=summary)
+        foreseen = asyncio.create_task(self.analyses.foresee(model))
+        self._foreseen.add(foreseen)
+        foreseen.add_done_callback(self._foreseen.discard)
+
+    async def _record_of(self, row: Test) -> tuple[Recording, str | None]:
+        """What is identified: the test's recording, or that joined to the one of the model it was made to judge."""
+        recording: Recording = await asyncio.to_thread(self.store.get, Recording, row.recording_id)
+        joins = row.plan.get("joins")
+        if joins is None:
+            return recording, None
+        model = await asyncio.to_thread(self.versions.get, joins)
+        return await self.analyses.join(model.recording_id, recording.id, row.participant), model.id
 
     async def missed_end(self, test_id: str, why: str) -> FinishedEvent:
         """The end of a test as the rig remembers it, or as its recording tells."""

@@ -54,6 +54,9 @@ class TestIn(Body):
         None, description="None: the default pre-session test"
     )
     pulse_rate_hz: Annotated[FiniteFloat, Field(gt=0, le=100)] = 40.0
+    joins: Annotated[str, StringConstraints(max_length=64)] | None = Field(
+        None, description="a model: the new recording is joined to that model's, and both are judged together"
+    )
 
 
 class StopIn(Body):

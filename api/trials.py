@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from api import audit
+from api.analyses import Analyses
 from api.clock import Clock
 from api.errors import ApiError, NotFoundError
 from api.fitting import Fitting
@@ -51,12 +52,13 @@ class Trials:
     """Starts tests, one at a time, and follows each to its model."""
 
     def __init__(
-        self, store: Store, clock: Clock, rig: RigClient, fitting: Fitting, versions: Versions, recordings_dir: Path
-    ) -> None:
-        self.store, self.clock, self.rig, self.versions = store, clock, rig, versions
+        self, store: Store, clock: Clock, rig: RigClient, fitting: Fitting, versions: Versions, analyses: Analyses,
+        recordings_dir: Path,
+    ) -> None:  # fmt: skip
+        self.store, self.clock, self.rig, self.versions, self.fitting = store, clock, rig, versions, fitting
         self.hub = Hub()
         self.current: Current | None = None
-        self.outcomes = Outcomes(store, clock, rig, fitting, versions, recordings_dir, self.announce)
+        self.outcomes = Outcomes(store, clock, rig, fitting, versions, analyses, recordings_dir, self.announce)
         self._lock = asyncio.Lock()
         self._tasks: set[asyncio.Task[Any]] = set()
         rig.listeners.append(self._on_event)
@@ -84,10 +86,13 @@ class Trials:
 
     async def _start(self, body: TestIn, participant: Participant, by: str) -> Test:
         plan = self._plan(body, participant)
+        if body.joins is not None:
+            await asyncio.to_thread(self._check_joins, body)
         self.current = Current(plan.test_id, plan.participant, by)
+        self.fitting.cancel_background()
         try:
             preview = await self.rig.ask(PreviewRequest(plan=plan, recruitment=self._recruitment(plan.participant)))
-            row = await asyncio.to_thread(self._write_intent, plan, preview, by)
+            row = await asyncio.to_thread(self._write_intent, plan, preview, by, body.joins)
             self.hub.begin(plan.test_id)
             await self._command(plan)
         except BaseException:
@@ -129,14 +134,21 @@ class Trials:
             pulse_rate_hz=body.pulse_rate_hz,
         )
 
+    def _check_joins(self, body: TestIn) -> None:
+        """The model whose recording the new one is to be joined to is the participant's own."""
+        model = self.versions.get(str(body.joins))
+        if model.participant != body.participant:
+            detail = f"{model.id} is a model of {model.participant}, the test is for {body.participant}."
+            raise ApiError(422, "other-participant", "The model is another participant's", detail)
+
     def _new_id(self) -> str:
         stamp = self.clock.utc()[:19].replace("-", "").replace(":", "")
         return f"T{stamp}-{secrets.token_hex(3)}"
 
-    def _write_intent(self, plan: TestPlan, preview: dict[str, Any], by: str) -> Test:
+    def _write_intent(self, plan: TestPlan, preview: dict[str, Any], by: str, joins: str | None) -> Test:
         now = self.clock.utc()
         row = Test(id=plan.test_id, participant=plan.participant, kind=plan.kind, state="requested")
-        row.plan, row.summary, row.reason = {**plan.model_dump(), "preview": preview}, {}, ""
+        row.plan, row.summary, row.reason = {**plan.model_dump(), "preview": preview, "joins": joins}, {}, ""
         row.requested_by, row.requested_utc = by, now
         with self.store.write() as session:
             session.add(row)
@@ -297,6 +309,7 @@ class Trials:
             "planned": planned,
             "recording_id": row.recording_id,
             "recording_url": f"/v1/recordings/{row.recording_id}" if row.recording_id else None,
+            "joins": row.plan.get("joins"),
             "model_id": row.model_id,
             "model_url": f"/v1/models/{row.model_id}" if row.model_id else None,
             "summary": row.summary,

@@ -84,6 +84,41 @@ class Versions:
         """A participant's versions, newest first."""
         return self.store.all(Model, Model.participant == participant, order=Model.created_utc.desc())
 
+    def child_with(self, parent: Model, effects: list[str]) -> Model | None:
+        """A version of the same recording, made from `parent`, that holds exactly these effects."""
+        rows = self.store.all(Model, Model.parent_id == parent.id, Model.recording_id == parent.recording_id)
+        return next((row for row in rows if sorted(row.effects) == sorted(effects)), None)
+
+    def lineage(self, model: Model) -> list[Model]:
+        """The versions from the first one of the recording to this one, then its newest descendants."""
+        rows = {row.id: row for row in self.store.all(Model, Model.recording_id == model.recording_id)}
+        path = [model]
+        while path[0].parent_id in rows:
+            path.insert(0, rows[str(path[0].parent_id)])
+        children = sorted(rows.values(), key=lambda row: row.created_utc)
+        while below := [row for row in children if row.parent_id == path[-1].id]:
+            path.append(below[-1])
+        return path
+
+    def undo(self, model_id: str, by: str, reason: str) -> Model:
+        """Go back to the version this one was made from: this one is rejected, and where it was in use, that one is.
+
+        Raises
+        ------
+        ApiError
+            409: there is nothing before it.
+        """
+        row = self.get(model_id)
+        if row.parent_id is None:
+            detail = f"{model_id} is the first version. Reject it instead."
+            raise ApiError(409, "nothing-to-undo", "There is no version before this one", detail)
+        holding = self.approved(row.participant)
+        words = f"undone: {reason}" if reason else "undone"
+        self.decide(row.id, False, by, words)
+        if holding is not None and holding.model_id == row.id:
+            self.decide(row.parent_id, True, by, words)
+        return self.get(row.parent_id)
+
     def decide(self, model_id: str, approved: bool, by: str, reason: str) -> Approval:
         """Approve or reject a version; only a person does this."""
         row = self.get(model_id)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from fastapi import APIRouter
 
-from api.pages import forms, home, static, views
+from api.pages import compare_view, forms, home, model_view, static, views
 
 
 def routers() -> list[APIRouter]:
     """The routers of the page."""
-    return [home.router, views.router, forms.router, static.router]
+    subjects = (home, views, model_view, compare_view, forms, static)
+    return [subject.router for subject in subjects]

@@ -49,18 +49,22 @@ def line(
             "line": {"color": colour, "width": width, **more.pop("line", {})}, **more}  # fmt: skip
 
 
-def of_model(document: dict[str, Any], curves: dict[str, Any] | None) -> dict[str, Any]:
+def of_model(
+    document: dict[str, Any], curves: dict[str, Any] | None, comparison: dict[str, Any] | None = None
+) -> dict[str, Any]:
     """All figures of a model's page; those that need the measurement only if there is one."""
     figures = {"recruitment": recruitment(document)}
     if curves is not None:
         noise_sd_nm = (document.get("fit") or {}).get("noise_sd_nm")
-        figures["comparison"] = measurement(curves, noise_sd_nm)
+        figures["comparison"] = measurement(curves, noise_sd_nm, (comparison or {}).get("series"))
         figures["step"] = step(document, curves["step_response"])
     return figures
 
 
-def measurement(curves: dict[str, Any], noise_sd_nm: float | None) -> dict[str, Any]:
-    """Torque measured and predicted, what is left, and the pulse width, on one time axis."""
+def measurement(
+    curves: dict[str, Any], noise_sd_nm: float | None, series: dict[str, Any] | None = None
+) -> dict[str, Any]:
+    """Torque measured and predicted with its band, what is left, and the pulse width, on one time axis."""
     time_s = curves["time_s"]
     residual = [
         None if predicted is None else measured - predicted
@@ -73,6 +77,13 @@ def measurement(curves: dict[str, Any], noise_sd_nm: float | None) -> dict[str, 
         line(time_s, curves["pulse_width_us"], "pulse width", STIMULUS, 1.2, yaxis="y3", showlegend=False,
              line={"shape": "hv"}),
     ]  # fmt: skip
+    if series and series.get("lower_nm"):
+        quiet = {"hoverinfo": "skip"}
+        data[1:1] = [
+            line(series["time_s"], series["upper_nm"], "", MODEL, 0, showlegend=False, **quiet),
+            line(series["time_s"], series["lower_nm"], "95 % band of the model", MODEL, 0, fill="tonexty",
+                 fillcolor=BAND, **quiet),
+        ]  # fmt: skip
     shapes, labels = segment_marks(curves["segments"])
     if noise_sd_nm:
         shapes.append(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -43,7 +44,19 @@ def when(label: str | None) -> str:
     return datetime.fromisoformat(label.replace("Z", "+00:00")).astimezone().strftime("%d %b %Y, %H:%M")
 
 
+def figures(value: float | None) -> str:
+    """A number to three significant figures, without powers of ten where they can be done without."""
+    if value is None:
+        return "–"
+    if value == 0:
+        return "0"
+    digits = max(0, 2 - math.floor(math.log10(abs(value))))
+    text = f"{value:.{digits}f}" if digits <= 6 else f"{value:.2g}"
+    return text.replace("-", "−")
+
+
 environment.filters["number"] = number
+environment.filters["figures"] = figures
 environment.filters["when"] = when
 
 

@@ -1,18 +1,14 @@
-"""What is looked at: a participant, a test, a model."""
+"""What is looked at: a participant, a test."""
 
 from __future__ import annotations
 
 import asyncio
-import json
 from typing import Any
 
 from fastapi import APIRouter, Request
 from fastapi.responses import Response
 
-from api import reading
-from api.context import Ctx, LiveReader, ModelReader, Tester
-from api.errors import ApiError
-from api.pages import charts
+from api.context import Ctx, LiveReader, Tester
 from api.pages.render import page
 from api.routes import participants, tests
 from api.store.tables import Test
@@ -44,26 +40,3 @@ async def test(request: Request, context: Ctx, _who: LiveReader, test_id: str) -
     planned = (row.plan.get("preview") or {}).get("pulse_width_us") or []
     data = {"test": document, "planned_us": planned, "pulse_rate_hz": row.plan.get("pulse_rate_hz", 40.0)}
     return page(request, "test.html", test=document, data=data)
-
-
-@router.get("/models/{model_id}")
-async def model(request: Request, context: Ctx, _who: ModelReader, model_id: str) -> Response:
-    """A model beside its measurement."""
-    row = await asyncio.to_thread(context.versions.get, model_id)
-    document = json.loads(row.document)
-    found, problem = None, None
-    try:
-        found = await context.analyses.curves(row)
-    except ApiError as error:
-        problem = error
-    public = await asyncio.to_thread(context.versions.public, row)
-    return page(
-        request,
-        "model.html",
-        model=public,
-        document=document,
-        recruitment=reading.recruitment(document),
-        dynamics=reading.dynamics(document),
-        problem=problem,
-        figures=charts.of_model(document, found),
-    )

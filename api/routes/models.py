@@ -1,4 +1,4 @@
-"""Models: versions, approval, what the controller gets, comparison, diagnosis, effects."""
+"""Models: versions, approval, what the controller gets."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Header, Response
 
-from api.context import PROBLEM, Approver, Ctx, ModelReader, Tester
+from api.context import PROBLEM, Approver, Ctx, ModelReader
+from api.documents import VersionOut
 from api.errors import ApiError
 from api.routes import participants
-from api.schemas import DecisionIn, EffectsIn
+from api.schemas import DecisionIn
 
 router = APIRouter(prefix="/v1", tags=["models"], responses=PROBLEM)
 
@@ -38,14 +39,14 @@ def matches(if_none_match: str, etag: str) -> bool:
     return "*" in tags or etag in tags
 
 
-@router.get("/participants/{code}/models")
+@router.get("/participants/{code}/models", response_model=list[VersionOut])
 def versions(context: Ctx, _who: ModelReader, code: str) -> list[dict[str, Any]]:
     """A participant's model versions, newest first, with their errors and what each added."""
     participants.find(context, code)
     return [context.versions.public(row) for row in context.versions.of(code)]
 
 
-@router.get("/models/{model_id}")
+@router.get("/models/{model_id}", response_model=VersionOut)
 def one_model(context: Ctx, _who: ModelReader, model_id: str) -> dict[str, Any]:
     """A version: its errors, its verdict, its lineage, and the model."""
     row = context.versions.get(model_id)
@@ -60,64 +61,22 @@ def model_file(context: Ctx, _who: ModelReader, model_id: str) -> Response:
     return Response(row.document, media_type="application/json", headers=headers)
 
 
-@router.post("/models/{model_id}/approve")
+@router.post("/models/{model_id}/approve", response_model=VersionOut)
 def approve(context: Ctx, who: Approver, model_id: str, body: DecisionIn | None = None) -> dict[str, Any]:
     """Let the controller have this version."""
     context.versions.decide(model_id, True, who.name, body.reason if body else "")
     return context.versions.public(context.versions.get(model_id))
 
 
-@router.post("/models/{model_id}/reject")
+@router.post("/models/{model_id}/reject", response_model=VersionOut)
 def reject(context: Ctx, who: Approver, model_id: str, body: DecisionIn | None = None) -> dict[str, Any]:
     """Keep this version from the controller."""
     context.versions.decide(model_id, False, who.name, body.reason if body else "")
     return context.versions.public(context.versions.get(model_id))
 
 
-@router.get("/models/{model_id}/comparison")
-async def comparison(context: Ctx, _who: ModelReader, model_id: str) -> dict[str, Any]:
-    """Measurement against the model's free run."""
-    row = await asyncio.to_thread(context.versions.get, model_id)
-    return await context.analyses.comparison(row)
-
-
-@router.get("/models/{model_id}/curves")
-async def curves(context: Ctx, _who: ModelReader, model_id: str) -> dict[str, Any]:
-    """The measured, predicted and commanded curves and the step response, thinned to what a screen shows."""
-    row = await asyncio.to_thread(context.versions.get, model_id)
-    return await context.analyses.curves(row)
-
-
-@router.get("/models/{model_id}/diagnosis")
-async def diagnosis(context: Ctx, _who: ModelReader, model_id: str) -> dict[str, Any]:
-    """What is missing, ranked; or that nothing is; or that what is left has no name in the library."""
-    row = await asyncio.to_thread(context.versions.get, model_id)
-    return await context.analyses.diagnosis(row)
-
-
-@router.post("/models/{model_id}/effects", status_code=201)
-async def add_effects(context: Ctx, who: Tester, model_id: str, body: EffectsIn, response: Response) -> dict[str, Any]:
-    """Add effects: a new version, fitted anew; the old one stays as it is."""
-    row = await asyncio.to_thread(context.versions.get, model_id)
-    twice = [effect for effect in body.effects if effect in row.effects]
-    if twice:
-        detail = f"{', '.join(twice)} is in {model_id} already. Name effects it does not hold."
-        raise ApiError(409, "effect-present", "The effect is in the model", detail)
-    new = await context.analyses.add_effects(row, body.effects, who.name)
-    response.headers["Location"] = f"/v1/models/{new.id}"
-    return await asyncio.to_thread(context.versions.public, new)
-
-
-@router.post("/models/{model_id}/improve", status_code=201)
-async def improve(context: Ctx, who: Tester, model_id: str) -> dict[str, Any]:
-    """Add effects one by one while the evidence lasts; each step is a version."""
-    row = await asyncio.to_thread(context.versions.get, model_id)
-    found, rows = await context.analyses.improve(row, who.name)
-    versions = await asyncio.to_thread(lambda: [context.versions.public(new) for new in rows])
-    return {**found, "versions": versions}
-
-
-@router.get("/effects")
-async def effects(context: Ctx, _who: ModelReader) -> dict[str, Any]:
-    """The library of effects."""
-    return await context.fitting.submit("effects").result
+@router.post("/models/{model_id}/undo", response_model=VersionOut)
+def undo(context: Ctx, who: Approver, model_id: str, body: DecisionIn | None = None) -> dict[str, Any]:
+    """Go back to the version this one was made from; nothing is deleted."""
+    parent = context.versions.undo(model_id, who.name, body.reason if body else "")
+    return context.versions.public(parent)

@@ -6,6 +6,7 @@ import hashlib
 import json
 import sys
 import time
+from pathlib import Path
 from typing import Any
 
 
@@ -35,6 +36,52 @@ def curves() -> dict[str, Any]:
     }  # fmt: skip
 
 
+def comparison() -> dict[str, Any]:
+    time_s = [k / 10 for k in range(200)]
+    part = {"label": "prbs", "samples": 100, "rms_nm": 0.2, "mean_nm": 0.1, "share_of_excess": 1.0}
+    return {
+        "fit_percent": 97.0, "ceiling_percent": 98.6, "rms_nm": 0.12, "noise_sd_nm": 0.04,
+        "held_out": {"rms_nm": 0.12},
+        "by": {kind: [part] for kind in ("segment", "level", "direction", "time", "frequency")},
+
+        "where": WHERE, "plain": [], "series": {"time_s": time_s, "residual_nm": [0.1] * 200, "noise_band_nm": 0.08},
+        "tests": {"tests": [{"with": "y", "largest": 0.3, "band": 0.1, "passed": False, "words": "goes with torque"}]},
+    }  # fmt: skip
+
+
+WHERE = [{
+    "segment": "prbs", "start_s": 3.0, "end_s": 4.5, "pulse_width_us": [0.0, 300.0], "direction": "falling",
+    "share_of_excess": 0.31, "text": "falling prbs, 0-300 µs: model too high by 0.4 N·m, 31 % of what is left",
+}]  # fmt: skip
+EXPERIMENT = {
+    "effect": "fatigue", "rivals": ["fatigue", "threshold_drift"], "duration_s": 6.0, "decides": True,
+    "text": "A ramp.",
+    "segments": [{"name": "rest", "sequence": "rest", "settings": {"duration_s": 1}},
+                 {"name": "ramp", "sequence": "ramp", "settings": {"up_s": 2, "down_s": 2}}],
+    "dose": {"pulses": 80, "pulse_width_sum_us": 9000.0, "torque_time_nm_s": 9.0},
+}  # fmt: skip
+
+
+def diagnosis() -> dict[str, Any]:
+    missing = {
+        "effect": "fatigue", "name": "Fatigue", "probability": 0.93, "rms_before_nm": 0.12, "rms_after_nm": 0.041,
+        "held_out_rms_before_nm": 0.2, "held_out_rms_after_nm": 0.042, "confused_with": ["threshold_drift"],
+        "next_experiment": "the ramp again", "plain": "The muscle tires.",
+        "parameters": {"depth": {"value": 0.4, "sd": 0.05, "unit": "1"}},
+    }  # fmt: skip
+    tried = [{"effect": name, "log_evidence_gain": gain} for name, gain in (("fatigue", 90.0), ("tremor", -4.0))]
+    return {
+        "verdict": "effect_missing", "noise_sd_nm": 0.04, "base": {}, "missing": [missing], "where": WHERE,
+        "candidates": [tried], "experiment": EXPERIMENT, "signatures": {}, "library": {}, "notes": [],
+    }  # fmt: skip
+
+
+def improvement() -> dict[str, Any]:
+    steps = [{"added": added, "fit_percent": 97.0, "rms_nm": rms} for added, rms in ((None, 0.12), ("fatigue", 0.041))]
+    models = [model([]), model(["fatigue"])]
+    return {"verdict": "effect_missing", "noise_sd_nm": 0.04, "steps": steps, "models": models, "refused": []}
+
+
 def answer(verb: str, arguments: dict[str, Any], say: Any) -> dict[str, Any]:
     if verb == "fit":
         say(progress=0.5, text="identifying")
@@ -49,13 +96,26 @@ def answer(verb: str, arguments: dict[str, Any], say: Any) -> dict[str, Any]:
         document = model(list(arguments.get("effects", [])))
         return {"result": {"json": json.dumps(document), "model": document}}
     if verb == "comparison":
-        return {"result": {"fit_percent": 98.5}}
+        return {"result": comparison()}
     if verb == "curves":
         return {"result": curves()}
     if verb == "diagnosis":
-        return {"result": {"verdict": "nothing_missing", "missing": [], "where": []}}
+        say(progress=0.5, text="trying fatigue")
+        if Path(arguments["data"]).with_suffix(".slow").exists():
+            time.sleep(60)
+        return {"result": diagnosis()}
+    if verb == "improve":
+        say(progress=0.5, text="adding fatigue")
+        return {"result": improvement()}
+    if verb == "join":
+        Path(arguments["out"]).write_text("\n".join(arguments["parts"]))
+        return {"result": {"file_sha256": "0" * 64}}
     if verb == "effects":
-        return {"result": {"effects": [{"id": "fatigue"}]}}
+        return {
+            "result": {
+                "effects": [{"id": name} for name in ("fatigue", "tremor", "threshold_drift", "slow", "die", "bad")]
+            }
+        }
     if verb == "find_recording":
         from api.jobs import find_recording
 

@@ -65,8 +65,8 @@ def test_effect_makes_a_new_version_with_lineage(client: httpx.Client, participa
     assert made.headers["location"] == f"/v1/models/{child['id']}"
     twice = client.post(f"/v1/models/{child['id']}/effects", json={"effects": ["fatigue"]})
     assert twice.status_code == 409
-    refused = client.post(f"/v1/models/{parent}/effects", json={"effects": ["bad"]})
-    assert refused.status_code == 422 and "no effect bad" in refused.json()["detail"]
+    refused = client.post(f"/v1/models/{parent}/effects", json={"effects": ["phlogiston"]})
+    assert refused.status_code == 422 and "Take one of" in refused.json()["detail"]
     assert client.get(f"/v1/models/{parent}").json()["effects"] == []
 
 
@@ -138,7 +138,7 @@ def test_comparison_and_diagnosis_are_made_once_and_kept(
     done = service.app.state.context.fitting.done_count
     assert client.get(f"{model}/comparison").json() == first
     assert service.app.state.context.fitting.done_count == done
-    assert client.get(f"{model}/diagnosis").json()["verdict"] == "nothing_missing"
+    assert client.get(f"{model}/diagnosis").json()["verdict"] == "effect_missing"
 
 
 def test_refused_plan_says_why_and_is_kept(client: httpx.Client, participant: str) -> None:

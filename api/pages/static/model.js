@@ -4,6 +4,6 @@ const figures = JSON.parse(document.getElementById("data").textContent);
 const settings = { responsive: true, displaylogo: false, modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"] };
 for (const box of document.querySelectorAll("[data-figure]")) {
   const figure = figures[box.dataset.figure];
-  if (figure && box.clientWidth < 560) figure.layout.annotations = []; // no room for the segments' names
+  if (figure && box.clientWidth < 560) figure.layout.annotations = (figure.layout.annotations || []).filter((a) => a.name); // no room for the segments' names
   if (figure) Plotly.newPlot(box, figure.data, figure.layout, settings);
 }

@@ -1,0 +1,82 @@
+"""Several recordings of one participant as one record, for a verdict on all of them.
+
+They are put one behind the other: each begins and ends at rest, and those measured rests are what stands between them.
+The pause that was between the tests is left out, since nothing was measured in it; so slow effects (fatigue, drift)
+appear in the joined record with less rest than there was. Nothing is made up to fill it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+HEADER = "time_s,pulse_width_us,torque_nm,segment"
+PULSE_RATE_HZ = 40.0
+"""A CSV file stands for this rate."""
+
+
+def table(records: Sequence[Any]) -> str:
+    """The joined record as CSV, at the first one's sample rate.
+
+    Raises
+    ------
+    identify.BadRecord
+        Pulse rates differ from 40 pulses/s, or a part does not begin at rest.
+    """
+    import numpy as np
+
+    rate_hz = float(records[0].sample_rate_hz)
+    columns: list[tuple[Any, Any, Any]] = []
+    for number, record in enumerate(records, start=1):
+        check(record, number)
+        columns.append(resampled(record, rate_hz))
+    width, torque, names = (np.concatenate(parts) for parts in zip(*columns, strict=True))
+    time_s = np.arange(width.size) / rate_hz
+    rows = zip(time_s, width, torque, names, strict=True)
+    return "\n".join([HEADER, *(f"{t:.6f},{u:g},{y:.6f},{name}" for t, u, y, name in rows)]) + "\n"
+
+
+def check(record: Any, number: int) -> None:
+    """Refuse a part that cannot be joined."""
+    import identify
+
+    if abs(record.pulse_rate_hz - PULSE_RATE_HZ) > 1e-6:
+        message = f"{record.pulse_rate_hz:g} pulses/s; recordings are joined at {PULSE_RATE_HZ:g} only"
+        raise identify.BadRecord(message, place=f"recording {number}")
+    if number > 1 and record.pulse_width_us[: max(1, round(0.1 * record.sample_rate_hz))].any():
+        mend = "Begin the test with a rest."
+        raise identify.BadRecord("it does not begin at rest", place=f"recording {number}", mend=mend)
+
+
+def resampled(record: Any, rate_hz: float) -> tuple[Any, Any, Any]:
+    """Pulse width, torque, segment names at another rate, beginning with the slot of a pulse.
+
+    Torque is averaged over a new sample's span where the rate falls, and interpolated where it does not.
+    """
+    import numpy as np
+
+    start_s = first_slot_s(record)
+    count = int(np.floor((record.time_s[-1] - start_s) * rate_hz + 1e-6)) + 1
+    per_slot = rate_hz / PULSE_RATE_HZ
+    count = int(np.floor(count / per_slot) * per_slot)
+    time_s = start_s + np.arange(count) / rate_hz
+    own_hz = float(record.sample_rate_hz)
+    torque = record.torque_nm
+    if own_hz > 1.5 * rate_hz:
+        span = max(1, round(own_hz / rate_hz))
+        torque = np.convolve(torque, np.ones(span) / span, "same")
+    last = np.clip(np.searchsorted(record.time_s, time_s + 0.25 / own_hz, side="right") - 1, 0, None)
+    names = np.array(record.segment_names)[record.segment[last]]
+    return record.pulse_width_us[last], np.interp(time_s, record.time_s, torque), names
+
+
+def first_slot_s(record: Any) -> float:
+    """The first time in the record at which a pulse is due, from the first change of the pulse width."""
+    import numpy as np
+
+    changes = np.flatnonzero(np.diff(record.pulse_width_us)) + 1
+    if not changes.size:
+        return float(record.time_s[0])
+    change_s = float(record.time_s[changes[0]])
+    slots = np.floor((change_s - record.time_s[0]) * PULSE_RATE_HZ + 1e-6)
+    return change_s - float(slots) / PULSE_RATE_HZ

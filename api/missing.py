@@ -1,0 +1,114 @@
+"""What a worker does to find what a model lacks: diagnosis, signatures, the next experiment, improving, joining.
+
+Imported by the worker and the command line only.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from api.cleaning import clean
+
+Progress = Callable[[float, str], None]
+POINTS = 900
+"""Points of a signature's curve: it is drawn small."""
+
+
+def diagnosis(data: str, progress: Progress) -> dict[str, Any]:
+    """What is missing in the model of a recording, what each effect would explain, and the test that decides.
+
+    The first four fifths of the progress are identify's diagnosis.
+    """
+    import identify
+
+    record = identify.read(Path(data))
+    found = dict(identify.diagnose(record, progress=lambda share, text="": progress(0.8 * share, text)))
+    found["library"] = {entry["id"]: entry for entry in library() if entry["id"] in mentioned(found)}
+    progress(0.82, "what each effect would explain")
+    found["signatures"] = signatures(record, [entry["effect"] for entry in found["missing"]])
+    found["experiment"] = experiment(found["missing"])
+    return clean(found)
+
+
+def library() -> list[dict[str, Any]]:
+    """The library of effects as plain data."""
+    from identify import effects
+
+    return effects.library()
+
+
+def mentioned(found: dict[str, Any]) -> set[str]:
+    """Ids of all effects that a diagnosis speaks of."""
+    named = {entry["effect"] for entry in found["missing"]}
+    named |= {rival for entry in found["missing"] for rival in entry.get("confused_with") or []}
+    return named | {row["effect"] for rows in found.get("candidates") or [] for row in rows}
+
+
+def signatures(record: Any, effects: Sequence[str]) -> dict[str, Any]:
+    """What each effect explains of what the model before it leaves: seen beside expected.
+
+    ``seen_nm`` is measurement minus the model before, ``expected_nm`` the model with the effect minus the model before.
+    An effect whose model cannot be fitted alone has none.
+    """
+    import numpy as np
+
+    import identify
+    from identify.engine import fit_with_effects
+
+    pick = slice(None, None, max(1, -(-record.time_s.size // POINTS)))
+    found: dict[str, Any] = {"time_s": record.time_s[pick].round(4)}
+    before, held = np.asarray(identify.predict(fit_with_effects(record, []), record)), []
+    for effect in effects:
+        held.append(effect)
+        try:
+            after = np.asarray(identify.predict(fit_with_effects(record, held), record))
+        except identify.IdentifyError:
+            held.pop()
+            continue
+        seen = record.torque_nm - before
+        found[effect] = {"seen_nm": smooth(record, seen)[pick].round(4), "expected_nm": (after - before)[pick].round(4)}
+        before = after
+    return found
+
+
+def smooth(record: Any, values: Any) -> Any:
+    """Running mean over a tenth of a second, so that a slow signature is seen through the noise."""
+    import numpy as np
+
+    width = max(1, round(0.1 * record.sample_rate_hz))
+    padded = np.pad(values, (width // 2, width - 1 - width // 2), mode="edge")
+    return np.convolve(padded, np.ones(width) / width, "valid")
+
+
+def experiment(missing: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
+    """The test that separates the first effect with rivals from them; None where no effect has any."""
+    for entry in missing:
+        if entry.get("confused_with") and entry.get("next_experiment_plan"):
+            return {**entry["next_experiment_plan"], "effect": entry["effect"]}
+    return None
+
+
+def improve(data: str, progress: Progress, force: Sequence[str] = ()) -> dict[str, Any]:
+    """Effects added one by one while the evidence lasts, each step with its model."""
+    import identify
+
+    record = identify.read(Path(data))
+    found = dict(identify.improve(record, progress=progress, force=tuple(force)))
+    models = [json.loads(model.to_json()) if hasattr(model, "to_json") else model for model in found["models"]]
+    return clean({**found, "models": models})
+
+
+def joined(parts: Sequence[str], out: str, progress: Progress) -> dict[str, Any]:
+    """Recordings one after the other as one (see `api.joining`), written as CSV to `out`; its SHA-256."""
+    import hashlib
+
+    import identify
+    from api.joining import table
+
+    progress(0.1, "joining the recordings")
+    text = table([identify.read(Path(part)) for part in parts])
+    Path(out).write_text(text)
+    return {"file_sha256": hashlib.sha256(text.encode()).hexdigest()}

@@ -1,0 +1,185 @@
+"""A model: beside its measurement, why it fails, and what can be done about it."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Form, Request
+from fastapi.responses import RedirectResponse, Response
+
+from api import reading
+from api.auth import Scope
+from api.context import Approver, Context, Ctx, ModelReader, Tester
+from api.errors import ApiError
+from api.pages import charts, why, why_charts
+from api.pages.render import page
+from api.routes import criticism
+from api.schemas import EffectsIn, TestIn
+from api.store.tables import Model
+from api.tasks import Task
+
+router = APIRouter(include_in_schema=False)
+TITLES = {"diagnosis": "Diagnosing", "add-effects": "Adding the effect", "improve": "Improving the model"}
+
+
+@router.get("/models/{model_id}")
+async def model(request: Request, context: Ctx, who: ModelReader, model_id: str, diagnose: int = -1) -> Response:
+    """A model beside its measurement, and why it fails. `diagnose`: 1 begins a diagnosis anew, 0 begins none."""
+    row = await asyncio.to_thread(context.versions.get, model_id)
+    document = json.loads(row.document)
+    measured = await measurement(context, row)
+    diagnosis = await looked_at(context, row, who.name, diagnose)
+    shown = await asyncio.to_thread(gather, context, row, measured, diagnosis)
+    return page(
+        request,
+        "model.html",
+        model=await asyncio.to_thread(context.versions.public, row),
+        document=document,
+        recruitment=reading.recruitment(document),
+        dynamics=reading.dynamics(document),
+        problem=measured["problem"],
+        may_test=who.may(Scope.RUN_TEST),
+        may_approve=who.may(Scope.APPROVE_MODEL),
+        **{key: value for key, value in shown.items() if key != "figures"},
+        figures={**charts.of_model(document, measured["curves"], measured["comparison"]), **shown["figures"]},
+    )
+
+
+async def measurement(context: Context, row: Model) -> dict[str, Any]:
+    """Curves and comparison, or the problem that keeps them from being drawn."""
+    found: dict[str, Any] = {"curves": None, "comparison": None, "problem": None}
+    try:
+        found["curves"], found["comparison"] = await asyncio.gather(
+            context.analyses.curves(row), context.analyses.comparison(row)
+        )
+    except ApiError as error:
+        found["problem"] = error
+    return found
+
+
+async def looked_at(context: Context, row: Model, by: str, diagnose: int) -> dict[str, Any]:
+    """The diagnosis if it is there; else the task that makes it, begun if nobody has."""
+    known = await asyncio.to_thread(context.analyses.known_diagnosis, row)
+    if known is not None:
+        return {"found": known, "task": None}
+    tasks = [task for task in context.tasks.all.values() if (task.kind, task.subject) == ("diagnosis", row.id)]
+    newest = tasks[-1] if tasks else None
+    if diagnose == 1 or (newest is None and diagnose != 0):
+        newest = criticism.begin_diagnosis(context, row, by)
+        await asyncio.sleep(0.05)
+    return {"found": None, "task": newest}
+
+
+def gather(context: Context, row: Model, measured: dict[str, Any], diagnosis: dict[str, Any]) -> dict[str, Any]:
+    """What the section "Why does it fail?" shows."""
+    found, comparison, task = diagnosis["found"], measured["comparison"], diagnosis["task"]
+    view = why.view(found, comparison, row.effects) if found else None
+    rows = why.versions([context.versions.public(version) for version in context.versions.lineage(row)], row.id)
+    segments = (measured["curves"] or {}).get("segments") or []
+    signatures = (found or {}).get("signatures") or {}
+    places = view["places"] if view else why_charts.places_of(comparison or {})
+    return {
+        "why": view,
+        "job": task.public() if task and task.state == "running" else None,
+        "why_problem": task.problem if task and task.state == "failed" else None,
+        "places": places,
+        "splits": why.splits(comparison),
+        "tests": view["tests"] if view else [],
+        "versions": rows,
+        "figures": why_charts.of_why(comparison, segments, view, signatures, rows),
+    }
+
+
+@router.post("/models/{model_id}/diagnosis/cancel")
+async def cancel_diagnosis(context: Ctx, _who: ModelReader, model_id: str) -> Response:
+    """Stop diagnosing; the page then offers to begin anew."""
+    for task in list(context.tasks.all.values()):
+        if (task.kind, task.subject) == ("diagnosis", model_id):
+            context.tasks.cancel(task)
+    return RedirectResponse(f"/models/{model_id}?diagnose=0#why", 303)
+
+
+@router.post("/models/{model_id}/effects")
+async def add_effect(
+    context: Ctx,
+    who: Tester,
+    model_id: str,
+    effect: Annotated[str, Form()] = "",
+    force: Annotated[str, Form()] = "",
+    reason: Annotated[str, Form()] = "",
+) -> Response:
+    """Add one effect."""
+    row = await asyncio.to_thread(context.versions.get, model_id)
+    body = EffectsIn(effects=[effect], reason=reason[:500], force=bool(force))
+    return await to_task(criticism.begin_adding(context, row, body, who.name))
+
+
+@router.post("/models/{model_id}/improve")
+async def improve(context: Ctx, who: Tester, model_id: str) -> Response:
+    """Add what is missing, one by one."""
+    row = await asyncio.to_thread(context.versions.get, model_id)
+    return await to_task(criticism.begin_improving(context, row, who.name))
+
+
+@router.post("/models/{model_id}/undo")
+async def undo(context: Ctx, who: Approver, model_id: str) -> Response:
+    """Back to the version before."""
+    parent = await asyncio.to_thread(context.versions.undo, model_id, who.name, "")
+    return RedirectResponse(f"/models/{parent.id}#why", 303)
+
+
+@router.post("/models/{model_id}/experiment")
+async def run_experiment(context: Ctx, who: Tester, model_id: str) -> Response:
+    """Play the next experiment of the diagnosis; its recording is joined to this model's."""
+    row = await asyncio.to_thread(context.versions.get, model_id)
+    found = await asyncio.to_thread(context.analyses.known_diagnosis, row)
+    experiment = (found or {}).get("experiment")
+    if not experiment:
+        detail = "The diagnosis of this recording names none: nothing is left to be told apart."
+        raise ApiError(409, "no-experiment", "There is no next experiment", detail)
+    body = TestIn.model_validate(
+        {"participant": row.participant, "kind": "next-experiment", "segments": experiment["segments"], "joins": row.id}
+    )
+    test = await context.trials.start(body, who.name)
+    return RedirectResponse(f"/tests/{test.id}", 303)
+
+
+# ---- long work ----------------------------------------------------------------------------------------------
+
+
+async def to_task(task: Task) -> Response:
+    """To the result where it is there at once, else to the page that waits for it."""
+    try:
+        await asyncio.wait_for(task.done.wait(), 0.3)
+    except TimeoutError:
+        return RedirectResponse(f"/jobs/{task.id}", 303)
+    return RedirectResponse(result_page(task) or f"/jobs/{task.id}", 303)
+
+
+def result_page(task: Task) -> str | None:
+    """The page on which the result is seen."""
+    if task.result_url is None:
+        return None
+    return task.result_url.removeprefix("/v1").removesuffix("/diagnosis") + "#why"
+
+
+@router.get("/jobs/{job_id}")
+async def job(request: Request, context: Ctx, _who: ModelReader, job_id: str) -> Response:
+    """Long work: how far it is; on to its result once it is done."""
+    task = context.tasks.get(job_id)
+    target = result_page(task)
+    if target:
+        return RedirectResponse(target, 303)
+    title = task.problem.title if task.state == "failed" and task.problem else TITLES[task.kind]
+    status = task.problem.status if task.problem and task.state == "failed" else 200
+    return page(request, "job.html", status, job=task.public(), problem=task.problem, title=title)
+
+
+@router.post("/jobs/{job_id}/cancel")
+async def cancel(context: Ctx, _who: ModelReader, job_id: str) -> Response:
+    """Cancel it."""
+    task = context.tasks.get(job_id)
+    context.tasks.cancel(task)
+    return RedirectResponse(f"/models/{task.subject}#why", 303)

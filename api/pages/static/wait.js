@@ -1,0 +1,20 @@
+// Follows long work and goes on once it is done.
+"use strict";
+for (const box of document.querySelectorAll("[data-job]")) follow(box);
+
+async function follow(box) {
+  const bar = box.querySelector("progress"), words = box.querySelector("[data-words]"), left = box.querySelector("[data-left]");
+  for (;;) {
+    await new Promise((resolve) => setTimeout(resolve, 400));
+    let job;
+    try {
+      const answer = await fetch("/v1/jobs/" + box.dataset.job, { headers: { Accept: "application/json" } });
+      if (!answer.ok) { location.reload(); return; }
+      job = await answer.json();
+    } catch { continue; } // the service may be starting again
+    bar.value = job.progress;
+    words.textContent = job.text || words.textContent;
+    left.textContent = job.time_left_s === null ? "" : job.time_left_s < 1 ? "nearly done" : "about " + Math.ceil(job.time_left_s) + " s left";
+    if (job.done) { location.reload(); return; } // the page says what comes next
+  }
+}
