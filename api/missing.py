@@ -87,7 +87,8 @@ def experiment(missing: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
     """The test that separates the first effect with rivals from them; None where no effect has any."""
     for entry in missing:
         if entry.get("confused_with") and entry.get("next_experiment_plan"):
-            return {**entry["next_experiment_plan"], "effect": entry["effect"]}
+            rivals = [entry["effect"], entry["confused_with"][0]]
+            return {"rivals": rivals, **entry["next_experiment_plan"], "effect": entry["effect"]}
     return None
 
 

@@ -7,16 +7,20 @@ from typing import Any
 from markupsafe import Markup
 
 from api import reading
-from api.pages import charts
+from api.pages import charts, why, why_charts
 from api.pages.render import HERE, environment
 from api.pages.static import plotly_path
 from api.verdict import figures, quality
 
 
 def comparison_html(
-    document: dict[str, Any], curves: dict[str, Any], name: str, test: dict[str, Any] | None = None
+    document: dict[str, Any],
+    curves: dict[str, Any],
+    name: str,
+    test: dict[str, Any] | None = None,
+    comparison: dict[str, Any] | None = None,
 ) -> str:
-    """Measurement against model.
+    """Measurement against model: where it fails, and by how much.
 
     Parameters
     ----------
@@ -28,6 +32,8 @@ def comparison_html(
         What was measured: a file's or a test's name.
     test : dict or None
         The test as the service shows it.
+    comparison : dict or None
+        As `identify.compare` gives it, cleaned and thinned.
     """
     fit = figures(document)
     return _page(
@@ -38,14 +44,48 @@ def comparison_html(
         recruitment=reading.recruitment(document),
         dynamics=reading.dynamics(document),
         test=test,
-        figures=charts.of_model(document, curves),
+        figures={
+            **charts.of_model(document, curves, comparison),
+            **why_charts.of_why(comparison, curves["segments"], None, {}, []),
+        },
+        plain=(comparison or {}).get("plain") or [],
+        places=why_charts.places_of(comparison or {}),
+        splits=why.splits(comparison),
+        tests=((comparison or {}).get("tests") or {}).get("tests") or [],
     )
 
 
-def improvement_html(found: dict[str, Any], name: str) -> str:
-    """Effects added one by one, and the falling error."""
+def improvement_html(
+    found: dict[str, Any],
+    name: str,
+    diagnosis: dict[str, Any] | None = None,
+    before: dict[str, Any] | None = None,
+    after: dict[str, Any] | None = None,
+    segments: list[dict[str, Any]] | None = None,
+) -> str:
+    """Effects added one by one, what each is, and the falling error.
+
+    Parameters
+    ----------
+    found : dict
+        As `identify.improve` gives it.
+    name : str
+        The record's.
+    diagnosis : dict or None
+        As `api.missing.diagnosis` gives it: explanations, parameters, signatures.
+    before, after : dict or None
+        Comparisons of the first model and of the last one with the record.
+    segments : list of dict or None
+        The record's, as `api.jobs.runs` gives them.
+    """
+    rows = why.of_steps(found)
+    view = why.view(diagnosis, before, []) if diagnosis else None
+    drawn = why_charts.of_why(before, segments or [], view, (diagnosis or {}).get("signatures") or {}, rows)
+    if after:
+        places = why_charts.places_of(after)
+        drawn["residual-after"] = why_charts.residual(after, segments or [], places if why.noisy(after) else [])
     return _page(
-        "report_improve.html", title=f"{name}: what was missing", found=found, figures={"steps": charts.steps(found)}
+        "report_improve.html", title=f"{name}: what was missing", found=found, rows=rows, why=view, figures=drawn
     )
 
 

@@ -23,14 +23,15 @@ def compare(
 ) -> None:
     """Measurement against the model's free run: where it fails, and by how much."""
     import identify
-    from api.jobs import clean, curves
+    from api.jobs import clean, curves, thinned
     from api.report import comparison_html
 
     model = load_model(model_json)
     record = identify.read(data)
     found = clean(dict(identify.compare(model, record)))
     if html is not None:
-        write(html, comparison_html(model.to_dict(), clean(curves(model, record)), data.name))
+        drawn = clean(curves(model, record))
+        write(html, comparison_html(model.to_dict(), drawn, data.name, comparison=thinned(found)))
     if as_json:
         say_json(found)
         return
@@ -40,14 +41,16 @@ def compare(
 
 
 def comparison_lines(found: dict[str, Any]) -> list[str]:
-    """The comparison in words; what is a number or a sentence, and the worst places."""
-    lines = []
-    for key, value in found.items():
-        if isinstance(value, int | float | str) and not isinstance(value, bool):
-            shown = f"{value:.4g}" if isinstance(value, float) else str(value)
-            lines.append(f"{key:28} {shown}")
-    for place in found.get("where") or found.get("worst") or []:
-        words = place.get("words") if isinstance(place, dict) else None
-        if words:
-            lines.append(f"  {words}")
+    """The comparison in words, the worst places, and where the error above the noise sits."""
+    lines = list(found.get("plain") or [])
+    places = [place["text"] for place in found.get("where") or []]
+    if places:
+        lines += ["", "worst places", *[f"  {text}" for text in places]]
+    for kind in ("segment", "level", "direction", "frequency"):
+        rows = (found.get("by") or {}).get(kind) or []
+        shares = [
+            f"{row['label']} {100 * row['share_of_excess']:.0f} %" for row in rows if row["share_of_excess"] > 0.005
+        ]
+        if shares:
+            lines.append(f"by {kind:12}{', '.join(shares)}")
     return lines

@@ -25,7 +25,6 @@ def improve(
     """Add effects one by one while the held-out error falls; each step is a model."""
     import identify
     from api.jobs import clean
-    from api.report import improvement_html
 
     record = identify.read(data)
     found = dict(identify.improve(record, progress=progress_line()))
@@ -33,12 +32,28 @@ def improve(
     if output is not None:
         write(output, json.dumps(clean(models[-1]), indent=1))
     if html is not None:
-        write(html, improvement_html(clean(found), data.name))
+        write(html, report(record, clean(found), models, data))
     if as_json:
         say_json(found)
         return
     say(*improvement_lines(found))
     say(*[f"written to {path}" for path in (output, html) if path is not None])
+
+
+def report(record: Any, found: dict[str, Any], models: list[Any], data: Path) -> str:
+    """The report: what was found, what each effect is, what is left before and after."""
+    import numpy as np
+
+    import identify
+    from api.jobs import clean, runs, thinned
+    from api.missing import diagnosis
+    from api.report import improvement_html
+
+    ends = [identify.Model.from_json(json.dumps(clean(model))) for model in (models[0], models[-1])]
+    before, after = (thinned(clean(dict(identify.compare(model, record)))) for model in ends)
+    labels = [str(record.segment_names[index]) for index in record.segment]
+    segments = runs(labels, np.asarray(record.time_s))
+    return improvement_html(found, data.name, diagnosis(str(data), progress_line()), before, after, segments)
 
 
 def improvement_lines(found: dict[str, Any]) -> list[str]:

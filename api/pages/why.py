@@ -192,3 +192,19 @@ def versions(rows: Sequence[dict[str, Any]], current: str) -> list[dict[str, Any
         }
         for row in rows
     ]
+
+
+def of_steps(found: dict[str, Any]) -> list[dict[str, Any]]:
+    """The steps of an improvement as versions."""
+    rows = [
+        {"id": str(number), "added_effect": step["added"], "noise_sd_nm": found["noise_sd_nm"], **step}
+        for number, step in enumerate(found["steps"])
+    ]
+    shown = versions([{"created_utc": None, "decision": None, "served": False, **row} for row in rows], "")
+    return [{**row, "reason": step.get("reason", "")} for row, step in zip(shown, found["steps"], strict=True)]
+
+
+def noisy(comparison: dict[str, Any]) -> bool:
+    """Whether more is left than noise would leave."""
+    times = times_noise(comparison)
+    return times is not None and times > NOISE_LIKE
