@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from api.cleaning import clean
+from api.forecasts import forecast
 from api.missing import diagnosis, improve, joined
 
 Progress = Callable[[float, str], None]
@@ -180,5 +181,6 @@ VERBS: dict[str, Callable[..., dict[str, Any]]] = {
     "join": joined,
     "effects": effects,
     "warm": warm,
+    "forecast": forecast,
     "find_recording": find_recording,
 }

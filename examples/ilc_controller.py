@@ -2,9 +2,10 @@
 
     STIMRIG_TOKEN=… python examples/ilc_controller.py --url http://127.0.0.1:8000 --participant P017 --svg ilc.svg
 
-It fetches the approved MODEL.json, plans the pulse widths of a trial for a reference torque by inverting the recruitment
-curve f and the linear dynamics G, plays them through `POST /v1/tests` (kind `sequence`: the rig's gate checks every
-pulse), reads the torque back from the recording, and corrects the next trial. Imports nothing of stimrig.
+It fetches the approved MODEL.json, plans the pulse widths of a trial for a reference torque by inverting the
+recruitment curve f and the linear dynamics G, plays them through `POST /v1/tests` (kind `sequence`: the rig's gate
+checks every pulse), reads the torque back from the recording, and corrects the next trial. Imports nothing of
+stimrig.
 
 Two laws, both on the demanded torque w before f⁻¹, e the tracking error of a trial:
 
@@ -75,19 +76,23 @@ class Plant:
         steps = np.subtract.outer(np.arange(size), np.arange(size))
         self.G = np.where(steps >= 0, self.response[np.abs(steps)], 0.0)
 
+    def level(self, widths_us: np.ndarray) -> np.ndarray:
+        """f, N·m."""
+        return np.interp(widths_us, self.width_us, self.level_nm)
+
     def widths(self, demand_nm: np.ndarray) -> np.ndarray:
         """f⁻¹ in whole µs, shape (N,): what rounding and the rise limit take is given back by the pulses after."""
         widths, owed, last = np.zeros(demand_nm.size), 0.0, 0.0
         for k, demand in enumerate(np.clip(demand_nm, 0.0, self.largest_nm)):
             wanted_us = float(np.interp(demand + owed, self.inverse_nm, self.inverse_us)) if demand > 0 else 0.0
             last = widths[k] = min(round(wanted_us), int(last + RISE_US), int(self.widest_us))
-            got = float(np.interp(last, self.width_us, self.level_nm))
+            got = float(self.level(np.array(last)))
             owed = float(np.clip(owed + demand - got, -0.3, 0.3)) if demand > 0 else 0.0
         return widths
 
 
 def pulse_response(linear: dict[str, Any], rate_hz: float, size: int) -> np.ndarray:
-    """Mean torque in each pulse's period after one held pulse of unit demand, shape (N,); B(q)/A(q) run sample by sample.
+    """Mean torque in each pulse's period after one held pulse of unit demand, shape (N,); B(q)/A(q), sample by sample.
 
     y[k] = sum_i b[i] w[k - delay - i] - sum_{j>=1} a[j] y[k - j]
     """
@@ -155,8 +160,8 @@ class Service:
             self.model, self.etag = checked(answer).json(), answer.headers["etag"]
         return self.model
 
-    def play(self, widths_us: np.ndarray) -> tuple[np.ndarray, int]:
-        """Play a trial; its torque in each pulse's period above rest, N·m, shape (N,), and how many pulses were lost."""
+    def play(self, widths_us: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Play a trial; its torque above rest in each pulse's period, N·m, and the widths sent, µs, both (N,)."""
         segments = [
             {"name": "rest", "sequence": "rest", "settings": {"duration_s": BEFORE_S}},
             {"name": "trial", "sequence": "widths", "settings": {"pulse_width_us": widths_us.tolist()}},
@@ -171,7 +176,7 @@ class Service:
         location = checked(answer).headers["location"]
         while not (test := checked(self.http.get(location)).json())["recording_id"]:
             if test["done"]:
-                raise SystemExit(f"the trial ended as {test['state']}: {test['reason']}")
+                raise HaltedError(f"the trial ended as {test['state']}: {test['reason']}")
             time.sleep(0.1)
         return measured(checked(self.http.get(test["recording_url"])).content, widths_us.size)
 
@@ -182,8 +187,12 @@ class Service:
         return np.array(answer.json()["torque_nm"])
 
 
+class HaltedError(Exception):
+    """The rig stopped, or refuses: a person has to look. The controller does nothing more."""
+
+
 def checked(answer: httpx.Response) -> httpx.Response:
-    """The answer, or the problem's own words as the end of the program."""
+    """The answer, or the problem's own words raised."""
     if answer.is_success:
         return answer
     try:
@@ -191,19 +200,22 @@ def checked(answer: httpx.Response) -> httpx.Response:
         words = f"{problem['title']}: {problem['detail']}"
     except ValueError:
         words = answer.text[:200]
-    raise SystemExit(f"{answer.request.method} {answer.request.url.path}: {words}")
+    raise HaltedError(f"{answer.request.method} {answer.request.url.path}: {words}")
 
 
-def measured(recording: bytes, size: int) -> tuple[np.ndarray, int]:
-    """Torque above the rest before the trial, mean in each pulse's period; and how many pulses were dropped."""
+def measured(recording: bytes, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Torque above the rest before the trial, mean in each pulse's period; and the widths that were really sent."""
     with h5py.File(io.BytesIO(recording)) as file:
+        if file.attrs["outcome"] != "completed":
+            raise HaltedError(f"the trial ended as {file.attrs['outcome']}: {file.attrs['reason']}")
         time_s, torque_nm = file["torque/time_s"][:], file["torque/torque_nm"][:]
-        lost = int(np.sum(file["pulses/status"][:] >= 2))
+        first = round(BEFORE_S * PULSE_RATE_HZ)
+        sent_us = np.nan_to_num(file["pulses/sent_pulse_width_us"][first : first + size])
     baseline_nm = torque_nm[(time_s > 0.3 * BEFORE_S) & (time_s < BEFORE_S)].mean()
     period = np.floor((time_s - BEFORE_S) * PULSE_RATE_HZ).astype(int)
     inside = (period >= 0) & (period < size)
     sums = np.bincount(period[inside], torque_nm[inside], size)
-    return sums / np.maximum(1, np.bincount(period[inside], minlength=size)) - baseline_nm, lost
+    return sums / np.maximum(1, np.bincount(period[inside], minlength=size)) - baseline_nm, sent_us
 
 
 # ---- learning -------------------------------------------------------------------------------------------------------
@@ -220,7 +232,7 @@ class Trial:
 
 
 def plan(plant: Plant, reference: Reference, predict: Callable[[np.ndarray], np.ndarray] | None) -> np.ndarray:
-    """The demand of the first trial, N·m, shape (N,): G inverted, and where effects are known, the prediction corrected."""
+    """The demand of the first trial, N·m, shape (N,): G inverted; where effects are known, corrected on predictions."""
     size = reference.torque_nm.size
     bend = np.diff(np.eye(size), 2, axis=0)
     demand = np.linalg.solve(plant.G.T @ plant.G + 0.1 * bend.T @ bend, plant.G.T @ reference.torque_nm)
@@ -231,22 +243,29 @@ def plan(plant: Plant, reference: Reference, predict: Callable[[np.ndarray], np.
         if (size_now := float(np.mean(error_nm**2))) < least:
             best, least = demand, size_now
         demand = np.clip(learn(demand, error_nm), 0.0, plant.largest_nm)
+    if predict:
+        print(f"  planned on the prediction: {100 * least**0.5 / reference.rms_nm:.2f} % left", file=sys.stderr)
     return best
 
 
-def learn(service: Service, model: dict[str, Any], reference: Reference, law: str, trials: int) -> list[Trial]:
-    """Play and correct, trial after trial."""
+def learn(
+    service: Service, model: dict[str, Any], reference: Reference, law: str, trials: int, static_start: bool = False
+) -> list[Trial]:
+    """Play and correct, trial after trial; `static_start`: the first trial inverts f alone, as if there were no G."""
     plant = Plant(model, reference.torque_nm.size)
     predict = (lambda widths: service.predict(model["model_id"], widths)) if model["effects"] else None
-    update, demand, done = LAWS[law](plant), plan(plant, reference, predict), []
+    demand = reference.torque_nm if static_start else plan(plant, reference, predict)
+    update, done = LAWS[law](plant), []
     for _ in range(trials):
         widths_us = plant.widths(demand)
-        torque_nm, lost = service.play(widths_us)
+        torque_nm, sent_us = service.play(widths_us)
         error_nm = reference.torque_nm - torque_nm
+        lost = int(np.sum(sent_us != widths_us))
         percent = 100 * float(np.sqrt(np.mean(error_nm**2))) / reference.rms_nm
         done.append(Trial(widths_us, torque_nm, percent, lost))
         print(f"  trial {len(done):2d}  {percent:6.2f} % of the reference's rms, {lost} pulses lost", file=sys.stderr)
-        demand = np.clip(update(demand, error_nm), 0.0, plant.largest_nm)
+        not_sent_nm = plant.G @ (plant.level(widths_us) - plant.level(sent_us))  # a late pulse is dropped by the rig:
+        demand = np.clip(update(demand, error_nm - not_sent_nm), 0.0, plant.largest_nm)  # no reason to learn from it
     return done
 
 
@@ -295,4 +314,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except HaltedError as error:
+        sys.exit(str(error))

@@ -1,0 +1,27 @@
+"""What a model says a list of pulse widths would give: for a controller that plans a trial. Run in a worker."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+REST_S = 1.0
+SAMPLES_A_PULSE = 8
+
+
+def forecast(
+    progress: Callable[[float, str], None], model_json: str, pulse_width_us: list[float], pulse_rate_hz: float = 40.0
+) -> dict[str, Any]:
+    """Mean torque above rest in each pulse's period, N·m, effects included, after one second of rest."""
+    import numpy as np
+
+    import identify
+
+    progress(0.1, "predicting")
+    model = identify.Model.from_json(model_json)
+    rest = round(REST_S * pulse_rate_hz)
+    widths = np.repeat(np.r_[np.zeros(rest), pulse_width_us], SAMPLES_A_PULSE)
+    time_s = np.arange(widths.size) / (SAMPLES_A_PULSE * pulse_rate_hz)
+    record = identify.Record.from_arrays(time_s, widths, np.zeros(widths.size), pulse_rate_hz=pulse_rate_hz)
+    torque = np.asarray(identify.predict(model, record)).reshape(-1, SAMPLES_A_PULSE).mean(axis=1)
+    return {"torque_nm": (torque[rest:] - torque[:rest].mean()).round(6).tolist()}

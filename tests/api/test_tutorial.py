@@ -1,0 +1,48 @@
+"""docs/tutorial.md does what it says: its commands are run, its blocks executed in order."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from api import notebook
+
+ROOT = Path(__file__).parents[2]
+TEXT = (ROOT / "docs" / "tutorial.md").read_text("utf-8")
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```", TEXT, re.MULTILINE | re.DOTALL)
+
+
+@pytest.mark.slow
+def test_every_block_runs_in_order(tmp_path: Path) -> None:
+    (command,) = blocks("sh")
+    assert command.startswith("python -m hardware_sim.hidden_records")
+    words = [sys.executable, *command.split()[1:]]
+    words[words.index("data")] = str(tmp_path)
+    subprocess.run(words, check=True, cwd=ROOT, capture_output=True)
+    (path,) = tmp_path.glob("*.csv")
+    scope: dict[str, object] = {"path": path}
+    pieces = blocks("python")
+    assert len(pieces) == 7
+    for piece in pieces:
+        exec(compile(piece, "tutorial.md", "exec"), scope)
+    figure = notebook.plot(scope["better"])  # pyright: ignore[reportArgumentType]
+    assert [trace.name for trace in figure.data] == ["fitted rows", "held out"]
+    drawn = notebook.plot(scope["model"], scope["record"])  # pyright: ignore[reportArgumentType]
+    assert [trace.name for trace in drawn.data] == ["measured", "model", "measured − model", "pulse width", "f"]
+
+
+def test_six_lines_are_six() -> None:
+    (first, *_) = blocks("python")
+    assert len([line for line in first.splitlines() if line and not line.startswith("from")]) == 6
+
+
+def test_plot_of_something_else_says_what_it_takes() -> None:
+    with pytest.raises(TypeError, match=r"plot\(model, record\)"):
+        notebook.plot({})
