@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from identify.diagnosis.candidates import Candidate, Progress, fit_form, scan
+from identify.diagnosis.candidates import Candidate, Progress, fit_form, scan, try_effect
 from identify.diagnosis.structure import Left, left_over, quiet_rows
+from identify.diagnosis.unknown import WANDER
 from identify.effects import registry
 from identify.effects.base import Effect, Form
 from identify.engine.fit import Fitted, solve, start_from
@@ -49,6 +50,8 @@ class Analysis:
         Effects added, in order.
     margins : list of float
         Log evidence asked for in each round.
+    nameless : list of float
+        Log evidence for a gain that wanders without a law, in each round.
     quiet : ndarray of bool
         Intervals in which the muscle rests.
     left : list of Left
@@ -63,6 +66,7 @@ class Analysis:
     chain: list[Fitted] = field(default_factory=list)
     added: list[str] = field(default_factory=list)
     margins: list[float] = field(default_factory=list)
+    nameless: list[float] = field(default_factory=list)
     quiet: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
     left: list[Left] = field(default_factory=list)
 
@@ -91,8 +95,11 @@ def analyse(
     for number in range(most):
         if number and _exhausted(work):
             break
-        candidates = scan(work.last, listed, progress, (0.1 + 0.3 * number, 0.1 + 0.3 * (number + 1)))
+        before = work.rounds[0] if work.rounds else None
+        candidates = scan(work.last, listed, progress, (0.1 + 0.3 * number, 0.4 + 0.3 * number), before)
         work.rounds.append(candidates)
+        nameless = try_effect(WANDER, work.last)
+        work.nameless.append(nameless.gain if nameless else 0.0)
         margin = _margin(work)
         work.margins.append(margin)
         if not candidates or candidates[0].gain < margin:

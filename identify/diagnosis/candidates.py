@@ -16,6 +16,8 @@ from identify.engine.problem import Problem
 from identify.engine.setup import Setup
 
 WORKERS = 2
+FORMS = 3
+"""Forms of an effect tried beside another effect."""
 PATIENCE = 2
 """Steps of a chain (one bump, two bumps, …) without a gain after which it ends: one of four bumps hardly helps."""
 BAND_COST = 16.0
@@ -126,10 +128,22 @@ def names(fitted: Fitted) -> list[str]:
     return listed
 
 
+def likeliest_forms(effect: Effect, before: Candidate | None) -> list[Form]:
+    """Forms worth a fit beside another effect: those that did best alone; chains are kept whole."""
+    if before is None or any(form.grows for form in effect.forms):
+        return list(effect.forms)
+    ranked = sorted(before.forms, key=lambda name: -before.forms[name])
+    return [effect.form(name) for name in ranked[:FORMS]]
+
+
 def scan(
-    base: Fitted, effects: Iterable[Effect], progress: Progress | None = None, share: tuple[float, float] = (0.0, 1.0)
+    base: Fitted,
+    effects: Iterable[Effect],
+    progress: Progress | None = None,
+    share: tuple[float, float] = (0.0, 1.0),
+    before: list[Candidate] | None = None,
 ) -> list[Candidate]:
-    """Every applicable effect added to a model, best first."""
+    """Every applicable effect added to a model, best first; `before` is what an earlier round found of them."""
     present = set(names(base))
     listed = [effect for effect in effects if applicable(effect, base.problem.setup, present)]
     done = 0
@@ -137,7 +151,11 @@ def scan(
     # Costly ones first, so that both workers end together; the compiled parts release the interpreter.
     listed.sort(key=lambda effect: -len(effect.forms))
     with ThreadPoolExecutor(WORKERS) as pool:
-        waiting = {pool.submit(try_effect, effect, base): effect for effect in listed}
+        earlier = {candidate.effect.id: candidate for candidate in before or []}
+        waiting = {
+            pool.submit(try_effect, effect, base, likeliest_forms(effect, earlier.get(effect.id))): effect
+            for effect in listed
+        }
         try:
             for future in as_completed(waiting):
                 done += 1

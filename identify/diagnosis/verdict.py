@@ -18,6 +18,8 @@ LEAST_EXPLAINED = 0.55
 """Share of the explicable log-likelihood below which the rest counts as structure of another kind."""
 STRUCTURE = 12.0
 """Log-likelihood by which work and rest must differ for structure to be left."""
+NAMELESS = 8.0
+"""Log evidence by which a gain without a law must beat the best effect."""
 HELD = 0.3
 """Share of repeated samples that no noisy converter gives."""
 
@@ -92,6 +94,7 @@ def judge(work: Analysis) -> Verdict:
         notes.append(f"{100 * held:.0f} % of the readings repeat the one before exactly: the converter holds or steps.")
     if work.added:
         strange = strange or (explained < LEAST_EXPLAINED and structure > STRUCTURE)
+        strange = strange or work.nameless[0] > work.rounds[0][0].gain + NAMELESS
     else:
         strange = strange or structure > STRUCTURE
     if strange:

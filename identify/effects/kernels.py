@@ -273,3 +273,20 @@ def follow_stiffening(
             out[m, k + 1] = z
             rate[m, k + 1] = v
     return out, rate
+
+
+@njit(cache=True, nogil=True)
+def bumps(
+    time_s: np.ndarray, centre: np.ndarray, width: np.ndarray, height: np.ndarray, flatness: np.ndarray
+) -> np.ndarray:  # pragma: no cover
+    """Sum of bumps; (K,), (M, n) each, flatness (M,), to (M, K). Beyond what rounds to zero nothing is evaluated."""
+    rows, count = centre.shape
+    out = np.zeros((rows, time_s.size))
+    for m in range(rows):
+        reach = 80.0 ** (1.0 / flatness[m])
+        for i in range(count):
+            for k in range(time_s.size):
+                away = abs((time_s[k] - centre[m, i]) / width[m, i])
+                if away < reach:
+                    out[m, k] += height[m, i] * np.exp(-0.5 * (away + 1e-12) ** flatness[m])
+    return out

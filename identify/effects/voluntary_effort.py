@@ -8,18 +8,19 @@ from typing import Any
 import numpy as np
 
 from identify.effects.base import Effect, Form, Parameter, Scene
+from identify.effects.kernels import bumps
 
 MOST = 6
 """Bumps at most: with more, they imitate anything."""
 
 
+_PARTS = (("centre", "s"), ("width", "s"), ("height", "nm"))
+
+
 def _bumps(count: int) -> Callable[..., np.ndarray]:
     def apply(_: None, p: dict[str, Any], scene: Scene) -> np.ndarray:
-        total = np.zeros(np.broadcast_shapes(scene.time_s.shape, np.shape(p["height_0_nm"])))
-        for i in range(count):
-            away = np.abs((scene.time_s - p[f"centre_{i}_s"]) / p[f"width_{i}_s"]) + 1e-12
-            total = total + p[f"height_{i}_nm"] * np.exp(-0.5 * away ** p["flatness"])
-        return total
+        listed = [np.concatenate([p[f"{part}_{i}_{unit}"] for i in range(count)], axis=1) for part, unit in _PARTS]
+        return bumps(scene.time_s, *listed, p["flatness"][:, 0])
 
     return apply
 

@@ -323,11 +323,16 @@ class _Walk:
         rows, values = self.join(range(3, 4))
         value = value[rows] + values
         for chosen in self.forms("additive"):
+            present = value.shape[0]
             rows, values = self.join(chosen.places)
             value = value[rows]
             if chosen.effect in skip or (not at_samples and chosen.effect == "mains_hum"):
                 continue
-            value = value + np.asarray(chosen.form.call(None, self.named(chosen, values), scene))
+            # What is added doesn't depend on the signal: rows that differ elsewhere alone share one evaluation.
+            own = np.r_[0, np.arange(present, rows.size)]
+            added = np.asarray(chosen.form.call(None, self.named(chosen, values[own]), scene))
+            value[:present] += added[:1]
+            value[present:] += added[1:]
         return value
 
     def sense(self, value: np.ndarray, scene=None) -> np.ndarray:
