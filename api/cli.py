@@ -43,6 +43,8 @@ def main(arguments: list[str] | None = None) -> None:
 
 def run(arguments: list[str] | None = None) -> int:
     """Run a verb; its exit code."""
+    # Matrices of a fit are small: a second BLAS thread only waits for the first, and on a busy machine for long.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     verb = next((word for word in (arguments if arguments is not None else sys.argv[1:]) if word[:1] != "-"), "")
     try:
         code = build()(arguments, standalone_mode=False)

@@ -16,6 +16,7 @@ def main() -> None:
     """Serve jobs until the input closes."""
     out = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)  # whatever a library prints must not fall into the protocol
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as in `api.cli`: small matrices gain nothing from a second
     os.nice(5)  # the rig's sender goes first
     say(out, {"ready": True})
     for line in sys.stdin:
