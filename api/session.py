@@ -41,8 +41,8 @@ def ensure_participant(client: httpx.Client, code: str) -> None:
         checked(client.post("/v1/participants", json={"code": code}))
 
 
-def run_test(client: httpx.Client, participant: str, watch: Watch = lambda: None) -> dict[str, Any]:
-    """Start the default pre-session test and follow it to its model.
+def run_test(client: httpx.Client, participant: str, watch: Watch = lambda: None, **more: Any) -> dict[str, Any]:
+    """Start a test (the default pre-session test unless more is asked for) and follow it to its model.
 
     Parameters
     ----------
@@ -52,13 +52,15 @@ def run_test(client: httpx.Client, participant: str, watch: Watch = lambda: None
         Code.
     watch : callable
         Called at each poll; raises where a process has ended.
+    **more
+        Further fields of the request: kind, segments, joins.
 
     Raises
     ------
     ReportedError
         The test was refused, or did not end in a model.
     """
-    location = checked(client.post("/v1/tests", json={"participant": participant})).headers["location"]
+    location = checked(client.post("/v1/tests", json={"participant": participant, **more})).headers["location"]
     document: dict[str, Any] = {}
     show = Progress()
     while not document.get("done"):

@@ -15,6 +15,8 @@ SPLITS = {
 NOISE_LIKE = 1.3
 """Held-out error over noise up to which what is left passes for noise."""
 SURE, LIKELY = 0.9, 0.6
+LEAST_SHARE = 0.005
+"""Octaves above the last one with a larger share are not shown."""
 
 
 def view(diagnosis: dict[str, Any], comparison: dict[str, Any] | None, effects: Sequence[str]) -> dict[str, Any]:
@@ -142,7 +144,9 @@ def splits(comparison: dict[str, Any] | None) -> list[dict[str, Any]]:
     by = (comparison or {}).get("by") or {}
     found = []
     for kind, title in SPLITS.items():
-        rows = by.get(kind) or []
+        rows = list(by.get(kind) or [])
+        while kind == "frequency" and len(rows) > 1 and rows[-1]["share_of_excess"] < LEAST_SHARE:
+            rows.pop()
         if rows:
             found.append({"title": title, "rows": rows, "most": max(row["share_of_excess"] for row in rows) or 1.0})
     return found

@@ -101,7 +101,7 @@ def answer(verb: str, arguments: dict[str, Any], say: Any) -> dict[str, Any]:
         return {"result": curves()}
     if verb == "diagnosis":
         say(progress=0.5, text="trying fatigue")
-        if Path(arguments["data"]).with_suffix(".slow").exists():
+        if (Path(arguments["data"]).parent / "slow").exists():
             time.sleep(60)
         return {"result": diagnosis()}
     if verb == "improve":

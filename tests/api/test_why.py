@@ -1,0 +1,334 @@
+"""Where a model fails, what it lacks, adding that, undoing it, the next experiment; progress and cancelling."""
+
+from __future__ import annotations
+
+import re
+import time
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from api import evidence, joining
+from api.pages import why
+from tests.api.conftest import Service, run_test, wait_done
+from tests.api.test_access import HTML, csrf, signed_in
+
+
+@pytest.fixture
+def model(client: httpx.Client, participant: str) -> str:
+    """The model of a test."""
+    return run_test(client, participant)["model_id"]
+
+
+def until(ready: Any, limit_s: float = 10.0) -> Any:
+    """Wait for something to be true."""
+    end = time.monotonic() + limit_s
+    while not (found := ready()):
+        assert time.monotonic() < end
+        time.sleep(0.02)
+    return found
+
+
+def make_slow(service: Service) -> Path:
+    """Diagnoses take a minute from now on."""
+    marker = service.data / "recordings" / "slow"
+    marker.parent.mkdir(parents=True, exist_ok=True)
+    marker.touch()
+    return marker
+
+
+# ---- long work ----------------------------------------------------------------------------------------------
+
+
+def test_diagnosis_is_made_after_a_test_before_anybody_asks(service: Service, model: str) -> None:
+    context = service.app.state.context
+    found = until(lambda: context.analyses.known(model, "diagnosis"))
+    assert found["verdict"] == "effect_missing"
+
+
+def test_new_test_ends_the_diagnosis_in_the_background(
+    client: httpx.Client, service: Service, participant: str
+) -> None:
+    make_slow(service)
+    model = run_test(client, participant)["model_id"]
+    analyses = service.app.state.context.analyses
+    job = until(lambda: analyses.running.get((model, "diagnosis")))
+    until(lambda: job.state == "running")
+    assert client.post("/v1/tests", json={"participant": participant}).status_code == 202
+    until(lambda: job.state == "cancelled")
+    assert analyses.known(model, "diagnosis") is None
+
+
+def test_job_tells_how_far_it_is_and_can_be_cancelled(client: httpx.Client, service: Service, model: str) -> None:
+    until(lambda: service.app.state.context.analyses.known(model, "diagnosis"))
+    begun = client.post(
+        f"/v1/models/{model}/effects?wait=false", json={"effects": ["slow"], "force": True, "reason": "x"}
+    )
+    assert begun.status_code == 202
+    url = begun.headers["location"]
+    again = client.post(
+        f"/v1/models/{model}/effects?wait=false", json={"effects": ["slow"], "force": True, "reason": "x"}
+    )
+    assert again.headers["location"] == url
+    job = until(lambda: (found := client.get(url).json())["progress"] == 0.5 and found)
+    assert job["state"] == "running" and job["time_left_s"] is not None and job["text"] == "identifying"
+    ended = client.delete(url).json()
+    assert ended["state"] == "cancelled" and ended["problem"]["title"] == "The job was cancelled"
+    assert len(client.get("/v1/participants/P017/models").json()) == 1
+    assert client.get("/v1/jobs/J999").status_code == 404
+
+
+def test_job_leads_to_its_result(client: httpx.Client, model: str) -> None:
+    begun = client.post(f"/v1/models/{model}/improve?wait=false")
+    assert begun.status_code == 202
+    job = until(lambda: (found := client.get(begun.headers["location"]).json())["done"] and found)
+    assert job["state"] == "completed" and job["progress"] == 1.0
+    assert client.get(job["result_url"]).json()["effects"] == ["fatigue"]
+
+
+# ---- effects ------------------------------------------------------------------------------------------------
+
+
+def test_effect_that_is_not_there_is_refused_with_the_reason(client: httpx.Client, model: str) -> None:
+    refused = client.post(f"/v1/models/{model}/effects", json={"effects": ["tremor"]})
+    assert refused.status_code == 409 and refused.json()["type"] == "/problems/effect-not-there"
+    assert "log evidence -4.0" in refused.json()["reasons"]["tremor"]
+    silent = client.post(f"/v1/models/{model}/effects", json={"effects": ["tremor"], "force": True})
+    assert silent.status_code == 422 and "say why" in silent.json()["detail"]
+    body = {"effects": ["tremor"], "force": True, "reason": "seen with the eye"}
+    forced = client.post(f"/v1/models/{model}/effects", json=body)
+    assert forced.status_code == 201 and forced.json()["effects"] == ["tremor"]
+    entries = [entry for entry in client.get("/v1/audit").json()["entries"] if entry["action"] == "force effect"]
+    assert [entry["detail"]["reason"] for entry in entries] == ["seen with the eye"]
+
+
+def test_rival_that_cannot_be_told_apart_may_be_added(client: httpx.Client, model: str) -> None:
+    assert client.post(f"/v1/models/{model}/effects", json={"effects": ["threshold_drift"]}).status_code == 201
+
+
+def test_adding_the_same_twice_gives_the_same_version(client: httpx.Client, model: str) -> None:
+    first, second = (client.post(f"/v1/models/{model}/effects", json={"effects": ["fatigue"]}) for _ in range(2))
+    assert first.json()["id"] == second.json()["id"]
+
+
+def test_improve_makes_a_version_a_step_and_undo_goes_back(client: httpx.Client, model: str) -> None:
+    done = client.post(f"/v1/models/{model}/improve")
+    assert done.status_code == 201, done.text
+    versions = done.json()["versions"]
+    assert [version["added_effect"] for version in versions] == [None, "fatigue"]
+    better = versions[-1]["id"]
+    assert versions[-1]["parent_id"] == model and done.headers["location"] == f"/v1/models/{better}"
+    assert client.get(f"/v1/models/{better}").json()["model"]["extra"]["parent"] == model
+    assert client.post(f"/v1/models/{model}/improve").json()["versions"][-1]["id"] == better
+    client.post(f"/v1/models/{better}/approve")
+    assert client.post(f"/v1/models/{better}/undo", json={"reason": "not plausible"}).json()["id"] == model
+    assert client.get("/v1/participants/P017/model").json()["model_id"] == model
+    assert client.get(f"/v1/models/{better}").json()["decision"] == "rejected"
+    assert client.post(f"/v1/models/{model}/undo").status_code == 409
+
+
+def test_undo_of_what_was_not_in_use_approves_nothing(client: httpx.Client, model: str) -> None:
+    better = client.post(f"/v1/models/{model}/improve").json()["versions"][-1]["id"]
+    client.post(f"/v1/models/{better}/undo")
+    assert client.get("/v1/participants/P017/model").status_code == 404
+
+
+def refusal(missing: list[dict[str, Any]], gains: list[list[tuple[str, float]]], effect: str) -> str | None:
+    rounds = [[{"effect": name, "log_evidence_gain": gain} for name, gain in found] for found in gains]
+    return evidence.refusal({"missing": missing, "candidates": rounds}, [], effect)
+
+
+def test_reasons_against_an_effect() -> None:
+    fatigue = {"effect": "fatigue", "name": "Fatigue", "confused_with": []}
+    assert refusal([fatigue], [[("fatigue", 90)]], "fatigue") is None
+    assert "explains the same better" in str(refusal([fatigue], [[("drift", 50)], [("drift", 2)]], "drift"))
+    assert "speaks against" in str(refusal([], [[("drift", -3)]], "drift"))
+    assert "too little" in str(refusal([], [[("drift", 3)]], "drift"))
+    assert "not considered" in str(refusal([], [], "torque_angle"))
+
+
+# ---- the next experiment ------------------------------------------------------------------------------------
+
+
+def test_next_experiment_is_played_and_joined(client: httpx.Client, service: Service, model: str) -> None:
+    experiment = client.get(f"/v1/models/{model}/diagnosis").json()["experiment"]
+    body = {"participant": "P017", "kind": "next-experiment", "segments": experiment["segments"], "joins": model}
+    started = client.post("/v1/tests", json=body)
+    assert started.status_code == 202, started.text
+    document = wait_done(client, started.json()["id"])
+    assert document["state"] == "completed" and document["joins"] == model
+    new = client.get(document["model_url"]).json()
+    assert new["parent_id"] == model and new["recording_id"].startswith("joined-")
+    parts = client.get(f"/v1/recordings/{new['recording_id']}").text.splitlines()
+    old = client.get(f"/v1/models/{model}").json()["recording_id"]
+    assert [Path(part).stem for part in parts] == [old, document["recording_id"]]
+    assert service.rig.starts == 2
+
+
+def test_experiment_joins_only_the_participants_own_model(client: httpx.Client, service: Service, model: str) -> None:
+    client.post("/v1/participants", json={"code": "P2"})
+    refused = client.post("/v1/tests", json={"participant": "P2", "joins": model})
+    assert refused.status_code == 422 and "P017" in refused.json()["detail"]
+    assert client.post("/v1/tests", json={"participant": "P017", "joins": "nothing"}).status_code == 404
+    assert service.rig.starts == 1 and client.get("/v1/rig").json()["holder"] is None
+
+
+def record(rate_hz: float, lag_s: float, seconds: float = 6.0) -> Any:
+    """Rest, steps, rest; pulses due `lag_s` after the first sample and every 25 ms from then on."""
+    import numpy as np
+
+    import identify
+
+    time_s = np.arange(round(seconds * rate_hz)) / rate_hz
+    slot = np.floor((time_s - lag_s) * 40 + 1e-9)
+    width = np.where((slot >= 40) & (slot < 200) & (slot // 20 % 2 == 0), 200.0, 0.0)
+    names = np.where(slot < 40, "rest", "steps")
+    return identify.Record.from_arrays(time_s, width, width / 40 + 0.01 * np.sin(7 * time_s), names)
+
+
+def test_joined_recordings_are_one_even_record_on_one_grid_of_pulses(tmp_path: Path) -> None:
+    import numpy as np
+
+    import identify
+
+    path = tmp_path / "joined.csv"
+    path.write_text(joining.table([record(400, 0.01), record(1600, 0.004)]))
+    joined = identify.read(path)
+    assert joined.sample_rate_hz == pytest.approx(400, abs=0.01)
+    assert list(joined.segment_names) == ["rest", "steps", "rest", "steps"]
+    changes = np.flatnonzero(np.diff(joined.pulse_width_us)) + 1
+    assert set(changes % 10) == {0}  # every change of width falls on the same grid of 25 ms
+    assert len(changes) == 16
+    followed = joined.torque_nm - joined.pulse_width_us / 40
+    assert np.abs(np.delete(followed, np.r_[changes - 1, changes, changes + 1])).max() < 0.05
+
+
+def test_recordings_that_cannot_be_joined_are_refused() -> None:
+    import numpy as np
+
+    import identify
+
+    working = record(400, 0.0)
+    late = identify.Record.from_arrays(working.time_s, np.full(working.time_s.size, 100.0), working.torque_nm)
+    with pytest.raises(identify.BadRecord, match="begin at rest"):
+        joining.table([working, late])
+
+
+# ---- what the page says -------------------------------------------------------------------------------------
+
+WORDS = "falling ramp, 120-180 µs: model too high by 0.4 N·m"
+PLACE = {
+    "segment": "ramp", "start_s": 1.0, "end_s": 2.0, "pulse_width_us": [120, 180], "share_of_excess": 0.31,
+    "direction": "falling", "text": f"{WORDS}, 31 % of what is left",
+}  # fmt: skip
+FATIGUE = {"effect": "fatigue", "name": "Fatigue", "probability": 0.97, "rms_before_nm": 0.2, "rms_after_nm": 0.05}
+
+
+def shown(verdict: str, missing: list[dict[str, Any]], effects: list[str], times: float) -> dict[str, Any]:
+    diagnosis = {"verdict": verdict, "missing": missing, "where": [PLACE], "noise_sd_nm": 0.04}
+    return why.view(diagnosis, {"noise_sd_nm": 0.04, "rms_nm": 0.04 * times}, effects)
+
+
+def test_verdict_on_this_model_in_words() -> None:
+    assert "ask" in shown("effect_missing", [FATIGUE], [], 6)["words"]
+    after = shown("effect_missing", [FATIGUE], ["fatigue"], 1.1)
+    assert after["title"] == "Nothing more is missing: what is left is noise" and after["missing"] == []
+    assert shown("nothing_missing", [], [], 1.0)["title"] == "Nothing is missing: what is left is noise"
+    assert shown("nothing_missing", [], [], 2.0)["kind"] == "unsure"
+    strange = shown("unexplained_structure", [], [], 5)
+    assert strange["kind"] == "unexplained" and "falling ramp, 120-180 µs" in strange["words"]
+
+
+def test_place_is_named_without_repeating_its_share() -> None:
+    found = why.place(PLACE, 3)
+    assert found["words"] == WORDS and found["percent"] == 31
+
+
+def test_page_shows_the_diagnosis_adds_by_a_form_and_shows_the_fall(service: Service, model: str) -> None:
+    until(lambda: service.app.state.context.analyses.known(model, "diagnosis"))
+    with signed_in(service) as browser:
+        text = browser.get(f"/models/{model}").text
+        for words in (
+            "Why does it fail?",
+            "Fatigue",
+            "93 %",
+            "This record cannot tell it from",
+            "Run it now",
+            "falling prbs",
+        ):
+            assert words in text, words
+        form = {"csrf": csrf(browser), "effect": "fatigue"}
+        led = browser.post(f"/models/{model}/effects", data=form)
+        assert led.status_code == 303
+        target = led.headers["location"]
+        for _ in range(50):
+            if target.startswith("/models/"):
+                break
+            time.sleep(0.1)
+            target = browser.get(target).headers.get("location", target)
+        after = browser.get(target).text
+        assert "The error over the versions" in after and "Undo: back to the version before" in after
+        assert "+ fatigue" in after and re.search(r"1\. <a[^>]*>base model", after)
+
+
+def test_forcing_on_the_page_wants_a_reason_and_refusals_are_pages(service: Service, model: str) -> None:
+    with signed_in(service) as browser:
+        led = browser.post(f"/models/{model}/effects", data={"csrf": csrf(browser), "effect": "tremor"})
+        page = until(lambda: (found := browser.get(led.headers["location"])).status_code != 200 and found)
+        assert (
+            page.status_code == 409 and "does not ask for this effect" in page.text and "Back to the model" in page.text
+        )
+
+
+def test_cancelled_diagnosis_offers_to_begin_anew(client: httpx.Client, service: Service, participant: str) -> None:
+    make_slow(service)
+    model = run_test(client, participant)["model_id"]
+    with signed_in(service) as browser:
+        assert "Cancel" in browser.get(f"/models/{model}").text
+        led = browser.post(f"/models/{model}/diagnosis/cancel", data={"csrf": csrf(browser)})
+        page = until(lambda: "Diagnose now" in (text := browser.get(led.headers["location"]).text) and text)
+        assert "data-job" not in page
+
+
+def test_two_models_side_by_side(client: httpx.Client, service: Service, model: str, participant: str) -> None:
+    other = run_test(client, participant)["model_id"]
+    with signed_in(service) as browser:
+        page = browser.get("/compare", params={"model": [model, other]})
+        assert page.status_code == 200 and "On the other recording" in page.text
+        assert browser.get("/compare", params={"model": [model]}).status_code == 422
+    recording = client.get(f"/v1/models/{other}").json()["recording_id"]
+    assert client.get(f"/v1/models/{model}/comparison", params={"recording": recording}).status_code == 200
+    assert client.get(f"/v1/models/{model}/comparison", params={"recording": "none"}).status_code == 404
+
+
+def test_openapi_types_what_is_answered(client: httpx.Client) -> None:
+    document = client.get("/openapi.json").json()
+    names = {"VersionOut", "ComparisonOut", "DiagnosisOut", "ImprovementOut", "JobOut", "ExperimentOut"}
+    assert names <= set(document["components"]["schemas"])
+
+
+def test_browser_asks_for_html(service: Service) -> None:
+    with service.client(None, headers=HTML) as stranger:
+        assert stranger.get("/compare").status_code == 303
+
+
+def test_real_worker_finds_what_is_missing_and_the_test_that_decides(tmp_path: Path) -> None:
+    """identify's own answers carry what page and routes build on."""
+    from api import missing
+    from api.documents import ComparisonOut, DiagnosisOut
+    from api.jobs import comparison, fit
+    from tests.api.test_worker import made_up_csv
+
+    path = str(made_up_csv(tmp_path / "record.csv"))
+    told: list[float] = []
+    found = missing.diagnosis(path, lambda share, _text="": told.append(share))
+    DiagnosisOut.model_validate(found)
+    assert told == sorted(told) and told[-1] <= 1 and len(told) > 5
+    model = fit(path, lambda *_: None)
+    compared = comparison(path, lambda *_: None, model["json"])
+    ComparisonOut.model_validate(compared)
+    assert len(compared["series"]["time_s"]) <= 2400
+    view = why.view(found, compared, [])
+    assert view["title"] and {split["title"] for split in view["splits"]} == set(why.SPLITS.values())
