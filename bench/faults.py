@@ -40,7 +40,12 @@ def order(injections: int, seed: int) -> list[tuple[str, str, int]]:
 
 
 def campaign(
-    jobs: list[tuple[str, str, int]], workers: int, speed: float, minutes: float, tell: bool = True
+    jobs: list[tuple[str, str, int]],
+    workers: int,
+    speed: float,
+    minutes: float,
+    tell: bool = True,
+    tell_all: bool = False,
 ) -> list[Verdict]:
     """Make the injections; stops early when the time is up."""
     waiting, found, lock = list(reversed(jobs)), [], threading.Lock()
@@ -57,7 +62,7 @@ def campaign(
                 verdict = worker.inject(*job)
                 with lock:
                     found.append(verdict)
-                    if tell and verdict.wrong:
+                    if tell and (verdict.wrong or tell_all):
                         print(json.dumps(verdict.__dict__), flush=True)
                     if tell and len(found) % 50 == 0:
                         print(f"{len(found)} of {len(jobs)}", file=sys.stderr, flush=True)
@@ -83,13 +88,14 @@ def main() -> None:
     parser.add_argument("--speed", type=float, default=4.0)
     parser.add_argument("--only", nargs="*", metavar="FAULT", help="these faults alone")
     parser.add_argument("--no-table", action="store_true")
+    parser.add_argument("--all", action="store_true", help="print every injection as JSON, not only what went wrong")
     options = parser.parse_args()
     injections = SHORT if options.short else options.injections
     jobs = order(injections, options.seed)
     if options.only:
         jobs = [job for job in order(10_000, options.seed) if job[0] in options.only][: options.injections]
     load, began_s = os.getloadavg(), time.monotonic()
-    found = campaign(jobs, options.workers, options.speed, options.minutes)
+    found = campaign(jobs, options.workers, options.speed, options.minutes, tell_all=options.all)
     took_s = time.monotonic() - began_s
     conditions = (
         f"{len(found)} injections in {took_s / 60:.1f} min on {datetime.now(UTC):%Y-%m-%d}, seed {options.seed}, speed "

@@ -70,7 +70,7 @@ CASES: dict[str, Case] = {
         Case("clock_jitter", "go on"),
         Case("delivery_jitter", "go on"),
         Case("disk_full", "stop", of="host"),
-        Case("disk_slow", "stop", of="host"),
+        Case("disk_slow", "stop", SYNC_WATCH_S, of="host"),
         Case("host_killed", "stop", of="host"),
         Case("host_stopped_2s", "stop", of="host"),
         Case("wall_clock_an_hour_on", "go on", of="host"),
@@ -85,12 +85,12 @@ def plan_of(phase: str, long: bool = False) -> list[dict[str, Any]]:
     prbs = {
         "name": "prbs",
         "sequence": "prbs",
-        "settings": {"bits": 8 if long else 7, "clock_pulses": 2 if long else 1},
+        "settings": {"bits": 8 if long else 7, "clock_pulses": 3 if long else 1},
     }
-    ramp_s = 5.0 if long else 1.6
+    ramp_s = 9.0 if long else 1.6
     ramp = {"name": "ramp", "sequence": "ramp", "settings": {"up_s": ramp_s, "down_s": ramp_s}}
     first = {"name": "steps", "sequence": "steps", "settings": {"on_s": 0.5, "off_s": 0.0, "repeats": 1}}
-    pause = {"name": "rest", "sequence": "rest", "settings": {"duration_s": 4.0 if long else 2.0}}
+    pause = {"name": "rest", "sequence": "rest", "settings": {"duration_s": 18.0 if long else 2.0}}
     return {
         "arming": [rest, prbs],
         "prbs": [rest, prbs],

@@ -29,6 +29,7 @@ class Verdict:
     last_pulse_ms: float | None = None
     after_known_ms: float | None = None
     confirmed: bool | None = None
+    evidence: str = ""
     felt: int = 0
     kept: int = 0
     tail_ms: float | None = None

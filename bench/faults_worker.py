@@ -22,6 +22,10 @@ DISK_MB = 96
 MODULE = "bench.faults_host"
 
 
+class StoppedBefore(RuntimeError):
+    """The rig stopped by itself before anything was injected."""
+
+
 class Worker:
     """An emulator, a rig on a small disk of its own, and what happened to them."""
 
@@ -33,6 +37,7 @@ class Worker:
         self.disk.mkdir()
         mount = ["mount", "-t", "tmpfs", "-o", f"size={DISK_MB}m", "tmpfs", str(self.disk)]
         self.mounted = subprocess.run(mount, capture_output=True, check=False).returncode == 0
+        self.stopped_before: list[str] = []
         self._made = 0
         self._count = 0
         self.bench: Bench | None = None
@@ -49,7 +54,13 @@ class Worker:
         """Play a test, break it in that phase, mend it, and judge."""
         verdict = Verdict(fault, phase, seed)
         try:
-            self._inject(CASES[fault], verdict, random.Random(f"{fault}{phase}{seed}"))
+            rng = random.Random(f"{fault}{phase}{seed}")
+            try:
+                self._inject(CASES[fault], verdict, rng)
+            except StoppedBefore as stopped:  # once more: a busy machine is no injection
+                self.stopped_before.append(str(stopped))
+                self._drop()
+                self._inject(CASES[fault], verdict, rng)
         except (TimeoutError, queue.Empty, OSError, RuntimeError, KeyError, AssertionError) as error:
             verdict.wrong.append(f"campaign: {type(error).__name__}: {error}")
             self._drop()
@@ -59,7 +70,9 @@ class Worker:
         client = self._ready()
         self._count += 1
         test_id = f"{case.name}.{verdict.phase}.{verdict.seed}.{self._count}"
-        plan = default_plan(test_id, segments=plan_of(verdict.phase, long=case.name == "rate_off"))
+        plan = default_plan(
+            test_id, segments=plan_of(verdict.phase, long=case.name in ("rate_off", "torque_stuck", "disk_slow"))
+        )
         before = self._felt_count()
         while not client.events.empty():
             client.events.get_nowait()
@@ -82,7 +95,7 @@ class Worker:
         verdict.outcome, verdict.reason = event["outcome"], event["reason"]
         stop = event["summary"].get("stop")
         if stop is not None and event["outcome"] != "completed":
-            verdict.confirmed = stop["confirmed"]
+            verdict.confirmed, verdict.evidence = stop["confirmed"], stop["detail"]
         felt = [p for p in self._felt(before) if p["delivered"]]
         verdict.felt = len(felt)
         self._mend(case, verdict, undo)
@@ -119,7 +132,9 @@ class Worker:
         end_s = time.monotonic() + 15
         if phase == "sealing":
             length_s = 1.1 / self.speed
-            while (status := client.status())["state"] in ("arming", "running"):
+            while (status := client.status())["state"] in ("arming", "running", "stopping", "latched"):
+                if status["state"] in ("stopping", "latched"):
+                    raise StoppedBefore(f"{status['state']} {status['reason']}")
                 if status["elapsed_s"] / self.speed > length_s - 0.01:
                     break
                 time.sleep(0.002)
@@ -132,7 +147,7 @@ class Worker:
             if status["segment"] == phase and seen_stimulation:
                 break
             if time.monotonic() > end_s or status["state"] in ("latched", "ready"):
-                raise TimeoutError(f"phase {phase} never came: {status['state']} {status['reason']}")
+                raise StoppedBefore(f"phase {phase} never came: {status['state']} {status['reason']}")
             time.sleep(0.003)
         time.sleep(rng.uniform(0.02, 0.2) if phase != "rest" else rng.uniform(0.0, 0.15))
 
@@ -237,7 +252,7 @@ class Worker:
             self._drop()
             return
         if case.name == "cell_unplugged":
-            self._drop()  # it comes back on another port: a person corrects the rig file
+            self._condemned = True  # it comes back on another port: a person corrects the rig file
             return
         end_s = time.monotonic() + 4
         while not (reply := client.ask("rearm", by="bench"))["ok"] and time.monotonic() < end_s:
@@ -266,8 +281,9 @@ class Worker:
 
     def _ready(self) -> RigClient:
         """A rig that is ready; a new pair where the last one could not be mended."""
-        if self.client is not None and self._settled(self.client)["state"] != "ready":
+        if self.client is not None and (self._condemned or self._settled(self.client)["state"] != "ready"):
             self._drop()
+        self._condemned = False
         if self.client is None:
             self._made += 1
             self.bench = Bench(self.disk / f"bench{self._made}", "--noise-seed", str(self._made), speed=self.speed)
@@ -282,7 +298,7 @@ class Worker:
         client.ask("subscribe")
         return client
 
-    _healed = False
+    _healed = _condemned = False
 
     def _drop(self) -> None:
         if self.bench is not None:

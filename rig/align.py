@@ -20,6 +20,7 @@ MEDIAN_EFFICIENCY = 1.2533
 """Standard error of a median over that of a mean, for normal errors (sqrt(pi / 2))."""
 MAX_POINTS = 400
 MISFIT_WINDOWS = 8
+COARSE_MISFIT_S = 0.005
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,6 +90,9 @@ def align(
     if pairs is not None and len(pairs[0]) >= MIN_EDGES:
         line, method = _robust_line(*pairs), "sync"
         misfit_s = _misfit(line, *pairs)
+        coarse_s = _misfit(envelope, *_earliest(cell_s, host_s))
+        if coarse_s > COARSE_MISFIT_S:  # then edges may have been taken for those of other pulses
+            misfit_s = max(misfit_s, coarse_s)
         # Pulses often keep step with the samples, so where in its sample a pulse began does not average out.
         error_s = float(np.hypot(line.error_s, 1 / sample_rate_hz / np.sqrt(12)))
         error_s = float(np.hypot(error_s, misfit_s))

@@ -200,7 +200,7 @@ class Gate:
             failure = self._write_ack(index, ack)
         if failure:
             self._on_fault(failure)  # outside the lock: a fault shuts the gate
-        if ack.error is not None:
+        if ack.error is not None and ack.fatal:
             self._on_fault(f"stimulator: {ack.error}" + (f" at pulse {index + 1}" if index >= 0 else ""))
 
     def _write_ack(self, index: int, ack: Ack) -> str:

@@ -13,6 +13,8 @@ DECAY_S = 3.0
 NEAR_REST_NM = 0.5
 AROUND_S = 0.05
 """Real seconds over which a torque's median is taken."""
+SILENT_S = 0.2
+"""Real seconds to wait for a torque at all."""
 ATTEMPTS = 2
 
 
@@ -42,17 +44,20 @@ def watch_decay(
     """
     if gate.last_pulse_s is None:
         return True, "no pulse had been sent"
-    if at_stop_nm is None or rest_nm is None:
+    if rest_nm is None:
         return False, "no torque to confirm the stop by"
-    above_nm = at_stop_nm - rest_nm
+    above_nm = 0.0 if at_stop_nm is None else at_stop_nm - rest_nm  # unknown: then it must come close to its rest
     side = 1.0 if above_nm >= 0 else -1.0
-    deadline_s = clock.now_s() + DECAY_S
+    deadline_s, silent_s = clock.now_s() + DECAY_S, clock.now_s() + SILENT_S * clock.speed
     while True:
         now_nm = receiver.torque_around(AROUND_S * clock.speed)
         if now_nm is None:
-            return False, "no torque to confirm the stop by"
+            if clock.now_s() >= silent_s:
+                return False, "no torque to confirm the stop by"
+            clock.wait(clock.now_s() + 0.01 * clock.speed)
+            continue
         if side * (now_nm - rest_nm) <= max(NEAR_REST_NM, 0.5 * abs(above_nm)):
-            return True, f"torque fell from {at_stop_nm:.2f} to {now_nm:.2f} N·m"
+            return True, f"torque fell from {rest_nm + above_nm:.2f} to {now_nm:.2f} N·m"
         if clock.now_s() >= deadline_s:
             return False, f"torque is still {now_nm:.2f} N·m {DECAY_S:g} s after the stop"
         clock.wait(clock.now_s() + 0.01 * clock.speed)

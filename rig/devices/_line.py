@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -16,7 +17,6 @@ from rig.signals import LateError
 from rig.wire.sciencemode4 import Packet
 
 READ_TIMEOUT_S = 0.05
-WRITE_TIMEOUT_S = 0.05
 
 
 class Reader(Protocol):
@@ -77,9 +77,7 @@ class PacketLine:
         if not Path(self.port).exists():
             raise DeviceError(f"stimulator.port: {self.port} is not there; plug the stimulator in or correct the port")
         try:
-            self._serial = serial.Serial(
-                self.port, timeout=READ_TIMEOUT_S, write_timeout=WRITE_TIMEOUT_S, exclusive=True, **self._arguments
-            )
+            self._serial = serial.Serial(self.port, timeout=READ_TIMEOUT_S, exclusive=True, **self._arguments)
         except (serial.SerialException, OSError, ValueError) as error:
             raise DeviceError(
                 f"stimulator.port: {self.port} cannot be opened ({error}); is another program using it?"
@@ -163,9 +161,12 @@ class PacketLine:
         if latest_s is not None and not (self._clock.now_s() <= latest_s):
             raise LateError
         try:
-            self._serial.write(frame)
-        except (serial.SerialException, OSError) as error:
+            # one system call: pyserial's own write calls a pulse that went out late-scheduled a timeout
+            written = os.write(self._serial.fileno(), frame)
+        except (serial.SerialException, OSError, TypeError) as error:
             raise DeviceError(f"stimulator {self.port} took no bytes: {error}") from None
+        if written != len(frame):
+            raise DeviceError(f"stimulator {self.port} took {written} of {len(frame)} bytes; is it still reading?")
         self.last_written_s = self._clock.now_s()
 
     def _read(self) -> None:

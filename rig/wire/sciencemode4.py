@@ -18,7 +18,9 @@ from rig.errors import WireError
 START, STOP, ESCAPE, KEY = 0xF0, 0x0F, 0x81, 0x55
 HEADER_BYTES = 9
 OVERHEAD_BYTES = 10
-MAX_FRAME_BYTES = 2048
+MAX_FRAME_BYTES = 128
+"""Longer than any answer of the low level. Half a frame before a whole one can look like the head of a longer frame,
+and would swallow what follows until its length is reached."""
 NUMBERS = 64
 INTERPHASE_US = 100
 

@@ -109,6 +109,18 @@ def test_acks_and_errors_are_matched_by_number(tmp_path: Path):
     assert setup.faults == ["stimulator: electrode error at pulse 1"]
 
 
+def test_a_pulse_that_the_device_did_not_take_is_recorded_and_no_fault(tmp_path: Path):
+    setup = Setup(tmp_path)
+    setup.stimulator.ack_delay_s = None
+    setup.fire(100)
+    setup.stimulator.on_ack(Ack(1, setup.clock.now_s(), "busy", fatal=False))
+    assert setup.faults == []
+    assert setup.gate.oldest_unacknowledged_s() is None
+    kind, payload = journal.read(setup.path).blocks[-1]
+    assert kind == Kind.ACKED
+    assert payload.endswith(b"busy")
+
+
 def test_disconnecting_stops_first_and_never_raises(tmp_path: Path):
     setup = Setup(tmp_path)
     setup.stimulator.silent = True

@@ -1,0 +1,40 @@
+"""A short fault campaign; the whole one is `python -m bench.faults`, its table docs/faults.md."""
+
+from __future__ import annotations
+
+import pytest
+
+from bench.faults import campaign, order
+from bench.faults_cases import CASES, PHASES
+from bench.faults_judge import table
+
+pytestmark = [pytest.mark.wire, pytest.mark.slow]
+
+FAULTS = (
+    "disk_full",
+    "host_stopped_2s",
+    "host_killed",
+    "corrupt_commands",
+    "cell_silent",
+    "torque_step",
+    "frames_dropped",
+)
+
+
+def test_a_short_campaign_finds_nothing_wrong():
+    jobs = [(fault, PHASES[1:4][number % 3], 77) for number, fault in enumerate(FAULTS)]
+    found = campaign(jobs, workers=1, speed=4.0, minutes=1.5, tell=False)
+    assert len(found) == len(FAULTS)
+    for verdict in found:
+        assert verdict.wrong == [], verdict
+        assert verdict.opens, verdict
+        assert verdict.felt <= verdict.kept
+    text = table(found, "A test.")
+    assert all(f"| {fault} |" in text for fault in FAULTS)
+    assert "injections with anything wrong: 0" in text
+
+
+def test_the_whole_campaign_is_every_fault_in_every_phase():
+    jobs = order(len(CASES) * len(PHASES), seed=1)
+    assert {(fault, phase) for fault, phase, _ in jobs} == {(fault, phase) for fault in CASES for phase in PHASES}
+    assert len({seed for _, _, seed in order(512, seed=1)}) >= 3

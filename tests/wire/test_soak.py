@@ -1,0 +1,25 @@
+"""A small part of the soak: `python -m bench.soak --minutes 60` is the whole, docs/soak.md has its figures."""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+
+from bench.soak import soak
+
+MINUTES = float(os.environ.get("STIMRIG_SOAK_MINUTES", "0.7"))
+
+
+@pytest.mark.wire
+@pytest.mark.realtime
+@pytest.mark.slow
+def test_no_sample_is_lost_while_fits_run_beside():
+    found = soak(MINUTES, every_minutes=min(MINUTES, 1.0))
+    assert found["completed"] == found["tests"] >= 1, found
+    assert found["lost_samples"] == 0
+    assert found["samples"] >= 60_000
+    assert found["fits_beside"] >= 1
+    assert found["alignment_error_ms"] < 1.0
+    assert found["pulses_felt"] == found["pulses_sent"]
+    assert found["state"] == "ready"
