@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 
 
 class Clock:
@@ -20,6 +20,12 @@ class Clock:
     def utc(self) -> str:
         """Now, as an ISO 8601 label."""
         return utc_label(self.unix_s())
+
+    def end_of_day_utc(self) -> str:
+        """The next midnight where the service stands, as an ISO 8601 label in UTC."""
+        today = datetime.fromtimestamp(self.unix_s()).astimezone()
+        midnight = datetime.combine(today.date() + timedelta(days=1), datetime.min.time())
+        return utc_label(midnight.astimezone().timestamp())
 
 
 def utc_label(unix_s: float) -> str:

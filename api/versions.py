@@ -16,6 +16,9 @@ from api.store import Store
 from api.store.tables import Approval, Model
 from api.verdict import figures, quality
 
+LATEST = "9999"
+"""Sorts after every label of time: an approval from before approvals expired."""
+
 
 @dataclass(frozen=True)
 class Served:
@@ -23,6 +26,7 @@ class Served:
 
     body: bytes
     etag: str
+    expires_utc: str
 
 
 class Versions:
@@ -125,6 +129,7 @@ class Versions:
         now = self.clock.utc()
         decision = Approval(model_id=row.id, participant=row.participant, approved=approved, reason=reason)
         decision.by, decision.at_utc = by, now
+        decision.expires_utc = self.clock.end_of_day_utc() if approved else None
         with self.store.write() as session:
             session.add(decision)
             audit.write(session, now, by, "approve" if approved else "reject", row.id, reason=reason)
@@ -137,7 +142,8 @@ class Versions:
         return found[0] if found else None
 
     def approved(self, participant: str) -> Approval | None:
-        """The approval that holds for a participant: the newest on a version not rejected since."""
+        """The approval that holds for a participant today: the newest on a version not rejected since."""
+        now = self.clock.utc()
         query = select(Approval).where(Approval.participant == participant).order_by(Approval.id.desc())
         rejected: set[str] = set()
         with self.store.read() as session:
@@ -145,19 +151,24 @@ class Versions:
                 if not decision.approved:
                     rejected.add(decision.model_id)
                 elif decision.model_id not in rejected:
-                    return decision
+                    return decision if decision.expires_utc is None or decision.expires_utc > now else None
         return None
 
     def served(self, participant: str) -> Served | None:
         """What the controller gets, or None where nothing is approved."""
         found = self._served.get(participant)
+        if found is not None and found.expires_utc <= self.clock.utc():
+            del self._served[participant]
+            return None
         if found is None:
             with self.store.write_lock:  # no approval may slip in between reading and keeping
                 approval = self.approved(participant)
                 if approval is None:
                     return None
                 row = self.get(approval.model_id)
-                found = self._served[participant] = Served(row.document, f'"{row.etag}"')
+                found = self._served[participant] = Served(
+                    row.document, f'"{row.etag}"', approval.expires_utc or LATEST
+                )
         return found
 
     def public(self, row: Model) -> dict[str, Any]:
@@ -179,6 +190,7 @@ class Versions:
             "decided_by": decision.by if decision else None,
             "decided_utc": decision.at_utc if decision else None,
             "decision_reason": decision.reason if decision else None,
+            "expires_utc": decision.expires_utc if decision else None,
             "served": holding is not None and holding.model_id == row.id,
             "created_utc": row.created_utc,
             "created_by": row.created_by,

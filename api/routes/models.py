@@ -25,7 +25,10 @@ async def approved_model(
     served = context.versions.served(code)
     if served is None:
         await asyncio.to_thread(participants.find, context, code)
-        detail = f"Participant {code!r} has no approved model. POST /v1/models/{{id}}/approve approves one."
+        detail = (
+            f"Participant {code!r} has no model approved today; an approval ends with its day. "
+            "POST /v1/models/{id}/approve approves one."
+        )
         raise ApiError(404, "no-approved-model", "No approved model", detail)
     headers = {"ETag": served.etag, "Cache-Control": "private, no-cache"}
     if if_none_match and matches(if_none_match, served.etag):

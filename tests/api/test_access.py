@@ -11,6 +11,7 @@ import httpx
 import pytest
 
 from api.auth import Scope
+from api.clock import utc_label
 from api.settings import Settings
 from tests.api.conftest import TOKEN, Service, run_test
 
@@ -50,6 +51,9 @@ ROUTES = [
     ("POST", "/v1/models/x/approve", Scope.APPROVE_MODEL),
     ("POST", "/v1/models/x/reject", Scope.APPROVE_MODEL),
     ("POST", "/v1/models/x/effects", Scope.RUN_TEST),
+    ("POST", "/v1/models/x/improve", Scope.RUN_TEST),
+    ("POST", "/v1/models/x/undo", Scope.APPROVE_MODEL),
+    ("GET", "/v1/jobs/x", Scope.READ_MODEL),
     ("GET", "/v1/tokens", Scope.ADMINISTER),
     ("GET", "/v1/audit", Scope.ADMINISTER),
 ]
@@ -232,3 +236,19 @@ def test_stopped_test_keeps_its_recording_and_makes_no_model(
     document = wait_done(client, test_id)
     assert document["state"] == "stopped" and document["model_id"] is None
     assert client.get(document["recording_url"]).status_code == 200
+
+
+def test_approval_ends_with_its_day(client: httpx.Client, service: Service, participant: str) -> None:
+    document = run_test(client, participant)
+    approved = client.post(f"{document['model_url']}/approve").json()
+    fetch = f"/v1/participants/{participant}/model"
+    assert client.get(fetch).status_code == 200
+    clock = service.app.state.context.clock
+    now = clock.unix_s()
+    assert clock.utc() < approved["expires_utc"] <= utc_label(now + 25 * 3600)
+    clock.unix_s = lambda: now + 25 * 3600
+    gone = client.get(fetch)
+    assert gone.status_code == 404 and "ends with its day" in gone.json()["detail"]
+    assert client.get(document["model_url"]).json()["served"] is False
+    client.post(f"{document['model_url']}/approve")
+    assert client.get(fetch).status_code == 200
