@@ -26,6 +26,8 @@ READ_TIMEOUT_S = 0.02
 SILENCE_S = 1.0
 """Real seconds without a sample after which the cell counts as gone and its bus is closed: some buses spin then."""
 LIVE_BLOCKS = 4000
+SETTLING_S = 0.1
+BACKLOG_RATE = 1.6
 JUMP_ALLOWANCE_S = 0.5
 """A counter that runs further ahead of the host's clock than this has jumped: no time can be given to its samples."""
 
@@ -133,6 +135,17 @@ class Receiver:
         """Age of the newest sample, infinite before the first."""
         last_s = self.last_s
         return np.inf if last_s is None else now_s - last_s
+
+    def settled(self) -> bool:
+        """Do samples come as fast as the cell takes them, and no faster?
+
+        Faster means that a buffer is being emptied of what is old: an adapter that nobody read, a host that stood.
+        """
+        since_s = self._clock.now_s() - SETTLING_S * self._clock.speed
+        rate = [entry for entry in tuple(self._rate) if entry[0] >= since_s]
+        if len(rate) < 2 or rate[-1][0] - rate[0][0] < 0.5 * SETTLING_S * self._clock.speed:
+            return False
+        return (rate[-1][1] - rate[0][1]) / (rate[-1][0] - rate[0][0]) <= BACKLOG_RATE * self.nominal_rate_hz
 
     def torque_around(self, duration_s: float) -> float | None:
         """Median of the torque over the last `duration_s`, N·m; None where there is none."""

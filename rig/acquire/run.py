@@ -36,6 +36,8 @@ log = logging.getLogger("rig.run")
 LEAD_S = 0.1
 """Real seconds between arming and the first deadline."""
 SENDER_PRIORITY = 50
+SETTLE_S = 3.0
+"""Real seconds to wait until what lay in buffers has been read."""
 FRESH_S = 0.5
 """Real seconds to wait for a fresh torque before arming."""
 
@@ -154,10 +156,16 @@ class TestRun:
 
     def _arm(self) -> bool:
         speed = self._clock.speed
-        deadline_s = self._clock.now_s() + FRESH_S * speed
-        while not (self._receiver.age_s(self._clock.now_s()) <= self._watch.stale_torque_s * speed):
-            if self._clock.now_s() >= deadline_s:
+        began_s = self._clock.now_s()
+        while True:
+            fresh = self._receiver.age_s(self._clock.now_s()) <= self._watch.stale_torque_s * speed
+            if fresh and self._receiver.settled():
+                break
+            waited_s = (self._clock.now_s() - began_s) / speed
+            if not fresh and waited_s >= FRESH_S:
                 self._fault("load cell: no fresh torque before the test; check its cable and supply")
+            if waited_s >= SETTLE_S:
+                self._fault("load cell: samples come far faster than the rig file says; check sample_rate_hz and bus")
             if self._clock.wait(self._clock.now_s() + 0.005 * speed, self.halt.event):
                 return False
         self._rest_nm = self._receiver.torque_around(0.1 * speed)

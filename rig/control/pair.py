@@ -7,7 +7,7 @@ from typing import Any
 
 from rig import devices
 from rig.acquire.receiver import Receiver
-from rig.acquire.run import FRESH_S
+from rig.acquire.run import FRESH_S, SETTLE_S
 from rig.clock import Clock
 from rig.config import RigConfig
 from rig.errors import DeviceError
@@ -80,8 +80,9 @@ class Pair:
         assert self.receiver is not None
         asked_s = self._clock.now_s()
         end_s = asked_s + FRESH_S * self._clock.speed
-        while self.receiver.age_s(asked_s) >= 0:
-            if self._clock.now_s() > end_s:
+        while self.receiver.age_s(asked_s) >= 0 or not self.receiver.settled():
+            came = self.receiver.age_s(asked_s) < 0
+            if self._clock.now_s() > (end_s + SETTLE_S * self._clock.speed if came else end_s):
                 return False
             self._clock.wait(self._clock.now_s() + 0.005 * self._clock.speed)
         return True

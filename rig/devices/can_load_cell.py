@@ -28,8 +28,6 @@ KIND = "load_cell"
 GATHER_S = 0.005
 """Samples are handed on at most this long (real time) after the first of a block came."""
 
-DRAIN_S = 0.5
-
 _FRAME = re.compile(r"^([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#((?:[0-9A-Fa-f]{2}){0,8})$")
 
 
@@ -110,7 +108,6 @@ class CanLoadCell:
         # Timestamps of these interfaces are the sender's or the kernel's, of the others the host's at reading.
         self._stamped = bus.get("interface") in ("socketcand", "socketcan", "pcan", "kvaser", "ixxat", "vector")
         self._send(self._settings.start_frames)
-        self._drain(self._bus)
         return {
             "device": "can_load_cell",
             "bus": self._place(),
@@ -118,17 +115,6 @@ class CanLoadCell:
             "message": self._frame.message.name,
             "sample_rate_hz": self.sample_rate_hz,
         }
-
-    def _drain(self, bus: can.BusABC) -> None:
-        """Throw away what lies in the adapter's and the kernel's buffers: it is from before, however long ago."""
-        end_s = time.monotonic() + DRAIN_S
-        while time.monotonic() < end_s:
-            with contextlib.suppress(ValueError):  # a damaged line is old, too
-                try:
-                    if bus.recv(0) is None:
-                        return
-                except (can.CanError, OSError) as error:
-                    raise DeviceError(f"load cell on {self._place()}: the bus is gone: {_line(error)}") from None
 
     def read(self, timeout_s: float) -> TorqueBlock:
         if self._bus is None:

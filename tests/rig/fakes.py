@@ -169,8 +169,8 @@ class VirtualRig:
         self.run = TestRun(self.test, self.table, self.journal, self.gate, self.receiver, self.clock, self.halt)
 
     def at(self, time_s: float, action: Callable[[], object]) -> None:
-        """Do something at a time on the test's clock (its start is about 0.1 s after arming)."""
-        self.clock.call_at(self.clock.now_s() + 0.106 + time_s, lambda: void(action()))
+        """Do something at a time on the test's clock (its start: torque settled, then the lead)."""
+        self.clock.call_at(self.clock.now_s() + 0.165 + time_s, lambda: void(action()))
 
     def execute(self) -> RunResult:
         """Play the test."""
