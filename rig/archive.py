@@ -262,7 +262,7 @@ def write_atomically(path: Path, data: bytes) -> None:
         if temporary is not None:
             Path(temporary).unlink(missing_ok=True)
         raise RecordingError(
-            f"{path}: {error.strerror}; the journal is kept, free the disk and restart the rig"
+            f"{path}: {error.strerror}; the journal is kept, free the disk and re-arm"
         ) from None
 
 
