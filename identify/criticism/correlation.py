@@ -1,7 +1,7 @@
 """Is the residual noise? Correlations with itself, u, u² and y, with bands whose false-alarm rate is what it says.
 
 A band of 1.96/√N at each lag alarms far more often than 5 % over all lags. Here the band of a function is the 95 %
-quantile of its largest value over all lags, found by drawing noise for this very record: its length, its gaps, its input.
+quantile of its largest value over all lags, found by drawing noise for this very record: its length, gaps and input.
 """
 
 from __future__ import annotations

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import numpy as np
@@ -50,7 +51,7 @@ def by_level(record: Record, residual_nm: np.ndarray, noise_sd_nm: float) -> lis
     u, top = record.pulse_width_us, float(record.pulse_width_us.max())
     labels, groups = ["0 µs"], [u <= 0]
     edges = np.linspace(0.0, top, LEVELS + 1)
-    for low, high in zip(edges[:-1], edges[1:], strict=True):
+    for low, high in itertools.pairwise(edges):
         labels.append(f"{low:.0f}-{high:.0f} µs")
         groups.append((u > max(low, 0.0)) & (u <= high) if high > 0 else np.zeros(u.size, bool))
     return _table(labels, groups, residual_nm, noise_sd_nm)
@@ -66,8 +67,8 @@ def by_time(record: Record, residual_nm: np.ndarray, noise_sd_nm: float) -> list
     """Equal spans since the start."""
     t = record.time_s - record.time_s[0]
     edges = np.linspace(0.0, t[-1] + 1e-9, SPANS + 1)
-    labels = [f"{a:.1f}-{b:.1f} s" for a, b in zip(edges[:-1], edges[1:], strict=True)]
-    groups = [(t >= a) & (t < b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    labels = [f"{a:.1f}-{b:.1f} s" for a, b in itertools.pairwise(edges)]
+    groups = [(t >= a) & (t < b) for a, b in itertools.pairwise(edges)]
     return _table(labels, groups, residual_nm, noise_sd_nm)
 
 
@@ -80,7 +81,7 @@ def by_frequency(record: Record, residual_nm: np.ndarray, noise_sd_nm: float) ->
     power[1:] *= 2.0
     frequency = np.fft.rfftfreq(values.size, 1.0 / rate)
     rows = []
-    for low, high in zip(OCTAVES_HZ[:-1], OCTAVES_HZ[1:], strict=True):
+    for low, high in itertools.pairwise(OCTAVES_HZ):
         inside = (frequency >= low) & (frequency < high)
         if not inside.any() or low >= rate / 2:
             continue

@@ -140,8 +140,8 @@ def _plain(
         lines.append("Nothing is missing: what is left looks like noise, at work and at rest alike.")
     if verdict.kind == "unexplained_structure":
         lines.append(
-            "There is structure left that no effect of the library explains: the error goes with the muscle's work, and "
-            "isn't noise of the measurement."
+            "There is structure left that no effect of the library explains: the error goes with the muscle's work, "
+            "and isn't noise of the measurement."
         )
         if where:
             lines.append(f"It sits mostly here: {where[0]['text']}.")

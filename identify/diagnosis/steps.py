@@ -38,10 +38,7 @@ def steps(work: Analysis) -> list[Step]:
     previous = work.base
     names = [*work.given, *work.added]
     for number, name in enumerate(names):
-        if number == len(names) - 1:
-            fitted = last
-        else:
-            fitted = _part(last, previous, names[: number + 1])
+        fitted = last if number == len(names) - 1 else _part(last, previous, names[: number + 1])
         result.append(Step(name, fitted, figures(fitted, record)))
         previous = fitted
     return result

@@ -75,13 +75,13 @@ def left_over(fitted: Fitted, quiet: np.ndarray, noise_sd_nm: float) -> Left:
         busy_nm=_rms(residual, works),
         quiet_seconds=sum(r.stop - r.start for r in rests) * setup.grid.step_s,
         ratio=ratio,
-        ideal=_ideal(residual, setup.fitted, resting, white, sum(r.stop - r.start for r in rests)),
+        ideal=_ideal(setup.fitted, resting, white, sum(r.stop - r.start for r in rests)),
         slow_nm=fitted.noise.sd_nm * float(np.sqrt(fitted.noise.share)),
         ar1=lag,
     )
 
 
-def _ideal(residual: np.ndarray, fitted: np.ndarray, resting: tuple, white: float, size: int) -> float:
+def _ideal(fitted: np.ndarray, resting: tuple, white: float, size: int) -> float:
     """Log-likelihood a record of this length would have, were its noise that of the rests throughout."""
     total = int(fitted.sum())
     at_white = -0.5 * total * (np.log(2 * np.pi * white * white) + 1.0)
@@ -122,7 +122,7 @@ def quiet_rows(fitted: Fitted) -> np.ndarray:
     level = QUIET * setup.scale_nm
     still = (np.abs(torque) < level) & (np.abs(drive) < level)
     # Half a second after the last torque: slow tails belong to work.
-    tail = int(round(0.5 / setup.grid.step_s))
+    tail = round(0.5 / setup.grid.step_s)
     busy = np.convolve(~still, np.r_[np.zeros(tail), np.ones(tail + 1)], "same") > 0
     return still & ~busy
 

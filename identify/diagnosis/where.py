@@ -14,7 +14,7 @@ STRETCH_S = 0.5
 def direction_of(record: Record) -> np.ndarray:
     """+1 where the pulse width rises over the last half second, -1 where it falls, 0 where it is held; shape (N,)."""
     u = record.pulse_width_us
-    back = max(int(round(0.3 * record.sample_rate_hz)), 1)
+    back = max(round(0.3 * record.sample_rate_hz), 1)
     change = u - np.r_[np.full(back, u[0]), u[:-back]]
     level = 0.004 * max(float(u.max()), 1.0)
     return np.where(change > level, 1, np.where(change < -level, -1, 0))
@@ -44,7 +44,7 @@ def worst_places(
         As `where` in the contract, worst first, with `mean_error_nm` (positive: the model is too low) and `text`.
     """
     rate, size = record.sample_rate_hz, record.time_s.size
-    length = max(int(round(STRETCH_S * rate)), 1)
+    length = max(round(STRETCH_S * rate), 1)
     rows = np.ones(size, bool) if rows is None else rows
     rising = direction_of(record)
     excess_total, pieces = 0.0, []

@@ -74,7 +74,7 @@ EFFECT = Effect(
             Form(
                 f"burst_{length * 1000:.0f}_ms",
                 "gain",
-                f"w = (1 + gain·exp(-(t/{length:g} s)^4)) f(u), t since the first pulse after {gap:g} s of silence or more",
+                f"w = (1 + gain·exp(-(t/{length:g} s)^4)) f(u), t since the first pulse after {gap:g} s of silence",
                 (_GAIN,),
                 _burst(length, gap),
                 batched=True,

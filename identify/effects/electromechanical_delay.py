@@ -12,7 +12,7 @@ from identify.effects.kernels import activate
 _DELAY = Parameter("delay_s", "s", 0.0, 0.15, 0.0, (0.02, 0.06), about="delay beyond the record's own timing")
 
 
-def _delay(_: None, p: dict[str, Any], scene: Scene) -> np.ndarray:
+def _delay(_: None, p: dict[str, Any], _scene: Scene) -> np.ndarray:
     return p["delay_s"]
 
 

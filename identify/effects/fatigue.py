@@ -69,7 +69,7 @@ EFFECT = Effect(
     resembles=("threshold_drift", "potentiation", "baseline_drift"),
     separated_by="Repeat the ramp after stimulation and again after a rest.",
     plain="The muscle tires: the same pulse gives less torque the longer it has worked, and recovers when it rests. "
-    "After a stroke muscles tire sooner. The controller must give more charge late in a session, or rest must be longer.",
+    "After a stroke muscles tire sooner. Late in a session it needs more charge, or longer rests.",
     source="Riener et al. 1996; Ding et al. 2003",
     experiment=("ramp", "rest", "steps"),
 )

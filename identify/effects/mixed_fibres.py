@@ -12,7 +12,7 @@ _SHARE = Parameter("slow_share", "1", 0.0, 0.9, 0.0, (0.3, 0.15), about="share o
 _RATIO = Parameter("ratio", "1", 1.4, 12.0, 2.0, (2.0, 4.0), "log", about="slow time constant over fast")
 
 
-def _parallel(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> list:
+def _parallel(drive: np.ndarray, p: dict[str, Any], _scene: Scene) -> list:
     share = p["slow_share"]
     return [((1.0 - share) * drive, np.ones_like(share)), (share * drive, p["ratio"])]
 

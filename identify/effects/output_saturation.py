@@ -11,11 +11,11 @@ from identify.effects.base import Effect, Form, Parameter, Scene
 _CEILING = Parameter("ceiling_nm", "N·m", 0.4, 4.0, np.inf, (1.2, 2.0), "log", "torque", "torque never exceeded")
 
 
-def _knee(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+def _knee(y: np.ndarray, p: dict[str, Any], _scene: Scene) -> np.ndarray:
     return y / (1.0 + np.abs(y / p["ceiling_nm"]) ** p["sharpness"]) ** (1.0 / p["sharpness"])
 
 
-def _exponential(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+def _exponential(y: np.ndarray, p: dict[str, Any], _scene: Scene) -> np.ndarray:
     c = p["ceiling_nm"]
     with np.errstate(invalid="ignore"):
         bent = np.sign(y) * c * -np.expm1(-np.abs(y) / c)

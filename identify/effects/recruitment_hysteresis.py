@@ -10,20 +10,23 @@ from identify.effects.base import Effect, Form, Parameter, Scene
 from identify.effects.kernels import dahl, play
 
 
-def _play(width: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+def _play(width: np.ndarray, p: dict[str, Any], _scene: Scene) -> np.ndarray:
     half = p["half_width_us"][:, 0]
-    growth = p["growth"][:, 0] / scene.largest_us if "growth" in p else np.zeros_like(half)
-    return play(np.ascontiguousarray(width), half, growth)
+    return play(np.ascontiguousarray(width), half, np.zeros_like(half))
 
 
-def _distributed(width: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+def _widening(width: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+    return play(np.ascontiguousarray(width), p["half_width_us"][:, 0], p["growth"][:, 0] / scene.largest_us)
+
+
+def _distributed(width: np.ndarray, p: dict[str, Any], __scene: Scene) -> np.ndarray:
     half, rows = p["half_width_us"], np.ascontiguousarray(width)
     even = np.zeros(rows.shape[0])
     plays = (play(rows, share * half[:, 0], even) for share in (0.2, 0.4, 0.6, 0.8, 1.0))
     return rows + p["share"] * (sum(plays, np.zeros_like(rows)) / 5.0 - rows)
 
 
-def _memory(width: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+def _memory(width: np.ndarray, p: dict[str, Any], _scene: Scene) -> np.ndarray:
     z = dahl(np.ascontiguousarray(width), p["reach_us"][:, 0])
     return np.where(width > 0, width - p["half_width_us"] * z, width)
 
@@ -74,7 +77,7 @@ EFFECT = Effect(
             "pulse_width",
             "as play, with r = half_width (1 + growth·u/u_max)",
             (_HALF, Parameter("growth", "1", -0.9, 4.0, 0.0, (1.0, 0.0), about="wider at larger widths")),
-            _play,
+            _widening,
             True,
         ),
         Form(

@@ -72,6 +72,7 @@ EFFECT = Effect(
             (*_RESONANCE, Parameter("share", "1", 0.0, 1.0, 0.0, (0.5,), about="share of torque through the spring")),
             _partly,
             True,
+            grows=True,
             restarts=_RESTARTS,
         ),
         Form(
@@ -84,12 +85,13 @@ EFFECT = Effect(
             ),
             _stiffening,
             True,
+            grows=True,
         ),
     ),
     signature="Ringing after every step.",
     resembles=("electromechanical_delay",),
     separated_by="Steps, sampled fast.",
-    plain="Strap, tendon or fixture give like a spring: the torque rings after every step. Fasten the limb and the cell.",
+    plain="Strap, tendon or fixture give like a spring: torque rings after every step. Fasten limb and cell.",
     source="An extra resonance in series with the muscle",
     experiment=("steps",),
 )

@@ -50,7 +50,7 @@ EFFECT = Effect(
         Form(
             "settling",
             "pulse_width",
-            "w = f(u - shift (exp(-t_ref/time_constant) - exp(-t/time_constant))) where u > 0; t_ref: middle of the ramp",
+            "w = f(u - shift (exp(-t_ref/time_constant) - exp(-t/time_constant))) where u > 0; t_ref mid-ramp",
             (
                 Parameter("shift_us", "µs", -80.0, 80.0, 0.0, (15.0, -15.0), about="final shift"),
                 Parameter("time_constant_s", "s", 5.0, 90.0, 15.0, (10.0,), "log", about="how fast it settles"),
@@ -90,8 +90,8 @@ EFFECT = Effect(
     signature="The curve moves along the pulse width: torque errs where the curve is steep, and more so later.",
     resembles=("fatigue", "potentiation", "voluntary_effort", "recruitment_hysteresis"),
     separated_by="Repeat the ramp at the end; log the electrodes' impedance.",
-    plain="The pulse width at which the muscle begins to answer moves during the session, as gel dries, skin warms or an "
-    "electrode shifts. Strong pulses look unchanged, weak ones are lost. Check the electrodes.",
+    plain="The pulse width at which the muscle begins to answer moves during the session, as gel dries, skin warms or "
+    "an electrode shifts. Strong pulses look unchanged, weak ones are lost. Check the electrodes.",
     source="Electrode and skin impedance; no single source, see docs/diagnosis.md",
     experiment=("ramp", "rest"),
 )

@@ -19,8 +19,10 @@ _PARTS = (("centre", "s"), ("width", "s"), ("height", "nm"))
 
 def _bumps(count: int) -> Callable[..., np.ndarray]:
     def apply(_: None, p: dict[str, Any], scene: Scene) -> np.ndarray:
-        listed = [np.concatenate([p[f"{part}_{i}_{unit}"] for i in range(count)], axis=1) for part, unit in _PARTS]
-        return bumps(scene.time_s, *listed, p["flatness"][:, 0])
+        centre, width, height = (
+            np.concatenate([p[f"{part}_{i}_{unit}"] for i in range(count)], axis=1) for part, unit in _PARTS
+        )
+        return bumps(scene.time_s, centre, width, height, p["flatness"][:, 0])
 
     return apply
 
@@ -88,8 +90,8 @@ EFFECT = Effect(
     signature="Isolated bumps, in rests as well, at times that have nothing to do with the stimulation.",
     resembles=("threshold_drift", "recruitment_hysteresis", "catch_like", "baseline_drift"),
     separated_by="A sham trial without stimulation; EMG; the instruction to relax.",
-    plain="The participant helped, resisted, or had a spasm. No model of the muscle can predict it. Repeat the test with "
-    "the instruction to relax, and leave these stretches out.",
+    plain="The participant helped, resisted, or had a spasm. No model of the muscle can predict it. Repeat the test "
+    "with the instruction to relax, and leave these stretches out.",
     source="Additive torque unrelated to the stimulation",
     foreseeable=False,
     prior=-5.0,

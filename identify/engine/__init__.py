@@ -46,7 +46,7 @@ def fit_candidate(record: Record, effects: Sequence[str], fit_on: Sequence[str] 
     """As `fit_with_effects`, with all that the engine knows of the fit."""
     rows = _rows(record, fit_on)
     raw = inspect(record)
-    setup, current = prepare(record, raw, rows)
+    _setup, current = prepare(record, raw, rows)
     for name in effects:
         identifier, _, wanted = name.partition(":")
         effect = get(identifier)

@@ -31,8 +31,8 @@ METHOD = "maximum-likelihood"
 def with_band(fitted: Fitted) -> Fitted:
     """A candidate whose noise has a narrow band, with that band written out as a tremor.
 
-    The wave is the band's share of the residual, given all of it, as a sine whose amplitudes run straight between knots:
-    a description of what was measured, nothing that could be foreseen.
+    The wave is the band's share of the residual, given all of it, as a sine whose amplitudes run straight between
+    knots: a description of what was measured, nothing that could be foreseen.
     """
     effect = next((e for e in registry().values() if e.band), None)
     if fitted.noise.band <= 0.0 or effect is None:
@@ -47,9 +47,9 @@ def with_band(fitted: Fitted) -> Fitted:
     frequency_hz = fitted.noise.turn / (2 * np.pi * step_s)
     chosen = problem.chosen[-1]
     p = {q.name: np.zeros((1, 1)) for q in chosen.parameters} | {"frequency_hz": np.full((1, 1), frequency_hz)}
-    columns = []
-    for q in chosen.parameters[1:]:
-        columns.append(np.asarray(form.call(None, p | {q.name: np.ones((1, 1))}, setup.scene)).ravel())
+    columns = [
+        np.asarray(form.call(None, p | {q.name: np.ones((1, 1))}, setup.scene)).ravel() for q in chosen.parameters[1:]
+    ]
     design = np.stack(columns, axis=1)[setup.fitted]
     ridge = 1e-3 * np.trace(design.T @ design) / design.shape[1] * np.eye(design.shape[1])
     amplitude = np.linalg.solve(design.T @ design + ridge, design.T @ wave[setup.fitted])

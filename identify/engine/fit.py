@@ -13,6 +13,11 @@ from identify.engine.noise_level import NoiseLevel, profile, whitened
 from identify.engine.problem import FIRST_COEFFICIENT, Problem
 from identify.engine.setup import Setup
 
+OCCAM = 60.0
+"""Least by which the evidence of a fit lies below its log posterior, about."""
+GIVE_UP = 4.0
+"""Steps as good as the last that a losing run is credited with before it is given up."""
+
 
 @dataclass(frozen=True)
 class Fitted:
@@ -121,62 +126,78 @@ def solve(
     floor : float or None
         Log evidence of a rival start: a run that stays far below it and hardly gains is given up.
     """
-    theta = np.clip(theta, problem.lower, problem.upper)
-    prior_mean, precision = problem.prior
+    at = _at(problem, np.clip(theta, problem.lower, problem.upper), noise)
+    assert at is not None
     frozen = np.zeros(problem.size, bool)
     for chosen in problem.chosen:
         if chosen.effect == "mains_hum":
             frozen[chosen.places.start : chosen.places.stop] = True
     damping, iterations = 1e-3, 0
-    mean, jacobian = problem.run(theta, derivatives=True)
-    residual = _residual(problem, mean)
-    noise, log_likelihood = _noise(problem, residual, noise)
-    value = log_likelihood - _penalty(problem, theta)
-    small = 0
-    best_occam = 60.0  # the evidence is at least about this far below the log posterior
+    prior_mean, precision = problem.prior
+    jacobian = _slopes(problem, at.theta)
     while iterations < most:
         iterations += 1
-        assert jacobian is not None
-        white = _whiten(problem, np.vstack([residual, jacobian]), noise)
-        products = gram(white)
-        gradient = products[0, 1:] - precision @ (theta - prior_mean)
-        hessian = products[1:, 1:] + precision
-        gain, accepted = 0.0, False
-        for _ in range(6):
-            step = _step(hessian, gradient, damping, theta, problem, frozen)
-            trial = np.clip(theta + step, problem.lower, problem.upper)
-            trial_mean, _ = problem.run(trial)
-            trial_residual = _residual(problem, trial_mean)
-            if np.all(np.isfinite(trial_mean)):
-                new_noise, new_likelihood = _noise(problem, trial_residual, noise)
-                new_value = new_likelihood - _penalty(problem, trial)
-                if new_value > value - 1e-9:
-                    gain, accepted = new_value - value, True
-                    break
-            damping = max(damping * 8.0, 1e-3)
-        if not accepted:
+        products = gram(_whiten(problem, np.vstack([at.residual, jacobian]), at.noise))
+        gradient = products[0, 1:] - precision @ (at.theta - prior_mean)
+        found, damping = _advance(problem, at, products[1:, 1:] + precision, gradient, damping, frozen)
+        if found is None:
             break
-        theta, residual, noise, value, log_likelihood = trial, trial_residual, new_noise, new_value, new_likelihood
-        damping = max(damping / 6.0, 1e-7)
-        small = small + 1 if gain < tolerance else 0
-        _, jacobian = problem.run(theta, derivatives=True)
-        if small >= 1 and iterations >= 2:
+        gain, at = found.value - at.value, found
+        jacobian = _slopes(problem, at.theta)
+        if gain < tolerance and iterations >= 2:
             break
-        if floor is not None and iterations >= 4 and gain < 2.0 and value - best_occam < floor - 12.0:
+        if floor is not None and iterations >= 3 and at.value - OCCAM + GIVE_UP * gain < floor - 12.0:
             break
-    assert jacobian is not None
-    white = _whiten(problem, jacobian, noise)
-    hessian = gram(white) + precision
+    hessian = gram(_whiten(problem, jacobian, at.noise)) + precision
     return Fitted(
         problem=problem,
-        theta=theta,
-        noise=noise,
-        log_likelihood=log_likelihood,
-        log_evidence=value - 0.5 * _log_det_ratio(hessian, precision),
-        residual_nm=residual,
+        theta=at.theta,
+        noise=at.noise,
+        log_likelihood=at.log_likelihood,
+        log_evidence=at.value - 0.5 * _log_det_ratio(hessian, precision),
+        residual_nm=at.residual,
         hessian=hessian,
         iterations=iterations,
     )
+
+
+@dataclass(frozen=True)
+class _Point:
+    """Where a run stands: parameters, residual, noise, log-likelihood, and the log posterior."""
+
+    theta: np.ndarray
+    residual: np.ndarray
+    noise: NoiseLevel
+    log_likelihood: float
+    value: float
+
+
+def _at(problem: Problem, theta: np.ndarray, noise: NoiseLevel) -> _Point | None:
+    mean, _ = problem.run(theta)
+    if not np.all(np.isfinite(mean)):
+        return None
+    residual = _residual(problem, mean)
+    level, log_likelihood = _noise(problem, residual, noise)
+    return _Point(theta, residual, level, log_likelihood, log_likelihood - _penalty(problem, theta))
+
+
+def _slopes(problem: Problem, theta: np.ndarray) -> np.ndarray:
+    _, jacobian = problem.run(theta, derivatives=True)
+    assert jacobian is not None
+    return jacobian
+
+
+def _advance(
+    problem: Problem, at: _Point, hessian: np.ndarray, gradient: np.ndarray, damping: float, frozen: np.ndarray
+) -> tuple[_Point | None, float]:
+    """The next point that is no worse, with the damping to go on with; None where there is none near."""
+    for _ in range(6):
+        step = _step(hessian, gradient, damping, at.theta, problem, frozen)
+        trial = _at(problem, np.clip(at.theta + step, problem.lower, problem.upper), at.noise)
+        if trial is not None and trial.value > at.value - 1e-9:
+            return trial, max(damping / 6.0, 1e-7)
+        damping = max(damping * 8.0, 1e-3)
+    return None, damping
 
 
 def _step(

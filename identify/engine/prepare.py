@@ -130,7 +130,7 @@ def _line(power: np.ndarray, frequency: np.ndarray, centre_hz: float, reach_hz: 
 def _fit_hum(record: Record, mains_hz: float, kept: np.ndarray) -> dict[str, float]:
     """Frequency and amplitudes by least squares on the high-passed torque."""
     rate_hz, time_s = record.sample_rate_hz, record.time_s - record.time_s[0]
-    width = max(int(round(rate_hz / record.pulse_rate_hz)), 2)
+    width = max(round(rate_hz / record.pulse_rate_hz), 2)
     harmonics = [h for h in range(1, HARMONICS + 1) if h * mains_hz <= 0.5 * rate_hz + 1e-6]
 
     def smooth_out(values: np.ndarray) -> np.ndarray:
