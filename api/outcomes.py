@@ -21,6 +21,8 @@ from rig.messages import FinishedEvent
 
 log = logging.getLogger("stimrig.outcomes")
 
+SEQUENCE = "sequence"
+"""A test of this kind plays what a controller has planned; nothing is identified from it."""
 OPEN_STATES = ("requested", "running", "sealing", "identifying")
 
 
@@ -67,7 +69,7 @@ class Outcomes:
                 session.add(recording)
                 session.flush()
                 row.recording_id = event.recording_id
-            identifies = event.outcome == "completed" and row.recording_id is not None
+            identifies = event.outcome == "completed" and row.recording_id is not None and row.kind != SEQUENCE
             row.state = "identifying" if identifies else event.outcome
             row.reason = event.reason
             row.summary = dict(event.summary)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, StringConstraints
 
@@ -54,9 +54,41 @@ class TestIn(Body):
         None, description="None: the default pre-session test"
     )
     pulse_rate_hz: Annotated[FiniteFloat, Field(gt=0, le=100)] = 40.0
+    max_pulse_width_us: (
+        Annotated[FiniteFloat, Field(gt=0, description="for this test alone, if tighter, µs")] | None
+    ) = None
+    max_torque_nm: Annotated[FiniteFloat, Field(gt=0, description="for this test alone, if tighter, N·m")] | None = None
     joins: Annotated[str, StringConstraints(max_length=64)] | None = Field(
         None, description="a model: the new recording is joined to that model's, and both are judged together"
     )
+
+
+class CalibrationIn(Body):
+    """How a guided calibration goes: one current, small steps, short trains."""
+
+    current_ma: Annotated[FiniteFloat, Field(gt=0, le=130, description="fixed current of every pulse, mA")] = 20.0
+    step_us: Annotated[FiniteFloat, Field(ge=1, le=25, description="how much wider a step up is, µs")] = 10.0
+    train_s: Annotated[FiniteFloat, Field(ge=0.1, le=2, description="length of a train, s")] = 1.0
+    max_pulse_width_us: Annotated[FiniteFloat, Field(gt=0, le=500, description="never wider, µs")] | None = None
+    max_torque_nm: Annotated[FiniteFloat, Field(gt=0, le=200, description="torque at which a train stops")] = 30.0
+
+
+class StepIn(Body):
+    """One train."""
+
+    direction: Literal["up", "down", "repeat"] = "up"
+
+
+class MarkIn(Body):
+    """What the participant feels, or the muscle does, at the last train's width."""
+
+    threshold: Literal["sensory", "motor", "comfort"]
+
+
+class FinishIn(Body):
+    """The end of a calibration."""
+
+    discard: bool = False
 
 
 class StopIn(Body):

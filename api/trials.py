@@ -132,6 +132,8 @@ class Trials:
             profile=Profile(**profile),
             segments=segments,
             pulse_rate_hz=body.pulse_rate_hz,
+            max_pulse_width_us=body.max_pulse_width_us,
+            max_torque_nm=body.max_torque_nm,
         )
 
     def _check_joins(self, body: TestIn) -> None:
@@ -228,7 +230,7 @@ class Trials:
             if row is None:
                 return
             self.announce(row.id)
-            if event.outcome == "completed" and row.recording_id:
+            if row.state == "identifying":
                 self._release(event.test_id)
                 await self.outcomes.identify(row.id, event.last_sample_unix_s)
         except Exception as error:

@@ -25,6 +25,7 @@ async def participant(request: Request, context: Ctx, _who: Tester, code: str) -
         history = context.store.all(Test, Test.participant == code, order=Test.requested_utc.desc(), limit=200)
         return {
             "participant": row,
+            "now_utc": context.clock.utc(),
             "tests": [context.trials.public(test) for test in history],
             "models": [context.versions.public(model) for model in context.versions.of(code)],
         }

@@ -81,6 +81,7 @@ class FakeRig:
         self.elapsed_s = self.duration_s = 0.0
         self.segment: str | None = None
         self.confirms_stop = True
+        self.calibration: m.CalibrationStatus | None = None
         self.mute = False
         self.starts = 0
         self.stopped_by: str | None = None
@@ -95,7 +96,7 @@ class FakeRig:
             participant=self.plan.participant if self.plan else None, segment=self.segment,
             elapsed_s=self.elapsed_s, duration_s=self.duration_s,
             stimulator={"device": "fake P24", "firmware": "1.0"}, load_cell={"device": "fake cell", "rate_hz": 400.0},
-            torque_age_s=0.004, torque_nm=0.01,
+            torque_age_s=0.004, torque_nm=0.01, calibration=self.calibration,
         )  # fmt: skip
 
     async def serve(self) -> None:
@@ -124,7 +125,7 @@ class FakeRig:
 
     async def _answer(self, request: Any, writer: asyncio.StreamWriter) -> m.Reply:
         try:
-            body = await getattr(self, f"_on_{request.kind}")(request, writer)
+            body = await getattr(self, f"_on_{request.kind}".replace("-", "_"))(request, writer)
             return m.Reply(id=request.id, ok=True, body=body)
         except m_refusal as error:
             code, title, detail = error.args
@@ -164,6 +165,54 @@ class FakeRig:
         self._stop.clear()
         self._play = asyncio.create_task(self._run(request.plan))
         return self.status().model_dump()
+
+    async def _on_calibrate_start(self, request: Any, writer: Any) -> dict[str, Any]:
+        if self.state != "ready":
+            raise m_refusal("busy" if self.state == "running" else self.state, "Not now", f"the rig is {self.state}")
+        self.state = "calibrating"
+        self.calibration = m.CalibrationStatus(
+            calibration_id=request.calibration_id, participant=request.participant, by=request.by,
+            current_ma=request.current_ma, step_us=request.step_us, train_s=request.train_s,
+            max_torque_nm=request.max_torque_nm, pulse_width_us=0.0, ceiling_us=45.0, ceiling_owner="hard limit",
+            missing=["sensory", "motor", "comfort"],
+        )  # fmt: skip
+        return self.status().model_dump()
+
+    async def _on_calibrate_step(self, request: Any, writer: Any) -> dict[str, Any]:
+        known = self.calibration
+        assert known is not None
+        width_us = known.pulse_width_us + {"up": 1, "down": -1, "repeat": 0}[request.direction] * known.step_us
+        if width_us > known.ceiling_us:
+            raise m_refusal("refused", "Above a limit", f"{width_us:g} µs is above the hard limit of 45 µs by 5 µs")
+        train = m.CalibrationTrain(number=len(known.trains) + 1, pulse_width_us=width_us, pulses=40, torque_rise_nm=0.1)
+        self.calibration = known.model_copy(update={"pulse_width_us": width_us, "trains": [*known.trains, train]})
+        return self.status().model_dump()
+
+    async def _on_calibrate_mark(self, request: Any, writer: Any) -> dict[str, Any]:
+        known = self.calibration
+        assert known is not None
+        if not known.trains:
+            raise m_refusal("bad-plan", "Nothing was played yet", "Step up first, then mark.")
+        marks = {**known.marks_us, request.threshold: known.pulse_width_us}
+        missing = [name for name in known.missing if name not in marks]
+        self.calibration = known.model_copy(update={"marks_us": marks, "missing": missing})
+        return self.status().model_dump()
+
+    async def _on_calibrate_finish(self, request: Any, writer: Any) -> dict[str, Any]:
+        known = self.calibration
+        assert known is not None
+        if known.missing and not request.discard:
+            raise m_refusal("bad-plan", "Not marked yet", f"not marked yet: {', '.join(known.missing)}")
+        self.state, self.calibration = "ready", None
+        if request.discard:
+            return m.CalibrationResult().model_dump()
+        marks = known.marks_us
+        profile = m.Profile(
+            current_ma=known.current_ma, max_pulse_width_us=marks["comfort"], max_torque_nm=known.max_torque_nm,
+            sensory_pulse_width_us=marks["sensory"], motor_pulse_width_us=marks["motor"],
+            set_at_utc="2026-01-01T08:00:00Z", expires_at_utc="2999-01-02T00:00:00Z",
+        )  # fmt: skip
+        return m.CalibrationResult(profile=profile, recordings=["C1.001"]).model_dump()
 
     async def _on_stop(self, request: Any, writer: Any) -> dict[str, Any]:
         self.stopped_by = request.by
