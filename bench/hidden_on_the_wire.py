@@ -18,7 +18,7 @@ from typing import Any
 import httpx
 
 from api.launcher import Services
-from api.session import checked, ensure_participant, run_test
+from api.session import ReportedError, checked, ensure_participant, run_test
 from api.settings import Settings
 
 TOKEN = "token-of-the-hidden-patients"
@@ -92,7 +92,7 @@ def run(seed: int, speed: float, folder: Path) -> dict[str, Any]:
     options = ["--hidden", str(seed), "--speed", str(speed), "--noise-seed", str(seed)]
     with Services(settings, options, TOKEN) as services:
         headers = {"Authorization": f"Bearer {TOKEN}"}
-        with httpx.Client(base_url=services.url, headers=headers, timeout=180) as client:
+        with httpx.Client(base_url=services.url, headers=headers, timeout=600) as client:
             found = play(client)
     truth = reveal(seed)
     last = found["steps"][-1]["times_noise"]
@@ -118,8 +118,13 @@ def main() -> None:
     first, _, last = options.seeds.partition(":")
     rows = []
     for seed in range(int(first), int(last or int(first) + 1)):
-        with tempfile.TemporaryDirectory(prefix="hidden-") as folder:
-            row = run(seed, options.speed, Path(folder))
+        try:
+            with tempfile.TemporaryDirectory(prefix="hidden-") as folder:
+                row = run(seed, options.speed, Path(folder))
+        except (ReportedError, httpx.HTTPError) as error:
+            rows.append({"seed": seed, "agrees": False, "error": str(error)})
+            print(f"{seed}  FAILED: {error}", flush=True)
+            continue
         rows.append(row)
         hidden = "+".join(row["hidden"]) or "nothing"
         print(
