@@ -6,7 +6,7 @@ import hashlib
 import hmac
 import secrets
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any
 
@@ -46,11 +46,14 @@ class Principal:
         What the token may do; ``administer`` includes everything.
     csrf : str or None
         The session's CSRF token; None for a bearer token.
+    session_hash : str or None
+        The session of a person with a password; None for tokens, which have none to ask for again.
     """
 
     name: str
     scopes: frozenset[str]
     csrf: str | None = None
+    session_hash: str | None = None
 
     def may(self, scope: Scope) -> bool:
         """Whether the scope is held."""
@@ -136,19 +139,22 @@ class Auth:
 
     def sign_in(self, token_text: str) -> str:
         """Open a page session; return its cookie."""
-        principal = self.bearer(token_text)
+        return self.open_session(digest(token_text), self.bearer(token_text).name)
+
+    def open_session(self, token_hash: str, name: str) -> str:
+        """Open a page session for the holder of a token; its cookie."""
         cookie, now = secrets.token_urlsafe(32), self.clock.unix_s()
         with self.store.write() as session:
             session.add(
                 PageSession(
                     hash=digest(cookie),
-                    token_hash=digest(token_text),
+                    token_hash=token_hash,
                     csrf=secrets.token_urlsafe(24),
                     created_unix_s=now,
                     expires_unix_s=now + self.session_s,
                 )
             )
-            audit.write(session, self.clock.utc(), principal.name, "sign in", "page")
+            audit.write(session, self.clock.utc(), name, "sign in", "page")
         return cookie
 
     def sign_out(self, cookie: str) -> None:
@@ -163,7 +169,9 @@ class Auth:
         row = self.store.get(PageSession, digest(cookie))
         if row is None or (row.expires_unix_s <= self.clock.unix_s() and not forgive_age):
             raise unauthorized("The session has ended. Sign in again.")
-        return self._principal(self._token(row.token_hash), row.csrf)
+        token = self._token(row.token_hash)
+        principal = self._principal(token, row.csrf)
+        return replace(principal, session_hash=row.hash) if token and token.origin == "user" else principal
 
     def identify(self, connection: HTTPConnection, *, forgive_age: bool = False) -> Principal:
         """Who stands behind a request or a WebSocket."""
@@ -200,6 +208,8 @@ def require(scope: Scope) -> Callable[[Request], Awaitable[Principal]]:
             detail = f"This needs the scope {scope}; {principal.name} holds {', '.join(sorted(principal.scopes))}."
             raise ApiError(403, "forbidden", "Not allowed", detail)
         await check_csrf(request, principal)
+        if scope is Scope.APPROVE_MODEL and request.method not in SAFE_METHODS:
+            await request.app.state.context.people.confirmed(request, principal)
         return principal
 
     check.__name__ = f"require_{scope.name.lower()}"

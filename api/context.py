@@ -14,6 +14,7 @@ from api.analyses import Analyses
 from api.auth import Auth, Principal, Scope, anyone_signed_in, anyone_who_may_stop, require
 from api.clock import Clock
 from api.fitting import WORKER, Fitting
+from api.people import People
 from api.rig_client import RigClient
 from api.settings import Settings
 from api.store import Store
@@ -30,6 +31,7 @@ class Context:
     clock: Clock
     store: Store
     auth: Auth
+    people: People
     rig: RigClient
     fitting: Fitting
     versions: Versions
@@ -78,7 +80,8 @@ def build(settings: Settings, clock: Clock | None = None, worker: tuple[str, ...
     analyses = Analyses(store, clock, fitting, versions)
     trials = Trials(store, clock, rig, fitting, versions, analyses, settings.recordings_dir)
     tasks = Tasks(fitting)
-    return Context(settings, clock, store, auth, rig, fitting, versions, trials, analyses, tasks, drawn)
+    people = People(store, clock, auth)
+    return Context(settings, clock, store, auth, people, rig, fitting, versions, trials, analyses, tasks, drawn)
 
 
 def of(connection: HTTPConnection) -> Context:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import ipaddress
 import json
 import socket
 import sys
@@ -25,6 +26,7 @@ def main() -> int:
     logs.configure()
     try:
         settings = Settings()
+        refuse_open_door(settings)
         listener = bind(settings.host, settings.port)
         app = create_app(settings)
     except ValidationError as error:
@@ -43,6 +45,31 @@ def main() -> int:
     with contextlib.suppress(KeyboardInterrupt):
         asyncio.run(serve(uvicorn.Server(config), listener, ready))
     return 0
+
+
+def refuse_open_door(settings: Settings) -> None:
+    """Passwords and tokens don't travel in the clear: another address than loopback only behind a TLS proxy.
+
+    Raises
+    ------
+    OSError
+        The host is not loopback, and TLS in front has not been vouched for.
+    """
+    if loopback(settings.host) or (settings.tls_proxy and settings.secure_cookies):
+        return
+    mend = (
+        "listen on 127.0.0.1 and put the TLS proxy of deploy/nginx in front; if one stands in front on another "
+        "machine, set STIMRIG_TLS_PROXY=true and STIMRIG_SECURE_COOKIES=true"
+    )
+    raise OSError(f"{settings.host}: refused, it is not this machine's loopback; {mend}")
+
+
+def loopback(host: str) -> bool:
+    """Whether an address can be reached from this machine only."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
 
 
 def bind(host: str, port: int) -> socket.socket:

@@ -27,6 +27,7 @@ class Settings(BaseSettings):
     workers: Annotated[int, Field(ge=1, le=16)] = 2
     session_hours: Annotated[float, Field(gt=0, le=24)] = 12.0
     secure_cookies: bool = Field(default=False, description="True behind a TLS proxy: cookies over HTTPS only")
+    tls_proxy: bool = Field(default=False, description="True: a TLS proxy stands in front; needed to leave loopback")
     max_upload_mb: Annotated[float, Field(gt=0)] = 64.0
     effects_dir: Path | None = Field(default=None, description="folder of the users' own effects")
 

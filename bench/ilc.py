@@ -14,6 +14,7 @@ import sys
 import tempfile
 import time
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from examples import ilc_controller as ilc
 
 ROOT = Path(__file__).parents[1]
 TOKEN = "bench-of-the-learning-controller"
-SEEDS = (59, 51, 60)
+SEEDS = (59, 29, 60)
 """Muscles with a hidden effect that were not looked at in development (that was on 14, 20 and 17)."""
 WITH_MODEL = "identified model"
 STATIC = "static start"
@@ -118,18 +119,38 @@ def ramp_deconvolution(service: ilc.Service, test: dict[str, Any]) -> dict[str, 
         return json.loads(model.read_text())
 
 
-def runs_of_a_hidden_effect(service: Patient, test: dict[str, Any], trials: int) -> dict[str, Any]:
-    """Before and after adding what the service itself finds missing; the same reference for both."""
-    before = service.fetch()
-    reference = ilc.Reference.reach(0.6 * float(before["recruitment"]["inverse"]["torque_nm"][-1]))
-    found = {"before": ilc.learn(service, before, reference, "norm-optimal", trials)}
-    service.http.timeout = 600
+def before(service: Patient, _test: dict[str, Any], trials: int) -> dict[str, Any]:
+    """With the base model."""
+    model = service.fetch()
+    reference = ilc.Reference.reach(0.6 * float(model["recruitment"]["inverse"]["torque_nm"][-1]))
+    runs = {"before": ilc.learn(service, model, reference, "norm-optimal", trials)}
+    return {"reference": reference, "runs": runs, "repeated": service.repeated}
+
+
+def after(
+    service: Patient, test: dict[str, Any], trials: int, reference: ilc.Reference, effects: list[str]
+) -> dict[str, Any]:
+    """With what was hidden added; the same reference. What `improve` would have added is told beside it."""
+    service.http.timeout = 900
+    body = {"effects": effects, "force": True, "reason": "the bench knows what was hidden"}
+    version = ilc.checked(service.http.post(f"/v1/models/{test['model_id']}/effects", json=body)).json()
+    approve(service, version["id"])
+    runs = {
+        f"after adding {', '.join(effects)}": ilc.learn(service, service.fetch(), reference, "norm-optimal", trials)
+    }
     improved = ilc.checked(service.http.post(f"/v1/models/{test['model_id']}/improve")).json()
     added = [step["added"] for step in improved["steps"] if step["added"]]
-    if added:
-        approve(service, improved["versions"][-1]["id"])
-        found["after"] = ilc.learn(service, service.fetch(), reference, "norm-optimal", trials)
-    return {"reference": reference, "runs": found, "added": added, "repeated": service.repeated}
+    return {"runs": runs, "added": added, "repeated": service.repeated}
+
+
+def hidden(seed: int, speed: float, trials: int) -> dict[str, Any]:
+    """A muscle twice from its beginning, since what tires or warms up with the first run would burden the second."""
+    emulate = f"--hidden {seed}"
+    first = case(emulate, speed, trials, before)
+    rest = partial(after, reference=first["reference"], effects=revealed(seed))
+    second = case(emulate, speed, trials, rest)
+    repeated = first["repeated"] + second["repeated"]
+    return {**first, **second, "runs": {**first["runs"], **second["runs"]}, "repeated": repeated}
 
 
 def main() -> None:
@@ -143,16 +164,12 @@ def main() -> None:
     parser.add_argument("--only-hidden", action="store_true")
     options = parser.parse_args()
     began = time.time()
-    wanted = {PAPER: ("", runs_of_the_paper)} | {
-        f"hidden effect, seed {seed} ({', '.join(revealed(seed))})": (f"--hidden {seed}", runs_of_a_hidden_effect)
-        for seed in options.seeds
+    wanted = {} if options.only_hidden else {PAPER: partial(case, "", work=runs_of_the_paper)}
+    wanted |= {
+        f"hidden effect, seed {seed} ({', '.join(revealed(seed))})": partial(hidden, seed) for seed in options.seeds
     }
     with ThreadPoolExecutor(options.jobs) as pool:
-        futures = {
-            name: pool.submit(case, emulate, options.speed, options.trials, work)
-            for name, (emulate, work) in wanted.items()
-            if not (options.only_hidden and name == PAPER)
-        }
+        futures = {name: pool.submit(work, speed=options.speed, trials=options.trials) for name, work in wanted.items()}
         cases = {name: future.result() for name, future in futures.items()}
     draw(options.out / "img" / "ilc.svg", cases)
     words = page(cases, options.speed, time.time() - began)
@@ -190,7 +207,7 @@ def page(cases: dict[str, dict[str, Any]], speed: float, seconds: float) -> str:
                 f"The same pulses played four times differ by {found['floor']:.2f} %: nothing can be learnt below that."
             )
         if "before" in found["runs"]:
-            lines.append(f"Added by `improve`: {', '.join(found['added']) or 'nothing: it found nothing missing'}.")
+            lines.append(f"On this test `improve` would have added: {', '.join(found['added']) or 'nothing'}.")
         lost = sum(trial.lost_pulses for trials in found["runs"].values() for trial in trials)
         lines.append(
             f"Pulses dropped because the host was late: {lost}; trials repeated after a fault: {found['repeated']}."

@@ -14,7 +14,8 @@ Two laws, both on the demanded torque w before f⁻¹, e the tracking error of a
   zero-phase filter Q chosen from G
 
 If the model carries effects, no equation of theirs is needed here: the service predicts a trial
-(`POST /v1/models/{id}/prediction`), and the plan is corrected on the prediction until it follows the reference.
+(`POST /v1/models/{id}/prediction`), and the plan is corrected on the prediction until it follows the reference; after
+a trial, until the prediction has moved by the error.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import h5py
@@ -38,6 +40,8 @@ RISE_US = 50.0
 """The gate's bound on a rise from pulse to pulse: below the threshold it costs nothing to keep it."""
 LAMBDA = 0.02
 PLAN_STEPS = 12
+STEP = 0.8
+"""Share of the error that is corrected at once where the prediction, not (f, G), is inverted."""
 
 
 @dataclass(frozen=True)
@@ -231,20 +235,25 @@ class Trial:
     lost_pulses: int
 
 
-def plan(plant: Plant, reference: Reference, predict: Callable[[np.ndarray], np.ndarray] | None) -> np.ndarray:
-    """The demand of the first trial, N·m, shape (N,): G inverted; where effects are known, corrected on predictions."""
+def plan(plant: Plant, reference: Reference) -> np.ndarray:
+    """The demand that G's inverse asks for, N·m, shape (N,); bends cost a little, so that noise in G isn't played."""
     size = reference.torque_nm.size
     bend = np.diff(np.eye(size), 2, axis=0)
     demand = np.linalg.solve(plant.G.T @ plant.G + 0.1 * bend.T @ bend, plant.G.T @ reference.torque_nm)
-    demand = np.clip(demand, 0.0, plant.largest_nm)
-    learn, best, least = norm_optimal(plant), demand, np.inf
-    for _ in range(PLAN_STEPS if predict else 0):
-        error_nm = reference.torque_nm - predict(plant.widths(demand))  # pyright: ignore[reportOptionalCall]
-        if (size_now := float(np.mean(error_nm**2))) < least:
-            best, least = demand, size_now
-        demand = np.clip(learn(demand, error_nm), 0.0, plant.largest_nm)
-    if predict:
-        print(f"  planned on the prediction: {100 * least**0.5 / reference.rms_nm:.2f} % left", file=sys.stderr)
+    return np.clip(demand, 0.0, plant.largest_nm)
+
+
+def follow(
+    plant: Plant, demand_nm: np.ndarray, wanted_nm: np.ndarray, predict: Callable[[np.ndarray], np.ndarray]
+) -> np.ndarray:
+    """The demand whose predicted torque is what is wanted: the same law, played on the model with its effects."""
+    update, best, least = norm_optimal(plant), demand_nm, np.inf
+    for _ in range(PLAN_STEPS):
+        error_nm = wanted_nm - predict(plant.widths(demand_nm))
+        left = float(np.mean(error_nm**2))
+        if left < least:
+            best, least = demand_nm, left
+        demand_nm = np.clip(update(demand_nm, error_nm), 0.0, plant.largest_nm)
     return best
 
 
@@ -252,10 +261,13 @@ def learn(
     service: Service, model: dict[str, Any], reference: Reference, law: str, trials: int, static_start: bool = False
 ) -> list[Trial]:
     """Play and correct, trial after trial; `static_start`: the first trial inverts f alone, as if there were no G."""
-    plant = Plant(model, reference.torque_nm.size)
-    predict = (lambda widths: service.predict(model["model_id"], widths)) if model["effects"] else None
-    demand = reference.torque_nm if static_start else plan(plant, reference, predict)
-    update, done = LAWS[law](plant), []
+    plant, update, predict = Plant(model, reference.torque_nm.size), None, None
+    demand, done = reference.torque_nm if static_start else plan(plant, reference), []
+    if model["effects"]:
+        predict = partial(service.predict, model["model_id"])
+        demand = demand if static_start else follow(plant, demand, reference.torque_nm, predict)
+    else:
+        update = LAWS[law](plant)
     for _ in range(trials):
         widths_us = plant.widths(demand)
         torque_nm, sent_us = service.play(widths_us)
@@ -265,7 +277,11 @@ def learn(
         done.append(Trial(widths_us, torque_nm, percent, lost))
         print(f"  trial {len(done):2d}  {percent:6.2f} % of the reference's rms, {lost} pulses lost", file=sys.stderr)
         not_sent_nm = plant.G @ (plant.level(widths_us) - plant.level(sent_us))  # a late pulse is dropped by the rig:
-        demand = np.clip(update(demand, error_nm - not_sent_nm), 0.0, plant.largest_nm)  # no reason to learn from it
+        learnt_nm = error_nm - not_sent_nm  # no reason to learn from it
+        if update is not None:
+            demand = np.clip(update(demand, learnt_nm), 0.0, plant.largest_nm)
+        else:
+            demand = follow(plant, demand, predict(widths_us) + STEP * learnt_nm, predict)  # pyright: ignore
     return done
 
 

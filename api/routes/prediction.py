@@ -25,7 +25,7 @@ class WidthsIn(BaseModel):
 
 @router.post("/models/{model_id}/prediction")
 async def prediction(context: Ctx, _who: ModelReader, model_id: str, body: WidthsIn) -> dict[str, Any]:
-    """Mean torque above rest in each pulse's period, N·m, after a second of rest; effects included."""
+    """Mean torque the pulses give in each pulse's period, N·m, after a second of rest; effects included."""
     row = await asyncio.to_thread(context.versions.get, model_id)
     job = context.fitting.submit(
         "forecast", urgent=True, model_json=row.document.decode(), pulse_width_us=body.pulse_width_us,

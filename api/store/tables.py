@@ -121,6 +121,25 @@ class PageSession(Table):
     expires_unix_s: Mapped[float] = mapped_column(Float)
 
 
+class User(Table):
+    """A person with a password; what it may do, and whether still, is said by a token that nobody holds the text of."""
+
+    __tablename__ = "users"
+    name: Mapped[str] = mapped_column(String(80), primary_key=True)
+    password_hash: Mapped[str] = mapped_column(String(200))
+    token_hash: Mapped[str] = mapped_column(ForeignKey("tokens.hash"))
+    created_utc: Mapped[str] = mapped_column(String(32))
+    changed_utc: Mapped[str] = mapped_column(String(32))
+
+
+class Confirmation(Table):
+    """A signed-in person has given the password once more; good for one approval."""
+
+    __tablename__ = "confirmations"
+    session_hash: Mapped[str] = mapped_column(String(64), primary_key=True)
+    at_unix_s: Mapped[float] = mapped_column(Float)
+
+
 class AuditEntry(Table):
     """Who did what, when, to what; each entry holds the hash of the one before."""
 

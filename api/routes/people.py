@@ -1,0 +1,157 @@
+"""Users, their sessions, and keys for controllers."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Annotated, Any
+from urllib.parse import urlsplit
+
+from fastapi import APIRouter, Request
+from fastapi.responses import JSONResponse, RedirectResponse, Response
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
+
+from api.auth import COOKIE, Scope
+from api.clock import utc_label
+from api.context import PROBLEM, Administrator, Anyone, Context, Ctx
+from api.errors import ApiError, NotFoundError
+
+router = APIRouter(prefix="/v1", tags=["people"], responses=PROBLEM)
+
+Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_.@-]{1,80}$")]
+Password = Annotated[str, StringConstraints(min_length=10, max_length=200)]
+
+
+class _Body(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+class UserIn(_Body):
+    """A person who may sign in on the page."""
+
+    name: Name
+    password: Password
+    scopes: Annotated[list[Scope], Field(min_length=1)] = [
+        Scope.READ_LIVE, Scope.RUN_TEST, Scope.READ_MODEL, Scope.APPROVE_MODEL,
+    ]  # fmt: skip
+
+
+class SignIn(_Body):
+    """Name and password."""
+
+    name: Annotated[str, StringConstraints(min_length=1, max_length=80)]
+    password: Annotated[str, StringConstraints(min_length=1, max_length=200)]
+
+
+class PasswordIn(_Body):
+    """A password."""
+
+    password: Password
+
+
+class ConfirmIn(_Body):
+    """The password, once more."""
+
+    password: Annotated[str, StringConstraints(min_length=1, max_length=200)]
+
+
+class KeyIn(_Body):
+    """A key for a controller."""
+
+    name: Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_. -]{1,80}$")]
+    days: Annotated[int, Field(ge=1, le=366, description="it expires after these")] = 30
+
+
+@router.post("/users", status_code=201)
+def add_user(context: Ctx, who: Administrator, body: UserIn) -> dict[str, Any]:
+    """Add a person; the default scopes are a clinician's."""
+    row = context.people.add(body.name, body.password, body.scopes, who.name)
+    return {"name": row.name, "scopes": body.scopes, "created_utc": row.created_utc}
+
+
+@router.get("/users")
+def list_users(context: Ctx, _who: Administrator) -> list[dict[str, Any]]:
+    """All users."""
+    return context.people.public()
+
+
+@router.put("/users/{name}/password", status_code=204)
+def set_password(context: Ctx, who: Administrator, name: str, body: PasswordIn) -> None:
+    """A new password; the person's sessions end."""
+    context.people.change_password(name, body.password, who.name)
+
+
+@router.delete("/users/{name}", status_code=204)
+def remove_user(context: Ctx, who: Administrator, name: str) -> None:
+    """Nobody signs in under this name any more."""
+    context.people.remove(name, who.name)
+
+
+@router.post(
+    "/sessions",
+    status_code=201,
+    openapi_extra={"requestBody": {"content": {"application/json": {"schema": SignIn.model_json_schema()}}}},
+)
+async def sign_in(context: Ctx, request: Request) -> Response:
+    """Sign in with name and password (JSON or a form); the session is a cookie. 429 after too many wrong tries."""
+    same_origin(request)
+    form = "form" in request.headers.get("content-type", "")
+    given = await _given(request, form)
+    address = request.client.host if request.client else ""
+    cookie = await asyncio.to_thread(context.people.sign_in, given.name, given.password, address)
+    principal = context.auth.cookie(cookie)
+    answer: Response
+    if form:
+        from api.pages.home import local
+
+        answer = RedirectResponse(local(str((await request.form()).get("next") or "/")), 303)
+    else:
+        scopes = sorted(principal.scopes)
+        answer = JSONResponse({"name": principal.name, "scopes": scopes, "csrf": principal.csrf}, 201)
+    set_cookie(context, answer, cookie)
+    return answer
+
+
+async def _given(request: Request, form: bool) -> SignIn:
+    try:
+        if not form:
+            return SignIn.model_validate_json(await request.body())
+        fields = await request.form()
+        return SignIn(name=str(fields.get("name") or ""), password=str(fields.get("password") or ""))
+    except (ValidationError, ValueError):
+        raise ApiError(422, "invalid-input", "Name and password are needed", "Send `name` and `password`.") from None
+
+
+def same_origin(request: Request) -> None:
+    """Refuse a sign-in that another site's page sends: there is no session yet whose CSRF token could be asked for."""
+    origin = request.headers.get("origin")
+    if origin and urlsplit(origin).netloc != request.headers.get("host"):
+        raise ApiError(403, "forbidden", "Not allowed", "The page of another site asked.")
+
+
+def set_cookie(context: Context, answer: Response, cookie: str) -> None:
+    """The session's cookie: not for scripts, not for other sites."""
+    age_s, secure = int(context.auth.session_s), context.settings.secure_cookies
+    answer.set_cookie(COOKIE, cookie, max_age=age_s, httponly=True, samesite="strict", secure=secure)
+
+
+@router.post("/sessions/confirm", status_code=204)
+def confirm(context: Ctx, who: Anyone, body: ConfirmIn) -> None:
+    """The password once more, before a model is approved."""
+    context.people.confirm(who, body.password)
+
+
+@router.delete("/sessions/current", status_code=204)
+def sign_out(context: Ctx, request: Request, _who: Anyone) -> None:
+    """Sign out."""
+    cookie = request.cookies.get(COOKIE)
+    if cookie is None:
+        raise NotFoundError("session", "current", "A token has none; DELETE /v1/tokens/{id} revokes it.")
+    context.auth.sign_out(cookie)
+
+
+@router.post("/controller-keys", status_code=201)
+def controller_key(context: Ctx, who: Administrator, body: KeyIn) -> dict[str, Any]:
+    """A key for an ILC controller: reads models, nothing else, and expires. Its text is shown this once."""
+    expires_utc = utc_label(context.clock.unix_s() + 86400.0 * body.days)
+    text = context.auth.issue(body.name, [Scope.READ_MODEL], who.name, expires_utc=expires_utc)
+    return {"key": text, "prefix": text[:12], "scopes": [Scope.READ_MODEL], "expires_utc": expires_utc}

@@ -1,0 +1,224 @@
+"""People with passwords, keys for controllers, the audit trail's verification, the closed door."""
+
+from __future__ import annotations
+
+import json
+import re
+import sqlite3
+from pathlib import Path
+
+import httpx
+import pytest
+from fastapi.routing import APIRoute
+
+from api import cli, pages, routes
+from api.auth import Scope
+from api.clock import Clock
+from api.errors import ApiError
+from api.people import Pace
+from api.server import loopback, refuse_open_door
+from api.settings import Settings
+from tests.api.conftest import Service, run_test
+
+PASSWORD = "correct horse battery"
+OPEN_V1 = {("POST", "/v1/sessions")}
+OPEN_PAGES = {
+    ("GET", "/"), ("GET", "/sign-in"), ("POST", "/sign-in"), ("GET", "/static/{name}"), ("GET", "/health"),
+    ("GET", "/metrics"),
+}  # fmt: skip
+"""Signing in is for those who are not yet signed in."""
+
+
+class SetClock(Clock):
+    def __init__(self) -> None:
+        self.now_s = 0.0
+
+    def monotonic_s(self) -> float:
+        return self.now_s
+
+
+@pytest.fixture
+def clinician(service: Service, client: httpx.Client) -> httpx.Client:
+    assert client.post("/v1/users", json={"name": "Ada", "password": PASSWORD}).status_code == 201
+    browser = service.client(token=None)
+    answer = browser.post("/v1/sessions", json={"name": "Ada", "password": PASSWORD})
+    assert answer.status_code == 201, answer.text
+    cookie = answer.headers["set-cookie"]
+    assert "HttpOnly" in cookie and "SameSite=strict" in cookie
+    browser.headers["X-CSRF-Token"] = answer.json()["csrf"]
+    return browser
+
+
+def test_every_route_asks_for_a_scope(service: Service) -> None:
+    """All routes of all routers are enumerated: one that forgets its scope is found here, not in the clinic."""
+    unguarded: set[tuple[str, str]] = set()
+    guarded: set[tuple[str, str]] = set()
+    for router in [*routes.routers(), *pages.routers()]:
+        for route in router.routes:
+            if not isinstance(route, APIRoute):  # the live channel, which test_session asks for its scope
+                continue
+            names = {getattr(dependency.call, "__name__", "") for dependency in route.dependant.dependencies}
+            asks = any(name.startswith(("require_", "anyone_")) for name in names)
+            (guarded if asks else unguarded).update((method, route.path) for method in route.methods)
+    assert unguarded == OPEN_V1 | OPEN_PAGES
+    described = {
+        (method.upper(), path)
+        for path, methods in httpx.get(f"{service.url}/openapi.json").json()["paths"].items()
+        for method in methods
+    }
+    assert described - OPEN_PAGES - OPEN_V1 <= guarded and len(guarded) > 40
+
+
+def test_every_route_of_the_api_turns_a_stranger_away(service: Service) -> None:
+    """The same over HTTP, with the paths' names filled in."""
+    paths = httpx.get(f"{service.url}/openapi.json").json()["paths"]
+    with service.client(token=None) as stranger:
+        for path, methods in paths.items():
+            for method in methods:
+                if not path.startswith("/v1") or (method.upper(), path) in OPEN_V1:
+                    continue
+                answer = stranger.request(method.upper(), re.sub(r"\{\w+\}", "x", path))
+                assert answer.status_code == 401, (method, path, answer.status_code)
+                assert answer.headers["content-type"] == "application/problem+json"
+
+
+def test_password_is_kept_as_argon2id_only(service: Service, clinician: httpx.Client) -> None:
+    assert clinician.get("/v1/rig").status_code == 200
+    with sqlite3.connect(service.data / "stimrig.db") as database:
+        (kept,) = database.execute("SELECT password_hash FROM users").fetchone()
+    assert kept.startswith("$argon2id$")
+    assert PASSWORD.encode() not in (service.data / "stimrig.db").read_bytes()
+
+
+def test_writes_need_the_csrf_token_and_administration_is_refused(clinician: httpx.Client) -> None:
+    assert clinician.post("/v1/participants", json={"code": "P1"}).status_code == 201
+    assert clinician.get("/v1/tokens").status_code == 403
+    del clinician.headers["X-CSRF-Token"]
+    refused = clinician.post("/v1/participants", json={"code": "P2"})
+    assert refused.status_code == 403 and refused.json()["type"] == "/problems/csrf"
+    stopped = clinician.post("/v1/stop")
+    assert stopped.status_code == 200, "stop asks for no CSRF token"
+
+
+def test_approval_needs_the_password_once_more(
+    service: Service, client: httpx.Client, clinician: httpx.Client, participant: str
+) -> None:
+    model_url = run_test(client, participant)["model_url"]
+    refused = clinician.post(f"{model_url}/approve", json={"reason": "good"})
+    assert refused.status_code == 403 and refused.json()["type"] == "/problems/confirm-password"
+    assert client.get(f"/v1/participants/{participant}/model").status_code == 404
+    assert clinician.post("/v1/sessions/confirm", json={"password": "not that"}).status_code == 401
+    assert clinician.post(f"{model_url}/approve").status_code == 403
+    assert clinician.post("/v1/sessions/confirm", json={"password": PASSWORD}).status_code == 204
+    assert clinician.post(f"{model_url}/approve", json={"reason": "good"}).json()["decided_by"] == "Ada"
+    again = clinician.post(f"{model_url}/reject", json={"reason": "slipped"})
+    assert again.status_code == 403, "a confirmation is good for one decision"
+
+
+def test_form_approval_carries_the_password(client: httpx.Client, clinician: httpx.Client, participant: str) -> None:
+    model_id = run_test(client, participant)["model_id"]
+    fields = {"csrf": clinician.headers["X-CSRF-Token"], "reason": "good"}
+    assert clinician.post(f"/models/{model_id}/approve", data=fields).status_code == 403
+    assert clinician.post(f"/models/{model_id}/approve", data=fields | {"password": "wrong word"}).status_code == 401
+    assert clinician.post(f"/models/{model_id}/approve", data=fields | {"password": PASSWORD}).status_code == 303
+    assert client.get(f"/v1/participants/{participant}/model").status_code == 200
+
+
+def test_a_form_signs_in_and_leads_on_and_another_site_does_not(service: Service, clinician: httpx.Client) -> None:
+    with service.client(token=None, follow_redirects=False) as browser:
+        form = {"name": "Ada", "password": PASSWORD, "next": "/participants/P1"}
+        foreign = browser.post("/v1/sessions", data=form, headers={"Origin": "https://elsewhere.example"})
+        assert foreign.status_code == 403
+        answer = browser.post("/v1/sessions", data=form)
+        assert answer.status_code == 303 and answer.headers["location"] == "/participants/P1"
+        away = browser.post("/v1/sessions", data=form | {"next": "//elsewhere.example"})
+        assert away.headers["location"] == "/"
+
+
+def test_wrong_passwords_are_slowed_down(service: Service, clinician: httpx.Client) -> None:
+    with service.client(token=None) as stranger:
+        answers = [stranger.post("/v1/sessions", json={"name": "Ada", "password": f"guess {k}"}) for k in range(7)]
+    assert [answer.status_code for answer in answers[:5]] == [401] * 5
+    assert answers[5].status_code == 429 and int(answers[5].headers["retry-after"]) >= 1
+    unknown = answers[0].json()["detail"]
+    assert "match" in unknown and "Ada" not in unknown
+    assert clinician.get("/v1/rig").status_code == 200, "who is signed in stays so"
+
+
+def test_pace_doubles_and_a_right_password_forgets() -> None:
+    clock = SetClock()
+    pace = Pace(clock)
+    for _ in range(5):
+        pace.admit("a")
+    waits = []
+    for _ in range(4):
+        with pytest.raises(ApiError) as caught:
+            pace.admit("a")
+        waits.append(int(caught.value.headers["Retry-After"]))
+        clock.now_s += waits[-1]
+        pace.admit("a")
+    assert waits[1] > waits[0] and waits[3] >= 2 * waits[2] - 2
+    pace.forget("a")
+    pace.admit("a")
+    pace.admit("b")
+
+
+def test_changed_password_and_removal_end_sessions(client: httpx.Client, clinician: httpx.Client) -> None:
+    assert client.put("/v1/users/Ada/password", json={"password": "another passphrase"}).status_code == 204
+    assert clinician.get("/v1/rig").status_code == 401
+    for password, status in ((PASSWORD, 401), ("another passphrase", 201)):
+        assert clinician.post("/v1/sessions", json={"name": "Ada", "password": password}).status_code == status
+    assert client.delete("/v1/users/Ada").status_code == 204
+    assert clinician.get("/v1/rig").status_code == 401
+    assert client.post("/v1/users", json={"name": "Ada", "password": PASSWORD}).status_code == 409
+    assert client.post("/v1/users", json={"name": "Eve", "password": "short"}).status_code == 422
+
+
+def test_controller_key_reads_models_and_nothing_else(service: Service, client: httpx.Client, participant: str) -> None:
+    made = client.post("/v1/controller-keys", json={"name": "ilc", "days": 1}).json()
+    assert made["scopes"] == [Scope.READ_MODEL] and made["expires_utc"]
+    with service.client(made["key"]) as controller:
+        assert controller.get(f"/v1/participants/{participant}/model").status_code == 404
+        for method, path in (("GET", "/v1/rig"), ("POST", "/v1/tests"), ("GET", "/v1/participants")):
+            body = {"json": {"participant": participant}} if method == "POST" else {}
+            assert controller.request(method, path, **body).status_code == 403
+    assert client.post("/v1/controller-keys", json={"name": "ilc", "days": 9999}).status_code == 422
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "192.168.1.4", "::", "rig.clinic.example"])
+def test_other_addresses_than_loopback_are_refused_without_tls(host: str) -> None:
+    assert not loopback(host)
+    with pytest.raises(OSError, match="STIMRIG_TLS_PROXY"):
+        refuse_open_door(Settings(host=host, secure_cookies=True))
+    refuse_open_door(Settings(host=host, secure_cookies=True, tls_proxy=True))
+    for own in ("127.0.0.1", "::1", "localhost", "127.0.0.9"):
+        refuse_open_door(Settings(host=own))
+
+
+def test_audit_is_verified_and_exported_by_a_command(
+    service: Service, participant: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data, out = str(service.data), tmp_path / "trail.jsonl"
+    for number in range(3):
+        service.token(f"more {number}", "read-live")
+    assert cli.run(["audit", "verify", "--data", data, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["whole"] and found["entries"] >= 2
+    assert cli.run(["audit", "export", "--data", data, "-o", str(out)]) == 0
+    assert cli.run(["audit", "verify", "--file", str(out), "--head", found["head"]]) == 0
+    lines = out.read_text().splitlines()
+    for tampered in (
+        lines[:1] + lines[2:],
+        [lines[0], *lines[1:-1], lines[-1].replace("more 2", "more 9")],
+        [lines[1], lines[0]],
+    ):
+        out.write_text("\n".join(tampered) + "\n")
+        assert cli.run(["audit", "verify", "--file", str(out)]) == 1
+    out.write_text(lines[0] + "\n")
+    assert cli.run(["audit", "verify", "--file", str(out), "--head", found["head"]]) == 1, "a cut end is found"
+    with sqlite3.connect(service.data / "stimrig.db") as database:
+        database.execute("UPDATE audit SET who = 'somebody else' WHERE seq = 2")
+    capsys.readouterr()
+    assert cli.run(["audit", "verify", "--data", data]) == 1
+    assert "broken at entry 2" in capsys.readouterr().out
+    assert cli.run(["audit", "verify", "--data", str(tmp_path / "nowhere")]) == 2
