@@ -62,7 +62,7 @@ class Worker:
                 self.stopped_before.append(str(stopped))
                 self._drop()
                 self._inject(CASES[fault], verdict, rng)
-        except (TimeoutError, queue.Empty, OSError, RuntimeError, KeyError, AssertionError) as error:
+        except (subprocess.SubprocessError, queue.Empty, OSError, RuntimeError, KeyError, AssertionError) as error:
             verdict.wrong.append(f"campaign: {type(error).__name__}: {error}")
             self._drop()
         return verdict
@@ -105,7 +105,8 @@ class Worker:
         content = judge_file(verdict, event["recording_path"])
         judge_times(verdict, [p["monotonic_s"] for p in felt], injected_s)
         judge_outcome(verdict)
-        if case.name == "host_killed" and content is not None and len(content["written_s"]) and felt:
+        ended = verdict.phase == "sealing"
+        if case.name == "host_killed" and not ended and content is not None and len(content["written_s"]) and felt:
             zero_s = felt[0]["monotonic_s"] - content["written_s"][0] / self.speed
             verdict.tail_ms = 1e3 * (injected_s - zero_s - content["host_s"][-1] / self.speed)
             if verdict.tail_ms > 50:
@@ -163,7 +164,10 @@ class Worker:
 
     def _disk_full(self) -> tuple[float, Any]:
         assert self.mounted, "a full disk needs root, for a small tmpfs"
-        self._resize(f"{self._used_kb() + 4}k")  # at once, however slow the machine is
+        for room_kb in (4, 8, 16, 32, 64):  # at once, however slow the machine is; the journal grows meanwhile
+            with contextlib.suppress(subprocess.CalledProcessError):
+                self._resize(f"{self._used_kb() + room_kb}k")
+                break
         return time.monotonic(), lambda: self._resize(f"{DISK_MB}m")
 
     def _used_kb(self) -> int:
@@ -171,7 +175,8 @@ class Worker:
         return (found.f_blocks - found.f_bfree) * found.f_frsize // 1024
 
     def _resize(self, size: str) -> None:
-        subprocess.run(["mount", "-o", f"remount,size={size}", str(self.disk)], check=True)
+        command = ["mount", "-o", f"remount,size={size}", str(self.disk)]
+        subprocess.run(command, check=True, capture_output=True)
 
     def _disk_slow(self) -> tuple[float, Any]:
         rig = self._rig()
