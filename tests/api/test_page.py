@@ -11,7 +11,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from tests.api.conftest import STUB, TOKEN, Service, run_service
+from tests.api.conftest import STUB, TOKEN, Service, run_service, run_test
 
 pytestmark = pytest.mark.browser
 
@@ -251,3 +251,37 @@ def test_every_control_has_a_name_and_every_page_a_title(tab: Any, service: Serv
         )
         assert nameless == [] and tab.title().endswith("stimrig")
         assert tab.locator("h1").count() == 1 or path == "/sign-in"
+
+
+def test_hidden_effect_is_found_and_added_by_clicking(tab: Any, service: Service) -> None:
+    with service.client() as http:
+        http.post("/v1/participants", json={"code": "P103"})
+        model = run_test(http, "P103")["model_id"]
+    for width, height in (WIDE, NARROW, PHONE):
+        tab.set_viewport_size({"width": width, "height": height})
+        tab.goto(f"{service.url}/models/{model}")
+        tab.get_by_role("heading", name="Fatigue").wait_for()
+        tab.locator("[data-figure=residual] .main-svg").first.wait_for()
+        assert tab.evaluate("document.documentElement.scrollWidth <= innerWidth"), width
+    tab.set_viewport_size({"width": WIDE[0], "height": WIDE[1]})
+    assert tab.get_by_text("31 % of what is left").is_visible()
+    tab.get_by_role("button", name="Add this effect").click()
+    tab.get_by_role("heading", name="The error over the versions").wait_for()
+    tab.locator("[data-figure=falling] .main-svg").first.wait_for()
+    assert tab.locator("tr.current").inner_text().startswith("2. + fatigue")
+    tab.get_by_role("button", name="Undo").click()
+    tab.wait_for_url(f"**/models/{model}#why")
+    assert tab.locator("tr.current").inner_text().startswith("1. base model")
+    hosts = {urlsplit(url).netloc for url in tab.requests if url.startswith("http")}
+    assert tab.errors == [] and hosts == {urlsplit(service.url).netloc}
+
+
+def test_next_experiment_runs_from_its_button(tab: Any, service: Service) -> None:
+    with service.client() as http:
+        http.post("/v1/participants", json={"code": "P104"})
+        model = run_test(http, "P104")["model_id"]
+    tab.goto(f"{service.url}/models/{model}")
+    tab.get_by_role("button", name="Run it now").click()
+    tab.wait_for_url("**/tests/*")
+    tab.wait_for_url("**/models/*", timeout=20_000)
+    assert model not in tab.url
