@@ -130,7 +130,7 @@ def names(fitted: Fitted) -> list[str]:
 
 def likeliest_forms(effect: Effect, before: Candidate | None) -> list[Form]:
     """Forms worth a fit beside another effect: those that did best alone; chains are kept whole."""
-    if before is None or any(form.grows for form in effect.forms):
+    if before is None or effect.band or any(form.grows for form in effect.forms):
         return list(effect.forms)
     ranked = sorted(before.forms, key=lambda name: -before.forms[name])
     return [effect.form(name) for name in ranked[:FORMS]]

@@ -19,7 +19,7 @@ def _widening(width: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
     return play(np.ascontiguousarray(width), p["half_width_us"][:, 0], p["growth"][:, 0] / scene.largest_us)
 
 
-def _distributed(width: np.ndarray, p: dict[str, Any], __scene: Scene) -> np.ndarray:
+def _distributed(width: np.ndarray, p: dict[str, Any], _scene: Scene) -> np.ndarray:
     half, rows = p["half_width_us"], np.ascontiguousarray(width)
     even = np.zeros(rows.shape[0])
     plays = (play(rows, share * half[:, 0], even) for share in (0.2, 0.4, 0.6, 0.8, 1.0))

@@ -145,7 +145,9 @@ def _simulate(fitted: Fitted, record: Record, derivatives: bool) -> tuple[np.nda
     problem = Problem(setup, kept)
     theta = np.zeros(problem.size)
     take = [np.arange(problem.coefficients.stop)]
-    take += [np.arange(c.first, c.first + len(c.parameters)) for c in fitted.problem.chosen if get(c.effect).foreseeable]
+    take += [
+        np.arange(c.first, c.first + len(c.parameters)) for c in fitted.problem.chosen if get(c.effect).foreseeable
+    ]
     place = np.concatenate(take)
     theta[:] = fitted.theta[place]
     mean, slopes = problem.run(theta, derivatives=derivatives)

@@ -111,7 +111,13 @@ def designs(largest_us: float) -> list[Design]:
         return Segment("steps", "steps", settings)
 
     def prbs(share: float, chips: int = 40) -> Segment:
-        settings = {"max_pulse_width_us": round(share * top, 1), "bits": 7, "clock_pulses": 4, "chips": chips, "seed": 3}
+        settings = {
+            "max_pulse_width_us": round(share * top, 1),
+            "bits": 7,
+            "clock_pulses": 4,
+            "chips": chips,
+            "seed": 3,
+        }
         return Segment("prbs", "prbs", settings)
 
     stairs = Segment("staircase", "staircase", {"max_pulse_width_us": top, "levels": 6, "hold_s": 1.0, "down": True})
