@@ -21,6 +21,8 @@ from api.versions import Versions
 
 log = logging.getLogger("stimrig.analyses")
 OnJob = Callable[[Job], None]
+HALF_DONE = 0.5
+"""From here on a diagnosis of low priority is left to finish when somebody begins to wait for it."""
 
 
 class Analyses:
@@ -98,14 +100,26 @@ class Analyses:
         path = await asyncio.to_thread(self.path, recording_id or model.recording_id)
         key = (model.id, kind)
         job = self.running.get(key)
+        if job is not None and job.background and not background and job.progress < HALF_DONE:
+            self.fitting.cancel(job)  # somebody waits now: on a busy machine low priority could take minutes
+            job = None
         if job is None:
-            job = self.running[key] = self.fitting.submit(verb or kind, background=background, data=path, **given)
-            job.result.add_done_callback(lambda _future: self.running.pop(key, None))
+            job = self._begin(key, verb or kind, background, {"data": path, **given})
         if on_job is not None:
             on_job(job)
         found = await asyncio.shield(job.result)
         await asyncio.to_thread(self._keep, model.id, kind, found)
         return found
+
+    def _begin(self, key: tuple[str, str], verb: str, background: bool, arguments: dict[str, Any]) -> Job:
+        job = self.running[key] = self.fitting.submit(verb, background=background, **arguments)
+
+        def done(_future: object) -> None:
+            if self.running.get(key) is job:
+                del self.running[key]
+
+        job.result.add_done_callback(done)
+        return job
 
     def _keep(self, model_id: str, kind: str, found: dict[str, Any]) -> None:
         with self.store.write() as session:

@@ -65,4 +65,7 @@ def say(out: TextIO, message: dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except BrokenPipeError:  # the service has ended: nobody listens any more
+        os._exit(0)

@@ -100,8 +100,9 @@ def answer(verb: str, arguments: dict[str, Any], say: Any) -> dict[str, Any]:
     if verb == "curves":
         return {"result": curves()}
     if verb == "diagnosis":
-        say(progress=0.5, text="trying fatigue")
-        if (Path(arguments["data"]).parent / "slow").exists():
+        slow = Path(arguments["data"]).parent / "slow"
+        say(progress=float(slow.read_text()) if slow.exists() else 0.5, text="trying fatigue")
+        if slow.exists():
             time.sleep(60)
         return {"result": diagnosis()}
     if verb == "improve":

@@ -31,11 +31,11 @@ def until(ready: Any, limit_s: float = 10.0) -> Any:
     return found
 
 
-def make_slow(service: Service) -> Path:
-    """Diagnoses take a minute from now on."""
+def make_slow(service: Service, progress: float = 0.5) -> Path:
+    """Diagnoses stand still for a minute from now on, this far."""
     marker = service.data / "recordings" / "slow"
     marker.parent.mkdir(parents=True, exist_ok=True)
-    marker.touch()
+    marker.write_text(str(progress))
     return marker
 
 
@@ -59,6 +59,15 @@ def test_new_test_ends_the_diagnosis_in_the_background(
     assert client.post("/v1/tests", json={"participant": participant}).status_code == 202
     until(lambda: job.state == "cancelled")
     assert analyses.known(model, "diagnosis") is None
+
+
+def test_who_asks_does_not_wait_for_low_priority(client: httpx.Client, service: Service, participant: str) -> None:
+    marker = make_slow(service, 0.2)
+    model = run_test(client, participant)["model_id"]
+    analyses = service.app.state.context.analyses
+    until(lambda: (job := analyses.running.get((model, "diagnosis"))) and job.background and job.progress > 0.1)
+    marker.unlink()
+    assert client.get(f"/v1/models/{model}/diagnosis").json()["verdict"] == "effect_missing"
 
 
 def test_job_tells_how_far_it_is_and_can_be_cancelled(client: httpx.Client, service: Service, model: str) -> None:
