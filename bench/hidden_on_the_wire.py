@@ -78,12 +78,13 @@ def summary(client: httpx.Client, model_id: str) -> dict[str, Any]:
 
 
 def agrees(found: dict[str, Any], truth: dict[str, Any]) -> bool:
-    """Whether the verdict is what was hidden: each effect named, or that nothing is, or that it has no name."""
+    """Whether the verdict is what was hidden: one effect named first, two both named; nothing; or no name for it."""
     if truth["outside_library"]:
         return found["verdict"] == "unexplained_structure"
     if not truth["effects"]:
         return found["verdict"] == "nothing_missing"
-    return found["verdict"] == "effect_missing" and set(truth["effects"]) <= set(found["named"])
+    first = found["named"][: len(truth["effects"])]
+    return found["verdict"] == "effect_missing" and set(truth["effects"]) == set(first)
 
 
 def run(seed: int, speed: float, folder: Path) -> dict[str, Any]:
