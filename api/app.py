@@ -9,6 +9,7 @@ from importlib.metadata import PackageNotFoundError, version
 from fastapi import FastAPI
 
 from api import errors, pages, routes
+from api.body_limit import BodyLimit
 from api.clock import Clock
 from api.context import Context, build
 from api.fitting import WORKER
@@ -53,6 +54,7 @@ def create_app(
         openapi_url="/openapi.json",
     )
     app.state.context = context
+    app.add_middleware(BodyLimit, context=context)
     errors.install(app)
     for router in [*routes.routers(), *pages.routers()]:
         app.include_router(router)

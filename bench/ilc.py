@@ -26,7 +26,7 @@ from examples import ilc_controller as ilc
 
 ROOT = Path(__file__).parents[1]
 TOKEN = "bench-of-the-learning-controller"
-SEEDS = (59, 29, 60)
+SEEDS = (59, 29)
 """Muscles with a hidden effect that were not looked at in development (that was on 14, 20 and 17)."""
 WITH_MODEL = "identified model"
 STATIC = "static start"
@@ -38,7 +38,7 @@ def case(emulate: str, speed: float, trials: int, work: Any) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="stimrig-ilc-") as folder:
         settings = Settings(data_dir=Path(folder))
         settings.port = 0
-        with Services(settings, [*emulate.split(), "--speed", f"{speed:g}"], TOKEN) as services:
+        with Services(settings, [*emulate.split(), "--speed", f"{speed:g}", "--rate-hz", "400"], TOKEN) as services:
             service = Patient(services.url, TOKEN, "ILC")
             http = service.http
             ilc.checked(http.post("/v1/participants", json={"code": "ILC"}))
@@ -55,8 +55,8 @@ class Patient(ilc.Service):
     repeated = 0
 
     def play(self, widths_us: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """As the controller's, up to five times."""
-        for _ in range(5):
+        """As the controller's, up to ten times."""
+        for _ in range(10):
             try:
                 return super().play(widths_us)
             except ilc.HaltedError as error:
@@ -79,7 +79,6 @@ def runs_of_the_paper(service: Patient, test: dict[str, Any], trials: int) -> di
     other = ramp_deconvolution(service, test)
     found = {
         f"{WITH_MODEL}, norm-optimal": ilc.learn(service, model, reference, "norm-optimal", trials),
-        f"{WITH_MODEL}, phase lead": ilc.learn(service, model, reference, "phase-lead", trials),
         f"{WITH_MODEL}, norm-optimal, {STATIC}": ilc.learn(service, model, reference, "norm-optimal", trials, True),
         f"{WITH_MODEL}, phase lead, {STATIC}": ilc.learn(service, model, reference, "phase-lead", trials, True),
         "ramp deconvolution, norm-optimal": ilc.learn(service, other, reference, "norm-optimal", trials),
@@ -88,7 +87,7 @@ def runs_of_the_paper(service: Patient, test: dict[str, Any], trials: int) -> di
         ),
     }
     widths_us = found[f"{WITH_MODEL}, norm-optimal"][-1].widths_us
-    again = [service.play(widths_us)[0] for _ in range(4)]
+    again = [service.play(widths_us)[0] for _ in range(3)]
     spread_nm = float(np.sqrt(np.mean(np.var(again, axis=0, ddof=1))))
     return {
         "reference": reference,
@@ -204,7 +203,7 @@ def page(cases: dict[str, dict[str, Any]], speed: float, seconds: float) -> str:
         lines.append(f"Reference {found['reference'].rms_nm:.2f} N·m rms.")
         if "floor" in found:
             lines.append(
-                f"The same pulses played four times differ by {found['floor']:.2f} %: nothing can be learnt below that."
+                f"The same pulses played three times differ by {found['floor']:.2f} %: nothing can be learnt below that."
             )
         if "before" in found["runs"]:
             lines.append(f"On this test `improve` would have added: {', '.join(found['added']) or 'nothing'}.")

@@ -35,7 +35,7 @@ import httpx
 import numpy as np
 
 PULSE_RATE_HZ = 40.0
-BEFORE_S, AFTER_S = 1.0, 2.0
+BEFORE_S, AFTER_S = 1.0, 1.0
 RISE_US = 50.0
 """The gate's bound on a rise from pulse to pulse: below the threshold it costs nothing to keep it."""
 LAMBDA = 0.02

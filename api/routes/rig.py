@@ -8,6 +8,8 @@ from typing import Any
 from fastapi import APIRouter, Request
 from fastapi.responses import JSONResponse, Response
 from pydantic import ValidationError
+from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 
 from api import audit
 from api.context import PROBLEM, Context, Ctx, LiveReader, MayStop, Tester
@@ -48,7 +50,7 @@ async def stop(request: Request, context: Ctx, who: MayStop) -> Response:
 
     200 only on the rig's evidence that stimulation has stopped; otherwise a problem that says so.
     """
-    reason = await _reason(request)
+    reason = await _reason(request, patience_s=0.5)
     evidence = await context.trials.stop(reason, who.name)
     from api.pages.render import stop_page, wants_html
 
@@ -57,16 +59,21 @@ async def stop(request: Request, context: Ctx, who: MayStop) -> Response:
     return JSONResponse({"stopped": evidence.confirmed, "evidence": evidence.model_dump(), "rig": rig_state(context)})
 
 
-async def _reason(request: Request) -> str:
-    """The stated reason; whatever the body holds, a stop is a stop."""
+async def _reason(request: Request, patience_s: float) -> str:
+    """The stated reason; whatever the body holds, and however slowly it comes, a stop is a stop."""
     default = "stop pressed"
     try:
-        if "form" in request.headers.get("content-type", ""):
-            return str((await request.form()).get("reason") or default)[:200]
-        body = await request.body()
-        return StopIn.model_validate_json(body).reason if body.strip() else default
-    except (ValidationError, ValueError, ApiError):
+        async with asyncio.timeout(patience_s):
+            return await _stated(request, default)
+    except (ValidationError, ValueError, ApiError, HTTPException, TimeoutError, ClientDisconnect):
         return default
+
+
+async def _stated(request: Request, default: str) -> str:
+    if "form" in request.headers.get("content-type", ""):
+        return str((await request.form()).get("reason") or default)[:200]
+    body = await request.body()
+    return StopIn.model_validate_json(body).reason if body.strip() else default
 
 
 async def rearm_rig(context: Context, by: str) -> dict[str, Any]:

@@ -1,0 +1,127 @@
+"""`python -m bench.fetch [--clients N] [--seconds S]`: the controller's fetch of the approved model.
+
+One service process with a stored, approved model; N controllers, each with its key and its kept-alive connection, ask
+with and without `If-None-Match`. `--every MS` gives each a pause, as a controller between trials
+has; without it all ask as fast as they are answered.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import os
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import httpx
+import numpy as np
+
+from api.launcher import Child
+from api.settings import Settings
+
+TOKEN = "bench-of-the-fetch-is-not-a-secret"
+
+
+def csv_of_a_muscle() -> str:
+    """A record good enough to be identified: a switching input, a ramp, levels held out; first-order torque."""
+    rng, widths, names = np.random.default_rng(3), [], []
+    for name, values in (
+        ("rest", np.zeros(40)),
+        ("prbs", np.repeat(rng.integers(0, 2, 60) * 250.0, 6)),
+        ("ramp", 250.0 * (1 - np.abs(np.linspace(-1, 1, 400)))),
+        ("validate", np.repeat(rng.uniform(0, 250, 10), 24)),
+    ):
+        widths += list(values)
+        names += [name] * len(values)
+    torque = np.zeros(len(widths))
+    for k in range(1, len(widths)):
+        level = 6.0 / (1 + np.exp(-(widths[k] - 140) / 20))
+        torque[k] = torque[k - 1] + (level - torque[k - 1]) / 15
+    torque += 0.03 * rng.standard_normal(torque.size)
+    rows = [f"{k / 40:.4f},{w:.2f},{y:.5f},{n}" for k, (w, y, n) in enumerate(zip(widths, torque, names, strict=True))]
+    return "time_s,pulse_width_us,torque_nm,segment\n" + "\n".join(rows) + "\n"
+
+
+async def one(port: int, key: str, path: str, end_s: float, every_s: float, times: dict[int, list[float]]) -> None:
+    """A controller: a full fetch, then nine that ask whether anything is new, and so on. A bare client, so that the
+    service is what is measured."""
+    reader, writer = await asyncio.open_connection("127.0.0.1", port)
+    etag, count = "", 0
+    while time.perf_counter() < end_s:
+        asked = f"If-None-Match: {etag}\r\n" if count % 10 else ""
+        began = time.perf_counter()
+        writer.write(f"GET {path} HTTP/1.1\r\nHost: bench\r\nAuthorization: Bearer {key}\r\n{asked}\r\n".encode())
+        head = (await reader.readuntil(b"\r\n\r\n")).decode()
+        fields = dict(line.split(": ", 1) for line in head.splitlines()[1:] if line)
+        await reader.readexactly(int(fields.get("content-length", 0)))
+        times[int(head.split()[1])].append(time.perf_counter() - began)
+        etag, count = fields["etag"], count + 1
+        await asyncio.sleep(every_s)
+    writer.close()
+
+
+def clients(port: int, keys: list[str], path: str, seconds: float, every_s: float) -> dict[int, list[float]]:
+    """All of them at once."""
+
+    async def run() -> dict[int, list[float]]:
+        times: dict[int, list[float]] = {200: [], 304: []}
+        end_s = time.perf_counter() + seconds
+        await asyncio.gather(*(one(port, key, path, end_s, every_s, times) for key in keys))
+        return times
+
+    return asyncio.run(run())
+
+
+def main() -> None:
+    """Measure and say."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--clients", type=int, default=50)
+    parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--every", type=float, default=0.0, help="pause of each client, ms")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="stimrig-fetch-") as folder:
+        settings = Settings(data_dir=Path(folder))
+        api = Child("api", [sys.executable, "-m", "api.server"], Path(folder) / "api.log")
+        api.environment = {
+            "STIMRIG_DATA_DIR": str(settings.data_dir),
+            "STIMRIG_PORT": "0",
+            "STIMRIG_ADMIN_TOKEN": TOKEN,
+        }
+        ready = api.start()
+        url = ready["url"]
+        try:
+            with httpx.Client(base_url=url, headers={"Authorization": f"Bearer {TOKEN}"}, timeout=120) as admin:
+                admin.post("/v1/participants", json={"code": "P1"}).raise_for_status()
+                made = admin.post("/v1/participants/P1/recordings", content=csv_of_a_muscle()).raise_for_status().json()
+                admin.post(f"/v1/models/{made['model']['id']}/approve", json={"reason": "bench"}).raise_for_status()
+                keys = [
+                    admin.post("/v1/controller-keys", json={"name": f"c{k}"}).json()["key"]
+                    for k in range(options.clients)
+                ]
+                size = len(admin.get("/v1/participants/P1/model").content)
+            used = api.cpu_s() or 0.0
+            times = clients(ready["port"], keys, "/v1/participants/P1/model", options.seconds, options.every / 1000)
+            used = (api.cpu_s() or 0.0) - used
+        finally:
+            api.end()
+    every = np.array(times[200] + times[304])
+    print(
+        json.dumps(
+            {
+                "clients": options.clients, "pause_ms": options.every, "model_bytes": size,
+                "fetches_per_s": round(every.size / options.seconds, 1),
+                "server_ms_each": round(1000 * used / every.size, 3),
+                "median_ms": round(1000 * float(np.median(every)), 2),
+                "p99_ms": round(1000 * float(np.percentile(every, 99)), 2),
+                "p99_304_ms": round(1000 * float(np.percentile(times[304], 99)), 2),
+                "max_ms": round(1000 * float(every.max()), 2), "load_average": os.getloadavg(), "cores": os.cpu_count(),
+            }
+        )
+    )  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
