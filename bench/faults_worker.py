@@ -248,6 +248,7 @@ class Worker:
             self._healed = False
         else:
             undo()
+        self._condemned = case.name == "cell_unplugged"  # it comes back on another port: the rig file must be corrected
         client = self.client
         if client is None:
             return
@@ -261,8 +262,7 @@ class Worker:
             verdict.wrong.append(f"a test could start while {status['state']}")
             self._drop()
             return
-        if case.name == "cell_unplugged":
-            self._condemned = True  # it comes back on another port: a person corrects the rig file
+        if self._condemned:
             return
         end_s = time.monotonic() + 4
         while not (reply := client.ask("rearm", by="bench"))["ok"] and time.monotonic() < end_s:

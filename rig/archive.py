@@ -261,9 +261,7 @@ def write_atomically(path: Path, data: bytes) -> None:
     except OSError as error:
         if temporary is not None:
             Path(temporary).unlink(missing_ok=True)
-        raise RecordingError(
-            f"{path}: {error.strerror}; the journal is kept, free the disk and re-arm"
-        ) from None
+        raise RecordingError(f"{path}: {error.strerror}; the journal is kept, free the disk and re-arm") from None
 
 
 def seal(contents: JournalContents, folder: Path, outcome: str = "fault", reason: str = "") -> Sealed:

@@ -389,6 +389,8 @@ class Rig:
                 self._calibration.played(run.test.plan.profile.max_pulse_width_us, result.rise_nm, finished)
             if not train:
                 self.finished = finished
+            if finished.recording_path is None and run.t0_s is not None:  # kept as a journal: a person must see to it
+                self._change(self._trial.halted(finished.reason))
             following = self._trial.sealed()
             if following.state == "latched":
                 self._remember("latched", following.reason)
