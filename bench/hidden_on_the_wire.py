@@ -61,6 +61,7 @@ def play(client: httpx.Client) -> dict[str, Any]:
         "named_before_experiment": [entry["effect"] for entry in first["missing"]],
         "experiment": experiment and experiment["text"],
         "steps": steps,
+        "lateness_ms": (test.get("summary") or {}).get("lateness_ms"),
     }
 
 
@@ -132,7 +133,7 @@ def main() -> None:
             f"{seed}  hidden {hidden} ({row['strength']}{', outside' if row['outside_library'] else ''})  "
             f"verdict {row['verdict']}: {', '.join(row['named']) or '-'}  before the experiment "
             f"{', '.join(row['named_before_experiment']) or '-'}  error/noise {row['times_noise']}  "
-            f"{'agrees' if row['agrees'] else 'DIFFERS'}",
+            f"pulses late {row['lateness_ms']} ms  {'agrees' if row['agrees'] else 'DIFFERS'}",
             flush=True,
         )
     print(f"{sum(row['agrees'] for row in rows)} of {len(rows)} agree")

@@ -23,6 +23,7 @@ def seed_by_what_it_hides() -> int:
 
 @pytest.mark.wire
 @pytest.mark.slow
+@pytest.mark.timeout(600)
 @pytest.mark.xfail(
     reason="seed 1000 (series_compliance): named second after voluntary_effort; error falls from 13.5 to 8.4 x noise",
     strict=False,
