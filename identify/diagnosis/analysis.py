@@ -22,8 +22,10 @@ FIRST_MARGIN = 4.5
 """Log evidence that the first effect must gain."""
 NEXT_MARGIN = 10.0
 """Log evidence that a further effect must gain."""
-PATCH = 0.05
+PATCH = 0.12
 """And in proportion to what the first gained."""
+PATCHERS = {"voluntary_effort": 0.4}
+"""Of those that mend anything, more is asked for."""
 MOST = 3
 """Effects at most."""
 
@@ -52,6 +54,8 @@ class Analysis:
         Log evidence asked for in each round.
     nameless : list of float
         Log evidence for a gain that wanders without a law, in each round.
+    losses : dict
+        Log evidence lost without each effect, where there are several.
     quiet : ndarray of bool
         Intervals in which the muscle rests.
     left : list of Left
@@ -67,6 +71,7 @@ class Analysis:
     added: list[str] = field(default_factory=list)
     margins: list[float] = field(default_factory=list)
     nameless: list[float] = field(default_factory=list)
+    losses: dict[str, float] = field(default_factory=dict)
     quiet: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
     left: list[Left] = field(default_factory=list)
 
@@ -102,12 +107,22 @@ def analyse(
         work.nameless.append(nameless.gain if nameless else 0.0)
         margin = _margin(work)
         work.margins.append(margin)
-        if not candidates or candidates[0].gain < margin:
+        enough = [c for c in candidates if c.gain >= max(margin, _least(work, c.effect.id))]
+        if not enough:
             break
-        _take(work, candidates[0].fitted, candidates[0].effect.id)
+        _take(work, enough[0].fitted, enough[0].effect.id)
         if number:
             _exchange(work)
+    if len(work.added) > 1:
+        for effect in work.added:
+            without = _without(work.last, effect)
+            work.losses[effect] = work.last.log_evidence - (without.log_evidence if without else 0.0)
     return work
+
+
+def _least(work: Analysis, effect: str) -> float:
+    """What a later effect must gain, if it is of the kind that mends anything."""
+    return PATCHERS.get(effect, 0.0) * work.rounds[0][0].gain if work.added else 0.0
 
 
 def _margin(work: Analysis) -> float:

@@ -115,6 +115,8 @@ def fit_form(
     for start in starts:
         theta = start_from(problem, base, {len(base.effects): start})
         found = solve(problem, theta, base.noise, floor=None if best is None else best.log_evidence)
+        if form.accept is not None and not form.accept(found.parameters_of(effect.id), scene):
+            continue
         if best is None or found.log_evidence > best.log_evidence:
             best = found
     return best

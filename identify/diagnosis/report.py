@@ -24,7 +24,7 @@ def report(work: Analysis, verdict: Verdict) -> dict[str, Any]:
     base_prediction = predict_fitted(work.base, record)
     row = steps(work)
     base = row[0].figures
-    missing = [_missing(work, verdict, effect, row) for effect in _ranked(verdict)]
+    missing = [_missing(work, verdict, effect, row) for effect in _ranked(work, verdict)]
     final = row[-1].figures
     residual = record.torque_nm - (
         predict_fitted(work.last, record) if verdict.kind == "unexplained_structure" else base_prediction
@@ -61,8 +61,9 @@ def report(work: Analysis, verdict: Verdict) -> dict[str, Any]:
     }
 
 
-def _ranked(verdict: Verdict) -> list[str]:
-    return sorted(verdict.found, key=lambda effect: -verdict.found[effect])
+def _ranked(work: Analysis, verdict: Verdict) -> list[str]:
+    """What the samples show beyond doubt, then by what would be lost without each."""
+    return sorted(verdict.found, key=lambda e: (e not in work.given, -work.losses.get(e, 0.0), -verdict.found[e]))
 
 
 def _missing(work: Analysis, verdict: Verdict, effect: str, row: list[Step]) -> dict[str, Any]:

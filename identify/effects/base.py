@@ -84,6 +84,8 @@ class Scene:
         White noise of a sample, N·m.
     reference_s : float
         Time to which the recruitment curve belongs where it drifts: the middle of the partly recruited pulses.
+    fitted : ndarray of bool or None, shape (K,)
+        Where the torque is used for fitting.
     """
 
     time_s: np.ndarray
@@ -95,6 +97,7 @@ class Scene:
     velocity_rad_s: np.ndarray | None = None
     noise_sd_nm: float = 0.0
     reference_s: float = 0.0
+    fitted: np.ndarray | None = None
 
     @property
     def on(self) -> np.ndarray:
@@ -150,6 +153,8 @@ class Form:
     restarts : tuple of dict
         Further starts that also set the base's T and ζ (`base.time_constant_s`, `base.damping`): where the base has
         bent its own dynamics to imitate the effect.
+    accept : callable or None
+        `accept(parameters, scene)`: whether a fit makes sense.
     grows : bool
         The form is the next in a chain: it is tried only while the form before it gained.
     source : str
@@ -166,6 +171,7 @@ class Form:
     log_law: tuple[str, ...] = ()
     propose: Callable[[np.ndarray, Scene, dict[str, float]], list[dict[str, float]]] | None = None
     grows: bool = False
+    accept: Callable[[dict[str, float], Scene], bool] | None = None
     restarts: tuple[dict[str, float], ...] = ()
     source: str = ""
 

@@ -58,6 +58,18 @@ def _propose(count: int, sign: float) -> Callable[..., list[dict[str, float]]]:
     return propose
 
 
+def _seen(count: int) -> Callable[[dict[str, float], Scene], bool]:
+    def accept(p: dict[str, float], scene: Scene) -> bool:
+        """A bump is seen where it stands: not in rows left out, where it would only mend what lies beside them."""
+        if scene.fitted is None:
+            return True
+        at = np.array([p[f"centre_{i}_s"] for i in range(count)])
+        place = np.clip(np.searchsorted(scene.time_s, at), 0, scene.time_s.size - 1)
+        return bool(np.all(scene.fitted[place]))
+
+    return accept
+
+
 def _parameters(count: int, sign: float) -> tuple[Parameter, ...]:
     low, high = (0.0, 0.9) if sign > 0 else (-0.9, 0.0)
     listed = [Parameter("flatness", "1", 1.6, 6.0, 2.0, (2.0,), "log", about="2 is a Gaussian, more is flatter")]
@@ -82,6 +94,7 @@ EFFECT = Effect(
             _bumps(count),
             batched=True,
             propose=_propose(count, sign),
+            accept=_seen(count),
             grows=count > 1,
         )
         for name, words, sign in (("bumps", "helping", 1.0), ("resisting", "resisting", -1.0))

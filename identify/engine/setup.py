@@ -63,7 +63,8 @@ class Setup:
         grid = self.grid
         mean = np.bincount(grid.interval, grid.fraction, minlength=grid.size) / np.maximum(grid.count, 1)
         mean = np.where(grid.count > 0, mean, 0.5)
-        return self._scene((np.arange(grid.size) + mean) * grid.step_s, grid.pulse_width_us)
+        scene = self._scene((np.arange(grid.size) + mean) * grid.step_s, grid.pulse_width_us)
+        return replace(scene, fitted=self.fitted)
 
     @cached_property
     def scene_at_ends(self) -> Scene:
