@@ -56,6 +56,8 @@ class Outcomes:
                 setattr(row, name, value)
             if row.state not in OPEN_STATES and row.finished_utc is None:
                 row.finished_utc = self.clock.utc()
+        if "state" in fields:
+            log.info("test %s", row.state, extra={"test_id": test_id})
         return row
 
     def take_recording(self, event: FinishedEvent) -> Test | None:
@@ -75,6 +77,7 @@ class Outcomes:
             row.summary = dict(event.summary)
             row.finished_utc = now = self.clock.utc()
             audit.write(session, now, "rig", f"test {event.outcome}", row.id, reason=event.reason)
+        log.info("the rig: test %s", event.outcome, extra={"test_id": row.id})
         return row
 
     def _recording(self, row: Test, event: FinishedEvent) -> Recording:

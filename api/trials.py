@@ -155,6 +155,7 @@ class Trials:
         with self.store.write() as session:
             session.add(row)
             audit.write(session, now, by, "start test", plan.test_id, participant=plan.participant, kind=plan.kind)
+        log.info("test requested, kind %s", plan.kind, extra={"test_id": plan.test_id})
         return row
 
     async def preview(self, body: TestIn) -> dict[str, Any]:
@@ -234,7 +235,7 @@ class Trials:
                 self._release(event.test_id)
                 await self.outcomes.identify(row.id, event.last_sample_unix_s)
         except Exception as error:
-            log.exception("test %s could not be taken over", event.test_id)
+            log.exception("the test could not be taken over", extra={"test_id": event.test_id})
             await asyncio.to_thread(
                 self.outcomes.update, event.test_id, state="failed", reason=" ".join(str(error).split())
             )

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import shutil
 import time
 from collections import Counter
 from typing import Any
 
 from fastapi import APIRouter
 from fastapi.responses import PlainTextResponse
-from sqlalchemy import text
+from sqlalchemy import func, select, text
 
 from api.context import Context, Ctx
-from api.store.tables import Model, Test
+from api.store.tables import AuditEntry, Model, Participant, Test
 
 router = APIRouter(tags=["operation"])
 
@@ -57,6 +58,9 @@ def _figures(context: Context) -> list[tuple[str, str, str, dict[str, float]]]:
         ),
         ("stimrig_tests", "gauge", "Tests by state", {f'{{state="{name}"}}': float(n) for name, n in states.items()}),
         ("stimrig_models", "gauge", "Model versions", {"": float(len(context.store.all(Model.id)))}),
+        ("stimrig_approved_models", "gauge", "Participants with one approved today", {"": float(_approved(context))}),
+        ("stimrig_audit_entries", "gauge", "Entries of the audit trail", {"": float(_audit_entries(context))}),
+        ("stimrig_free_disk_bytes", "gauge", "Free where the data lie", {"": float(_free_bytes(context))}),
         ("stimrig_live_listeners", "gauge", "Open live channels", {"": float(context.trials.hub.listeners)}),
         ("stimrig_lost_samples", "gauge", "Lost in the newest test", {"": float(newest.lost_samples if newest else 0)}),
         ("stimrig_dropped_pulses", "gauge", "Dropped in it", {"": float(newest.dropped_pulses if newest else 0)}),
@@ -65,6 +69,19 @@ def _figures(context: Context) -> list[tuple[str, str, str, dict[str, float]]]:
         ("stimrig_jobs_busy_seconds_total", "counter", "Time in analyses", {"": context.fitting.busy_s}),
         ("stimrig_jobs_queued", "gauge", "Analyses waiting", {"": float(len(context.fitting.queue))}),
     ]
+
+
+def _approved(context: Context) -> int:
+    return sum(context.versions.served(code) is not None for code in context.store.all(Participant.code))
+
+
+def _audit_entries(context: Context) -> int:
+    with context.store.read() as session:
+        return session.scalar(select(func.max(AuditEntry.seq))) or 0
+
+
+def _free_bytes(context: Context) -> int:
+    return shutil.disk_usage(context.settings.data_dir).free
 
 
 def _family(name: str, kind: str, words: str, values: dict[str, float]) -> list[str]:

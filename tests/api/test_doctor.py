@@ -1,0 +1,158 @@
+"""`stimrig doctor` says what is wrong and what mends it; logs carry the test's id; metrics are Prometheus' text."""
+
+from __future__ import annotations
+
+import json
+import logging
+import re
+import sqlite3
+from collections.abc import Callable
+from pathlib import Path
+
+import httpx
+import pytest
+
+from api import cli, doctor
+from api.doctor import Finding, examine
+from api.logs import JsonLines
+from api.settings import Settings
+from tests.api.conftest import Service, run_test
+
+RIG = """data_dir = "{folder}"
+socket = "{folder}/rig.sock"
+[stimulator]
+device = "p24"
+port = "{port}"
+[load_cell]
+device = "can_load_cell"
+bus = {{ interface = "{interface}", channel = "{channel}" }}
+"""
+
+
+def rig_file(folder: Path, port: str = "/dev/null", interface: str = "slcan", channel: str = "/dev/null") -> Path:
+    path = folder / "rig.toml"
+    path.write_text(RIG.format(folder=folder, port=port, interface=interface, channel=channel))
+    return path
+
+
+def finding(name: str, **settings: object) -> Finding:
+    return next(found for found in examine(Settings(**settings)) if found.check == name)  # pyright: ignore[reportArgumentType]
+
+
+def test_sound_machine_exits_0_and_one_json_object(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.run(["doctor", "--data", str(tmp_path), "--rig", str(rig_file(tmp_path)), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    verdicts = {found["check"]: found["verdict"] for found in report["findings"]}
+    assert verdicts["rig file"] == verdicts["stimulator"] == verdicts["load cell"] == "ok"
+    wanted = {
+        "data folder",
+        "disk",
+        "disk speed",
+        "clock",
+        "wake-up",
+        "priority",
+        "compiled code",
+        "database",
+        "address",
+    }
+    assert wanted <= set(verdicts)
+
+
+def test_missing_devices_exit_1_with_the_mend(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = rig_file(tmp_path, port=str(tmp_path / "not-there"), interface="socketcan", channel="can77")
+    assert cli.run(["doctor", "--data", str(tmp_path), "--rig", str(path)]) == 1
+    out = capsys.readouterr().out
+    assert "not-there is not there" in out and "plug it in" in out
+    assert "there is no interface can77" in out and "stimrig-can@can77" in out
+
+
+def test_wrong_key_of_the_rig_file_is_named(tmp_path: Path) -> None:
+    path = rig_file(tmp_path)
+    path.write_text(path.read_text().replace("port =", "prot ="))
+    found = finding("rig file", rig_file=path, data_dir=tmp_path)
+    assert found.verdict == "fails" and "stimulator.port" in found.says
+
+
+def test_a_file_is_no_serial_port(tmp_path: Path) -> None:
+    assert doctor.port_finding("stimulator", Path(__file__)).verdict == "fails"
+
+
+def test_little_room_and_a_slow_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    usage: Callable[[object], object] = lambda _: type("Usage", (), {"free": 0.1e9})  # noqa: E731
+    monkeypatch.setattr(doctor.shutil, "disk_usage", usage)
+    monkeypatch.setattr(doctor, "synced_ms", lambda _: 900.0)
+    assert finding("disk", data_dir=tmp_path).verdict == "fails"
+    assert finding("disk speed", data_dir=tmp_path).verdict == "care"
+
+
+def test_folder_open_to_all_is_said(tmp_path: Path) -> None:
+    tmp_path.chmod(0o755)
+    assert finding("data folder", data_dir=tmp_path).mend.startswith("chmod")
+    tmp_path.chmod(0o750)
+    assert finding("data folder", data_dir=tmp_path).verdict == "ok"
+
+
+def test_rig_that_is_not_there_or_stands_still(service: Service, tmp_path: Path) -> None:
+    assert finding("rig", data_dir=tmp_path, rig_socket=tmp_path / "none.sock").verdict == "fails"
+    assert finding("rig", data_dir=tmp_path, rig_socket=service.rig.path).verdict == "ok"
+    with service.client() as client:
+        client.post("/v1/stop")
+    found = finding("rig", data_dir=tmp_path, rig_socket=service.rig.path)
+    assert found.verdict == "fails" and "latched" in found.says and "re-arm" in found.mend
+
+
+def test_tampered_trail_is_found(service: Service) -> None:
+    assert finding("database", data_dir=service.data).verdict == "ok"
+    with sqlite3.connect(service.data / "stimrig.db") as database:
+        database.execute("UPDATE audit SET who = 'nobody' WHERE seq = 1")
+    assert finding("database", data_dir=service.data).verdict == "fails"
+
+
+def test_open_door_fails(tmp_path: Path) -> None:
+    assert finding("address", data_dir=tmp_path, host="0.0.0.0").verdict == "fails"
+
+
+def test_check_that_breaks_is_a_finding(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(_: Settings) -> None:
+        raise RuntimeError("no such thing")
+
+    monkeypatch.setattr(doctor, "check_clock", broken)
+    assert "no such thing" in finding("clock", data_dir=tmp_path).says
+
+
+def test_log_lines_are_json_with_the_tests_id(client: httpx.Client, participant: str) -> None:
+    records: list[logging.LogRecord] = []
+
+    class Keep(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            records.append(record)
+
+    handler = Keep()
+    logger = logging.getLogger("stimrig")
+    level = logger.level
+    logger.addHandler(handler)
+    logger.setLevel(logging.INFO)
+    try:
+        test_id = run_test(client, participant)["id"]
+    finally:
+        logger.removeHandler(handler)
+        logger.setLevel(level)
+    lines = [json.loads(JsonLines().format(record)) for record in records]
+    words = [line["message"] for line in lines if line.get("test_id") == test_id]
+    assert any("requested" in line for line in words) and any("completed" in line for line in words), lines
+    assert all({"time", "level", "logger", "message"} <= set(line) for line in lines)
+    assert not any(participant in line["message"] for line in lines), "no participant in a log"
+
+
+def test_metrics_are_prometheus_text_and_tell_nothing_of_anybody(client: httpx.Client, participant: str) -> None:
+    run_test(client, participant)
+    answer = client.get("/metrics", headers={"Authorization": ""})
+    assert answer.headers["content-type"].startswith("text/plain; version=0.0.4")
+    values = dict(line.rsplit(" ", 1) for line in answer.text.splitlines() if not line.startswith("#"))
+    assert float(values['stimrig_tests{state="completed"}']) == 1
+    assert float(values["stimrig_rig_connected"]) == 1
+    for name in ("stimrig_audit_entries", "stimrig_approved_models", "stimrig_free_disk_bytes"):
+        assert float(values[name]) >= 0
+    for line in answer.text.splitlines():
+        assert re.match(r"^# (HELP|TYPE) stimrig_\w+ .+$|^stimrig_\w+(\{[^}]*\})? -?[0-9.e+-]+$", line), line
+    assert participant not in answer.text
