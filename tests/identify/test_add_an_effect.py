@@ -1,0 +1,87 @@
+"""docs/add-an-effect.md, run: the file it shows finds what the library alone can't explain."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from hardware_sim import hidden_records
+
+PAGE = Path(__file__).parents[2] / "docs" / "add-an-effect.md"
+SEED = 1063
+
+pytestmark = pytest.mark.slow
+
+
+def block(language: str) -> str:
+    found = re.search(rf"```{language}\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    assert found
+    return found.group(1)
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a record of a swinging amplifier, and the effect of the page in `my_effects`."""
+    folder = tmp_path_factory.mktemp("own")
+    record = hidden_records.generate("sensor_gain_swing", "strong", seed=SEED, rate_hz=100)
+    hidden_records.write_csv(record, folder / "record.csv")
+    (folder / "my_effects").mkdir()
+    (folder / "my_effects" / "sensor_gain_swing.py").write_text(block("python"), encoding="utf-8")
+    return folder
+
+
+def run(words: list[str], place: Path, effects: str = "") -> str:
+    command = [str(Path(sys.executable).with_name("stimrig")), *words]
+    environment = os.environ | {"STIMRIG_EFFECTS_DIR": effects}
+    done = subprocess.run(command, cwd=place, env=environment, capture_output=True, text=True, timeout=280)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_the_file_is_short() -> None:
+    lines = [line for line in block("python").splitlines() if line.strip()]
+    assert len(lines) < 40
+
+
+def test_without_it_the_library_does_not_explain_the_record(place: Path) -> None:
+    found = json.loads(run(["diagnose", "record.csv", "--json"], place))
+    assert "sensor_gain_swing" not in [entry["effect"] for entry in found["missing"]]
+    assert found["verdict"] == "unexplained_structure"
+
+
+def test_every_command_of_the_page_does_what_it_says(place: Path) -> None:
+    outputs = {}
+    for line in block("sh").splitlines():
+        assignment, name, *words = line.split()
+        assert (assignment, name) == ("STIMRIG_EFFECTS_DIR=my_effects", "stimrig")
+        flags = [] if words[0] == "predict" else ["--json"]
+        outputs[words[0]] = run(words + flags, place, "my_effects")
+    assert "sensor_gain_swing" in [effect["id"] for effect in json.loads(outputs["effects"])["effects"]]
+    found = json.loads(outputs["diagnose"])
+    assert found["verdict"] == "effect_missing"
+    first = found["missing"][0]
+    assert first["effect"] == "sensor_gain_swing"
+    assert first["rms_after_nm"] < 0.5 * first["rms_before_nm"]
+    assert first["parameters"]["period_s"]["sd"] > 0
+    steps = json.loads(outputs["improve"])["steps"]
+    assert steps[1]["added"] == "sensor_gain_swing"
+    model = json.loads((place / "MODEL.json").read_text())
+    assert "sensor_gain_swing" in [effect["id"] for effect in model["effects"]]
+    assert (place / "predicted.csv").stat().st_size > 1000
+
+
+def test_a_mistake_in_the_file_is_one_line(place: Path) -> None:
+    (place / "broken").mkdir(exist_ok=True)
+    (place / "broken" / "mine.py").write_text("EFFEKT = 1\n")
+    command = [str(Path(sys.executable).with_name("stimrig")), "effects"]
+    environment = os.environ | {"STIMRIG_EFFECTS_DIR": "broken"}
+    done = subprocess.run(command, cwd=place, env=environment, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert "mine.py" in done.stderr
