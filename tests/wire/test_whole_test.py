@@ -118,7 +118,6 @@ def test_aligned_times_are_those_of_the_muscle(make_bench: Callable[..., Bench],
     without, found = align.align(counter / 1600, host_s, no_sync, written_s, 1600.0)
     assert found.method == "regression"
     assert np.median(np.abs(without - time_s)) < 1e-3  # 0.3 ms when the machine is not shared
-    assert abs(event["summary"]["alignment"]["rate_ppm"] + float(clock[1])) < 60
     assert event["summary"]["alignment"]["error_ms"] < 1.0
 
 
