@@ -33,7 +33,7 @@ STATIC = "static start"
 PAPER = "the paper's muscle"
 
 
-def case(emulate: str, speed: float, trials: int, work: Any) -> dict[str, Any]:
+def case(emulate: str, speed: float, trials: int, work: Any, widest_us: float = 300.0) -> dict[str, Any]:
     """Start a rig, make the first model, and hand over."""
     with tempfile.TemporaryDirectory(prefix="stimrig-ilc-") as folder:
         settings = Settings(data_dir=Path(folder))
@@ -41,7 +41,8 @@ def case(emulate: str, speed: float, trials: int, work: Any) -> dict[str, Any]:
         with Services(settings, [*emulate.split(), "--speed", f"{speed:g}", "--rate-hz", "400"], TOKEN) as services:
             service = Patient(services.url, TOKEN, "ILC")
             http = service.http
-            ilc.checked(http.post("/v1/participants", json={"code": "ILC"}))
+            profile = {"current_ma": 20.0, "max_pulse_width_us": widest_us, "max_torque_nm": 30.0}
+            ilc.checked(http.post("/v1/participants", json={"code": "ILC", "profile": profile}))
             location = ilc.checked(http.post("/v1/tests", json={"participant": "ILC"})).headers["location"]
             while not (test := http.get(location).json())["done"]:
                 time.sleep(0.2)
@@ -72,30 +73,27 @@ def approve(service: ilc.Service, model_id: str) -> None:
     ilc.checked(service.http.post(f"/v1/models/{model_id}/approve", json={"reason": "bench"}))
 
 
-def runs_of_the_paper(service: Patient, test: dict[str, Any], trials: int) -> dict[str, Any]:
-    """Both laws with the identified model, the ramp-deconvolution model, and a start without G."""
+def one_run(
+    service: Patient, test: dict[str, Any], trials: int, law: str, static: bool, method: str = ""
+) -> dict[str, Any]:
+    """One law from one start, with the approved model or with that of another method."""
     model = service.fetch()
     reference = ilc.Reference.reach(0.6 * float(model["recruitment"]["inverse"]["torque_nm"][-1]))
-    other = ramp_deconvolution(service, test)
-    found = {
-        f"{WITH_MODEL}, norm-optimal": ilc.learn(service, model, reference, "norm-optimal", trials),
-        f"{WITH_MODEL}, norm-optimal, {STATIC}": ilc.learn(service, model, reference, "norm-optimal", trials, True),
-        f"{WITH_MODEL}, phase lead, {STATIC}": ilc.learn(service, model, reference, "phase-lead", trials, True),
-        "ramp deconvolution, norm-optimal": ilc.learn(service, other, reference, "norm-optimal", trials),
-        f"ramp deconvolution, norm-optimal, {STATIC}": ilc.learn(
-            service, other, reference, "norm-optimal", trials, True
-        ),
-    }
-    widths_us = found[f"{WITH_MODEL}, norm-optimal"][-1].widths_us
-    again = [service.play(widths_us)[0] for _ in range(3)]
-    spread_nm = float(np.sqrt(np.mean(np.var(again, axis=0, ddof=1))))
-    return {
-        "reference": reference,
-        "floor": 100 * spread_nm / reference.rms_nm,
-        "runs": found,
-        "added": [],
-        "repeated": service.repeated,
-    }
+    used = ramp_deconvolution(service, test) if method else model
+    done = ilc.learn(service, used, reference, law, trials, static)
+    found: dict[str, Any] = {"reference": reference, "trials": done}
+    if not static:
+        again = [service.play(done[-1].widths_us)[0] for _ in range(3)]
+        found["floor"] = 100 * float(np.sqrt(np.mean(np.var(again, axis=0, ddof=1)))) / reference.rms_nm
+    return found | {"repeated": service.repeated}
+
+
+RUNS = {
+    f"{WITH_MODEL}, norm-optimal": {"law": "norm-optimal", "static": False},
+    f"{WITH_MODEL}, norm-optimal, {STATIC}": {"law": "norm-optimal", "static": True},
+    f"{WITH_MODEL}, phase lead, {STATIC}": {"law": "phase-lead", "static": True},
+    f"ramp deconvolution, norm-optimal, {STATIC}": {"law": "norm-optimal", "static": True, "method": "ramp"},
+}
 
 
 def ramp_deconvolution(service: ilc.Service, test: dict[str, Any]) -> dict[str, Any]:
@@ -118,38 +116,21 @@ def ramp_deconvolution(service: ilc.Service, test: dict[str, Any]) -> dict[str, 
         return json.loads(model.read_text())
 
 
-def before(service: Patient, _test: dict[str, Any], trials: int) -> dict[str, Any]:
+def before(service: Patient, _test: dict[str, Any], trials: int, peak_nm: float) -> dict[str, Any]:
     """With the base model."""
-    model = service.fetch()
-    reference = ilc.Reference.reach(0.6 * float(model["recruitment"]["inverse"]["torque_nm"][-1]))
-    runs = {"before": ilc.learn(service, model, reference, "norm-optimal", trials)}
-    return {"reference": reference, "runs": runs, "repeated": service.repeated}
+    reference = ilc.Reference.reach(peak_nm)
+    done = ilc.learn(service, service.fetch(), reference, "norm-optimal", trials)
+    return {"reference": reference, "trials": done, "repeated": service.repeated}
 
 
-def after(
-    service: Patient, test: dict[str, Any], trials: int, reference: ilc.Reference, effects: list[str]
-) -> dict[str, Any]:
-    """With what was hidden added; the same reference. What `improve` would have added is told beside it."""
-    service.http.timeout = 900
+def after(service: Patient, test: dict[str, Any], trials: int, peak_nm: float, effects: list[str]) -> dict[str, Any]:
+    """With what was hidden added, on a muscle from its beginning: what tires would burden a second run."""
     body = {"effects": effects, "force": True, "reason": "the bench knows what was hidden"}
     version = ilc.checked(service.http.post(f"/v1/models/{test['model_id']}/effects", json=body)).json()
     approve(service, version["id"])
-    runs = {
-        f"after adding {', '.join(effects)}": ilc.learn(service, service.fetch(), reference, "norm-optimal", trials)
-    }
-    improved = ilc.checked(service.http.post(f"/v1/models/{test['model_id']}/improve")).json()
-    added = [step["added"] for step in improved["steps"] if step["added"]]
-    return {"runs": runs, "added": added, "repeated": service.repeated}
-
-
-def hidden(seed: int, speed: float, trials: int) -> dict[str, Any]:
-    """A muscle twice from its beginning, since what tires or warms up with the first run would burden the second."""
-    emulate = f"--hidden {seed}"
-    first = case(emulate, speed, trials, before)
-    rest = partial(after, reference=first["reference"], effects=revealed(seed))
-    second = case(emulate, speed, trials, rest)
-    repeated = first["repeated"] + second["repeated"]
-    return {**first, **second, "runs": {**first["runs"], **second["runs"]}, "repeated": repeated}
+    reference = ilc.Reference.reach(peak_nm)
+    done = ilc.learn(service, service.fetch(), reference, "norm-optimal", trials)
+    return {"reference": reference, "trials": done, "repeated": service.repeated}
 
 
 def main() -> None:
@@ -163,23 +144,51 @@ def main() -> None:
     parser.add_argument("--only-hidden", action="store_true")
     options = parser.parse_args()
     began = time.time()
-    wanted = {} if options.only_hidden else {PAPER: partial(case, "", work=runs_of_the_paper)}
-    wanted |= {
-        f"hidden effect, seed {seed} ({', '.join(revealed(seed))})": partial(hidden, seed) for seed in options.seeds
-    }
-    with ThreadPoolExecutor(options.jobs) as pool:
-        futures = {name: pool.submit(work, speed=options.speed, trials=options.trials) for name, work in wanted.items()}
-        cases = {name: future.result() for name, future in futures.items()}
+    wanted: dict[str, dict[str, Any]] = {}
+    if not options.only_hidden:
+        wanted[PAPER] = {name: partial(case, "", work=partial(one_run, **run)) for name, run in RUNS.items()}
+    for seed in options.seeds:
+        effects, base = revealed(seed)
+        emulate, widest_us, peak_nm = f"--hidden {seed}", base["largest_width_us"], 0.6 * base["largest_torque_nm"]
+        wanted[f"hidden effect, seed {seed} ({', '.join(effects)})"] = {
+            "before": partial(case, emulate, widest_us=widest_us, work=partial(before, peak_nm=peak_nm)),
+            f"after adding {', '.join(effects)}": partial(
+                case, emulate, widest_us=widest_us, work=partial(after, peak_nm=peak_nm, effects=effects)
+            ),
+        }
+    cases = play_all(wanted, options)
     draw(options.out / "img" / "ilc.svg", cases)
     words = page(cases, options.speed, time.time() - began)
     (options.out / "ilc.md").write_text(words, "utf-8")
     print(words)
 
 
-def revealed(seed: int) -> list[str]:
-    """What the seed hid; asked after the fact only."""
+def play_all(wanted: dict[str, dict[str, Any]], options: argparse.Namespace) -> dict[str, dict[str, Any]]:
+    """Every run on a rig of its own; one that its rig did not survive is left out and said so."""
+    with ThreadPoolExecutor(options.jobs) as pool:
+        futures = {
+            (name, run): pool.submit(work, speed=options.speed, trials=options.trials)
+            for name, runs in wanted.items()
+            for run, work in runs.items()
+        }
+    cases: dict[str, dict[str, Any]] = {}
+    for (name, run), future in futures.items():
+        if future.exception() is not None:
+            print(f"{name}, {run}: {future.exception()}", file=sys.stderr)
+            continue
+        found = future.result()
+        case_ = cases.setdefault(name, {"reference": found["reference"], "runs": {}, "repeated": 0})
+        case_["runs"][run] = found["trials"]
+        case_["repeated"] += found["repeated"]
+        case_ |= {"floor": found["floor"]} if "floor" in found else {}
+    return cases
+
+
+def revealed(seed: int) -> tuple[list[str], dict[str, Any]]:
+    """What the seed hid, and the muscle without it (its largest width is the participant's comfort maximum)."""
     command = [sys.executable, "-m", "hardware_sim", "--reveal", str(seed)]
-    return json.loads(subprocess.run(command, check=True, capture_output=True, text=True, cwd=ROOT).stdout)["effects"]
+    found = json.loads(subprocess.run(command, check=True, capture_output=True, text=True, cwd=ROOT).stdout)
+    return found["effects"], found["base"]
 
 
 def page(cases: dict[str, dict[str, Any]], speed: float, seconds: float) -> str:
@@ -203,10 +212,8 @@ def page(cases: dict[str, dict[str, Any]], speed: float, seconds: float) -> str:
         lines.append(f"Reference {found['reference'].rms_nm:.2f} N·m rms.")
         if "floor" in found:
             lines.append(
-                f"The same pulses played three times differ by {found['floor']:.2f} %: nothing can be learnt below that."
+                f"The same pulses played three times differ by {found['floor']:.2f} %: nothing is learnt below that."
             )
-        if "before" in found["runs"]:
-            lines.append(f"On this test `improve` would have added: {', '.join(found['added']) or 'nothing'}.")
         lost = sum(trial.lost_pulses for trials in found["runs"].values() for trial in trials)
         lines.append(
             f"Pulses dropped because the host was late: {lost}; trials repeated after a fault: {found['repeated']}."

@@ -1,0 +1,135 @@
+"""The learning controller: imports nothing of ours; learns on a muscle that is not its model; halts with the rig."""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import io
+import sys
+from itertools import pairwise
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+PATH = Path(__file__).parents[2] / "examples" / "ilc_controller.py"
+
+
+@pytest.fixture(scope="module")
+def ilc() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("ilc_controller", PATH)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["ilc_controller"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def second_order(
+    widths_us: np.ndarray, period_s: float, damping: float, plateau_nm: float, middle_us: float
+) -> np.ndarray:
+    """A sigmoid and two lags by small Euler steps: written apart from the controller's own arithmetic."""
+    torque, rate, out = 0.0, 0.0, []
+    for width in widths_us:
+        level = plateau_nm / (1 + np.exp(-(width - middle_us) / 22)) - plateau_nm / (1 + np.exp(middle_us / 22))
+        total = 0.0
+        for _ in range(50):
+            rate += ((level - torque - 2 * damping * period_s * rate) / period_s**2) * 0.0005
+            torque += rate * 0.0005
+            total += torque
+        out.append(total / 50)
+    return np.array(out)
+
+
+def model_of(period_s: float, damping: float, plateau_nm: float, middle_us: float) -> dict[str, Any]:
+    """MODEL.json as far as the controller reads it: the linear part as a recursion at 400 Hz."""
+    widths = np.arange(0.0, 301.0, 2.0)
+    levels = plateau_nm / (1 + np.exp(-(widths - middle_us) / 22)) - plateau_nm / (1 + np.exp(middle_us / 22))
+    step = 1 / 400
+    poles = np.roots([period_s**2, 2 * damping * period_s, 1.0])
+    a = np.poly(np.exp(poles * step)).real
+    back = np.linspace(0, levels[-1], 200)
+    back_us = np.interp(back, levels, widths)
+    return {
+        "model_id": "M", "sample_rate_hz": 400.0, "effects": [],
+        "linear": {"b": [0.0, float(a.sum())], "a": a.tolist(), "delay_samples": 0},
+        "recruitment": {
+            "pulse_width_us": widths.tolist(),
+            "torque_nm": levels.tolist(),
+            "inverse": {"torque_nm": back.tolist(), "pulse_width_us": back_us.tolist()},
+        },
+        "valid_for": {"pulse_width_us": [0.0, 300.0]},
+    }  # fmt: skip
+
+
+class Muscle:
+    """Stands where the service stands: 10 % stronger, 15 % slower, threshold shifted, noisy; may drop pulses."""
+
+    def __init__(self, drops: bool = False) -> None:
+        self.rng, self.drops, self.widest_us = np.random.default_rng(8), drops, 0.0
+
+    def play(self, widths_us: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        sent = widths_us.copy()
+        self.widest_us = max(self.widest_us, float(widths_us.max()))
+        assert np.all(np.diff(np.r_[0, widths_us]) <= 50) and np.all(widths_us == np.round(widths_us))
+        if self.drops:
+            sent[self.rng.integers(0, sent.size, 3)] = 0.0
+        return second_order(sent, 0.46, 0.68, 7.2, 152.0) + 0.01 * self.rng.standard_normal(sent.size), sent
+
+
+MODEL = (0.40, 0.65, 6.6, 148.0)
+
+
+def test_imports_nothing_of_ours() -> None:
+    names = {
+        name.split(".")[0]
+        for node in ast.walk(ast.parse(PATH.read_text("utf-8")))
+        if isinstance(node, ast.Import | ast.ImportFrom)
+        for name in ([node.module or ""] if isinstance(node, ast.ImportFrom) else [alias.name for alias in node.names])
+    }
+    assert not names & {"rig", "identify", "api", "hardware_sim"}
+    assert {"httpx", "numpy", "h5py"} <= names
+
+
+def test_pulse_response_has_unit_gain(ilc: ModuleType) -> None:
+    response = ilc.Plant(model_of(*MODEL), 400).response
+    assert response.sum() == pytest.approx(1.0, abs=0.01)
+    assert response[0] < response[5]
+
+
+@pytest.mark.parametrize(("law", "static"), [("norm-optimal", False), ("norm-optimal", True), ("phase-lead", False)])
+def test_error_falls_below_five_percent_in_five_trials(ilc: ModuleType, law: str, static: bool) -> None:
+    """On a muscle unlike its model: below 5 % by the fifth trial, falling from the first until noise is reached."""
+    reference = ilc.Reference.reach(4.0)
+    trials = ilc.learn(Muscle(), model_of(*MODEL), reference, law, 10, static)
+    errors = [trial.error_percent for trial in trials]
+    assert errors[0] > 4, "else there was nothing to learn"
+    assert min(errors[:5]) < 5, errors
+    floor = 2.0
+    assert all(later < before for before, later in pairwise(errors) if before > floor), errors
+    assert errors[-1] < floor, errors
+
+
+def test_dropped_pulses_are_not_learnt_from(ilc: ModuleType) -> None:
+    reference = ilc.Reference.reach(4.0)
+    trials = ilc.learn(Muscle(drops=True), model_of(*MODEL), reference, "norm-optimal", 6)
+    assert all(trial.lost_pulses for trial in trials)
+    clean, _ = Muscle().play(trials[-1].widths_us)
+    assert 100 * np.sqrt(np.mean((clean - reference.torque_nm) ** 2)) / reference.rms_nm < 3
+
+
+def test_reference_asks_for_what_a_muscle_can_give(ilc: ModuleType) -> None:
+    reference = ilc.Reference.reach(3.0)
+    assert reference.torque_nm.max() == pytest.approx(3.0) and reference.torque_nm.min() == 0.0
+    assert reference.torque_nm.size == 400
+
+
+def test_trial_that_did_not_end_well_halts_the_controller(ilc: ModuleType) -> None:
+    file = io.BytesIO()
+    with h5py.File(file, "w") as recording:
+        recording.attrs["outcome"], recording.attrs["reason"] = "fault", "the load cell fell silent"
+    with pytest.raises(ilc.HaltedError, match="load cell fell silent"):
+        ilc.measured(file.getvalue(), 400)
