@@ -63,7 +63,7 @@ def left_over(fitted: Fitted, quiet: np.ndarray, noise_sd_nm: float) -> Left:
     setup = fitted.problem.setup
     residual = fitted.residual_nm - band_part(fitted.residual_nm, setup.stretches, fitted.noise)
     count = float(np.median(setup.grid.count[setup.fitted]))
-    white = noise_sd_nm / np.sqrt(count)
+    white = max(noise_sd_nm / np.sqrt(count), 1e-6 * setup.scale_nm)
     rests, works = _long(setup.fitted & quiet, 8), _long(setup.fitted & ~quiet, 4)
     together = _profile(residual, rests + works)
     resting, working = _profile(residual, rests), _profile(residual, works)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from identify.diagnosis.analysis import Analysis
+from identify.diagnosis.analysis import FIRST_MARGIN, Analysis
 from identify.diagnosis.candidates import Candidate
 from identify.diagnosis.structure import held_readings
 
@@ -62,9 +62,15 @@ def shares(candidates: list[Candidate]) -> dict[str, float]:
     top = candidates[0].gain
     spread = TEMPERATURE + RELATIVE * max(top, 0.0)
     weights = {c.effect.id: float(np.exp(max((c.gain - top) / spread, -60.0))) for c in candidates}
-    weights[""] = float(np.exp(np.clip(-top, -60.0, 60.0)))
+    # At the margin an effect is as likely there as not.
+    weights[""] = float(np.exp(np.clip(FIRST_MARGIN - top, -60.0, 60.0)))
     total = sum(weights.values())
     return {name: weight / total for name, weight in weights.items()}
+
+
+def _nothing(candidates: list[Candidate]) -> float:
+    """Probability that none of the candidates is there."""
+    return 1.0 / (1.0 + sum(float(np.exp(min(c.gain - FIRST_MARGIN, 60.0))) for c in candidates))
 
 
 def judge(work: Analysis) -> Verdict:
@@ -104,8 +110,5 @@ def judge(work: Analysis) -> Verdict:
     elif found:
         kind, probability = "effect_missing", max(found.values())
     else:
-        kind, probability = (
-            "nothing_missing",
-            1.0 - sum(p for n, p in shares(work.rounds[0] if work.rounds else []).items() if n),
-        )
+        kind, probability = "nothing_missing", _nothing(work.rounds[0] if work.rounds else [])
     return Verdict(kind, found, rivals, float(explained), float(structure), float(probability), notes)

@@ -86,7 +86,8 @@ EFFECT = Effect(
     signature="The error follows the measured angle, and only under stimulation.",
     resembles=("torque_velocity", "fatigue"),
     separated_by="Isometric tests at three angles.",
-    plain="The muscle is stronger at some elbow angles than at others.",
+    plain="The muscle is stronger at some elbow angles than at others. A controller that knows the angle can allow "
+    "for it; a test at one angle can't show it.",
     source="Marion et al. 2010; Thelen 2003",
     needs=("angle_rad",),
     experiment=("ramp",),

@@ -69,7 +69,8 @@ EFFECT = Effect(
     signature="The error follows the measured velocity, and only under stimulation.",
     resembles=("torque_angle", "passive_torque"),
     separated_by="The same movement with stimulation and without.",
-    plain="A muscle that shortens quickly pulls less, one that is stretched pulls more.",
+    plain="A muscle that shortens quickly pulls less, one that is stretched pulls more. In a held limb it makes no "
+    "difference.",
     source="Hill 1938; Marion et al. 2010; De Groote et al. 2016",
     needs=("velocity_rad_s",),
     experiment=("ramp",),

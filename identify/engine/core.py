@@ -9,6 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+PARTS = 3
+"""Steps in which a speed law is followed through a pulse interval."""
 LAWS = 21
 """Columns of the speed law: see `factor`."""
 
@@ -150,7 +152,7 @@ def run_core(drive, time_constant_s, damping, law, multiplier, scale_nm, step_s,
         for j in range(law.shape[1]):
             alike = alike and law[m, j] == law[0, j]
         y, v, bound = 0.0, 0.0, 0.0
-        forget = np.exp(-step_s / max(quick_s if law[m, 18] != 0.0 else slow_s, 1e-4))
+        forget = np.exp(-step_s / PARTS / max(quick_s if law[m, 18] != 0.0 else slow_s, 1e-4))
         if alike and varied:
             for k in range(size):
                 w = drive[m, k]
@@ -167,27 +169,34 @@ def run_core(drive, time_constant_s, damping, law, multiplier, scale_nm, step_s,
                 torque[m, k + 1] = y
                 rate[m, k + 1] = v
             continue
+        h = step_s / PARTS
         for k in range(size):
             w = drive[m, k]
-            f, d, q = 1.0, 1.0, 1.0
-            if lawful:
-                f, d, q = _factor(law[m], w, y, v, scale_nm, slow_s, quick_s, bound)
-            if given > 0:
-                f *= multiplier[m if given > 1 else 0, k]
-            if f == 1.0 and d == 1.0 and q == 1.0:
-                p11, p12, p21, p22 = b11, b12, b21, b22
-            else:
+            given_f = multiplier[m if given > 1 else 0, k] if given > 0 else 1.0
+            p11, p12, p21, p22 = 1.0, 0.0, 0.0, 1.0
+            # The law is asked several times in an interval: its side may turn in between.
+            for _ in range(PARTS):
+                f, d, q = 1.0, 1.0, 1.0
+                if lawful:
+                    f, d, q = _factor(law[m], w, y, v, scale_nm, slow_s, quick_s, bound)
+                f *= given_f
                 # The slower lag times d, the quicker times q: T² = quick·slow, 2 ζ T = quick + slow.
                 t = base * f * np.sqrt(d * q)
                 z = 0.5 * f * (quick_s * q + slow_s * d) / t
-                p11, p12, p21, p22 = _transition(t, z, step_s)
-            goal = abs(w) / (abs(w) + 0.05 * scale_nm)
-            bound = goal + (bound - goal) * forget
+                q11, q12, q21, q22 = _transition(t, z, h)
+                gap = y - w
+                y, v = w + q11 * gap + q12 * v, q21 * gap + q22 * v
+                p11, p12, p21, p22 = (
+                    q11 * p11 + q12 * p21,
+                    q11 * p12 + q12 * p22,
+                    q21 * p11 + q22 * p21,
+                    q21 * p12 + q22 * p22,
+                )
+                goal = abs(w) / (abs(w) + 0.05 * scale_nm)
+                bound = goal + (bound - goal) * forget
             if m == 0:
                 varied = True
                 first[0, k], first[1, k], first[2, k], first[3, k] = p11, p12, p21, p22
-            gap = y - w
-            y, v = w + p11 * gap + p12 * v, p21 * gap + p22 * v
             torque[m, k + 1] = y
             rate[m, k + 1] = v
     return torque, rate

@@ -271,6 +271,8 @@ class _Walk:
             for chosen, values in given:
                 middle = 0.5 * (torque[:, 1:] + torque[:, :-1])
                 factor = factor * np.asarray(chosen.form.call((drive, middle), self.named(chosen, values), setup.scene))
+            if np.all(factor == 1.0):
+                break
             torque, rate = self.respond(branches, core, law, np.ascontiguousarray(np.clip(factor, 0.02, 50.0)))
         return torque, rate
 

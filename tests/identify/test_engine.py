@@ -1,0 +1,94 @@
+"""The engine against dense algebra, central differences and independent integration."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from identify.effects import get
+from identify.engine import fit_candidate
+from identify.engine.core import whiten_rows
+from identify.engine.export import predict_fitted
+from identify.engine.noise_level import NoiseLevel, band_part, profile, whitened
+from identify.engine.prepare import first_setup, inspect
+from identify.engine.problem import Problem
+from tests.identify import hidden_muscles
+
+
+def _covariance(size: int, n: NoiseLevel) -> np.ndarray:
+    lag = np.abs(np.arange(size)[:, None] - np.arange(size))
+    band = n.band * n.keep**lag * np.cos(n.turn * lag)
+    return n.share * n.ar1**lag + band + (1 - n.share - n.band) * np.eye(size)
+
+
+@pytest.mark.parametrize("noise", [NoiseLevel(0.9, 0.6, 1.0), NoiseLevel(0.8, 0.3, 1.0, 0.8, 0.97, 0.4)])
+def test_whitening_is_that_of_the_dense_covariance(noise):
+    rng = np.random.default_rng(2)
+    rows = rng.standard_normal((3, 130))
+    stretch = (np.array([0]), np.array([130]))
+    white = whitened(rows, stretch, noise)
+    dense = rows @ np.linalg.solve(_covariance(130, noise), rows.T)
+    np.testing.assert_allclose(white @ white.T, dense, rtol=1e-6)
+    if noise.band:
+        gain = noise.band * noise.keep ** np.abs(np.arange(130)[:, None] - np.arange(130))
+        gain = gain * np.cos(noise.turn * (np.arange(130)[:, None] - np.arange(130)))
+        best = gain @ np.linalg.solve(_covariance(130, noise), rows[0])
+        np.testing.assert_allclose(band_part(rows[0].copy(), stretch, noise), best, atol=1e-6)
+
+
+def test_correlation_does_not_cross_a_gap():
+    rows = np.random.default_rng(1).standard_normal((1, 60))
+    both, _ = whiten_rows(rows, np.array([0, 40]), np.array([30, 60]), 0.9, 0.7)
+    first, _ = whiten_rows(rows, np.array([0]), np.array([30]), 0.9, 0.7)
+    second, _ = whiten_rows(rows, np.array([40]), np.array([60]), 0.9, 0.7)
+    np.testing.assert_allclose(both, np.c_[first, second])
+
+
+def test_noise_is_found_again():
+    rng = np.random.default_rng(7)
+    noise = NoiseLevel(0.95, 0.6, 0.03)
+    row = np.linalg.cholesky(_covariance(1500, noise)) @ rng.standard_normal(1500) * 0.03
+    found, _ = profile(row, (np.array([0]), np.array([1500])), NoiseLevel(0.5, 0.5, 1.0))
+    assert abs(found.ar1 - 0.95) < 0.04 and abs(found.share - 0.6) < 0.2 and abs(found.sd_nm - 0.03) < 0.006
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["fatigue:fitness", "output_saturation:knee"],
+        ["recruitment_hysteresis:memory", "electromechanical_delay:delay"],
+        ["mixed_fibres:parallel", "baseline_drift:warming"],
+        ["series_compliance:series"],
+    ],
+)
+def test_derivatives_are_those_of_central_differences(names):
+    record = hidden_muscles.record(seed=2, rate_hz=100)
+    setup = first_setup(record, inspect(record))
+    problem = Problem(setup, [(n.split(":")[0], get(n.split(":")[0]).form(n.split(":")[1])) for n in names])
+    values = np.r_[[0.2, 0.8, 0.001, 0.1], np.linspace(0, 6, setup.basis.size)]
+    starts = [p.start[0] for c in problem.chosen for p in c.parameters]
+    theta = problem.from_physical(np.r_[values, starts])
+    _, slopes = problem.run(theta, derivatives=True)
+    assert slopes is not None
+    for place in [0, 1, 2, 3, 12, *range(problem.coefficients.stop, problem.size)]:
+        step = 2e-5 * (1.0 if problem.log[place] else max(problem.upper[place] - problem.lower[place], 1e-3))
+        ahead, back = theta.copy(), theta.copy()
+        ahead[place] += step
+        back[place] -= step
+        central = (problem.run(ahead)[0] - problem.run(back)[0]) / (2 * step)
+        scale = np.max(np.abs(central)) + 1e-6
+        assert np.median(np.abs(slopes[place] - central)) < 2e-3 * scale, problem.table[place].name
+
+
+def test_a_model_meets_a_muscle_integrated_apart():
+    """Without noise the base meets a Runge-Kutta muscle of two lags to a few thousandths of its range."""
+    record = hidden_muscles.record(seed=4, noise_nm=1e-4)
+    error = predict_fitted(fit_candidate(record, []), record) - record.torque_nm
+    assert np.sqrt(np.mean(error[record.held_out] ** 2)) < 0.012
+
+
+def test_held_out_rows_change_nothing_of_a_fit():
+    record = hidden_muscles.record("fatigue", seed=6, rate_hz=100)
+    spoilt = record.with_torque(np.where(record.held_out, 50.0 * np.sin(record.time_s * 9.0), record.torque_nm))
+    one, two = fit_candidate(record, ["fatigue", "mains_hum"]), fit_candidate(spoilt, ["fatigue", "mains_hum"])
+    np.testing.assert_array_equal(one.theta, two.theta)

@@ -1,0 +1,51 @@
+"""Improving: the error falls step by step, each step a model with its forebear; what isn't there is refused."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+import identify
+from identify.errors import BadRequest
+from identify.model import Model
+from tests.identify import hidden_muscles
+
+
+@pytest.fixture(scope="module")
+def improved():
+    record = hidden_muscles.record("fatigue", seed=15)
+    return record, identify.improve(record, force=["electromechanical_delay"])
+
+
+def test_the_error_falls_towards_the_noise(improved):
+    _, result = improved
+    assert result["steps"][0]["added"] is None and result["steps"][1]["added"] == "fatigue"
+    before, after = result["steps"][0], result["steps"][1]
+    assert after["held_out_rms_nm"] < 0.6 * before["held_out_rms_nm"]
+    assert after["rms_nm"] < 1.1 * result["noise_sd_nm"]
+
+
+def test_each_step_is_a_model_that_predicts_what_the_step_says(improved):
+    record, result = improved
+    for step, data in zip(result["steps"], result["models"], strict=True):
+        model = Model.from_dict(json.loads(json.dumps(data)))
+        error = (record.torque_nm - model.predict(record))[record.held_out]
+        assert abs(np.sqrt(np.mean(error**2)) - step["held_out_rms_nm"]) < 1e-6
+        assert model.model_id == step["model_id"]
+    parents = [data["extra"]["parent"] for data in result["models"]]
+    assert parents == [None, *[data["model_id"] for data in result["models"][:-1]]]
+
+
+def test_what_is_not_there_is_refused_with_a_reason_and_can_be_forced(improved):
+    _, result = improved
+    assert result["steps"][-1]["added"] == "electromechanical_delay"
+    assert "person" in result["steps"][-1]["reason"]
+    refusals = {row["effect"]: row["reason"] for row in result["refused"]}
+    assert "log evidence" in refusals["electromechanical_delay"]
+
+
+def test_an_unknown_effect_is_no_effect():
+    with pytest.raises(BadRequest):
+        identify.improve(hidden_muscles.record(rate_hz=100), force=["witchcraft"])
