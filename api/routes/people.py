@@ -10,7 +10,7 @@ from fastapi import APIRouter, Request
 from fastapi.responses import JSONResponse, RedirectResponse, Response
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 
-from api.auth import COOKIE, Scope
+from api.auth import COOKIE, Scope, unauthorized
 from api.clock import utc_label
 from api.context import PROBLEM, Administrator, Anyone, Context, Ctx
 from api.errors import ApiError, NotFoundError
@@ -118,7 +118,7 @@ async def _given(request: Request, form: bool) -> SignIn:
         fields = await request.form()
         return SignIn(name=str(fields.get("name") or ""), password=str(fields.get("password") or ""))
     except (ValidationError, ValueError):
-        raise ApiError(422, "invalid-input", "Name and password are needed", "Send `name` and `password`.") from None
+        raise unauthorized("Send `name` and `password`.") from None
 
 
 def same_origin(request: Request) -> None:
