@@ -14,7 +14,7 @@ TEMPERATURE = 2.0
 """Spread, in log evidence, that the best form of a rival may lose by chance."""
 RELATIVE = 0.03
 """And in proportion to the gain: a form close to the truth explains most, not all."""
-LEAST_EXPLAINED = 0.62
+LEAST_EXPLAINED = 0.56
 """Share of the explicable log-likelihood below which the rest counts as structure of another kind."""
 STRUCTURE = 12.0
 """Log-likelihood by which work and rest must differ for structure to be left."""

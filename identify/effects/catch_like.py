@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from identify.effects.base import Effect, Form, Parameter, Scene
-from identify.effects.kernels import adapt, since_onset, train
+from identify.effects.kernels import adapt, since_onset, train, used_up
 
 _GAIN = Parameter("gain", "1", 0.0, 2.5, 0.0, (0.3, 0.8), about="extra torque at the onset")
 _DECAY = Parameter("decay_s", "s", 0.12, 1.2, 0.3, (0.25, 0.5), "log", about="time constant with which it fades")
@@ -30,6 +30,24 @@ def _after_silence(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.nda
     """The longer the silence before a train, the larger the boost at its onset."""
     since, gap = train(scene.on, scene.step_s)
     return drive * (1.0 + p["gain"] * -np.expm1(-gap / p["recovery_s"]) * np.exp(-since / p["decay_s"]))
+
+
+def _counts(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+    x = used_up(scene.on, p["decay_s"][:, 0], p["recovery_s"][:, 0], scene.step_s)
+    return drive * (1.0 + p["gain"] * np.exp(-x))
+
+
+def _sharp(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+    """As after_silence, back more at once: a silence half as long as recovery brings back little."""
+    since, gap = train(scene.on, scene.step_s)
+    back = (gap / p["recovery_s"]) ** 2.5
+    return drive * (1.0 + p["gain"] * back / (1.0 + back) * np.exp(-since / p["decay_s"]))
+
+
+def _flat(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+    since, gap = train(scene.on, scene.step_s)
+    fade = np.exp(-np.minimum((since / p["length_s"]) ** 3, 200.0))
+    return drive * (1.0 + p["gain"] * -np.expm1(-gap / p["recovery_s"]) * fade)
 
 
 def _burst(length_s: float, least_gap_s: float) -> Any:
@@ -70,6 +88,34 @@ EFFECT = Effect(
             _after_silence,
             batched=True,
         ),
+        Form(
+            "counts",
+            "gain",
+            "w = (1 + gain·exp(-x)) f(u); x' = 1/decay under pulses, -x/recovery in silence",
+            (_GAIN, _QUICK, _RECOVERY),
+            _counts,
+            batched=True,
+        ),
+        Form(
+            "sharp",
+            "gain",
+            "w = (1 + gain·r/(1 + r)·exp(-t/decay)) f(u), r = (silence/recovery)^2.5",
+            (_GAIN, _QUICK, _RECOVERY),
+            _sharp,
+            batched=True,
+        ),
+        Form(
+            "flat",
+            "gain",
+            "w = (1 + gain (1 - exp(-silence/recovery)) exp(-(t/length)³)) f(u)",
+            (
+                _GAIN,
+                Parameter("length_s", "s", 0.08, 0.9, 0.3, (0.15, 0.4), "log", about="how long the boost lasts"),
+                _RECOVERY,
+            ),
+            _flat,
+            batched=True,
+        ),
         *(
             Form(
                 f"burst_{length * 1000:.0f}_ms",
@@ -79,7 +125,7 @@ EFFECT = Effect(
                 _burst(length, gap),
                 batched=True,
             )
-            for length, gap in ((0.06, 0.1), (0.12, 0.1), (0.24, 0.25))
+            for length, gap in ((0.06, 0.1),)
         ),
     ),
     signature="Torque above the model in the first tenths of a second after every silence.",

@@ -290,3 +290,22 @@ def bumps(
                 if away < reach:
                     out[m, k] += height[m, i] * np.exp(-0.5 * (away + 1e-12) ** flatness[m])
     return out
+
+
+@njit(cache=True, nogil=True)
+def used_up(
+    on: np.ndarray, decay_s: np.ndarray, recovery_s: np.ndarray, step_s: float
+) -> np.ndarray:  # pragma: no cover
+    """Time under pulses over decay, forgotten in silence: x' = 1/decay, or -x/recovery; (K,), (M,) to (M, K), middles."""
+    rows = decay_s.size
+    out = np.empty((rows, on.size))
+    for m in range(rows):
+        x, gain, forget = 0.0, step_s / decay_s[m], np.exp(-step_s / recovery_s[m])
+        for k in range(on.size):
+            if on[k] > 0:
+                out[m, k] = x + 0.5 * gain
+                x += gain
+            else:
+                out[m, k] = x
+                x *= forget
+    return out

@@ -17,9 +17,27 @@ from identify.model import Model
 from identify.record import Record
 from tests.identify import hidden_muscles
 
-CONTRACT = """fatigue potentiation recruitment_hysteresis asymmetric_relaxation electromechanical_delay mixed_fibres
-threshold_drift baseline_drift voluntary_effort tremor mains_hum output_saturation sensor_clipping series_compliance
-torque_angle torque_velocity passive_torque activation_dependent_speed catch_like""".split()
+CONTRACT = {
+    "fatigue",
+    "potentiation",
+    "recruitment_hysteresis",
+    "asymmetric_relaxation",
+    "electromechanical_delay",
+    "mixed_fibres",
+    "threshold_drift",
+    "baseline_drift",
+    "voluntary_effort",
+    "tremor",
+    "mains_hum",
+    "output_saturation",
+    "sensor_clipping",
+    "series_compliance",
+    "torque_angle",
+    "torque_velocity",
+    "passive_torque",
+    "activation_dependent_speed",
+    "catch_like",
+}
 FORMS = [(effect.id, form.name) for effect in registry().values() for form in effect.forms]
 
 
@@ -48,7 +66,7 @@ def _theta(problem: Problem) -> np.ndarray:
 
 
 def test_every_id_of_the_contract_is_there():
-    assert set(CONTRACT) <= set(registry())
+    assert set(registry()) >= CONTRACT
 
 
 def test_the_library_is_plain_data_with_everything_a_page_shows():
