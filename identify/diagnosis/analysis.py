@@ -139,9 +139,9 @@ def _take(work: Analysis, fitted: Fitted, effect: str) -> None:
 
 
 def _exhausted(work: Analysis) -> bool:
-    """Whether the residual is already as white and small as noise can be."""
+    """Whether no further effect could gain what is asked: the residual is nearly as small and white as noise can be."""
     left, last = work.left[-1], work.last
-    return left.ideal - last.log_likelihood < NEXT_MARGIN and left.ratio < NEXT_MARGIN
+    return left.ideal - last.log_likelihood < _margin(work) and left.ratio < _margin(work)
 
 
 def _with_given(work: Analysis, base: Fitted) -> Fitted:

@@ -296,7 +296,7 @@ def bumps(
 def used_up(
     on: np.ndarray, decay_s: np.ndarray, recovery_s: np.ndarray, step_s: float
 ) -> np.ndarray:  # pragma: no cover
-    """Time under pulses, forgotten in silence: x' = 1/decay, or -x/recovery; (K,), (M,) to (M, K), middles."""
+    """Time under pulses, forgotten in silence: x' = 1/decay, or -x/recovery; (K,), (M,) to (M, K)."""
     rows = decay_s.size
     out = np.empty((rows, on.size))
     for m in range(rows):

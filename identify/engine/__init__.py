@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from identify.effects import get
+from identify.effects import get, registry
 from identify.engine.export import predict, to_model
 from identify.engine.figures import figures
 from identify.engine.fit import Fitted, solve, start_from
@@ -107,9 +107,15 @@ def warm() -> None:
     width = np.where((np.floor(time_s * 4) % 2) == 1, 200.0, 0.0)
     torque = np.convolve(width / 100.0, np.exp(-np.arange(40) / 10.0) / 10.0)[:400]
     record = Record.from_arrays(time_s, width, torque + 0.01 * np.sin(37.0 * np.arange(400) ** 1.3))
-    names = ("fatigue", "recruitment_hysteresis:memory", "recruitment_hysteresis:play", "series_compliance:series")
-    for name in (*names, "asymmetric_relaxation:kinetics", "catch_like:after_100_ms"):
-        fit_candidate(record, [name])
+    base = fit_candidate(record, [])
+    setup = base.problem.setup
+    find_band(base.residual_nm, setup.stretches, setup.grid.step_s)
+    for effect in registry().values():
+        if effect.needs or effect.raw or effect.band:
+            continue
+        for form in effect.forms[:6] if effect.foreseeable else effect.forms[:1]:
+            problem = Problem(setup, [(effect.id, form)])
+            problem.run(start_from(problem, base, {0: form.starts(setup.scene)[0]}), derivatives=True)
 
 
 __all__ = ["Fitted", "fit_candidate", "fit_with_effects", "predict", "to_model", "warm"]

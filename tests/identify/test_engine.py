@@ -92,3 +92,9 @@ def test_held_out_rows_change_nothing_of_a_fit():
     spoilt = record.with_torque(np.where(record.held_out, 50.0 * np.sin(record.time_s * 9.0), record.torque_nm))
     one, two = fit_candidate(record, ["fatigue", "mains_hum"]), fit_candidate(spoilt, ["fatigue", "mains_hum"])
     np.testing.assert_array_equal(one.theta, two.theta)
+
+
+def test_warming_up_touches_every_compiled_part():
+    from identify.engine import warm
+
+    warm()
