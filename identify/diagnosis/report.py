@@ -14,6 +14,8 @@ from identify.effects import get
 from identify.engine.export import describe_parameters, predict_fitted, with_band
 from identify.experiments import plan
 
+CLOSE = 0.8
+"""Share of the best one's gain from which an effect that resembles it is named beside it."""
 RIVAL = 0.04
 """Probability from which an effect is named as one that the record can't tell from the best."""
 
@@ -33,7 +35,7 @@ def report(work: Analysis, verdict: Verdict) -> dict[str, Any]:
     return {
         "noise_sd_nm": raw.noise_sd_nm,
         "slow_noise": {
-            "sd_nm": work.last.noise.sd_nm * float(np.sqrt(work.last.noise.share)),
+            "sd_nm": work.last.noise.sd_nm * float(np.sqrt(min(work.last.noise.share, 1.0))),
             "ar1": work.last.noise.ar1,
         },
         "base": {
@@ -72,9 +74,9 @@ def _missing(work: Analysis, verdict: Verdict, effect: str, row: list[Step]) -> 
     fitted = with_band(work.last)
     index = [e for e, _ in fitted.effects].index(effect)
     rivals = verdict.rivals.get(effect, {})
-    confused = [
-        name for name, p in sorted(rivals.items(), key=lambda item: -item[1]) if name and name != effect and p >= RIVAL
-    ]
+    named = _close(work, effect)
+    ranked = sorted((name for name in rivals if name and name != effect), key=lambda name: -rivals[name])
+    confused = [name for name in ranked if rivals[name] >= RIVAL or name in named]
     described = get(effect)
     experiment = _experiment(work, effect, confused)
     return {
@@ -94,6 +96,16 @@ def _missing(work: Analysis, verdict: Verdict, effect: str, row: list[Step]) -> 
         "rival_probabilities": {name: p for name, p in rivals.items() if name and p >= 0.005},
         "plain": described.plain,
     }
+
+
+def _close(work: Analysis, effect: str) -> set[str]:
+    """Effects that the library calls alike, and that explain nearly as much: another form might turn the tables."""
+    if effect not in work.added:
+        return set()
+    round_ = work.rounds[work.added.index(effect)]
+    gains = {c.effect.id: c.gain for c in round_}
+    alike = {c.effect.id for c in round_ if effect in c.effect.resembles} | set(get(effect).resembles)
+    return {name for name in alike if gains.get(name, 0.0) > CLOSE * gains.get(effect, 0.0)}
 
 
 def _experiment(work: Analysis, effect: str, confused: list[str]) -> dict[str, Any] | None:

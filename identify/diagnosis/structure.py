@@ -76,7 +76,7 @@ def left_over(fitted: Fitted, quiet: np.ndarray, noise_sd_nm: float) -> Left:
         quiet_seconds=sum(r.stop - r.start for r in rests) * setup.grid.step_s,
         ratio=ratio,
         ideal=_ideal(setup.fitted, resting, white, sum(r.stop - r.start for r in rests)),
-        slow_nm=fitted.noise.sd_nm * float(np.sqrt(fitted.noise.share)),
+        slow_nm=fitted.noise.sd_nm * float(np.sqrt(min(fitted.noise.share, 1.0))),
         ar1=lag,
     )
 

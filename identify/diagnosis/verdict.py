@@ -18,6 +18,8 @@ LEAST_EXPLAINED = 0.56
 """Share of the explicable log-likelihood below which the rest counts as structure of another kind."""
 STRUCTURE = 12.0
 """Log-likelihood by which work and rest must differ for structure to be left."""
+LAPSE = 0.04
+"""Probability kept for what no form of the library foresees."""
 NAMELESS = 8.0
 """Log evidence by which a gain without a law must beat the best effect."""
 HELD = 0.3
@@ -65,7 +67,7 @@ def shares(candidates: list[Candidate]) -> dict[str, float]:
     # At the margin an effect is as likely there as not.
     weights[""] = float(np.exp(np.clip(FIRST_MARGIN - top, -60.0, 60.0)))
     total = sum(weights.values())
-    return {name: weight / total for name, weight in weights.items()}
+    return {name: (1.0 - LAPSE) * weight / total for name, weight in weights.items()}
 
 
 def _nothing(candidates: list[Candidate]) -> float:

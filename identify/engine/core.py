@@ -11,6 +11,8 @@ from numba import njit
 
 PARTS = 3
 """Steps in which a speed law is followed through a pulse interval."""
+MEAN_OF_SLOW = 0.27
+"""Correlation of neighbouring innovations that averaging over an interval brings, at most."""
 LAWS = 21
 """Columns of the speed law: see `factor`."""
 
@@ -253,6 +255,36 @@ def read_means(torque, rate, first, weights, step_s):  # pragma: no cover
 
 
 @njit(cache=True, nogil=True)
+def _ratio(ar1, mean):  # pragma: no cover
+    """Variance of means of slow noise over that of their innovations."""
+    return (1.0 + 2.0 * ar1 * mean + mean * mean) / (1.0 - ar1 * ar1)
+
+
+@njit(cache=True, nogil=True)
+def _whiten_means(rows, start, stop, ar1, mean, total):  # pragma: no cover
+    """Innovations of means of slow noise, x[k] = ar1 x[k-1] + e[k] + mean e[k-1], by the innovations algorithm."""
+    white = np.empty((rows.shape[0], total))
+    first = _ratio(ar1, mean)
+    logdet = 0.0
+    for i in range(start.size):
+        r = first
+        for _ in range(stop[i] - start[i]):
+            logdet += 0.5 * np.log(r / first)
+            r = 1.0 + mean * mean - mean * mean / r
+    for m in range(rows.shape[0]):
+        f = 0
+        for i in range(start.size):
+            r, x = first, 0.0
+            for k in range(start[i], stop[i]):
+                e = rows[m, k] - x
+                white[m, f] = e * np.sqrt(first / r)
+                x = ar1 * rows[m, k] + mean * e / r
+                r = 1.0 + mean * mean - mean * mean / r
+                f += 1
+    return white, logdet
+
+
+@njit(cache=True, nogil=True)
 def whiten_rows(rows, start, stop, ar1, share):  # pragma: no cover
     """Innovations of white plus AR(1) noise, scaled to equal variance, by an exact Kalman filter.
 
@@ -265,7 +297,8 @@ def whiten_rows(rows, start, stop, ar1, share):  # pragma: no cover
     ar1 : float
         Correlation of neighbours of the slow part.
     share : float
-        Share of the variance that is slow, 0 … 1; the rest is white.
+        Share of the variance that is slow, 0 … 1; the rest is white. Above 1: means of slow noise over an interval,
+        which are smoother than slow noise read at instants.
 
     Returns
     -------
@@ -277,6 +310,8 @@ def whiten_rows(rows, start, stop, ar1, share):  # pragma: no cover
     total = 0
     for i in range(start.size):
         total += stop[i] - start[i]
+    if share > 1.0:
+        return _whiten_means(rows, start, stop, ar1, (share - 1.0) * MEAN_OF_SLOW, total)
     white = np.empty((rows.shape[0], total))
     gain = np.empty(total)
     scale = np.empty(total)
@@ -309,6 +344,22 @@ def whiten_rows(rows, start, stop, ar1, share):  # pragma: no cover
 def _squares(row, start, stop, ar1, share):  # pragma: no cover
     """Sum of squared innovations, half the log determinant, count; the filter's gain settles within some steps."""
     total, squares, logdet = 0, 0.0, 0.0
+    if share > 1.0:
+        mean = (share - 1.0) * MEAN_OF_SLOW
+        first = _ratio(ar1, mean)
+        for i in range(start.size):
+            r, x = first, 0.0
+            for k in range(start[i], stop[i]):
+                e = row[k] - x
+                squares += e * e * first / r
+                if r != 1.0:
+                    logdet += 0.5 * np.log(r / first)
+                else:
+                    logdet -= 0.5 * np.log(first)
+                x = ar1 * row[k] + mean * e / r
+                r = 1.0 + mean * mean - mean * mean / r
+                total += 1
+        return squares, logdet, total
     noise = (1.0 - ar1 * ar1) * share
     for i in range(start.size):
         p, x, k, end = share, 0.0, start[i], stop[i]
@@ -358,9 +409,15 @@ def profile_noise(row, start, stop, ar1, share):  # pragma: no cover
     # On the scale of memory: a = log(1 - ar1), from 0.002 (long) to 1 (none).
     low, high = np.log(0.002), 0.0
     a = min(max(np.log(1.0 - min(ar1, 0.9985)), low), high)
-    b = min(max(share, 0.0), 1.0)
+    b = min(max(share, 0.0), 2.0)
     best = _minus_log_likelihood(row, start, stop, 1.0 - np.exp(a), b)
-    for guess_a, guess_b in ((np.log(0.3), 0.9), (np.log(0.03), 0.3), (np.log(0.03), 1.0), (np.log(0.5), 0.02)):
+    for guess_a, guess_b in (
+        (np.log(0.3), 0.9),
+        (np.log(0.03), 0.3),
+        (np.log(0.03), 1.0),
+        (np.log(0.5), 0.02),
+        (np.log(0.3), 1.7),
+    ):
         value = _minus_log_likelihood(row, start, stop, 1.0 - np.exp(guess_a), guess_b)
         if value < best:
             best, a, b = value, guess_a, guess_b
@@ -370,7 +427,7 @@ def profile_noise(row, start, stop, ar1, share):  # pragma: no cover
         for i in range(8):
             na = a + da * (1.0 if i in (0, 4, 5) else -1.0 if i in (1, 6, 7) else 0.0)
             nb = b + db * (1.0 if i in (2, 4, 6) else -1.0 if i in (3, 5, 7) else 0.0)
-            na, nb = min(max(na, low), high), min(max(nb, 0.0), 1.0)
+            na, nb = min(max(na, low), high), min(max(nb, 0.0), 2.0)
             if na == a and nb == b:
                 continue
             value = _minus_log_likelihood(row, start, stop, 1.0 - np.exp(na), nb)

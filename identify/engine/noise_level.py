@@ -23,7 +23,7 @@ class NoiseLevel:
     ar1 : float
         Correlation of neighbours of the slow part.
     share : float
-        Share of the variance that is slow.
+        Share of the variance that is slow; above 1: all of it, and smoothed by the mean over an interval.
     sd_nm : float
         Total standard deviation of an interval's mean, N·m.
     turn, keep, band : float
@@ -51,7 +51,7 @@ def profile(residual: np.ndarray, stretches: Stretches, near: NoiseLevel) -> tup
     x = np.array(
         [
             np.log(1.0 - min(near.ar1, 0.998)),
-            near.share / max(1.0 - near.band, 1e-9),
+            min(near.share / max(1.0 - near.band, 1e-9), 1.0),
             near.turn,
             np.log(1.0 - min(near.keep, 0.9999)),
             near.band,
@@ -65,7 +65,7 @@ def _search(
 ) -> tuple[NoiseLevel, float]:
     start, stop = stretches
     lower = np.array([np.log(0.002), 0.0, turns[0], np.log(0.0008), 0.001])
-    upper = np.array([0.0, 1.0, turns[1], np.log(0.3), 0.999])
+    upper = np.array([0.0, 1.0, turns[1], np.log(0.12), 0.999])
     x, sd, log_likelihood = profile_band(
         residual,
         start,
