@@ -70,7 +70,9 @@ async def looked_at(context: Context, row: Model, by: str, diagnose: int) -> dic
     if diagnose == 1 or (newest is None and diagnose != 0):
         newest = criticism.begin_diagnosis(context, row, by)
         await asyncio.sleep(0.05)
-    return {"found": None, "task": newest}
+    if newest is not None and newest.state == "completed":  # it was done between the two looks
+        known = await asyncio.to_thread(context.analyses.known_diagnosis, row)
+    return {"found": known, "task": newest}
 
 
 def gather(context: Context, row: Model, measured: dict[str, Any], diagnosis: dict[str, Any]) -> dict[str, Any]:
@@ -83,7 +85,8 @@ def gather(context: Context, row: Model, measured: dict[str, Any], diagnosis: di
     places = view["places"] if view else why_charts.places_of(comparison or {})
     return {
         "why": view,
-        "job": task.public() if task and task.state == "running" else None,
+        # One that has just ended is shown as running once more: the page asks after it, and then shows what it found.
+        "job": task.public() if task and not found and task.state in ("running", "completed") else None,
         "why_problem": task.problem if task and task.state == "failed" else None,
         "places": places,
         "splits": why.splits(comparison),
