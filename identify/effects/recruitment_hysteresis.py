@@ -145,5 +145,6 @@ EFFECT = Effect(
     plain="The muscle answers differently to the same pulse on the way up and on the way down. The controller needs to "
     "know where it comes from, or it will be off by the distance of two curves.",
     source="Two curves, one a direction, come out of a ramp's deconvolution: Durfee, MacLean 1989",
+    prior=-2.5,
     experiment=("ramp",),
 )

@@ -93,5 +93,6 @@ EFFECT = Effect(
     plain="The pulse width at which the muscle begins to answer moves during the session, as gel dries, skin warms or "
     "an electrode shifts. Strong pulses look unchanged, weak ones are lost. Check the electrodes.",
     source="Electrode and skin impedance; no single source, see docs/diagnosis.md",
+    prior=-2.5,
     experiment=("ramp", "rest"),
 )
