@@ -39,7 +39,11 @@ COLUMNS: tuple[tuple[str, str, str], ...] = (
     ("pulses/pulse_width_us", "µs", "planned width of a phase; 0 is no pulse"),
     ("pulses/sent_pulse_width_us", "µs", "what was sent after the gate's rounding; NaN where nothing was sent"),
     ("pulses/current_ma", "mA", "current sent; 0 where nothing was sent"),
-    ("pulses/written_time_s", "s", "when the last byte was handed to the line; NaN where nothing was sent"),
+    (
+        "pulses/written_time_s",
+        "s",
+        "when the last byte was handed to the line, at latest when its ack had been read; NaN where nothing was sent",
+    ),
     ("pulses/acknowledged_time_s", "s", "when the device's ack had been read; NaN where none came"),
     (
         "pulses/status",
@@ -176,6 +180,8 @@ def _pulses(
                 acked_s[i] = time_s - t0_s
                 failed = len(payload) > journal.ACKED.size
                 status[i] = PulseStatus.DEVICE_ERROR if failed else PulseStatus.ACKNOWLEDGED
+    # the sender may lose the processor between its write and its look at the clock; the ack came after the write
+    written_s = np.fmin(written_s, np.where(np.isfinite(written_s), acked_s, np.nan))
     sent_us[status == PulseStatus.REST] = 0.0
     tried = np.flatnonzero(np.nan_to_num(current) > 0)
     reached = max(int(np.clip(np.ceil(played_s * rate_hz - 1e-6), 0, n)), int(tried[-1]) + 1 if len(tried) else 0)
