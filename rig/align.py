@@ -88,9 +88,10 @@ def align(
     envelope = _lower_envelope(cell_s, host_s)
     pairs = _edges(cell_s, sync, written_s, envelope, sample_rate_hz)
     if pairs is not None and len(pairs[0]) >= MIN_EDGES:
+        *pairs, sure = pairs
         line, method = _robust_line(*pairs), "sync"
         misfit_s = _misfit(line, *pairs)
-        coarse_s = _misfit(envelope, *_earliest(cell_s, host_s))
+        coarse_s = 0.0 if sure else _misfit(envelope, *_earliest(cell_s, host_s))
         if coarse_s > COARSE_MISFIT_S:  # then edges may have been taken for those of other pulses
             misfit_s = max(misfit_s, coarse_s)
         # Pulses often keep step with the samples, so where in its sample a pulse began does not average out.
@@ -157,8 +158,8 @@ def _earliest(cell_s: Array, host_s: Array) -> tuple[Array, Array]:
 
 def _edges(
     cell_s: Array, sync: NDArray[np.uint8], written_s: Array, envelope: _Line, sample_rate_hz: float
-) -> tuple[Array, Array] | None:
-    """Pairs (cell's time of a pulse, host's time of writing it), matched by the coarse line; None without sync."""
+) -> tuple[Array, Array, bool] | None:
+    """Pairs (cell's time of a pulse, host's time of writing it), and whether the match is sure; None: no sync."""
     if len(written_s) < MIN_EDGES or not np.any(sync == 1):
         return None
     period_s = 1 / sample_rate_hz
@@ -166,9 +167,20 @@ def _edges(
     edge_s = cell_s[1:][rising] - period_s / 2
     if len(edge_s) == 0:
         return None
+    if len(edge_s) == len(written_s) and _in_step(edge_s, written_s):
+        return edge_s, written_s, True
     about_s = envelope.at(edge_s)
     after = np.clip(np.searchsorted(written_s, about_s), 1, len(written_s) - 1)
     nearest = np.where(about_s - written_s[after - 1] < written_s[after] - about_s, after - 1, after)
     within_s = 0.45 * float(np.min(np.diff(written_s)))
     near = np.abs(written_s[nearest] - about_s) < within_s
-    return edge_s[near], written_s[nearest[near]]
+    return edge_s[near], written_s[nearest[near]], False
+
+
+def _in_step(edge_s: Array, written_s: Array) -> bool:
+    """As many edges as pulses, in the same rhythm: then each belongs to its own, however late the samples came.
+
+    A stall of the host bends the envelope, and the nearest pulse may then be a wrong one.
+    """
+    lead_s = written_s - _robust_line(edge_s, written_s).at(edge_s)
+    return float(np.quantile(np.abs(lead_s), 0.9)) < 0.25 * float(np.min(np.diff(written_s)))

@@ -116,3 +116,14 @@ def test_a_clock_that_is_no_line_is_not_called_exact():
             sync[np.searchsorted(true_s, pulses_s)] = 1
         _, found = align(np.arange(n) / rate, true_s + 0.001, sync, pulses_s, rate)
         assert found.error_ms > 1.0
+
+
+def test_a_host_that_falls_behind_does_not_mismatch_edges():
+    """Samples come ever later (60 ms over 4 s, then all at once): the envelope bends, every pulse was still seen."""
+    for seed in range(5):
+        counter, host_s, flag, written_s, true_s = made(seed, 20.0, 0.2, duration_s=4.0)
+        host_s = host_s + 0.06 * np.clip(true_s, 0, 3) / 3
+        cell_s = cell_time(counter, np.full(len(counter), np.nan), RATE_HZ)
+        time_s, found = align(cell_s, host_s, flag, written_s, RATE_HZ)
+        assert np.max(np.abs(time_s - true_s)) < 1e-3
+        assert found.error_ms < 1.0

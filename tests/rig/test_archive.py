@@ -12,7 +12,7 @@ from rig.journal import JournalContents, Kind
 
 
 def test_a_sender_that_lost_the_processor_wrote_before_the_ack() -> None:
-    """The ack of pulse 0 was read before the sender could look at its clock; pulse 1 went as usual; pulse 2 got none."""
+    """The ack of pulse 0 was read before the sender could look at its clock, that of 1 as usual, of 2 never."""
     blocks: list[tuple[Kind, bytes]] = []
     for index, (written_s, acked_s) in enumerate([(10.0042, 10.0013), (10.0251, 10.0262), (10.0503, None)]):
         blocks.append((Kind.INTENT, journal.INTENT.pack(index, 10.0 + 0.025 * index, 0.0, 120.0, 20.0)))

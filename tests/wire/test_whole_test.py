@@ -85,7 +85,7 @@ def test_the_default_test(make_bench: Callable[..., Bench]):
 
 
 def test_sped_up_test_over_slcan(make_bench: Callable[..., Bench]):
-    bench = make_bench("--load-cell", "slcan", "--noise-seed", "5")
+    bench = make_bench("--load-cell", "slcan", "--noise-seed", "5", speed=3.0)  # text frames cost the emulator more
     event = play(bench, short_plan("fast"))
     check_recording(bench, event)
 
