@@ -142,6 +142,17 @@ def _misfit(line: _Line, cell_s: Array, host_s: Array) -> float:
     return max(0.0, worst_s - by_chance_s)
 
 
+def robust_rate(cell_s: Array, host_s: Array) -> float:
+    """Seconds of the cell's own clock a second of the host's; of the points up to a quarter may be far off.
+
+    Parameters
+    ----------
+    cell_s, host_s
+        As `align` takes them, a few hundred at most being looked at; 1 where fewer than three are given.
+    """
+    return 1 / _robust_line(cell_s, host_s).rate
+
+
 def _lower_envelope(cell_s: Array, host_s: Array) -> _Line:
     """A line under the receive times: through the earliest sample of each of many windows."""
     return _robust_line(*_earliest(cell_s, host_s))

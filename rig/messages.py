@@ -294,7 +294,8 @@ class FinishedEvent(Message):
     summary: dict[str, Any] = Field(
         default_factory=dict,
         description="duration_s, samples, lost_samples, pulses, dropped_pulses, lateness_ms {median, p99, max}, "
-        "charge_uc, alignment {method, error_ms}, sample_rate_hz, torque_peak_nm, cpu_percent",
+        "charge_uc, alignment {method, error_ms}, sample_rate_hz, torque_peak_nm, cpu_percent, warnings (sentences "
+        "about what is in doubt, for people)",
     )
 
 

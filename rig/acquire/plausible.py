@@ -12,10 +12,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rig.align import robust_rate
+
 RATE_WINDOW_S = 3.0
 """Real seconds over which the rate is taken: a hiccup of the host of 60 ms is then 2 %."""
 RATE_TOLERANCE = 0.035
 HOLE_S = 0.06
+BIN_S = 0.1
+"""Rig seconds of which the earliest block is kept for the rate over the whole test."""
 FASTEST_NM_S = 1000.0
 
 
@@ -42,6 +46,7 @@ class Plausible:
         self._same_since_s: float | None = None
         self._arrived: deque[tuple[float, int]] = deque()
         self._count = 0
+        self._earliest: list[tuple[float, int]] = []
 
     def wrong(self, samples: NDArray[Any]) -> str | None:
         """What is wrong with this block, None if nothing is."""
@@ -78,7 +83,9 @@ class Plausible:
     def _off_rate(self, samples: NDArray[Any], now_s: float) -> str | None:
         self._count += len(samples)
         number = int(samples["counter"][-1])
-        self._arrived.append((now_s, number if number >= 0 else self._count))
+        number = number if number >= 0 else self._count
+        self._keep_earliest(now_s, number)
+        self._arrived.append((now_s, number))
         if len(self._arrived) > 1 and now_s - self._arrived[-2][0] > self._hole_s:
             self._arrived.clear()  # the host or the line stood still: begin anew
             return None
@@ -90,6 +97,32 @@ class Plausible:
         rate_hz = (self._arrived[-1][1] - first) / (now_s - first_s)
         if abs(rate_hz / self._rate_hz - 1) <= RATE_TOLERANCE:
             return None
+        return self._told(rate_hz)
+
+    def _keep_earliest(self, now_s: float, number: int) -> None:
+        """Of each bin of time the block that came with the least delay."""
+        kept = self._earliest
+        if not kept or int(kept[-1][0] / BIN_S) != int(now_s / BIN_S):
+            kept.append((now_s, number))
+        elif now_s - number / self._rate_hz < kept[-1][0] - kept[-1][1] / self._rate_hz:
+            kept[-1] = now_s, number
+
+    def wrong_at_end(self) -> str | None:
+        """Was the rate over the whole test another than the rig file's? None: no, or too little came to tell.
+
+        The window of `wrong` sees nothing in a test that is shorter, or where the host stood still again and again.
+        A host that stood still may bend this line by that much, which is allowed for.
+        """
+        kept = np.array(tuple(self._earliest), dtype=float).reshape(-1, 2)
+        if len(kept) < 3:
+            return None
+        rate_hz = robust_rate(kept[:, 1] / self._rate_hz, kept[:, 0]) * self._rate_hz
+        tolerance = RATE_TOLERANCE + self._hole_s / float(np.ptp(kept[:, 0]))
+        if abs(rate_hz / self._rate_hz - 1) <= tolerance:
+            return None
+        return self._told(rate_hz)
+
+    def _told(self, rate_hz: float) -> str:
         return (
             f"load cell: {rate_hz:.0f} samples/s come, the rig file says {self._rate_hz:g}; check its settings and bus"
         )

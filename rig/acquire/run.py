@@ -109,13 +109,13 @@ class TestRun:
         cpu_s, wall_s = time.process_time(), time.monotonic()
         self._gate.reset()
         torque = self._table["torque_nm"]
-        plausible = Plausible(
+        self._plausible = Plausible(
             self._table["torque_jump_nm"].hi,
             self._watch.stuck_torque_s * self._clock.speed,
             self._receiver.nominal_rate_hz,
             self._clock.speed,
         )
-        self._receiver.record(self._journal, (torque.lo, torque.hi), self._fault, plausible)
+        self._receiver.record(self._journal, (torque.lo, torque.hi), self._fault, self._plausible)
         disk = Disk(self._journal)
         self._health = Health(self._gate, self._receiver, disk, self._clock, self._watch)
         try:
@@ -206,7 +206,9 @@ class TestRun:
         self.stimulation_ended.set()
         if cause is None and not device[0]:  # a test whose end the device does not confirm did not end well
             self._fault(f"the end of stimulation is not confirmed: {device[2] or device[1]}")
-            cause = self.halt.cause
+        elif cause is None and (wrong := self._plausible.wrong_at_end()):
+            self._fault(wrong)
+        cause = self.halt.cause
         if cause is None:
             clock.wait(clock.now_s() + AROUND_S * clock.speed)  # samples on their way still belong to the test
             torque = True, "the test ended by itself"

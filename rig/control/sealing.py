@@ -24,6 +24,10 @@ log = logging.getLogger("rig.sealing")
 MIN_FREE_BYTES = 64 * 2**20
 """A test of the longest duration makes 25 MB of journal and as much of recording at 1600 samples/s."""
 
+DOUBTFUL_ALIGNMENT_MS = 5.0
+DOUBTFUL_RATE = 0.02
+"""Beyond these a recording's times are in doubt, and its finished event says so; a rate further off is a fault."""
+
 
 class Shelf:
     """The folders of unfinished journals and sealed recordings in the data folder."""
@@ -153,7 +157,29 @@ def _of_recording(recording: archive.Recording) -> dict[str, Any]:
             "delay_ms": alignment.delay_ms,
             "rate_ppm": alignment.rate_ppm,
         },
+        "warnings": warnings(recording),
     }
+
+
+def warnings(recording: archive.Recording) -> list[str]:
+    """What a person should know before a model is made of it, a sentence each; empty where nothing is in doubt."""
+    alignment, attributes = recording.alignment, recording.attributes
+    nominal_hz, measured_hz = attributes["sample_rate_hz"], attributes["sample_rate_measured_hz"]
+    if not len(recording.columns["torque/time_s"]):
+        return []
+    found = []
+    if not (alignment.error_ms <= DOUBTFUL_ALIGNMENT_MS):
+        error = "not known" if alignment.error_ms != alignment.error_ms else f"{alignment.error_ms:.1f} ms"
+        found.append(
+            f"torque and pulses: the alignment's error is {error} (up to {DOUBTFUL_ALIGNMENT_MS:g} ms is usual): the "
+            "computer or the bus stood still; delays of a model of this recording are in doubt"
+        )
+    if nominal_hz > 0 and not (abs(measured_hz / nominal_hz - 1) <= DOUBTFUL_RATE):
+        found.append(
+            f"load cell: {measured_hz:.0f} samples/s came, the rig file says {nominal_hz:g}: times of this recording "
+            "are in doubt"
+        )
+    return found
 
 
 def software() -> str:

@@ -101,8 +101,13 @@ class FakeCell:
         self.nan = False
         self.add_nm = 0.0
         self.skip = 0
+        self.rate = 1.0
+        self.noise_nm = 0.0
+        self._rng = np.random.default_rng(0)
         self.counter = 65000
         self.torque_nm = 0.0
+        self.held: Callable[[float], bool] = lambda _: False
+        self._held: list[Any] = []
         self._seen = 0
 
     def open(self) -> dict[str, Any]:
@@ -116,7 +121,7 @@ class FakeCell:
 
     def feed(self, receiver: Receiver, until_s: float, per_block: int = 10) -> None:
         """Schedule blocks for the receiver until a time."""
-        period_s = per_block / RATE_HZ
+        period_s = per_block / RATE_HZ / self.rate
         first_s = self.clock.now_s()
         for i in range(1, math.ceil((until_s - first_s) / period_s)):
             self.clock.call_at(first_s + i * period_s, lambda: self._block(receiver, per_block))
@@ -134,9 +139,16 @@ class FakeCell:
         block["host_time_s"] = now_s
         block["stamp_s"] = np.nan
         block["torque_nm"] = np.nan if self.nan else self.torque_nm + self.add_nm
+        block["torque_nm"] += self.noise_nm * self._rng.standard_normal(n)
         block["counter"] = (self.counter + np.arange(n)) % 65536
         block["sync"][0] = len(self.stimulator.sent) > self._seen
         self._seen = len(self.stimulator.sent)
+        self._held.append(block)
+        if self.held(now_s):  # the host or the bus stands still; what was measured comes afterwards, all at once
+            return
+        block = np.concatenate(self._held)
+        block["host_time_s"] = now_s
+        self._held.clear()
         receiver.take(TorqueBlock(block))
 
 

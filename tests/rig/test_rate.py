@@ -1,0 +1,113 @@
+"""A cell whose rate is another than the rig file's: told in the test, at the latest at its end, however short it is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rig import archive, journal
+from rig.acquire.plausible import Plausible
+from rig.control.sealing import warnings
+from rig.messages import SegmentPlan
+from rig.signals import SAMPLE
+from tests.rig.fakes import VirtualRig
+
+
+def hold(duration_s: float) -> list[SegmentPlan]:
+    return [SegmentPlan(name="hold", sequence="steps", settings={"on_s": duration_s, "off_s": 0.0, "repeats": 1})]
+
+
+def restless(rig: VirtualRig) -> None:
+    """70 ms of every second and a half without a sample: longer than a hole, shorter than what counts as silence."""
+    rig.cell.noise_nm = 0.01
+    rig.cell.held = lambda now_s: now_s % 1.5 < 0.07
+
+
+@pytest.mark.parametrize("rate", [0.5, 0.94, 1.06, 2.0])
+def test_a_short_test_of_a_cell_with_another_rate_is_a_fault(tmp_path: Path, rate: float):
+    rig = VirtualRig(tmp_path, hold(2.8))  # shorter than the window in which it would be told at once
+    rig.cell.rate = rate
+    result = rig.execute()
+    assert result.outcome == "fault"
+    told_hz = float(result.reason.removeprefix("load cell: ").split()[0])
+    assert told_hz == pytest.approx(1600 * rate, rel=0.02)
+    assert "the rig file says 1600" in result.reason
+    assert (rig.stimulator.sent == []) == (rate > 1.6)  # so fast it might be a buffer that is emptied: never armed
+    assert archive.assemble(journal.read(rig.path)).attributes["outcome"] == "fault"
+
+
+@pytest.mark.parametrize("rate", [0.95, 1.05])
+def test_a_rate_off_by_5_percent_stops_a_longer_test_within_4_s(tmp_path: Path, rate: float):
+    rig = VirtualRig(tmp_path, hold(12.0))
+    rig.cell.rate = rate
+    began_s = rig.clock.now_s()
+    assert rig.execute().outcome == "fault"
+    assert rig.stimulator.sent[-1][0] - began_s < 4.0
+
+
+@pytest.mark.parametrize(
+    ("rate", "outcome"), [(0.95, "fault"), (1.05, "fault"), (1.0, "completed"), (1.01, "completed")]
+)
+def test_a_restless_host_hides_no_rate_and_is_not_taken_for_one(tmp_path: Path, rate: float, outcome: str):
+    rig = VirtualRig(tmp_path, hold(12.0))
+    rig.cell.rate = rate
+    restless(rig)
+    result = rig.execute()
+    assert result.outcome == outcome, result.reason
+    assert ("samples/s come" in result.reason) == (outcome == "fault")
+
+
+def test_a_rig_that_runs_faster_than_the_world_still_sees_half_a_rate(tmp_path: Path):
+    """Its window of 3 real seconds is then longer than the test."""
+    rig = VirtualRig(tmp_path, hold(6.0))
+    rig.clock.speed = 20.0
+    rig.cell.rate = 0.5
+    result = rig.execute()
+    assert result.outcome == "fault"
+    assert "800 samples/s come" in result.reason
+
+
+def test_a_cell_without_a_counter_is_judged_by_what_came():
+    found = {}
+    for rate in (0.9, 1.0):
+        judge = Plausible(5.0, 1e9, 1600.0, 1.0)
+        for i in range(200):
+            block = np.zeros(16, SAMPLE)
+            block["counter"], block["host_time_s"], block["torque_nm"] = -1, i * 0.01 / rate, i % 2
+            assert judge.wrong(block) is None
+        found[rate] = judge.wrong_at_end()
+    assert found[1.0] is None
+    assert found[0.9]
+    assert "1440 samples/s" in found[0.9]
+
+
+def test_what_came_too_little_is_not_judged():
+    judge = Plausible(5.0, 1e9, 1600.0, 1.0)
+    assert judge.wrong_at_end() is None
+    block = np.zeros(16, SAMPLE)
+    judge.wrong(block)
+    assert judge.wrong_at_end() is None
+
+
+def test_times_in_doubt_are_told_with_the_finished_test(tmp_path: Path):
+    rig = VirtualRig(tmp_path)
+    rig.execute()
+    recording = archive.assemble(journal.read(rig.path))
+    assert warnings(recording) == []
+    for error_ms, words in ((60.0, "60.0 ms"), (float("nan"), "not known")):
+        doubtful = archive.Recording(
+            recording.columns,
+            recording.names,
+            recording.attributes,
+            type(recording.alignment)("sync", error_ms, 0.0, 0.0),
+        )
+        assert words in warnings(doubtful)[0]
+    recording.attributes["sample_rate_measured_hz"] = 1560.0
+    assert "1560 samples/s came, the rig file says 1600" in warnings(recording)[0]
+    (tmp_path / "2").mkdir()
+    nothing = VirtualRig(tmp_path / "2")
+    nothing.cell.silent = True
+    nothing.execute()
+    assert warnings(archive.assemble(journal.read(nothing.path))) == []
