@@ -22,11 +22,13 @@ from rig.clock import MonotonicClock
 from rig.control.rig import Rig
 from rig.control.server import Server
 from rig.errors import RigError
+from rig.notify import Notifier
 
 SWITCH_INTERVAL_S = 0.0005
 """How long a thread may hold the interpreter while the sender waits; Python's default is 5 ms."""
 PROCESS_PRIORITY = 10
-PARENT_PERIOD_S = 0.5
+BEAT_PERIOD_S = 0.5
+"""How often the process looks whether its parent lives, and whether it lives itself (deploy: WatchdogSec)."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -82,15 +84,19 @@ async def _serve(config: configuration.RigConfig, parent: int | None) -> None:
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop.set)
-    server = Server()
+    server, notifier = Server(), Notifier()
     rig = Rig(config, MonotonicClock(config.clock_speed), server.publish)
     await asyncio.to_thread(rig.open)
     await server.start(rig, config.socket)
     print(json.dumps({"socket": str(config.socket), "state": rig.status().state}), flush=True)
+    notifier.ready()
     while not stop.is_set() and parent in (None, os.getppid()):
+        # in a worker thread: an event loop that hangs, or threads that all wait, feed nothing
+        notifier.alive(await asyncio.to_thread(rig.trouble))
         with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(stop.wait(), PARENT_PERIOD_S)
+            await asyncio.wait_for(stop.wait(), BEAT_PERIOD_S)
     logging.getLogger("rig").info("asked to end")
+    notifier.stopping()
     await asyncio.to_thread(rig.close)
     await server.close()
     config.socket.unlink(missing_ok=True)

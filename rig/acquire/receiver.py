@@ -6,6 +6,7 @@ its limit or no number.
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -21,6 +22,8 @@ from rig.devices import LoadCell
 from rig.errors import DeviceError, JournalError
 from rig.journal import Journal, Kind
 from rig.signals import Recorded, TorqueBlock
+
+log = logging.getLogger("rig.receiver")
 
 READ_TIMEOUT_S = 0.02
 SILENCE_S = 1.0
@@ -103,6 +106,11 @@ class Receiver:
         """Begin to read."""
         self._thread = threading.Thread(target=self._run, name="torque-receiver", daemon=True)
         self._thread.start()
+
+    @property
+    def living(self) -> bool:
+        """Does its thread still read?"""
+        return self._thread is not None and self._thread.is_alive()
 
     def close(self) -> None:
         """End the thread and give the bus back."""
@@ -230,6 +238,13 @@ class Receiver:
             self.range_nm = min(self.range_nm[0], mean_nm), max(self.range_nm[1], mean_nm)
 
     def _run(self) -> None:
+        try:
+            self._read_all()
+        except Exception as error:  # a mistake in a driver or here: told at once, not only by its silence
+            log.exception("the torque receiver broke")
+            self._lose(f"load cell: internal: {type(error).__name__}: {error}")
+
+    def _read_all(self) -> None:
         last_heard_s = self._clock.now_s()
         while not self._closing.is_set():
             try:

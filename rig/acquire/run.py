@@ -98,6 +98,7 @@ class TestRun:
         self._receiver = receiver
         self._clock = clock
         self._watch = watch
+        self._asked_s: float | None = None
         self._rest_nm: float | None = None
         self._outcome: TestOutcome = "fault"
         self._duration_s = 0.0
@@ -147,6 +148,11 @@ class TestRun:
         """Pulses dropped so far because they were late."""
         return self._gate.dropped
 
+    def sender_age_s(self) -> float:
+        """Real seconds since the sender last asked for proof of health; 0 while it has nothing to send."""
+        asked_s = self._asked_s
+        return 0.0 if asked_s is None else (self._clock.now_s() - asked_s) / self._clock.speed
+
     def elapsed_s(self) -> float:
         """Time on the test's clock, 0 before its start."""
         return 0.0 if self.t0_s is None else max(0.0, self._clock.now_s() - self.t0_s)
@@ -190,6 +196,7 @@ class TestRun:
                 self._rest_nm = self._receiver.torque_around(0.1 * clock.speed)  # at rest, if ever
             if clock.wait(due_s, self.halt.event):
                 return
+            self._asked_s = clock.now_s()
             wrong = self._health.wrong(due_s)
             if wrong is not None:
                 self._fault(wrong)
@@ -200,6 +207,7 @@ class TestRun:
 
     def _stop(self) -> StopEvidence:
         """Stop the device, ask its state, watch the torque fall, end the journal."""
+        self._asked_s = None
         clock, cause = self._clock, self.halt.cause
         at_stop_nm = self._receiver.torque_around(AROUND_S * clock.speed)
         device = stop_device(self._gate)

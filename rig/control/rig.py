@@ -6,6 +6,7 @@ import logging
 import math
 import re
 import threading
+import time
 from collections.abc import Callable
 
 from rig import limits, plan
@@ -40,6 +41,11 @@ log = logging.getLogger("rig")
 _NAME = re.compile(r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$")
 STOP_TIMEOUT_S = 6.0
 """Real seconds to wait for the evidence of a stop, decay of the torque included."""
+HUNG_S = 5.0
+"""Real seconds without a sign of the sender: it asks for proof of health at every pulse's time, 1 s apart at most."""
+LOCK_PATIENCE_S = 0.2
+LONGEST_REQUEST_S = 60.0
+"""Real seconds that a request may take: re-arming opens both devices anew and seals what a full disk had left."""
 
 
 class Rig:
@@ -80,6 +86,7 @@ class Rig:
         self._next_live_pulse = 0
         self._calibration: Calibration | None = None
         self._last_pulse_s: float | None = None
+        self._held_since_s: float | None = None
         self._born_s = clock.now_s()
         self.finished: FinishedEvent | None = None
 
@@ -138,6 +145,25 @@ class Rig:
             calibration=calibration,
             finished=self.finished,
         )
+
+    def trouble(self) -> str | None:
+        """What should live in this process and does not; None: all of it does. For the process's own watchdog."""
+        if self._lock.acquire(timeout=LOCK_PATIENCE_S):
+            self._lock.release()
+            self._held_since_s = None
+        else:
+            now_s = time.monotonic()
+            since_s = self._held_since_s = self._held_since_s or now_s
+            if now_s - since_s > LONGEST_REQUEST_S:
+                return f"a request has not come to its end for {now_s - since_s:.0f} s"
+        trial, run, thread, receiver = self._trial, self._run, self._thread, self._pair.receiver
+        if run is not None and run.sender_age_s() > HUNG_S:
+            return f"the sender hangs: it has asked for nothing for {run.sender_age_s():.0f} s"
+        if trial.busy and not (thread is not None and (thread.is_alive() or thread.ident is None)):
+            return f"the thread of test {trial.test_id} has ended without an end"
+        if receiver is not None and not receiver.living and trial.state != "disconnected" and not trial.lost:
+            return "the torque receiver's thread has ended"
+        return None
 
     def preview(self, request: PreviewRequest) -> Preview:
         """Duration, dose and pulses of a plan. Raises PlanError, RefusedError."""

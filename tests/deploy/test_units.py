@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from api.launcher import SEAL_S
-from rig.__main__ import PROCESS_PRIORITY
+from rig.__main__ import BEAT_PERIOD_S, PROCESS_PRIORITY
 from rig.acquire.run import SENDER_PRIORITY
 
 ROOT = Path(__file__).parents[2]
@@ -73,6 +73,13 @@ def test_a_stop_of_the_unit_leaves_time_to_seal_and_a_crash_is_followed_by_a_sta
     for settings in (RIG, API):
         assert settings["Restart"] == ["always"]
         assert settings["RestartPreventExitStatus"] == ["2"]
+
+
+def test_a_rig_that_hangs_is_found_and_one_that_is_busy_is_let_be() -> None:
+    """What the process sends: tests/rig/test_notify.py."""
+    assert (RIG["Type"], RIG["NotifyAccess"]) == (["notify"], ["main"])
+    assert 10 * BEAT_PERIOD_S < int(RIG["WatchdogSec"][0]) <= 60
+    assert "AF_UNIX" in RIG["RestrictAddressFamilies"][0].split()
 
 
 def test_both_speak_of_the_same_socket_and_folders() -> None:

@@ -51,6 +51,9 @@ def test_the_example_is_good():
     path = Path(__file__).parents[2] / "deploy" / "rig.example.toml"
     loaded = config.load(path)
     assert find("load_cell", loaded.load_cell.device).create(loaded.load_cell, None).sample_rate_hz == 1600
+    assert loaded.require_calibration
+    rest = loaded.limits.table()["rest_between_tests_s"]
+    assert (rest.lo, rest.owner) == (60.0, "rig file")
 
 
 MISTAKES = {

@@ -1,0 +1,60 @@
+"""What the rig tells systemd: that it is ready, that it lives, that it ends (sd_notify's protocol, a datagram a word).
+
+Without systemd (no NOTIFY_SOCKET) nothing is told. Source: systemd, sd_notify(3).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+from collections.abc import Mapping
+
+
+class Notifier:
+    """Speaks to the service manager that started this process; never blocks, never raises.
+
+    Parameters
+    ----------
+    environment
+        Where NOTIFY_SOCKET and WATCHDOG_USEC are looked for.
+    """
+
+    def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
+        address = environment.get("NOTIFY_SOCKET", "")
+        self._address = "\0" + address[1:] if address.startswith("@") else address  # @: an abstract socket
+        self.watched = bool(address) and environment.get("WATCHDOG_USEC", "").isdigit()
+        self._complained = False
+
+    def ready(self) -> None:
+        """The socket answers and both devices have been tried."""
+        self._tell("READY=1")
+
+    def alive(self, trouble: str | None) -> None:
+        """Feed the watchdog if there is proof of health; else say what is wrong, and let it bark.
+
+        Parameters
+        ----------
+        trouble
+            What `Rig.trouble` found; None: all that must live does.
+        """
+        if trouble is None:
+            if self._complained:
+                self._tell("STATUS=")
+            self._complained = False
+            if self.watched:
+                self._tell("WATCHDOG=1")
+        elif not self._complained:
+            self._complained = True
+            self._tell(f"STATUS=not fed: {trouble}")
+
+    def stopping(self) -> None:
+        """Stimulation is being stopped, the recording sealed."""
+        self._tell("STOPPING=1")
+
+    def _tell(self, words: str) -> None:
+        if not self._address:
+            return
+        with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as line:
+            line.setblocking(False)
+            line.sendto(words.encode(), self._address)

@@ -1,0 +1,234 @@
+"""The rig itself, on devices in this process: from one test to the next, and what only a person may undo."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import h5py
+import pytest
+
+from rig.control import rig as control
+from rig.errors import BusyError, DeviceError, LatchedError, PlanError, RefusedError, UncertainError
+from rig.messages import CalibrateStartRequest, PreviewRequest, Profile
+from tests.rig.live import SPEED, LiveRig
+
+Make = Callable[..., LiveRig]
+
+
+@pytest.fixture
+def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Make]:
+    made: list[LiveRig] = []
+
+    def of(**overrides: Any) -> LiveRig:
+        made.append(LiveRig(tmp_path, monkeypatch, **overrides))
+        return made[-1]
+
+    yield of
+    for live in made:
+        live.rig.close()
+
+
+def test_from_ready_to_ready_with_a_sealed_file(make: Make):
+    live = make()
+    assert live.rig.start(live.plan("one")).state in ("arming", "running")
+    live.wait("running")
+    with pytest.raises(BusyError, match="test one of participant P"):
+        live.rig.start(live.plan("two"))
+    status = live.rig.status()
+    assert (status.test_id, status.participant, status.duration_s) == ("one", "P", 3.0)
+    assert live.rig.live() is not None
+    assert live.rig.trouble() is None
+    live.wait("ready")
+    assert live.states == ["ready", "arming", "running", "sealing", "ready"]
+    finished = live.rig.finished
+    assert finished is not None
+    assert (finished.outcome, finished.reason) == ("completed", "")
+    assert finished in live.events
+    assert finished.summary["warnings"] == []
+    with h5py.File(str(finished.recording_path)) as file:
+        assert file.attrs["test_id"] == "one"
+    with pytest.raises(PlanError, match="used before"):
+        live.rig.start(live.plan("one"))
+    with pytest.raises(PlanError, match="letters, digits"):
+        live.rig.start(live.plan("../two"))
+
+
+def test_the_rest_between_two_tests_is_asked_for_and_says_how_long(make: Make):
+    live = make()
+    live.rig.start(live.plan("one", hold_s=0.5))
+    live.wait("ready")
+    rested = Profile(rest_between_tests_s=60.0)
+    with pytest.raises(RefusedError, match=r"rest_between_tests_s .*participant's profile, under by .*; wait 5\d"):
+        live.rig.start(live.plan("two", profile=rested))
+    assert live.rig.preview(PreviewRequest(plan=live.plan("p", profile=rested))).duration_s == 3.0
+
+
+def test_a_stop_latches_over_the_rigs_death_until_a_person_rearms(make: Make):
+    live = make()
+    live.rig.start(live.plan("one", hold_s=20.0))
+    live.wait_pulses(20)
+    evidence = live.rig.stop("enough", "nurse")
+    sent = len(live.stimulator.sent)
+    assert evidence.confirmed, evidence
+    assert live.wait("latched") == "enough (by nurse)"
+    assert live.rig.finished is not None
+    assert live.rig.finished.outcome == "stopped"
+    with pytest.raises(LatchedError, match="enough"):
+        live.rig.start(live.plan("two"))
+    assert len(live.stimulator.sent) == sent
+    live.rig.close()
+    again = make()
+    assert again.wait("latched") == "enough (by nurse)"
+    assert again.rig.rearm("nurse").state == "ready"
+    assert again.states[-1] == "ready"
+
+
+@pytest.mark.parametrize(
+    ("inject", "words"),
+    [
+        (lambda live: setattr(live.stimulator, "error", "electrode error"), "electrode error at pulse"),
+        (lambda live: setattr(live.cell, "silent", True), "torque is stale"),
+    ],
+)
+def test_a_fault_stops_says_why_and_latches(make: Make, inject: Callable[[LiveRig], None], words: str):
+    live = make()
+    live.rig.start(live.plan("one", hold_s=20.0))
+    live.wait_pulses(10)
+    inject(live)
+    assert words in live.wait("latched")
+    assert live.rig.finished is not None
+    assert live.rig.finished.outcome == "fault"
+    live.stimulator.error, live.cell.silent = None, False
+    assert live.rig.rearm("nurse").state == "ready"
+
+
+def test_half_the_rate_is_a_fault(make: Make):
+    live = make()
+    live.cell.rate = 0.5
+    time.sleep(2 * live.cell.age_s / SPEED + 0.05)  # until it has fallen behind
+    live.rig.start(live.plan("one", hold_s=3.0))
+    assert float(live.wait("latched").split()[2]) == pytest.approx(800, rel=0.03)
+    assert "samples/s come" in live.rig.status().reason
+
+
+def test_a_mistake_in_a_driver_is_told_as_one(make: Make):
+    live = make()
+    live.rig.start(live.plan("one", hold_s=20.0))
+    live.wait_pulses(5)
+    live.cell.broken = True
+    assert "internal: ZeroDivisionError: a mistake in a driver" in live.wait("latched")
+    live.cell.broken = False
+    assert live.rig.rearm("nurse").state == "ready"
+
+
+def test_a_device_that_is_gone_is_told_and_opened_anew_by_rearming(make: Make):
+    live = make()
+    live.cell.gone = True
+    assert "the bus is gone" in live.wait("disconnected")
+    assert live.rig.trouble() is None  # told, and waiting for a person: nothing that a restart would mend
+    with pytest.raises(DeviceError, match="mend it"):
+        live.rig.start(live.plan("one"))
+    with pytest.raises(DeviceError, match="not there"):
+        live.rig.rearm("nurse")
+    live.cell.gone = False
+    assert live.rig.rearm("nurse").state == "ready"
+
+
+def test_a_stop_of_a_deaf_device_is_not_called_confirmed(make: Make):
+    live = make()
+    live.stimulator.deaf = True
+    assert not live.rig.stop("check", "nurse").confirmed
+    assert live.rig.status().state == "latched"
+
+
+def test_a_calibration_from_start_to_its_profile(make: Make):
+    live = make()
+    with pytest.raises(PlanError, match="none is open"):
+        live.rig.calibrate_step("up")
+    request = CalibrateStartRequest(calibration_id="c", participant="P", by="therapist", step_us=25.0, train_s=0.5)
+    assert live.rig.calibrate(request).state == "calibrating"
+    with pytest.raises(BusyError, match="calibration"):
+        live.rig.start(live.plan("one"))
+    for threshold in ("sensory", "motor", "comfort"):
+        live.rig.calibrate_step("up")
+        with pytest.raises(BusyError):
+            live.rig.calibrate_step("up")
+        live.wait("calibrating")
+        assert threshold in live.rig.calibrate_mark(threshold).calibration.marks_us  # pyright: ignore
+    with pytest.raises(RefusedError, match="comfort maximum"):
+        live.rig.calibrate_step("up")
+    result = live.rig.calibrate_finish("therapist", discard=False)
+    assert result.profile is not None
+    assert result.profile.max_pulse_width_us == 75.0
+    assert len(result.recordings) == 3
+    assert live.rig.finished is None  # a train is no test
+    assert max(pulse.pulse_width_us for _, pulse in live.stimulator.sent) == 75
+    assert live.rig.status().state == "ready"
+
+
+def test_a_stop_closes_the_calibration(make: Make):
+    live = make()
+    live.rig.calibrate(CalibrateStartRequest(calibration_id="c", participant="P", by="t", train_s=2.0))
+    live.rig.calibrate_step("up")
+    live.wait_pulses(3)
+    live.rig.stop("ouch", "P")
+    live.wait("latched")
+    assert live.rig.status().calibration is None
+    with pytest.raises(PlanError, match="none is open"):
+        live.rig.calibrate_step("up")
+
+
+def test_a_journal_without_an_end_comes_back_uncertain(make: Make, tmp_path: Path):
+    live = make()
+    live.rig.start(live.plan("one", hold_s=20.0))
+    live.wait_pulses(10)
+    left = (tmp_path / "journals" / "one.journal").read_bytes()
+    live.rig.close()
+    (tmp_path / "latch.json").unlink()
+    (tmp_path / "journals" / "dead.journal").write_bytes(left.replace(b'"one"', b'"ten"'))
+    again = make()
+    assert "died" in again.wait("uncertain")
+    with pytest.raises(UncertainError):
+        again.rig.start(again.plan("two"))
+    assert again.rig.finished is not None
+    assert again.rig.finished.outcome == "fault"
+    assert again.rig.rearm("nurse").state == "ready"
+
+
+def test_what_hangs_or_died_is_trouble(make: Make, monkeypatch: pytest.MonkeyPatch):
+    live = make()
+    rig = live.rig
+    assert rig.trouble() is None
+    monkeypatch.setattr(control, "LOCK_PATIENCE_S", 0.01)
+    release, held = threading.Event(), threading.Event()
+
+    def hang() -> None:
+        with rig._lock:
+            held.set()
+            release.wait(10)
+
+    thread = threading.Thread(target=hang)
+    thread.start()
+    held.wait()
+    assert rig.trouble() is None  # a request may take its time
+    monkeypatch.setattr(control, "LONGEST_REQUEST_S", 0.0)
+    assert "has not come to its end" in str(rig.trouble())
+    release.set()
+    thread.join()
+    assert rig.trouble() is None
+    rig.start(live.plan("one", hold_s=20.0))
+    live.wait_pulses(5)
+    assert rig.trouble() is None
+    run = rig._run
+    assert run is not None
+    monkeypatch.setattr(run, "sender_age_s", lambda: 6.0)
+    assert "sender hangs" in str(rig.trouble())
+    monkeypatch.undo()
+    receiver = rig._pair.receiver
+    assert receiver is not None
+    monkeypatch.setattr(type(receiver), "living", False)
+    assert "receiver" in str(rig.trouble())
