@@ -11,7 +11,7 @@ from typing import Any
 import h5py
 import pytest
 
-from rig.control import rig as control
+from rig.control import core
 from rig.errors import BusyError, DeviceError, LatchedError, PlanError, RefusedError, UncertainError
 from rig.messages import CalibrateStartRequest, PreviewRequest, Profile
 from tests.rig.live import SPEED, LiveRig
@@ -203,7 +203,7 @@ def test_what_hangs_or_died_is_trouble(make: Make, monkeypatch: pytest.MonkeyPat
     live = make()
     rig = live.rig
     assert rig.trouble() is None
-    monkeypatch.setattr(control, "LOCK_PATIENCE_S", 0.01)
+    monkeypatch.setattr(core, "LOCK_PATIENCE_S", 0.01)
     release, held = threading.Event(), threading.Event()
 
     def hang() -> None:
@@ -215,7 +215,7 @@ def test_what_hangs_or_died_is_trouble(make: Make, monkeypatch: pytest.MonkeyPat
     thread.start()
     held.wait()
     assert rig.trouble() is None  # a request may take its time
-    monkeypatch.setattr(control, "LONGEST_REQUEST_S", 0.0)
+    monkeypatch.setattr(core, "LONGEST_REQUEST_S", 0.0)
     assert "has not come to its end" in str(rig.trouble())
     release.set()
     thread.join()

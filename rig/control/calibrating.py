@@ -1,0 +1,78 @@
+"""The verbs of a guided calibration, as people ask for them; `rig.control.calibration` decides, `Playing` plays."""
+
+from __future__ import annotations
+
+import logging
+
+from rig import plan
+from rig.control.calibration import Calibration
+from rig.control.playing import Playing, check_names
+from rig.errors import BusyError, PlanError
+from rig.messages import CalibrateStartRequest, CalibrationResult, StateEvent, Status, Threshold
+
+log = logging.getLogger("rig")
+
+
+class Calibrating(Playing):
+    """Opens, plays step by step, marks and closes a calibration."""
+
+    def calibrate(self, request: CalibrateStartRequest) -> Status:
+        """Open a guided calibration; nothing is sent yet.
+
+        Raises
+        ------
+        BusyError, LatchedError, UncertainError, DeviceError
+            As for a test.
+        PlanError, RefusedError
+            A wrong name or id; a step, train, current or rate outside the limits.
+        """
+        with self._lock:
+            following = self._trial.calibrate(request.participant)
+            check_names("calibration", calibration_id=request.calibration_id, participant=request.participant)
+            calibration = Calibration(request, self._table)
+            self._shelf.check_room(f"{request.calibration_id}.001")
+            self._calibration = calibration
+            self._change(following)
+        return self.status()
+
+    def calibrate_step(self, direction: str) -> Status:
+        """Play one train: a step up, a step down, or the same again; returns when it has begun.
+
+        Raises
+        ------
+        PlanError, BusyError, RefusedError
+            No calibration is open; a train is on its way; above a limit or the marked comfort maximum.
+        """
+        with self._lock:
+            calibration = self._open_calibration()
+            request = calibration.train(calibration.next_width_us(direction))
+            test = plan.build(request, calibration.table)
+            self._check_rest(test, calibration.table["rest_between_trains_s"])
+            self._shelf.check_room(request.test_id)
+            self._launch(test, calibration.table, self._trial.train(request.test_id))
+        return self.status()
+
+    def calibrate_mark(self, threshold: Threshold) -> Status:
+        """Mark the last train's width as a threshold. Raises PlanError, BusyError."""
+        with self._lock:
+            self._open_calibration().mark(threshold)
+            self._publish(StateEvent(status=self.status()))
+        return self.status()
+
+    def calibrate_finish(self, by: str, discard: bool) -> CalibrationResult:
+        """Close the calibration and give its profile. Raises PlanError (a threshold is missing), BusyError."""
+        with self._lock:
+            calibration = self._open_calibration()
+            profile = None if discard else calibration.profile(self._clock.unix_s())
+            log.info(
+                "calibration %s %s by %s", calibration.request.calibration_id, "discarded" if discard else "done", by
+            )
+            self._change(self._trial.calibrated())
+        return CalibrationResult(profile=profile, recordings=calibration.recordings)
+
+    def _open_calibration(self) -> Calibration:
+        if self._calibration is None:
+            raise PlanError("calibration: none is open (a stop or a fault closes it); begin with calibrate-start")
+        if self._trial.state != "calibrating":
+            raise BusyError(f"calibration: train {self._trial.test_id} is {self._trial.state}; wait or stop it")
+        return self._calibration

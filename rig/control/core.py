@@ -1,0 +1,172 @@
+"""What all of the rig's deeds stand on: its devices, its state, what is told of it, and how anything ends."""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+import time
+from collections.abc import Callable
+
+from rig.acquire.halt import Cause, Halt
+from rig.acquire.run import TestRun
+from rig.clock import Clock
+from rig.config import RigConfig
+from rig.control.calibration import Calibration
+from rig.control.latch import Latch, Remembered, lock_folder
+from rig.control.live import live_event
+from rig.control.pair import Pair
+from rig.control.sealing import Shelf
+from rig.errors import ConfigError, RigError
+from rig.messages import Event, FinishedEvent, LiveEvent, StateEvent, Status, StopEvidence
+from rig.trial import Trial
+
+log = logging.getLogger("rig")
+
+HUNG_S = 5.0
+"""Real seconds without a sign of the sender: it asks for proof of health at every pulse's time, 1 s apart at most."""
+LOCK_PATIENCE_S = 0.2
+LONGEST_REQUEST_S = 60.0
+"""Real seconds that a request may take: re-arming opens both devices anew and seals what a full disk had left."""
+
+
+class Core:
+    """State and devices of a rig (see `rig.control.rig.Rig`, which is what others use).
+
+    `_lock` guards the state; a stop of a running test never waits for it.
+    """
+
+    def __init__(self, config: RigConfig, clock: Clock, publish: Callable[[Event], None]) -> None:
+        self._watch = config.watch.watch()
+        self._clock = clock
+        self._publish = publish
+        self._table = config.limits.table()
+        self._require_calibration = config.require_calibration
+        self._shelf = Shelf(config, clock)
+        try:
+            self._shelf.make_folders()
+            self._folder_lock = lock_folder(config.data_dir)
+        except OSError as error:
+            raise ConfigError(f"data_dir: {error.filename or config.data_dir}: {error.strerror}") from None
+        self._latch = Latch(config.data_dir)
+        self._lock = threading.RLock()
+        self._trial = Trial()
+        self._pair = Pair(config, clock, self._fault, self._lost)
+        self._halt: Halt | None = None
+        self._run: TestRun | None = None
+        self._thread: threading.Thread | None = None
+        self._evidence: StopEvidence | None = None
+        self._told = threading.Event()
+        self._next_live_pulse = 0
+        self._calibration: Calibration | None = None
+        self._last_pulse_s: float | None = None
+        self._held_since_s: float | None = None
+        self._born_s = clock.now_s()
+        self.finished: FinishedEvent | None = None
+
+    def status(self) -> Status:
+        """How things stand now."""
+        with self._lock:
+            trial, run, receiver = self._trial, self._run, self._pair.receiver
+            calibration = self._calibration.status() if self._calibration else None
+        elapsed_s = run.elapsed_s() if run else 0.0
+        seen = receiver is not None and receiver.last_s is not None
+        torque_nm = receiver.last_torque_nm if receiver else None
+        cell = dict(self._pair.identity["load_cell"])
+        if receiver and (measured_hz := receiver.measured_rate_hz()) is not None:
+            cell["measured_rate_hz"] = round(measured_hz, 2)
+        return Status(
+            state=trial.state,
+            reason=trial.reason if trial.lost in trial.reason else f"{trial.reason}; {trial.lost}".lstrip("; "),
+            test_id=trial.test_id,
+            participant=trial.participant,
+            segment=run.segment() if run else None,
+            elapsed_s=elapsed_s,
+            duration_s=run.test.duration_s if run else 0.0,
+            stimulator=self._pair.identity["stimulator"],
+            load_cell=cell,
+            torque_age_s=receiver.age_s(self._clock.now_s()) if receiver and seen else None,
+            torque_nm=torque_nm if torque_nm is not None and math.isfinite(torque_nm) else None,
+            calibration=calibration,
+            finished=self.finished,
+        )
+
+    def trouble(self) -> str | None:
+        """What should live in this process and does not; None: all of it does. For the process's own watchdog."""
+        if self._lock.acquire(timeout=LOCK_PATIENCE_S):
+            self._lock.release()
+            self._held_since_s = None
+        else:
+            now_s = time.monotonic()
+            since_s = self._held_since_s = self._held_since_s or now_s
+            if now_s - since_s > LONGEST_REQUEST_S:
+                return f"a request has not come to its end for {now_s - since_s:.0f} s"
+        trial, run, thread, receiver = self._trial, self._run, self._thread, self._pair.receiver
+        if run is not None and run.sender_age_s() > HUNG_S:
+            return f"the sender hangs: it has asked for nothing for {run.sender_age_s():.0f} s"
+        if trial.busy and not (thread is not None and (thread.is_alive() or thread.ident is None)):
+            return f"the thread of test {trial.test_id} has ended without an end"
+        if receiver is not None and not receiver.living and trial.state != "disconnected" and not trial.lost:
+            return "the torque receiver's thread has ended"
+        return None
+
+    def live(self) -> LiveEvent | None:
+        """The newest torque and pulses; None where nothing came since the last call."""
+        with self._lock:
+            run, receiver, now_s = self._run, self._pair.receiver, self._clock.now_s()
+            if receiver is None:
+                return None
+            origin_s = run.t0_s if run and run.t0_s is not None else self._born_s
+            event = live_event(receiver, run, origin_s, now_s, self._next_live_pulse)
+            if event is not None:
+                self._next_live_pulse += len(event.pulse_time_s)
+            return event
+
+    def _fault(self, reason: str) -> None:
+        """A device says that something is wrong, from one of its threads."""
+        log.error("%s", reason)
+        self._end("fault", reason)
+
+    def _lost(self, reason: str) -> None:
+        """A device is gone, from one of its threads."""
+        log.error("%s", reason)
+        self._end("fault", reason, latch_idle=False)
+        with self._lock:
+            self._change(self._trial.disconnected(reason))
+
+    def _end(self, cause: Cause, reason: str, latch_idle: bool = True) -> bool:
+        """End the test that runs, or latch; True if one runs. Takes the lock only when idle: a stop must not wait."""
+        halt = self._halt
+        if not (self._trial.busy and halt is not None):
+            with self._lock:  # a start may be on its way, and must then be ended, too
+                halt = self._halt if self._trial.busy else None
+                if halt is None and latch_idle:
+                    self._halted(reason)
+        if halt is not None:
+            halt.set(cause, reason)
+        return halt is not None
+
+    def _remember(self, state: Remembered, reason: str) -> None:
+        """Write the latch file; where the disk refuses, the rig stays stopped all the same, and what the file says
+        since the test's start ("running") makes the next start uncertain."""
+        try:
+            self._latch.write(state, reason)
+        except RigError as error:
+            log.error("%s", error)
+
+    def _halted(self, reason: str) -> None:
+        with self._lock:
+            following = self._trial.halted(reason)
+            if following.state == "latched":
+                self._remember("latched", reason)
+            self._change(following)
+
+    def _change(self, trial: Trial) -> None:
+        with self._lock:
+            changed = trial != self._trial
+            self._trial = trial
+            if not trial.calibrating:
+                self._calibration = None  # a stop, a fault or a lost device closes it
+        if changed:
+            log.info("state %s %s", trial.state, trial.reason, extra={"test_id": trial.test_id})
+            self._publish(StateEvent(status=self.status()))

@@ -1,0 +1,112 @@
+"""One test, or one train of a calibration: from its journal's first block to its sealed recording."""
+
+from __future__ import annotations
+
+import logging
+import re
+import threading
+
+from rig import limits, plan
+from rig.acquire.halt import Halt
+from rig.acquire.run import LEAD_S, TestRun
+from rig.control.core import Core
+from rig.errors import JournalError, PlanError, RefusedError
+from rig.trial import Trial
+
+log = logging.getLogger("rig")
+
+_NAME = re.compile(r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$")
+
+
+class Playing(Core):
+    """Plays what has been planned and admitted."""
+
+    def _check_rest(self, test: plan.PlannedTest, limit: limits.Limit) -> None:
+        """Time enough between the last pulse that was sent and the first that is planned?"""
+        if self._last_pulse_s is None or not (test.pulse_width_us > 0).any():
+            return
+        first_s = float((test.pulse_width_us > 0).argmax()) / test.plan.pulse_rate_hz + LEAD_S * self._clock.speed
+        rest_s = self._clock.now_s() + first_s - self._last_pulse_s
+        refusal = limits.check(limit, rest_s)
+        if refusal is not None:
+            raise RefusedError(f"plan: {refusal}; wait {limit.lo - rest_s:.1f} s")
+
+    def _launch(self, test: plan.PlannedTest, table: dict[str, limits.Limit], following: Trial) -> None:
+        """Journal, latch file, thread: what every test and every train of a calibration goes through."""
+        self._latch.write("running", f"test {following.test_id} of participant {following.participant}")
+        try:
+            self._begin(test, table)
+        except JournalError:
+            self._latch.clear()
+            raise
+        self._change(following)
+        assert self._thread is not None
+        self._thread.start()
+
+    def _begin(self, test: plan.PlannedTest, table: dict[str, limits.Limit]) -> None:
+        gate, receiver = self._pair.gate, self._pair.receiver
+        assert gate is not None
+        assert receiver is not None
+        journal = self._shelf.begin(test, self._pair.identity)
+        halt = Halt(self._clock)
+        run = TestRun(test, table, journal, gate, receiver, self._clock, halt, self._watch)
+        halt.on_set(lambda: self._halted(halt.reason))
+        self._halt, self._run, self._evidence = halt, run, None
+        self._told.clear()
+        self._next_live_pulse = 0
+        self._thread = threading.Thread(target=self._execute, args=(run,), name="test", daemon=True)
+
+    def _execute(self, run: TestRun) -> None:
+        threading.Thread(target=self._announce, args=(run,), name="announce", daemon=True).start()
+        try:
+            result = run.execute()
+            self._evidence = result.evidence
+            self._told.set()
+            with self._lock:
+                self._change(self._trial.ended())
+            finished = self._shelf.finish(run.journal_path, run.test.plan.test_id, result)
+        except Exception as error:  # a mistake in this program: stay stopped, keep the journal for the next start
+            log.exception("the test could not be ended in order")
+            self._broken(f"internal: {type(error).__name__}: {error}")
+            return
+        with self._lock:
+            self._run = None
+            self._last_pulse_s = result.last_pulse_s or self._last_pulse_s
+            train = self._trial.calibrating
+            if train and self._calibration is not None:
+                self._calibration.played(run.test.plan.profile.max_pulse_width_us, result.rise_nm, finished)
+            if not train:
+                self.finished = finished
+            if finished.recording_path is None and run.t0_s is not None:  # kept as a journal: a person must see to it
+                self._change(self._trial.halted(finished.reason))
+            following = self._trial.sealed()
+            if following.state == "latched":
+                self._remember("latched", following.reason)
+            else:
+                self._latch.clear()
+            self._change(following)
+        if not train:
+            self._publish(finished)
+
+    def _broken(self, reason: str) -> None:
+        with self._lock:
+            self._run = None
+            self._remember("running", reason)
+            self._change(Trial("latched", reason, lost=reason))
+        self._told.set()
+
+    def _announce(self, run: TestRun) -> None:
+        """Tell that the test runs, from outside the thread that must be on time."""
+        while not run.started.wait(0.05):
+            if run.stimulation_ended.is_set():
+                return
+        with self._lock:
+            if self._trial.state == "arming":
+                self._change(self._trial.armed())
+
+
+def check_names(place: str, **names: str) -> None:
+    """Names end up in paths. Raises PlanError."""
+    for name, value in names.items():
+        if not _NAME.match(value):
+            raise PlanError(f"{place}.{name}: {value!r} must be letters, digits, '.', '_' or '-', at most 100")
