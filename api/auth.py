@@ -59,6 +59,15 @@ class Principal:
         """Whether the scope is held."""
         return scope in self.scopes or Scope.ADMINISTER in self.scopes
 
+    @property
+    def role(self) -> str:
+        """What a person calls these scopes."""
+        if self.may(Scope.ADMINISTER):
+            return "administrator"
+        if self.may(Scope.APPROVE_MODEL):
+            return "clinician"
+        return "operator" if self.may(Scope.RUN_TEST) else "reader"
+
 
 class Auth:
     """Issues and checks tokens and sessions; keeps only hashes."""
@@ -192,9 +201,9 @@ def digest(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def unauthorized(detail: str) -> ApiError:
+def unauthorized(detail: str, code: str = "unauthorized", title: str = "Not signed in") -> ApiError:
     """A 401 with the challenge that RFC 9110 asks for."""
-    problem = ApiError(401, "unauthorized", "Not signed in", detail)
+    problem = ApiError(401, code, title, detail)
     problem.headers["WWW-Authenticate"] = 'Bearer realm="stimrig"'
     return problem
 

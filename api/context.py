@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import shutil
 import time
 from dataclasses import dataclass, field
 from typing import Annotated, Any
@@ -70,6 +71,8 @@ def build(settings: Settings, clock: Clock | None = None, worker: tuple[str, ...
     """
     clock = clock or Clock()
     settings.recordings_dir.mkdir(parents=True, exist_ok=True)
+    shutil.rmtree(settings.exports_dir, ignore_errors=True)
+    settings.exports_dir.mkdir()
     store = Store(settings.database)
     auth = Auth(store, clock, settings.session_hours)
     configured = settings.admin_token.get_secret_value() if settings.admin_token else None

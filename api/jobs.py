@@ -152,6 +152,32 @@ def _warm_csv() -> str:
     return "\n".join(rows) + "\n"
 
 
+def export_csv(data: str, progress: Progress, out: str) -> dict[str, Any]:
+    """A recording as a CSV file in the layout that `identify.read` takes in (docs/recording.md's times and widths)."""
+    import identify
+
+    progress(0.1, "reading the recording")
+    record = identify.read(Path(data))
+    if abs(record.pulse_rate_hz - 40.0) > 1e-6:
+        message = f"{record.pulse_rate_hz:g} pulses/s; a CSV file would be read as 40"
+        raise identify.BadRecord(message, mend="Take the HDF5 file.")
+    columns = {"time_s": record.time_s, "pulse_width_us": record.pulse_width_us, "torque_nm": record.torque_nm}
+    texts: list[Any] = [[f"{value:.6f}" for value in record.time_s.tolist()]]
+    texts += [[f"{value:.8g}" for value in columns[name].tolist()] for name in ("pulse_width_us", "torque_nm")]
+    texts.append([record.segment_names[index] for index in record.segment])
+    names = [*columns, "segment"]
+    for name in ("angle_rad", "velocity_rad_s"):
+        values = getattr(record, name)
+        if values is not None:
+            names.append(name)
+            texts.append([f"{value:.8g}" for value in values.tolist()])
+    progress(0.7, "writing")
+    with Path(out).open("w", encoding="utf-8", newline="") as file:
+        file.write(",".join(names) + "\n")
+        file.writelines(",".join(row) + "\n" for row in zip(*texts, strict=True))
+    return {"rows": len(texts[0])}
+
+
 def find_recording(progress: Progress, folder: str, test_id: str) -> dict[str, Any]:
     """The sealed recording of a test, when the service did not hear of its end."""
     import hashlib
@@ -182,5 +208,6 @@ VERBS: dict[str, Callable[..., dict[str, Any]]] = {
     "effects": effects,
     "warm": warm,
     "forecast": forecast,
+    "export_csv": export_csv,
     "find_recording": find_recording,
 }

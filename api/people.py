@@ -115,6 +115,23 @@ class People:
             self._store_password(name, self._hash(password))
         return self.auth.open_session(token.hash, name)
 
+    def sign_in_with_token(self, text: str, address: str) -> str:
+        """Open a session for a token's holder; its cookie. Held to the same pace: a token that was set may be weak.
+
+        Raises
+        ------
+        ApiError
+            401 unknown, revoked or expired; 429 too many tries.
+        """
+        self.pace.admit(f"address {address}")
+        cookie = self.auth.sign_in(text)
+        self.pace.forget(f"address {address}")
+        return cookie
+
+    def any(self) -> bool:
+        """Whether there is anybody who could sign in with a password."""
+        return bool(self.store.all(User, limit=1))
+
     def confirm(self, principal: Principal, password: str) -> None:
         """The password once more: good for one approval within two minutes.
 
@@ -130,7 +147,8 @@ class People:
         row = self.store.get(User, principal.name)
         if row is None or not self._verify(row.password_hash, password):
             self._note(principal.name, "confirmation refused")
-            raise unauthorized("The password does not match.")
+            detail = "Nothing was decided. Go back and give it once more."
+            raise unauthorized(detail, "wrong-password", "The password does not match")
         self.pace.forget(key)
         with self.store.write() as session:
             session.merge(Confirmation(session_hash=principal.session_hash, at_unix_s=self.clock.unix_s()))

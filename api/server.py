@@ -14,6 +14,7 @@ import sys
 
 import uvicorn
 from pydantic import ValidationError
+from starlette.types import ASGIApp
 
 from api import logs
 from api.app import create_app
@@ -39,12 +40,21 @@ def main() -> int:
         return 2
     host, port = listener.getsockname()[:2]
     ready = {"url": f"http://{host}:{port}", "port": port, "drawn_token": app.state.context.drawn_token}
-    config = uvicorn.Config(
-        app, log_config=None, access_log=False, timeout_graceful_shutdown=2, ws_max_size=2**20, server_header=False
-    )
     with contextlib.suppress(KeyboardInterrupt):
-        asyncio.run(serve(uvicorn.Server(config), listener, ready))
+        asyncio.run(serve(uvicorn.Server(configuration(app)), listener, ready))
     return 0
+
+
+def configuration(app: ASGIApp) -> uvicorn.Config:
+    """How uvicorn runs the service.
+
+    `X-Forwarded-For` is believed of a proxy on this machine only: who signs in too often is told apart by address, and
+    anybody could write another one into the header.
+    """
+    return uvicorn.Config(
+        app, log_config=None, access_log=False, timeout_graceful_shutdown=2, ws_max_size=2**20, server_header=False,
+        proxy_headers=True, forwarded_allow_ips=["127.0.0.1", "::1"],
+    )  # fmt: skip
 
 
 def refuse_open_door(settings: Settings) -> None:

@@ -42,6 +42,11 @@ class Settings(BaseSettings):
         return self.data_dir / "recordings"
 
     @property
+    def exports_dir(self) -> Path:
+        """Where a file lies while it is handed out; emptied at each start."""
+        return self.data_dir / "exports"
+
+    @property
     def logs_dir(self) -> Path:
         """Where each process writes its log."""
         return self.data_dir / "logs"

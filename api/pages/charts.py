@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from api.pages import directions
+
 INK, MEASURED, MODEL, BAND, STIMULUS, GRID = (
     "#1b2733",
     "#a9b4be",
@@ -15,6 +17,9 @@ INK, MEASURED, MODEL, BAND, STIMULUS, GRID = (
 )
 SEGMENT_FILL = {"validate": "rgba(180,105,14,.07)", "rest": "rgba(0,0,0,0)"}
 FONT = {"family": "system-ui, -apple-system, 'Segoe UI', 'DejaVu Sans', sans-serif", "size": 13, "color": INK}
+
+
+SYMBOLS = {"rising": "triangle-up", "falling": "triangle-down"}
 
 
 def axis(title: str, **more: Any) -> dict[str, Any]:
@@ -53,7 +58,7 @@ def of_model(
     document: dict[str, Any], curves: dict[str, Any] | None, comparison: dict[str, Any] | None = None
 ) -> dict[str, Any]:
     """All figures of a model's page; those that need the measurement only if there is one."""
-    figures = {"recruitment": recruitment(document)}
+    figures = {"recruitment": recruitment(document, curves)}
     if curves is not None:
         noise_sd_nm = (document.get("fit") or {}).get("noise_sd_nm")
         figures["comparison"] = measurement(curves, noise_sd_nm, (comparison or {}).get("series"))
@@ -132,24 +137,28 @@ def band(x: Sequence[float], lower: Sequence[float], upper: Sequence[float]) -> 
     quiet = {"hoverinfo": "skip"}
     return [
         line(x, upper, "", MODEL, 0, showlegend=False, **quiet),
-        line(x, lower, "95 % band of the whole curve", MODEL, 0, fill="tonexty", fillcolor=BAND, **quiet),
+        line(x, lower, "95 % band", MODEL, 0, fill="tonexty", fillcolor=BAND, **quiet),
     ]
 
 
-def recruitment(document: dict[str, Any]) -> dict[str, Any]:
-    """The recruitment curve with its band."""
+def recruitment(document: dict[str, Any], curves: dict[str, Any] | None = None) -> dict[str, Any]:
+    """The recruitment curve with its band; with a recording's curves, what its ramp says on the way up and down."""
     curve, known = document["recruitment"], band_of(document, "recruitment")
     data = band(known["pulse_width_us"], known["whole_lower"], known["whole_upper"]) if known else []
-    data.append(line(curve["pulse_width_us"], curve["torque_nm"], "recruitment curve", MODEL, 2.2))
+    data.append(line(curve["pulse_width_us"], curve["torque_nm"], "model", MODEL, 2.2))
+    for way, points in sorted(directions.seen(document, curves).items(), reverse=True) if curves else []:
+        marker = {"symbol": SYMBOLS[way], "size": 9, "color": "#fff", "line": {"color": STIMULUS, "width": 1.8}}
+        data.append(line(points["pulse_width_us"], points["torque_nm"], f"ramp, {way}", STIMULUS, mode="markers",
+                         marker=marker))  # fmt: skip
     x, y = axis("Pulse width (µs)"), axis("Steady torque (N·m)")
-    return {"data": data, "layout": layout(height=340, xaxis=x, yaxis=y, showlegend=bool(known))}
+    return {"data": data, "layout": layout(height=340, xaxis=x, yaxis=y, showlegend=len(data) > 1)}
 
 
 def step(document: dict[str, Any], response: dict[str, list[float]]) -> dict[str, Any]:
     """The linear part's step response with its band."""
     known = band_of(document, "step_response")
     data = band(known["time_s"], known["whole_lower"], known["whole_upper"]) if known else []
-    data.append(line(response["time_s"], response["response"], "step response", MODEL, 2.2))
+    data.append(line(response["time_s"], response["response"], "model", MODEL, 2.2))
     x = axis("Time (s)", range=[0, response["time_s"][-1]])
     y = axis("Share of the final torque (1)")
     return {"data": data, "layout": layout(height=340, xaxis=x, yaxis=y, showlegend=bool(known))}

@@ -5,13 +5,13 @@ from __future__ import annotations
 import asyncio
 from typing import Annotated
 
-from fastapi import APIRouter, Form
+from fastapi import APIRouter, File, Form, UploadFile
 from fastapi.responses import RedirectResponse, Response
 from pydantic import ValidationError
 
-from api.context import Approver, Ctx, Tester
+from api.context import Approver, Context, Ctx, Tester
 from api.errors import ApiError
-from api.routes import participants
+from api.routes import participants, recordings
 from api.routes.rig import rearm_rig
 from api.schemas import ParticipantIn, ProfileIn, TestIn
 
@@ -64,17 +64,41 @@ async def start_test(context: Ctx, who: Tester, code: str) -> Response:
     return RedirectResponse(f"/tests/{row.id}", 303)
 
 
+@router.post("/participants/{code}/recordings")
+async def upload(context: Ctx, who: Tester, code: str, file: Annotated[UploadFile, File()]) -> Response:
+    """A recording of another tool, CSV or HDF5; leads to the model made from it."""
+    await asyncio.to_thread(participants.find, context, code)
+    data = await file.read()
+    if not data:
+        raise ApiError(422, "empty", "No file came", "Go back and choose a CSV file or a sealed recording (HDF5).")
+    _row, model = await recordings.take_in(context, code, data, who.name)
+    return RedirectResponse(f"/models/{model.id}", 303)
+
+
 @router.post("/models/{model_id}/approve")
 async def approve(context: Ctx, who: Approver, model_id: str, reason: Annotated[str, Form()] = "") -> Response:
     """Let the controller have a version."""
-    await asyncio.to_thread(context.versions.decide, model_id, True, who.name, reason[:500])
-    return RedirectResponse(f"/models/{model_id}", 303)
+    return await decide(context, who.name, model_id, True, reason)
 
 
 @router.post("/models/{model_id}/reject")
 async def reject(context: Ctx, who: Approver, model_id: str, reason: Annotated[str, Form()] = "") -> Response:
     """Keep a version from the controller."""
-    await asyncio.to_thread(context.versions.decide, model_id, False, who.name, reason[:500])
+    return await decide(context, who.name, model_id, False, reason)
+
+
+async def decide(context: Context, by: str, model_id: str, approved: bool, reason: str) -> Response:
+    """Write a decision down; on the page it wants a reason.
+
+    Raises
+    ------
+    ApiError
+        422: no reason was given.
+    """
+    if not reason.strip():
+        detail = "Go back and say in a few words why; it is kept in the audit trail. Nothing was decided."
+        raise ApiError(422, "reason-missing", "A decision wants a reason", detail)
+    await asyncio.to_thread(context.versions.decide, model_id, approved, by, reason.strip()[:500])
     return RedirectResponse(f"/models/{model_id}", 303)
 
 

@@ -8,10 +8,11 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Form, Request
 from fastapi.responses import RedirectResponse, Response
 
-from api.auth import COOKIE
+from api.auth import COOKIE, Scope
 from api.context import Anyone, Context, Ctx
 from api.errors import ApiError
 from api.pages.render import page
+from api.routes.people import same_origin, set_cookie
 from api.store.tables import Participant, Test
 
 router = APIRouter(include_in_schema=False)
@@ -21,11 +22,23 @@ router = APIRouter(include_in_schema=False)
 async def home(request: Request, context: Ctx) -> Response:
     """Participants and the rig; the sign-in form for who is not signed in."""
     try:
-        context.auth.identify(request)
+        who = context.auth.identify(request)
     except ApiError:
-        return page(request, "sign_in.html", next="/", problem=None)
-    rows = await asyncio.to_thread(_overview, context)
-    return page(request, "home.html", rows=rows)
+        return await door(request, context, "/")
+    may_test = who.may(Scope.RUN_TEST)
+    rows = await asyncio.to_thread(_overview, context) if may_test else []
+    return page(request, "home.html", rows=rows, may_test=may_test)
+
+
+async def door(
+    request: Request, context: Context, next: str, problem: ApiError | None = None, name: str = ""
+) -> Response:
+    """The sign-in form; with what went wrong, if anything did."""
+    people = await asyncio.to_thread(context.people.any)
+    status = problem.status if problem else 200
+    answer = page(request, "sign_in.html", status, next=local(next), problem=problem, people=people, name=name)
+    answer.headers.update(problem.headers if problem else {})
+    return answer
 
 
 def _overview(context: Context) -> list[dict[str, Any]]:
@@ -45,29 +58,30 @@ def _overview(context: Context) -> list[dict[str, Any]]:
 
 
 @router.get("/sign-in")
-def sign_in_form(request: Request, next: str = "/") -> Response:
+async def sign_in_form(request: Request, context: Ctx, next: str = "/") -> Response:
     """The form."""
-    return page(request, "sign_in.html", next=local(next), problem=None)
+    return await door(request, context, next)
 
 
 @router.post("/sign-in")
 async def sign_in(
-    request: Request, context: Ctx, token: Annotated[str, Form()] = "", next: Annotated[str, Form()] = "/"
-) -> Response:
-    """Open a session with a token."""
+    request: Request, context: Ctx,
+    name: Annotated[str, Form()] = "", password: Annotated[str, Form()] = "", token: Annotated[str, Form()] = "",
+    next: Annotated[str, Form()] = "/",
+) -> Response:  # fmt: skip
+    """Open a session with name and password, or with a token."""
+    address = request.client.host if request.client else ""
+    people = context.people
     try:
-        cookie = await asyncio.to_thread(context.auth.sign_in, token.strip())
+        same_origin(request)
+        if token.strip():
+            cookie = await asyncio.to_thread(people.sign_in_with_token, token.strip(), address)
+        else:
+            cookie = await asyncio.to_thread(people.sign_in, name.strip()[:80], password[:200], address)
     except ApiError as error:
-        return page(request, "sign_in.html", 401, next=local(next), problem=error)
+        return await door(request, context, next, error, name[:80])
     response = RedirectResponse(local(next), 303)
-    response.set_cookie(
-        COOKIE,
-        cookie,
-        max_age=int(context.auth.session_s),
-        httponly=True,
-        samesite="strict",
-        secure=context.settings.secure_cookies,
-    )
+    set_cookie(context, response, cookie)
     return response
 
 

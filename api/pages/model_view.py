@@ -40,12 +40,20 @@ async def model(request: Request, context: Ctx, who: ModelReader, model_id: str,
         recruitment=reading.recruitment(document),
         dynamics=reading.dynamics(document),
         problem=measured["problem"],
+        reasons=doubts(document),
+        hdf5=not (await asyncio.to_thread(context.analyses.path, row.recording_id)).endswith(".csv"),
         now_utc=context.clock.utc(),
         may_test=who.may(Scope.RUN_TEST),
         may_approve=who.may(Scope.APPROVE_MODEL),
         **{key: value for key, value in shown.items() if key != "figures"},
         figures={**charts.of_model(document, measured["curves"], measured["comparison"]), **shown["figures"]},
     )
+
+
+def doubts(document: dict[str, Any]) -> list[str]:
+    """What else speaks against the model; that its fit stays below the ceiling is said in the verdict already."""
+    gates = ((document.get("quality") or {}).get("gates") or {}).items()
+    return [gate["says"] for name, gate in gates if not gate["passed"] and name not in ("ceiling", "residual")]
 
 
 async def measurement(context: Context, row: Model) -> dict[str, Any]:

@@ -6,6 +6,7 @@ import math
 from datetime import datetime
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from fastapi import Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
@@ -19,9 +20,11 @@ SECURITY_HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; "
     "img-src 'self' data: blob:; connect-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'",
     "X-Content-Type-Options": "nosniff",
-    "Referrer-Policy": "no-referrer",
+    "Referrer-Policy": "same-origin",  # with no-referrer a form's Origin is "null", and the door asks for it
     "Cache-Control": "no-store",
 }
+
+BACK = {"models": "Back to the model", "participants": "Back to the participant", "tests": "Back to the test"}
 
 environment = Environment(
     loader=FileSystemLoader(HERE / "templates"), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
@@ -85,10 +88,18 @@ def wants_html(request: Request) -> bool:
 def problem_page(request: Request, problem: ApiError) -> Response:
     """A problem as a page that says what to do; the way to the door where nobody is signed in."""
     if problem.status == 401 and request.method == "GET":
-        return RedirectResponse(f"/sign-in?next={request.url.path}", 303)
-    response = page(request, "problem.html", problem.status, problem=problem)
+        return RedirectResponse(f"/sign-in?next={quote(request.url.path)}", 303)
+    response = page(request, "problem.html", problem.status, problem=problem, back=back_from(request.url.path))
     response.headers.update(problem.headers)
     return response
+
+
+def back_from(path: str) -> tuple[str, str] | None:
+    """Address and words of the page that a form was on."""
+    parts = path.strip("/").split("/")
+    if len(parts) < 3 or parts[0] not in BACK:
+        return None
+    return f"/{parts[0]}/{quote(parts[1])}", BACK[parts[0]]
 
 
 def stop_page(request: Request, evidence: StopEvidence) -> Response:

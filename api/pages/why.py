@@ -156,6 +156,7 @@ def tidy_experiment(found: dict[str, Any], library: dict[str, Any]) -> dict[str,
     """The next experiment for people."""
     return {
         **found,
+        "text": found["text"].split(": expected log evidence")[0].rstrip(".") + ".",
         "names": [name_of(rival, library).lower() for rival in found["rivals"]],
         "shown": [f"{segment['sequence']} {_seconds(segment['settings'])}".strip() for segment in found["segments"]],
     }

@@ -10,12 +10,13 @@ from typing import Any
 
 from fastapi import APIRouter, Request, Response
 from fastapi.responses import FileResponse
+from starlette.background import BackgroundTask
 
 from api import audit
 from api.context import PROBLEM, Context, Ctx, ModelReader, Tester
 from api.errors import ApiError, NotFoundError
 from api.routes import participants
-from api.store.tables import Recording
+from api.store.tables import Model, Recording
 
 router = APIRouter(prefix="/v1", tags=["recordings"], responses=PROBLEM)
 
@@ -25,6 +26,36 @@ HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 @router.get("/recordings/{recording_id}", response_class=FileResponse)
 def recording(context: Ctx, _who: ModelReader, recording_id: str) -> FileResponse:
     """The raw recording."""
+    row, path = held(context, recording_id)
+    kind = "text/csv" if path.suffix == ".csv" else "application/x-hdf5"
+    return FileResponse(path, media_type=kind, filename=path.name, headers={"X-Content-SHA256": row.file_sha256})
+
+
+@router.get("/recordings/{recording_id}/csv", response_class=FileResponse)
+async def recording_csv(context: Ctx, _who: ModelReader, recording_id: str) -> FileResponse:
+    """The recording as CSV, one row a sample: what other tools read, and what can be uploaded again."""
+    _row, source = await asyncio.to_thread(held, context, recording_id)
+    name = f"{recording_id}.csv"
+    if source.suffix == ".csv":
+        return FileResponse(source, media_type="text/csv", filename=name)
+    out = context.settings.exports_dir / f"{secrets.token_hex(8)}.csv"
+    gone = BackgroundTask(out.unlink, missing_ok=True)
+    try:
+        await context.fitting.submit("export_csv", data=str(source), out=str(out)).result
+    except ApiError:
+        out.unlink(missing_ok=True)
+        raise
+    return FileResponse(out, media_type="text/csv", filename=name, background=gone)
+
+
+def held(context: Context, recording_id: str) -> tuple[Recording, Path]:
+    """A recording and its file.
+
+    Raises
+    ------
+    ApiError
+        404 no such recording; 410 its file is gone.
+    """
     row = context.store.get(Recording, recording_id)
     if row is None:
         raise NotFoundError("recording", recording_id, "A test's document names its recording.")
@@ -32,8 +63,7 @@ def recording(context: Ctx, _who: ModelReader, recording_id: str) -> FileRespons
     if not path.is_file():
         detail = f"The file of recording {recording_id!r} is not in its place ({path.name}). Restore it from a backup."
         raise ApiError(410, "recording-gone", "The recording's file is missing", detail)
-    kind = "text/csv" if path.suffix == ".csv" else "application/x-hdf5"
-    return FileResponse(path, media_type=kind, filename=path.name, headers={"X-Content-SHA256": row.file_sha256})
+    return row, path
 
 
 @router.post("/participants/{code}/recordings", status_code=201)
@@ -41,6 +71,19 @@ async def upload(context: Ctx, who: Tester, code: str, request: Request, respons
     """Take in a recording of another tool (CSV or HDF5 as the request's body) and identify a model from it."""
     await asyncio.to_thread(participants.find, context, code)
     data = await bounded_body(request, context.settings.max_upload_mb)
+    row, model = await take_in(context, code, data, who.name)
+    response.headers["Location"] = f"/v1/recordings/{row.id}"
+    return {"recording_id": row.id, "model": context.versions.public(model)}
+
+
+async def take_in(context: Context, code: str, data: bytes, by: str) -> tuple[Recording, Model]:
+    """Keep a recording of another tool and identify a model from it.
+
+    Raises
+    ------
+    ApiError
+        422: it cannot be read or fitted; nothing is kept of it.
+    """
     path = await asyncio.to_thread(_write, context, data)
     try:
         found = await context.fitting.submit("fit", data=str(path)).result
@@ -48,10 +91,8 @@ async def upload(context: Ctx, who: Tester, code: str, request: Request, respons
         path.unlink(missing_ok=True)
         error.detail = error.detail.replace(str(path), "the upload")
         raise
-    row = await asyncio.to_thread(_store, context, code, path, data, who.name)
-    model = await asyncio.to_thread(context.versions.add, found["json"], code, row.id, who.name)
-    response.headers["Location"] = f"/v1/recordings/{row.id}"
-    return {"recording_id": row.id, "model": context.versions.public(model)}
+    row = await asyncio.to_thread(_store, context, code, path, data, by)
+    return row, await asyncio.to_thread(context.versions.add, found["json"], code, row.id, by)
 
 
 async def bounded_body(request: Request, limit_mb: float) -> bytes:

@@ -2,6 +2,7 @@
 "use strict";
 const carried = new URLSearchParams(location.hash.slice(1)).get("token");
 if (carried) {
+  document.getElementById("by-token").open = true;
   document.getElementById("token").value = carried;
   history.replaceState(null, "", location.pathname + location.search);
 }

@@ -1,0 +1,138 @@
+"""The administrator's page: people, keys and tokens, the audit trail."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Form, Request
+from fastapi.responses import PlainTextResponse, RedirectResponse, Response
+from pydantic import ValidationError
+
+from api import audit
+from api.auth import Scope
+from api.context import Administrator, Context, Ctx
+from api.errors import ApiError
+from api.pages.render import page
+from api.routes import people, tokens
+from api.store.tables import AuditEntry
+
+router = APIRouter(include_in_schema=False, prefix="/administration")
+NEWEST = 60
+ROLES = {
+    "clinician": [Scope.READ_LIVE, Scope.RUN_TEST, Scope.READ_MODEL, Scope.APPROVE_MODEL],
+    "operator": [Scope.READ_LIVE, Scope.RUN_TEST, Scope.READ_MODEL],
+    "reader": [Scope.READ_LIVE, Scope.READ_MODEL],
+    "administrator": [Scope.ADMINISTER],
+}
+MAY = {
+    "clinician": "runs tests, approves models",
+    "operator": "runs tests; approves nothing",
+    "reader": "looks on; may stop, like everyone",
+    "administrator": "everything",
+}
+
+
+@router.get("")
+async def show(request: Request, context: Ctx, _who: Administrator) -> Response:
+    """The page."""
+    return await shown(request, context)
+
+
+async def shown(request: Request, context: Context, key: dict[str, Any] | None = None) -> Response:
+    """The page; with a key that was just made, the only time its text is seen."""
+
+    def gather() -> dict[str, Any]:
+        entries = context.store.all(AuditEntry, order=AuditEntry.seq)
+        return {
+            "users": [{**user, "role": role_of(user["scopes"])} for user in context.people.public()],
+            "tokens": [token for token in tokens.list_tokens(context, None) if token["origin"] == "issued"],  # pyright: ignore[reportArgumentType]
+            "entries": entries[: -NEWEST - 1 : -1],
+            "count": len(entries),
+            "broken": audit.first_broken(entries),
+        }
+
+    found = await asyncio.to_thread(gather)
+    return page(request, "administration.html", **found, key=key, roles=MAY, now_utc=context.clock.utc())
+
+
+def role_of(scopes: list[str]) -> str:
+    """The role that holds exactly these scopes; else their names."""
+    return next((name for name, held in ROLES.items() if set(held) == set(scopes)), ", ".join(scopes))
+
+
+@router.post("/users")
+async def add_user(
+    context: Ctx, who: Administrator, name: Annotated[str, Form()] = "", role: Annotated[str, Form()] = "",
+    password: Annotated[str, Form()] = "",
+) -> Response:  # fmt: skip
+    """A new person."""
+    body = checked(people.UserIn, name=name.strip(), password=password, scopes=ROLES.get(role, []))
+    await asyncio.to_thread(context.people.add, body.name, body.password, body.scopes, who.name)
+    return back()
+
+
+@router.post("/users/{name}/password")
+async def set_password(context: Ctx, who: Administrator, name: str, password: Annotated[str, Form()] = "") -> Response:
+    """A new password."""
+    body = checked(people.PasswordIn, password=password)
+    await asyncio.to_thread(context.people.change_password, name, body.password, who.name)
+    return back()
+
+
+@router.post("/users/{name}/remove")
+async def remove(context: Ctx, who: Administrator, name: str) -> Response:
+    """Nobody signs in under this name any more."""
+    await asyncio.to_thread(context.people.remove, name, who.name)
+    return back()
+
+
+@router.post("/keys")
+async def make_key(
+    request: Request, context: Ctx, who: Administrator, name: Annotated[str, Form()] = "",
+    days: Annotated[str, Form()] = "30",
+) -> Response:  # fmt: skip
+    """A key for a controller; its text is shown on the answering page only."""
+    body = checked(people.KeyIn, name=name.strip(), days=days)
+    made = await asyncio.to_thread(people.controller_key, context, who, body)
+    return await shown(request, context, {**made, "name": body.name})
+
+
+@router.post("/tokens/{token_id}/revoke")
+async def revoke(context: Ctx, who: Administrator, token_id: str) -> Response:
+    """It opens nothing any more."""
+    await asyncio.to_thread(tokens.revoke_token, context, who, token_id)
+    return back()
+
+
+@router.get("/audit.jsonl")
+async def export(context: Ctx, _who: Administrator) -> Response:
+    """The whole audit trail, one JSON object a line, as `stimrig audit verify --file` takes it in."""
+    entries = await asyncio.to_thread(lambda: context.store.all(AuditEntry, order=AuditEntry.seq))
+    lines = "".join(json.dumps(entry.as_dict(), ensure_ascii=False) + "\n" for entry in entries)
+    headers = {"Content-Disposition": 'attachment; filename="stimrig-audit.jsonl"'}
+    return PlainTextResponse(lines, media_type="application/x-ndjson", headers=headers)
+
+
+def checked(model: Any, **fields: Any) -> Any:
+    """A form's fields as the route takes them; 422 in one sentence, and never a password in it."""
+    try:
+        return model(**fields)
+    except ValidationError as error:
+        first = error.errors()[0]
+        field = str(first["loc"][0]).replace("scopes", "role")
+        detail = f"{field}: {first['msg']}. {HINTS.get(field, '')}".strip()
+        raise ApiError(422, "invalid-input", "This cannot be used", detail) from None
+
+
+HINTS = {
+    "name": "Take letters, digits, and . _ @ - without spaces.",
+    "password": "Take at least 10 characters; a few words do well.",
+    "days": "From 1 to 366.",
+}
+
+
+def back() -> Response:
+    """To the page."""
+    return RedirectResponse("/administration", 303)
