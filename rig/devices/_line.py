@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import threading
 from collections.abc import Callable, Iterator
@@ -15,6 +16,8 @@ from rig.clock import Clock
 from rig.errors import DeviceError, WireError
 from rig.signals import LateError
 from rig.wire.sciencemode4 import Packet
+
+log = logging.getLogger("rig.line")
 
 READ_TIMEOUT_S = 0.05
 
@@ -170,6 +173,13 @@ class PacketLine:
         self.last_written_s = self._clock.now_s()
 
     def _read(self) -> None:
+        try:
+            self._read_all()
+        except Exception as error:  # a mistake in a driver: told at once, not only by acks that do not come
+            log.exception("the reader of %s broke", self.port)
+            self._lose(f"internal: {type(error).__name__}: {error}")
+
+    def _read_all(self) -> None:
         frames = self._reader()
         port = self._serial
         assert port is not None

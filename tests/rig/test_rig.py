@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -13,7 +14,7 @@ import pytest
 
 from rig.control import core
 from rig.errors import BusyError, DeviceError, LatchedError, PlanError, RefusedError, UncertainError
-from rig.messages import CalibrateStartRequest, PreviewRequest, Profile
+from rig.messages import CalibrateStartRequest, PreviewRequest, Profile, SegmentPlan
 from tests.rig.live import SPEED, LiveRig
 
 Make = Callable[..., LiveRig]
@@ -197,6 +198,43 @@ def test_a_journal_without_an_end_comes_back_uncertain(make: Make, tmp_path: Pat
     assert again.rig.finished is not None
     assert again.rig.finished.outcome == "fault"
     assert again.rig.rearm("nurse").state == "ready"
+
+
+def test_a_wall_clock_that_jumps_in_a_test_changes_nothing(make: Make, monkeypatch: pytest.MonkeyPatch):
+    live = make()
+    now = time.time
+    live.rig.start(live.plan("one"))
+    live.wait_pulses(10)
+    for hours in (1, -2):
+        monkeypatch.setattr(time, "time", lambda h=hours: now() + 3600 * h)
+        live.wait_pulses(10)
+    live.wait("ready")
+    assert live.rig.finished is not None
+    assert live.rig.finished.outcome == "completed"
+    with h5py.File(str(live.rig.finished.recording_path)) as file:
+        times = file["pulses/written_time_s"][:]
+        assert 0.4 < times[times == times].min() < times[times == times].max() < 2.6
+        assert file["torque/time_s"][-1] == pytest.approx(3.0, abs=0.05)
+
+
+WILD: dict[str, list[float]] = {
+    "no numbers": [100.0, math.nan],
+    "negative": [-1.0],
+    "huge": [1e9],
+    "endless": [10.0] * 20_000,
+    "jumping": [0.0, 300.0] * 20,
+    "beyond the comfort maximum": [50.0 * i for i in range(1, 8)],
+}
+
+
+@pytest.mark.parametrize("what", WILD)
+def test_what_a_controller_that_runs_wild_asks_for_is_refused_whole(make: Make, what: str):
+    live = make()
+    play = SegmentPlan(name="trial", sequence="widths", settings={"pulse_width_us": WILD[what]})
+    with pytest.raises((RefusedError, PlanError)):
+        live.rig.start(live.plan("wild", kind="sequence", segments=[play]))
+    assert live.stimulator.sent == []
+    assert live.rig.status().state == "ready"
 
 
 def test_what_hangs_or_died_is_trouble(make: Make, monkeypatch: pytest.MonkeyPatch):
