@@ -1,10 +1,11 @@
 """A million requests at the gate, most of them mad: how many pulses outside the limits came out? There must be none.
 
-    python -m bench.rig_fuzz [--requests N] [--seed N]
+    python -m bench.rig_fuzz [--requests N] [--plans N] [--seed N]
 
-Widths and currents are NaN, infinite, negative, huge, tiny, at and beside every bound and every rounding step; times
-come too close, too late and at random; profiles change every 500 requests. What reaches the stimulator is judged by
-this file's own arithmetic, not by the rig's.
+Widths and currents are NaN, infinite, negative, huge, tiny, at and beside every bound and every rounding step of both
+stimulators; times come too close, too late and at random; profiles change every 500 requests. Then whole plans of the
+same kind: rates, currents, lists of widths, durations. What reaches the stimulator, and what a plan that was admitted
+would play, is judged by this file's own arithmetic, not by the rig's.
 """
 
 from __future__ import annotations
@@ -18,17 +19,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rig import limits
+from rig import limits, plan
 from rig.clock import VirtualClock
-from rig.errors import RefusedError
+from rig.errors import PlanError, RefusedError
 from rig.gate import Gate
-from rig.limits import HARD_LIMITS, Admitted
-from rig.messages import Profile, TestPlan
+from rig.limits import HARD_LIMITS, Admitted, Steps
+from rig.messages import Profile, SegmentPlan, TestPlan
 from rig.signals import Pulse
 from tests.rig.fakes import FakeStimulator
 
 MOST = {"width_us": 500.0, "current_ma": 100.0, "charge_uc": 40.0, "charge_per_s_uc": 1600.0, "pulses_per_s": 61}
 """What no table may exceed, written down here again on purpose."""
+MOST_OF_A_TEST = {"duration_s": 300.0, "charge_uc": 50_000.0, "rise_us": 50.0, "rate_hz": 60.0}
+STIMULATORS = (Steps(1.0, 0.5, 1.0), Steps(1.0, 2.0, 20.0))
+"""What a P24 and a RehaStim 2 can tell apart."""
 BLOCK = 500
 
 
@@ -105,12 +109,15 @@ def _block(
     clock = VirtualClock()
     stimulator = FakeStimulator(clock)
     stimulator.ack_delay_s = None
+    stimulator.steps = STIMULATORS[int(rng.integers(len(STIMULATORS)))]
     gate = Gate(stimulator, clock, lambda _: None, lambda _: None)
     gate.open(NoJournal(), table)  # pyright: ignore[reportArgumentType]
     widths, currents = values(rng, BLOCK, tightest[0]), values(rng, BLOCK, tightest[1])
     steady = rng.random(BLOCK) < 0.5  # half of them sane, so that doses and rates are reached
     widths[steady], currents[steady] = tightest[0] * rng.random(np.sum(steady)) ** 0.1, tightest[1]
     pauses = rng.choice([0.0, 1e-4, 0.0079, 0.008, 0.0081, 0.0125, 0.0166, 0.025, 0.5], BLOCK)
+    if rng.random() < 0.5:  # steadily, or rates and doses of a second are never reached
+        pauses[:] = rng.choice([0.008, 0.0125, 0.0166, 0.02, 0.025])
     for index, (width_us, current_ma, pause_s) in enumerate(zip(widths, currents, pauses, strict=True)):
         now_s = clock.now_s()
         latest_s = now_s + (-0.001 if index % 97 == 0 else 1.0)
@@ -118,18 +125,19 @@ def _block(
         clock.advance(float(pause_s))
     found.requests += BLOCK
     found.sent += len(stimulator.sent)
-    for words in _judge(stimulator.sent, tightest):
+    for words in _judge(stimulator.sent, tightest, stimulator.steps):
         found.outside += 1
         found.example = found.example or words
 
 
-def _judge(sent: list[tuple[float, Admitted]], tightest: tuple[float, float]) -> list[str]:
+def _judge(sent: list[tuple[float, Admitted]], tightest: tuple[float, float], steps: Steps) -> list[str]:
     """One line for each pulse that should not have been sent."""
     wrong: list[str] = []
     for time_s, pulse in sent:
         width_us, current_ma = pulse.pulse_width_us, pulse.current_ma
         fine = 0 < width_us <= tightest[0] and 0 < current_ma <= tightest[1] and width_us * current_ma <= 40_000
-        if not (fine and isinstance(width_us, int) and float(2 * current_ma).is_integer()):
+        whole = isinstance(width_us, int) and float(current_ma / steps.current_ma).is_integer()
+        if not (fine and whole and width_us >= steps.shortest_us):
             wrong.append(f"{width_us} µs {current_ma} mA at {time_s}")
     times = np.array([t for t, _ in sent])
     charges_uc = np.array([p.pulse_width_us * p.current_ma * 1e-3 for _, p in sent])
@@ -142,10 +150,71 @@ def _judge(sent: list[tuple[float, Admitted]], tightest: tuple[float, float]) ->
     return wrong
 
 
+def fuzz_plans(plans: int, seed: int) -> Found:
+    """Ask for whole tests and judge those that were admitted."""
+    rng = np.random.default_rng(seed)
+    found = Found()
+    for _ in range(plans):
+        found.requests += 1
+        most_us, most_ma = rng.choice([500.0, 300.0, 123.4]), float(rng.choice([100.0, 20.0, 60.5, 500.0, math.nan]))
+        rate_hz = float(rng.choice([40.0, 40.0, 20.0, 60.0, 60.0000001, 1.0, 0.999, 0.0, -40.0, math.nan, 1e9]))
+        widths = _widths(rng, most_us)
+        jumps = bool(rng.random() < 0.5)
+        request = TestPlan(
+            test_id="f", participant="f", pulse_rate_hz=rate_hz,
+            profile=Profile(current_ma=most_ma, max_pulse_width_us=most_us),
+            segments=[
+                SegmentPlan(name="f", sequence="widths", settings={"pulse_width_us": widths.tolist(), "jumps": jumps})
+            ],
+        )  # fmt: skip
+        try:
+            test = plan.build(request, limits.for_plan(HARD_LIMITS, request))
+        except (PlanError, RefusedError):
+            found.refused_profiles += 1
+            continue
+        found.sent += 1
+        if words := _judge_plan(test.pulse_width_us, most_ma, rate_hz, min(most_us, 500.0), jumps):
+            found.outside += 1
+            found.example = found.example or words
+    return found
+
+
+def _widths(rng: np.random.Generator, most_us: float) -> np.ndarray:
+    """A list of widths: mostly one that might pass but for one thing."""
+    kind, n = rng.integers(6), int(rng.choice([1, 5, 60, 400, 3000, 13_000], p=[0.2, 0.3, 0.25, 0.15, 0.08, 0.02]))
+    if kind == 0:
+        return values(rng, n, most_us)
+    slope = rng.choice([1.0, 49.9, 50.0, 50.0000001, 80.0])
+    ramp = np.minimum(slope * np.arange(1, n + 1), most_us * rng.random() ** 0.1)
+    if kind == 1:
+        ramp[rng.integers(n)] = values(rng, 1, most_us)[0]
+    return ramp
+
+
+def _judge_plan(widths_us: np.ndarray, current_ma: float, rate_hz: float, most_us: float, jumps: bool) -> str:
+    """What is outside in a test that was admitted; empty: nothing."""
+    charge_uc = widths_us * current_ma * 1e-3
+    total = np.concatenate([[0.0], np.cumsum(charge_uc)])
+    second = min(len(widths_us), round(rate_hz))
+    rise_us = float(np.max(np.diff(widths_us, prepend=0.0)))
+    wrong = {
+        "width": not (np.min(widths_us) >= 0 and np.max(widths_us) <= most_us),
+        "current": not (0 <= current_ma <= MOST["current_ma"]),
+        "charge": not (np.max(charge_uc) <= MOST["charge_uc"]),
+        "charge per second": not (np.max(total[second:] - total[:-second]) <= MOST["charge_per_s_uc"] + 1e-6),
+        "rate": not (1 <= rate_hz <= MOST_OF_A_TEST["rate_hz"]),
+        "duration": not (len(widths_us) / rate_hz <= MOST_OF_A_TEST["duration_s"]),
+        "charge of the test": not (total[-1] <= MOST_OF_A_TEST["charge_uc"] + 1e-6),
+        "rise": not jumps and not (rise_us <= MOST_OF_A_TEST["rise_us"]),
+    }
+    return ", ".join(name for name, is_wrong in wrong.items() if is_wrong)
+
+
 def main() -> None:
     """Fuzz and print; exit 1 if a pulse came out that should not have."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--requests", type=int, default=1_000_000)
+    parser.add_argument("--plans", type=int, default=20_000)
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
     began_s = time.monotonic()
@@ -154,7 +223,12 @@ def main() -> None:
         f"seed {options.seed}: {found.requests} requests, {found.sent} pulses sent, {found.outside} outside, "
         f"{found.refused_profiles} mad profiles refused, {time.monotonic() - began_s:.0f} s {found.example}"
     )
-    sys.exit(1 if found.outside else 0)
+    plans = fuzz_plans(options.plans, options.seed)
+    print(
+        f"seed {options.seed}: {plans.requests} whole plans, {plans.sent} admitted, {plans.outside} outside "
+        f"{plans.example}"
+    )
+    sys.exit(1 if found.outside or plans.outside else 0)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bench.rig_fuzz import fuzz
+from bench.rig_fuzz import fuzz, fuzz_plans
 from rig import limits
 from rig.errors import RefusedError
 from rig.limits import HARD_LIMITS, Admitted, Refusal, admit
@@ -99,6 +99,13 @@ def test_a_million_mad_requests_at_the_gate():
     assert found.outside == 0, found.example
     assert found.sent > 50_000  # it is no wall
     assert found.refused_profiles > 10
+
+
+def test_no_mad_plan_is_admitted_with_anything_outside():
+    found = fuzz_plans(2000, seed=20)
+    assert found.outside == 0, found.example
+    assert found.sent > 50
+    assert found.refused_profiles > 200
 
 
 @pytest.mark.parametrize("name", sorted({r.name for r in HARD_LIMITS.values()}))

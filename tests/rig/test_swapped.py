@@ -1,4 +1,4 @@
-"""Cables on the wrong device: a driver that gets no answer of its own device says so, and sends nothing that stimulates."""
+"""Cables on the wrong device: a driver that hears nothing of its own kind says so and sends nothing that stimulates."""
 
 from __future__ import annotations
 
