@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from api.errors import ApiError
+from api.logs import current_test
 
 log = logging.getLogger("stimrig.fitting")
 
@@ -39,6 +40,7 @@ class Job:
     started_s: float | None = None
     result: asyncio.Future[dict[str, Any]] = field(default_factory=lambda: asyncio.get_running_loop().create_future())
     on_progress: Callable[[Job], None] | None = None
+    test_id: str | None = field(default_factory=current_test.get)
 
     @property
     def elapsed_s(self) -> float:
@@ -216,10 +218,12 @@ class Fitting:
 
     async def _work(self, worker: Worker, job: Job) -> None:
         job.state, job.started_s = "running", time.monotonic()
+        current_test.set(job.test_id)  # a task of its own; whoever happened to dispatch it may have had another test
         try:
             result = await worker.run(job)
             job.state, job.progress = "done", 1.0
             self.done_count += 1
+            log.info("%s done in %.1f s", job.verb, job.elapsed_s)
             if not job.result.done():
                 job.result.set_result(result)
         except (ApiError, OSError, ValueError) as error:

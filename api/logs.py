@@ -5,6 +5,10 @@ from __future__ import annotations
 import json
 import logging
 import sys
+from contextvars import ContextVar
+
+current_test: ContextVar[str | None] = ContextVar("test_id", default=None)
+"""The test that is being dealt with: every line that comes of it carries its id, whoever writes the line."""
 
 
 class JsonLines(logging.Formatter):
@@ -17,7 +21,7 @@ class JsonLines(logging.Formatter):
             "logger": record.name,
             "message": record.getMessage(),
         }
-        test_id = getattr(record, "test_id", None)
+        test_id = getattr(record, "test_id", None) or current_test.get()
         if test_id is not None:
             line["test_id"] = test_id
         if record.exc_info:

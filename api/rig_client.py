@@ -7,6 +7,7 @@ import contextlib
 import itertools
 import json
 import logging
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -203,7 +204,8 @@ class RigClient:
 
 def no_rig(detail: str) -> ApiError:
     """503: the rig cannot be reached."""
-    return ApiError(503, "rig-unreachable", "The rig cannot be reached", f"{detail} Is its process running?")
+    words = re.sub(r"^\[Errno \d+\] ", "", detail).rstrip(".")
+    return ApiError(503, "rig-unreachable", "The rig cannot be reached", f"{words}. Is its process running?")
 
 
 __all__ = ["AnyEvent", "Request", "RigClient", "no_rig"]

@@ -16,6 +16,7 @@ from api.clock import Clock
 from api.errors import ApiError, NotFoundError
 from api.fitting import Fitting
 from api.live import Hub
+from api.logs import current_test
 from api.outcomes import OPEN_STATES, Outcomes
 from api.rig_client import AnyEvent, RigClient
 from api.schemas import TestIn
@@ -36,6 +37,8 @@ from rig.messages import (
 )
 
 log = logging.getLogger("stimrig.trials")
+NOT_CONFIRMED = "The stop is not confirmed"
+EMERGENCY = "Use the stimulator's own emergency switch now."
 
 
 @dataclass
@@ -89,6 +92,7 @@ class Trials:
         if body.joins is not None:
             await asyncio.to_thread(self._check_joins, body)
         self.current = Current(plan.test_id, plan.participant, by)
+        current_test.set(plan.test_id)
         self.fitting.cancel_background()
         try:
             preview = await self.rig.ask(PreviewRequest(plan=plan, recruitment=self._recruitment(plan.participant)))
@@ -188,14 +192,12 @@ class Trials:
             )
         except ApiError as error:
             await asyncio.to_thread(self._audit, by, "stop failed", detail=error.detail)
-            error.detail = f"{error.detail} Use the stimulator's own emergency switch now."
+            error.title, error.detail = NOT_CONFIRMED, f"{EMERGENCY} {error.title}: {error.detail}"
             raise
         await asyncio.to_thread(self._audit, by, "stop", reason=reason, confirmed=evidence.confirmed)
         if not evidence.confirmed:
-            detail = f"{evidence.detail} Use the stimulator's own emergency switch now."
-            raise ApiError(
-                503, "stop-not-confirmed", "The stop is not confirmed", detail, evidence=evidence.model_dump()
-            )
+            detail = f"{EMERGENCY} The rig says: {evidence.detail}"
+            raise ApiError(503, "stop-not-confirmed", NOT_CONFIRMED, detail, evidence=evidence.model_dump())
         return evidence
 
     def _audit(self, by: str, action: str, **detail: Any) -> None:
@@ -226,6 +228,7 @@ class Trials:
 
     async def _finish(self, event: FinishedEvent) -> None:
         """Take over a finished test: store the recording, identify, store the model."""
+        current_test.set(event.test_id)
         try:
             row = await asyncio.to_thread(self.outcomes.take_recording, event)
             if row is None:
@@ -267,6 +270,7 @@ class Trials:
 
     async def _recover(self, test_id: str, why: str) -> None:
         """A test whose end was not heard: its recording, if the rig sealed one, is adopted."""
+        current_test.set(test_id)
         row: Test = await asyncio.to_thread(self.store.get, Test, test_id)
         if row.recording_id is not None:
             await self.outcomes.identify(test_id)

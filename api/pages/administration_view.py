@@ -14,7 +14,7 @@ from api import audit
 from api.auth import Scope
 from api.context import Administrator, Context, Ctx
 from api.errors import ApiError
-from api.pages.render import page
+from api.pages.render import environment, page
 from api.routes import people, tokens
 from api.store.tables import AuditEntry
 
@@ -113,6 +113,25 @@ async def export(context: Ctx, _who: Administrator) -> Response:
     lines = "".join(json.dumps(entry.as_dict(), ensure_ascii=False) + "\n" for entry in entries)
     headers = {"Content-Disposition": 'attachment; filename="stimrig-audit.jsonl"'}
     return PlainTextResponse(lines, media_type="application/x-ndjson", headers=headers)
+
+
+def told(detail: dict[str, Any]) -> str:
+    """An entry's details on one line; hashes shortened, the export has them whole."""
+    parts = []
+    for name, value in detail.items():
+        if value in (None, "", [], {}):
+            continue
+        if isinstance(value, dict):
+            value = told(value)
+        elif isinstance(value, list):
+            value = ", ".join(str(item) for item in value)
+        text = str(value)
+        short = f"{text[:12]}…" if len(text) == 64 and " " not in text else text
+        parts.append(f"{name.replace('_', ' ')} {short}")
+    return " · ".join(parts)
+
+
+environment.filters["told"] = told
 
 
 def checked(model: Any, **fields: Any) -> Any:

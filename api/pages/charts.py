@@ -40,7 +40,7 @@ def layout(**more: Any) -> dict[str, Any]:
         "paper_bgcolor": "#fff",
         "plot_bgcolor": "#fff",
         "margin": {"l": 64, "r": 16, "t": 24, "b": 48},
-        "legend": {"orientation": "h", "x": 0, "y": 1.0, "yanchor": "bottom"},
+        "legend": {"orientation": "h", "x": 0, "y": 1.0, "yanchor": "bottom", "traceorder": "normal"},
         "hovermode": "x unified",
         **more,
     }
@@ -101,7 +101,7 @@ def measurement(
             height=720,
             shapes=shapes,
             annotations=labels,
-            legend={"orientation": "h", "x": 0, "y": 1.04, "yanchor": "bottom"},
+            legend={"orientation": "h", "x": 0, "y": 1.04, "yanchor": "bottom", "traceorder": "normal"},
             margin={"l": 64, "r": 16, "t": 60, "b": 48},
             xaxis=axis("Time (s)", anchor="y3", range=[time_s[0], time_s[-1]]),
             yaxis=axis("Torque (N·m)", domain=[0.52, 1.0]),

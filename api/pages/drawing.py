@@ -94,7 +94,7 @@ class Plane:
         parts = []
         for name in self.names:
             bottom, top = self.span(name)
-            for value in ticks(*self.y_ranges[name], max(2, round((bottom - top) / 26))):
+            for value in ticks(*self.y_ranges[name], max(3, round((bottom - top) / 30))):
                 at = self.y(value, name)
                 parts.append(stroke(LEFT, at, self.width - RIGHT, at, GRID_COLOUR))
                 parts.append(text(LEFT - 7, at + 4, plain(value), DIM, "end"))
@@ -174,12 +174,16 @@ class Plane:
         shown = [t for t in self.data if t.get("name") and t.get("showlegend", self.layout.get("showlegend", True))]
         if len(shown) < 2:
             return []
-        parts, x = [], LEFT
-        for trace in shown:
+        wide = [LEGEND_GAP + 19 + 6.1 * len(trace["name"]) for trace in shown]
+        parts, x = [], LEFT if LEFT + sum(wide) < self.width else 4.0
+        for trace, room in zip(shown, wide, strict=True):
             colour = trace.get("fillcolor") or trace["line"]["color"]
-            parts.append(f'<rect x="{x:.1f}" y="6" width="14" height="8" rx="2" fill="{colour}"/>')
+            if trace.get("mode") == "markers":
+                parts.append(symbol((x + 8, 10.0), trace, colour))
+            else:
+                parts.append(f'<rect x="{x:.1f}" y="6" width="14" height="8" rx="2" fill="{colour}"/>')
             parts.append(text(x + 19, 14, trace["name"], INK, "start"))
-            x += LEGEND_GAP + 19 + 6.1 * len(trace["name"])
+            x += room
         return parts
 
 

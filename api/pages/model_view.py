@@ -90,8 +90,12 @@ def gather(context: Context, row: Model, measured: dict[str, Any], diagnosis: di
     rows = why.versions([context.versions.public(version) for version in context.versions.lineage(row)], row.id)
     segments = (measured["curves"] or {}).get("segments") or []
     signatures = (found or {}).get("signatures") or {}
+    quiet = view is not None and view["kind"] == "nothing"  # then the worst of the noise is no place to look at
+    if view is not None and quiet:
+        view["places"] = []
     places = view["places"] if view else why_charts.places_of(comparison or {})
     return {
+        "quiet": quiet,
         "why": view,
         # One that has just ended is shown as running once more: the page asks after it, and then shows what it found.
         "job": task.public() if task and not found and task.state in ("running", "completed") else None,

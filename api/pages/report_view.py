@@ -17,7 +17,7 @@ from api.pages.render import page
 from api.store.tables import Recording
 
 router = APIRouter(include_in_schema=False)
-TALL, LOW = 440.0, 270.0
+TALL, LOW = 370.0, 215.0
 
 
 @router.get("/models/{model_id}/report")

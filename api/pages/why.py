@@ -119,6 +119,7 @@ def card(entry: dict[str, Any], library: dict[str, Any]) -> dict[str, Any]:
         "signature": known.get("signature") or "",
         "equation": entry.get("equation") or known.get("equation") or "",
         "source": known.get("source") or "",
+        "next_experiment": worded(entry.get("next_experiment") or ""),
         "rivals": [name_of(rival, library).lower() for rival in entry.get("confused_with") or []],
         "errors": [error for error in errors if error[1] is not None],
         "most_nm": max([value for _, *pair in errors for value in pair if value is not None], default=1.0),
@@ -152,11 +153,16 @@ def splits(comparison: dict[str, Any] | None) -> list[dict[str, Any]]:
     return found
 
 
+def worded(experiment: str) -> str:
+    """An experiment's sentence without the figure that only its ranking needs."""
+    return experiment.split(": expected log evidence")[0].rstrip(".") + "." if experiment else ""
+
+
 def tidy_experiment(found: dict[str, Any], library: dict[str, Any]) -> dict[str, Any]:
     """The next experiment for people."""
     return {
         **found,
-        "text": found["text"].split(": expected log evidence")[0].rstrip(".") + ".",
+        "text": worded(found["text"]),
         "names": [name_of(rival, library).lower() for rival in found["rivals"]],
         "shown": [f"{segment['sequence']} {_seconds(segment['settings'])}".strip() for segment in found["segments"]],
     }

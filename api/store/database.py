@@ -10,11 +10,11 @@ from typing import Any
 
 from sqlalchemy import create_engine, event, select
 from sqlalchemy.engine import make_url
-from sqlalchemy.exc import ArgumentError, OperationalError
+from sqlalchemy.exc import ArgumentError, DatabaseError, OperationalError
 from sqlalchemy.orm import Session, sessionmaker
 
 from api.errors import ApiError
-from api.store import tables
+from api.store import migrations
 
 
 class Store:
@@ -39,9 +39,13 @@ class Store:
             self.engine = create_engine(parsed)
             if parsed.get_backend_name() == "sqlite":
                 event.listen(self.engine, "connect", _durable_sqlite)
-            tables.Table.metadata.create_all(self.engine)
-        except (ArgumentError, OperationalError, ImportError, OSError) as error:
+            migrations.bring_up(self.engine)
+        except migrations.SchemaError as error:
+            raise ApiError(503, "database", "The database does not fit", str(error)) from error
+        except (ArgumentError, DatabaseError, ImportError, OSError) as error:
             mend = "set STIMRIG_DATABASE_URL or STIMRIG_DATA_DIR to a place this user may write"
+            if isinstance(error, DatabaseError) and not isinstance(error, OperationalError):
+                mend = "restore the database from a backup, or set STIMRIG_DATA_DIR to another folder"
             raise ApiError(503, "database", "The database does not open", f"{_first_line(error)}; {mend}") from error
         self._sessions = sessionmaker(self.engine, expire_on_commit=False)
         self.write_lock = threading.RLock()

@@ -25,12 +25,17 @@ function take(message) {
     showTest(message.test);
   } else if (message.type === "link" || message.type === "idle") {
     state.connected = message.type === "link" ? message.connected : message.rig_connected;
+    if (!state.connected) showRig("disconnected");
   } else if (message.type === "state") {
-    const pill = byId("rig-state");
-    pill.className = "pill state-" + message.rig.state;
-    pill.lastElementChild.textContent = message.rig.state;
+    showRig(message.rig.state);
   }
   state.dirty = true;
+}
+
+function showRig(name) {
+  const pill = byId("rig-state");
+  pill.className = "pill state-" + name;
+  pill.lastElementChild.textContent = name;
 }
 
 function addFrame(message) {
