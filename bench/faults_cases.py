@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -11,6 +12,10 @@ WATCH_S = 0.1
 """The rig's watch for torque and acks (defaults)."""
 SYNC_WATCH_S = 3.5
 """The rig's watch for the disk, and the time from one attempt to the next."""
+PAGE_S = 0.08
+"""How long the journal still finds room when no page is free: in its last one, 4 kB, at 33 bytes a sample."""
+WINDOW_S = 1.0
+"""Rig seconds of a phase within which a fault comes."""
 PHASES = ("arming", "prbs", "rest", "ramp", "sealing")
 
 
@@ -69,7 +74,7 @@ CASES: dict[str, Case] = {
         Case("error_frames", "go on"),
         Case("clock_jitter", "go on"),
         Case("delivery_jitter", "go on"),
-        Case("disk_full", "stop", of="host"),
+        Case("disk_full", "stop", PAGE_S, of="host"),
         Case("disk_slow", "stop", SYNC_WATCH_S, of="host"),
         Case("host_killed", "stop", of="host"),
         Case("host_stopped_2s", "stop", of="host"),
@@ -79,18 +84,24 @@ CASES: dict[str, Case] = {
 }
 
 
-def plan_of(phase: str, long: bool = False) -> list[dict[str, Any]]:
-    """Segments of a test in which that phase comes soon; `long`: for faults that take seconds to be seen."""
+def plan_of(phase: str, hidden_s: float, speed: float) -> list[dict[str, Any]]:
+    """Segments of a test in which that phase comes soon and lasts until the fault must have been seen.
+
+    Parameters
+    ----------
+    hidden_s
+        Real seconds until it can be seen.
+    speed
+        Rig seconds a real second.
+    """
+    lasting_s = WINDOW_S + (hidden_s + 1.0) * speed
     rest = {"name": "rest", "sequence": "rest", "settings": {"duration_s": 0.6}}
-    prbs = {
-        "name": "prbs",
-        "sequence": "prbs",
-        "settings": {"bits": 8 if long else 7, "clock_pulses": 3 if long else 1},
-    }
-    ramp_s = 9.0 if long else 1.6
+    chip = max(1, math.ceil(lasting_s / (127 * 0.025)))
+    prbs = {"name": "prbs", "sequence": "prbs", "settings": {"bits": 7, "clock_pulses": chip}}
+    ramp_s = max(1.6, round(lasting_s / 2, 1))
     ramp = {"name": "ramp", "sequence": "ramp", "settings": {"up_s": ramp_s, "down_s": ramp_s}}
     first = {"name": "steps", "sequence": "steps", "settings": {"on_s": 0.5, "off_s": 0.0, "repeats": 1}}
-    pause = {"name": "rest", "sequence": "rest", "settings": {"duration_s": 18.0 if long else 2.0}}
+    pause = {"name": "rest", "sequence": "rest", "settings": {"duration_s": max(2.0, round(lasting_s, 1))}}
     return {
         "arming": [rest, prbs],
         "prbs": [rest, prbs],

@@ -1,16 +1,15 @@
-"""What came of an injection, and the table of all of them."""
+"""What came of an injection, and what of it is wrong."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 
-from bench.faults_cases import CASES, PHASES
+from bench.faults_cases import CASES
 from rig import archive
 from rig.errors import RecordingError
 
@@ -32,14 +31,17 @@ class Verdict:
     evidence: str = ""
     felt: int = 0
     kept: int = 0
+    acknowledged: int = 0
     tail_ms: float | None = None
     opens: bool | None = None
     rearmed: bool | None = None
     wrong: list[str] = field(default_factory=list)
+    failed: str = ""
+    """Why the campaign itself could not judge it; it is then no injection."""
 
 
 def judge_file(verdict: Verdict, path: str | None) -> dict[str, Any] | None:
-    """Does the recording open, is it whole, and does it hold every pulse that was felt?"""
+    """Does the recording open, is it whole, does it hold every pulse that was felt, and no ack of one that was not?"""
     if path is None:
         verdict.opens = False
         verdict.wrong.append("no recording")
@@ -55,6 +57,9 @@ def judge_file(verdict: Verdict, path: str | None) -> dict[str, Any] | None:
         verdict.wrong.append(f"file: {error}")
         return None
     verdict.kept = int(np.sum(np.isin(status, (0, 4, 5))))
+    verdict.acknowledged = int(np.sum(status == 0))
+    if verdict.acknowledged > verdict.felt:
+        verdict.wrong.append(f"{verdict.acknowledged} pulses acknowledged in the file, {verdict.felt} felt")
     if verdict.felt > verdict.kept:
         verdict.wrong.append(f"{verdict.felt} pulses felt, {verdict.kept} in the file")
     return {"written_s": written_s[np.isfinite(written_s)], "host_s": host_s}
@@ -90,69 +95,3 @@ def judge_outcome(verdict: Verdict) -> None:
         verdict.wrong.append(f"it stopped: {verdict.reason}")
     if verdict.outcome != "completed" and not verdict.reason:
         verdict.wrong.append("no reason told")
-
-
-def _spread(values: list[float]) -> str:
-    return "" if not values else f"{np.median(values):.0f} / {max(values):.0f}"
-
-
-def _share(flags: list[bool]) -> str:
-    return "" if not flags else f"{sum(flags)}/{len(flags)}"
-
-
-def table(found: list[Verdict], conditions: str) -> str:
-    """docs/faults.md."""
-    wrong = [v for v in found if v.wrong]
-    stops = [v.after_known_ms for v in found if v.after_known_ms is not None and CASES[v.fault].must == "stop"]
-    late = sum(ms > BOUND_MS for ms in stops)
-    files = [v.opens for v in found if v.opens is not None]
-    ended = [v for v in found if v.outcome != "completed"]
-    confirmed = [v.confirmed for v in ended if v.confirmed is not None]
-    lines = [
-        "# Faults",
-        "",
-        "Written by `python -m bench.faults` (`make faults`); a short version runs in the tests. " + conditions,
-        "",
-        f"- pulses later than {BOUND_MS:.0f} ms after the host could know of the fault: {late} of {len(stops)} stopped "
-        f"tests (worst {max(stops, default=0):.0f} ms)",
-        f"- felt pulses that no file holds: {sum(max(0, v.felt - v.kept) for v in found if v.opens)}",
-        f"- files that open and match their hash: {sum(map(bool, files))} of {len(files)}",
-        f"- tests that ended early and were told a reason: {sum(bool(v.reason) for v in ended)} of {len(ended)}",
-        f"- stops confirmed by device and torque where both could still answer: {_share([bool(c) for c in confirmed])}",
-        f"- re-armed after the fault was mended: {_share([bool(v.rearmed) for v in found if v.rearmed is not None])}",
-        f"- injections with anything wrong: {len(wrong)}",
-        "",
-        '"Known" is when something that the host receives differs, or when nothing came for as long as it waits: '
-        "100 ms for torque and acks, 0.5 s for a value that stands still, 3 s for the disk. Times are real ms, "
-        'median / worst; a time below zero means that no pulse came after the fault. "Ended" counts tests that did '
-        "not go on to their end. Where a fault cannot be seen in a phase (an electrode in a rest), going on is right.",
-        "",
-        "| fault | phase | n | ended | last pulse after fault, ms | after it was known, ms | confirmed | file opens "
-        "| felt / in file | re-armed | what was told (one of them) |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
-    ]
-    key = lambda v: (list(CASES).index(v.fault), PHASES.index(v.phase))  # noqa: E731
-    for (fault, phase), group in groupby(sorted(found, key=key), key=key):
-        these = list(group)
-        reasons = [v.reason for v in these if v.reason] or [""]
-        lines.append(
-            f"| {list(CASES)[fault]} | {PHASES[phase]} | {len(these)} "
-            f"| {sum(v.outcome != 'completed' for v in these)} "
-            f"| {_spread([v.last_pulse_ms for v in these if v.last_pulse_ms is not None])} "
-            f"| {_spread([v.after_known_ms for v in these if v.after_known_ms is not None])} "
-            f"| {_share([bool(v.confirmed) for v in these if v.confirmed is not None])} "
-            f"| {_share([bool(v.opens) for v in these if v.opens is not None])} "
-            f"| {sum(v.felt for v in these)} / {sum(v.kept for v in these)} "
-            f"| {_share([bool(v.rearmed) for v in these if v.rearmed is not None])} "
-            f"| {_tidy(reasons[0])} |"
-        )
-    if wrong:
-        lines += ["", "## What went wrong", ""]
-        lines += [f"- {v.fault}, {v.phase}, seed {v.seed}: {'; '.join(map(_tidy, v.wrong))}" for v in wrong]
-    return "\n".join(lines) + "\n"
-
-
-def _tidy(text: str) -> str:
-    """One cell of a table, without this machine's paths."""
-    words = ["…/" + word.rsplit("/", 1)[1] if word.count("/") > 1 else word for word in text.split()]
-    return " ".join(words).replace("|", "/")[:150]
