@@ -44,13 +44,17 @@ class Case:
     resting: Must | None = None
     loses_samples: bool = False
 
+    def at_speed(self, speed: float) -> dict[str, Any]:
+        """The settings, delays in emulated seconds: a rig that runs faster still waits for real ones."""
+        return {key: value * speed if key == "delay_s" else value for key, value in self.settings.items()}
+
 
 CASES: dict[str, Case] = {
     case.name: case
     for case in (
         Case("stimulator_unplugged", "stop"),
         Case("no_ack", "stop", WATCH_S),
-        Case("late_ack", "stop", WATCH_S, settings={"delay_s": 0.8}),
+        Case("late_ack", "stop", WATCH_S, settings={"delay_s": 0.2}),
         Case("corrupt_answers", "stop", WATCH_S),
         Case("corrupt_commands", "stop", WATCH_S),
         Case("electrode_error", "stop", resting="either"),

@@ -77,9 +77,15 @@ class Worker:
         before = self._felt_count()
         while not client.events.empty():
             client.events.get_nowait()
+        accepted = verdict.phase != "arming"
         if verdict.phase == "arming":
             asked: queue.Queue[dict[str, Any]] = queue.Queue()
-            threading.Thread(target=lambda: asked.put(self._start(client, plan)), daemon=True).start()
+
+            def ask() -> None:
+                with contextlib.suppress(queue.Empty, OSError):  # nobody answers: killed before it could
+                    asked.put(self._start(client, plan))
+
+            threading.Thread(target=ask, daemon=True).start()
             time.sleep(rng.uniform(0.0, 0.15))
             injected_s, undo = self._break(case)
             with contextlib.suppress(queue.Empty):
@@ -87,6 +93,7 @@ class Worker:
                 if not reply["ok"]:
                     self._refused(case, verdict, reply, undo)
                     return
+                accepted = True
         else:
             reply = self._start(client, plan)
             assert reply["ok"], reply
@@ -97,11 +104,15 @@ class Worker:
         stop = event["summary"].get("stop")
         if stop is not None and event["outcome"] != "completed":
             verdict.confirmed, verdict.evidence = stop["confirmed"], stop["detail"]
-        felt = [p for p in self._felt(before) if p["delivered"]]
-        verdict.felt = len(felt)
+        felt = self._delivered(before)
         self._mend(case, verdict, undo)
+        if self.bench is not None:
+            felt = self._delivered(before)  # one that came after the end that was told would be seen here
+        verdict.felt = len(felt)
         if event["recording_path"] is None:
             event = self._sealed_later(test_id) or event
+        if event["recording_path"] is None and not accepted and not felt:
+            return  # it died before it had said that there is a test: no pulse, and no file to open
         content = judge_file(verdict, event["recording_path"])
         judge_times(verdict, [p["monotonic_s"] for p in felt], injected_s)
         judge_outcome(verdict)
@@ -157,7 +168,7 @@ class Worker:
         bench = self.bench
         assert bench is not None
         if case.of == "emulator":
-            answer = bench.fault(cmd="fault", name=case.name, on=True, **case.settings)
+            answer = bench.fault(cmd="fault", name=case.name, on=True, **case.at_speed(self.speed))
             assert answer["ok"], answer
             return answer["monotonic_s"], lambda: bench.fault(cmd="fault", name=case.name, on=False)
         return getattr(self, f"_{case.name}")()
@@ -291,6 +302,9 @@ class Worker:
     def _felt(self, since: int) -> list[dict[str, Any]]:
         assert self.bench is not None
         return control(self.bench.emulator.ready["control"], {"cmd": "pulses", "since": since})["pulses"]
+
+    def _delivered(self, since: int) -> list[dict[str, Any]]:
+        return [pulse for pulse in self._felt(since) if pulse["delivered"]]
 
     def _ready(self) -> RigClient:
         """A rig that is ready; a new pair where the last one could not be mended."""

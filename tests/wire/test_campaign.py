@@ -16,9 +16,8 @@ FAULTS = (
     "host_killed",
     "corrupt_commands",
     "cell_silent",
-    "torque_step",
-    "frames_dropped",
 )
+"""Those that the other tests of this folder do not make, and one of the load cell."""
 
 
 def test_a_short_campaign_finds_nothing_wrong():
@@ -32,7 +31,7 @@ def test_a_short_campaign_finds_nothing_wrong():
         assert verdict.felt <= verdict.kept
     text = table(found, "A test.")
     assert all(f"| {fault} |" in text for fault in FAULTS)
-    assert "injections with anything wrong: 0 of 7" in text
+    assert f"injections with anything wrong: 0 of {len(FAULTS)}" in text
 
 
 def test_the_whole_campaign_is_every_fault_in_every_phase():

@@ -226,7 +226,8 @@ def test_lost_samples_are_found_and_marked(shared: tuple[Bench, RigClient]):
         assert np.allclose(np.diff(file["torque/time_s"][:]), steps / 1600, rtol=0.01)
 
 
-def test_two_rigs_cannot_share_the_data_or_the_port(bench: Bench):
-    bench.start_rig()
+def test_two_rigs_cannot_share_the_data_or_the_port(shared: tuple[Bench, RigClient]):
+    bench, client = shared
     with pytest.raises(RuntimeError, match="another rig"):
         bench.start_rig()
+    assert client.status()["state"] == "ready"  # the first is none the worse for it

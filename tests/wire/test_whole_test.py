@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from rig import align, archive
-from tests.wire.processes import Bench, control, default_plan, short_plan
+from tests.wire.processes import Bench, RigClient, control, default_plan, short_plan
 
 pytestmark = pytest.mark.wire
 
@@ -122,10 +122,11 @@ def test_aligned_times_are_those_of_the_muscle(make_bench: Callable[..., Bench],
     assert event["summary"]["alignment"]["error_ms"] < 1.0
 
 
-def test_two_tests_one_after_the_other(bench: Bench):
-    first = play(bench, short_plan("one"))
-    client = bench.client()
+def test_two_tests_one_after_the_other(shared: tuple[Bench, RigClient]):
+    client = shared[1]
     client.ask("subscribe")
+    assert client.ask("start", plan=short_plan("one"))["ok"]
+    first = client.wait_finished("one")
     assert client.ask("start", plan=short_plan("two"))["ok"]
     second = client.wait_finished("two")
     assert first["recording_id"] != second["recording_id"]
