@@ -17,13 +17,14 @@ class Notifier:
     Parameters
     ----------
     environment
-        Where NOTIFY_SOCKET and WATCHDOG_USEC are looked for.
+        Where NOTIFY_SOCKET, WATCHDOG_USEC and WATCHDOG_PID are looked for.
     """
 
     def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
         address = environment.get("NOTIFY_SOCKET", "")
         self._address = "\0" + address[1:] if address.startswith("@") else address  # @: an abstract socket
-        self.watched = bool(address) and environment.get("WATCHDOG_USEC", "").isdigit()
+        meant = environment.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())  # else it was a parent's
+        self.watched = bool(address) and meant and environment.get("WATCHDOG_USEC", "").isdigit()
         self._complained = False
 
     def ready(self) -> None:

@@ -49,8 +49,9 @@ def test_the_watchdog_is_fed_by_proof_alone(manager: socket.socket):
     ]  # fmt: skip
 
 
-def test_without_a_watchdog_there_is_nothing_to_feed(manager: socket.socket):
-    notifier = Notifier({"NOTIFY_SOCKET": manager.getsockname()})
+@pytest.mark.parametrize("watchdog", [{}, {"WATCHDOG_USEC": "30000000", "WATCHDOG_PID": "1"}])
+def test_without_a_watchdog_of_its_own_there_is_nothing_to_feed(manager: socket.socket, watchdog: dict[str, str]):
+    notifier = Notifier({"NOTIFY_SOCKET": manager.getsockname(), **watchdog})
     notifier.ready()
     notifier.alive(None)
     assert heard(manager) == ["READY=1"]
