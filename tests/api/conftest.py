@@ -99,6 +99,20 @@ def run_service(tmp_path: Path, short_dir: Path, worker: Any, speed: float = 30.
             yield Service(url, app, rig, tmp_path)
 
 
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Any]:
+    """Debian's chromium, started once for all tests that want it."""
+    from tests.api.browser import ARGUMENTS, CHROMIUM
+
+    playwright = pytest.importorskip("playwright.sync_api")
+    if CHROMIUM is None:
+        pytest.skip("Debian's chromium is not installed (apt-get install chromium)")
+    with playwright.sync_playwright() as driver:
+        chromium = driver.chromium.launch(executable_path=str(CHROMIUM), args=ARGUMENTS)
+        yield chromium
+        chromium.close()
+
+
 @pytest.fixture
 def client(service: Service) -> Iterator[httpx.Client]:
     """The administrator's client."""

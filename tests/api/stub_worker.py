@@ -117,6 +117,9 @@ def answer(verb: str, arguments: dict[str, Any], say: Any) -> dict[str, Any]:
                 "effects": [{"id": name} for name in ("fatigue", "tremor", "threshold_drift", "slow", "die", "bad")]
             }
         }
+    if verb == "export_csv":
+        Path(arguments["out"]).write_text("time_s,pulse_width_us,torque_nm,segment\n0.0,0.0,0.0,rest\n")
+        return {"result": {"rows": 1}}
     if verb == "find_recording":
         from api.jobs import find_recording
 

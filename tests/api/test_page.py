@@ -11,16 +11,10 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from tests.api.conftest import STUB, TOKEN, Service, run_service, run_test
+from tests.api.browser import NARROW, PASSWORD, PHONE, WIDE, open_tab, painted_soon, participant, start
+from tests.api.conftest import STUB, Service, run_service, run_test
 
 pytestmark = pytest.mark.browser
-
-CHROMIUM = next((path for path in map(Path, ("/usr/bin/chromium", "/usr/bin/chromium-browser")) if path.exists()), None)
-ARGUMENTS = [
-    "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
-    "--disable-component-update", "--disable-sync",
-]  # fmt: skip
-WIDE, NARROW, PHONE = (1280, 860), (1024, 768), (390, 844)
 
 
 @pytest.fixture(scope="module")
@@ -28,77 +22,10 @@ def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterat
     yield from run_service(tmp_path_factory.mktemp("page"), short_dir, STUB, speed=8.0)
 
 
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    playwright = pytest.importorskip("playwright.sync_api")
-    if CHROMIUM is None:
-        pytest.skip("Debian's chromium is not installed (apt-get install chromium)")
-    with playwright.sync_playwright() as driver:
-        chromium = driver.chromium.launch(executable_path=str(CHROMIUM), args=ARGUMENTS)
-        yield chromium
-        chromium.close()
-
-
 @pytest.fixture
 def tab(browser: Any, service: Service) -> Iterator[Any]:
     """A signed-in tab that takes down every request, error and console message."""
     yield from open_tab(browser, service)
-
-
-def open_tab(browser: Any, service: Service, **options: Any) -> Iterator[Any]:
-    """A tab, signed in."""
-    service.rig.confirms_stop = True
-    context = browser.new_context(viewport={"width": WIDE[0], "height": WIDE[1]}, **options)
-    page = context.new_page()
-    page.requests, page.errors = [], []
-    page.on("request", lambda request: page.requests.append(request.url))
-    page.on("pageerror", lambda error: page.errors.append(str(error)))
-    page.on("console", lambda message: page.errors.append(message.text) if message.type == "error" else None)
-    sign_in(page, service)
-    yield page
-    context.close()
-    with service.client() as http:
-        http.post("/v1/stop")
-        end = time.monotonic() + 5
-        while http.get("/v1/rig").json()["holder"]:
-            assert time.monotonic() < end
-            time.sleep(0.05)
-        http.post("/v1/rearm")
-
-
-def sign_in(page: Any, service: Service) -> None:
-    page.goto(service.url + "/")
-    page.get_by_label("Access token").fill(TOKEN)
-    page.get_by_role("button", name="Sign in").click()
-    page.get_by_role("heading", name="Participants").wait_for()
-
-
-def participant(page: Any, service: Service, code: str) -> None:
-    page.goto(service.url + "/")
-    page.get_by_label("Code").fill(code)
-    page.get_by_role("button", name="Create").click()
-    page.get_by_role("heading", name=code).wait_for()
-
-
-def start(page: Any) -> None:
-    page.get_by_role("button", name="Start the pre-session test").click()
-    page.wait_for_url("**/tests/T*")
-
-
-def painted(page: Any, canvas: str) -> int:
-    """How many pixels of a canvas are not empty."""
-    script = """(id) => { const c = document.getElementById(id);
-      const d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data;
-      let n = 0; for (let i = 3; i < d.length; i += 4) if (d[i]) n++; return n; }"""
-    return page.evaluate(script, canvas)
-
-
-def painted_soon(page: Any, canvas: str) -> int:
-    """The same once the first frames have been drawn."""
-    end = time.monotonic() + 3
-    while (count := painted(page, canvas)) < 3001 and time.monotonic() < end:
-        time.sleep(0.05)
-    return count
 
 
 def test_a_clinicians_whole_way(tab: Any, service: Service) -> None:
@@ -119,8 +46,10 @@ def test_a_clinicians_whole_way(tab: Any, service: Service) -> None:
         assert tab.locator(".figure-box").get_by_text(words).first.is_visible(), words
     assert "ceiling 98.60 %" in tab.inner_text("main")
     tab.get_by_label("Reason").fill("close to its ceiling")
+    tab.get_by_label("Your password, once more").fill(PASSWORD)
     tab.get_by_role("button", name="Approve").click()
     tab.get_by_text("the controller gets this model").wait_for()
+    assert tab.locator(".who").inner_text().split() == ["Signed", "in:", "Ada", "clinician"]
     tab.get_by_role("link", name="P100").click()
     assert tab.get_by_text("in use", exact=True).is_visible()
     with service.client() as http:
@@ -270,6 +199,7 @@ def test_hidden_effect_is_found_and_added_by_clicking(tab: Any, service: Service
     tab.get_by_role("heading", name="The error over the versions").wait_for()
     tab.locator("[data-figure=falling] .main-svg").first.wait_for()
     assert tab.locator("tr.current").inner_text().startswith("2. + fatigue")
+    tab.locator(".undo").get_by_label("Your password, once more").fill(PASSWORD)
     tab.get_by_role("button", name="Undo").click()
     tab.wait_for_url(f"**/models/{model}#why")
     assert tab.locator("tr.current").inner_text().startswith("1. base model")

@@ -1,0 +1,88 @@
+"""A real browser for the page's tests: tabs that take down every request and error, signed in as the clinician Ada."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from tests.api.conftest import TOKEN, Service
+
+CHROMIUM = next((path for path in map(Path, ("/usr/bin/chromium", "/usr/bin/chromium-browser")) if path.exists()), None)
+ARGUMENTS = [
+    "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
+    "--disable-component-update", "--disable-sync",
+]  # fmt: skip
+WIDE, NARROW, PHONE = (1280, 860), (1024, 768), (390, 844)
+
+
+NAME, PASSWORD = "Ada", "correct horse battery"
+
+
+def open_tab(browser: Any, service: Service, signed_in: bool = True, **options: Any) -> Iterator[Any]:
+    """A tab, signed in; at its end the rig is brought to rest and re-armed."""
+    service.rig.confirms_stop = True
+    context = browser.new_context(viewport={"width": WIDE[0], "height": WIDE[1]}, **options)
+    page = context.new_page()
+    page.requests, page.errors = [], []
+    page.on("request", lambda request: page.requests.append(request.url))
+    page.on("pageerror", lambda error: page.errors.append(str(error)))
+    page.on("console", lambda message: page.errors.append(message.text) if message.type == "error" else None)
+    if signed_in:
+        sign_in(page, service)
+    yield page
+    context.close()
+    with service.client() as http:
+        http.post("/v1/stop")
+        end = time.monotonic() + 5
+        while http.get("/v1/rig").json()["holder"]:
+            assert time.monotonic() < end
+            time.sleep(0.05)
+        http.post("/v1/rearm")
+
+
+def sign_in(page: Any, service: Service, name: str = NAME, password: str = PASSWORD) -> None:
+    """By name and password; the person is made if nobody has."""
+    with service.client() as http:
+        http.post("/v1/users", json={"name": name, "password": password})
+    page.goto(service.url + "/")
+    page.get_by_label("Name", exact=True).fill(name)
+    page.get_by_label("Password").fill(password)
+    page.get_by_role("button", name="Sign in", exact=True).click()
+    page.get_by_role("heading", name="Participants").wait_for()
+
+
+def sign_in_with_token(page: Any, service: Service) -> None:
+    """As the administrator of the first set-up."""
+    page.goto(f"{service.url}/sign-in#token={TOKEN}")
+    page.get_by_role("button", name="Sign in with the token").click()
+    page.get_by_role("heading", name="Participants").wait_for()
+
+
+def participant(page: Any, service: Service, code: str) -> None:
+    page.goto(service.url + "/")
+    page.get_by_label("Code").fill(code)
+    page.get_by_role("button", name="Create").click()
+    page.get_by_role("heading", name=code).wait_for()
+
+
+def start(page: Any) -> None:
+    page.get_by_role("button", name="Start the pre-session test").click()
+    page.wait_for_url("**/tests/T*")
+
+
+def painted(page: Any, canvas: str) -> int:
+    """How many pixels of a canvas are not empty."""
+    script = """(id) => { const c = document.getElementById(id);
+      const d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data;
+      let n = 0; for (let i = 3; i < d.length; i += 4) if (d[i]) n++; return n; }"""
+    return page.evaluate(script, canvas)
+
+
+def painted_soon(page: Any, canvas: str) -> int:
+    """The same once the first frames have been drawn."""
+    end = time.monotonic() + 3
+    while (count := painted(page, canvas)) < 3001 and time.monotonic() < end:
+        time.sleep(0.05)
+    return count

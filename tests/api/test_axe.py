@@ -1,0 +1,164 @@
+"""Every page in every state under axe: no violation, wide and on a phone; stop uncovered, nothing sticks out."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.api.browser import PHONE, WIDE, open_tab, participant, sign_in_with_token, start
+from tests.api.conftest import STUB, Service, run_service, run_test, wait_done
+
+axe_path = pytest.importorskip("axe_playwright_python.base").AXE_FILE_PATH
+pytestmark = pytest.mark.browser
+
+UNCOVERED = """() => { const b = document.getElementById('stop').getBoundingClientRect();
+  const at = (x, y) => document.elementFromPoint(b.left + b.width * x, b.top + b.height * y);
+  return [[.5, .5], [.03, .1], [.97, .9]].every(([x, y]) => at(x, y)?.id === 'stop'); }"""
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
+    yield from run_service(tmp_path_factory.mktemp("axe"), short_dir, STUB, speed=8.0)
+
+
+@pytest.fixture
+def tab(browser: Any, service: Service) -> Iterator[Any]:
+    yield from open_tab(browser, service)
+
+
+def violations(page: Any) -> list[str]:
+    """What axe finds, rule by rule, with the elements. The page's own policy keeps foreign scripts out of its world."""
+    if not page.evaluate("typeof window.axe === 'object'"):
+        page.evaluate(Path(axe_path).read_text("utf-8"))
+    found = page.evaluate("axe.run(document, {resultTypes: ['violations']})")
+    return [
+        f"{entry['id']} ({entry['impact']}): {json.dumps([node['html'][:160] for node in entry['nodes'][:3]])}"
+        for entry in found["violations"]
+    ]
+
+
+def examined(page: Any, what: str, stop: bool = True) -> None:
+    for width, height in (WIDE, PHONE):
+        page.set_viewport_size({"width": width, "height": height})
+        page.wait_for_timeout(150)
+        assert violations(page) == [], (what, width)
+        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth"), (what, width)
+        assert not stop or page.evaluate(UNCOVERED), (what, width)
+
+
+def visit(page: Any, service: Service, path: str, ready: Callable[[], Any] | None = None, stop: bool = True) -> None:
+    page.set_viewport_size({"width": WIDE[0], "height": WIDE[1]})
+    page.goto(service.url + path)
+    if ready:
+        ready()
+    examined(page, path, stop)
+
+
+def test_pages_without_a_test(browser: Any, tab: Any, service: Service) -> None:
+    visit(tab, service, "/")
+    participant(tab, service, "X1")
+    examined(tab, "empty participant")
+    tab.get_by_text("Limits for today", exact=True).click()
+    tab.get_by_text("Take in a recording of another tool").click()
+    examined(tab, "participant, all open")
+    for path in ("/models/none", "/nowhere", "/participants/X1/calibration", "/compare"):
+        visit(tab, service, path)
+    tab.goto(service.url + "/participants/X1/calibration")
+    tab.get_by_role("button", name="Begin the calibration").click()
+    tab.get_by_role("button", name="Wider").wait_for()
+    examined(tab, "calibration")
+    tab.get_by_role("button", name="Discard").click()
+    for stranger in open_tab(browser, service, signed_in=False):
+        visit(stranger, service, "/sign-in", stop=False)
+        stranger.get_by_label("Name", exact=True).fill("Ada")
+        stranger.get_by_label("Password").fill("not the password")
+        stranger.get_by_role("button", name="Sign in", exact=True).click()
+        stranger.get_by_text("do not match").wait_for()
+        examined(stranger, "refused sign-in", stop=False)
+        sign_in_with_token(stranger, service)
+        visit(stranger, service, "/administration")
+        stranger.get_by_label("Name of the controller").fill("ilc")
+        stranger.get_by_role("button", name="Make the key").click()
+        stranger.get_by_text("shown this once").wait_for()
+        examined(stranger, "a new key")
+
+
+def test_a_test_and_its_ends(tab: Any, service: Service) -> None:
+    service.rig.speed = 2.0
+    participant(tab, service, "X2")
+    start(tab)
+    tab.locator("#age", has_text="ms").wait_for()
+    examined(tab, "live")
+    tab.get_by_role("button", name="Stop stimulation").click()
+    tab.get_by_text("The rig confirms").wait_for()
+    examined(tab, "stopped")
+    visit(tab, service, "/")
+    visit(tab, service, "/participants/X2")
+    service.rig.confirms_stop = False
+    tab.get_by_role("button", name="Stop stimulation").click()
+    tab.get_by_role("heading", name="The stop is not confirmed").wait_for()
+    examined(tab, "not confirmed")
+    service.rig.speed = 8.0
+
+
+def test_a_model_and_what_is_made_of_it(tab: Any, service: Service) -> None:
+    with service.client() as http:
+        http.post("/v1/participants", json={"code": "X3"})
+        first = run_test(http, "X3")
+        second = run_test(http, "X3")
+
+    def drawn() -> None:
+        tab.get_by_role("heading", name="Fatigue").wait_for()
+        for figure in ("comparison", "recruitment", "step", "residual"):
+            tab.locator(f"[data-figure={figure}] .main-svg").first.wait_for()
+
+    visit(tab, service, f"/models/{first['model_id']}", drawn)
+    tab.evaluate("document.querySelectorAll('details').forEach((part) => { part.open = true; })")
+    examined(tab, "model, all open")
+    tab.get_by_role("button", name="Add this effect").click()
+    tab.locator("[data-figure=falling] .main-svg").first.wait_for()
+    examined(tab, "versions")
+    visit(tab, service, f"/models/{first['model_id']}/report", stop=False)
+    visit(tab, service, f"/tests/{first['id']}")
+    both = f"/compare?model={first['model_id']}&model={second['model_id']}"
+    visit(tab, service, both, lambda: tab.locator("[data-figure=step] .main-svg").first.wait_for())
+    visit(tab, service, "/participants/X3")
+
+
+def test_a_diagnosis_under_way(tab: Any, service: Service) -> None:
+    marker = service.data / "recordings" / "slow"
+    marker.write_text("0.4")
+    try:
+        with service.client() as http:
+            http.post("/v1/participants", json={"code": "X4"})
+            started = http.post("/v1/tests", json={"participant": "X4"}).json()
+            model = wait_done(http, started["id"], 60.0)["model_id"]
+        visit(tab, service, f"/models/{model}", lambda: tab.get_by_role("button", name="Cancel").wait_for())
+    finally:
+        marker.unlink()
+        tab.get_by_role("button", name="Cancel").click()
+        tab.get_by_role("link", name="Diagnose now").wait_for()
+
+
+def test_without_a_rig(tab: Any, service: Service) -> None:
+    service.rig_thread.__exit__()
+    try:
+        tab.goto(service.url + "/")
+        tab.get_by_text("The rig cannot be reached.").wait_for()
+        examined(tab, "no rig")
+        tab.get_by_role("button", name="Stop stimulation").click()
+        tab.get_by_role("heading", name="The stop is not confirmed").wait_for(timeout=15_000)
+        assert "emergency switch" in tab.locator("[role=alert]").first.inner_text()
+        examined(tab, "stop without a rig")
+    finally:
+        service.rig_thread.__enter__()
+        with service.client() as http:
+            end = time.monotonic() + 20
+            while not http.get("/v1/rig").json()["connected"]:
+                assert time.monotonic() < end
+                time.sleep(0.05)
