@@ -123,18 +123,13 @@ class LiveCell:
         self._count = max(due, self._count)
         return TorqueBlock(block)
 
-    @property
-    def age_s(self) -> float:
-        """Rig seconds since it was switched on."""
-        return self.clock.now_s() - self._began_s
-
     def close(self) -> None: ...
 
 
 class LiveRig:
     """A `Rig` on both, and every event that it published."""
 
-    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch, **overrides: Any) -> None:
+    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch, rate: float = 1.0) -> None:
         self.clock = MonotonicClock(SPEED)
         self.stimulator = LiveStimulator(self.clock)
         self.cell = LiveCell(self.clock, self.stimulator)
@@ -142,7 +137,8 @@ class LiveRig:
         found = SimpleNamespace(find=lambda kind, _: SimpleNamespace(create=lambda _settings, _clock: made[kind]))
         monkeypatch.setattr(pair, "devices", found)
         settings = config.for_emulator(json.dumps(LINE), data_dir=folder, socket=folder / "s")
-        self.config = settings.model_copy(update=overrides)
+        self.config = settings
+        self.cell.rate = rate
         self.events: list[Event] = []
         self.rig = Rig(self.config, self.clock, self.events.append)
         self.rig.open()

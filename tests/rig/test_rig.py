@@ -7,7 +7,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import h5py
 import pytest
@@ -15,7 +14,7 @@ import pytest
 from rig.control import core
 from rig.errors import BusyError, DeviceError, LatchedError, PlanError, RefusedError, UncertainError
 from rig.messages import CalibrateStartRequest, PreviewRequest, Profile, SegmentPlan
-from tests.rig.live import SPEED, LiveRig
+from tests.rig.live import LiveRig
 
 Make = Callable[..., LiveRig]
 
@@ -24,8 +23,8 @@ Make = Callable[..., LiveRig]
 def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Make]:
     made: list[LiveRig] = []
 
-    def of(**overrides: Any) -> LiveRig:
-        made.append(LiveRig(tmp_path, monkeypatch, **overrides))
+    def of(rate: float = 1.0) -> LiveRig:
+        made.append(LiveRig(tmp_path, monkeypatch, rate))
         return made[-1]
 
     yield of
@@ -108,9 +107,7 @@ def test_a_fault_stops_says_why_and_latches(make: Make, inject: Callable[[LiveRi
 
 
 def test_half_the_rate_is_a_fault(make: Make):
-    live = make()
-    live.cell.rate = 0.5
-    time.sleep(2 * live.cell.age_s / SPEED + 0.05)  # until it has fallen behind
+    live = make(rate=0.5)
     live.rig.start(live.plan("one", hold_s=3.0))
     assert float(live.wait("latched").split()[2]) == pytest.approx(800, rel=0.03)
     assert "samples/s come" in live.rig.status().reason
