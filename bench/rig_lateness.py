@@ -1,6 +1,6 @@
 """Figures of the rig over the wire: lateness of pulses, lost samples, CPU, alignment; idle and beside a busy process.
 
-    python -m bench.rig_lateness [--busy N] [--tests N] [--no-sync] [--load-cell slcan] [--json]
+    python -m bench.rig_lateness [--fit] [--busy N] [--tests N] [--no-sync] [--load-cell slcan] [--json]
 
 Plays the default test in real time (38.7 s each) on the emulated rig.
 """
@@ -14,16 +14,18 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+from bench.soak import fitting_one
 from tests.wire.processes import Bench, busy_process, default_plan
 
 
-def measure(busy: int, tests: int, emulator_options: list[str]) -> list[dict[str, Any]]:
+def measure(busy: int, tests: int, emulator_options: list[str], fit: bool = False) -> list[dict[str, Any]]:
     """Summaries of `tests` default tests with `busy` CPU-bound processes beside them."""
     with tempfile.TemporaryDirectory(prefix="rig-bench-") as folder, contextlib.ExitStack() as stack:
         bench = Bench(Path(folder), *emulator_options)
         stack.callback(bench.close)
         client = bench.start_rig()
         client.ask("subscribe")
+        stack.enter_context(fitting_one(bench, client, fit))
         for _ in range(busy):
             stack.enter_context(busy_process())
         events = []
@@ -41,6 +43,7 @@ def measure(busy: int, tests: int, emulator_options: list[str]) -> list[dict[str
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--fit", action="store_true", help="fit a recording again and again in another process")
     parser.add_argument("--busy", type=int, default=0, help="CPU-bound processes beside the rig")
     parser.add_argument("--tests", type=int, default=1)
     parser.add_argument("--no-sync", action="store_true")
@@ -48,11 +51,12 @@ def main() -> None:
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     emulator = ["--load-cell", options.load_cell, *(["--no-sync"] if options.no_sync else [])]
-    summaries = measure(options.busy, options.tests, emulator)
+    summaries = measure(options.busy, options.tests, emulator, options.fit)
     if options.json:
         print(json.dumps(summaries))
         return
-    print(f"{options.busy} busy processes, {options.load_cell}, {'no ' if options.no_sync else ''}sync line")
+    beside = f"{options.busy} busy processes" + (" and a fit" if options.fit else "")
+    print(f"{beside}, {options.load_cell}, {'no ' if options.no_sync else ''}sync line")
     print("| pulses | dropped | late median ms | p99 | max | samples | lost | rig CPU % | alignment | error ms |")
     print("|---|---|---|---|---|---|---|---|---|---|")
     for s in summaries:

@@ -1,6 +1,6 @@
 """How fast a stop is: from the request on the socket to the last pulse felt, and to the confirmed answer.
 
-    python -m bench.rig_stop [--busy N] [--stops N]
+    python -m bench.rig_stop [--fit] [--busy N] [--stops N]
 
 Each stop falls at a random moment of a steady stimulation on the emulated rig, in real time.
 """
@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+from bench.soak import fitting_one
 from tests.wire.processes import Bench, busy_process, control, default_plan
 
 STEPS = [
@@ -24,7 +25,7 @@ STEPS = [
 ]
 
 
-def measure(busy: int, stops: int) -> tuple[list[float], list[float]]:
+def measure(busy: int, stops: int, fit: bool = False) -> tuple[list[float], list[float]]:
     """Milliseconds from request to last pulse (negative: before it) and to the answer, one each per stop."""
     last_pulse_ms, answer_ms = [], []
     with tempfile.TemporaryDirectory(prefix="rig-bench-") as folder, contextlib.ExitStack() as stack:
@@ -32,6 +33,7 @@ def measure(busy: int, stops: int) -> tuple[list[float], list[float]]:
         stack.callback(bench.close)
         client = bench.start_rig()
         client.ask("subscribe")
+        stack.enter_context(fitting_one(bench, client, fit))
         for _ in range(busy):
             stack.enter_context(busy_process())
         for number in range(stops):
@@ -53,11 +55,13 @@ def measure(busy: int, stops: int) -> tuple[list[float], list[float]]:
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--fit", action="store_true", help="fit a recording again and again in another process")
     parser.add_argument("--busy", type=int, default=0, help="CPU-bound processes beside the rig")
     parser.add_argument("--stops", type=int, default=30)
     options = parser.parse_args()
-    last_pulse_ms, answer_ms = measure(options.busy, options.stops)
-    print(f"{options.busy} busy processes, {options.stops} stops (ms: median / p99 / max)")
+    last_pulse_ms, answer_ms = measure(options.busy, options.stops, options.fit)
+    beside = f"{options.busy} busy processes" + (" and a fit" if options.fit else "")
+    print(f"{beside}, {options.stops} stops (ms: median / p99 / max)")
     for name, values in (("request to last pulse", last_pulse_ms), ("request to confirmed answer", answer_ms)):
         print(f"{name}: {np.median(values):.1f} / {np.percentile(values, 99):.1f} / {max(values):.1f}")
 
