@@ -20,6 +20,9 @@ UNCOVERED = """() => { const b = document.getElementById('stop').getBoundingClie
   const at = (x, y) => document.elementFromPoint(b.left + b.width * x, b.top + b.height * y);
   return [[.5, .5], [.03, .1], [.97, .9]].every(([x, y]) => at(x, y)?.id === 'stop'); }"""
 
+STICKING_OUT = """() => [...document.querySelectorAll('body *')].filter((e) => !e.closest('.scroll, .sr') &&
+  e.getBoundingClientRect().right > innerWidth + 1).slice(0, 5).map((e) => e.outerHTML.slice(0, 120))"""
+
 
 @pytest.fixture(scope="module")
 def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
@@ -42,12 +45,19 @@ def violations(page: Any) -> list[str]:
     ]
 
 
+def fits(page: Any, what: str) -> None:
+    """Nothing sticks out to the right, once the figures have taken the new width."""
+    end = time.monotonic() + 8
+    while not page.evaluate("document.documentElement.scrollWidth <= innerWidth"):
+        assert time.monotonic() < end, (what, page.evaluate(STICKING_OUT))
+        page.wait_for_timeout(100)
+
+
 def examined(page: Any, what: str, stop: bool = True) -> None:
     for width, height in (WIDE, PHONE):
         page.set_viewport_size({"width": width, "height": height})
-        page.wait_for_timeout(150)
+        fits(page, f"{what} at {width}")
         assert violations(page) == [], (what, width)
-        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth"), (what, width)
         assert not stop or page.evaluate(UNCOVERED), (what, width)
 
 
