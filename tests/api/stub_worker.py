@@ -93,6 +93,8 @@ def answer(verb: str, arguments: dict[str, Any], say: Any) -> dict[str, Any]:
             return {
                 "error": {"expected": True, "detail": "no effect bad. Take one of fatigue, tremor.", "place": "effects"}
             }
+        while (Path(arguments["data"]).parent / "fitting-slowly").exists():
+            time.sleep(0.05)
         document = model(list(arguments.get("effects", [])))
         return {"result": {"json": json.dumps(document), "model": document}}
     if verb == "comparison":
