@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from typing import Any
 
@@ -12,6 +13,8 @@ from rig.clock import Clock
 from rig.config import RigConfig
 from rig.errors import DeviceError
 from rig.gate import Gate
+
+log = logging.getLogger("rig.pair")
 
 
 class Pair:
@@ -31,16 +34,22 @@ class Pair:
         self._on_fault, self._on_lost = on_fault, on_lost
         self.gate: Gate | None = None
         self.receiver: Receiver | None = None
+        self.found_state = ""
+        """What the stimulator said of itself when it was connected."""
         self.identity: dict[str, dict[str, Any]] = {"stimulator": {}, "load_cell": {}}
 
     def connect(self) -> None:
-        """Open both. Raises DeviceError (neither stays open then) and ConfigError (a DBC without the signal)."""
+        """Open both; a stimulator that says that it may stimulate, though no test is on, is stopped at once.
+
+        Raises DeviceError (neither stays open then) and ConfigError (a DBC without the signal).
+        """
         settings = self._config.stimulator, self._config.load_cell
         stimulator = devices.find("stimulator", settings[0].device).create(settings[0], self._clock)
         cell = devices.find("load_cell", settings[1].device).create(settings[1], self._clock)
         gate = Gate(stimulator, self._clock, self._on_fault, self._on_lost)
         self.identity["stimulator"] = gate.identify()
         try:
+            self._stop_what_was_left(gate)
             self.identity["load_cell"] = cell.open()
         except DeviceError:
             gate.disconnect()
@@ -48,6 +57,13 @@ class Pair:
         receiver = Receiver(cell, self._clock, self._on_lost)
         receiver.start()
         self.gate, self.receiver = gate, receiver
+
+    def _stop_what_was_left(self, gate: Gate) -> None:
+        safe, state = gate.state()
+        self.found_state = state
+        if not safe:
+            log.warning("the stimulator was found %s; stopped", state)
+            gate.stop()
 
     def disconnect(self) -> None:
         """Stop stimulation and give both back; never raises."""

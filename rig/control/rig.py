@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 
 from rig import limits, plan
 from rig.control.calibrating import Calibrating
@@ -40,6 +41,8 @@ class Rig(Calibrating):
             self.finished = event
             self._publish(event)
         before = None
+        if remembered is not None:
+            self._last_pulse_s = self._clock.now_s()  # how long ago it was is not known: a death is no rest
         if remembered == "running":
             before, reason = "uncertain", f"the rig died during a test ({reason or 'its journal was left'})"
         elif remembered == "latched":
@@ -50,6 +53,9 @@ class Rig(Calibrating):
         except DeviceError as error:
             log.error("%s", error)
             trial = trial.disconnected(str(error))  # a latch outlives the missing device
+        else:
+            if before == "uncertain":
+                trial = replace(trial, reason=f"{reason}; the stimulator, asked now: {self._pair.found_state}")
         self._change(trial)
 
     def close(self) -> None:

@@ -129,7 +129,7 @@ class LiveCell:
 class LiveRig:
     """A `Rig` on both, and every event that it published."""
 
-    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch, rate: float = 1.0) -> None:
+    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch, rate: float = 1.0, armed: bool = False) -> None:
         self.clock = MonotonicClock(SPEED)
         self.stimulator = LiveStimulator(self.clock)
         self.cell = LiveCell(self.clock, self.stimulator)
@@ -138,7 +138,7 @@ class LiveRig:
         monkeypatch.setattr(pair, "devices", found)
         settings = config.for_emulator(json.dumps(LINE), data_dir=folder, socket=folder / "s")
         self.config = settings
-        self.cell.rate = rate
+        self.cell.rate, self.stimulator.armed = rate, armed
         self.events: list[Event] = []
         self.rig = Rig(self.config, self.clock, self.events.append)
         self.rig.open()

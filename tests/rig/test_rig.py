@@ -23,8 +23,8 @@ Make = Callable[..., LiveRig]
 def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Make]:
     made: list[LiveRig] = []
 
-    def of(rate: float = 1.0) -> LiveRig:
-        made.append(LiveRig(tmp_path, monkeypatch, rate))
+    def of(rate: float = 1.0, armed: bool = False) -> LiveRig:
+        made.append(LiveRig(tmp_path, monkeypatch, rate, armed))
         return made[-1]
 
     yield of
@@ -188,13 +188,18 @@ def test_a_journal_without_an_end_comes_back_uncertain(make: Make, tmp_path: Pat
     live.rig.close()
     (tmp_path / "latch.json").unlink()
     (tmp_path / "journals" / "dead.journal").write_bytes(left.replace(b'"one"', b'"ten"'))
-    again = make()
-    assert "died" in again.wait("uncertain")
+    again = make(armed=True)
+    reason = again.wait("uncertain")
+    assert "died" in reason
+    assert reason.endswith("the stimulator, asked now: armed")
+    assert not again.stimulator.armed  # and was stopped
     with pytest.raises(UncertainError):
         again.rig.start(again.plan("two"))
     assert again.rig.finished is not None
     assert again.rig.finished.outcome == "fault"
     assert again.rig.rearm("nurse").state == "ready"
+    with pytest.raises(RefusedError, match="rest_between_tests_s"):  # a death is no rest
+        again.rig.start(again.plan("three", profile=Profile(rest_between_tests_s=60.0)))
 
 
 def test_a_wall_clock_that_jumps_in_a_test_changes_nothing(make: Make, monkeypatch: pytest.MonkeyPatch):
