@@ -1,7 +1,8 @@
 """`python -m rig`: the process that owns the devices.
 
-Prints one JSON line on standard output when its socket answers, logs on standard error, runs until SIGTERM or
-SIGINT: then it stops stimulation first, sees that it stopped, seals, and exits 0. Exit 2: a mistake in the rig file.
+Prints one JSON line on standard output when its socket answers, logs on standard error. Any key in its terminal, if it
+has one, stops stimulation. It runs until SIGTERM or SIGINT: then it stops stimulation first, sees that it stopped, seals,
+and exits 0. Exit 2: a mistake in the rig file.
 """
 
 from __future__ import annotations
@@ -22,7 +23,10 @@ from rig.clock import MonotonicClock
 from rig.control.rig import Rig
 from rig.control.server import Server
 from rig.errors import RigError
+from rig.keys import StopKey
 from rig.notify import Notifier
+
+log = logging.getLogger("rig")
 
 SWITCH_INTERVAL_S = 0.0005
 """How long a thread may hold the interpreter while the sender waits; Python's default is 5 ms."""
@@ -90,16 +94,24 @@ async def _serve(config: configuration.RigConfig, parent: int | None) -> None:
     await server.start(rig, config.socket)
     print(json.dumps({"socket": str(config.socket), "state": rig.status().state}), flush=True)
     notifier.ready()
-    while not stop.is_set() and parent in (None, os.getppid()):
-        # in a worker thread: an event loop that hangs, or threads that all wait, feed nothing
-        notifier.alive(await asyncio.to_thread(rig.trouble))
-        with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(stop.wait(), BEAT_PERIOD_S)
-    logging.getLogger("rig").info("asked to end")
+    with StopKey(loop, lambda: loop.run_in_executor(None, _stop_by_key, rig)) as key:
+        if key.watched:
+            log.info("any key in this terminal stops stimulation; Ctrl-C ends the rig")
+        while not stop.is_set() and parent in (None, os.getppid()):
+            # in a worker thread: an event loop that hangs, or threads that all wait, feed nothing
+            notifier.alive(await asyncio.to_thread(rig.trouble))
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(stop.wait(), BEAT_PERIOD_S)
+    log.info("asked to end")
     notifier.stopping()
     await asyncio.to_thread(rig.close)
     await server.close()
     config.socket.unlink(missing_ok=True)
+
+
+def _stop_by_key(rig: Rig) -> None:
+    evidence = rig.stop("a key in the terminal", "operator")
+    log.info("stop by key: %s, %s", "confirmed" if evidence.confirmed else "NOT CONFIRMED", evidence.detail)
 
 
 def _handler() -> logging.Handler:

@@ -28,7 +28,12 @@ class Process:
         self.log = log
         self._stderr = log.open("ab")
         self.popen = subprocess.Popen(
-            [sys.executable, "-m", *arguments], cwd=ROOT, stdout=subprocess.PIPE, stderr=self._stderr, text=True
+            [sys.executable, "-m", *arguments],
+            cwd=ROOT,
+            stdin=subprocess.DEVNULL,  # a key in the terminal of whoever tests is not meant for this rig
+            stdout=subprocess.PIPE,
+            stderr=self._stderr,
+            text=True,
         )
         self.ready = self._first_line(arguments)
 
