@@ -126,7 +126,7 @@ def participant(client: httpx.Client) -> str:
     return "P017"
 
 
-def wait_done(client: httpx.Client, test_id: str, limit_s: float = 20.0) -> dict[str, Any]:
+def wait_done(client: httpx.Client, test_id: str, limit_s: float = 60.0) -> dict[str, Any]:
     """Poll a test to its end."""
     end = time.monotonic() + limit_s
     while time.monotonic() < end:
@@ -137,8 +137,8 @@ def wait_done(client: httpx.Client, test_id: str, limit_s: float = 20.0) -> dict
     raise AssertionError(f"not done: {document}")
 
 
-def run_test(client: httpx.Client, participant: str) -> dict[str, Any]:
+def run_test(client: httpx.Client, participant: str, limit_s: float = 60.0) -> dict[str, Any]:
     """Start a test and follow it to its end."""
     started = client.post("/v1/tests", json={"participant": participant})
     assert started.status_code == 202, started.text
-    return wait_done(client, started.json()["id"])
+    return wait_done(client, started.json()["id"], limit_s)

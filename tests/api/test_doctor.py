@@ -140,6 +140,7 @@ def test_log_lines_are_json_with_the_tests_id(client: httpx.Client, participant:
     lines = [json.loads(JsonLines().format(record)) for record in records]
     words = [line["message"] for line in lines if line.get("test_id") == test_id]
     assert any("requested" in line for line in words) and any("completed" in line for line in words), lines
+    assert any("fit done" in line for line in words), "the worker's line carries it, too"
     assert all({"time", "level", "logger", "message"} <= set(line) for line in lines)
     assert not any(participant in line["message"] for line in lines), "no participant in a log"
 

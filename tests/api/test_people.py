@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import re
 import sqlite3
 from pathlib import Path
+from typing import Any
 
 import httpx
 import pytest
@@ -16,7 +18,7 @@ from api.auth import Scope
 from api.clock import Clock
 from api.errors import ApiError
 from api.people import Pace
-from api.server import loopback, refuse_open_door
+from api.server import configuration, loopback, refuse_open_door
 from api.settings import Settings
 from tests.api.conftest import Service, run_test
 
@@ -143,6 +145,52 @@ def test_wrong_passwords_are_slowed_down(service: Service, clinician: httpx.Clie
     unknown = answers[0].json()["detail"]
     assert "match" in unknown and "Ada" not in unknown
     assert clinician.get("/v1/rig").status_code == 200, "who is signed in stays so"
+
+
+def tries(asgi: Any, peer: str, forwarded: list[str], token: bool = False) -> list[int]:
+    """Wrong sign-ins from a peer under ever new names, one for each `X-Forwarded-For`; their status codes."""
+
+    async def run() -> list[int]:
+        transport = httpx.ASGITransport(app=asgi, client=(peer, 4711))
+        async with httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1") as http:
+            codes = []
+            for number, address in enumerate(forwarded):
+                form = {"token": "wrong"} if token else {"name": f"n{peer}-{number}", "password": "wrong"}
+                headers = {"X-Forwarded-For": address} if address else {}
+                codes.append((await http.post("/sign-in", data=form, headers=headers)).status_code)
+            return codes
+
+    return asyncio.run(run())
+
+
+def test_behind_a_proxy_of_this_machine_addresses_are_told_apart(service: Service) -> None:
+    """nginx on loopback names the client; anybody else's word for it is not taken."""
+    config = configuration(service.app)
+    config.load()
+    asgi = config.loaded_app
+    assert tries(asgi, "127.0.0.1", ["10.0.0.1"] * 7) == [401] * 5 + [429] * 2
+    assert tries(asgi, "127.0.0.1", ["10.0.0.2"]) == [401], "another client of the proxy is not held back"
+    assert tries(asgi, "::1", ["10.0.0.1"]) == [429], "the same one is, whichever loopback the proxy uses"
+    invented = [f"192.0.2.{k}, 10.0.0.3" for k in range(6)]
+    assert tries(asgi, "127.0.0.1", invented) == [401] * 5 + [429], "its own inventions don't count"
+    assert tries(asgi, "10.0.0.9", [f"192.0.2.{k}" for k in range(6)]) == [401] * 5 + [429], "no proxy, no belief"
+
+
+def test_tokens_are_tried_at_the_same_pace(service: Service) -> None:
+    config = configuration(service.app)
+    config.load()
+    assert tries(config.loaded_app, "127.0.0.1", ["10.0.0.1"] * 6, token=True) == [401] * 5 + [429]
+    assert tries(config.loaded_app, "127.0.0.1", ["10.0.0.1"]) == [429], "passwords and tokens share one pace"
+
+
+def test_the_page_says_how_long_to_wait(service: Service) -> None:
+    with service.client(token=None, headers={"Accept": "text/html"}) as browser:
+        for _ in range(6):
+            answer = browser.post("/sign-in", data={"name": "Nobody", "password": "wrong"})
+    assert answer.status_code == 429 and int(answer.headers["retry-after"]) >= 1 and "Try again in" in answer.text
+    other = {"Origin": "https://elsewhere.example"}
+    with service.client(token=None) as browser:
+        assert browser.post("/sign-in", data={"name": "x", "password": "y"}, headers=other).status_code == 403
 
 
 def test_pace_doubles_and_a_right_password_forgets() -> None:
