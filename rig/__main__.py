@@ -1,7 +1,7 @@
 """`python -m rig`: the process that owns the devices.
 
 Prints one JSON line on standard output when its socket answers, logs on standard error. Any key in its terminal, if it
-has one, stops stimulation. It runs until SIGTERM or SIGINT: then it stops stimulation first, sees that it stopped, seals,
+has one, stops stimulation. Runs until SIGTERM or SIGINT: then it stops stimulation first, sees that it stopped, seals
 and exits 0. Exit 2: a mistake in the rig file.
 """
 
