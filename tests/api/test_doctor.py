@@ -121,11 +121,11 @@ def test_check_that_breaks_is_a_finding(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 def test_log_lines_are_json_with_the_tests_id(client: httpx.Client, participant: str) -> None:
-    records: list[logging.LogRecord] = []
+    written: list[str] = []
 
     class Keep(logging.Handler):
         def emit(self, record: logging.LogRecord) -> None:
-            records.append(record)
+            written.append(JsonLines().format(record))  # as it is written, where it is written
 
     handler = Keep()
     logger = logging.getLogger("stimrig")
@@ -137,7 +137,7 @@ def test_log_lines_are_json_with_the_tests_id(client: httpx.Client, participant:
     finally:
         logger.removeHandler(handler)
         logger.setLevel(level)
-    lines = [json.loads(JsonLines().format(record)) for record in records]
+    lines = [json.loads(line) for line in written]
     words = [line["message"] for line in lines if line.get("test_id") == test_id]
     assert any("requested" in line for line in words) and any("completed" in line for line in words), lines
     assert any("fit done" in line for line in words), "the worker's line carries it, too"
