@@ -47,6 +47,19 @@ def dynamics(document: dict[str, Any]) -> dict[str, Any]:
     return found
 
 
+def validity(document: dict[str, Any]) -> str | None:
+    """What the model holds for, in one sentence; None where it does not say."""
+    known = document.get("valid_for") or {}
+    named = []
+    if known.get("pulse_width_us"):
+        named.append("pulse widths of {:.0f}–{:.0f} µs".format(*known["pulse_width_us"]))
+    if known.get("torque_nm"):
+        named.append(f"torques up to {known['torque_nm'][1]:.1f} N·m")
+    if known.get("pulse_rate_hz"):
+        named.append("{:.0f}–{:.0f} pulses/s".format(*known["pulse_rate_hz"]))
+    return f"Valid for {', '.join(named)}." if named else None
+
+
 def _poles(a: list[float], step_s: float) -> list[complex]:
     """Continuous poles of a denominator of at most second order, 1/s."""
     while len(a) > 1 and a[-1] == 0.0:

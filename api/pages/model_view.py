@@ -39,6 +39,7 @@ async def model(request: Request, context: Ctx, who: ModelReader, model_id: str,
         document=document,
         recruitment=reading.recruitment(document),
         dynamics=reading.dynamics(document),
+        validity=reading.validity(document),
         problem=measured["problem"],
         reasons=doubts(document),
         hdf5=not (await asyncio.to_thread(context.analyses.path, row.recording_id)).endswith(".csv"),
@@ -53,7 +54,9 @@ async def model(request: Request, context: Ctx, who: ModelReader, model_id: str,
 def doubts(document: dict[str, Any]) -> list[str]:
     """What else speaks against the model; that its fit stays below the ceiling is said in the verdict already."""
     gates = ((document.get("quality") or {}).get("gates") or {}).items()
-    return [gate["says"] for name, gate in gates if not gate["passed"] and name not in ("ceiling", "residual")]
+    return [
+        gate["says"] for name, gate in gates if not gate.get("passed", True) and name not in ("ceiling", "residual")
+    ]
 
 
 async def measurement(context: Context, row: Model) -> dict[str, Any]:

@@ -46,6 +46,7 @@ async def report(request: Request, context: Ctx, _who: ModelReader, model_id: st
         document=document,
         recruitment=reading.recruitment(document),
         dynamics=reading.dynamics(document),
+        validity=reading.validity(document),
         drawn=drawn,
         problem=measured["problem"],
         why=why.view(found, measured["comparison"], row.effects) if found else None,

@@ -1,0 +1,71 @@
+"""A hidden effect, found and added by clicking: a record of the emulator's muscle, real workers, a real browser."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import pytest
+
+from api.fitting import WORKER
+from tests.api.browser import PASSWORD, open_tab, participant
+from tests.api.conftest import Service, run_service
+
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
+ROOT = Path(__file__).parents[2]
+HIDDEN = ["--effects", "recruitment_hysteresis", "--seeds", "29:30", "--strengths", "strong", "--rate-hz", "200"]
+PATIENCE_MS = 100_000
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
+    yield from run_service(tmp_path_factory.mktemp("clicking"), short_dir, WORKER)
+
+
+@pytest.fixture
+def tab(browser: Any, service: Service) -> Iterator[Any]:
+    yield from open_tab(browser, service)
+
+
+def error_of(row: Any) -> float:
+    """Error on held-out rows of a version's row, N·m."""
+    return float(row.locator("td").nth(4).inner_text())
+
+
+def test_hidden_effect_is_found_added_and_approved_by_clicking(tab: Any, service: Service, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "hardware_sim.hidden_records", "--out", str(tmp_path), *HIDDEN]
+    subprocess.run(command, check=True, cwd=ROOT, capture_output=True)
+    (record,) = tmp_path.glob("*.csv")
+    participant(tab, service, "H1")
+    tab.get_by_text("Take in a recording of another tool").click()
+    tab.get_by_label("or HDF5").set_input_files(record)
+    tab.get_by_role("button", name="Take in and identify").click(timeout=PATIENCE_MS)
+    tab.get_by_text("An effect is missing in this model").wait_for(timeout=PATIENCE_MS)
+    first = tab.url.split("#")[0].split("?")[0]
+    tab.get_by_role("heading", name="Hysteresis of recruitment").wait_for()
+    tab.locator("[data-figure=signature-recruitment_hysteresis] .main-svg").first.wait_for()
+    card = tab.locator("#effect-recruitment_hysteresis")
+    assert "very probably missing" in card.inner_text()
+    assert tab.locator(".places li").count() >= 3, "the worst places are named"
+    card.get_by_role("button", name="Add this effect").click()
+    tab.locator("[data-figure=falling] .main-svg").first.wait_for(timeout=PATIENCE_MS)
+    rows = tab.locator(".versions tbody tr")
+    assert rows.count() == 2 and rows.nth(1).inner_text().startswith("2. + recruitment hysteresis")
+    assert error_of(rows.nth(1)) < 0.5 * error_of(rows.nth(0)), "the error falls to less than half on rows not seen"
+    assert tab.url.split("#")[0] != first
+    tab.get_by_role("link", name="Report").click()
+    tab.get_by_role("heading", name="Muscle model of H1").wait_for()
+    assert tab.get_by_text("+ recruitment hysteresis").is_visible()
+    tab.go_back()
+    tab.get_by_label("Reason").fill("follows the ramp both ways now")
+    tab.get_by_label("Your password, once more").first.fill(PASSWORD)
+    tab.get_by_role("button", name="Approve").click()
+    tab.get_by_text("the controller gets this model").wait_for()
+    with service.client() as http:
+        assert [e["id"] for e in http.get("/v1/participants/H1/model").json()["effects"]] == ["recruitment_hysteresis"]
+    hosts = {urlsplit(url).netloc for url in tab.requests if url.startswith("http")}
+    assert hosts == {urlsplit(service.url).netloc} and tab.errors == []
