@@ -17,6 +17,9 @@ from api.errors import ApiError, NotFoundError
 
 router = APIRouter(prefix="/v1", tags=["people"], responses=PROBLEM)
 
+TOO_MANY: dict[int | str, dict[str, Any]] = {
+    429: {"description": "too many wrong passwords: `Retry-After`", "content": {"application/problem+json": {}}}
+}
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_.@-]{1,80}$")]
 Password = Annotated[str, StringConstraints(min_length=10, max_length=200)]
 
@@ -89,6 +92,7 @@ def remove_user(context: Ctx, who: Administrator, name: str) -> None:
 @router.post(
     "/sessions",
     status_code=201,
+    responses=TOO_MANY,
     openapi_extra={"requestBody": {"content": {"application/json": {"schema": SignIn.model_json_schema()}}}},
 )
 async def sign_in(context: Ctx, request: Request) -> Response:
@@ -134,7 +138,7 @@ def set_cookie(context: Context, answer: Response, cookie: str) -> None:
     answer.set_cookie(COOKIE, cookie, max_age=age_s, httponly=True, samesite="strict", secure=secure)
 
 
-@router.post("/sessions/confirm", status_code=204)
+@router.post("/sessions/confirm", status_code=204, responses=TOO_MANY)
 def confirm(context: Ctx, who: Anyone, body: ConfirmIn) -> None:
     """The password once more, before a model is approved."""
     context.people.confirm(who, body.password)
