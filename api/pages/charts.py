@@ -19,7 +19,7 @@ SEGMENT_FILL = {"validate": "rgba(180,105,14,.07)", "rest": "rgba(0,0,0,0)"}
 FONT = {"family": "system-ui, -apple-system, 'Segoe UI', 'DejaVu Sans', sans-serif", "size": 13, "color": INK}
 
 
-SYMBOLS = {"rising": "triangle-up", "falling": "triangle-down"}
+SYMBOLS, WORDS = {"rising": "triangle-up", "falling": "triangle-down"}, {"rising": "up", "falling": "down"}
 
 
 def axis(title: str, **more: Any) -> dict[str, Any]:
@@ -72,7 +72,7 @@ def measurement(
     """Torque measured and predicted with its band, what is left, and the pulse width, on one time axis."""
     time_s = curves["time_s"]
     residual = [
-        None if predicted is None else measured - predicted
+        None if predicted is None else round(measured - predicted, 5)
         for measured, predicted in zip(curves["torque_nm"], curves["predicted_torque_nm"], strict=True)
     ]
     data = [
@@ -148,7 +148,7 @@ def recruitment(document: dict[str, Any], curves: dict[str, Any] | None = None) 
     data.append(line(curve["pulse_width_us"], curve["torque_nm"], "model", MODEL, 2.2))
     for way, points in sorted(directions.seen(document, curves).items(), reverse=True) if curves else []:
         marker = {"symbol": SYMBOLS[way], "size": 9, "color": "#fff", "line": {"color": STIMULUS, "width": 1.8}}
-        data.append(line(points["pulse_width_us"], points["torque_nm"], f"ramp, {way}", STIMULUS, mode="markers",
+        data.append(line(points["pulse_width_us"], points["torque_nm"], f"ramp {WORDS[way]}", STIMULUS, mode="markers",
                          marker=marker))  # fmt: skip
     x, y = axis("Pulse width (µs)"), axis("Steady torque (N·m)")
     return {"data": data, "layout": layout(height=340, xaxis=x, yaxis=y, showlegend=len(data) > 1)}
