@@ -42,6 +42,9 @@ LAMBDA = 0.02
 PLAN_STEPS = 12
 STEP = 0.8
 """Share of the error that is corrected at once where the prediction, not (f, G), is inverted."""
+LEAST_SHARE = 0.2
+"""A trial worse than the one before halves the share of each correction, down to this: near the noise a full correction
+only plays the last trial's noise back; some is kept, since a muscle changes."""
 
 
 @dataclass(frozen=True)
@@ -268,20 +271,24 @@ def learn(
         demand = demand if static_start else follow(plant, demand, reference.torque_nm, predict)
     else:
         update = LAWS[law](plant)
+    share = 1.0
     for _ in range(trials):
         widths_us = plant.widths(demand)
         torque_nm, sent_us = service.play(widths_us)
         error_nm = reference.torque_nm - torque_nm
         lost = int(np.sum(sent_us != widths_us))
         percent = 100 * float(np.sqrt(np.mean(error_nm**2))) / reference.rms_nm
+        if done and percent > done[-1].error_percent:
+            share = max(LEAST_SHARE, share / 2)
         done.append(Trial(widths_us, torque_nm, percent, lost))
         print(f"  trial {len(done):2d}  {percent:6.2f} % of the reference's rms, {lost} pulses lost", file=sys.stderr)
         not_sent_nm = plant.G @ (plant.level(widths_us) - plant.level(sent_us))  # a late pulse is dropped by the rig:
         learnt_nm = error_nm - not_sent_nm  # no reason to learn from it
         if update is not None:
-            demand = np.clip(update(demand, learnt_nm), 0.0, plant.largest_nm)
+            corrected = demand + share * (update(demand, learnt_nm) - demand)
+            demand = np.clip(corrected, 0.0, plant.largest_nm)
         else:
-            demand = follow(plant, demand, predict(widths_us) + STEP * learnt_nm, predict)  # pyright: ignore
+            demand = follow(plant, demand, predict(widths_us) + STEP * share * learnt_nm, predict)  # pyright: ignore
     return done
 
 

@@ -113,6 +113,23 @@ def test_error_falls_below_five_percent_in_five_trials(ilc: ModuleType, law: str
     assert errors[-1] < floor, errors
 
 
+def test_noise_is_not_played_back(ilc: ModuleType) -> None:
+    """At the noise's floor a full correction gives the last trial's noise back (error √2 of it, less what G takes)."""
+    reference, noise_nm, last = ilc.Reference.reach(4.0), 0.2, []
+    for seed in range(6):
+        muscle, rng = Muscle(), np.random.default_rng(seed)
+
+        def play(widths_us: np.ndarray, rng: np.random.Generator = rng) -> tuple[np.ndarray, np.ndarray]:
+            slow = np.convolve(rng.standard_normal(widths_us.size + 20), np.ones(20) / np.sqrt(20), "valid")
+            return second_order(widths_us, 0.46, 0.68, 7.2, 152.0) + noise_nm * slow[: widths_us.size], widths_us
+
+        muscle.play = play  # pyright: ignore[reportAttributeAccessIssue]
+        trials = ilc.learn(muscle, model_of(*MODEL), reference, "norm-optimal", 10)
+        last += [trial.error_percent for trial in trials[-4:]]
+    floor = 100 * noise_nm / reference.rms_nm
+    assert np.mean(last) < 1.13 * floor, (np.mean(last), floor)
+
+
 def test_dropped_pulses_are_not_learnt_from(ilc: ModuleType) -> None:
     reference = ilc.Reference.reach(4.0)
     trials = ilc.learn(Muscle(drops=True), model_of(*MODEL), reference, "norm-optimal", 6)
