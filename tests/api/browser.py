@@ -35,7 +35,7 @@ def open_tab(browser: Any, service: Service, signed_in: bool = True, **options: 
     context.close()
     with service.client() as http:
         http.post("/v1/stop")
-        end = time.monotonic() + 5
+        end = time.monotonic() + 30
         while http.get("/v1/rig").json()["holder"]:
             assert time.monotonic() < end
             time.sleep(0.05)
@@ -82,7 +82,7 @@ def painted(page: Any, canvas: str) -> int:
 
 def painted_soon(page: Any, canvas: str) -> int:
     """The same once the first frames have been drawn."""
-    end = time.monotonic() + 3
+    end = time.monotonic() + 15
     while (count := painted(page, canvas)) < 3001 and time.monotonic() < end:
         time.sleep(0.05)
     return count

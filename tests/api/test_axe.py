@@ -99,7 +99,7 @@ def test_pages_without_a_test(browser: Any, tab: Any, service: Service) -> None:
 
 
 def test_a_test_and_its_ends(tab: Any, service: Service) -> None:
-    service.rig.speed = 2.0
+    service.rig.speed = 0.7
     participant(tab, service, "X2")
     start(tab)
     tab.locator("#age", has_text="ms").wait_for()

@@ -107,7 +107,7 @@ def test_a_muscle_with_hysteresis_shows_two_curves() -> None:
     found = directions.seen(document, drawn)
     assert distance(found) > 0.2, "less than the 0.8 N·m put in: the fitted lag takes a part of it upon itself"
     figure = charts.recruitment(document, drawn)
-    assert {"ramp, rising", "ramp, falling"} <= {trace["name"] for trace in figure["data"]}
+    assert {"ramp up", "ramp down"} <= {trace["name"] for trace in figure["data"]}
 
 
 def test_a_recording_without_a_ramp_has_no_directions() -> None:
