@@ -78,6 +78,9 @@ def one(job: tuple[str, str, int, dict[str, Any]]) -> dict[str, Any] | None:
         "before": result["base"]["held_out_rms_nm"],
         "after": result["with_all"]["held_out_rms_nm"],
         "noise": noise,
+        "explained": result["explained"],
+        "structure": result["structure_left"],
+        "gains": [(c["effect"], c["form"], c["log_evidence_gain"]) for c in result["candidates"][0][:4]],
         "seconds": time.perf_counter() - began,
         "cpu_seconds": time.process_time() - cpu,
     }

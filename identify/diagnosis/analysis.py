@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from identify.diagnosis.candidates import Candidate, Progress, fit_form, scan, try_effect
 from identify.diagnosis.structure import Left, left_over, quiet_rows
 from identify.diagnosis.unknown import WANDER
-from identify.effects import registry
+from identify.effects import get, registry
 from identify.effects.base import Effect, Form
 from identify.engine.fit import Fitted, solve, start_from
 from identify.engine.noise_level import NoiseLevel
@@ -24,8 +24,22 @@ NEXT_MARGIN = 10.0
 """Log evidence that a further effect must gain."""
 PATCH = 0.12
 """And in proportion to what the first gained."""
-PATCHERS = {"voluntary_effort": 0.4}
+KINDRED = 0.25
+"""In proportion, where it resembles the first or both change the dynamics: one in an imperfect form looks like both."""
+SEEN_APART = 0.03
+"""In proportion, where something else bears it out: rests for a drift of zero, a gain without a law for a slow gain."""
+BORNE_OUT = 0.4
+"""Share of a slow gain's evidence that a gain without a law must find, too."""
+PATCHERS = {"voluntary_effort": 0.4, "tremor": 0.4}
 """Of those that mend anything, more is asked for."""
+AT_WORK_ONLY = 0.85
+"""What evidence counts for efforts of which the rests show nothing: they'd be the first to keep to the stimulation."""
+SEEN_AT_REST = 0.25
+"""Least share of an effort's torque, rests against work, that counts as seen at rest."""
+DYNAMIC = {"speed", "branch", "delay", "filter"}
+"""Stages that change how quickly torque follows."""
+SLOWEST = 0.97
+"""Correlation of neighbours above which slow noise may as well be a drift."""
 MOST = 3
 """Effects at most."""
 
@@ -102,12 +116,12 @@ def analyse(
             break
         before = work.rounds[0] if work.rounds else None
         candidates = scan(work.last, listed, progress, (0.1 + 0.3 * number, 0.4 + 0.3 * number), before)
+        candidates = sorted((_tempered(work, c) for c in candidates), key=lambda c: -c.gain)
         work.rounds.append(candidates)
         nameless = try_effect(WANDER, work.last)
         work.nameless.append(nameless.gain if nameless else 0.0)
-        margin = _margin(work)
-        work.margins.append(margin)
-        enough = [c for c in candidates if c.gain >= max(margin, _least(work, c.effect.id))]
+        work.margins.append(_margin(work, None))
+        enough = [c for c in candidates if c.gain >= _margin(work, c)]
         if not enough:
             break
         _take(work, enough[0].fitted, enough[0].effect.id)
@@ -120,16 +134,53 @@ def analyse(
     return work
 
 
-def _least(work: Analysis, effect: str) -> float:
-    """What a later effect must gain, if it is of the kind that mends anything."""
-    return PATCHERS.get(effect, 0.0) * work.rounds[0][0].gain if work.added else 0.0
+def seen_at_rest(quiet: np.ndarray, fitted: Fitted, effect: str) -> float:
+    """An added torque, in rests over in work: efforts come when they like, not when the stimulator works."""
+    setup = fitted.problem.setup
+    form = next(form for name, form in fitted.effects if name == effect)
+    values = {name: np.array([[value]]) for name, value in fitted.parameters_of(effect).items()}
+    torque = np.broadcast_to(form.call(None, values, setup.scene), (1, quiet.size))[0]
+    parts = [
+        np.mean(torque[rows] ** 2) if np.any(rows) else 0.0 for rows in (setup.fitted & quiet, setup.fitted & ~quiet)
+    ]
+    return float(np.sqrt(parts[0] / max(parts[1], 1e-30)))
 
 
-def _margin(work: Analysis) -> float:
+def _tempered(work: Analysis, candidate: Candidate) -> Candidate:
+    """An effort that only work shows counts for a little less than a law that explains as much."""
+    if candidate.effect.foreseeable or candidate.effect.band:
+        return candidate
+    if candidate.form.stage != "additive" or _at_rest(work, candidate):
+        return candidate
+    return replace(candidate, gain=AT_WORK_ONLY * candidate.gain)
+
+
+def _at_rest(work: Analysis, candidate: Candidate) -> bool:
+    return seen_at_rest(work.quiet, candidate.fitted, candidate.effect.id) >= SEEN_AT_REST
+
+
+def _margin(work: Analysis, candidate: Candidate | None) -> float:
     """Log evidence that the next effect must gain: a patch on the first one's imperfect form isn't an effect."""
     if not work.added:
         return FIRST_MARGIN
-    return max(NEXT_MARGIN, PATCH * work.rounds[0][0].gain)
+    share = PATCH if candidate is None else _patch(work, candidate)
+    return max(NEXT_MARGIN, share * work.rounds[0][0].gain)
+
+
+def _patch(work: Analysis, candidate: Candidate) -> float:
+    effect, stage = candidate.effect, candidate.form.stage
+    if effect.id in PATCHERS:
+        return PATCHERS[effect.id]
+    if stage == "additive":
+        return 0.5 * SEEN_APART
+    if stage in ("gain", "pulse_width") and work.nameless[-1] > BORNE_OUT * candidate.gain:
+        return SEEN_APART
+    for name, form in work.last.effects:
+        if name in work.added and (form.stage in DYNAMIC and stage in DYNAMIC):
+            return KINDRED
+        if name in work.added and (name in effect.resembles or effect.id in get(name).resembles):
+            return KINDRED
+    return PATCH
 
 
 def _take(work: Analysis, fitted: Fitted, effect: str) -> None:
@@ -141,7 +192,10 @@ def _take(work: Analysis, fitted: Fitted, effect: str) -> None:
 def _exhausted(work: Analysis) -> bool:
     """Whether no further effect could gain what is asked: the residual is nearly as small and white as noise can be."""
     left, last = work.left[-1], work.last
-    return left.ideal - last.log_likelihood < _margin(work) and left.ratio < _margin(work)
+    if last.noise.ar1 > SLOWEST and left.slow_nm > left.white_nm:
+        return False  # noise so slow may be a drift: the rests can't say what is ideal
+    least = max(NEXT_MARGIN, SEEN_APART * work.rounds[0][0].gain)
+    return left.ideal - last.log_likelihood < least and left.ratio < least
 
 
 def _with_given(work: Analysis, base: Fitted) -> Fitted:

@@ -113,6 +113,9 @@ def fit_form(
         starts = form.propose(np.where(setup.fitted, residual, np.nan), scene, previous)
     best: Fitted | None = None
     for start in starts:
+        apart = start.get("base.damping")
+        if apart is not None and "base.time_constant_s" not in start and base.physical[1] >= apart:
+            continue  # the base has its lags apart already
         theta = start_from(problem, base, {len(base.effects): start})
         found = solve(problem, theta, base.noise, floor=None if best is None else best.log_evidence)
         if form.accept is not None and not form.accept(found.parameters_of(effect.id), scene):

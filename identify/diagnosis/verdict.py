@@ -6,16 +6,25 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from identify.diagnosis.analysis import FIRST_MARGIN, Analysis
+from identify.diagnosis.analysis import FIRST_MARGIN, SEEN_AT_REST, Analysis, seen_at_rest
 from identify.diagnosis.candidates import Candidate
 from identify.diagnosis.structure import held_readings
+from identify.effects import get
 
 TEMPERATURE = 2.0
 """Spread, in log evidence, that the best form of a rival may lose by chance."""
 RELATIVE = 0.03
 """And in proportion to the gain: a form close to the truth explains most, not all."""
-LEAST_EXPLAINED = 0.56
+LEAST_EXPLAINED = 0.68
 """Share of the explicable log-likelihood below which the rest counts as structure of another kind."""
+LEAST_BY_EFFORTS = 0.8
+"""The same where efforts are named first: they mend anything a little."""
+LEAST_BY_BAND = 0.94
+"""Share of the power that a tremor must take, where work and rest differ beside it."""
+MANY = 5
+"""Efforts, none of them at rest, that are more likely something the stimulation does."""
+UNSTEADY = 60.0
+"""Log-likelihood by which work and rest must differ beside a tremor for it to be something else."""
 STRUCTURE = 12.0
 """Log-likelihood by which work and rest must differ for structure to be left."""
 LAPSE = 0.04
@@ -75,6 +84,16 @@ def _nothing(candidates: list[Candidate]) -> float:
     return 1.0 / (1.0 + sum(float(np.exp(min(c.gain - FIRST_MARGIN, 60.0))) for c in candidates))
 
 
+def _no_effort(work: Analysis, explained: float, structure: float) -> bool:
+    """Whether what looks like efforts is more likely something the stimulation does."""
+    if explained < LEAST_BY_EFFORTS and structure > STRUCTURE:
+        return True
+    if seen_at_rest(work.quiet, work.chain[1], work.added[0]) >= SEEN_AT_REST:
+        return False
+    form = next(form.name for name, form in work.chain[1].effects if name == work.added[0])
+    return "resisting" in form or int(form.rsplit("_", 1)[1]) >= MANY
+
+
 def judge(work: Analysis) -> Verdict:
     """The verdict on an analysis."""
     first, last = work.chain[0], work.last
@@ -103,6 +122,10 @@ def judge(work: Analysis) -> Verdict:
     if work.added:
         strange = strange or (explained < LEAST_EXPLAINED and structure > STRUCTURE)
         strange = strange or work.nameless[0] > work.rounds[0][0].gain + NAMELESS
+        if get(work.added[0]).band:
+            strange = strange or (explained < LEAST_BY_BAND and structure > UNSTEADY)
+        elif not get(work.added[0]).foreseeable:
+            strange = strange or _no_effort(work, explained, structure)
     else:
         strange = strange or structure > STRUCTURE
     if strange:

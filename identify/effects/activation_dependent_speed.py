@@ -10,6 +10,18 @@ def _form(name: str, equation: str, column: int, lower: float = -0.85, upper: fl
     return Form(name, "speed", equation, (slope,), law={"slope": column})
 
 
+def _two_lags(name: str, equation: str, column: int, source: str) -> Form:
+    """A form for two real lags: where the base found none apart, it begins with two that are."""
+    slope = Parameter("slope", "1", -0.9, 20.0, 0.0, (0.5, -0.35), about="change of the lag from rest to full torque")
+    apart = ({"slope": 1.0, "base.damping": 1.25},)
+    return Form(name, "speed", equation, (slope,), law={"slope": column}, restarts=apart, source=source)
+
+
+_BOUND = "Ding, Wexler, Binder-Macleod 2000: force decays with τ1 + τ2·(bound calcium)"
+_ATTACHED = "Campbell 1997: attached bridges help others attach"
+_PUMP = "Stein, Bobet, Oğuztöreli, Fryer 1988: uptake of calcium saturates"
+
+
 EFFECT = Effect(
     id="activation_dependent_speed",
     name="Speed depends on activation",
@@ -23,7 +35,6 @@ EFFECT = Effect(
         _form("inverse_slow_lag", "slower of the two lags over (1 + slope·w/y_max)", 9),
         _form("bound", "slower of the two lags times (1 + slope·1.15 s/(s + 0.15)), s = w/y_max", 13),
         _form("activation", "T (1 + slope·a/y_max), a the state between the two lags", 11),
-        _form("activation_slow_lag", "slower of the two lags times (1 + slope·a/y_max)", 10),
         _form(
             "calcium_slow_lag",
             "slower lag times (1 + slope·c), c bound calcium: c follows the stimulation",
@@ -32,7 +43,12 @@ EFFECT = Effect(
             12.0,
         ),
         _form("calcium_quick_lag", "quicker lag times (1 + slope·c), c bound calcium", 19, -0.9, 12.0),
-        _form("activation_quick_lag", "quicker of the two lags times (1 + slope·a/y_max)", 14, -0.85, 12.0),
+        _two_lags("activation_slow_lag", "a' = (w - a)/quick, y' = (a - y)/(slow (1 + slope·a/y_max))", 21, _BOUND),
+        _two_lags("attached_slow_lag", "a' = (w - a)/quick, y' = (a - y)(1 + slope·y/y_max)/slow", 22, _ATTACHED),
+        _two_lags("activation_quick_lag", "a' = (w - a)/slow, y' = (a - y)/(quick (1 + slope·a/y_max))", 23, _BOUND),
+        _two_lags("attached_quick_lag", "a' = (w - a)/slow, y' = (a - y)(1 + slope·y/y_max)/quick", 24, _ATTACHED),
+        _two_lags("pump_slow_lag", "a' = (w - a)/(slow (1 + slope·a/y_max)), y' = (a - y)/quick", 25, _PUMP),
+        _two_lags("pump_quick_lag", "a' = (w - a)/(quick (1 + slope·a/y_max)), y' = (a - y)/slow", 26, _PUMP),
     ),
     signature="Small torques come faster (or slower) than large ones: the error's sign goes with level and time.",
     resembles=("asymmetric_relaxation", "voluntary_effort", "mixed_fibres", "output_saturation"),

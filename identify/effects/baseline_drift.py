@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from identify.effects.base import Effect, Form, Parameter, Scene
 
@@ -25,6 +26,17 @@ def _bent(_: None, p: dict[str, Any], scene: Scene) -> np.ndarray:
 def _breathing(_: None, p: dict[str, Any], scene: Scene) -> np.ndarray:
     turn = 2 * np.pi * scene.time_s / p["period_s"]
     return p["cos_nm"] * (np.cos(turn) - 1.0) + p["sin_nm"] * np.sin(turn)
+
+
+KNOTS = 6
+
+
+def _wander(_: None, p: dict[str, Any], scene: Scene) -> np.ndarray:
+    """A natural cubic spline through evenly spaced knots, zero at the start."""
+    knots = np.linspace(0.0, 1.0, KNOTS + 1)
+    values = np.concatenate([np.zeros_like(p["knot_1_nm"]), *(p[f"knot_{i}_nm"] for i in range(1, KNOTS + 1))], axis=1)
+    place = np.clip((scene.time_s - scene.time_s[0]) / max(scene.span_s, 1e-9), 0.0, 1.0)
+    return CubicSpline(knots, np.eye(KNOTS + 1), bc_type="natural")(place).dot(values.T).T
 
 
 _SLOPE = Parameter("slope_nm_per_s", "N·m/s", -0.25, 0.25, 0.0, (0.0,), about="drift in a second")
@@ -64,6 +76,17 @@ EFFECT = Effect(
                 Parameter("sin_nm", "N·m", *_WAVE),
             ),
             _breathing,
+            True,
+        ),
+        Form(
+            "wander",
+            "additive",
+            "y + s(t), s a natural cubic spline through six knots over the record",
+            tuple(
+                Parameter(f"knot_{i}_nm", "N·m", -2.0, 2.0, 0.0, (0.0,), about=f"shift at {i} sixths of the record")
+                for i in range(1, KNOTS + 1)
+            ),
+            _wander,
             True,
         ),
     ),

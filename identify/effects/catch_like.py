@@ -9,7 +9,7 @@ import numpy as np
 from identify.effects.base import Effect, Form, Parameter, Scene
 from identify.effects.kernels import adapt, since_onset, train, used_up
 
-_GAIN = Parameter("gain", "1", 0.0, 2.5, 0.0, (0.3, 0.8), about="extra torque at the onset")
+_GAIN = Parameter("gain", "1", 0.0, 4.0, 0.0, (0.3, 0.8), about="extra torque at the onset")
 _DECAY = Parameter("decay_s", "s", 0.12, 1.2, 0.3, (0.25, 0.5), "log", about="time constant with which it fades")
 _RECOVERY = Parameter("recovery_s", "s", 0.02, 4.0, 0.3, (0.1, 1.0), "log", about="silence after which it is back")
 
@@ -48,6 +48,16 @@ def _flat(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
     since, gap = train(scene.on, scene.step_s)
     fade = np.exp(-np.minimum((since / p["length_s"]) ** 3, 200.0))
     return drive * (1.0 + p["gain"] * -np.expm1(-gap / p["recovery_s"]) * fade)
+
+
+def _trains(least_gap_s: float) -> Any:
+    """As after_silence, where shorter silences don't end a train."""
+
+    def apply(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+        since, gap = train(scene.on, scene.step_s, least_gap_s)
+        return drive * (1.0 + p["gain"] * -np.expm1(-gap / p["recovery_s"]) * np.exp(-since / p["decay_s"]))
+
+    return apply
 
 
 def _burst(length_s: float, least_gap_s: float) -> Any:
@@ -103,6 +113,17 @@ EFFECT = Effect(
             (_GAIN, _QUICK, _RECOVERY),
             _sharp,
             batched=True,
+        ),
+        *(
+            Form(
+                f"trains_{gap * 1000:.0f}_ms",
+                "gain",
+                f"as after_silence, a silence of less than {gap:g} s doesn't end a train",
+                (_GAIN, _QUICK, _RECOVERY),
+                _trains(gap),
+                batched=True,
+            )
+            for gap in (0.12, 0.22)
         ),
         Form(
             "flat",

@@ -188,14 +188,17 @@ def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:  # pragma: no cover
 
 
 @njit(cache=True, nogil=True)
-def train(on: np.ndarray, step_s: float) -> tuple[np.ndarray, np.ndarray]:  # pragma: no cover
-    """Time since the onset of the present train and the silence before it, s; a train is pulses without a gap."""
+def train(on: np.ndarray, step_s: float, least_gap_s: float = 0.0) -> tuple[np.ndarray, np.ndarray]:  # pragma: no cover
+    """Time under pulses since the onset of the present train and the silence before it, s.
+
+    A train is pulses without a gap, or with none as long as `least_gap_s`.
+    """
     since = np.full(on.size, 1e9)
     before = np.zeros(on.size)
     gap, length, silence = 1e3, 0.0, 1e3
     for k in range(on.size):
         if on[k] > 0:
-            if gap > 0.0:
+            if gap > least_gap_s:
                 silence, length = gap, 0.0
             gap = 0.0
             since[k] = length + 0.5 * step_s

@@ -31,6 +31,20 @@ def _bell(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
     return y * np.exp(sharp * (best * best - (_away(scene) - best) ** 2))
 
 
+KNOTS = 8
+
+
+def _curve(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+    """Linear between knots over the angles that were met."""
+    assert scene.angle_rad is not None
+    low, high = float(scene.angle_rad.min()), float(scene.angle_rad.max())
+    place = (scene.angle_rad - low) / max(high - low, 1e-6) * (KNOTS - 1)
+    values = np.concatenate([p[f"gain_{i}"] for i in range(KNOTS)], axis=1)
+    first = np.minimum(place.astype(np.int64), KNOTS - 2)
+    part = place - first
+    return y * (1.0 + values[:, first] * (1.0 - part) + values[:, first + 1] * part)
+
+
 EFFECT = Effect(
     id="torque_angle",
     name="Torque depends on angle",
@@ -70,6 +84,18 @@ EFFECT = Effect(
             _bell,
             True,
             source="Gaussian active force-length curve, Thelen 2003",
+        ),
+        Form(
+            "curve",
+            "output",
+            "y (1 + c(angle)), c linear between eight knots: whatever muscle length and moment arm make together",
+            tuple(
+                Parameter(f"gain_{i}", "1", -0.8, 0.8, 0.0, (0.0,), about="share of torque more at a knot")
+                for i in range(KNOTS)
+            ),
+            _curve,
+            True,
+            source="Murray, Delp, Buchanan 1995: moment arms vary freely with the angle",
         ),
         Form(
             "drive",

@@ -35,6 +35,14 @@ def _marion(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
     ) * scene.velocity_rad_s * np.minimum(np.abs(y) / (0.2 * scene.scale_nm), 1.0)
 
 
+def _bell(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+    """The same as a share of the torque, the slope being that at the angle where it is most."""
+    assert scene.angle_rad is not None and scene.velocity_rad_s is not None
+    place = p["decay_per_rad"] * np.abs(scene.angle_rad)
+    share = p["slope_s_per_rad"] * place * np.exp(1.0 - place) * scene.velocity_rad_s
+    return y * np.maximum(1.0 - share, 0.0)
+
+
 EFFECT = Effect(
     id="torque_velocity",
     name="Torque depends on velocity",
@@ -64,6 +72,15 @@ EFFECT = Effect(
             _marion,
             True,
             source="Marion, Wexler, Hull: V1 θ exp(-V2 θ) θ'",
+        ),
+        Form(
+            "bell",
+            "output",
+            "y (1 - slope·x exp(1 - x)·θ'), x = decay·θ",
+            (_SIDE, Parameter("decay_per_rad", "1/rad", 0.3, 4.0, 1.3, (1.3,), "log", about="V2")),
+            _bell,
+            True,
+            source="Marion, Wexler, Hull: V1 θ exp(-V2 θ) θ', as a share of the torque",
         ),
     ),
     signature="The error follows the measured velocity, and only under stimulation.",

@@ -13,7 +13,9 @@ PARTS = 3
 """Steps in which a speed law is followed through a pulse interval."""
 MEAN_OF_SLOW = 0.27
 """Correlation of neighbouring innovations that averaging over an interval brings, at most."""
-LAWS = 21
+SHORTEST = 0.006
+"""1 - ar1 of the slowest noise (a memory of 4 s at 40 pulses/s): what is slower is a drift, and has a cause."""
+LAWS = 27
 """Columns of the speed law: see `factor`."""
 
 
@@ -51,7 +53,9 @@ def _factor(law, w, y, v, scale_nm, slow_s, quick_s, bound):  # pragma: no cover
     on the quicker lag: 14 linear in activation, 15 log ratio where torque falls, 16 log ratio where the drive is
     below the torque; 17 as 15 on the slower lag; 18 slower lag, linear in bound calcium c (c follows whether there is
     drive at all, with the quicker lag), 19 quicker lag, linear in c (with the slower lag);
-    20 as 12 on the slower lag.
+    20 as 12 on the slower lag; two lags in a row, of which the second keeps its input a when its speed changes:
+    21 the slower second and linear in a, 22 the slower second and inverse linear in torque, 23 and 24 the same with
+    the quicker second; of which the first goes with its own level: 25 the slower first and linear in a, 26 the quicker.
     """
     m = 1.0
     if law[0] != 0.0:
@@ -107,7 +111,22 @@ def _factor(law, w, y, v, scale_nm, slow_s, quick_s, bound):  # pragma: no cover
         d *= max(1.0 + law[18] * bound, 0.08)
     if law[19] != 0.0:
         q *= max(1.0 + law[19] * bound, 0.08)
+    if law[25] != 0.0:
+        d *= max(1.0 + law[25] * min(max((y + quick_s * v) / scale_nm, 0.0), 1.2), 0.08)
+    if law[26] != 0.0:
+        q *= max(1.0 + law[26] * min(max((y + slow_s * v) / scale_nm, 0.0), 1.2), 0.08)
     return min(max(m, 0.02), 50.0), min(max(d, 0.02), 50.0), min(max(q, 0.02), 50.0)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _second(law, linear, inverse, y, v, lag_s, scale_nm):  # pragma: no cover
+    """Factor on the second of two lags; `lag_s` is what it is now."""
+    factor = 1.0
+    if law[linear] != 0.0:
+        factor *= max(1.0 + law[linear] * min(max((y + lag_s * v) / scale_nm, 0.0), 1.2), 0.08)
+    if law[inverse] != 0.0:
+        factor *= 1.0 / max(1.0 + law[inverse] * min(max(y / scale_nm, 0.0), 1.2), 0.08)
+    return min(max(factor, 0.02), 50.0)
 
 
 @njit(cache=True, nogil=True)
@@ -154,6 +173,9 @@ def run_core(drive, time_constant_s, damping, law, multiplier, scale_nm, step_s,
         for j in range(law.shape[1]):
             alike = alike and law[m, j] == law[0, j]
         y, v, bound = 0.0, 0.0, 0.0
+        slow_second = law[m, 21] != 0.0 or law[m, 22] != 0.0
+        quick_second = law[m, 23] != 0.0 or law[m, 24] != 0.0
+        last = 1.0
         forget = np.exp(-step_s / PARTS / max(quick_s if law[m, 18] != 0.0 else slow_s, 1e-4))
         if alike and varied:
             for k in range(size):
@@ -181,6 +203,16 @@ def run_core(drive, time_constant_s, damping, law, multiplier, scale_nm, step_s,
                 f, d, q = 1.0, 1.0, 1.0
                 if lawful:
                     f, d, q = _factor(law[m], w, y, v, scale_nm, slow_s, quick_s, bound)
+                turned = 1.0
+                if slow_second:
+                    second = _second(law[m], 21, 22, y, v, last * slow_s, scale_nm)
+                    d *= second
+                    turned, last = last / second, second
+                elif quick_second:
+                    second = _second(law[m], 23, 24, y, v, last * quick_s, scale_nm)
+                    q *= second
+                    turned, last = last / second, second
+                v *= turned  # y' = (a - y) / lag: what is kept is a
                 f *= given_f
                 # The slower lag times d, the quicker times q: T² = quick·slow, 2 ζ T = quick + slow.
                 t = base * f * np.sqrt(d * q)
@@ -188,6 +220,7 @@ def run_core(drive, time_constant_s, damping, law, multiplier, scale_nm, step_s,
                 q11, q12, q21, q22 = _transition(t, z, h)
                 gap = y - w
                 y, v = w + q11 * gap + q12 * v, q21 * gap + q22 * v
+                p21, p22 = turned * p21, turned * p22
                 p11, p12, p21, p22 = (
                     q11 * p11 + q12 * p21,
                     q11 * p12 + q12 * p22,
@@ -406,9 +439,9 @@ def profile_noise(row, start, stop, ar1, share):  # pragma: no cover
     total = 0
     for i in range(start.size):
         total += stop[i] - start[i]
-    # On the scale of memory: a = log(1 - ar1), from 0.002 (long) to 1 (none).
-    low, high = np.log(0.002), 0.0
-    a = min(max(np.log(1.0 - min(ar1, 0.9985)), low), high)
+    # On the scale of memory: a = log(1 - ar1), from SHORTEST (long memory) to 1 (none).
+    low, high = np.log(SHORTEST), 0.0
+    a = min(max(np.log(1.0 - min(ar1, 1.0 - SHORTEST)), low), high)
     b = min(max(share, 0.0), 2.0)
     best = _minus_log_likelihood(row, start, stop, 1.0 - np.exp(a), b)
     for guess_a, guess_b in (

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from identify.engine.core import profile_noise, whiten_rows
+from identify.engine.core import SHORTEST, profile_noise, whiten_rows
 from identify.engine.oscillator import profile_band, smooth_band, whiten_band
 
 Stretches = tuple[np.ndarray, np.ndarray]
@@ -50,7 +50,7 @@ def profile(residual: np.ndarray, stretches: Stretches, near: NoiseLevel) -> tup
         return NoiseLevel(ar1, share, max(sd, 1e-9)), log_likelihood
     x = np.array(
         [
-            np.log(1.0 - min(near.ar1, 0.998)),
+            np.log(1.0 - min(near.ar1, 1.0 - SHORTEST)),
             min(near.share / max(1.0 - near.band, 1e-9), 1.0),
             near.turn,
             np.log(1.0 - min(near.keep, 0.9999)),
@@ -64,7 +64,7 @@ def _search(
     residual: np.ndarray, stretches: Stretches, x: np.ndarray, wide: float, least: float, turns: tuple[float, float]
 ) -> tuple[NoiseLevel, float]:
     start, stop = stretches
-    lower = np.array([np.log(0.002), 0.0, turns[0], np.log(0.0008), 0.001])
+    lower = np.array([np.log(SHORTEST), 0.0, turns[0], np.log(0.0008), 0.001])
     upper = np.array([0.0, 1.0, turns[1], np.log(0.12), 0.999])
     x, sd, log_likelihood = profile_band(
         residual,

@@ -14,6 +14,9 @@ from identify.record import Record
 
 LEAST_LINE = 30.0
 """Power of a mains line over its neighbours' median that counts as hum."""
+FOLLOWED_S = 1.0
+"""Window over which hum's amplitude and phase are taken as even: the grid's frequency wanders more slowly."""
+MOST_HARMONICS = 8
 LEAST_EQUAL = 20
 """Samples at exactly the greatest (or smallest) value that count as clipping."""
 
@@ -52,6 +55,7 @@ def inspect(record: Record) -> Raw:
     hum, ratio = _find_hum(record, kept)
     if hum is not None:
         torque = torque - hum_at(hum, record.time_s - record.time_s[0])
+        torque = torque - _wander(record, torque, hum["frequency_hz"], kept)
     noise = white_noise(record, torque[kept])
     return Raw(torque, noise, hum, ratio, ceiling, None if floor is None else -floor)
 
@@ -125,6 +129,31 @@ def _line(power: np.ndarray, frequency: np.ndarray, centre_hz: float, reach_hz: 
     if not inside.any() or not around.any():
         return 0.0
     return float(power[inside].max() / max(np.mean(power[around]), 1e-30))
+
+
+def _wander(record: Record, torque: np.ndarray, mains_hz: float, kept: np.ndarray) -> np.ndarray:
+    """What amplitude and phase of hum do beside the even line, N·m: each harmonic followed over a second."""
+    rate_hz = record.sample_rate_hz
+    width = 2 * max(round(rate_hz / record.pulse_rate_hz), 2) + 1
+    box = np.ones(width) / width
+    window = np.hanning(max(round(FOLLOWED_S * rate_hz), 8) + 2)[1:-1]
+    found = np.zeros(torque.size)
+    for run in runs(kept):
+        part = torque[run]
+        if part.size < 2 * window.size:
+            continue
+        high = part - np.convolve(np.convolve(part, box, "same"), box, "same")
+        high[: 2 * width] = high[-2 * width :] = 0.0
+        weight = np.convolve(np.abs(high) > 0, window, "same")
+        h = 1
+        while h * mains_hz < 0.5 * rate_hz - 1.0 and h <= MOST_HARMONICS:
+            turn = np.exp(2j * np.pi * h * mains_hz * record.time_s[run])
+            half = np.pi * h * mains_hz / rate_hz
+            passed = 1.0 - (np.sin(width * half) / (width * np.sin(half))) ** 2
+            slow = np.convolve(high * np.conj(turn), window, "same") / np.maximum(weight, 1e-9)
+            found[run] += 2.0 * np.real(slow * turn) / passed
+            h += 1
+    return found
 
 
 def _fit_hum(record: Record, mains_hz: float, kept: np.ndarray) -> dict[str, float]:
