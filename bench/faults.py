@@ -200,7 +200,7 @@ class Progress:
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--short", action="store_true", help=f"{SHORT} injections, no table")
-    parser.add_argument("--injections", type=int, default=512)
+    parser.add_argument("--injections", type=int, default=640)
     parser.add_argument("--minutes", type=float, default=35.0, help="begin none after that long, whatever is left")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--seed", type=int, default=1)

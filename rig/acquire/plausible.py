@@ -36,13 +36,15 @@ class Plausible:
         Nominal.
     speed
         Rig seconds a real second.
+    noisy
+        How often the value changed shortly before the test: a cell that is stuck from its start on had noise then.
     """
 
-    def __init__(self, jump_nm: float, stuck_s: float, rate_hz: float, speed: float) -> None:
+    def __init__(self, jump_nm: float, stuck_s: float, rate_hz: float, speed: float, noisy: int = 0) -> None:
         self._jump_nm, self._stuck_s, self._rate_hz = jump_nm, stuck_s, rate_hz
         self._window_s, self._hole_s = RATE_WINDOW_S * speed, HOLE_S * speed
         self._last: tuple[float, float] | None = None
-        self._noisy = 0
+        self._noisy = noisy
         self._same_since_s: float | None = None
         self._arrived: deque[tuple[float, int]] = deque()
         self._count = 0

@@ -161,6 +161,11 @@ class Receiver:
         values = [torque for time_s, torque in tuple(self.recent) if time_s >= since_s]
         return float(np.median(values)) if values else None
 
+    def changes_lately(self) -> int:
+        """How often the torque changed from block to block over the last second or two."""
+        means_nm = [torque for _, torque in tuple(self.recent)]
+        return int(np.sum(np.abs(np.diff(means_nm)) > 1e-9))  # of equal samples the mean is not quite the same
+
     def measured_rate_hz(self) -> float | None:
         """Samples a second over the last seconds, by the host's clock."""
         rate = tuple(self._rate)

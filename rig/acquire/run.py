@@ -115,6 +115,7 @@ class TestRun:
             self._watch.stuck_torque_s * self._clock.speed,
             self._receiver.nominal_rate_hz,
             self._clock.speed,
+            self._receiver.changes_lately(),
         )
         self._receiver.record(self._journal, (torque.lo, torque.hi), self._fault, self._plausible)
         disk = Disk(self._journal)

@@ -10,6 +10,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from rig import archive, journal
 from rig.acquire.run import RunResult, lateness_ms
 from rig.clock import Clock
@@ -168,6 +170,9 @@ def warnings(recording: archive.Recording) -> list[str]:
     if not len(recording.columns["torque/time_s"]):
         return []
     found = []
+    torque_nm = recording.columns["torque/torque_nm"]
+    if np.all(torque_nm == torque_nm[0]):
+        found.append(f"load cell: stood at exactly {torque_nm[0]:.3f} N·m through the whole test: is it stuck?")
     if not (alignment.error_ms <= DOUBTFUL_ALIGNMENT_MS):
         error = "not known" if alignment.error_ms != alignment.error_ms else f"{alignment.error_ms:.1f} ms"
         found.append(

@@ -91,7 +91,7 @@ class LiveCell:
 
     def __init__(self, clock: MonotonicClock, stimulator: LiveStimulator) -> None:
         self.clock, self.stimulator = clock, stimulator
-        self.silent = self.gone = self.broken = False
+        self.silent = self.gone = self.broken = self.stuck = False
         self.rate = 1.0
         self._rng = np.random.default_rng(1)
         self._began_s = clock.now_s()
@@ -119,6 +119,8 @@ class LiveCell:
         block["torque_nm"] = target_nm + (self._torque_nm - target_nm) * fallen
         self._torque_nm = block["torque_nm"][-1] if len(block) else self._torque_nm
         block["torque_nm"] += 0.01 * self._rng.standard_normal(len(block))
+        if self.stuck:
+            block["torque_nm"] = 0.25
         block["counter"] = (self._count + np.arange(len(block))) % 65536
         self._count = max(due, self._count)
         return TorqueBlock(block)
@@ -137,7 +139,8 @@ class LiveRig:
         found = SimpleNamespace(find=lambda kind, _: SimpleNamespace(create=lambda _settings, _clock: made[kind]))
         monkeypatch.setattr(pair, "devices", found)
         settings = config.for_emulator(json.dumps(LINE), data_dir=folder, socket=folder / "s")
-        self.config = settings
+        patient = config.WatchSettings(stale_torque_s=0.5, missing_ack_s=0.5)  # pyright: ignore[reportCallIssue]
+        self.config = settings.model_copy(update={"watch": patient})  # this process has no priority over others
         self.cell.rate, self.stimulator.armed = rate, armed
         self.events: list[Event] = []
         self.rig = Rig(self.config, self.clock, self.events.append)

@@ -104,6 +104,9 @@ def test_times_in_doubt_are_told_with_the_finished_test(tmp_path: Path):
             type(recording.alignment)("sync", error_ms, 0.0, 0.0),
         )
         assert words in warnings(doubtful)[0]
+    recording.columns["torque/torque_nm"][:] = 1.25
+    assert "stood at exactly 1.250" in warnings(recording)[0]
+    recording.columns["torque/torque_nm"][3] = 1.5
     recording.attributes["sample_rate_measured_hz"] = 1560.0
     assert "1560 samples/s came, the rig file says 1600" in warnings(recording)[0]
     (tmp_path / "2").mkdir()

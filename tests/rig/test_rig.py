@@ -106,6 +106,15 @@ def test_a_fault_stops_says_why_and_latches(make: Make, inject: Callable[[LiveRi
     assert live.rig.rearm("nurse").state == "ready"
 
 
+def test_a_cell_that_sticks_right_before_the_test_is_a_fault(make: Make):
+    live = make()
+    live.wait("ready")
+    time.sleep(0.2)  # it has noise
+    live.cell.stuck = True
+    live.rig.start(live.plan("one", hold_s=20.0))
+    assert "has stood at exactly 0.250" in live.wait("latched")
+
+
 def test_half_the_rate_is_a_fault(make: Make):
     live = make(rate=0.5)
     live.rig.start(live.plan("one", hold_s=3.0))
