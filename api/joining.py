@@ -1,8 +1,8 @@
 """Several recordings of one participant as one record, for a verdict on all of them.
 
-They are put one behind the other: each begins and ends at rest, and those measured rests are what stands between them.
-The pause that was between the tests is left out, since nothing was measured in it; so slow effects (fatigue, drift)
-appear in the joined record with less rest than there was. Nothing is made up to fill it.
+They are put one behind the other with the pause that was between them, as far as it is known and up to two minutes
+(what has not recovered in them is not told from what does not recover): fatigue and drift go on in a pause, and a
+joined record without it would show them wrong. Nothing is made up to fill it: it has no rows.
 """
 
 from __future__ import annotations
@@ -15,8 +15,23 @@ PULSE_RATE_HZ = 40.0
 """A CSV file stands for this rate."""
 
 
-def table(records: Sequence[Any]) -> str:
-    """The joined record as CSV, at the first one's sample rate.
+LONGEST_PAUSE_S = 120.0
+LEAST_PAUSE_S = 2.0
+"""What a jump of the clock has to be for a reader to take it as a pause."""
+
+
+def pauses(begun_s: Sequence[float | None], records: Sequence[Any]) -> list[float]:
+    """Seconds between the end of each record and the begin of the next; 0 where it is not known."""
+    found = []
+    for earlier, later, record in zip(begun_s, begun_s[1:], records, strict=False):
+        known = earlier is not None and later is not None
+        pause_s = later - earlier - float(record.time_s[-1]) if known else 0.0
+        found.append(min(pause_s, LONGEST_PAUSE_S) if pause_s >= LEAST_PAUSE_S else 0.0)
+    return found
+
+
+def table(records: Sequence[Any], pause_s: Sequence[float] = ()) -> str:
+    """The joined record as CSV, at the first one's sample rate; `pause_s` stands before the second, the third, …
 
     Raises
     ------
@@ -32,6 +47,9 @@ def table(records: Sequence[Any]) -> str:
         columns.append(resampled(record, rate_hz))
     width, torque, names = (np.concatenate(parts) for parts in zip(*columns, strict=True))
     time_s = np.arange(width.size) / rate_hz
+    ends = np.cumsum([part[0].size for part in columns])
+    for end, pause in zip(ends[:-1], pause_s, strict=False):
+        time_s[end:] += np.round(pause * PULSE_RATE_HZ) / PULSE_RATE_HZ
     rows = zip(time_s, width, torque, names, strict=True)
     return "\n".join([HEADER, *(f"{t:.6f},{u:g},{y:.6f},{name}" for t, u, y, name in rows)]) + "\n"
 

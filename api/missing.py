@@ -107,9 +107,23 @@ def joined(parts: Sequence[str], out: str, progress: Progress) -> dict[str, Any]
     import hashlib
 
     import identify
-    from api.joining import table
+    from api.joining import pauses, table
 
     progress(0.1, "joining the recordings")
-    text = table([identify.read(Path(part)) for part in parts])
+    records = [identify.read(Path(part)) for part in parts]
+    text = table(records, pauses([begun(Path(part)) for part in parts], records))
     Path(out).write_text(text)
     return {"file_sha256": hashlib.sha256(text.encode()).hexdigest()}
+
+
+def begun(path: Path) -> float | None:
+    """When a sealed recording's clock was 0, as Unix time; None for a file that doesn't say."""
+    from datetime import datetime
+
+    import h5py
+
+    try:
+        with h5py.File(path) as file:
+            return datetime.fromisoformat(str(file.attrs["created_utc"])).timestamp()
+    except (OSError, KeyError, ValueError):
+        return None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import hashlib
 import io
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,8 @@ from identify.record import Record, Source
 
 REQUIRED = ("time_s", "pulse_width_us", "torque_nm", "segment")
 OPTIONAL = ("angle_rad", "velocity_rad_s")
+PAUSE_S = 1.0
+"""A jump of the clock as long as this, at zero pulse width, is a pause between two tests."""
 HEADER = ",".join(REQUIRED)
 LOWEST_HZ, HIGHEST_HZ = 39.0, 2100.0
 LARGEST = {"time_s": 1e7, "pulse_width_us": 1e4, "torque_nm": 1e6, "angle_rad": 1e3, "velocity_rad_s": 1e5}
@@ -54,7 +57,7 @@ def read_csv(path: Path, pulse_rate_hz: float = 40.0) -> Record:
             place=f"{name}, line {lines[empty[0]]}, column segment",
             mend="Name it: rest, prbs, ramp, validate…",
         )
-    time_s = uniform_time(columns["time_s"], lines, name)
+    time_s = _even_parts(columns["time_s"], columns["pulse_width_us"], lines, name)
     if (negative := np.flatnonzero(columns["pulse_width_us"] < 0)).size:
         raise BadRecord(
             f"{columns['pulse_width_us'][negative[0]]:g} µs is negative",
@@ -131,6 +134,24 @@ def _is_number(cell: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def _even_parts(time_s: np.ndarray, width_us: np.ndarray, lines: list[int], name: str) -> np.ndarray:
+    """As `uniform_time`, each part by itself: tests of one session may follow one another after a pause at rest."""
+    steps = np.diff(time_s)
+    least_s = max(PAUSE_S, 20 * float(np.median(steps))) if steps.size else PAUSE_S
+    jumps = np.flatnonzero((steps >= least_s) & (width_us[:-1] == 0) & (width_us[1:] == 0)) + 1
+    edges = [0, *jumps.tolist(), time_s.size]
+    parts = [uniform_time(time_s[a:b], lines[a:b], name) for a, b in pairwise(edges)]
+    for part, edge in zip(parts, edges, strict=False):
+        step, first = float(part[1] - part[0]), float(parts[0][1] - parts[0][0])
+        if abs(step - first) > 0.002 * first:
+            raise BadRecord(
+                f"sampled at {1 / step:.4g} Hz after a pause, {1 / first:.4g} Hz before it ({part.size} rows)",
+                place=f"{name}, line {lines[edge]}, column time_s",
+                mend="Resample to one rate.",
+            )
+    return np.concatenate(parts)
 
 
 def uniform_time(time_s: np.ndarray, lines: list[int], name: str) -> np.ndarray:

@@ -102,10 +102,12 @@ class Record:
 
     @cached_property
     def sample_rate_hz(self) -> float:
-        """Samples a second, from the first and last sample."""
+        """Samples a second, gaps and pauses aside."""
         if self.time_s.size < 2:
             return self.pulse_rate_hz
-        return (self.time_s.size - 1) / float(self.time_s[-1] - self.time_s[0])
+        steps = np.diff(self.time_s)
+        steps = steps[steps < 1.5 * np.median(steps)]
+        return steps.size / float(np.sum(steps))
 
     @cached_property
     def held_out(self) -> np.ndarray:

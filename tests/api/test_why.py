@@ -214,6 +214,23 @@ def test_joined_recordings_are_one_even_record_on_one_grid_of_pulses(tmp_path: P
     assert np.abs(np.delete(followed, np.r_[changes - 1, changes, changes + 1])).max() < 0.05
 
 
+def test_the_pause_between_joined_recordings_is_kept(tmp_path: Path) -> None:
+    import identify
+
+    parts = [record(400, 0.01), record(400, 0.01)]
+    pause_s = joining.pauses([1000.0, 1000.0 + float(parts[0].time_s[-1]) + 61.0], parts)
+    assert pause_s == pytest.approx([61.0])
+    assert joining.pauses([1000.0, 9000.0], parts) == [joining.LONGEST_PAUSE_S]
+    assert joining.pauses([None, 9000.0], parts) == [0.0]
+    path = tmp_path / "joined.csv"
+    path.write_text(joining.table(parts, pause_s))
+    joined = identify.read(path)
+    assert joined.sample_rate_hz == pytest.approx(400, abs=0.01)
+    jumps = [step for step in joined.time_s[1:] - joined.time_s[:-1] if step > 0.1]
+    assert jumps == pytest.approx([61.0], abs=0.05)
+    assert identify.fit(joined).baseline_nm == pytest.approx(0.0, abs=0.05)
+
+
 def test_recordings_that_cannot_be_joined_are_refused() -> None:
     import numpy as np
 
