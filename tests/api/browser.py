@@ -36,8 +36,8 @@ def open_tab(browser: Any, service: Service, signed_in: bool = True, **options: 
     with service.client() as http:
         http.post("/v1/stop")
         end = time.monotonic() + 30
-        while http.get("/v1/rig").json()["holder"]:
-            assert time.monotonic() < end
+        while (rig := http.get("/v1/rig").json())["holder"]:
+            assert time.monotonic() < end, (rig, http.get("/v1/tests").json()[:2], service.rig.status())
             time.sleep(0.05)
         http.post("/v1/rearm")
 
