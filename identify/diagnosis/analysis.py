@@ -34,7 +34,7 @@ PATCHERS = {"voluntary_effort": 0.4, "tremor": 0.4}
 """Of those that mend anything, more is asked for."""
 AT_WORK_ONLY = 0.85
 """What evidence counts for efforts of which the rests show nothing: they'd be the first to keep to the stimulation."""
-SEEN_AT_REST = 0.25
+SEEN_AT_REST = 0.15
 """Least share of an effort's torque, rests against work, that counts as seen at rest."""
 DYNAMIC = {"speed", "branch", "delay", "filter"}
 """Stages that change how quickly torque follows."""

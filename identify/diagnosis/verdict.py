@@ -21,8 +21,10 @@ LEAST_BY_EFFORTS = 0.8
 """The same where efforts are named first: they mend anything a little."""
 LEAST_BY_BAND = 0.94
 """Share of the power that a tremor must take, where work and rest differ beside it."""
-MANY = 5
+MANY = 4
 """Efforts, none of them at rest, that are more likely something the stimulation does."""
+APART_S = 1.2
+"""Between the middles of two bumps that are two efforts."""
 UNSTEADY = 60.0
 """Log-likelihood by which work and rest must differ beside a tremor for it to be something else."""
 STRUCTURE = 12.0
@@ -91,7 +93,14 @@ def _no_effort(work: Analysis, explained: float, structure: float) -> bool:
     if seen_at_rest(work.quiet, work.chain[1], work.added[0]) >= SEEN_AT_REST:
         return False
     form = next(form.name for name, form in work.chain[1].effects if name == work.added[0])
-    return "resisting" in form or int(form.rsplit("_", 1)[1]) >= MANY
+    return "resisting" in form or _efforts(work) >= MANY
+
+
+def _efforts(work: Analysis) -> int:
+    """How many efforts the bumps make: those close to one another are one."""
+    parameters = work.chain[1].parameters_of(work.added[0])
+    centres = np.sort([value for name, value in parameters.items() if name.startswith("centre_")])
+    return int(np.sum(np.diff(centres) > APART_S)) + 1 if centres.size else 0
 
 
 def judge(work: Analysis) -> Verdict:

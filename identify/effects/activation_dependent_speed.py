@@ -47,8 +47,12 @@ EFFECT = Effect(
         _two_lags("attached_slow_lag", "a' = (w - a)/quick, y' = (a - y)(1 + slope·y/y_max)/slow", 22, _ATTACHED),
         _two_lags("activation_quick_lag", "a' = (w - a)/slow, y' = (a - y)/(quick (1 + slope·a/y_max))", 23, _BOUND),
         _two_lags("attached_quick_lag", "a' = (w - a)/slow, y' = (a - y)(1 + slope·y/y_max)/quick", 24, _ATTACHED),
-        _two_lags("pump_slow_lag", "a' = (w - a)/(slow (1 + slope·a/y_max)), y' = (a - y)/quick", 25, _PUMP),
-        _two_lags("pump_quick_lag", "a' = (w - a)/(quick (1 + slope·a/y_max)), y' = (a - y)/slow", 26, _PUMP),
+        _two_lags(
+            "pump_slow_lag", "a' = (w/(1 + s·w) - a/(1 + s·a))/slow, y' = (a - y)/quick, s = slope/y_max", 25, _PUMP
+        ),
+        _two_lags(
+            "pump_quick_lag", "a' = (w/(1 + s·w) - a/(1 + s·a))/quick, y' = (a - y)/slow, s = slope/y_max", 26, _PUMP
+        ),
     ),
     signature="Small torques come faster (or slower) than large ones: the error's sign goes with level and time.",
     resembles=("asymmetric_relaxation", "voluntary_effort", "mixed_fibres", "output_saturation"),

@@ -58,6 +58,58 @@ def _propose(count: int, sign: float) -> Callable[..., list[dict[str, float]]]:
     return propose
 
 
+def _spasms(count: int) -> Callable[..., np.ndarray]:
+    def apply(_: None, p: dict[str, Any], scene: Scene) -> np.ndarray:
+        total = np.zeros((p["rise_s"].shape[0], scene.time_s.size))
+        rise = p["rise_s"]
+        for i in range(count):
+            age = np.clip(scene.time_s - p[f"centre_{i}_s"], 0.0, 1e3)
+            decay = p[f"decay_{i}_s"]
+            both = decay * rise / np.maximum(decay - rise, 1e-3)
+            peak_s = both * np.log(np.maximum(decay / rise, 1.001))
+            peak = np.exp(-peak_s / decay) - np.exp(-peak_s / rise)
+            total += p[f"height_{i}_nm"] * (np.exp(-age / decay) - np.exp(-age / rise)) / np.maximum(peak, 1e-6)
+        return total
+
+    return apply
+
+
+def _propose_spasm(count: int) -> Callable[..., list[dict[str, float]]]:
+    def propose(residual_nm: np.ndarray, scene: Scene, previous: dict[str, float]) -> list[dict[str, float]]:
+        """The burst that best matches the residual, at each of a few decays."""
+        known = np.isfinite(residual_nm)
+        value = np.where(known, residual_nm, 0.0)
+        found = []
+        for decay_s in (0.3, 0.8, 1.8):
+            age = np.arange(int(np.ceil(4 * decay_s / scene.step_s))) * scene.step_s
+            kernel = np.exp(-age / decay_s) - np.exp(-age / (0.1 * decay_s))
+            kernel /= kernel.max()
+            match = np.convolve(value, kernel[::-1])[kernel.size - 1 :]
+            power = np.convolve(known.astype(float), (kernel**2)[::-1])[kernel.size - 1 :] + 0.3 * np.sum(kernel**2)
+            score = np.where(match > 0, match**2 / power, 0.0)
+            at = int(np.argmax(score))
+            found.append((float(score[at]), decay_s, at, float(match[at] / power[at])))
+        score, decay_s, at, height = max(found)
+        if score <= 0.0:
+            return []
+        i = count - 1
+        burst = {f"centre_{i}_s": float(scene.time_s[at]), f"decay_{i}_s": decay_s, f"height_{i}_nm": height}
+        return [{"rise_s": 0.07} | dict(previous) | burst]
+
+    return propose
+
+
+def _spasm_parameters(count: int) -> tuple[Parameter, ...]:
+    listed = [Parameter("rise_s", "s", 0.02, 0.14, 0.07, (0.07,), "log", about="how quickly they burst")]
+    for i in range(count):
+        listed += [
+            Parameter(f"centre_{i}_s", "s", 0.0, 1.0, 0.0, (0.5,), relative="span", about="begin"),
+            Parameter(f"decay_{i}_s", "s", 0.15, 3.0, 0.6, (0.6,), "log", about="how slowly it lets go"),
+            Parameter(f"height_{i}_nm", "N·m", 0.0, 0.9, 0.0, (0.1,), relative="torque", about="peak torque"),
+        ]
+    return tuple(listed)
+
+
 def _seen(count: int) -> Callable[[dict[str, float], Scene], bool]:
     def accept(p: dict[str, float], scene: Scene) -> bool:
         """A bump is seen where it stands: not in rows left out, where it would only mend what lies beside them."""
@@ -98,6 +150,20 @@ EFFECT = Effect(
             grows=count > 1,
         )
         for name, words, sign in (("bumps", "helping", 1.0), ("resisting", "resisting", -1.0))
+        for count in range(1, MOST + 1)
+    )
+    + tuple(
+        Form(
+            f"spasms_{count}",
+            "additive",
+            f"y + Σ height·(exp(-t/decay) - exp(-t/rise)), t since its begin, {count} of them",
+            _spasm_parameters(count),
+            _spasms(count),
+            batched=True,
+            propose=_propose_spasm(count),
+            accept=_seen(count),
+            grows=count > 1,
+        )
         for count in range(1, MOST + 1)
     ),
     signature="Isolated bumps, in rests as well, at times that have nothing to do with the stimulation.",

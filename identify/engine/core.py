@@ -41,6 +41,13 @@ def _transition(time_constant_s, damping, step_s):  # pragma: no cover
 
 
 @njit(cache=True, nogil=True, inline="always")
+def _uptake(slope, w, a):  # pragma: no cover
+    """Lag of a pump that saturates, w/(1 + s w) - a/(1 + s a) being what drives a towards w."""
+    w, a = min(max(w, 0.0), 1.2), min(max(a, 0.0), 1.2)
+    return max(1.0 + slope * w, 0.08) * max(1.0 + slope * a, 0.08)
+
+
+@njit(cache=True, nogil=True, inline="always")
 def _factor(law, w, y, v, scale_nm, slow_s, quick_s, bound):  # pragma: no cover
     """Factors on T, on the slower and on the quicker lag. `law` holds, each neutral at 0:
 
@@ -55,7 +62,8 @@ def _factor(law, w, y, v, scale_nm, slow_s, quick_s, bound):  # pragma: no cover
     drive at all, with the quicker lag), 19 quicker lag, linear in c (with the slower lag);
     20 as 12 on the slower lag; two lags in a row, of which the second keeps its input a when its speed changes:
     21 the slower second and linear in a, 22 the slower second and inverse linear in torque, 23 and 24 the same with
-    the quicker second; of which the first goes with its own level: 25 the slower first and linear in a, 26 the quicker.
+    the quicker second; of which the first is a pump that saturates, linear in a and in drive: 25 the slower, 26 the
+    quicker first.
     """
     m = 1.0
     if law[0] != 0.0:
@@ -112,9 +120,9 @@ def _factor(law, w, y, v, scale_nm, slow_s, quick_s, bound):  # pragma: no cover
     if law[19] != 0.0:
         q *= max(1.0 + law[19] * bound, 0.08)
     if law[25] != 0.0:
-        d *= max(1.0 + law[25] * min(max((y + quick_s * v) / scale_nm, 0.0), 1.2), 0.08)
+        d *= _uptake(law[25], w / scale_nm, (y + quick_s * v) / scale_nm)
     if law[26] != 0.0:
-        q *= max(1.0 + law[26] * min(max((y + slow_s * v) / scale_nm, 0.0), 1.2), 0.08)
+        q *= _uptake(law[26], w / scale_nm, (y + slow_s * v) / scale_nm)
     return min(max(m, 0.02), 50.0), min(max(d, 0.02), 50.0), min(max(q, 0.02), 50.0)
 
 
