@@ -56,6 +56,7 @@ class RigClient:
         self.connected = False
         self.listeners: list[Callable[[AnyEvent], None]] = []
         self.link_listeners: list[Callable[[bool], None]] = []
+        self.poll_listeners: list[Callable[[Status], None]] = []
         self._heard_s: float | None = None
         self._numbers = itertools.count(1)
         self._waiting: dict[int, asyncio.Future[Reply]] = {}
@@ -139,6 +140,8 @@ class RigClient:
                 await self._listen(reader)
             except (OSError, ValueError, asyncio.IncompleteReadError) as error:
                 log.debug("rig link: %s", error)
+            except Exception:  # whatever it was, a service that never connects again hears of no test's end
+                log.exception("the rig's link failed")
             finally:
                 self._lose_link()
             await asyncio.sleep(RECONNECT_S)
@@ -180,10 +183,16 @@ class RigClient:
         while True:
             await asyncio.sleep(STATUS_EVERY_S)
             before = self.status.state if self.status else None
-            with contextlib.suppress(ApiError):
+            try:
                 status = await self.fresh_status()
                 if status.state != before:  # a change that no event told
                     self._tell(StateEvent(status=status))
+                for listener in list(self.poll_listeners):
+                    listener(status)
+            except ApiError:
+                continue  # its age tells
+            except Exception:
+                log.exception("the rig's state could not be taken")
 
     def _take(self, message: dict[str, Any], subscription_id: int) -> None:
         if "event" in message:

@@ -31,6 +31,7 @@ from rig.messages import (
     RecruitmentTable,
     SegmentPlan,
     StartRequest,
+    Status,
     StopEvidence,
     StopRequest,
     TestPlan,
@@ -38,6 +39,8 @@ from rig.messages import (
 
 log = logging.getLogger("stimrig.trials")
 NOT_CONFIRMED = "The stop is not confirmed"
+MISSED_POLLS = 3
+"""After so many states that don't name the test, its end was lost: it comes within milliseconds of the state."""
 EMERGENCY = "Use the stimulator's own emergency switch now."
 
 
@@ -49,6 +52,12 @@ class Current:
     participant: str
     by: str
     finished: asyncio.Event = field(default_factory=asyncio.Event)
+    started: bool = False
+    """The rig has said that it plays."""
+    ending: bool = False
+    """Its end has been heard."""
+    missed: int = 0
+    """How often in a row the rig, asked for its state, did not name it."""
 
 
 class Trials:
@@ -66,6 +75,7 @@ class Trials:
         self._tasks: set[asyncio.Task[Any]] = set()
         rig.listeners.append(self._on_event)
         rig.link_listeners.append(self._on_link)
+        rig.poll_listeners.append(self._on_poll)
 
     # ---- start and stop -------------------------------------------------------------------------------------
 
@@ -91,7 +101,7 @@ class Trials:
         plan = self._plan(body, participant)
         if body.joins is not None:
             await asyncio.to_thread(self._check_joins, body)
-        self.current = Current(plan.test_id, plan.participant, by)
+        current = self.current = Current(plan.test_id, plan.participant, by)
         current_test.set(plan.test_id)
         self.fitting.cancel_background()
         try:
@@ -99,6 +109,7 @@ class Trials:
             row = await asyncio.to_thread(self._write_intent, plan, preview, by, body.joins)
             self.hub.begin(plan.test_id)
             await self._command(plan)
+            current.started = True
         except BaseException:
             self.current = None
             raise
@@ -217,9 +228,22 @@ class Trials:
 
     def _on_link(self, connected: bool) -> None:
         self.hub.send({"type": "link", "connected": connected})
-        status = self.rig.status
-        if connected and self.current is not None and status is not None and status.test_id != self.current.test_id:
-            self._spawn(self._recover(self.current.test_id, "the rig's process ended during the test"))
+        current, status = self.current, self.rig.status
+        if not connected or status is None or current is None or not current.started:
+            return  # a start under way learns by itself what became of it
+        if not current.ending and status.test_id != current.test_id:
+            current.ending = True
+            self._spawn(self._recover(current.test_id, "the rig's process ended during the test"))
+
+    def _on_poll(self, status: Status) -> None:
+        """A test whose end was lost on the way must not hold the rig for ever."""
+        current = self.current
+        if current is None or not current.started or current.ending:
+            return
+        current.missed = 0 if status.test_id == current.test_id else current.missed + 1
+        if current.missed >= MISSED_POLLS:
+            current.ending = True
+            self._spawn(self._recover(current.test_id, f"the rig is {status.state} and no longer plays this test"))
 
     def _spawn(self, work: Any) -> None:
         task = asyncio.create_task(work)
@@ -229,6 +253,8 @@ class Trials:
     async def _finish(self, event: FinishedEvent) -> None:
         """Take over a finished test: store the recording, identify, store the model."""
         current_test.set(event.test_id)
+        if self.current is not None and self.current.test_id == event.test_id:
+            self.current.ending = True
         try:
             row = await asyncio.to_thread(self.outcomes.take_recording, event)
             if row is None:
@@ -263,7 +289,7 @@ class Trials:
                 and status.test_id == row.id
                 and status.state not in ("ready", "latched", "uncertain")
             ):
-                self.current = Current(row.id, row.participant, row.requested_by)
+                self.current = Current(row.id, row.participant, row.requested_by, started=True)
                 self.hub.begin(row.id)
             else:
                 self._spawn(self._recover(row.id, "the service was restarted during the test"))

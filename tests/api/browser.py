@@ -34,12 +34,12 @@ def open_tab(browser: Any, service: Service, signed_in: bool = True, **options: 
     yield page
     context.close()
     with service.client() as http:
-        http.post("/v1/stop")
         end = time.monotonic() + 30
-        while (rig := http.get("/v1/rig").json())["holder"]:
-            assert time.monotonic() < end, (rig, http.get("/v1/tests").json()[:2], service.rig.status())
+        stopped = http.post("/v1/stop")
+        while (rig := http.get("/v1/rig").json())["holder"] or service.rig.state == "running":
+            assert time.monotonic() < end, (stopped.text, rig, http.get("/v1/tests").json()[:2], service.rig.status())
             time.sleep(0.05)
-        http.post("/v1/rearm")
+        assert http.post("/v1/rearm").status_code == 200
 
 
 def sign_in(page: Any, service: Service, name: str = NAME, password: str = PASSWORD) -> None:

@@ -16,9 +16,12 @@ import signal
 import sys
 import threading
 import time
+import traceback
 from pathlib import Path
 from typing import Any
 
+import h5py  # here, not at a test's end: seconds, and other threads of the test process import meanwhile
+import numpy as np
 from pydantic import TypeAdapter
 
 from rig import messages as m
@@ -85,6 +88,8 @@ class FakeRig:
         self.mute = False
         self.starts = 0
         self.stopped_by: str | None = None
+        self.loses_ends = False
+        self.warnings: list[str] = []
         self._stop = asyncio.Event()
         self._writers: set[asyncio.StreamWriter] = set()
         self._play: asyncio.Task[None] | None = None
@@ -237,6 +242,15 @@ class FakeRig:
                 writer.write(line)
 
     async def _run(self, plan: m.TestPlan) -> None:
+        try:
+            await self._played(plan)
+        except Exception as error:  # a test never goes on for ever, whatever is wrong in here
+            traceback.print_exc()
+            self.state, self.reason, self.plan, self.segment = "latched", f"fake rig: {error!r}", None, None
+            self._send(m.StateEvent(status=self.status()))
+            self._send(m.FinishedEvent(test_id=plan.test_id, outcome="fault", reason=self.reason))
+
+    async def _played(self, plan: m.TestPlan) -> None:
         widths, segments = default_widths()
         torque = muscle(widths, self.rate_hz)
         self.duration_s = len(widths) / PULSE_RATE_HZ
@@ -272,6 +286,8 @@ class FakeRig:
         self.state, self.segment = ("latched" if stopped else "ready"), None
         self.plan = None
         self._send(m.StateEvent(status=self.status()))
+        if self.loses_ends:
+            return
         self._send(
             m.FinishedEvent(
                 test_id=plan.test_id, outcome=outcome, reason=self.reason, recording_path=str(path),
@@ -281,7 +297,7 @@ class FakeRig:
                     "pulses": sum(1 for w in widths if w), "dropped_pulses": 0,
                     "lateness_ms": {"median": 0.08, "p99": 0.12, "max": 0.3}, "charge_uc": sum(widths) * 20 / 1000,
                     "alignment": {"method": "sync", "error_ms": 0.02}, "sample_rate_hz": self.rate_hz,
-                    "torque_peak_nm": max(torque, default=0.0), "cpu_percent": 3.0,
+                    "torque_peak_nm": max(torque, default=0.0), "cpu_percent": 3.0, "warnings": self.warnings,
                 },
             )
         )  # fmt: skip
@@ -294,9 +310,6 @@ class m_refusal(Exception):
 def write_recording(folder: Path, plan: m.TestPlan, widths: list[float], torque: list[float], segments: Any,
                     rate_hz: float, outcome: str) -> tuple[Path, str]:  # fmt: skip
     """A recording as docs/recording.md lays it out."""
-    import h5py
-    import numpy as np
-
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"R-{plan.test_id}.h5"
     count, pulses = len(torque), len(widths)
