@@ -38,6 +38,9 @@ PULSE_RATE_HZ = 40.0
 BEFORE_S, AFTER_S = 1.0, 1.0
 RISE_US = 50.0
 """The gate's bound on a rise from pulse to pulse: below the threshold it costs nothing to keep it."""
+GAINS = (0.8, 1.0, 1.2, 1.4, 1.6)
+REFERENCE_HZ = 0.4
+"""Where a smooth reference's power ends, about."""
 LAMBDA = 0.02
 PLAN_STEPS = 12
 STEP = 0.8
@@ -123,25 +126,32 @@ def norm_optimal(plant: Plant) -> Callable[[np.ndarray, np.ndarray], np.ndarray]
     return lambda demand_nm, error_nm: demand_nm + learn @ error_nm
 
 
-def phase_lead(plant: Plant, gain: float = 0.8) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """w(t) ← Q[w(t) + γ e(t + τ)]: the lead under which |1 - γ z^τ G| < 1 reaches furthest; Q ends a little before."""
+def phase_lead(plant: Plant) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """w(t) ← Q[w(t) + γ e(t + τ)]: γ and τ that leave least of a smooth reference after four trials.
+
+    A frequency's error shrinks by |1 - γ z^τ G| a trial; Q ends before that reaches 1.
+    """
     size = plant.response.size
     frequency_hz = np.fft.rfftfreq(16 * size, 1 / PULSE_RATE_HZ)
     G = np.fft.rfft(plant.response, 16 * size)
-    reach = {}
-    for lead in range(1, 60):
-        moved = G * np.exp(2j * np.pi * frequency_hz * lead / PULSE_RATE_HZ)
-        outside = np.flatnonzero(np.abs(1 - gain * moved) >= 0.98)
-        reach[lead] = frequency_hz[outside[0]] if outside.size else PULSE_RATE_HZ / 2
-    lead = max(reach, key=lambda lead: reach[lead])
-    spread = 0.75 * PULSE_RATE_HZ / (2 * np.pi * reach[lead])  # a Gaussian, -3 dB near 1.1 of where it must end
+    weight = 1 / (1 + (frequency_hz / REFERENCE_HZ) ** 4) ** 2
+
+    def left(gain: float, lead: int) -> tuple[float, float]:
+        factor = np.abs(1 - gain * G * np.exp(2j * np.pi * frequency_hz * lead / PULSE_RATE_HZ))
+        outside = np.flatnonzero(factor >= 0.98)
+        reach_hz = float(frequency_hz[outside[0]]) if outside.size else PULSE_RATE_HZ / 2
+        learnt = np.where(frequency_hz < 0.7 * reach_hz, np.minimum(factor, 1.0) ** 8, 1.0)
+        return float(np.sum(weight * learnt)), reach_hz
+
+    gain, lead = min(((g, n) for g in GAINS for n in range(60)), key=lambda choice: left(*choice)[0])
+    spread = 0.75 * PULSE_RATE_HZ / (2 * np.pi * max(left(gain, lead)[1], 0.2))  # a Gaussian, -3 dB where Q must end
     taps = np.exp(-0.5 * (np.arange(-80, 81) / max(spread, 0.5)) ** 2)
 
     def smooth(demand_nm: np.ndarray) -> np.ndarray:
         return np.convolve(np.pad(demand_nm, 80, mode="edge"), taps / taps.sum(), mode="valid")
 
     def law(demand_nm: np.ndarray, error_nm: np.ndarray) -> np.ndarray:
-        ahead = np.r_[error_nm[lead:], np.full(lead, error_nm[-1])]
+        ahead = np.r_[error_nm[lead:], np.full(lead, error_nm[-1])] if lead else error_nm
         return demand_nm + smooth(gain * ahead)
 
     return law
