@@ -100,7 +100,9 @@ def test_pulse_response_has_unit_gain(ilc: ModuleType) -> None:
     assert response[0] < response[5]
 
 
-@pytest.mark.parametrize(("law", "static"), [("norm-optimal", False), ("norm-optimal", True), ("phase-lead", False)])
+@pytest.mark.parametrize(
+    ("law", "static"), [("norm-optimal", False), ("norm-optimal", True), ("phase-lead", False), ("phase-lead", True)]
+)
 def test_error_falls_below_five_percent_in_five_trials(ilc: ModuleType, law: str, static: bool) -> None:
     """On a muscle unlike its model: below 5 % by the fifth trial, falling from the first until noise is reached."""
     reference = ilc.Reference.reach(4.0)
