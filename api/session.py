@@ -136,6 +136,7 @@ def report_lines(test: dict[str, Any], model: dict[str, Any]) -> list[str]:
         f"pulses         {summary.get('pulses')}, dropped {summary.get('dropped_pulses')}; lateness median "
         f"{number(late.get('median'), 3)}, p99 {number(late.get('p99'), 3)}, max {number(late.get('max'), 3)} ms",
         f"clocks         aligned by {aligned.get('method')}, error {number(aligned.get('error_ms'), 4)} ms",
+        *(f"in doubt       {words}" for words in summary.get("warnings") or []),
         *fit_lines(model),
         f"served         {number(summary.get('last_sample_to_model_s'), 2)} s from the last sample to the stored model",
     ]

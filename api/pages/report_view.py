@@ -52,5 +52,6 @@ async def report(request: Request, context: Ctx, _who: ModelReader, model_id: st
         why=why.view(found, measured["comparison"], row.effects) if found else None,
         versions=why.versions([context.versions.public(version) for version in lineage], row.id),
         recording=recording,
+        warnings=await asyncio.to_thread(context.trials.outcomes.warnings, row.recording_id),
         now_utc=context.clock.utc(),
     )

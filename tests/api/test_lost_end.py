@@ -13,7 +13,9 @@ from tests.api import fake_rig
 from tests.api.conftest import Service, run_test
 
 
-def test_an_end_that_was_never_told_is_found_by_asking(client: httpx.Client, service: Service, participant: str) -> None:
+def test_an_end_that_was_never_told_is_found_by_asking(
+    client: httpx.Client, service: Service, participant: str
+) -> None:
     service.rig.loses_ends = True
     ended = run_test(client, participant)
     assert ended["recording_id"] == f"R-{ended['id']}" and ended["state"] == "completed" and ended["model_id"]
