@@ -147,17 +147,23 @@ class Services:
         Passed to the emulator.
     admin_token : str or None
         Set the administrator's token instead of drawing one.
+    attach : Path or None
+        Socket of a rig that runs already: none is started, and none is ended.
     """
 
     def __init__(
-        self, settings: Settings, emulator_arguments: list[str] | None = None, admin_token: str | None = None
+        self,
+        settings: Settings,
+        emulator_arguments: list[str] | None = None,
+        admin_token: str | None = None,
+        attach: Path | None = None,
     ) -> None:
-        self.settings = settings
+        self.settings, self.attached = settings, attach is not None
         settings.logs_dir.mkdir(parents=True, exist_ok=True)
         self.runtime = Path(tempfile.mkdtemp(prefix="stimrig-"))  # a Unix socket's path holds 107 characters only
-        self.socket = self.runtime / "rig.sock"
+        self.socket = attach.absolute() if attach else self.runtime / "rig.sock"
         self.emulator: Child | None = None
-        if settings.rig_file is None:
+        if settings.rig_file is None and not self.attached:
             arguments = ["--die-with-parent", *(emulator_arguments or [])]
             self.emulator = self._child("emulator", ["hardware_sim", *arguments])
         self.rig = self._child("rig", ["rig"])
@@ -191,13 +197,8 @@ class Services:
     def start(self) -> None:
         """Start everything, the devices first."""
         data = str(self.settings.data_dir.absolute())
-        if self.emulator is not None:
-            ready = self.emulator.start()
-            source = ["--emulator-json", json.dumps(ready)]
-        else:
-            source = ["--config", str(self.settings.rig_file)]
-        self.rig.command += [*source, "--socket", str(self.socket), "--data", data]
-        self._start_rig()
+        if not self.attached:
+            self._start_devices(data)
         self.api.environment = {
             "STIMRIG_DATA_DIR": data,
             "STIMRIG_RIG_SOCKET": str(self.socket),
@@ -208,6 +209,15 @@ class Services:
             self.api.environment["STIMRIG_ADMIN_TOKEN"] = self.admin_token
         self.api.start()
         self.api.environment["STIMRIG_PORT"] = str(self.api.ready["port"])  # the same one after a restart
+
+    def _start_devices(self, data: str) -> None:
+        if self.emulator is not None:
+            ready = self.emulator.start()
+            source = ["--emulator-json", json.dumps(ready)]
+        else:
+            source = ["--config", str(self.settings.rig_file)]
+        self.rig.command += [*source, "--socket", str(self.socket), "--data", data]
+        self._start_rig()
 
     def _start_rig(self) -> None:
         try:
@@ -228,7 +238,8 @@ class Services:
         """
         if self.emulator is not None and not self.emulator.alive():
             raise self.emulator.failure()
-        return [self._restart(child) for child in (self.rig, self.api) if not child.alive()]
+        ours = (self.api,) if self.attached else (self.rig, self.api)
+        return [self._restart(child) for child in ours if not child.alive()]
 
     def _restart(self, child: Child) -> str:
         if time.monotonic() - child.started_s > 60:
@@ -243,7 +254,7 @@ class Services:
         return f"{child.name} had ended ({words or 'without a word'}) and was started again"
 
     def stop(self) -> None:
-        """End everything: the rig first, since it stops stimulation; the service hears how its test ended."""
+        """End what was started here: the rig first, since it stops stimulation; the service hears its test's end."""
         self.rig.end(SEAL_S)
         self.api.end()
         if self.emulator is not None:

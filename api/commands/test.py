@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import secrets
+import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,6 +14,7 @@ import typer
 from api.launcher import Services
 from api.session import ReportedError, checked, ensure_participant, report_lines, run_test
 from api.settings import Settings
+from api.stop_key import StopKey, at_rig, at_service
 from api.terminal import InputError, Json, say, say_json
 
 
@@ -35,7 +37,9 @@ def test(
         token = os.environ.get("STIMRIG_TOKEN") or os.environ.get("STIMRIG_ADMIN_TOKEN")
         if not token:
             raise InputError(f"--url {url} needs a token in STIMRIG_TOKEN.")
-        found = through(url, token, participant)
+        with StopKey(at_service(url, token), say_aside) as key:
+            announce(key)
+            found = through(url, token, participant)
     else:
         found = on_own_services(rig, data, emulate, participant)
     recording = found.pop("recording")
@@ -46,6 +50,17 @@ def test(
         return
     say(*report_lines(found["test"], found["model"]))
     say(f"recording      {output or found['test']['recording_url']}")
+
+
+def announce(key: StopKey) -> None:
+    """Say that a key stops, where one does."""
+    if key.listens:
+        say_aside("any key stops the test")
+
+
+def say_aside(words: str) -> None:
+    """On standard error, on a line of its own: standard output is the result's."""
+    print(f"\r\x1b[K{words}" if sys.stderr.isatty() else words, file=sys.stderr, flush=True)
 
 
 def save(path: Path, recording: bytes) -> None:
@@ -70,7 +85,11 @@ def on_own_services(rig: Path | None, data: Path | None, emulate: str, participa
     settings.port = 0
     token = secrets.token_urlsafe(32)
 
-    with Services(settings, emulate.split(), token) as services:
+    with (
+        Services(settings, emulate.split(), token) as services,
+        StopKey(at_rig(services.socket), say_aside) as key,
+    ):
+        announce(key)
 
         def watch() -> None:
             for event in services.watch():

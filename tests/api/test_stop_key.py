@@ -1,0 +1,198 @@
+"""A key at the terminal stops a running test; `stimrig serve` attaches to a rig that runs already."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pty
+import signal
+import subprocess
+import sys
+import termios
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from api import cli, stop_key
+from api.commands import test as test_verb
+from api.stop_key import StopKey, at_rig, at_service
+from tests.api.conftest import TOKEN, Service, wait_done
+from tests.api.fake_rig import RigThread
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture
+def terminal() -> Iterator[tuple[int, int]]:
+    """The keyboard's end and the program's end."""
+    keyboard, program = pty.openpty()
+    yield keyboard, program
+    for descriptor in (keyboard, program):
+        with contextlib.suppress(OSError):
+            os.close(descriptor)
+
+
+def told(words: list[str], count: int = 1) -> list[str]:
+    end = time.monotonic() + 15
+    while len(words) < count:
+        assert time.monotonic() < end, words
+        time.sleep(0.02)
+    return words
+
+
+def started(client: httpx.Client, service: Service, participant: str) -> str:
+    service.rig.speed = 1.0
+    return client.post("/v1/tests", json={"participant": participant}).json()["id"]
+
+
+@pytest.mark.parametrize("way", ["rig", "service"])
+def test_any_key_stops_a_running_test(
+    client: httpx.Client, service: Service, participant: str, terminal: tuple[int, int], way: str
+) -> None:
+    keyboard, program = terminal
+    before, words = termios.tcgetattr(program), []
+    stop = at_rig(service.rig.path) if way == "rig" else at_service(service.url, TOKEN)
+    with StopKey(stop, words.append, program) as key:
+        assert key.listens
+        test_id = started(client, service, participant)
+        os.write(keyboard, b"x")
+        assert told(words) == [stop_key.CONFIRMED]
+        ended = wait_done(client, test_id)
+    assert ended["state"] == "stopped" and service.rig.stopped_by == (stop_key.BY if way == "rig" else "administrator")
+    assert termios.tcgetattr(program) == before, "the terminal is as it was"
+
+
+def test_a_key_while_nothing_runs_does_not_latch(service: Service, terminal: tuple[int, int]) -> None:
+    keyboard, program = terminal
+    words: list[str] = []
+    with StopKey(at_rig(service.rig.path), words.append, program):
+        os.write(keyboard, b"\n")
+        assert told(words) == [stop_key.NOTHING]
+        with service.client() as http:
+            assert http.get("/v1/rig").json()["state"] == "ready"
+            http.post("/v1/stop")
+        os.write(keyboard, b" ")
+        assert told(words, 2)[1] == stop_key.NOTHING
+
+
+def test_what_is_not_confirmed_says_what_to_do(
+    client: httpx.Client, service: Service, participant: str, terminal: tuple[int, int], tmp_path: Path
+) -> None:
+    keyboard, program = terminal
+    words: list[str] = []
+    service.rig.confirms_stop = False
+    with StopKey(at_rig(service.rig.path), words.append, program):
+        started(client, service, participant)
+        os.write(keyboard, b"x")
+        assert "emergency switch" in told(words)[0] and "No ack." in words[0]
+    with StopKey(at_rig(tmp_path / "none.sock"), words.append, program):
+        os.write(keyboard, b"x")
+        assert "emergency switch" in told(words, 2)[1] and "cannot be reached" in words[1]
+    with StopKey(lambda: [][0], words.append, program):
+        os.write(keyboard, b"x")
+        assert "emergency switch" in told(words, 3)[2] and "IndexError" in words[2]
+
+
+def test_without_a_terminal_nothing_listens(tmp_path: Path) -> None:
+    reading, writing = os.pipe()
+    with StopKey(lambda: "never", print, reading) as key, (tmp_path / "file").open("w") as file:
+        assert not key.listens
+        os.write(writing, b"x")
+        with StopKey(lambda: "never", print, file.fileno()) as other:
+            assert not other.listens
+    assert os.read(reading, 1) == b"x", "what is not a terminal is not read"
+    os.close(reading)
+    os.close(writing)
+
+
+def test_a_terminal_that_closes_ends_the_listening(terminal: tuple[int, int]) -> None:
+    keyboard, program = terminal
+    with StopKey(lambda: "never", print, program) as key:
+        os.close(keyboard)
+        assert key._thread is not None
+        key._thread.join(5)
+        assert not key._thread.is_alive()
+
+
+def test_stimrig_test_stops_on_a_key(
+    service: Service, terminal: tuple[int, int], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    keyboard, program = terminal
+    service.rig.speed = 1.0
+    monkeypatch.setenv("STIMRIG_TOKEN", TOKEN)
+    monkeypatch.setattr(stop_key, "standard_input", lambda: program)
+    real = test_verb.run_test
+
+    def watched(client: httpx.Client, participant: str, watch: Any, **more: Any) -> dict[str, Any]:
+        """A key as soon as the rig plays."""
+
+        def look() -> None:
+            if service.rig.state == "running" and not pressed:
+                pressed.append(os.write(keyboard, b"q"))
+
+        return real(client, participant, look, **more)
+
+    pressed: list[int] = []
+    monkeypatch.setattr(test_verb, "run_test", watched)
+    assert cli.run(["test", "--url", service.url, "--participant", "K1"]) == 1
+    said = capsys.readouterr().err
+    assert "any key stops the test" in said and "ended as stopped" in said and "any key" not in said.splitlines()[-1]
+
+
+# ---- attaching ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("other", [["--rig", "rig.toml"], ["--emulate", "--hidden 7"]])
+def test_attaching_and_starting_a_rig_exclude_each_other(
+    other: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.run(["serve", "--rig-socket", "rig.sock", "--data", str(tmp_path / "data"), *other]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and "--rig-socket rig.sock" in said and other[0] in said
+    assert not (tmp_path / "data").exists()
+
+
+def test_no_rig_at_the_socket_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "none.sock"
+    assert cli.run(["serve", "--rig-socket", str(path), "--data", str(tmp_path / "data")]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and str(path) in said and "python -m rig" in said
+
+
+def test_serve_attaches_stops_on_a_key_and_leaves_the_rig_alone(
+    short_dir: Path, tmp_path: Path, terminal: tuple[int, int]
+) -> None:
+    keyboard, program = terminal
+    socket = short_dir / f"attached-{time.time_ns()}.sock"
+    command = [sys.executable, "-m", "api.cli", "serve", "--rig-socket", str(socket), "--port", "0", "--data", "data"]
+    environment = {**os.environ, "STIMRIG_ADMIN_TOKEN": TOKEN, "PYTHONPATH": str(ROOT)}
+    with RigThread(socket, tmp_path / "data" / "recordings", speed=1.0) as thread:
+        served = subprocess.Popen(
+            command, cwd=tmp_path, env=environment, stdin=program, stdout=subprocess.PIPE, text=True
+        )
+        assert served.stdout is not None
+        try:
+            first = served.stdout.readline()
+            assert "stimrig serves http://127.0.0.1:" in first and f"with the rig at {socket}" in first
+            url = first.split()[2]
+            while "any key stops" not in (line := served.stdout.readline()):
+                assert line, "it says that keys stop"
+            with httpx.Client(base_url=url, headers={"Authorization": f"Bearer {TOKEN}"}, timeout=20) as http:
+                http.post("/v1/participants", json={"code": "A1"})
+                test_id = http.post("/v1/tests", json={"participant": "A1"}).json()["id"]
+                os.write(keyboard, b"s")
+                assert served.stdout.readline().strip() == stop_key.CONFIRMED
+                ended = wait_done(http, test_id)
+            assert ended["state"] == "stopped" and stop_key.BY in ended["reason"]
+        finally:
+            served.send_signal(signal.SIGTERM)
+            rest = served.stdout.read()
+            assert served.wait(20) == 0
+            served.stdout.close()
+        assert "the rig goes on by itself" in rest
+        assert socket.exists() and thread.rig.state == "latched", "the rig was neither ended nor re-armed"
+    assert [path.name for path in (tmp_path / "data" / "logs").iterdir()] == ["api.log"], "no rig, no emulator started"
