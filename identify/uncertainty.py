@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from identify.grid import make_grid
+from identify.grid import Grid, make_grid
 from identify.linear import SecondOrder
 from identify.model import Covariance, Model
 from identify.record import Record
@@ -40,8 +40,14 @@ def bands(model: Model, points: int = 41) -> dict[str, Any]:
 def recruitment_slopes(basis: Basis, covariance: Covariance, width_us: np.ndarray) -> np.ndarray:
     """Derivatives of f(u) by all parameters, shape (len(width_us), P)."""
     slopes = np.zeros((width_us.size, len(covariance.names)))
-    slopes[:, len(covariance.names) - basis.size :] = basis.design(width_us)
+    slopes[:, _coefficients(basis, covariance)] = basis.design(width_us)
     return slopes
+
+
+def _coefficients(basis: Basis, covariance: Covariance) -> slice:
+    """Where f's coefficients stand: behind the dynamics, before the effects (`effect.parameter`)."""
+    last = len(covariance.names) - sum("." in name for name in covariance.names)
+    return slice(last - basis.size, last)
 
 
 def step_slopes(linear: SecondOrder, covariance: Covariance, time_s: np.ndarray) -> np.ndarray:
@@ -63,15 +69,19 @@ def prediction_band(model: Model, record: Record) -> tuple[np.ndarray, np.ndarra
     Raises
     ------
     ValueError
-        The model has no covariance (another method, or effects around it).
+        The model has no covariance (another method).
     """
     covariance, linear = model.covariance, model.linear
-    if covariance is None or not isinstance(linear, SecondOrder) or model.effects:
-        raise ValueError("this model carries no covariance of a base model")
+    if covariance is None or not isinstance(linear, SecondOrder):
+        raise ValueError("this model carries no covariance")
     grid = make_grid(record)
+    if model.effects:
+        from identify.engine.export import grid_slopes  # the engine stands on this module's curves
+
+        return _around(model, record, grid, _sd(grid_slopes(model, record), covariance))
     drive = model.recruitment.basis.design(grid.pulse_width_us)
     slopes = np.zeros((grid.size, len(covariance.names)))
-    slopes[:, len(covariance.names) - drive.shape[1] :] = linear.on_grid(grid, drive)
+    slopes[:, _coefficients(model.recruitment.basis, covariance)] = linear.on_grid(grid, drive)
     if "baseline_nm" in covariance.names:
         slopes[:, covariance.names.index("baseline_nm")] = 1.0
     held = drive @ model.recruitment.coefficients_nm
@@ -79,7 +89,11 @@ def prediction_band(model: Model, record: Record) -> tuple[np.ndarray, np.ndarra
         if name in covariance.names:
             up, down, width = _neighbours(linear, name)
             slopes[:, covariance.names.index(name)] = (up.on_grid(grid, held) - down.on_grid(grid, held)) / width
-    sd = _sd(slopes, covariance)
+    return _around(model, record, grid, _sd(slopes, covariance))
+
+
+def _around(model: Model, record: Record, grid: Grid, sd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The band at the samples, from the standard deviation of each interval's mean."""
     middle = grid.start_s + (np.arange(grid.size) + float(np.mean(grid.fraction))) * grid.step_s
     half = POINTWISE * np.interp(record.time_s, middle, sd)
     predicted = model.predict(record)

@@ -24,6 +24,8 @@ from identify.record import Record
 from identify.recruitment.curve import Curve
 from identify.recruitment.spline import SplineBasis
 from identify.simulate import fingerprint, same_data
+from identify.uncertainty import bands
+from identify.validity import quality, valid_for
 
 METHOD = "maximum-likelihood"
 
@@ -86,7 +88,6 @@ def to_model(fitted: Fitted, record: Record, fit: dict[str, Any] | None = None, 
     for chosen in problem.chosen:
         listed += [f"{chosen.effect}.{p.name}" for p in chosen.parameters]
     matrix = fitted.covariance()
-    width = setup.grid.pulse_width_us[setup.fitted]
     model = Model(
         method=METHOD,
         recruitment=Curve(setup.basis, values[problem.coefficients].copy()),
@@ -102,11 +103,6 @@ def to_model(fitted: Fitted, record: Record, fit: dict[str, Any] | None = None, 
         effects=tuple(_effect(fitted, index, matrix) for index in range(len(problem.chosen))),
         covariance=Covariance(tuple(listed[:known]), values[:known], matrix[:known, :known]),
         fit=dict(fit or {}) | {"log_evidence": fitted.log_evidence, "log_likelihood": fitted.log_likelihood},
-        valid_for={
-            "pulse_width_us": [float(width.min()), float(width.max())],
-            "torque_nm": [float(np.nanmin(setup.target_nm)), float(np.nanmax(setup.target_nm))],
-            "sample_rate_hz": [record.pulse_rate_hz, 2000.0],
-        },
         data={
             "fingerprint": fingerprint(record),
             "recording_id": record.source.recording_id,
@@ -116,6 +112,9 @@ def to_model(fitted: Fitted, record: Record, fit: dict[str, Any] | None = None, 
         model_id=uuid.uuid4().hex,
         created=datetime.now(UTC).isoformat(timespec="seconds"),
     )
+    rows = setup.fitted
+    model = model.with_(valid_for=valid_for(model, setup.grid, rows))
+    model = model.with_(bands=bands(model), quality=quality(model, setup.grid, rows))
     return model.with_(**changes) if changes else model
 
 
@@ -164,6 +163,17 @@ def predict(model: Model, record: Record) -> np.ndarray:
     if not unforeseen or not same_data(model, record):
         return foreseen
     return np.where(record.held_out, foreseen, problem.at_samples(theta))
+
+
+def grid_slopes(model: Model, record: Record) -> np.ndarray:
+    """Derivatives of each interval's mean torque by the parameters of the model's covariance, shape (K, P)."""
+    assert model.covariance is not None
+    problem, theta = _problem(model, record)
+    jacobian = problem.run(theta, derivatives=True)[1]
+    assert jacobian is not None
+    known = len(model.covariance.names)
+    per_unit = np.where(problem.log, problem.physical(theta), 1.0)[:known]
+    return (jacobian[:known] / per_unit[:, None]).T
 
 
 def predict_fitted(fitted: Fitted, record: Record) -> np.ndarray:

@@ -10,6 +10,7 @@ import pytest
 import identify
 from identify.errors import BadRequest
 from identify.model import Model
+from identify.uncertainty import prediction_band
 from tests.identify import hidden_muscles
 
 
@@ -49,3 +50,21 @@ def test_what_is_not_there_is_refused_with_a_reason_and_can_be_forced(improved):
 def test_an_unknown_effect_is_no_effect():
     with pytest.raises(BadRequest):
         identify.improve(hidden_muscles.record(rate_hz=100), force=["witchcraft"])
+
+
+def test_a_model_with_effects_carries_bands_and_a_verdict():
+    """Twice the noise, twice as wide a band; the verdict's gates are those of any model."""
+    widths = []
+    for noise_nm in (0.03, 0.06):
+        record = hidden_muscles.record("fatigue", seed=5, noise_nm=noise_nm)
+        model = Model.from_json(json.dumps(identify.improve(record)["models"][-1]))
+        assert [effect["id"] for effect in model.effects] == ["fatigue"]
+        assert model.quality["verdict"] in ("usable", "usable with care")
+        assert model.valid_for["pulse_rate_hz"] == [38.0, 42.0]
+        lower, upper = prediction_band(model, record)
+        predicted = model.predict(record)
+        assert np.all(lower <= predicted) and np.all(predicted <= upper)
+        curve = model.bands["recruitment"]
+        assert np.all(np.asarray(curve["lower"]) <= np.asarray(curve["upper"]))
+        widths.append(float(np.mean((upper - lower)[~record.held_out])))
+    assert 1.4 < widths[1] / widths[0] < 2.8
