@@ -49,7 +49,7 @@ class TestIn(Body):
 
     participant: Code
     kind: Annotated[str, StringConstraints(pattern=r"^[a-z-]{1,40}$")] = "pre-session"
-    profile: ProfileIn | None = Field(None, description="None: the participant's own")
+    profile: ProfileIn | None = Field(None, description="for this test alone, never wider than the participant's own")
     segments: Annotated[list[SegmentIn], Field(min_length=1, max_length=200)] | None = Field(
         None, description="None: the default pre-session test"
     )

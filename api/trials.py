@@ -17,6 +17,7 @@ from api.errors import ApiError, NotFoundError
 from api.fitting import Fitting
 from api.live import Hub
 from api.logs import current_test
+from api.narrowing import limits_of
 from api.outcomes import OPEN_STATES, Outcomes
 from api.rig_client import AnyEvent, RigClient
 from api.schemas import TestIn
@@ -27,7 +28,6 @@ from rig.messages import (
     FinishedEvent,
     LiveEvent,
     PreviewRequest,
-    Profile,
     RecruitmentTable,
     SegmentPlan,
     StartRequest,
@@ -136,7 +136,6 @@ class Trials:
             log.warning("stop after a failed start: %s", error)
 
     def _plan(self, body: TestIn, participant: Participant) -> TestPlan:
-        profile = body.profile.model_dump() if body.profile else participant.profile
         segments = None
         if body.segments is not None:
             segments = [SegmentPlan(**segment.model_dump()) for segment in body.segments]
@@ -144,11 +143,9 @@ class Trials:
             test_id=self._new_id(),
             participant=participant.code,
             kind=body.kind,
-            profile=Profile(**profile),
             segments=segments,
             pulse_rate_hz=body.pulse_rate_hz,
-            max_pulse_width_us=body.max_pulse_width_us,
-            max_torque_nm=body.max_torque_nm,
+            **limits_of(body, participant.profile),
         )
 
     def _check_joins(self, body: TestIn) -> None:

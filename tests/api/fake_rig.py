@@ -248,7 +248,9 @@ class FakeRig:
             traceback.print_exc()
             self.state, self.reason, self.plan, self.segment = "latched", f"fake rig: {error!r}", None, None
             self._send(m.StateEvent(status=self.status()))
-            self._send(m.FinishedEvent(test_id=plan.test_id, outcome="fault", reason=self.reason))
+            self._send(
+                m.FinishedEvent(test_id=plan.test_id, outcome="fault", reason=self.reason, last_sample_unix_s=None)
+            )
 
     async def _played(self, plan: m.TestPlan) -> None:
         widths, segments = default_widths()
