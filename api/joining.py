@@ -24,8 +24,7 @@ def pauses(begun_s: Sequence[float | None], records: Sequence[Any]) -> list[floa
     """Seconds between the end of each record and the begin of the next; 0 where it is not known."""
     found = []
     for earlier, later, record in zip(begun_s, begun_s[1:], records, strict=False):
-        known = earlier is not None and later is not None
-        pause_s = later - earlier - float(record.time_s[-1]) if known else 0.0
+        pause_s = 0.0 if earlier is None or later is None else later - earlier - float(record.time_s[-1])
         found.append(min(pause_s, LONGEST_PAUSE_S) if pause_s >= LEAST_PAUSE_S else 0.0)
     return found
 
