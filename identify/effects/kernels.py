@@ -279,6 +279,46 @@ def follow_stiffening(
 
 
 @njit(cache=True, nogil=True)
+def follow_toe(
+    torque: np.ndarray,
+    slope: np.ndarray,
+    omega: np.ndarray,
+    damping: np.ndarray,
+    toe: np.ndarray,
+    scale: float,
+    step_s: float,
+) -> tuple[np.ndarray, np.ndarray]:  # pragma: no cover
+    """q'' = ω² (x - z) - 2 ζ ω q', z = q (1 + β q²/scale²) the spring's torque; x the cubic through boundary states."""
+    rows, size = torque.shape
+    parts = 12
+    h = step_s / parts
+    out = np.zeros((rows, size))
+    rate = np.zeros((rows, size))
+    for m in range(rows):
+        q, v = torque[m, 0], 0.0
+        out[m, 0] = q
+        w2, c, beta = omega[m] * omega[m], damping[m] * omega[m] * h, toe[m] / (scale * scale)
+        for k in range(size - 1):
+            a, b, d, e = torque[m, k], slope[m, k], torque[m, k + 1], slope[m, k + 1]
+            for i in range(parts):
+                q += 0.5 * h * v
+                s = (i + 0.5) / parts
+                x = (
+                    (1 + 2 * s) * (1 - s) * (1 - s) * a
+                    + s * (1 - s) * (1 - s) * b
+                    + s * s * (3 - 2 * s) * d
+                    + s * s * (s - 1) * e
+                )
+                v = (v * (1.0 - c) + h * w2 * (x - q * (1.0 + beta * q * q))) / (1.0 + c)
+                q += 0.5 * h * v
+            if not abs(q) < 1e6:
+                q, v = 0.0, 0.0
+            out[m, k + 1] = q * (1.0 + beta * q * q)
+            rate[m, k + 1] = v * (1.0 + 3.0 * beta * q * q)
+    return out, rate
+
+
+@njit(cache=True, nogil=True)
 def bumps(
     time_s: np.ndarray, centre: np.ndarray, width: np.ndarray, height: np.ndarray, flatness: np.ndarray
 ) -> np.ndarray:  # pragma: no cover

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from identify.effects.base import Effect, Form, Parameter, Scene
-from identify.effects.kernels import exponential, follow, follow_stiffening
+from identify.effects.kernels import exponential, follow, follow_stiffening, follow_toe
 
 _RESTARTS = tuple(
     {"resonance_hz": hz, "damping": 0.15, "share": 0.4, "base.time_constant_s": t, "base.damping": 1.0}
@@ -50,12 +50,34 @@ def _partly(x: tuple[np.ndarray, np.ndarray], p: dict[str, Any], scene: Scene) -
     return x[0] + share * (torque - x[0]), x[1] + share * (rate - x[1])
 
 
+def _inertia(x: tuple[np.ndarray, np.ndarray], p: dict[str, Any], scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """The cell bears the mass as well: what its acceleration takes is missing from the reading."""
+    (y, y_rate), share = x, p["share"]
+    z, z_rate = _series(x, p, scene)
+    if z is y:
+        return x
+    omega, damping = 2 * np.pi * p["resonance_hz"], p["damping"]
+    speeding = omega**2 * (y - z) - 2 * damping * omega * z_rate
+    taken = (y - z) - 2 * damping * z_rate / omega
+    return y - share * taken, y_rate - share * (y_rate - z_rate - 2 * damping * speeding / omega)
+
+
 def _stiffening(x: tuple[np.ndarray, np.ndarray], p: dict[str, Any], scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     frequency = p["resonance_hz"][:, 0]
     if np.all(np.isinf(frequency)):
         return x
     omega = 2 * np.pi * frequency
     return follow_stiffening(
+        x[0], x[1] * scene.step_s, omega, p["damping"][:, 0], p["stiffening"][:, 0], scene.scale_nm, scene.step_s
+    )
+
+
+def _toe(x: tuple[np.ndarray, np.ndarray], p: dict[str, Any], scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    frequency = p["resonance_hz"][:, 0]
+    if np.all(np.isinf(frequency)):
+        return x
+    omega = 2 * np.pi * frequency
+    return follow_toe(
         x[0], x[1] * scene.step_s, omega, p["damping"][:, 0], p["stiffening"][:, 0], scene.scale_nm, scene.step_s
     )
 
@@ -76,6 +98,18 @@ EFFECT = Effect(
             restarts=_RESTARTS,
         ),
         Form(
+            "inertia",
+            "filter",
+            "y - share·z''/ω², z as in series: the cell feels the mass's acceleration",
+            (
+                *_RESONANCE,
+                Parameter("share", "1", 0.0, 1.5, 0.0, (0.5,), about="share of the mass that the cell bears"),
+            ),
+            _inertia,
+            True,
+            grows=True,
+        ),
+        Form(
             "stiffening",
             "filter",
             "z'' + 2 ζ ω z' + ω² (1 + stiffening·|z|/y_max) (z - y) = 0",
@@ -86,6 +120,19 @@ EFFECT = Effect(
             _stiffening,
             True,
             grows=True,
+        ),
+        Form(
+            "toe",
+            "filter",
+            "q'' + 2 ζ ω q' + ω² (z - y) = 0, z = q (1 + stiffening·q²/y_max²)",
+            (
+                *_RESONANCE,
+                Parameter("stiffening", "1", 0.0, 12.0, 0.0, (1.0,), about="rise of stiffness to full torque"),
+            ),
+            _toe,
+            True,
+            grows=True,
+            source="toe region of a tendon: Zajac 1989; Duffing's spring",
         ),
     ),
     signature="Ringing after every step.",
