@@ -33,6 +33,8 @@ LAPSE = 0.04
 """Probability kept for what no form of the library foresees."""
 NAMELESS = 8.0
 """Log evidence by which a gain without a law must beat the best effect."""
+EXPLAINED_BY_LAWS = 0.9
+"""Share that effects together must explain for a gain without a law not to count."""
 HELD = 0.3
 """Share of repeated samples that no noisy converter gives."""
 
@@ -130,7 +132,8 @@ def judge(work: Analysis) -> Verdict:
         notes.append(f"{100 * held:.0f} % of the readings repeat the one before exactly: the converter holds or steps.")
     if work.added:
         strange = strange or (explained < LEAST_EXPLAINED and structure > STRUCTURE)
-        strange = strange or work.nameless[0] > work.rounds[0][0].gain + NAMELESS
+        lawless = work.nameless[0] > work.rounds[0][0].gain + NAMELESS
+        strange = strange or (lawless and explained < EXPLAINED_BY_LAWS)
         if get(work.added[0]).band:
             strange = strange or (explained < LEAST_BY_BAND and structure > UNSTEADY)
         elif not get(work.added[0]).foreseeable:

@@ -9,6 +9,8 @@ import numpy as np
 from identify.effects.base import Effect, Form, Parameter, Scene
 from identify.effects.kernels import adapt, since_onset, train, used_up
 
+ENGAGED = 0.03
+"""Share of full torque from which pulses engage the muscle."""
 _GAIN = Parameter("gain", "1", 0.0, 4.0, 0.0, (0.3, 0.8), about="extra torque at the onset")
 _DECAY = Parameter("decay_s", "s", 0.12, 1.2, 0.3, (0.25, 0.5), "log", about="time constant with which it fades")
 _RECOVERY = Parameter("recovery_s", "s", 0.02, 4.0, 0.3, (0.1, 1.0), "log", about="silence after which it is back")
@@ -68,6 +70,16 @@ def _burst(length_s: float, least_gap_s: float) -> Any:
     return apply
 
 
+def _engaged(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+    """A burst that rises and fades from where pulses begin to recruit, after a silence in which they did not."""
+    since, gap = np.empty_like(drive), np.empty_like(drive)
+    for m in range(drive.shape[0]):
+        working = (np.abs(drive[m]) > ENGAGED * scene.scale_nm).astype(float)
+        since[m], gap[m] = train(working, scene.step_s)
+    z = np.minimum(since / p["decay_s"], 50.0)
+    return drive * (1.0 + p["gain"] * -np.expm1(-gap / p["recovery_s"]) * (z + 0.3) * np.exp(-z))
+
+
 _QUICK = Parameter("decay_s", "s", 0.05, 1.2, 0.3, (0.12, 0.4), "log", about="time constant with which it fades")
 
 EFFECT = Effect(
@@ -124,6 +136,15 @@ EFFECT = Effect(
                 batched=True,
             )
             for gap in (0.12, 0.22)
+        ),
+        Form(
+            "engaged",
+            "gain",
+            "w = (1 + gain (1 - exp(-silence/recovery)) (z + 0.3) exp(-z)) f(u), z = t/decay since pulses recruit",
+            (_GAIN, _QUICK, _RECOVERY),
+            _engaged,
+            batched=True,
+            source="stiffness of the series elastic element at the onset: Parmiggiani, Stein 1981",
         ),
         Form(
             "flat",

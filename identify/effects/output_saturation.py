@@ -23,7 +23,7 @@ def _exponential(y: np.ndarray, p: dict[str, Any], _scene: Scene) -> np.ndarray:
 
 
 def _yielding(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
-    width = 0.05 * scene.scale_nm
+    width = p["corner"] * scene.scale_nm
     over, rest = np.abs(y) - p["knee_nm"], -p["knee_nm"]
     # A soft corner, exactly zero at zero torque.
     soft = 0.5 * (over + np.sqrt(over * over + width * width)) - 0.5 * (rest + np.sqrt(rest * rest + width * width))
@@ -53,6 +53,7 @@ EFFECT = Effect(
             (
                 Parameter("knee_nm", "N·m", 0.2, 1.1, 0.8, (0.6, 0.8), "log", "torque", "where it begins to yield"),
                 Parameter("yield_share", "1", 0.0, 1.0, 0.0, (0.5, 0.8), about="share lost above the knee"),
+                Parameter("corner", "1", 0.005, 0.4, 0.05, (0.05, 0.15), "log", about="softness, share of full torque"),
             ),
             _yielding,
             True,
