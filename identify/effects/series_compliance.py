@@ -110,6 +110,18 @@ EFFECT = Effect(
             grows=True,
         ),
         Form(
+            "toe",
+            "filter",
+            "q'' + 2 ζ ω q' + ω² (z - y) = 0, z = q (1 + stiffening·q²/y_max²)",
+            (
+                *_RESONANCE,
+                Parameter("stiffening", "1", 0.0, 12.0, 0.0, (1.0,), about="rise of stiffness to full torque"),
+            ),
+            _toe,
+            True,
+            source="toe region of a tendon: Zajac 1989; Duffing's spring",
+        ),
+        Form(
             "stiffening",
             "filter",
             "z'' + 2 ζ ω z' + ω² (1 + stiffening·|z|/y_max) (z - y) = 0",
@@ -120,19 +132,6 @@ EFFECT = Effect(
             _stiffening,
             True,
             grows=True,
-        ),
-        Form(
-            "toe",
-            "filter",
-            "q'' + 2 ζ ω q' + ω² (z - y) = 0, z = q (1 + stiffening·q²/y_max²)",
-            (
-                *_RESONANCE,
-                Parameter("stiffening", "1", 0.0, 12.0, 0.0, (1.0,), about="rise of stiffness to full torque"),
-            ),
-            _toe,
-            True,
-            grows=True,
-            source="toe region of a tendon: Zajac 1989; Duffing's spring",
         ),
     ),
     signature="Ringing after every step.",
