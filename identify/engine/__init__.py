@@ -18,6 +18,9 @@ from identify.grid import make_grid
 from identify.model import Model
 from identify.record import Record
 
+PATIENCE = 2
+"""Steps of a chain of forms without a gain after which it ends."""
+
 
 def fit_with_effects(record: Record, effects: Sequence[str], fit_on: Sequence[str] | None = None) -> Model:
     """A Hammerstein model with the effects named, each in its likeliest form.
@@ -67,21 +70,26 @@ def _add(base: Fitted, identifier: str, forms: list, known: dict[str, float] | N
         return solve(base.problem, base.theta, find_band(base.residual_nm, setup.stretches, setup.grid.step_s)[0])
     best: Fitted | None = None
     previous: dict[str, float] = {}
-    residual = base.residual_nm
+    residual, idle, top_gain = base.residual_nm, 0, -np.inf
     for form in forms:
+        if not form.grows:  # the first of a chain: what comes before says nothing of it
+            previous, residual, idle, top_gain = {}, base.residual_nm, 0, -np.inf
+        elif idle >= PATIENCE:
+            continue
         problem = Problem(setup, [*base.effects, (identifier, form)])
         starts = [known] if known else form.starts(setup.scene)
         if form.propose is not None:
             found = form.propose(np.where(setup.fitted, residual, np.nan), setup.scene, previous)
             starts = found or [{p.name: p.neutral for p in form.parameters}]
         runs = [solve(problem, start_from(problem, base, {len(base.effects): s}), base.noise) for s in starts]
+        runs = [r for r in runs if form.accept is None or form.accept(r.parameters_of(identifier), setup.scene)] or runs
         top = max(runs, key=lambda f: f.log_evidence)
+        gain = top.log_evidence - base.log_evidence
+        idle, top_gain = (0, gain) if gain > max(top_gain, 0.0) else (idle + 1, top_gain)
         if form.propose is not None:
             previous, residual = top.parameters_of(identifier), top.residual_nm
         if best is None or top.log_evidence > best.log_evidence:
             best = top
-        elif form.grows and top.log_evidence < best.log_evidence - 20.0:
-            break
     assert best is not None
     return best
 

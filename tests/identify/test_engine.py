@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from identify.effects import get
-from identify.engine import fit_candidate
+from identify.engine import fit_candidate, fit_with_effects
 from identify.engine.core import whiten_rows
 from identify.engine.export import predict_fitted
 from identify.engine.noise_level import NoiseLevel, band_part, profile, whitened
 from identify.engine.prepare import first_setup, inspect
 from identify.engine.problem import Problem
+from identify.record import Record
 from tests.identify import hidden_muscles
 
 
@@ -98,3 +99,15 @@ def test_warming_up_touches_every_compiled_part():
     from identify.engine import warm
 
     warm()
+
+
+def test_an_effect_asked_for_gets_the_form_that_the_diagnosis_would_give():
+    """A spring with a toe: the forms before it in the list hardly help, and must not end the search."""
+    from hardware_sim.hidden_records import generate
+
+    made = generate(("series_compliance",), "strong", 81)
+    assert made["truth"]["formulation"] == ["mass on a spring that stiffens"]
+    record = Record.from_arrays(made["time_s"], made["pulse_width_us"], made["torque_nm"], made["segment"])
+    model = fit_with_effects(record, ["series_compliance"])
+    assert model.effects[0]["form"] == "toe"
+    assert model.fit["held_out_rms_nm"] < 1.3 * made["truth"]["noise"]["sd_nm"]
