@@ -1,4 +1,4 @@
-"""`python -m bench [NAME …]`: peers, table1, goals, drawings; all of them without a name."""
+"""`python -m bench [NAME …]`: goals, table1, drawings, peers, diagnosis; all of them without a name."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
-NAMES = ("goals", "table1", "drawings", "peers")
+NAMES = ("goals", "table1", "drawings", "peers", "diagnosis")
 
 
 def main() -> int:
@@ -22,10 +22,16 @@ def main() -> int:
     if unknown:
         print(f"no bench {unknown[0]!r}; there are {', '.join(NAMES)}", file=sys.stderr)
         return 2
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set()
     for name in names:
         print(f"== {name}", flush=True)
+        if name == "diagnosis":  # counts, no times to compare: on every core there is
+            if cores:
+                os.sched_setaffinity(0, cores)
+            import_module("bench.diagnosis").run([])
+            continue
+        if cores:
+            os.sched_setaffinity(0, {max(cores)})
         import_module(f"bench.{name}").run()
     return 0
 

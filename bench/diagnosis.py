@@ -1,6 +1,6 @@
 """What the diagnosis says of muscles with something hidden: tables, confusions, calibration; see docs/diagnosis.md.
 
-    python -m bench.diagnosis --seeds 1000:1002 [--only single,nothing,…] [--json FILE]
+    python -m bench.diagnosis --seeds 1003:1004 [--only single,nothing,…] [--json FILE]
 
 Seeds 0 to 99 were developed on; report on seeds from 1000. The records come from the emulator's physics, whose
 equations are not the library's. Each set is scored as the goals of issue 4 ask.
@@ -192,7 +192,7 @@ def _confusions(rows: list[dict[str, Any]]) -> None:
 def run(arguments: list[str] | None = None) -> None:
     """Make, diagnose, tell."""
     parser = argparse.ArgumentParser(prog="python -m bench.diagnosis", description=__doc__)
-    parser.add_argument("--seeds", default="1000:1001", help="first:last, last not included")
+    parser.add_argument("--seeds", default="1003:1004", help="first:last, last not included")
     parser.add_argument("--only", default="single,nothing,outside,two,slow,rates")
     parser.add_argument("--json", type=Path, default=None)
     settings = parser.parse_args(arguments)
