@@ -8,12 +8,13 @@ import pytest
 
 from bench.soak import soak
 
-MINUTES = float(os.environ.get("STIMRIG_SOAK_MINUTES", "0.7"))
+MINUTES = float(os.environ.get("STIMRIG_SOAK_MINUTES", "3"))
 
 
 @pytest.mark.wire
 @pytest.mark.realtime
 @pytest.mark.slow
+@pytest.mark.timeout(600)
 def test_no_sample_is_lost_while_fits_run_beside():
     for _ in range(2):  # once more where others took the machine away; nothing may be lost all the same
         found = soak(MINUTES, every_minutes=min(MINUTES, 1.0))
