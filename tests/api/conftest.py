@@ -99,9 +99,9 @@ def run_service(tmp_path: Path, short_dir: Path, worker: Any, speed: float = 30.
             yield Service(url, app, rig, tmp_path)
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    """Debian's chromium, started once for all tests that want it."""
+    """Debian's chromium, once a file: while it runs, playwright's event loop does, and no test can have its own."""
     from tests.api.browser import ARGUMENTS, CHROMIUM
 
     playwright = pytest.importorskip("playwright.sync_api")
