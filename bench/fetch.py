@@ -11,6 +11,7 @@ import argparse
 import asyncio
 import json
 import os
+import random
 import sys
 import tempfile
 import time
@@ -45,11 +46,21 @@ def csv_of_a_muscle() -> str:
     return "time_s,pulse_width_us,torque_nm,segment\n" + "\n".join(rows) + "\n"
 
 
-async def one(port: int, key: str, path: str, end_s: float, every_s: float, times: dict[int, list[float]]) -> None:
+async def one(
+    port: int,
+    key: str,
+    path: str,
+    end_s: float,
+    every_s: float,
+    times: dict[int, list[float]],
+    rng: random.Random | None,
+) -> None:
     """A controller: a full fetch, then nine that ask whether anything is new, and so on. A bare client, so that the
     service is what is measured."""
     reader, writer = await asyncio.open_connection("127.0.0.1", port)
     etag, count = "", 0
+    if rng is not None:  # a controller of its own asks when it likes, not when the others do
+        await asyncio.sleep(rng.uniform(0.0, every_s))
     while time.perf_counter() < end_s:
         asked = f"If-None-Match: {etag}\r\n" if count % 10 else ""
         began = time.perf_counter()
@@ -59,17 +70,21 @@ async def one(port: int, key: str, path: str, end_s: float, every_s: float, time
         await reader.readexactly(int(fields.get("content-length", 0)))
         times[int(head.split()[1])].append(time.perf_counter() - began)
         etag, count = fields["etag"], count + 1
-        await asyncio.sleep(every_s)
+        await asyncio.sleep(every_s if rng is None else every_s * rng.uniform(0.8, 1.2))
     writer.close()
 
 
-def clients(port: int, keys: list[str], path: str, seconds: float, every_s: float) -> dict[int, list[float]]:
-    """All of them at once."""
+def clients(
+    port: int, keys: list[str], path: str, seconds: float, every_s: float, in_step: bool
+) -> dict[int, list[float]]:
+    """All of them, each at moments of its own, or all at the same instants."""
 
     async def run() -> dict[int, list[float]]:
         times: dict[int, list[float]] = {200: [], 304: []}
         end_s = time.perf_counter() + seconds
-        await asyncio.gather(*(one(port, key, path, end_s, every_s, times) for key in keys))
+        own = [None if in_step else random.Random(number) for number in range(len(keys))]
+        asked = (one(port, key, path, end_s, every_s, times, rng) for key, rng in zip(keys, own, strict=True))
+        await asyncio.gather(*asked)
         return times
 
     return asyncio.run(run())
@@ -81,6 +96,7 @@ def main() -> None:
     parser.add_argument("--clients", type=int, default=50)
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--every", type=float, default=0.0, help="pause of each client, ms")
+    parser.add_argument("--in-step", action="store_true", help="all ask at the same instants")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="stimrig-fetch-") as folder:
         settings = Settings(data_dir=Path(folder))
@@ -103,7 +119,8 @@ def main() -> None:
                 ]
                 size = len(admin.get("/v1/participants/P1/model").content)
             used = api.cpu_s() or 0.0
-            times = clients(ready["port"], keys, "/v1/participants/P1/model", options.seconds, options.every / 1000)
+            path = "/v1/participants/P1/model"
+            times = clients(ready["port"], keys, path, options.seconds, options.every / 1000, options.in_step)
             used = (api.cpu_s() or 0.0) - used
         finally:
             api.end()
@@ -111,7 +128,7 @@ def main() -> None:
     print(
         json.dumps(
             {
-                "clients": options.clients, "pause_ms": options.every, "model_bytes": size,
+                "clients": options.clients, "pause_ms": options.every, "in_step": options.in_step, "model_bytes": size,
                 "fetches_per_s": round(every.size / options.seconds, 1),
                 "server_ms_each": round(1000 * used / every.size, 3),
                 "median_ms": round(1000 * float(np.median(every)), 2),
