@@ -15,6 +15,7 @@ import logging
 import os
 import signal
 import sys
+import threading
 from pathlib import Path
 
 from rig import config as configuration
@@ -24,6 +25,7 @@ from rig.control.rig import Rig
 from rig.control.server import Server
 from rig.errors import RigError
 from rig.keys import StopKey
+from rig.messages import stop_socket
 from rig.notify import Notifier
 
 log = logging.getLogger("rig")
@@ -58,7 +60,7 @@ def _parser() -> argparse.ArgumentParser:
     source.add_argument("--emulator-json", metavar="LINE", help="JSON line of `stimrig emulate`, or a file with it")
     parser.add_argument("--socket", type=Path, help="Unix socket to listen on; wins over the rig file")
     parser.add_argument("--data", type=Path, help="folder for journals and recordings; wins over the rig file")
-    parser.add_argument("--clock-speed", type=float, help="rig seconds a real second, for an emulator that runs faster")
+    parser.add_argument("--clock-speed", type=float, help="with --emulator-json only: its rig seconds a real second")
     parser.add_argument("--check", action="store_true", help="check the rig file and the DBC, then exit")
     parser.add_argument("--die-with-parent", action="store_true", help="end, as by SIGTERM, when the parent has died")
     parser.add_argument("--verbose", action="store_true")
@@ -89,12 +91,14 @@ async def _serve(config: configuration.RigConfig, parent: int | None) -> None:
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop.set)
     server, notifier = Server(), Notifier()
+    if not config.require_calibration:
+        log.warning("require_calibration is false: tests start without a calibration; no person may sit here")
     rig = Rig(config, MonotonicClock(config.clock_speed), server.publish)
     await asyncio.to_thread(rig.open)
     await server.start(rig, config.socket)
     print(json.dumps({"socket": str(config.socket), "state": rig.status().state}), flush=True)
     notifier.ready()
-    with StopKey(loop, lambda: loop.run_in_executor(None, _stop_by_key, rig)) as key:
+    with StopKey(loop, lambda: threading.Thread(target=_stop_by_key, args=(rig,), name="stop-key").start()) as key:
         if key.watched:
             log.info("any key in this terminal stops stimulation; Ctrl-C ends the rig")
         while not stop.is_set() and parent in (None, os.getppid()):
@@ -106,7 +110,8 @@ async def _serve(config: configuration.RigConfig, parent: int | None) -> None:
     notifier.stopping()
     await asyncio.to_thread(rig.close)
     await server.close()
-    config.socket.unlink(missing_ok=True)
+    for path in (config.socket, stop_socket(config.socket)):
+        path.unlink(missing_ok=True)
 
 
 def _stop_by_key(rig: Rig) -> None:

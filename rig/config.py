@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, StrictBool, ValidationError
 
 from rig import devices, limits
 from rig.acquire.health import Watch
@@ -24,7 +24,13 @@ class _Table(BaseModel):
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
 
-class LimitSettings(_Table):
+class _Numbers(_Table):
+    """Strict: `true` is no number of mA."""
+
+    model_config = ConfigDict(strict=True)
+
+
+class LimitSettings(_Numbers):
     """Tightens the hard limits for this rig; a value above the hard limit changes nothing."""
 
     pulse_width_us: float | None = Field(None, ge=0)
@@ -52,7 +58,7 @@ class LimitSettings(_Table):
         return table
 
 
-class WatchSettings(_Table):
+class WatchSettings(_Numbers):
     """When silence counts as a fault, real seconds; tighter or a little looser than the defaults."""
 
     stale_torque_s: float = Field(0.1, gt=0, le=0.5)
@@ -67,12 +73,16 @@ class WatchSettings(_Table):
 
 
 class RigConfig(_Table):
-    """A whole rig file, checked. `stimulator` and `load_cell` are the settings of the chosen devices."""
+    """A whole rig file, checked. `stimulator` and `load_cell` are the settings of the chosen devices.
+
+    `clock_speed` is no key of a rig file: every limit that has a second in it is meant in rig seconds, so a faster
+    clock would widen them all. Only the emulator's own line sets it (`for_emulator`).
+    """
 
     data_dir: Path
     socket: Path
-    clock_speed: float = Field(1.0, gt=0, le=100)
-    require_calibration: bool = True
+    clock_speed: float = Field(1.0, gt=0, le=100, strict=True)
+    require_calibration: StrictBool = True
     stimulator: DeviceSettings
     load_cell: DeviceSettings
     limits: LimitSettings = LimitSettings.model_validate({})
@@ -86,6 +96,10 @@ class RigConfig(_Table):
         return content
 
 
+EMULATOR_ONLY = "clock_speed"
+PSEUDO_TERMINALS = Path("/dev/pts")
+
+
 def load(path: Path, **overrides: Any) -> RigConfig:
     """Read a rig file.
 
@@ -94,7 +108,7 @@ def load(path: Path, **overrides: Any) -> RigConfig:
     path
         The TOML file; a relative DBC path in it is taken from the file's folder.
     overrides
-        Values that win over the file's: `data_dir`, `socket`, `clock_speed`.
+        Values that win over the file's: `data_dir`, `socket`.
 
     Raises
     ------
@@ -107,6 +121,11 @@ def load(path: Path, **overrides: Any) -> RigConfig:
         raise ConfigError(f"{path}: {error.strerror}; give the path of a rig file (see docs/rig-file.md)") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: not TOML: {error}") from None
+    if EMULATOR_ONLY in content or overrides.get(EMULATOR_ONLY) is not None:
+        place = f"{path}: {EMULATOR_ONLY}" if EMULATOR_ONLY in content else f"--clock-speed with {path}"
+        raise ConfigError(
+            f"{place}: only an emulator's clock may run faster than the world, and its own line says so; take it out"
+        )
     cell = content.get("load_cell")
     if isinstance(cell, dict) and str(cell.get("dbc", "")).endswith(".dbc"):
         cell["dbc"] = str(path.parent / cell["dbc"])
@@ -128,10 +147,13 @@ EMULATED_CELLS: dict[str, Callable[[int], dict[str, Any]]] = {
 def for_emulator(ready: str, **overrides: Any) -> RigConfig:
     """A rig on the emulator's devices, from the JSON line that it prints (or a file holding that line).
 
+    The line may set the clock's speed and asks for no calibration, so it must not lead to a real stimulator: its port
+    is a pseudo-terminal.
+
     Raises
     ------
     ConfigError
-        No such line.
+        No such line, or a port that is no pseudo-terminal.
     """
     try:
         text = ready if ready.lstrip().startswith("{") else Path(ready).read_text("utf-8")
@@ -139,10 +161,16 @@ def for_emulator(ready: str, **overrides: Any) -> RigConfig:
         # the link, like udev's names by id, outlives a replugging
         stimulator, can = line.get("stimulator_link", line["stimulator"]), line["can"]
         cell = EMULATED_CELLS[line.get("cell", "plain")](int(line.get("samples_per_frame", 1)))
+        place = Path(str(stimulator)).resolve()  # one that was unplugged is not there: its opening looks again
     except OSError as error:
         raise ConfigError(f"--emulator-json {ready}: {error.strerror}") from None
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise ConfigError(f"--emulator-json: not the line that `stimrig emulate` prints ({error})") from None
+    if place.exists() and place.parent != PSEUDO_TERMINALS:
+        raise ConfigError(
+            f"--emulator-json: stimulator {stimulator} is no pseudo-terminal of an emulator; real "
+            "devices need a rig file"
+        )
     content: dict[str, Any] = {
         "clock_speed": line.get("speed", 1.0),
         "require_calibration": False,  # nobody sits at an emulator

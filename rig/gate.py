@@ -1,6 +1,10 @@
 """The only way to a stimulator: open only during a test, limits first, intent on disk before the command.
 
-Once `shut` has returned, no pulse is on its way and none will follow, whatever other threads still try.
+At most one pulse is on its way: until the device has acknowledged it, each pulse that comes due is dropped and
+recorded. A line that stalls can therefore hold one pulse, never a row of them. When that pulse is felt is not known
+before its ack is read, so intervals, rates and charge per second are counted from the ack: they hold at the electrode.
+
+Once `shut` has returned no pulse is handed to the line any more, whatever other threads still try.
 """
 
 from __future__ import annotations
@@ -9,6 +13,7 @@ import contextlib
 import threading
 from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
 
 from rig import journal as jn
 from rig.clock import Clock
@@ -17,6 +22,19 @@ from rig.errors import DeviceError, JournalError
 from rig.journal import Journal, Kind
 from rig.limits import Limit, Refusal, admit, check
 from rig.signals import Ack, LateError, Pulse, PulseStatus
+
+LATE_ACK_S = 0.015
+"""Real seconds: an ack that took longer is told in the recording: the pulse may have been felt as late, and at 40
+pulses/s the next one is too close to it."""
+
+
+@dataclass(frozen=True, slots=True)
+class OnItsWay:
+    """A pulse that was handed to the line and that the device has not acknowledged."""
+
+    index: int
+    number: int
+    written_s: float
 
 
 class Gate:
@@ -46,11 +64,12 @@ class Gate:
         self._journal: Journal | None = None
         self._passing = False
         self._table: dict[str, Limit] = {}
-        self._index_of: dict[int, int] = {}
-        self._unacknowledged: dict[int, float] = {}
+        self.on_its_way: OnItsWay | None = None
         self._recent: deque[tuple[float, float]] = deque()
         self.last_pulse_s: float | None = None
+        """The latest moment at which the last pulse can have been felt, as far as is known."""
         self.lateness_s: list[float] = []
+        self.ack_delay_s: list[float] = []
         self.charge_uc = 0.0
         self.dropped = 0
         stimulator.listen(self._acknowledged, on_lost)
@@ -71,7 +90,8 @@ class Gate:
     def reset(self) -> None:
         """Forget the counts of the test before."""
         with self._lock:
-            self.last_pulse_s, self.lateness_s, self.charge_uc, self.dropped = None, [], 0.0, 0
+            self.last_pulse_s, self.lateness_s, self.ack_delay_s = None, [], []
+            self.charge_uc, self.dropped = 0.0, 0
             self._recent.clear()
 
     def open(self, journal: Journal, table: dict[str, Limit]) -> None:
@@ -86,8 +106,7 @@ class Gate:
         self._stimulator.arm()
         with self._lock:
             self._table = table
-            self._index_of.clear()
-            self._unacknowledged.clear()
+            self.on_its_way = None  # the device has answered since: whatever lay in the line is through
             self._journal = journal
             self._passing = True
 
@@ -120,6 +139,9 @@ class Gate:
             now_s = self._clock.now_s()
             if not (now_s <= latest_s):
                 return self._skip(journal, index, PulseStatus.DROPPED)
+            held = self._too_close(now_s)
+            if held:
+                return self._skip(journal, index, PulseStatus.DROPPED, held)
             refusal = self._too_much(now_s, verdict.charge_uc)
             if refusal is not None:
                 return self._skip(journal, index, PulseStatus.REFUSED, str(refusal))
@@ -130,8 +152,7 @@ class Gate:
             except LateError:  # the disk or the line was slow
                 return self._skip(journal, index, PulseStatus.DROPPED)
             written_s = self._clock.now_s()
-            self._index_of[number] = index
-            self._unacknowledged[index] = written_s
+            self.on_its_way = OnItsWay(index, number, written_s)
             self._recent.append((written_s, verdict.charge_uc))
             self.last_pulse_s = written_s
             self.lateness_s.append(written_s - due_s)
@@ -146,7 +167,7 @@ class Gate:
                 self._stimulator.feed()
 
     def shut(self) -> None:
-        """From here on nothing passes; returns when nothing is on its way either."""
+        """From here on nothing is handed to the line; what it holds already is `on_its_way`."""
         with self._lock:
             self._passing = False
 
@@ -157,13 +178,23 @@ class Gate:
             self._journal = None
 
     def stop(self) -> None:
-        """Shut, and tell the device to stop. Raises DeviceError."""
+        """Shut, and tell the device to stop; what has not left this computer is discarded. Raises DeviceError.
+
+        The line keeps its order: a device that has answered has taken, or lost, the pulse that was on its way before.
+        """
         self.shut()
         self._stimulator.stop()
+        with self._lock:
+            if self.on_its_way is not None:
+                self.on_its_way, self.last_pulse_s = None, self._clock.now_s()
 
-    def oldest_unacknowledged_s(self) -> float | None:
-        """When the oldest pulse that waits for its ack was written."""
-        return next(iter(self._unacknowledged.copy().values()), None)
+    def still_possible(self) -> str:
+        """In words: may a pulse that was sent still be felt? Empty: no."""
+        pulse = self.on_its_way
+        if pulse is None:
+            return ""
+        age_ms = 1e3 * (self._clock.now_s() - pulse.written_s) / self._clock.speed
+        return f"pulse {pulse.index + 1} was sent {age_ms:.0f} ms ago and not acknowledged: it may still be felt"
 
     def disconnect(self) -> None:
         """Stop if it still can be, and give the line back; never raises."""
@@ -177,16 +208,23 @@ class Gate:
         if status == PulseStatus.DROPPED:
             self.dropped += 1
         if reason:
-            journal.append_json(Kind.EVENT, {"event": "refused", "index": index, "reason": reason, "time_s": now_s})
+            event = status.name.lower()
+            journal.append_json(Kind.EVENT, {"event": event, "index": index, "reason": reason, "time_s": now_s})
         return status
+
+    def _too_close(self, now_s: float) -> str:
+        """Why the pulse before is not known to be past for long enough; empty: it is."""
+        if self.on_its_way is not None:
+            return f"pulse {self.on_its_way.index + 1} is not acknowledged yet"
+        if not self._recent:
+            return ""
+        refusal = check(self._table["pulse_interval_s"], now_s - self._recent[-1][0])
+        return "" if refusal is None else str(refusal)
 
     def _too_much(self, now_s: float, charge_uc: float) -> Refusal | None:
         while self._recent and self._recent[0][0] <= now_s - 1.0:
             self._recent.popleft()
         if self._recent:
-            refusal = check(self._table["pulse_interval_s"], now_s - self._recent[-1][0])
-            if refusal is not None:
-                return refusal
             # those of the last second; the window that ends on a pulse may begin on one, too
             refusal = check(self._table["pulse_rate_hz"], len(self._recent))
             if refusal is not None:
@@ -195,18 +233,38 @@ class Gate:
 
     def _acknowledged(self, ack: Ack) -> None:
         with self._lock:  # `fire` holds it until the number is known
-            index = self._index_of.pop(ack.number, -1)
-            self._unacknowledged.pop(index, None)
-            failure = self._write_ack(index, ack)
-        if failure:
-            self._on_fault(failure)  # outside the lock: a fault shuts the gate
-        if ack.error is not None and ack.fatal:
-            self._on_fault(f"stimulator: {ack.error}" + (f" at pulse {index + 1}" if index >= 0 else ""))
+            pulse, index = self.on_its_way, -1
+            unasked = ack.number >= 0 and ack.error is None and self._passing
+            if pulse is not None and pulse.number == ack.number:
+                index, unasked = pulse.index, False
+                self._settle(pulse, ack)
+            failure = self._write_ack(index, ack, unasked)
+        place = f" at pulse {index + 1}" if index >= 0 else ""
+        for reason in (
+            failure,
+            f"stimulator: {ack.error}{place}" if ack.error is not None else "",
+            "stimulator: it acknowledged a pulse that it was not sent; is the line disturbed?" if unasked else "",
+        ):
+            if reason:
+                self._on_fault(reason)  # outside the lock: a fault shuts the gate
 
-    def _write_ack(self, index: int, ack: Ack) -> str:
+    def _settle(self, pulse: OnItsWay, ack: Ack) -> None:
+        """The pulse has been felt, between its write and its ack."""
+        self.on_its_way = None
+        self.last_pulse_s = max(ack.time_s, pulse.written_s)
+        self.ack_delay_s.append(self.last_pulse_s - pulse.written_s)
+        if self._recent:
+            self._recent[-1] = self.last_pulse_s, self._recent[-1][1]
+
+    def _write_ack(self, index: int, ack: Ack, unasked: bool) -> str:
         try:
             if self._journal is not None:
                 self._journal.append(Kind.ACKED, jn.ACKED.pack(index, ack.time_s) + (ack.error or "").encode())
+                if unasked:
+                    self._journal.append_json(Kind.EVENT, {"event": "unasked_ack", "time_s": ack.time_s})
+                if index >= 0 and self.ack_delay_s[-1] > LATE_ACK_S * self._clock.speed:
+                    late = {"event": "late_ack", "index": index, "delay_s": self.ack_delay_s[-1]}
+                    self._journal.append_json(Kind.EVENT, {**late, "time_s": ack.time_s})
         except JournalError as error:
             return str(error)
         return ""

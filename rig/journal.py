@@ -2,10 +2,14 @@
 
 A process that is killed, or a disk that fills up, costs the last block at most. Blocks reach the kernel before
 `append` returns (so they outlive this process) and the disk at the start, once a second and at the end.
+
+Header and plan, without which the rest is hard to read, stand in it twice, further apart than a sector of a disk is
+long. While it is open it is locked, so that nobody seals what is still being written.
 """
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import struct
@@ -35,6 +39,10 @@ ACKED = struct.Struct("<id")
 """Pulse index (−1: not of this test), time_s; then the error's words in UTF-8, none when delivered."""
 
 
+APART_BYTES = 8192
+"""Between the two copies of header and plan: no damaged sector, 4096 bytes at most, reaches both."""
+
+
 class Kind(IntEnum):
     """What a block holds."""
 
@@ -48,6 +56,7 @@ class Kind(IntEnum):
     TORQUE = 8
     EVENT = 9
     END = 10
+    SPACER = 11
 
 
 class Journal:
@@ -63,6 +72,7 @@ class Journal:
         self._failure = ""
         try:
             self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o640)
+            fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
             self._put(MAGIC)
             self.sync()
             _sync_directory(path.parent)
@@ -88,6 +98,15 @@ class Journal:
                 self._failure = f"journal {self.path}: {error.strerror}; the test stops, what was written is kept"
                 raise JournalError(self._failure) from None
             self._number += 1
+
+    def begin(self, header: dict[str, Any], plan: bytes) -> None:
+        """Header and plan, twice, and on the disk. Raises JournalError."""
+        for spacer in (bytes(APART_BYTES), b""):
+            self.append_json(Kind.HEADER, header)
+            self.append(Kind.PLAN, plan)
+            if spacer:
+                self.append(Kind.SPACER, spacer)
+        self.sync()
 
     def append_json(self, kind: Kind, content: dict[str, Any]) -> None:
         """Write one block of JSON."""
@@ -129,6 +148,11 @@ class JournalContents:
     blocks_missing: int
 
     @property
+    def damaged(self) -> bool:
+        """Something cannot be read, or is missing."""
+        return self.damaged_bytes > 0 or self.blocks_missing > 0
+
+    @property
     def ended(self) -> bool:
         """The test's end was written: nothing is missing at the tail."""
         return any(kind == Kind.END for kind, _ in self.blocks)
@@ -150,10 +174,9 @@ def read(path: Path) -> JournalContents:
         data = path.read_bytes()
     except OSError as error:
         raise RecordingError(f"journal {path}: {error.strerror}") from None
-    if not data.startswith(MAGIC):
-        raise RecordingError(f"journal {path}: does not start like a journal; it is another file or was overwritten")
     blocks: list[tuple[Kind, bytes]] = []
-    at, damaged, missing, expected = len(MAGIC), 0, 0, 0
+    at, missing, expected = len(MAGIC), 0, 0
+    damaged = sum(a != b for a, b in zip(data[:at], MAGIC, strict=False)) if len(data) > at else 0
     while at < len(data):
         block = _block_at(data, at)
         if block is None:
@@ -166,6 +189,8 @@ def read(path: Path) -> JournalContents:
         missing += (number - expected) & 0xFFFF
         expected = number + 1
         blocks.append((kind, payload))
+    if not blocks and not data.startswith(MAGIC):
+        raise RecordingError(f"journal {path}: does not start like a journal; it is another file or was overwritten")
     return JournalContents(path, blocks, damaged, missing)
 
 

@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 
 from rig.errors import RefusedError
-from rig.messages import Profile, TestPlan
+from rig.messages import Bound, Profile, TestPlan
 from rig.signals import Pulse
 
 STEP_PULSE_WIDTH_US = 1.0
@@ -122,6 +122,15 @@ class Steps:
     current_ma: float = STEP_CURRENT_MA
     shortest_us: float = STEP_PULSE_WIDTH_US
 
+    def width_us(self, asked_us: float) -> int:
+        """The width that is sent for it; 0: none."""
+        width_us = int(int(asked_us / self.pulse_width_us) * self.pulse_width_us)
+        return width_us if width_us >= self.shortest_us else 0
+
+    def current(self, asked_ma: float) -> float:
+        """The current that is sent for it, mA; 0: none."""
+        return int(asked_ma / self.current_ma) * self.current_ma
+
 
 FINEST = Steps()
 
@@ -165,6 +174,19 @@ class Admitted:
     def charge_uc(self) -> float:
         """Charge of one phase, µC."""
         return self.pulse_width_us * self.current_ma * 1e-3
+
+
+def bounds(table: dict[str, Limit]) -> dict[str, Bound]:
+    """The table as clients see it, so that a form can say what the rig would refuse."""
+    return {
+        row.name: Bound(
+            lo=row.lo if math.isfinite(row.lo) else None,
+            hi=row.hi if math.isfinite(row.hi) else None,
+            unit=row.unit,
+            owner=row.owner,
+        )
+        for row in table.values()
+    }
 
 
 def check(limit: Limit, value: float) -> Refusal | None:
@@ -265,6 +287,4 @@ def admit(pulse: Pulse, table: dict[str, Limit], steps: Steps = FINEST) -> Admit
         refusal = check(table[name], value)
         if refusal is not None:
             return refusal
-    width_us = int(int(pulse.pulse_width_us / steps.pulse_width_us) * steps.pulse_width_us)
-    current_ma = int(pulse.current_ma / steps.current_ma) * steps.current_ma
-    return Admitted(width_us if width_us >= steps.shortest_us else 0, current_ma)
+    return Admitted(steps.width_us(pulse.pulse_width_us), steps.current(pulse.current_ma))

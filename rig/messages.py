@@ -3,10 +3,14 @@
 A client sends a `Request` and gets one reply, a `Reply` with the same `id`. After `subscribe` the
 connection also carries `Event` lines until either side closes it. `api` imports this module and
 nothing else that reaches a device.
+
+A second socket beside the first, `stop_socket`, takes `stop` alone: nothing that happens on the first one can
+keep it from being heard. A request over 64 kB begins with its `kind` and `id`, as these models write it.
 """
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -20,13 +24,27 @@ RigState = Literal[
 
 Threshold = Literal["sensory", "motor", "comfort"]
 
+Direction = Literal["up", "repeat", "down"]
+
 TestOutcome = Literal["completed", "stopped", "fault"]
 
 
-class Message(BaseModel):
-    """Base of everything on the socket: unknown fields are refused, so a typing slip is seen."""
+LONGEST_LINE = 1_900_000
+"""Bytes of a request: the rig hears out none that is longer."""
 
-    model_config = ConfigDict(extra="forbid")
+
+def stop_socket(path: Path) -> Path:
+    """Where a rig that listens at `path` takes stops."""
+    return path.with_name(f"{path.name}.stop")
+
+
+class Message(BaseModel):
+    """Base of everything on the socket: unknown fields are refused, so a typing slip is seen.
+
+    Strict: `true` is no current and `"20"` no width.
+    """
+
+    model_config = ConfigDict(extra="forbid", strict=True)
 
 
 class SegmentPlan(Message):
@@ -138,7 +156,7 @@ class CalibrateStepRequest(Message):
 
     kind: Literal["calibrate-step"] = "calibrate-step"
     id: int = 0
-    direction: Literal["up", "down", "repeat"] = "up"
+    direction: Direction = "up"
 
 
 class CalibrateMarkRequest(Message):
@@ -212,6 +230,9 @@ class CalibrationStatus(Message):
     pulse_width_us: float = Field(description="width of the last train, µs; 0 before the first")
     ceiling_us: float = Field(description="the widest that limits and a marked comfort maximum allow, µs")
     ceiling_owner: str = Field(description="whose bound that is")
+    next_us: dict[Direction, float] = Field(
+        default_factory=dict, description="width that each step would send, µs; one that is missing would be refused"
+    )
     marks_us: dict[Threshold, float] = Field(default_factory=dict, description="marked widths, µs")
     missing: list[Threshold] = Field(default_factory=list, description="what has to be marked before finishing")
     trains: list[CalibrationTrain] = Field(default_factory=list)
@@ -220,6 +241,15 @@ class CalibrationStatus(Message):
 class CalibrationResult(Message):
     profile: Profile | None = Field(None, description="valid until the end of the day; None: discarded")
     recordings: list[str] = Field(default_factory=list, description="a sealed recording for each train")
+
+
+class Bound(Message):
+    """What this rig admits of one quantity: the hard limit, narrowed by the rig file."""
+
+    lo: float | None = Field(None, description="None: no lower bound")
+    hi: float | None = Field(None, description="None: no upper bound")
+    unit: str
+    owner: str = Field(description="whose bound it is: hard limit or rig file")
 
 
 class Status(Message):
@@ -235,6 +265,8 @@ class Status(Message):
     torque_age_s: float | None = Field(None, description="age of the newest torque sample; None: never seen")
     torque_nm: float | None = None
     calibration: CalibrationStatus | None = Field(None, description="while a guided calibration is open")
+    limits: dict[str, Bound] = Field(default_factory=dict, description="this rig's limits by name")
+    require_calibration: bool | None = Field(None, description="None: not told")
     finished: FinishedEvent | None = Field(
         None, description="the newest FinishedEvent since the rig started, a recovered one included: for who came late"
     )
@@ -257,6 +289,9 @@ class StopEvidence(Message):
     detail: str
     last_pulse_age_s: float | None = None
     device_state: str | None = None
+    pulse_may_follow: bool = Field(
+        default=False, description="one pulse was sent before the stop and not acknowledged: it may still be felt"
+    )
 
 
 class StateEvent(Message):
@@ -294,6 +329,7 @@ class FinishedEvent(Message):
     summary: dict[str, Any] = Field(
         default_factory=dict,
         description="duration_s, samples, lost_samples, pulses, dropped_pulses, lateness_ms {median, p99, max}, "
+        "ack_delay_ms {median, p99, max}, "
         "charge_uc, alignment {method, error_ms}, sample_rate_hz, torque_peak_nm, cpu_percent, warnings (sentences "
         "about what is in doubt, for people)",
     )

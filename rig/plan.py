@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,10 +11,11 @@ from numpy.typing import NDArray
 
 from rig import sequences
 from rig.errors import PlanError, RefusedError
-from rig.limits import Limit, Refusal, admit, check
+from rig.limits import Limit, Refusal, Steps, admit, check
 from rig.messages import Preview, RecruitmentTable, SegmentPlan, TestPlan
 from rig.signals import Pulse
 
+MOST_SEGMENTS = 200
 MAX_WIDTH_SETTING = "max_pulse_width_us"
 """Where a sequence has this setting and the plan does not give it: the comfort maximum, or the request's if less."""
 
@@ -87,30 +90,60 @@ def build(plan: TestPlan, table: dict[str, Limit]) -> PlannedTest:
     Raises
     ------
     PlanError
-        Unknown sequence, wrong setting, no segment: names the segment.
+        Unknown sequence, wrong setting, no segment, one without a pulse: names the segment.
     RefusedError
         A limit that the plan would break, which pulse breaks it and by how much.
     """
     _refuse(check(table["pulse_rate_hz"], plan.pulse_rate_hz), "plan")
-    segments: list[PlannedSegment] = []
-    parts: list[NDArray[np.float64]] = []
-    start = 0
     chosen = default_segments() if plan.segments is None else plan.segments
-    if not chosen:
-        raise PlanError("plan.segments is empty; leave it out for the default test, or give at least one segment")
+    segments = _laid_out(chosen, plan, table)
+    parts: list[NDArray[np.float64]] = []
     for number, segment in enumerate(chosen, start=1):
-        try:
-            widths = sequences.build(segment.sequence, _settings(segment, plan), plan.pulse_rate_hz)
-        except PlanError as error:
-            raise PlanError(f"segment {number} ({segment.name}): {error}") from None
-        parts.append(widths)
-        segments.append(PlannedSegment(segment.name, start, start + len(widths)))
-        start += len(widths)
-    test = PlannedTest(plan, np.concatenate(parts), tuple(segments))
+        with _named(number, segment):
+            parts.append(sequences.build(segment.sequence, _settings(segment, plan), plan.pulse_rate_hz))
+    test = PlannedTest(plan, np.concatenate(parts), segments)
     _check(test, table)
     for segment, of in zip(segments, chosen, strict=True):
         _check_rise(test.pulse_width_us, segment, of, table)
     return test
+
+
+def check_steps(test: PlannedTest, steps: Steps) -> None:
+    """A plan that asks for pulses must not come to none by this stimulator's rounding. Raises PlanError."""
+    widest_us, current_ma = float(test.pulse_width_us.max()), test.plan.profile.current_ma
+    if widest_us > 0 and (steps.width_us(widest_us) == 0 or steps.current(current_ma) == 0):
+        raise PlanError(
+            f"plan: {widest_us:g} µs at {current_ma:g} mA stimulates nothing: this stimulator begins at "
+            f"{steps.shortest_us:g} µs and {steps.current_ma:g} mA"
+        )
+
+
+def _laid_out(chosen: list[SegmentPlan], plan: TestPlan, table: dict[str, Limit]) -> tuple[PlannedSegment, ...]:
+    """Where each segment begins and ends, by arithmetic alone: what is too long is refused before it is built."""
+    if not chosen:
+        raise PlanError("plan.segments is empty; leave it out for the default test, or give at least one segment")
+    if len(chosen) > MOST_SEGMENTS:
+        raise PlanError(f"plan.segments: {len(chosen)} segments, at most {MOST_SEGMENTS}; put several into one")
+    segments: list[PlannedSegment] = []
+    start = 0
+    for number, segment in enumerate(chosen, start=1):
+        with _named(number, segment):
+            count = sequences.pulse_count(segment.sequence, _settings(segment, plan), plan.pulse_rate_hz)
+            if count < 1:
+                raise PlanError(f"it is too short for one pulse at {plan.pulse_rate_hz:g} pulses/s; lengthen it")
+        segments.append(PlannedSegment(segment.name, start, start + count))
+        start += count
+        _refuse(check(table["duration_s"], start / plan.pulse_rate_hz), f"plan, up to segment {number}")
+    return tuple(segments)
+
+
+@contextlib.contextmanager
+def _named(number: int, segment: SegmentPlan) -> Iterator[None]:
+    """A mistake within names the segment."""
+    try:
+        yield
+    except PlanError as error:
+        raise PlanError(f"segment {number} ({segment.name}): {error}") from None
 
 
 def _settings(segment: SegmentPlan, plan: TestPlan) -> dict[str, object]:
@@ -135,7 +168,6 @@ def _check(test: PlannedTest, table: dict[str, Limit]) -> None:
     worst_uc = float(np.max(np.convolve(charge_uc, np.ones(window), "valid")))
     _refuse(check(table["charge_per_second_uc"], worst_uc), "plan")
     _refuse(check(table["charge_per_test_uc"], test.charge_uc), "plan")
-    _refuse(check(table["duration_s"], test.duration_s), "plan")
 
 
 def _check_rise(

@@ -39,16 +39,11 @@ class LateError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Ack:
-    """A stimulator's answer to one pulse. `error` is None when the pulse was delivered.
-
-    `fatal` is False where the device merely did not take this one pulse, which harms nobody: it is recorded as not
-    delivered and the test goes on.
-    """
+    """A stimulator's answer to one pulse: `error` is None when it was delivered, `number` -1 if it names no pulse."""
 
     number: int
     time_s: float
     error: str | None = None
-    fatal: bool = True
 
 
 SAMPLE = np.dtype(

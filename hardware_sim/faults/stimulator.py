@@ -38,6 +38,37 @@ def late_ack(emulator: Emulator, delay_s: float = 0.2) -> Undo:
 
 
 @fault
+def line_stalled(emulator: Emulator, to_device: bool = True, to_host: bool = True) -> Undo:
+    """The line holds what it is given, in either direction or both, and lets all of it go at once when undone."""
+    commands, answers = bytearray(), bytearray()
+
+    def hold(kept: bytearray, data: bytes) -> None:
+        kept.extend(data)
+
+    undo = []
+    if to_device:
+        undo.append(hooked(emulator.board.incoming, lambda data: hold(commands, data)))
+    if to_host:
+        undo.append(hooked(emulator.board.outgoing, lambda data: hold(answers, data)))
+
+    def let_go() -> None:
+        for take_out in undo:
+            take_out()
+        if answers:
+            emulator.board.write(bytes(answers))
+        if commands:
+            emulator.firmware.received(bytes(commands))
+
+    return let_go
+
+
+@fault
+def frames_doubled(emulator: Emulator, probability: float = 1.0) -> Undo:
+    """What the host sends arrives twice, with this probability for each piece read."""
+    return hooked(emulator.board.incoming, lambda data: data * 2 if emulator.random.random() < probability else data)
+
+
+@fault
 def corrupt_answers(emulator: Emulator, probability: float = 1.0) -> Undo:
     """One byte of an answer is another, with this probability."""
     return hooked(emulator.board.outgoing, lambda frame: _garble(emulator, frame, probability))

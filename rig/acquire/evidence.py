@@ -29,7 +29,7 @@ def stop_device(gate: Gate) -> tuple[bool, str | None, str]:
             said = str(error)
             continue
         return safe, state, ""
-    return False, None, said
+    return False, None, "; ".join(part for part in (said, gate.still_possible()) if part)
 
 
 def watch_decay(
@@ -57,14 +57,26 @@ def watch_decay(
             clock.wait(clock.now_s() + 0.01 * clock.speed)
             continue
         if side * (now_nm - rest_nm) <= max(NEAR_REST_NM, 0.5 * abs(above_nm)):
-            return True, f"torque fell from {rest_nm + above_nm:.2f} to {now_nm:.2f} N·m"
+            return True, _near_rest(at_stop_nm, abs(above_nm), now_nm)
         if clock.now_s() >= deadline_s:
             return False, f"torque is still {now_nm:.2f} N·m {DECAY_S:g} s after the stop"
         clock.wait(clock.now_s() + 0.01 * clock.speed)
 
 
+def _near_rest(at_stop_nm: float | None, above_nm: float, now_nm: float) -> str:
+    """What the torque says, and no more than that."""
+    if at_stop_nm is None:
+        return f"torque is near its rest, {now_nm:.2f} N·m; what it was at the stop is not known"
+    if above_nm <= NEAR_REST_NM:
+        return f"torque was near its rest and is, {now_nm:.2f} N·m: too small to tell more"
+    return f"torque fell from {at_stop_nm:.2f} to {now_nm:.2f} N·m"
+
+
 def evidence(
-    device: tuple[bool, str | None, str], torque: tuple[bool, str], last_pulse_age_s: float | None
+    device: tuple[bool, str | None, str],
+    torque: tuple[bool, str],
+    last_pulse_age_s: float | None,
+    pulse_may_follow: bool,
 ) -> StopEvidence:
     """Both findings in one answer."""
     safe, state, said = device
@@ -73,5 +85,6 @@ def evidence(
         confirmed=safe and falling,
         detail="; ".join(part for part in (f"device: {state or 'did not answer'}", said, words) if part),
         last_pulse_age_s=last_pulse_age_s,
+        pulse_may_follow=pulse_may_follow,
         device_state=state,
     )

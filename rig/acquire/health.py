@@ -94,8 +94,8 @@ class Health:
         age_s = self._receiver.age_s(now_s) / speed
         if not (age_s <= watch.stale_torque_s):
             return f"load cell: torque is stale, the newest sample is {age_s * 1e3:.0f} ms old"
-        oldest_s = self._gate.oldest_unacknowledged_s()
-        if oldest_s is not None and not ((now_s - oldest_s) / speed <= watch.missing_ack_s):
+        pulse = self._gate.on_its_way
+        if pulse is not None and not ((now_s - pulse.written_s) / speed <= watch.missing_ack_s):
             return f"stimulator: a pulse was not acknowledged within {watch.missing_ack_s * 1e3:.0f} ms"
         if not (self._disk.age_s() <= watch.stale_disk_s):
             return f"disk: the journal could not be brought to it for {watch.stale_disk_s:g} s; it is too slow or gone"

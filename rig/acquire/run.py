@@ -1,7 +1,7 @@
 """One test, played in its own thread: arm, a pulse at each deadline, stop, and see that it stopped.
 
-Deadlines are absolute on the monotonic clock. Before each pulse the proof of health is looked at; a late pulse is
-dropped and recorded, never sent in a burst.
+Deadlines are absolute on the monotonic clock. Before each pulse the proof of health is looked at; a late pulse, or one
+that comes due before the one before is acknowledged, is dropped and recorded, never sent in a burst.
 """
 
 from __future__ import annotations
@@ -44,13 +44,14 @@ FRESH_S = 0.5
 
 @dataclass(slots=True)
 class RunResult:
-    """How a test went; lateness of the written pulses in s."""
+    """How a test went; lateness of the written pulses and delay of their acks in s."""
 
     outcome: TestOutcome
     reason: str
     evidence: StopEvidence
     counts: Recorded = field(default_factory=Recorded)
     lateness_s: list[float] = field(default_factory=list)
+    ack_delay_s: list[float] = field(default_factory=list)
     dropped: int = 0
     charge_uc: float = 0.0
     peak_nm: float = 0.0
@@ -226,7 +227,8 @@ class TestRun:
         now_s, last_s = clock.now_s(), self._gate.last_pulse_s
         planned_end_s = (self.t0_s or now_s) + self.test.duration_s
         self._end_journal(cause, planned_end_s if cause is None else now_s)
-        return evidence(device, torque, None if last_s is None else now_s - last_s)
+        may_follow = self._gate.on_its_way is not None
+        return evidence(device, torque, None if last_s is None else now_s - last_s, may_follow)
 
     def _end_journal(self, cause: Cause | None, end_s: float) -> None:
         self._outcome = cause or "completed"
@@ -256,6 +258,7 @@ class TestRun:
             evidence=found,
             counts=self._counts,
             lateness_s=list(self._gate.lateness_s),
+            ack_delay_s=list(self._gate.ack_delay_s),
             dropped=self._gate.dropped,
             charge_uc=self._gate.charge_uc,
             peak_nm=self._receiver.peak_nm,
@@ -290,11 +293,11 @@ def _undisturbed():
         gc.enable()
 
 
-def lateness_ms(lateness_s: list[float]) -> dict[str, float]:
-    """Median, 99th percentile and maximum of the written pulses' lateness, ms; empty without pulses."""
-    if not lateness_s:
+def spread_ms(durations_s: list[float]) -> dict[str, float]:
+    """Median, 99th percentile and maximum, ms; empty without any."""
+    if not durations_s:
         return {}
-    values = np.asarray(lateness_s) * 1e3
+    values = np.asarray(durations_s) * 1e3
     return {
         "median": float(np.median(values)),
         "p99": float(np.percentile(values, 99)),

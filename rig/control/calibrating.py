@@ -24,12 +24,12 @@ class Calibrating(Playing):
         BusyError, LatchedError, UncertainError, DeviceError
             As for a test.
         PlanError, RefusedError
-            A wrong name or id; a step, train, current or rate outside the limits.
+            A wrong name or id; a step, train, current or rate outside the limits, or one that stimulates nothing.
         """
         with self._lock:
             following = self._trial.calibrate(request.participant)
             check_names("calibration", calibration_id=request.calibration_id, participant=request.participant)
-            calibration = Calibration(request, self._table)
+            calibration = Calibration(request, self._table, self._clock.unix_s(), self._pair.steps)
             self._shelf.check_room(f"{request.calibration_id}.001")
             self._calibration = calibration
             self._change(following)
@@ -41,26 +41,32 @@ class Calibrating(Playing):
         Raises
         ------
         PlanError, BusyError, RefusedError
-            No calibration is open; a train is on its way; above a limit or the marked comfort maximum.
+            No calibration is open; a train is on its way; above a limit or the marked comfort maximum; its day is over.
         """
         with self._lock:
             calibration = self._open_calibration()
+            calibration.check_day(self._clock.unix_s())
             request = calibration.train(calibration.next_width_us(direction))
             test = plan.build(request, calibration.table)
-            self._check_rest(test, calibration.table["rest_between_trains_s"])
+            self._rest.check(test, calibration.rest)
             self._shelf.check_room(request.test_id)
             self._launch(test, calibration.table, self._trial.train(request.test_id))
         return self.status()
 
     def calibrate_mark(self, threshold: Threshold) -> Status:
-        """Mark the last train's width as a threshold. Raises PlanError, BusyError."""
+        """Mark the last train's width as a threshold. Raises PlanError, BusyError, RefusedError (its day is over)."""
         with self._lock:
-            self._open_calibration().mark(threshold)
+            calibration = self._open_calibration()
+            calibration.check_day(self._clock.unix_s())
+            calibration.mark(threshold)
             self._publish(StateEvent(status=self.status()))
         return self.status()
 
     def calibrate_finish(self, by: str, discard: bool) -> CalibrationResult:
-        """Close the calibration and give its profile. Raises PlanError (a threshold is missing), BusyError."""
+        """Close the calibration and give its profile.
+
+        Raises PlanError (a threshold is missing), BusyError, RefusedError (its day is over).
+        """
         with self._lock:
             calibration = self._open_calibration()
             profile = None if discard else calibration.profile(self._clock.unix_s())

@@ -1,6 +1,11 @@
 """Guided calibration: one short train for each step that a person asks for, thresholds marked, a profile for the day.
 
 Nothing here sends: it decides what the next train may be. The rig plays it as it plays every test.
+
+What is found holds for the day on which the calibration was begun. After midnight an open one takes no train, no mark
+and gives no profile, and says so: thresholds felt yesterday must not become a profile of today. A test that would end
+after its profile is refused at its start rather than cut short: the person hears the reason before anything is felt,
+and no pulse train ends in its middle by the calendar. Nothing that has begun looks at the wall clock.
 """
 
 from __future__ import annotations
@@ -11,11 +16,12 @@ from datetime import UTC, datetime, timedelta
 from rig import limits
 from rig.clock import utc_text
 from rig.errors import PlanError, RefusedError
-from rig.limits import Limit
+from rig.limits import FINEST, Limit, Steps
 from rig.messages import (
     CalibrateStartRequest,
     CalibrationStatus,
     CalibrationTrain,
+    Direction,
     FinishedEvent,
     Profile,
     SegmentPlan,
@@ -24,6 +30,7 @@ from rig.messages import (
 )
 
 ORDER: tuple[Threshold, ...] = ("sensory", "motor", "comfort")
+STEPS: tuple[Direction, ...] = ("up", "repeat", "down")
 REST_S = 0.25
 """Before and after each train: the torque's level at rest, and its fall."""
 CLOCK_SLIP_S = 300.0
@@ -42,15 +49,23 @@ class Calibration:
         As the client sent it.
     table
         The rig's limits, hard ones narrowed by the rig file.
+    unix_s
+        Now: its day is that of the calibration.
+    steps
+        What the stimulator can tell apart.
 
     Raises
     ------
     RefusedError
-        A step, train, current or rate outside the limits.
+        A step, train, current or rate outside the limits, or one that stimulates nothing.
     """
 
-    def __init__(self, request: CalibrateStartRequest, table: dict[str, Limit]) -> None:
+    def __init__(
+        self, request: CalibrateStartRequest, table: dict[str, Limit], unix_s: float, steps: Steps = FINEST
+    ) -> None:
         self.request = request
+        self._steps = steps
+        self._ends_s = end_of_day_s(unix_s)
         for name, value in (
             ("current_ma", request.current_ma),
             ("calibration_step_us", request.step_us),
@@ -60,8 +75,16 @@ class Calibration:
             refusal = limits.check(table[name], value)
             if refusal is not None:
                 raise RefusedError(f"calibration: {refusal}")
-        if int(request.current_ma / limits.STEP_CURRENT_MA) == 0:
-            raise RefusedError(f"calibration: current_ma {request.current_ma:g} mA stimulates nothing; give at least 1")
+        if steps.current(request.current_ma) == 0:
+            raise RefusedError(
+                f"calibration: current_ma {request.current_ma:g} mA stimulates nothing; this stimulator begins at "
+                f"{steps.current_ma:g} mA"
+            )
+        if self._pulses() < 1:
+            raise RefusedError(
+                f"calibration: a train of {request.train_s:g} s at {request.pulse_rate_hz:g} pulses/s has no pulse; "
+                "make it longer or the rate higher"
+            )
         most_us = table["pulse_width_us"].hi if request.max_pulse_width_us is None else request.max_pulse_width_us
         wanted = Profile(current_ma=request.current_ma, max_pulse_width_us=most_us, max_torque_nm=request.max_torque_nm)
         self.table = limits.for_profile(table, wanted, OWNER)
@@ -83,18 +106,35 @@ class Calibration:
         """
         change_us = {"up": self.request.step_us, "down": -self.request.step_us}.get(direction, 0.0)
         width_us = self._width_us + change_us
-        if not (width_us >= limits.STEP_PULSE_WIDTH_US):
+        if self._width_us == 0 and direction == "up":
+            width_us = max(width_us, self._steps.shortest_us)  # below it nothing would be sent, and all be felt as none
+        if self._steps.width_us(width_us) == 0:
             raise PlanError(f"calibration: no train is narrower than {self._width_us:g} µs; the first step goes up")
         refusal = limits.check(self._ceiling(), width_us)
         if refusal is not None:
             raise RefusedError(f"calibration: {refusal}")
         return width_us
 
+    def check_day(self, unix_s: float) -> None:
+        """Is it still the day on which it was begun? Raises RefusedError."""
+        if not (unix_s < self._ends_s):
+            raise RefusedError(
+                f"calibration: it was begun on the day before, which ended at {utc_text(self._ends_s)}; discard it and "
+                "begin anew"
+            )
+
+    @property
+    def rest(self) -> Limit:
+        """What must lie before the next train: before the first, as much as between two tests."""
+        return self.table["rest_between_trains_s" if self._trains else "rest_between_tests_s"]
+
+    def _pulses(self) -> int:
+        return round(self.request.train_s * self.request.pulse_rate_hz)
+
     def train(self, width_us: float) -> TestPlan:
         """The plan of one train at that width. Raises RefusedError when the calibration's dose is used up."""
         request = self.request
-        pulses = round(request.train_s * request.pulse_rate_hz)
-        dose_uc = self._charge_uc + pulses * width_us * request.current_ma * 1e-3
+        dose_uc = self._charge_uc + self._pulses() * width_us * request.current_ma * 1e-3
         refusal = limits.check(self.table["charge_per_test_uc"], dose_uc)
         if refusal is not None:
             raise RefusedError(f"calibration, all trains together: {refusal}")
@@ -143,7 +183,8 @@ class Calibration:
         self._marks_us = marks
 
     def profile(self, unix_s: float) -> Profile:
-        """What was found, valid until the end of the day. Raises PlanError naming what is not marked."""
+        """What was found, valid until the end of the day. Raises PlanError naming what is not marked, RefusedError."""
+        self.check_day(unix_s)
         if missing := self._missing():
             raise PlanError(f"calibration: not marked yet: {', '.join(missing)}; mark, or finish with discard")
         return Profile(
@@ -153,7 +194,7 @@ class Calibration:
             sensory_pulse_width_us=self._marks_us["sensory"],
             motor_pulse_width_us=self._marks_us["motor"],
             set_at_utc=utc_text(unix_s),
-            expires_at_utc=utc_text(end_of_day_s(unix_s)),
+            expires_at_utc=utc_text(self._ends_s),
         )
 
     def status(self) -> CalibrationStatus:
@@ -170,10 +211,17 @@ class Calibration:
             pulse_width_us=self._width_us,
             ceiling_us=ceiling.hi,
             ceiling_owner=ceiling.owner,
+            next_us={step: width_us for step in STEPS if (width_us := self._would_send_us(step)) is not None},
             marks_us=dict(self._marks_us),
             missing=self._missing(),
             trains=list(self._trains),
         )
+
+    def _would_send_us(self, direction: Direction) -> float | None:
+        try:
+            return float(self._steps.width_us(self.next_width_us(direction)))
+        except (PlanError, RefusedError):
+            return None
 
     def _missing(self) -> list[Threshold]:
         return [name for name in ORDER if name not in self._marks_us]
@@ -200,7 +248,7 @@ def end_of_day_s(unix_s: float) -> float:
     return tomorrow.astimezone().timestamp()
 
 
-def check_profile(profile: Profile, unix_s: float, required: bool) -> None:
+def check_profile(profile: Profile, unix_s: float, required: bool, duration_s: float = 0.0) -> None:
     """Is what a calibration found consistent and still valid?
 
     Parameters
@@ -209,6 +257,8 @@ def check_profile(profile: Profile, unix_s: float, required: bool) -> None:
         Now. The one decision that rests on UTC: a day ends by the calendar.
     required
         Refuse a profile without a calibration.
+    duration_s
+        Real seconds of the test that is to be played: it must have ended before the profile does.
 
     Raises
     ------
@@ -236,6 +286,11 @@ def check_profile(profile: Profile, unix_s: float, required: bool) -> None:
         raise RefusedError("participant's profile: must expire after it was set, within a day; calibrate anew")
     if not (unix_s < expires_s):
         raise RefusedError(f"participant's profile: expired at {profile.expires_at_utc}; calibrate anew")
+    if not (unix_s + duration_s < expires_s):
+        raise RefusedError(
+            f"participant's profile: expires at {profile.expires_at_utc}, before this test of {duration_s:.0f} s would "
+            "end; calibrate anew once the day is over"
+        )
 
 
 def _time(name: str, text: str) -> float:

@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable
 
+from rig import limits
 from rig.acquire.halt import Cause, Halt
 from rig.acquire.run import TestRun
 from rig.clock import Clock
@@ -16,6 +17,7 @@ from rig.control.calibration import Calibration
 from rig.control.latch import Latch, Remembered, lock_folder
 from rig.control.live import live_event
 from rig.control.pair import Pair
+from rig.control.rest import Rest
 from rig.control.sealing import Shelf
 from rig.errors import ConfigError, RigError
 from rig.messages import Event, FinishedEvent, LiveEvent, StateEvent, Status, StopEvidence
@@ -49,6 +51,7 @@ class Core:
         except OSError as error:
             raise ConfigError(f"data_dir: {error.filename or config.data_dir}: {error.strerror}") from None
         self._latch = Latch(config.data_dir)
+        self._rest = Rest(config.data_dir, clock)
         self._lock = threading.RLock()
         self._trial = Trial()
         self._pair = Pair(config, clock, self._fault, self._lost)
@@ -59,10 +62,24 @@ class Core:
         self._told = threading.Event()
         self._next_live_pulse = 0
         self._calibration: Calibration | None = None
-        self._last_pulse_s: float | None = None
         self._held_since_s: float | None = None
         self._born_s = clock.now_s()
         self.finished: FinishedEvent | None = None
+
+    @property
+    def table(self) -> dict[str, limits.Limit]:
+        """Hard limits, narrowed by the rig file."""
+        return self._table
+
+    @property
+    def speed(self) -> float:
+        """Of the rig's clock."""
+        return self._clock.speed
+
+    @property
+    def busy(self) -> bool:
+        """Is a test on its way?"""
+        return self._trial.busy
 
     def status(self) -> Status:
         """How things stand now."""
@@ -88,6 +105,8 @@ class Core:
             torque_age_s=receiver.age_s(self._clock.now_s()) if receiver and seen else None,
             torque_nm=torque_nm if torque_nm is not None and math.isfinite(torque_nm) else None,
             calibration=calibration,
+            limits=limits.bounds(self._table),
+            require_calibration=self._require_calibration,
             finished=self.finished,
         )
 

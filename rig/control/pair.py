@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable
 from typing import Any
 
-from rig import devices
+from rig import devices, limits
 from rig.acquire.receiver import Receiver
 from rig.acquire.run import FRESH_S, SETTLE_S
 from rig.clock import Clock
@@ -36,6 +36,8 @@ class Pair:
         self.receiver: Receiver | None = None
         self.found_state = ""
         """What the stimulator said of itself when it was connected."""
+        self.steps = limits.FINEST
+        """What the stimulator can tell apart."""
         self.identity: dict[str, dict[str, Any]] = {"stimulator": {}, "load_cell": {}}
 
     def connect(self) -> None:
@@ -56,7 +58,7 @@ class Pair:
             raise
         receiver = Receiver(cell, self._clock, self._on_lost)
         receiver.start()
-        self.gate, self.receiver = gate, receiver
+        self.gate, self.receiver, self.steps = gate, receiver, stimulator.steps
 
     def _stop_what_was_left(self, gate: Gate) -> None:
         safe, state = gate.state()

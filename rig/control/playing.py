@@ -8,9 +8,9 @@ import threading
 
 from rig import limits, plan
 from rig.acquire.halt import Halt
-from rig.acquire.run import LEAD_S, TestRun
+from rig.acquire.run import RunResult, TestRun
 from rig.control.core import Core
-from rig.errors import JournalError, PlanError, RefusedError
+from rig.errors import JournalError, PlanError
 from rig.trial import Trial
 
 log = logging.getLogger("rig")
@@ -20,16 +20,6 @@ _NAME = re.compile(r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$")
 
 class Playing(Core):
     """Plays what has been planned and admitted."""
-
-    def _check_rest(self, test: plan.PlannedTest, limit: limits.Limit) -> None:
-        """Time enough between the last pulse that was sent and the first that is planned?"""
-        if self._last_pulse_s is None or not (test.pulse_width_us > 0).any():
-            return
-        first_s = float((test.pulse_width_us > 0).argmax()) / test.plan.pulse_rate_hz + LEAD_S * self._clock.speed
-        rest_s = self._clock.now_s() + first_s - self._last_pulse_s
-        refusal = limits.check(limit, rest_s)
-        if refusal is not None:
-            raise RefusedError(f"plan: {refusal}; wait {limit.lo - rest_s:.1f} s")
 
     def _launch(self, test: plan.PlannedTest, table: dict[str, limits.Limit], following: Trial) -> None:
         """Journal, latch file, thread: what every test and every train of a calibration goes through."""
@@ -61,7 +51,8 @@ class Playing(Core):
         try:
             result = run.execute()
             self._evidence = result.evidence
-            self._told.set()
+            self._told.set()  # who waits for a stop's evidence does not wait for the disk
+            self._remember_pulse(result)
             with self._lock:
                 self._change(self._trial.ended())
             finished = self._shelf.finish(run.journal_path, run.test.plan.test_id, result)
@@ -71,7 +62,6 @@ class Playing(Core):
             return
         with self._lock:
             self._run = None
-            self._last_pulse_s = result.last_pulse_s or self._last_pulse_s
             train = self._trial.calibrating
             if train and self._calibration is not None:
                 self._calibration.played(run.test.plan.profile.max_pulse_width_us, result.rise_nm, finished)
@@ -88,12 +78,19 @@ class Playing(Core):
         if not train:
             self._publish(finished)
 
+    def _remember_pulse(self, result: RunResult) -> None:
+        """Before another test may start; where the end of stimulation is not confirmed, one may still come."""
+        if result.last_pulse_s is not None:
+            confirmed = result.evidence.confirmed
+            self._rest.pulse_at(result.last_pulse_s if confirmed else self._clock.now_s(), ended=confirmed)
+
     def _broken(self, reason: str) -> None:
+        self._told.set()
         with self._lock:
             self._run = None
             self._remember("running", reason)
             self._change(Trial("latched", reason, lost=reason))
-        self._told.set()
+        self._rest.pulse_at(self._clock.now_s(), ended=False)
 
     def _announce(self, run: TestRun) -> None:
         """Tell that the test runs, from outside the thread that must be on time."""

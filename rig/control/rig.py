@@ -10,7 +10,7 @@ from rig.control.calibrating import Calibrating
 from rig.control.calibration import check_profile
 from rig.control.playing import check_names
 from rig.errors import DeviceError
-from rig.messages import Preview, PreviewRequest, Status, StopEvidence, TestPlan
+from rig.messages import Status, StopEvidence, TestPlan
 from rig.trial import Trial
 
 log = logging.getLogger("rig")
@@ -41,8 +41,7 @@ class Rig(Calibrating):
             self.finished = event
             self._publish(event)
         before = None
-        if remembered is not None:
-            self._last_pulse_s = self._clock.now_s()  # how long ago it was is not known: a death is no rest
+        self._rest.recall(in_doubt=remembered == "running")  # a death is no rest
         if remembered == "running":
             before, reason = "uncertain", f"the rig died during a test ({reason or 'its journal was left'})"
         elif remembered == "latched":
@@ -67,12 +66,6 @@ class Rig(Calibrating):
         self._pair.disconnect()
         self._folder_lock.close()
 
-    def preview(self, request: PreviewRequest) -> Preview:
-        """Duration, dose and pulses of a plan. Raises PlanError, RefusedError."""
-        check_profile(request.plan.profile, self._clock.unix_s(), required=False)
-        table = limits.for_plan(self._table, request.plan)
-        return plan.preview(plan.build(request.plan, table), request.recruitment)
-
     def start(self, request: TestPlan) -> Status:
         """Begin a test in its own thread.
 
@@ -85,13 +78,16 @@ class Rig(Calibrating):
         JournalError, RigError
             The disk refuses the journal or the latch file.
         """
+        self._trial.may_start()  # before waiting for the lock: what was asked while stopped isn't played once re-armed
         with self._lock:
             self._trial.may_start()
             check_names("plan", test_id=request.test_id, participant=request.participant)
-            check_profile(request.profile, self._clock.unix_s(), self._require_calibration)
             table = limits.for_plan(self._table, request)
             test = plan.build(request, table)
-            self._check_rest(test, table["rest_between_tests_s"])
+            now_s, duration_s = self._clock.unix_s(), test.duration_s / self._clock.speed
+            check_profile(request.profile, now_s, self._require_calibration, duration_s)
+            plan.check_steps(test, self._pair.steps)
+            self._rest.check(test, table["rest_between_tests_s"])
             self._shelf.check_room(request.test_id)
             self._launch(test, table, self._trial.start(request.test_id, request.participant))
         return self.status()
@@ -101,8 +97,7 @@ class Rig(Calibrating):
         words = f"{reason} (by {by})" if by else reason
         if self._end("stopped", words, latch_idle):
             self._told.wait(STOP_TIMEOUT_S)
-            late = StopEvidence(confirmed=False, detail="no pulse leaves; the device did not answer in time")
-            return self._evidence or late
+            return self._evidence or self._unconfirmed("no pulse leaves; the device did not answer in time")
         gate = self._pair.gate
         if gate is None:
             return StopEvidence(confirmed=False, detail="the stimulator is not connected; no pulse can leave")
@@ -110,8 +105,15 @@ class Rig(Calibrating):
             gate.stop()
             safe, state = gate.state()
         except DeviceError as error:
-            return StopEvidence(confirmed=False, detail=str(error))
+            return self._unconfirmed(str(error))
+        self._rest.settle()
         return StopEvidence(confirmed=safe, detail=f"no test was running; device: {state}", device_state=state)
+
+    def _unconfirmed(self, detail: str) -> StopEvidence:
+        """The device has not answered: may a pulse still come that was sent before?"""
+        possible = self._pair.gate.still_possible() if self._pair.gate else ""
+        words = "; ".join(part for part in (detail, possible) if part)
+        return StopEvidence(confirmed=False, detail=words, pulse_may_follow=bool(possible))
 
     def rearm(self, by: str) -> Status:
         """A person has looked: ask both devices anew and be ready.
@@ -134,6 +136,7 @@ class Rig(Calibrating):
             for event in self._shelf.recover("its recording could not be sealed at its end"):
                 self.finished = event
                 self._publish(event)
+            self._rest.settle()
             self._latch.clear()
             log.info("re-armed by %s after: %s", by, self._trial.reason)
             self._change(following)

@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from rig import archive, journal
-from rig.acquire.run import RunResult, lateness_ms
+from rig import archive, assembly, journal
+from rig.acquire.run import RunResult, spread_ms
 from rig.clock import Clock
 from rig.config import RigConfig
 from rig.errors import JournalError, PlanError, RecordingError
-from rig.journal import Journal, Kind
+from rig.journal import Journal
 from rig.messages import FinishedEvent
 from rig.plan import PlannedTest
 
@@ -82,9 +82,7 @@ class Shelf:
             "time_s": self._clock.now_s(),
             "unix_s": self._clock.unix_s(),
         }
-        book.append_json(Kind.HEADER, header)
-        book.append(Kind.PLAN, test.pulse_width_us.astype("<f8").tobytes())
-        book.sync()
+        book.begin(header, test.pulse_width_us.astype("<f8").tobytes())
         return book
 
     def finish(self, path: Path, test_id: str, result: RunResult) -> FinishedEvent:
@@ -99,7 +97,8 @@ class Shelf:
             "error_frames": result.counts.error_frames,
             "pulses": len(result.lateness_s),
             "dropped_pulses": result.dropped,
-            "lateness_ms": lateness_ms([s / self._clock.speed for s in result.lateness_s]),
+            "lateness_ms": spread_ms([s / self._clock.speed for s in result.lateness_s]),
+            "ack_delay_ms": spread_ms([s / self._clock.speed for s in result.ack_delay_s]),
             "charge_uc": result.charge_uc,
             "torque_peak_nm": result.peak_nm,
             "cpu_percent": round(result.cpu_percent, 2),
@@ -125,11 +124,18 @@ class Shelf:
     def _seal(
         self, path: Path, test_id: str, outcome: str, reason: str, summary: dict[str, Any], unix_s: float | None
     ) -> FinishedEvent:
-        """Seal a journal and remove it; where that fails the journal stays and the event says why."""
+        """Seal a journal and remove it; where that fails the journal stays and the event says why.
+
+        A damaged one is sealed as far as it goes, and kept beside the others as `TEST_ID.damaged`.
+        """
         sealed = None
         try:
-            sealed = archive.seal(journal.read(path), self.recordings, outcome, reason)
-            path.unlink()
+            contents = journal.read(path)
+            sealed = archive.seal(assembly.assemble(contents, outcome, reason), self.recordings)
+            if contents.damaged:  # what could be read is sealed; the rest may be wanted by whoever looks into it
+                path.rename(path.with_suffix(".damaged"))
+            else:
+                path.unlink()
         except (RecordingError, OSError) as error:
             log.error("%s", error, extra={"test_id": test_id})
             reason = "; ".join(part for part in (reason, str(error)) if part)
@@ -148,7 +154,7 @@ class Shelf:
         return FinishedEvent.model_validate(event)
 
 
-def _of_recording(recording: archive.Recording) -> dict[str, Any]:
+def _of_recording(recording: assembly.Recording) -> dict[str, Any]:
     alignment = recording.alignment
     return {
         "samples": len(recording.columns["torque/time_s"]),
@@ -163,13 +169,15 @@ def _of_recording(recording: archive.Recording) -> dict[str, Any]:
     }
 
 
-def warnings(recording: archive.Recording) -> list[str]:
+def warnings(recording: assembly.Recording) -> list[str]:
     """What a person should know before a model is made of it, a sentence each; empty where nothing is in doubt."""
     alignment, attributes = recording.alignment, recording.attributes
+    found = _disturbed_line(recording)
+    if attributes["journal_note"]:
+        found.append(f"journal: {attributes['journal_note']}")
     nominal_hz, measured_hz = attributes["sample_rate_hz"], attributes["sample_rate_measured_hz"]
     if not len(recording.columns["torque/time_s"]):
-        return []
-    found = []
+        return found
     torque_nm = recording.columns["torque/torque_nm"]
     if np.all(torque_nm == torque_nm[0]):
         found.append(f"load cell: stood at exactly {torque_nm[0]:.3f} N·m through the whole test: is it stuck?")
@@ -183,6 +191,25 @@ def warnings(recording: archive.Recording) -> list[str]:
         found.append(
             f"load cell: {measured_hz:.0f} samples/s came, the rig file says {nominal_hz:g}: times of this recording "
             "are in doubt"
+        )
+    return found
+
+
+def _disturbed_line(recording: archive.Recording) -> list[str]:
+    """Pulses that the stimulator acknowledged late, or that nobody sent, and those that were dropped meanwhile."""
+    named = [event.get("event") for event in recording.events]
+    late_s = [event["delay_s"] for event in recording.events if event.get("event") == "late_ack"]
+    found = []
+    if unasked := named.count("unasked_ack"):
+        found.append(
+            f"stimulator: it acknowledged pulses that were not sent ({unasked}): so many more may have been felt than "
+            "this recording holds"
+        )
+    if late_s:
+        found.append(
+            f"stimulator: {len(late_s)} acknowledgements came late, up to {max(late_s) * 1e3:.0f} ms after the pulse "
+            f"was sent: these pulses may have been felt as late; {named.count('dropped')} that came due meanwhile were "
+            "dropped"
         )
     return found
 

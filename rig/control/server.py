@@ -1,10 +1,13 @@
-"""The Unix socket: requests in, replies and events out, one JSON object a line."""
+"""The Unix socket: requests in, replies and events out, one JSON object a line; beside it the one for stops alone.
+
+What touches a device or the disk runs in worker threads, previews in another process. The number of connections, of
+requests that wait and of bytes in a request is bounded; who is over a bound is refused at once.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-import json
 import logging
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -12,32 +15,42 @@ from typing import Any
 
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
+from rig.control.crowd import Crowd
+from rig.control.previews import Previews
+from rig.control.replies import head_of, id_of, refusal, to_line, unforeseen, wrong
 from rig.control.rig import Rig
-from rig.errors import ConfigError, RigError
-from rig.messages import Event, LiveEvent, Problem, Reply, Request, StateEvent
+from rig.control.stop_door import StopDoor
+from rig.errors import BusyError, ConfigError, PlanError, RigError
+from rig.messages import LONGEST_LINE, Event, LiveEvent, Reply, Request, StateEvent, stop_socket
 
 log = logging.getLogger("rig.socket")
 
 LIVE_PERIOD_S = 0.05
 WORKERS = 32
-"""Requests that may wait at the same time: those who wait for a stop's evidence must not hold up another stop."""
 SLOW_BYTES = 1_000_000
 """A subscriber that lets this much wait gets no live events until it has caught up."""
 DEAD_BYTES = 8_000_000
-MAX_LINE_BYTES = 4_000_000
+LONG_LINE_BYTES = 64_000
+"""Reading a longer one holds the interpreter for milliseconds, which a test's sender has not to give."""
+MOST_PENDING = 64
+"""Requests of one connection that may wait at the same time."""
+MOST_SILENT, MOST_SPEAKING = 64, 128
 
 _REQUEST: TypeAdapter[Any] = TypeAdapter(Request)
 
 
 class Server:
-    """Serves any number of clients; what touches a device or the disk runs in worker threads."""
+    """Serves any number of clients."""
 
     def __init__(self) -> None:
         self.rig: Rig | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._subscribers: set[asyncio.StreamWriter] = set()
         self._tasks: set[asyncio.Task[None]] = set()
+        self._crowd = Crowd(MOST_SILENT, MOST_SPEAKING)
         self._server: asyncio.Server | None = None
+        self._door: StopDoor | None = None
+        self._previews: Previews
 
     def publish(self, event: Event) -> None:
         """Send an event to every subscriber; from any thread."""
@@ -45,28 +58,36 @@ class Server:
             self._loop.call_soon_threadsafe(self._send_all, event)
 
     async def start(self, rig: Rig, path: Path) -> None:
-        """Listen on `path`; only this user and group may connect."""
+        """Listen on `path`, and for stops beside it; only this user and group may connect."""
         self._loop = asyncio.get_running_loop()
         self.rig = rig
+        self._previews = Previews(rig.table, rig.speed)
         self._loop.set_default_executor(ThreadPoolExecutor(WORKERS, "request"))
         if await _answers(path):
             raise ConfigError(f"socket: {path}: another rig listens there; stop it or give another path")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
+            self._door = StopDoor(rig.stop)
+            self._door.open(stop_socket(path))  # first: who can ask for anything can stop
             path.unlink(missing_ok=True)
-            self._server = await asyncio.start_unix_server(self._serve, path, limit=MAX_LINE_BYTES)
+            self._server = await asyncio.start_unix_server(self._serve, path, limit=LONGEST_LINE, backlog=512)
             path.chmod(0o660)
         except OSError as error:
             raise ConfigError(f"socket: {path}: {error.strerror or error}; a short path in a writable folder") from None
         self._keep(self._loop.create_task(self._live()))
+        self._keep(self._loop.create_task(self._previews.warm()))
 
     async def close(self) -> None:
         """Stop listening and let every client go."""
         if self._server is not None:
             self._server.close()
+        if self._door is not None:
+            await asyncio.to_thread(self._door.close)
         for task in tuple(self._tasks):
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
+        if self.rig is not None:
+            await self._previews.close()
 
     def _keep(self, task: asyncio.Task[None]) -> None:
         self._tasks.add(task)
@@ -83,7 +104,7 @@ class Server:
     def _send_all(self, event: Event) -> None:
         if not self._subscribers:
             return
-        line = _line(event)
+        line = to_line(event)
         for writer in tuple(self._subscribers):
             waiting = writer.transport.get_write_buffer_size()
             if waiting > DEAD_BYTES:
@@ -94,55 +115,83 @@ class Server:
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         pending: set[asyncio.Task[None]] = set()
+        self._crowd.enter(writer.transport)
         try:
             while line := await reader.readline():
                 if line.strip():
+                    self._crowd.spoke(writer.transport)
                     # each request is its own task, so that a stop never waits behind another request
-                    task = asyncio.create_task(self._answer(line, writer))
+                    task = asyncio.create_task(self._answer(line, writer, len(pending) >= MOST_PENDING))
                     pending.add(task)
                     task.add_done_callback(pending.discard)
                     self._keep(task)
-        except (ConnectionError, ValueError) as error:
+        except ValueError:
+            _write(writer, to_line(refusal(0, PlanError(f"request: longer than {LONGEST_LINE // 1000} kB"))))
+        except ConnectionError as error:
             log.warning("client let go: %s", error)
         finally:
             self._subscribers.discard(writer)
+            self._crowd.leave(writer.transport)
             await asyncio.gather(*pending, return_exceptions=True)
             writer.close()
             with contextlib.suppress(ConnectionError, OSError):
                 await writer.wait_closed()
 
-    async def _answer(self, line: bytes, writer: asyncio.StreamWriter) -> None:
+    async def _answer(self, line: bytes, writer: asyncio.StreamWriter, crowded: bool) -> None:
+        head = head_of(line)
+        kind = head[0] if head else ""
+        if kind == "stop" and self._door is not None:  # with the threads that are kept for stops
+            _write(writer, to_line(await self._door.answer(line)))
+            return
         try:
+            if crowded:
+                raise BusyError(f"{MOST_PENDING} requests of this connection wait already; take their replies first")
+            if kind == "preview":
+                _write(writer, await self._preview(line, writer))
+                return
+            self._refuse_long(line, kind)
             request = _REQUEST.validate_json(line)
+        except RigError as error:
+            _write(writer, to_line(refusal(id_of(line[:200]), error)))
+            return
         except ValidationError as error:
-            first = error.errors()[0]
-            place = ".".join(str(part) for part in first["loc"]) or "request"
-            problem = Problem(code="bad-plan", title="The request is wrong", detail=f"{place}: {first['msg']}")
-            _write(writer, Reply(id=_id_of(line), ok=False, problem=problem))
+            _write(writer, to_line(wrong(id_of(line), error)))
+            return
+        await self._obey(request, writer)
+
+    async def _preview(self, line: bytes, writer: asyncio.StreamWriter) -> bytes:
+        """In the order of asking; who has gone meanwhile is not worked for."""
+        return b"" if writer.transport.is_closing() else await self._previews.reply(line)
+
+    def _refuse_long(self, line: bytes, kind: str) -> None:
+        assert self.rig is not None
+        if len(line) > LONG_LINE_BYTES and kind == "":
+            raise PlanError(f"request: one over {LONG_LINE_BYTES // 1000} kB begins with its kind and its id")
+        if len(line) > LONG_LINE_BYTES and self.rig.busy:
+            raise BusyError("a test is on its way; wait or stop it")
+
+    async def _obey(self, request: Any, writer: asyncio.StreamWriter) -> None:
+        if request.kind in ("preview", "stop"):  # one that does not begin with its kind and id
+            await self._answer(to_line(request), writer, crowded=False)
             return
         try:
             body = await asyncio.to_thread(self._do, request)
             reply = Reply(id=request.id, ok=True, body=body.model_dump(mode="json"))
         except RigError as error:
-            reply = Reply(id=request.id, ok=False, problem=problem_of(error))
+            reply = refusal(request.id, error)
         except Exception as error:
             log.exception("request %s failed", request.kind)
-            problem = Problem(code="internal", title=RigError.title, detail=f"{type(error).__name__}: {error}")
-            reply = Reply(id=request.id, ok=False, problem=problem)
-        _write(writer, reply)
+            reply = unforeseen(request.id, error)
+        _write(writer, to_line(reply))
         if request.kind == "subscribe" and reply.ok and self.rig is not None:
             self._subscribers.add(writer)
-            _write(writer, StateEvent(status=self.rig.status()))
+            _write(writer, to_line(StateEvent(status=self.rig.status())))
 
     def _do(self, request: Any) -> BaseModel:
         assert self.rig is not None
         match request.kind:
-            case "preview":
-                return self.rig.preview(request)
             case "start":
                 return self.rig.start(request.plan)
-            case "stop":
-                return self.rig.stop(request.reason, request.by)
             case "rearm":
                 return self.rig.rearm(request.by)
             case "calibrate-start":
@@ -167,21 +216,8 @@ async def _answers(path: Path) -> bool:
     return True
 
 
-def problem_of(error: RigError) -> Problem:
-    """An exception as clients see it."""
-    return Problem(code=error.code, title=error.title, detail=str(error))
-
-
-def _line(message: BaseModel) -> bytes:
-    return message.model_dump_json().encode() + b"\n"
-
-
-def _write(writer: asyncio.StreamWriter, message: BaseModel) -> None:
-    if not writer.transport.is_closing():
-        writer.write(_line(message))
-
-
-def _id_of(line: bytes) -> int:
-    with contextlib.suppress(ValueError, TypeError, AttributeError):
-        return int(json.loads(line).get("id", 0))
-    return 0
+def _write(writer: asyncio.StreamWriter, line: bytes) -> None:
+    if writer.transport.get_write_buffer_size() > DEAD_BYTES:
+        writer.transport.abort()  # asks and does not read
+    elif line and not writer.transport.is_closing():
+        writer.write(line)

@@ -68,7 +68,9 @@ class Stimulator(Protocol):
         ...
 
     def stop(self) -> None:
-        """Stop stimulation; safe at any time and from any thread. Raises DeviceError."""
+        """Stop stimulation; safe at any time and from any thread. What still waits in this computer to be sent is
+        discarded first. Raises DeviceError.
+        """
         ...
 
     def state(self) -> tuple[bool, str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import termios
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -20,6 +21,7 @@ from rig.wire.sciencemode4 import Packet
 log = logging.getLogger("rig.line")
 
 READ_TIMEOUT_S = 0.05
+PSEUDO_TERMINALS = "/dev/pts/"
 
 
 class Reader(Protocol):
@@ -85,10 +87,22 @@ class PacketLine:
             raise DeviceError(
                 f"stimulator.port: {self.port} cannot be opened ({error}); is another program using it?"
             ) from None
+        self._refuse_fast_clock()
         self._closing.clear()
         self._lost = ""
         self._thread = threading.Thread(target=self._read, name="stimulator-acks", daemon=True)
         self._thread.start()
+
+    def _refuse_fast_clock(self) -> None:
+        """Limits are in rig seconds: a clock that runs faster than the world may drive an emulator's port only."""
+        assert self._serial is not None
+        place = os.ttyname(self._serial.fileno())
+        if self._clock.speed != 1.0 and not place.startswith(PSEUDO_TERMINALS):
+            self.close()
+            raise DeviceError(
+                f"stimulator.port: {self.port} is {place}, a real device, and the rig's clock runs "
+                f"{self._clock.speed:g} times as fast as the world; use a rig file"
+            )
 
     def close(self) -> None:
         """End the thread and give the port back; never raises."""
@@ -99,6 +113,16 @@ class PacketLine:
             with contextlib.suppress(OSError):  # an unplugged line cannot be given back
                 self._serial.close()
             self._serial = None
+
+    def discard(self) -> None:
+        """Throw away what was written and still waits in this computer: a line that takes nothing holds it there.
+
+        Never raises. A frame that is cut in two by this is damaged, and the device drops it by its checksum.
+        """
+        port = self._serial
+        if port is not None:
+            with contextlib.suppress(OSError, TypeError, ValueError, termios.error):
+                termios.tcflush(port.fileno(), termios.TCOFLUSH)
 
     def tell(self, make: Callable[[int], bytes], latest_s: float | None = None) -> int:
         """Write the frame that `make` gives for the next number; the number.

@@ -88,6 +88,7 @@ class P24:
         pass  # in low level nothing goes on by itself, so there is nothing to keep alive
 
     def stop(self) -> None:
+        self._line.discard()
         self._ask(Command.LL_STOP, fine=(0, NOT_INITIALISED))  # one that is not initialised has stopped already
 
     def state(self) -> tuple[bool, str]:

@@ -32,9 +32,6 @@ FEED_S = 0.3
 OFFER_S = 1.5
 """Real seconds to wait for the device to offer a connection; it does so every 500 ms."""
 START_MODE = 0
-MOST_REFUSED = 3
-"""A pulse that comes while another is being given, since a line held both back, is refused as busy; so many in a row
-are a fault."""
 
 
 class Settings(DeviceSettings):
@@ -62,7 +59,6 @@ class RehaStim2:
             parity=serial.PARITY_EVEN,
         )
         self._armed = False
-        self._refused_in_a_row = 0
         self._offers = threading.Condition()
         self._offer: Packet | None = None
         self._on_ack: Callable[[Ack], None] = lambda _: None
@@ -107,6 +103,7 @@ class RehaStim2:
 
     def stop(self) -> None:
         self._armed = False
+        self._line.discard()
         result = wire.result_of(self._ask(Command.STOP).data)
         if result != 0:
             raise DeviceError(f"stimulator {self._settings.port}: stop: {wire.result_text(result)}")
@@ -153,9 +150,7 @@ class RehaStim2:
     def _take(self, packet: Packet, time_s: float) -> None:
         if packet.command == Command.SINGLE_PULSE + 1:
             result = wire.result_of(packet.data)
-            self._refused_in_a_row = self._refused_in_a_row + 1 if result == wire.BUSY else 0
-            fatal = result != wire.BUSY or self._refused_in_a_row >= MOST_REFUSED
-            self._on_ack(Ack(packet.number, time_s, wire.result_text(result) if result else None, fatal))
+            self._on_ack(Ack(packet.number, time_s, wire.result_text(result) if result else None))
         elif packet.command == Command.STIMULATION_ERROR:
             error = wire.result_of(packet.data)
             self._on_ack(Ack(-1, time_s, wire.ERRORS.get(error, f"stimulation error {error}")))

@@ -1,7 +1,8 @@
 """The library of stimulation sequences: one file each, found by looking into this folder.
 
-A sequence is a module with `Settings` (a pydantic model, units in the names) and
-`pulse_widths(settings, pulse_rate_hz) -> ndarray`, a pure function giving one pulse width in µs for each pulse.
+A sequence is a module with `Settings` (a pydantic model, units in the names), `pulse_count(settings, pulse_rate_hz)`,
+how many pulses it has (0 µs ones included) by arithmetic alone, so that a length is refused before anything is built,
+and `pulse_widths(settings, pulse_rate_hz) -> ndarray`, a pure function giving one width in µs for each pulse.
 The module's name is the sequence's id. Adding one is adding a file. A sequence that jumps between levels by design
 says so: `JUMPS = True` in the module, or a setting `jumps` where the caller decides.
 """
@@ -23,15 +24,21 @@ Floats = NDArray[np.float64] | list[float]
 
 
 class SequenceSettings(BaseModel):
-    """Base of every sequence's settings: unknown names are refused, and so are NaN and infinities."""
+    """Base of every sequence's settings: unknown names are refused, and so are NaN, infinities, and what is no number.
 
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+    Strict: `true` is no duration and `"5"` no width.
+    """
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, strict=True)
 
 
 class Sequence(Protocol):
     """What a module in this folder offers."""
 
     Settings: type[SequenceSettings]
+
+    @staticmethod
+    def pulse_count(settings: Any, pulse_rate_hz: float) -> int: ...
 
     @staticmethod
     def pulse_widths(settings: Any, pulse_rate_hz: float) -> NDArray[np.float64]: ...
@@ -89,6 +96,11 @@ def jumps(sequence_id: str, settings: dict[str, Any]) -> bool:
     """May the width rise in one pulse to any level that is allowed?"""
     checked = settings_of(sequence_id, settings)
     return bool(getattr(find(sequence_id), "JUMPS", False) or getattr(checked, "jumps", False))
+
+
+def pulse_count(sequence_id: str, settings: dict[str, Any], pulse_rate_hz: float) -> int:
+    """How many pulses `build` would give, without building them."""
+    return find(sequence_id).pulse_count(settings_of(sequence_id, settings), pulse_rate_hz)
 
 
 def pulses_in(duration_s: float, pulse_rate_hz: float) -> int:

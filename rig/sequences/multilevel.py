@@ -19,8 +19,8 @@ class Settings(SequenceSettings):
     max_pulse_width_us: float = Field(300.0, description="highest level c, µs")
     min_pulse_width_us: float = Field(0.0, ge=0, description="lowest level that is not zero, µs")
     duration_s: float = Field(7.0, gt=0, le=600)
-    min_hold_s: float = Field(0.3, gt=0)
-    max_hold_s: float = Field(1.0, gt=0)
+    min_hold_s: float = Field(0.3, gt=0, le=600)
+    max_hold_s: float = Field(1.0, gt=0, le=600)
     zero_share: float = Field(0.15, ge=0, lt=1, description="share of the levels that are zero")
     seed: int = Field(20, ge=0)
 
@@ -31,6 +31,11 @@ class Settings(SequenceSettings):
         return self
 
 
+def pulse_count(settings: Settings, pulse_rate_hz: float) -> int:
+    """Pulses, those of width 0 included."""
+    return pulses_in(settings.duration_s, pulse_rate_hz)
+
+
 def pulse_widths(settings: Settings, pulse_rate_hz: float) -> NDArray[np.float64]:
     """Widths in µs, shape (duration × rate,)."""
     rng = np.random.default_rng(settings.seed)
@@ -38,8 +43,10 @@ def pulse_widths(settings: Settings, pulse_rate_hz: float) -> NDArray[np.float64
     shortest = max(1, pulses_in(settings.min_hold_s, pulse_rate_hz))
     longest = max(shortest, pulses_in(settings.max_hold_s, pulse_rate_hz))
     holds: list[int] = []
-    while sum(holds) < total:
+    held = 0
+    while held < total:
         holds.append(int(rng.integers(shortest, longest + 1)))
+        held += holds[-1]
     n_zero = round(settings.zero_share * len(holds))
     n_levels = len(holds) - n_zero
     bands = (rng.permutation(n_levels) + rng.random(n_levels)) / max(n_levels, 1)

@@ -51,6 +51,12 @@ def shift_register(bits: int, chips: int, seed: int = 1) -> NDArray[np.uint8]:
     return out
 
 
+def pulse_count(settings: Settings, pulse_rate_hz: float) -> int:
+    """Pulses, those of width 0 included."""
+    del pulse_rate_hz
+    return (settings.chips or 2**settings.bits - 1) * settings.clock_pulses
+
+
 def pulse_widths(settings: Settings, pulse_rate_hz: float) -> NDArray[np.float64]:
     """0 or c in µs, shape (chips × clock_pulses,); the clock is in pulses, so the rate sets only its seconds."""
     del pulse_rate_hz

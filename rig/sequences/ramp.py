@@ -15,6 +15,11 @@ class Settings(SequenceSettings):
     down_s: float = Field(5.0, gt=0, le=120)
 
 
+def pulse_count(settings: Settings, pulse_rate_hz: float) -> int:
+    """Pulses, those of width 0 included."""
+    return pulses_in(settings.up_s, pulse_rate_hz) + pulses_in(settings.down_s, pulse_rate_hz)
+
+
 def pulse_widths(settings: Settings, pulse_rate_hz: float) -> NDArray[np.float64]:
     """Widths in µs, shape ((up + down) × rate,); the top is reached with the last pulse of the rise."""
     up = pulses_in(settings.up_s, pulse_rate_hz)

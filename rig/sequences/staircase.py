@@ -18,6 +18,12 @@ class Settings(SequenceSettings):
     down: bool = Field(True, description="come down by the same steps")
 
 
+def pulse_count(settings: Settings, pulse_rate_hz: float) -> int:
+    """Pulses, those of width 0 included."""
+    steps = 2 * settings.levels if settings.down else settings.levels
+    return steps * pulses_in(settings.hold_s, pulse_rate_hz)
+
+
 def pulse_widths(settings: Settings, pulse_rate_hz: float) -> NDArray[np.float64]:
     """Widths in µs, shape (steps × hold × rate,)."""
     up = np.arange(1, settings.levels + 1) / settings.levels

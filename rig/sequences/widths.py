@@ -8,10 +8,19 @@ from pydantic import Field
 
 from rig.sequences import SequenceSettings
 
+LONGEST = 18_000
+"""Pulses of the longest test (300 s) at the highest rate (60 Hz): `rig.limits` admits no more."""
+
 
 class Settings(SequenceSettings):
-    pulse_width_us: list[float] = Field(min_length=1, max_length=100_000, description="µs, one for each pulse")
+    pulse_width_us: list[float] = Field(min_length=1, max_length=LONGEST, description="µs, one for each pulse")
     jumps: bool = Field(False, description="the list jumps between levels on purpose, as a PRBS does")
+
+
+def pulse_count(settings: Settings, pulse_rate_hz: float) -> int:
+    """Pulses, those of width 0 included."""
+    del pulse_rate_hz
+    return len(settings.pulse_width_us)
 
 
 def pulse_widths(settings: Settings, pulse_rate_hz: float) -> NDArray[np.float64]:

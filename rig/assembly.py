@@ -1,0 +1,335 @@
+"""Journal -> recording: what happened, as arrays; and where the journal is damaged, what can still be told.
+
+Header and plan lie in a journal twice. Where both copies of one are damaged, the blocks tell the rest: each pulse has
+an intent with its width and current, then what was written and what was acknowledged. What had to be inferred, and what
+may be missing, is said in `journal_note`; nothing that may have been felt is left out without a word.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import struct
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig import align, journal
+from rig.clock import utc_text
+from rig.errors import RecordingError
+from rig.journal import JournalContents, Kind
+from rig.signals import SAMPLE, PulseStatus
+
+FORMAT = "stimrig-recording"
+FORMAT_VERSION = 1
+EVIDENCE = (Kind.START, Kind.INTENT, Kind.WRITTEN, Kind.SKIPPED, Kind.ACKED, Kind.TORQUE)
+"""What shows that the test had begun."""
+LIKELY_RATE_HZ = 40.0
+"""Where neither header nor intents tell the pulse rate."""
+
+
+@dataclass(slots=True)
+class Recording:
+    """A test as arrays: `columns` by the paths of `COLUMNS`, `names` of the segments, attributes of the root."""
+
+    columns: dict[str, NDArray[Any]]
+    names: list[str]
+    attributes: dict[str, Any]
+    alignment: align.Alignment
+    events: list[dict[str, Any]] = field(default_factory=list)
+
+
+def assemble(contents: JournalContents, outcome: str = "fault", reason: str = "") -> Recording:
+    """A recording from a journal, whole, half-written or damaged.
+
+    Parameters
+    ----------
+    contents
+        What `journal.read` could read.
+    outcome, reason
+        Used where the journal does not say how the test ended.
+
+    Raises
+    ------
+    RecordingError
+        There is nothing to seal, or what there is cannot be understood.
+    """
+    try:
+        return _assembled(contents, outcome, reason)
+    except (KeyError, IndexError, TypeError, ValueError, struct.error) as error:
+        raise RecordingError(f"journal {contents.path}: cannot be understood ({error!r}); it is kept") from None
+
+
+def _assembled(contents: JournalContents, outcome: str, reason: str) -> Recording:
+    _refuse_nothing(contents)
+    notes = _damage(contents)
+    header = contents.first_json(Kind.HEADER) or _header_of_blocks(contents, notes)
+    planned = next((np.frombuffer(p, "<f8") for k, p in contents.blocks if k == Kind.PLAN), None)
+    if planned is None:
+        planned = _plan_of_intents(contents, notes)
+    rate_hz = float(header["plan"]["pulse_rate_hz"])
+    begun, t0_s, unix_s = _start(contents, header, rate_hz)
+    end = contents.first_json(Kind.END) or {"outcome": outcome, "reason": reason, "time_s": _last_time(contents)}
+    end_s = float(end["time_s"]) - t0_s
+    played_s = min(end_s, float(end.get("stimulation_end_s", end["time_s"])) - t0_s) if begun else 0.0
+    pulses = _Pulses(planned, float(header["current_ma"]), t0_s)
+    pulses.take(contents)
+    columns = pulses.columns(rate_hz, played_s, contents.blocks_missing > 0, notes)
+    written_s = columns["pulses/written_time_s"]
+    pulse_times = np.sort(written_s[np.isfinite(written_s)])
+    torque, alignment, measured_hz = _torque(contents, t0_s, end_s, pulse_times, float(header["sample_rate_hz"]))
+    columns.update(torque)
+    names = [s["name"] for s in header["segments"] if s["start"] / rate_hz < played_s]
+    columns["segments/start_s"] = np.array([s["start"] / rate_hz for s in header["segments"][: len(names)]])
+    ends = np.array([s["end"] / rate_hz for s in header["segments"][: len(names)]])
+    columns["segments/end_s"] = np.minimum(ends, max(played_s, 0.0))
+    attributes = {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "recording_id": header["recording_id"],
+        "test_id": header["plan"]["test_id"],
+        "participant": header["plan"]["participant"],
+        "kind": header["plan"]["kind"],
+        "created_utc": utc_text(unix_s),
+        "outcome": end["outcome"],
+        "reason": end["reason"],
+        "software": header["software"],
+        "configuration": json.dumps({"rig": header["configuration"], "plan": header["plan"]}),
+        "pulse_rate_hz": rate_hz,
+        "sample_rate_hz": float(header["sample_rate_hz"]),
+        "sample_rate_measured_hz": measured_hz,
+        "current_ma": float(header["current_ma"]),
+        "journal_damaged_bytes": contents.damaged_bytes,
+        "journal_blocks_missing": contents.blocks_missing,
+        "journal_note": "; ".join(notes),
+    }
+    events = [json.loads(payload) for kind, payload in contents.blocks if kind == Kind.EVENT]
+    return Recording(columns, names, attributes, alignment, events)
+
+
+def _refuse_nothing(contents: JournalContents) -> None:
+    """Raises RecordingError where neither header and plan nor any block shows that something was played."""
+    kinds = {kind for kind, _ in contents.blocks}
+    if kinds & set(EVIDENCE) or kinds >= {Kind.HEADER, Kind.PLAN}:
+        return
+    if contents.damaged:
+        raise RecordingError(
+            f"journal {contents.path}: {contents.damaged_bytes} bytes cannot be read, and what is left tells of no "
+            "pulse and no torque; it is kept"
+        )
+    raise RecordingError(f"journal {contents.path}: ends before its plan, no pulse was sent; nothing to seal")
+
+
+def _damage(contents: JournalContents) -> list[str]:
+    if not contents.damaged:
+        return []
+    return [
+        f"the journal is damaged: {contents.damaged_bytes} bytes cannot be read and at least {contents.blocks_missing} "
+        "blocks are missing"
+    ]
+
+
+def _header_of_blocks(contents: JournalContents, notes: list[str]) -> dict[str, Any]:
+    """What the blocks tell where both copies of the header are damaged."""
+    intents = _intents(contents)
+    rate_hz = LIKELY_RATE_HZ
+    if len(intents) > 1 and intents[-1][0] > intents[0][0]:
+        rate_hz = round((intents[-1][0] - intents[0][0]) / (intents[-1][2] - intents[0][2]), 6)
+    else:
+        notes.append(f"the pulse rate is not known, {rate_hz:g} pulses/s were assumed")
+    notes.append(
+        "both copies of the header are lost: participant, limits, segments and devices are not known, and neither is "
+        "when the test was, if its start is lost, too"
+    )
+    plan = {
+        "test_id": contents.path.stem,
+        "participant": "unknown",
+        "kind": "recovered",
+        "pulse_rate_hz": rate_hz,
+    }
+    return {
+        "recording_id": hashlib.sha256(b"".join(payload for _, payload in contents.blocks)).hexdigest()[:32],
+        "plan": plan,
+        "segments": [],
+        "current_ma": max((intent[4] for intent in intents), default=0.0),
+        "sample_rate_hz": _sample_rate(contents),
+        "software": "unknown",
+        "configuration": {},
+        "time_s": _first_time(contents),
+        "unix_s": contents.path.stat().st_mtime if contents.path.exists() else 0.0,
+    }
+
+
+def _plan_of_intents(contents: JournalContents, notes: list[str]) -> NDArray[np.float64]:
+    """The widths that were sent, where both copies of the plan are damaged."""
+    known = [journal.SKIPPED.unpack(p)[0] for k, p in contents.blocks if k in (Kind.WRITTEN, Kind.SKIPPED)]
+    known += [journal.ACKED.unpack_from(p)[0] for k, p in contents.blocks if k == Kind.ACKED]
+    intents = _intents(contents)
+    known += [intent[0] for intent in intents]
+    notes.append("both copies of the plan are lost: planned widths are those that were sent")
+    planned = np.zeros(max(known, default=-1) + 1)
+    for index, _, _, width_us, _ in intents:
+        planned[index] = width_us
+    return planned
+
+
+def _intents(contents: JournalContents) -> list[tuple[int, float, float, float, float]]:
+    """Index, time, due time, width and current of each pulse that was about to be sent."""
+    return [journal.INTENT.unpack(payload) for kind, payload in contents.blocks if kind == Kind.INTENT]
+
+
+def _start(contents: JournalContents, header: dict[str, Any], rate_hz: float) -> tuple[bool, float, float]:
+    """Had it begun; zero of the test's clock on the rig's, s; the same moment by the wall clock."""
+    started = contents.first_json(Kind.START)
+    if started is not None:
+        return True, float(started["t0_s"]), float(started["unix_s"])
+    intents = _intents(contents)
+    t0_s = float(header["time_s"])
+    if intents:
+        t0_s = float(np.median([due_s - index / rate_hz for index, _, due_s, _, _ in intents]))
+    return bool(intents), t0_s, float(header["unix_s"]) + t0_s - float(header["time_s"])
+
+
+def _sample_rate(contents: JournalContents) -> float:
+    """Torque samples a second, as they came."""
+    blocks = [np.frombuffer(p, SAMPLE) for k, p in contents.blocks if k == Kind.TORQUE and len(p)]
+    if len(blocks) < 2:
+        return 1.0
+    first, last = blocks[0][0], blocks[-1][-1]
+    counted = int(last["counter"] - first["counter"]) if first["counter"] >= 0 else sum(map(len, blocks)) - 1
+    return round(counted / max(float(last["host_time_s"] - first["host_time_s"]), 1e-9), 3) or 1.0
+
+
+def _first_time(contents: JournalContents) -> float:
+    times = [intent[1] for intent in _intents(contents)[:1]]
+    times += [float(np.frombuffer(p, SAMPLE)["host_time_s"][0]) for k, p in contents.blocks if k == Kind.TORQUE][:1]
+    return min(times, default=0.0)
+
+
+def _last_time(contents: JournalContents) -> float:
+    """The newest time in a journal without an end."""
+    newest = -np.inf
+    for kind, payload in contents.blocks:
+        if kind == Kind.TORQUE and len(payload) >= SAMPLE.itemsize:
+            newest = max(newest, float(np.frombuffer(payload, SAMPLE)["host_time_s"][-1]))
+        elif kind == Kind.WRITTEN:
+            newest = max(newest, journal.WRITTEN.unpack(payload)[2])
+        elif kind in (Kind.HEADER, Kind.START):
+            content = json.loads(payload)
+            newest = max(newest, content.get("time_s", content.get("t0_s", newest)))
+    return newest if np.isfinite(newest) else 0.0
+
+
+class _Pulses:
+    """What became of each planned pulse."""
+
+    def __init__(self, planned: NDArray[Any], current_ma: float, t0_s: float) -> None:
+        n = len(planned)
+        self._planned, self._current_ma, self._t0_s = planned, current_ma, t0_s
+        self._sent_us, self._current = np.full(n, np.nan), np.zeros(n)
+        self._written_s, self._acked_s = np.full(n, np.nan), np.full(n, np.nan)
+        self._status = np.where(planned == 0, PulseStatus.REST, PulseStatus.DROPPED).astype(np.uint8)
+        self._intended, self._told = np.zeros(n, bool), np.zeros(n, bool)
+
+    def take(self, contents: JournalContents) -> None:
+        """Every block, in order."""
+        for kind, payload in contents.blocks:
+            if kind not in (Kind.INTENT, Kind.WRITTEN, Kind.SKIPPED, Kind.ACKED):
+                continue
+            i = struct.unpack_from("<i", payload)[0]
+            if not (0 <= i < len(self._planned)):
+                continue
+            self._told[i] = True
+            if kind == Kind.INTENT:
+                _, _, _, self._sent_us[i], self._current[i] = journal.INTENT.unpack(payload)
+                self._intended[i], self._status[i] = True, PulseStatus.UNACKNOWLEDGED
+            elif kind == Kind.WRITTEN:
+                self._written_s[i] = journal.WRITTEN.unpack(payload)[2] - self._t0_s
+            elif kind == Kind.SKIPPED:
+                self._sent_us[i], self._current[i], self._status[i] = np.nan, 0.0, journal.SKIPPED.unpack(payload)[1]
+            else:
+                self._acked_s[i] = journal.ACKED.unpack_from(payload)[1] - self._t0_s
+                failed = len(payload) > journal.ACKED.size
+                self._status[i] = PulseStatus.DEVICE_ERROR if failed else PulseStatus.ACKNOWLEDGED
+
+    def columns(
+        self, rate_hz: float, played_s: float, blocks_missing: bool, notes: list[str]
+    ) -> dict[str, NDArray[Any]]:
+        """The datasets of `/pulses`, as far as the test went."""
+        n = len(self._planned)
+        reached = int(np.clip(np.ceil(played_s * rate_hz - 1e-6), 0, n))
+        self._without_intent(notes)
+        if blocks_missing:
+            self._without_trace(reached, notes)
+        tried = np.flatnonzero((self._current > 0) | np.isfinite(self._written_s))
+        reached = max(reached, int(tried[-1]) + 1 if len(tried) else 0)
+        # the sender may lose the processor between its write and its look at the clock; the ack came after the write
+        acked_s = np.where(np.isfinite(self._written_s), self._acked_s, np.nan)
+        self._sent_us[self._status == PulseStatus.REST] = 0.0
+        found: dict[str, NDArray[Any]] = {
+            "pulses/planned_time_s": np.arange(n) / rate_hz,
+            "pulses/pulse_width_us": self._planned.astype(np.float64),
+            "pulses/sent_pulse_width_us": self._sent_us,
+            "pulses/current_ma": self._current,
+            "pulses/written_time_s": np.fmin(self._written_s, acked_s),
+            "pulses/acknowledged_time_s": self._acked_s,
+            "pulses/status": self._status,
+        }
+        return {path: column[:reached] for path, column in found.items()}
+
+    def _without_intent(self, notes: list[str]) -> None:
+        """Written or acknowledged, so it was sent: as planned, where its intent is lost."""
+        sent = ~self._intended & (np.isfinite(self._written_s) | np.isfinite(self._acked_s))
+        if not sent.any():
+            return
+        silent = sent & ~np.isfinite(self._acked_s)
+        self._status[silent] = PulseStatus.UNACKNOWLEDGED
+        self._as_planned(sent)
+        notes.append(f"{int(sent.sum())} pulses were sent whose intents are lost: they stand as they were planned")
+        if unknown := int(np.sum(sent & (self._planned == 0))):
+            notes.append(f"of {unknown} of them the width is not known")
+
+    def _without_trace(self, reached: int, notes: list[str]) -> None:
+        """Planned, and no block tells what became of it: it may have been felt, so it counts as unacknowledged."""
+        lost = ~self._told & (self._planned > 0)
+        lost[reached:] = False
+        if not lost.any():
+            return
+        self._status[lost] = PulseStatus.UNACKNOWLEDGED
+        self._as_planned(lost)
+        notes.append(
+            f"{int(lost.sum())} planned pulses left no trace: they may have been felt and stand as unacknowledged"
+        )
+
+    def _as_planned(self, which: NDArray[np.bool_]) -> None:
+        known = which & (self._planned > 0)
+        self._sent_us[known] = np.floor(self._planned[known])
+        self._current[known] = self._current_ma
+
+
+def _torque(
+    contents: JournalContents, t0_s: float, end_s: float, written_s: NDArray[np.float64], sample_rate_hz: float
+) -> tuple[dict[str, NDArray[Any]], align.Alignment, float]:
+    blocks = [np.frombuffer(p, SAMPLE) for k, p in contents.blocks if k == Kind.TORQUE]
+    samples = np.concatenate(blocks) if blocks else np.empty(0, SAMPLE)
+    counter = samples["counter"].astype(np.int64)
+    host_s = samples["host_time_s"] - t0_s
+    cell_s = align.cell_time(counter, samples["stamp_s"], sample_rate_hz)
+    time_s, alignment = align.align(cell_s, host_s, samples["sync"], written_s, sample_rate_hz)
+    inside = np.flatnonzero((time_s >= 0) & (time_s < end_s))
+    steps = np.diff(counter)
+    after = np.flatnonzero((steps > 1) & (counter[:-1] >= 0)) + 1
+    after = after[np.isin(after, inside) & np.isin(after - 1, inside)]
+    gaps = np.column_stack([np.searchsorted(inside, after), steps[after - 1] - 1])
+    measured_hz = sample_rate_hz / (1 + alignment.rate_ppm * 1e-6)
+    columns: dict[str, NDArray[Any]] = {
+        "torque/time_s": time_s[inside],
+        "torque/torque_nm": samples["torque_nm"][inside],
+        "torque/counter": counter[inside],
+        "torque/host_time_s": host_s[inside],
+        "torque/sync": samples["sync"][inside],
+        "torque/gaps": gaps.astype(np.int64).reshape(-1, 2),
+    }
+    return columns, alignment, measured_hz

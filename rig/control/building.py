@@ -1,0 +1,49 @@
+"""What the builder of previews does, in its own process (see `rig.builder`)."""
+
+from __future__ import annotations
+
+import json
+import time
+from typing import BinaryIO
+
+from pydantic import ValidationError
+
+from rig import limits, plan
+from rig.control.calibration import check_profile
+from rig.control.replies import id_of, refusal, to_line, unforeseen, wrong
+from rig.errors import RigError
+from rig.limits import Limit
+from rig.messages import Preview, PreviewRequest, Reply
+
+
+def previewed(request: PreviewRequest, table: dict[str, Limit], unix_s: float, speed: float = 1.0) -> Preview:
+    """Duration, dose and pulses of a plan. Raises PlanError, RefusedError."""
+    test = plan.build(request.plan, limits.for_plan(table, request.plan))
+    check_profile(request.plan.profile, unix_s, required=False, duration_s=test.duration_s / speed)
+    return plan.preview(test, request.recruitment)
+
+
+def answer(line: bytes, table: dict[str, Limit], unix_s: float, speed: float) -> Reply:
+    """The reply to one request."""
+    try:
+        request = PreviewRequest.model_validate_json(line)
+        body = previewed(request, table, unix_s, speed).model_dump(mode="json")
+        return Reply(id=request.id, ok=True, body=body)
+    except ValidationError as error:
+        return wrong(id_of(line), error)
+    except RigError as error:
+        return refusal(id_of(line), error)
+    except Exception as error:
+        return unforeseen(id_of(line), error)
+
+
+def serve(requests: BinaryIO, replies: BinaryIO) -> None:
+    """The rig's limits in the first line, then a request a line, until there are no more."""
+    first = requests.readline()
+    if not first:
+        return
+    settings = json.loads(first)
+    table = {name: Limit(**row) for name, row in settings["table"].items()}
+    for line in requests:
+        replies.write(to_line(answer(line, table, time.time(), settings["speed"])))
+        replies.flush()

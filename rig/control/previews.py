@@ -1,0 +1,104 @@
+"""Previews are built in another process: `rig.builder`, one at a time, with a bound on its memory and its time.
+
+Whatever a plan asks for, it can cost the rig neither memory nor the processor that its sender needs. Those that would
+have to wait for too long are refused at once.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import logging
+import os
+import sys
+from dataclasses import asdict
+
+from rig.errors import BusyError, PlanError
+from rig.limits import Limit
+
+log = logging.getLogger("rig.previews")
+
+MOST_WAITING = 8
+LONGEST_S = 30.0
+"""Real seconds that one may take: the longest test takes a tenth of a second of a processor that others may have."""
+LONGEST_REPLY = 8_000_000
+
+
+class Previews:
+    """Asks the builder, and begins it anew when it has died or taken too long.
+
+    Parameters
+    ----------
+    table
+        The rig's limits, hard ones narrowed by the rig file.
+    speed
+        Of the rig's clock.
+    """
+
+    def __init__(self, table: dict[str, Limit], speed: float) -> None:
+        rows = {name: asdict(row) for name, row in table.items()}
+        self._settings = json.dumps({"table": rows, "speed": speed}).encode() + b"\n"
+        self._one = asyncio.Lock()
+        self._waiting = 0
+        self._process: asyncio.subprocess.Process | None = None
+
+    async def warm(self) -> None:
+        """Begin the builder, so that the first preview need not wait for it."""
+        async with self._one:
+            await self._begin()
+
+    async def reply(self, line: bytes) -> bytes:
+        """The reply to a preview's request, both a line of JSON.
+
+        Raises
+        ------
+        BusyError
+            Too many wait already.
+        PlanError
+            It took too long, or too much memory.
+        """
+        if self._waiting >= MOST_WAITING:
+            raise BusyError(f"previews: {self._waiting} wait already; ask again in a moment")
+        self._waiting += 1
+        try:
+            async with self._one:
+                return await asyncio.wait_for(self._ask(line), LONGEST_S)
+        except TimeoutError:
+            await self.close()
+            raise BusyError(f"preview: not built within {LONGEST_S:g} s, the computer is too busy; ask again") from None
+        except (OSError, ValueError):
+            await self.close()
+            raise PlanError("preview: could not be built; make the plan smaller") from None
+        finally:
+            self._waiting -= 1
+
+    async def close(self) -> None:
+        """End the builder."""
+        process, self._process = self._process, None
+        if process is not None:
+            with contextlib.suppress(ProcessLookupError):
+                process.kill()
+            await process.wait()
+
+    async def _begin(self) -> asyncio.subprocess.Process:
+        if self._process is None or self._process.returncode is not None:
+            self._process = await asyncio.create_subprocess_exec(
+                sys.executable, "-m", "rig.builder",
+                stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, limit=LONGEST_REPLY,
+                env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
+            )  # fmt: skip
+            assert self._process.stdin is not None
+            self._process.stdin.write(self._settings)
+        return self._process
+
+    async def _ask(self, line: bytes) -> bytes:
+        process = await self._begin()
+        assert process.stdin is not None
+        assert process.stdout is not None
+        process.stdin.write(line.rstrip(b"\n") + b"\n")
+        await process.stdin.drain()
+        reply = await process.stdout.readline()
+        if not reply.endswith(b"\n"):
+            raise ConnectionError("the builder of previews has died")
+        return reply

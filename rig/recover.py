@@ -1,0 +1,112 @@
+"""`python -m rig.recover JOURNAL`: seal a journal by hand, whole, half-written or damaged.
+
+The journal is only read and stays where it is. What could not be read, and what had to be inferred, is said in words
+and in the recording's attribute `journal_note`. Exit 2: there is nothing to seal, or a living rig still writes it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import fcntl
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rig import archive, assembly, journal
+from rig.errors import BusyError, RecordingError, RigError
+
+UNKNOWN_END = "recovered by hand; how the test ended is not written in its journal"
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Recover one journal; the exit code."""
+    parser = argparse.ArgumentParser(prog="python -m rig.recover", description="Seal a journal by hand.")
+    parser.add_argument("journal", type=Path, metavar="JOURNAL")
+    parser.add_argument("-o", "--output", type=Path, metavar="FOLDER", help="default: recordings/ of its data folder")
+    parser.add_argument("--json", action="store_true", help="one JSON object on standard output")
+    options = parser.parse_args(arguments)
+    try:
+        with _nobody_writes(options.journal):
+            found = recover(options.journal, options.output or _folder_of(options.journal))
+    except RigError as error:
+        print(f"recover: {error}", file=sys.stderr)
+        return 2
+    print(json.dumps(found, ensure_ascii=False) if options.json else _words(found))
+    return 0
+
+
+def recover(path: Path, folder: Path) -> dict[str, Any]:
+    """Seal what the journal holds into the folder, and say what that is.
+
+    Raises
+    ------
+    RecordingError
+        Not a journal, nothing to seal, the disk refuses, or another recording has its place.
+    """
+    if not folder.is_dir():
+        raise RecordingError(f"{folder}: no such folder; make it, or give another with -o")
+    recording = assembly.assemble(journal.read(path), "fault", UNKNOWN_END)
+    target = archive.place(recording, folder)
+    known = target.exists() and archive.verify(target) == archive.content_sha256(recording.columns)
+    if target.exists() and not known:
+        raise RecordingError(f"{target}: another recording of this test is there; give another folder with -o")
+    if not known:
+        archive.seal(recording, folder)
+    columns, attributes = recording.columns, recording.attributes
+    felt = np.isin(columns["pulses/status"], (0, 4, 5))
+    return {
+        "recording": str(target),
+        "was_there": known,
+        **{name: attributes[name] for name in ("recording_id", "test_id", "participant", "outcome", "reason")},
+        "pulses": int(np.sum(felt)),
+        "unacknowledged": int(np.sum(columns["pulses/status"] == 4)),
+        "samples": len(columns["torque/time_s"]),
+        "damaged_bytes": attributes["journal_damaged_bytes"],
+        "blocks_missing": attributes["journal_blocks_missing"],
+        "note": attributes["journal_note"],
+    }
+
+
+@contextlib.contextmanager
+def _nobody_writes(path: Path) -> Iterator[None]:
+    """Hold the journal, and its data folder where the rig would seal it at its next start. Raises BusyError."""
+    locks = [path]
+    if path.suffix == ".journal" and path.parent.name == "journals":
+        locks.append(path.parent.parent / "rig.lock")
+    with contextlib.ExitStack() as stack:
+        for lock in locks:
+            if not lock.is_file():
+                continue
+            try:
+                file = stack.enter_context(lock.open("rb"))
+                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise BusyError(
+                    f"journal {path}: a rig that is alive has it and seals it itself; stop that rig first"
+                ) from None
+            except OSError as error:
+                raise RecordingError(f"{lock}: {error.strerror}") from None
+        yield
+
+
+def _folder_of(path: Path) -> Path:
+    recordings = path.parent.parent / "recordings"
+    return recordings if path.parent.name == "journals" and recordings.is_dir() else path.parent
+
+
+def _words(found: dict[str, Any]) -> str:
+    lines = [
+        f"{'was sealed already' if found['was_there'] else 'sealed'}: {found['recording']}",
+        f"test {found['test_id']} of participant {found['participant']}, {found['outcome']}: {found['reason'] or '-'}",
+        f"{found['pulses']} pulses ({found['unacknowledged']} not acknowledged), {found['samples']} torque samples",
+    ]
+    return "\n".join([*lines, *([f"note: {found['note']}"] if found["note"] else [])])
+
+
+if __name__ == "__main__":
+    sys.exit(main())
