@@ -1,15 +1,22 @@
-"""A record from a CSV file: fast where it is sound, exact about line and column where it is not."""
+"""A record from a CSV file: fast where it is sound, exact about line and column where it is not.
+
+It is read in blocks of rows, so that memory follows the numbers it holds and not what else is in the file.
+"""
 
 from __future__ import annotations
 
 import csv
 import hashlib
 import io
-from itertools import pairwise
+from array import array
+from collections.abc import Iterator, Sequence
+from itertools import islice, pairwise
 from pathlib import Path
 
 import numpy as np
 
+from identify import bounds
+from identify.bounds import LARGEST
 from identify.errors import BadRecord
 from identify.record import Record, Source
 
@@ -17,47 +24,38 @@ REQUIRED = ("time_s", "pulse_width_us", "torque_nm", "segment")
 OPTIONAL = ("angle_rad", "velocity_rad_s")
 PAUSE_S = 1.0
 """A jump of the clock as long as this, at zero pulse width, is a pause between two tests."""
+MOST_PAUSES = 1000
 HEADER = ",".join(REQUIRED)
-LOWEST_HZ, HIGHEST_HZ = 39.0, 2100.0
-LARGEST = {"time_s": 1e7, "pulse_width_us": 1e4, "torque_nm": 1e6, "angle_rad": 1e3, "velocity_rad_s": 1e5}
+BLOCK = 4096
+LONGEST_LINE = 10_000
+"""Characters; no row of numbers has as many."""
+CUT = "Every row needs every column; was the file cut off?"
 
 
-def read_csv(path: Path, pulse_rate_hz: float = 40.0) -> Record:
-    """Read a CSV record.
+def read_csv(content: bytes, path: Path, pulse_rate_hz: float = 40.0) -> Record:
+    """A CSV record from its bytes; `path` is how it is called.
 
     Raises
     ------
     BadRecord
         With file, line and column, and the mend.
     """
-    content = path.read_bytes()
     name = str(path)
+    table = _Table(name)
+    reader = csv.reader(_text_lines(content, name))
     try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = content.count(b"\n", 0, error.start) + 1
-        raise BadRecord("not UTF-8 text", place=f"{name}, line {line}", mend="Save the file as UTF-8 CSV.") from error
-    try:
-        rows = list(csv.reader(io.StringIO(text, newline="")))
+        table.fill(reader)
+    except UnicodeDecodeError:
+        place = f"{name}, line {_undecodable(content)}"
+        raise BadRecord("not UTF-8 text", place=place, mend="Save the file as UTF-8 CSV.") from None
     except csv.Error as error:
-        raise BadRecord(f"not CSV ({error})", place=name, mend="Save the file as comma-separated text.") from error
-    place = _header(rows, name)
-    lines = _lines(rows)
-    body = [rows[line - 1] for line in lines]
-    if not body:
+        place = f"{name}, line {reader.line_num}"
+        raise BadRecord(f"not CSV ({error})", place=place, mend="Save the file as comma-separated text.") from error
+    columns, lines = {column: np.array(values) for column, values in table.numbers.items()}, table.lines
+    if not lines:
         raise BadRecord("no row under the header", place=f"{name}, line 2", mend="Give a few seconds of data.")
-    columns = {column: _numbers(body, at, column, lines, name) for column, at in place.items() if column != "segment"}
-    try:
-        segment = np.array([row[place["segment"]].strip() for row in body])
-    except IndexError:
-        raise _short_row(body, place["segment"], "segment", lines, name) from None
-    if (empty := np.flatnonzero(segment == "")).size:
-        raise BadRecord(
-            "empty",
-            place=f"{name}, line {lines[empty[0]]}, column segment",
-            mend="Name it: rest, prbs, ramp, validate…",
-        )
     time_s = _even_parts(columns["time_s"], columns["pulse_width_us"], lines, name)
+    bounds.check_span(time_s, f"{name}, line {lines[-1]}, column time_s")
     if (negative := np.flatnonzero(columns["pulse_width_us"] < 0)).size:
         raise BadRecord(
             f"{columns['pulse_width_us'][negative[0]]:g} µs is negative",
@@ -68,7 +66,8 @@ def read_csv(path: Path, pulse_rate_hz: float = 40.0) -> Record:
         time_s,
         columns["pulse_width_us"],
         columns["torque_nm"],
-        segment,
+        np.array(table.segment),
+        segment_names=list(table.names),
         angle_rad=columns.get("angle_rad"),
         velocity_rad_s=columns.get("velocity_rad_s"),
         pulse_rate_hz=pulse_rate_hz,
@@ -76,11 +75,109 @@ def read_csv(path: Path, pulse_rate_hz: float = 40.0) -> Record:
     )
 
 
-def _header(rows: list[list[str]], name: str) -> dict[str, int]:
+def _text_lines(content: bytes, name: str) -> Iterator[str]:
+    """The file's lines, none too long and not too many."""
+    file = io.TextIOWrapper(io.BytesIO(content), "utf-8-sig", newline="")
+    for number, line in enumerate(file, start=1):
+        if len(line) > LONGEST_LINE:
+            mend = "One row a line, separated by commas; is it text at all?"
+            raise BadRecord(f"more than {LONGEST_LINE} characters", place=f"{name}, line {number}", mend=mend)
+        if number > bounds.LARGEST_ROWS:
+            mend = "Cut the record, or resample it to a lower rate."
+            raise BadRecord(f"more than {bounds.LARGEST_ROWS} lines", place=f"{name}, line {number}", mend=mend)
+        yield line
+
+
+def _undecodable(content: bytes) -> int:
+    """The number of the first line that is no UTF-8."""
+    for number, line in enumerate(io.BytesIO(content), start=1):
+        try:
+            line.decode("utf-8")
+        except UnicodeDecodeError:
+            return number
+    return 1
+
+
+class _Table:
+    """What the rows hold: numbers by column, segments by name, and the line each row stands in."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.lines = array("L")
+        self.segment = array("L")
+        self.names: dict[str, int] = {}
+        self.numbers: dict[str, array[float]] = {}
+        self.place: dict[str, int] = {}
+
+    def fill(self, reader: Iterator[list[str]]) -> None:
+        """Take all rows in; blank lines are passed over."""
+        self.place = _header(next(reader, []), self.name)
+        self.numbers = {column: array("d") for column in self.place if column != "segment"}
+        rows = ((reader.line_num, row) for row in reader if row)  # pyright: ignore[reportAttributeAccessIssue]
+        while block := list(islice(rows, BLOCK)):
+            self._take([row for _, row in block], [line for line, _ in block])
+
+    def _take(self, rows: list[list[str]], lines: list[int]) -> None:
+        for column, values in self.numbers.items():
+            values.extend(self._column(rows, column, lines))
+        at = self.place["segment"]
+        for row, line in zip(rows, lines, strict=True):
+            if len(row) <= at:
+                raise self._short(row, line, "segment")
+            text = row[at].strip()
+            code = self.names.get(text)
+            self.segment.append(self._new_name(text, line) if code is None else code)
+        self.lines.extend(lines)
+
+    def _column(self, rows: list[list[str]], column: str, lines: list[int]) -> np.ndarray:
+        at = self.place[column]
+        try:
+            cells = [row[at] for row in rows]
+            values = np.array([float(cell) for cell in cells])
+        except (IndexError, ValueError):
+            raise self._first_bad(rows, column, lines) from None
+        # Python's float also takes digits of other scripts and underscores, which no measuring tool writes.
+        text = "".join(cells)
+        if not text.isascii() or "_" in text:
+            raise self._first_bad(rows, column, lines)
+        bad = np.flatnonzero(~(np.abs(values) <= LARGEST[column]))
+        if bad.size:
+            raise BadRecord(
+                f"{_short(rows[bad[0]][at].strip())} is no measurement",
+                place=self._at(lines[bad[0]], column),
+                mend="Remove the row's cause, or cut the record before it; values must be finite.",
+            )
+        return values
+
+    def _first_bad(self, rows: list[list[str]], column: str, lines: list[int]) -> BadRecord:
+        at = self.place[column]
+        for row, line in zip(rows, lines, strict=True):
+            if len(row) <= at:
+                return self._short(row, line, column)
+            if not _is_number(row[at]):
+                message = f"{_short(row[at])!r} is no number" if row[at].strip() else "empty"
+                return BadRecord(message, place=self._at(line, column), mend="Give a number with a decimal point.")
+        raise AssertionError("a row that could not be read can be read")
+
+    def _new_name(self, text: str, line: int) -> int:
+        bounds.check_name(text, self._at(line, "segment"))
+        if len(self.names) == bounds.MOST_SEGMENTS:
+            mend = "Name segments by what they are (rest, prbs…), not each row."
+            raise BadRecord(f"more than {bounds.MOST_SEGMENTS} names", place=self._at(line, "segment"), mend=mend)
+        return self.names.setdefault(text, len(self.names))
+
+    def _short(self, row: list[str], line: int, column: str) -> BadRecord:
+        return BadRecord(f"only {len(row)} cells", place=self._at(line, column), mend=CUT)
+
+    def _at(self, line: int, column: str) -> str:
+        return f"{self.name}, line {line}, column {column}"
+
+
+def _header(first: list[str], name: str) -> dict[str, int]:
     """Column of each known name."""
-    if not rows or not any(cell.strip() for cell in rows[0]):
+    if not any(cell.strip() for cell in first):
         raise BadRecord("empty", place=f"{name}, line 1", mend=f"The first line must be {HEADER}.")
-    header = [cell.strip() for cell in rows[0]]
+    header = [cell.strip() for cell in first]
     missing = [column for column in REQUIRED if column not in header]
     if missing:
         separator = next((mark for mark in ";\t" if len(header) == 1 and mark in header[0]), None)
@@ -92,55 +189,26 @@ def _header(rows: list[list[str]], name: str) -> dict[str, int]:
     return {column: header.index(column) for column in REQUIRED + OPTIONAL if column in header}
 
 
-def _lines(rows: list[list[str]]) -> list[int]:
-    """Line numbers of the rows that hold something (blank lines are passed over)."""
-    return [number for number, row in enumerate(rows[1:], start=2) if row]
-
-
-def _short_row(body: list[list[str]], at: int, column: str, lines: list[int], name: str) -> BadRecord:
-    index = next(i for i, row in enumerate(body) if len(row) <= at)
-    return BadRecord(
-        f"only {len(body[index])} cells",
-        place=f"{name}, line {lines[index]}, column {column}",
-        mend="Every row needs every column; was the file cut off?",
-    )
-
-
-def _numbers(body: list[list[str]], at: int, column: str, lines: list[int], name: str) -> np.ndarray:
-    try:
-        values = np.array([float(row[at]) for row in body])
-    except IndexError:
-        raise _short_row(body, at, column, lines, name) from None
-    except ValueError:
-        index, cell = next((i, row[at]) for i, row in enumerate(body) if len(row) > at and not _is_number(row[at]))
-        raise BadRecord(
-            f"{cell!r} is no number" if cell.strip() else "empty",
-            place=f"{name}, line {lines[index]}, column {column}",
-            mend="Give a number with a decimal point.",
-        ) from None
-    bad = np.flatnonzero(~(np.abs(values) <= LARGEST[column]))
-    if bad.size:
-        raise BadRecord(
-            f"{body[bad[0]][at].strip()} is no measurement",
-            place=f"{name}, line {lines[bad[0]]}, column {column}",
-            mend="Remove the row's cause, or cut the record before it; values must be finite.",
-        )
-    return values
-
-
 def _is_number(cell: str) -> bool:
     try:
         float(cell)
     except ValueError:
         return False
-    return True
+    return cell.isascii() and "_" not in cell
 
 
-def _even_parts(time_s: np.ndarray, width_us: np.ndarray, lines: list[int], name: str) -> np.ndarray:
+def _short(cell: str) -> str:
+    return cell if len(cell) <= 40 else f"{cell[:40]}…"
+
+
+def _even_parts(time_s: np.ndarray, width_us: np.ndarray, lines: Sequence[int], name: str) -> np.ndarray:
     """As `uniform_time`, each part by itself: tests of one session may follow one another after a pause at rest."""
     steps = np.diff(time_s)
     least_s = max(PAUSE_S, 20 * float(np.median(steps))) if steps.size else PAUSE_S
     jumps = np.flatnonzero((steps >= least_s) & (width_us[:-1] == 0) & (width_us[1:] == 0)) + 1
+    if jumps.size > MOST_PAUSES:
+        place = f"{name}, line {lines[jumps[MOST_PAUSES]]}, column time_s"
+        raise BadRecord(f"more than {MOST_PAUSES} pauses", place=place, mend="Give a record without holes.")
     edges = [0, *jumps.tolist(), time_s.size]
     parts = [uniform_time(time_s[a:b], lines[a:b], name) for a, b in pairwise(edges)]
     for part, edge in zip(parts, edges, strict=False):
@@ -154,7 +222,7 @@ def _even_parts(time_s: np.ndarray, width_us: np.ndarray, lines: list[int], name
     return np.concatenate(parts)
 
 
-def uniform_time(time_s: np.ndarray, lines: list[int], name: str) -> np.ndarray:
+def uniform_time(time_s: np.ndarray, lines: Sequence[int], name: str) -> np.ndarray:
     """Times freed of the rounding they were written with.
 
     Raises
@@ -192,6 +260,5 @@ def uniform_time(time_s: np.ndarray, lines: list[int], name: str) -> np.ndarray:
     far = np.flatnonzero(np.abs(time_s - line) > 0.75 * slope)
     if far.size:
         raise BadRecord("uneven sampling: the rate changes", place=at(int(far[0])), mend="Resample to one rate.")
-    if not LOWEST_HZ <= 1 / slope <= HIGHEST_HZ:
-        raise BadRecord(f"sampled at {1 / slope:.4g} Hz", place=at(0), mend="40 Hz to 2 kHz can be used.")
+    bounds.check_sampling(1 / slope, at(0))
     return line

@@ -8,14 +8,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from identify import model_shape
 from identify.errors import BadModel
 from identify.linear import Discrete, Linear, SecondOrder, linear_from_dict
 from identify.recruitment.curve import Curve, basis_from_dict
+from identify.strict_json import BadJson, parse
 
 if TYPE_CHECKING:
     from identify.record import Record
 
 SCHEMA_VERSION = "1.0"
+LARGEST_TEXT = 16 * 2**20
+"""A thousand knots and all effects together take two million characters."""
 SOFTWARE = {"name": "stimrig", "version": "0.1.0"}
 
 
@@ -189,19 +193,23 @@ class Model:
         """
         if not isinstance(data, dict):
             raise BadModel("a model is a JSON object", mend="Give a file written by `stimrig fit -o`.")
-        version = str(data.get("schema_version", ""))
+        version = str(data.get("schema_version", ""))[:20]
         if version.split(".")[0] != SCHEMA_VERSION.split(".")[0]:
             raise BadModel(
                 f"schema version {version or 'missing'}, this software reads {SCHEMA_VERSION}",
                 place="schema_version",
                 mend="Fit the record again with this version.",
             )
+        model_shape.MODEL(data, "")
         try:
-            return _from_dict(data)
-        except KeyError as error:
-            raise BadModel("key is missing", place=str(error.args[0]), mend="Fit the record again.") from error
-        except (TypeError, ValueError, IndexError, AttributeError) as error:
-            raise BadModel(f"malformed: {error}", mend="Fit the record again.") from error
+            model = _from_dict(data)
+            with np.errstate(all="ignore"):
+                table = model.recruitment.table()[1]
+        except (KeyError, TypeError, ValueError, IndexError, AttributeError, ArithmeticError) as error:
+            raise BadModel(f"its parts do not go together ({_line(error)})", mend=model_shape.MEND) from error
+        if not np.isfinite(table).all():
+            raise BadModel("a curve that is not finite", place="recruitment.basis", mend=model_shape.MEND)
+        return model
 
     @classmethod
     def from_json(cls, text: str | bytes) -> Model:
@@ -210,14 +218,14 @@ class Model:
         Raises
         ------
         BadModel
-            No JSON, or not a model.
+            No JSON, too long, too deep, a key that stands twice, a number that is none, or not a model.
         """
+        if len(text) > LARGEST_TEXT:
+            raise BadModel(f"more than {LARGEST_TEXT} characters", mend="Give a file written by `stimrig fit -o`.")
         try:
-            data = json.loads(text)
-        except ValueError as error:
-            line, column = getattr(error, "lineno", "?"), getattr(error, "colno", "?")
-            raise BadModel("not JSON", place=f"line {line}, column {column}", mend="Fit the record again.") from error
-        return cls.from_dict(data)
+            return cls.from_dict(parse(text))
+        except BadJson as error:
+            raise BadModel(str(error), mend=model_shape.MEND) from error
 
     def with_(self, **changes: Any) -> Model:
         """The model with some fields changed."""
@@ -232,7 +240,6 @@ def _from_dict(data: dict[str, Any]) -> Model:
         raise BadModel(
             f"{coefficients.size} coefficients for a basis of {basis.size}", place="recruitment.basis.coefficients_nm"
         )
-    covariance = uncertainty.get("covariance")
     return Model(
         method=str(data["method"]),
         recruitment=Curve(basis, coefficients),
@@ -243,11 +250,7 @@ def _from_dict(data: dict[str, Any]) -> Model:
         initial=(float(data.get("initial", (0, 0))[0]), float(data.get("initial", (0, 0))[1])),
         noise=Noise(**data.get("noise", {})),
         effects=tuple(data.get("effects", ())),
-        covariance=None
-        if not covariance
-        else Covariance(
-            tuple(covariance["names"]), np.asarray(covariance["values"], float), np.asarray(covariance["matrix"], float)
-        ),
+        covariance=_covariance(uncertainty.get("covariance")),
         fit=data.get("fit", {}),
         residual_tests=data.get("residual_tests", {}),
         valid_for=data.get("valid_for", {}),
@@ -260,6 +263,20 @@ def _from_dict(data: dict[str, Any]) -> Model:
         created=str(data.get("created", "")),
         software=data.get("software", {}),
     )
+
+
+def _covariance(data: dict[str, Any] | None) -> Covariance | None:
+    if not data:
+        return None
+    names, size = tuple(data["names"]), len(data["names"])
+    values, matrix = np.asarray(data["values"], float), np.asarray(data["matrix"], float)
+    if values.shape != (size,) or matrix.shape != (size, size):
+        raise BadModel("names, values and matrix differ in size", place="uncertainty.covariance", mend=model_shape.MEND)
+    return Covariance(names, values, matrix)
+
+
+def _line(error: Exception) -> str:
+    return " ".join(f"{type(error).__name__} {error}".split())[:100]
 
 
 def _plain(value: Any) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -64,12 +65,16 @@ class Record:
         torque_nm: np.ndarray,
         segment: np.ndarray | list[str] | None = None,
         *,
+        segment_names: Sequence[str] | None = None,
         angle_rad: np.ndarray | None = None,
         velocity_rad_s: np.ndarray | None = None,
         pulse_rate_hz: float = 40.0,
         source: Source | None = None,
     ) -> Record:
         """Build a record from arrays; `segment` gives a name for each row (default: all `prbs`).
+
+        With `segment_names`, `segment` gives an index into them for each row: a million rows need not hold a million
+        names.
 
         Raises
         ------
@@ -78,22 +83,22 @@ class Record:
         """
         time_s = np.ascontiguousarray(time_s, float)
         size = time_s.size
-        names = np.asarray(["prbs"] * size if segment is None else segment, dtype=str)
-        columns = {"pulse_width_us": pulse_width_us, "torque_nm": torque_nm, "segment": names}
+        code, known = _coded(size, segment, segment_names)
+        columns = {"pulse_width_us": pulse_width_us, "torque_nm": torque_nm, "segment": code}
         for label, column in columns.items():
             if np.shape(column) != (size,):
                 raise BadRecord(f"{label} has shape {np.shape(column)}, time_s has ({size},)", place=label)
         if size == 0:
             raise BadRecord("the record holds no sample", mend="Give at least a few seconds of data.")
-        starts = np.flatnonzero(np.r_[True, names[1:] != names[:-1]])
-        code = np.zeros(size, np.int64)
-        code[starts[1:]] = 1
+        starts = np.flatnonzero(np.r_[True, code[1:] != code[:-1]])
+        begins = np.zeros(size, np.int64)
+        begins[starts[1:]] = 1
         return cls(
             time_s=time_s,
             pulse_width_us=np.ascontiguousarray(pulse_width_us, float),
             torque_nm=np.ascontiguousarray(torque_nm, float),
-            segment=np.cumsum(code),
-            segment_names=tuple(str(name) for name in names[starts]),
+            segment=np.cumsum(begins),
+            segment_names=tuple(known[index] for index in code[starts]),
             angle_rad=None if angle_rad is None else np.ascontiguousarray(angle_rad, float),
             velocity_rad_s=None if velocity_rad_s is None else np.ascontiguousarray(velocity_rad_s, float),
             pulse_rate_hz=pulse_rate_hz,
@@ -123,3 +128,17 @@ class Record:
     def with_torque(self, torque_nm: np.ndarray) -> Record:
         """The same record with another torque, N·m, shape (N,)."""
         return replace(self, torque_nm=np.ascontiguousarray(torque_nm, float))
+
+
+def _coded(
+    size: int, segment: np.ndarray | list[str] | None, names: Sequence[str] | None
+) -> tuple[np.ndarray, list[str]]:
+    """A number for each row's segment, the same for the same name, and the names by number."""
+    if segment is None:
+        return np.zeros(size, np.int64), ["prbs"]
+    if names is None:
+        known, code = np.unique(np.asarray(segment, dtype=str), return_inverse=True)
+        return code.reshape(np.shape(segment)), [str(name) for name in known]
+    first = {name: index for index, name in reversed(list(enumerate(names)))}
+    same = np.array([first[name] for name in names], np.int64)
+    return same[np.asarray(segment, np.int64)], [str(name) for name in names]

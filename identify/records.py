@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from identify.errors import BadRecord
+from identify import bounds
 from identify.record import Record
 
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
@@ -27,22 +27,13 @@ def read(path: str | Path, pulse_rate_hz: float | None = None) -> Record:
         With file, line and column, and the mend.
     """
     path = Path(path)
-    if pulse_rate_hz is not None and not 1.0 <= pulse_rate_hz <= 200.0:
-        raise BadRecord(f"{pulse_rate_hz:g} pulses a second", place="pulse rate", mend="Give 1 to 200 Hz.")
-    try:
-        with path.open("rb") as file:
-            magic = file.read(8)
-    except FileNotFoundError as error:
-        raise BadRecord("no such file", place=str(path), mend="Check the path.") from error
-    except IsADirectoryError as error:
-        raise BadRecord("a directory, not a record", place=str(path), mend="Name the file in it.") from error
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise BadRecord(f"can't be read ({reason})", place=str(path), mend="Check its rights.") from error
-    if magic == HDF5_MAGIC:
+    if pulse_rate_hz is not None:
+        bounds.check_rate(pulse_rate_hz, "pulse rate")
+    content = bounds.content_of(path)
+    if content.startswith(HDF5_MAGIC):
         from identify.recording import read_recording
 
-        return read_recording(path, pulse_rate_hz)
+        return read_recording(content, path, pulse_rate_hz)
     from identify.csv_record import read_csv
 
-    return read_csv(path, 40.0 if pulse_rate_hz is None else pulse_rate_hz)
+    return read_csv(content, path, 40.0 if pulse_rate_hz is None else pulse_rate_hz)

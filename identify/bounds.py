@@ -1,0 +1,106 @@
+"""What a record of a muscle can hold: every reader refuses what lies outside, before it takes the memory for it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from identify.errors import BadRecord
+
+LARGEST_FILE_BYTES = 256 * 2**20
+PIECE_BYTES = 2**20
+LARGEST_ROWS = 5_000_000
+"""Forty minutes at the highest rate; a file of more is cut, or sampled at a lower rate."""
+LONGEST_S = 24 * 3600.0
+"""From the first sample to the last, pauses included."""
+LOWEST_HZ, HIGHEST_HZ = 39.0, 2100.0
+LARGEST = {"time_s": 1e7, "pulse_width_us": 1e4, "torque_nm": 1e6, "angle_rad": 1e3, "velocity_rad_s": 1e5}
+LONGEST_NAME = 100
+MOST_SEGMENTS = 1000
+PULSE_RATES_HZ = (1.0, 200.0)
+
+
+def content_of(path: Path) -> bytes:
+    """A file's bytes, at most as many as a record can have.
+
+    Raises
+    ------
+    BadRecord
+        It cannot be read, or is larger.
+    """
+    try:
+        with path.open("rb") as file:
+            pieces, size = [], 0
+            while size <= LARGEST_FILE_BYTES and (piece := file.read(PIECE_BYTES)):
+                pieces.append(piece)
+                size += len(piece)
+    except FileNotFoundError as error:
+        raise BadRecord("no such file", place=str(path), mend="Check the path.") from error
+    except IsADirectoryError as error:
+        raise BadRecord("a directory, not a record", place=str(path), mend="Name the file in it.") from error
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise BadRecord(f"can't be read ({reason})", place=str(path), mend="Check its rights.") from error
+    except ValueError as error:  # a NUL in the name
+        raise BadRecord("no such file", place=repr(str(path)), mend="Check the path.") from error
+    if size > LARGEST_FILE_BYTES:
+        mend = "Cut the record, or give the sealed recording."
+        raise BadRecord(f"more than {LARGEST_FILE_BYTES // 2**20} MB", place=str(path), mend=mend)
+    return b"".join(pieces)
+
+
+def check_rate(pulse_rate_hz: float, place: str) -> None:
+    """Refuse a pulse rate that no stimulator has.
+
+    Raises
+    ------
+    BadRecord
+        Outside 1 to 200 Hz, or no number.
+    """
+    lo, hi = PULSE_RATES_HZ
+    if not (lo <= pulse_rate_hz <= hi):
+        raise BadRecord(f"{pulse_rate_hz:g} pulses a second", place=place, mend=f"Give {lo:g} to {hi:g} Hz.")
+
+
+def check_sampling(rate_hz: float, place: str) -> None:
+    """Refuse a rate of sampling at which no muscle is identified.
+
+    Raises
+    ------
+    BadRecord
+        Below 40 Hz or above 2 kHz, by more than rounding.
+    """
+    if not (LOWEST_HZ <= rate_hz <= HIGHEST_HZ):
+        raise BadRecord(f"sampled at {rate_hz:.4g} Hz", place=place, mend="40 Hz to 2 kHz can be used.")
+
+
+def check_name(name: str, place: str) -> None:
+    """Refuse a segment's name that is no name.
+
+    Raises
+    ------
+    BadRecord
+        Empty, too long, or with signs that cannot be printed.
+    """
+    if not name.strip():
+        raise BadRecord("empty", place=place, mend="Name it: rest, prbs, ramp, validate…")
+    if len(name) > LONGEST_NAME:
+        mend = f"A segment's name has at most {LONGEST_NAME}."
+        raise BadRecord(f"a name of {len(name)} characters", place=place, mend=mend)
+    if not name.isprintable():
+        raise BadRecord("a name that cannot be printed", place=place, mend="Use letters, digits, - and _.")
+
+
+def check_span(time_s: np.ndarray, place: str) -> None:
+    """Refuse a record that no session lasts.
+
+    Raises
+    ------
+    BadRecord
+        Longer than a day.
+    """
+    span_s = float(time_s[-1] - time_s[0])
+    if not (span_s <= LONGEST_S):
+        mend = f"At most {LONGEST_S / 3600:g} h in one record; is the time in seconds?"
+        raise BadRecord(f"from the first to the last sample {span_s:.6g} s", place=place, mend=mend)

@@ -1,0 +1,225 @@
+"""What a MODEL.json may hold, field by field: checked before anything is computed from it.
+
+A check is a function of a value and its place; it raises `BadModel` with the place, or returns nothing. Fields that
+are not named here are let pass: a later version may write more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from itertools import pairwise
+from typing import Any
+
+from identify.errors import BadModel
+
+Check = Callable[[Any, str], None]
+MEND = "Fit the record again."
+MOST_KNOTS = 1000
+LONGEST = 10_000
+
+
+def number(lo: float, hi: float) -> Check:
+    """A finite number within bounds; no boolean."""
+
+    def check(value: Any, place: str) -> None:
+        if isinstance(value, bool) or not isinstance(value, int | float) or not (lo <= value <= hi):
+            raise BadModel(f"{_short(value)} is no number from {lo:g} to {hi:g}", place=place, mend=MEND)
+
+    return check
+
+
+def text(value: Any, place: str) -> None:
+    """Some text, not too long."""
+    if not isinstance(value, str) or len(value) > LONGEST:
+        raise BadModel(f"{_short(value)} is no text", place=place, mend=MEND)
+
+
+def anything(value: Any, place: str) -> None:
+    """Whatever JSON holds."""
+
+
+def maybe(inner: Check) -> Check:
+    """The same, or null."""
+
+    def check(value: Any, place: str) -> None:
+        if value is not None:
+            inner(value, place)
+
+    return check
+
+
+def either(first: Check, second: Check) -> Check:
+    """One or the other; the second's words count."""
+
+    def check(value: Any, place: str) -> None:
+        try:
+            first(value, place)
+        except BadModel:
+            second(value, place)
+
+    return check
+
+
+def several(inner: Check, least: int = 0, most: int = LONGEST, rising: bool = False) -> Check:
+    """A list of values, each of which holds."""
+
+    def check(value: Any, place: str) -> None:
+        if not isinstance(value, list) or not (least <= len(value) <= most):
+            what = f"a list of {len(value)}" if isinstance(value, list) else _short(value)
+            raise BadModel(f"{what}, not a list of {least} to {most}", place=place, mend=MEND)
+        for index, item in enumerate(value):
+            inner(item, f"{place}.{index}")
+        if rising and any(not (b > a) for a, b in pairwise(value)):
+            raise BadModel("the values do not rise", place=place, mend=MEND)
+
+    return check
+
+
+def each(inner: Check) -> Check:
+    """An object, whose values all hold."""
+
+    def check(value: Any, place: str) -> None:
+        for name, item in _object(value, place).items():
+            inner(item, f"{place}.{name}"[:100])
+
+    return check
+
+
+def fields(wanted: Mapping[str, Check], optional: Mapping[str, Check] | None = None) -> Check:
+    """An object with these fields, and more."""
+
+    def check(value: Any, place: str) -> None:
+        prefix = f"{place}." if place else ""
+        found = _object(value, place)
+        for name, inner in wanted.items():
+            if name not in found:
+                raise BadModel("key is missing", place=prefix + name, mend=MEND)
+            inner(found[name], prefix + name)
+        for name, inner in (optional or {}).items():
+            if name in found:
+                inner(found[name], prefix + name)
+
+    return check
+
+
+def kinds(known: Mapping[str, Check], default: str = "") -> Check:
+    """An object whose `kind` says what else it holds."""
+
+    def check(value: Any, place: str) -> None:
+        kind = _object(value, place).get("kind", default)
+        if not isinstance(kind, str) or kind not in known:
+            message = f"unknown {place.rpartition('.')[2]} {_short(kind)}"
+            raise BadModel(message, place=f"{place}.kind", mend=f"Known: {', '.join(known)}.")
+        known[kind](value, place)
+
+    return check
+
+
+def _object(value: Any, place: str) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise BadModel(f"{_short(value)} is no JSON object", place=place, mend=MEND)
+    return value
+
+
+def _short(value: Any) -> str:
+    shown = repr(value) if isinstance(value, str | int | float | None) else f"a {type(value).__name__}"
+    return shown if len(shown) <= 40 else f"{shown[:40]}…"
+
+
+ANY = number(-1e300, 1e300)
+WIDTH = number(0.0, 1e6)
+FIGURE = maybe(ANY)
+FIGURES = (
+    "fit_percent", "ceiling_percent", "rms_nm", "noise_sd_nm", "held_out_fit_percent", "held_out_ceiling_percent",
+    "held_out_rms_nm",
+)  # fmt: skip
+PAIR = either(maybe(ANY), several(maybe(ANY), 2, 2))
+COEFFICIENTS = several(ANY, 1, 2 * MOST_KNOTS)
+BASIS = kinds(
+    {
+        "cubic-spline": fields(
+            {"knots_us": several(WIDTH, 2, MOST_KNOTS, rising=True), "coefficients_nm": COEFFICIENTS}
+        ),
+        "power-series": fields(
+            {"order": number(1, 20), "scale_us": number(1e-3, 1e6), "coefficients_nm": COEFFICIENTS}
+        ),
+        "sigmoid": fields(
+            {"a2_per_us": ANY, "a3": ANY, "coefficients_nm": COEFFICIENTS},
+            {"largest_us": number(1e-3, 1e6)},
+        ),
+    }
+)
+LINEAR = kinds(
+    {
+        "second-order": fields(
+            {"time_constant_s": number(1e-6, 1e4), "damping": number(1e-6, 1e4)}, {"delay_s": number(-10, 10)}
+        ),
+        "discrete": fields(
+            {
+                "b": several(ANY, 1, 1000), "a": several(ANY, 1, 1000), "delay_samples": number(0, 10_000),
+                "step_s": number(1e-4, 10),
+            },
+            {"centre": number(-10, 10)},
+        ),
+    },
+    "discrete",
+)  # fmt: skip
+EFFECT = fields(
+    {"id": text, "parameters": each(either(ANY, fields({"value": ANY})))}, {"form": text, "settings": each(ANY)}
+)
+WHOLE = number(0, LONGEST)
+_NARX = fields(
+    {
+        "variables": several(several(WHOLE, 2, 2), 1, 1000), "terms": several(several(WHOLE, 0, 20), 0, 1000),
+        "weights": several(ANY, 0, 1000), "torque_scale_nm": ANY, "width_scale_us": ANY, "baseline_nm": ANY,
+    }
+)  # fmt: skip
+
+
+def narx(value: Any, place: str) -> None:
+    """A polynomial: a weight for each term, and in the terms numbers of variables that there are."""
+    _NARX(value, place)
+    if len(value["terms"]) != len(value["weights"]):
+        raise BadModel("terms and weights differ in number", place=place, mend=MEND)
+    largest = max((index for term in value["terms"] for index in term), default=-1)
+    if not (largest < len(value["variables"])):
+        raise BadModel(f"a term of variable {largest}, which is not there", place=f"{place}.terms", mend=MEND)
+
+
+COVARIANCE = fields(
+    {
+        "names": several(text),
+        "values": several(maybe(ANY)),
+        "matrix": several(several(maybe(ANY), most=1000), most=1000),
+    }
+)
+MODEL = fields(
+    {
+        "method": text,
+        "recruitment": fields({"basis": BASIS}),
+        "linear": LINEAR,
+        "pulse_rate_hz": number(1, 200),
+        "sample_rate_hz": number(0.1, 1e5),
+    },
+    {
+        "record_rate_hz": number(0.1, 1e5),
+        "baseline_nm": ANY,
+        "initial": several(ANY, 2, 2),
+        "noise": each(maybe(ANY)),
+        "effects": several(EFFECT, most=50),
+        "uncertainty": maybe(fields({}, {"covariance": maybe(COVARIANCE), "bands": each(anything)})),
+        "fit": fields({}, dict.fromkeys(FIGURES, FIGURE)),
+        "residual_tests": each(each(anything)),
+        "valid_for": each(PAIR),
+        "quality": fields(
+            {}, {"verdict": text, "reasons": several(text), "gates": each(fields({"passed": anything, "says": text}))}
+        ),
+        "reasons": several(text),
+        "data": each(anything),
+        "software": each(anything),
+        "extra": fields({}, {"narx": narx}),
+        "model_id": text,
+        "created": text,
+    },
+)
+"""The whole document."""

@@ -1,0 +1,84 @@
+"""JSON from others, read strictly: how deep it may go is known before it is parsed, and no key stands twice."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections import Counter
+from typing import Any
+
+DEEPEST = 32
+TOKEN = re.compile(r'"[^"\\]*+(?:\\.[^"\\]*+)*+(?:"|\\?\Z)|[\[{]|[\]}]', re.DOTALL)
+"""A whole string (to the text's end where it is not closed), or a bracket: each sign is looked at once."""
+
+
+class BadJson(ValueError):
+    """Text that is no JSON, or JSON that is not taken; the message says what and where."""
+
+
+class NotJson(BadJson):
+    """Text that breaks off, or that is something else."""
+
+
+def parse(text: str | bytes, *, deepest: int = DEEPEST, finite: bool = True) -> Any:
+    """The value that a JSON text holds.
+
+    Parameters
+    ----------
+    text : str or bytes
+        Bytes are UTF-8.
+    deepest : int
+        How many brackets may be open at once.
+    finite : bool
+        Whether NaN, Infinity and numbers too large for a float are refused.
+
+    Raises
+    ------
+    BadJson
+    """
+    if isinstance(text, bytes):
+        try:
+            text = text.decode("utf-8-sig")
+        except UnicodeDecodeError as error:
+            raise BadJson(f"not UTF-8 text (byte {error.start})") from error
+    _check_depth(text, deepest)
+    more: dict[str, Any] = {"parse_constant": _refused, "parse_float": _finite} if finite else {}
+    try:
+        return json.loads(text, object_pairs_hook=_single, **more)
+    except json.JSONDecodeError as error:
+        raise NotJson(f"not JSON (line {error.lineno}, column {error.colno}: {error.msg})") from error
+    except BadJson:
+        raise
+    except ValueError as error:  # a whole number of thousands of digits
+        raise BadJson("a number without an end") from error
+
+
+def _check_depth(text: str, deepest: int) -> None:
+    depth = 0
+    for token in TOKEN.finditer(text):
+        sign = text[token.start()]
+        depth += (sign in "[{") - (sign in "]}")
+        if depth > deepest:
+            line = text.count("\n", 0, token.start()) + 1
+            raise BadJson(f"more than {deepest} brackets within one another (line {line})")
+
+
+def _single(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        names = [name for name, _ in pairs]
+        twice = next(name for name, count in Counter(names).items() if count > 1)
+        raise BadJson(f"the key {twice[:60]!r} stands twice")
+    return found
+
+
+def _refused(name: str) -> Any:
+    raise BadJson(f"{name} is no number")
+
+
+def _finite(digits: str) -> float:
+    value = float(digits)
+    if not math.isfinite(value):
+        raise BadJson(f"{digits[:40]} is no number that can be used")
+    return value
