@@ -11,10 +11,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from api import audit, evidence
+from api import audit, evidence, uploads
 from api.clock import Clock
 from api.errors import ApiError, NotFoundError
 from api.fitting import Fitting, Job
+from api.settings import Settings
 from api.store import Store
 from api.store.tables import Analysis, Model, Recording
 from api.versions import Versions
@@ -28,8 +29,9 @@ HALF_DONE = 0.5
 class Analyses:
     """Asks the workers once for each finding; a second asker shares the first one's job."""
 
-    def __init__(self, store: Store, clock: Clock, fitting: Fitting, versions: Versions) -> None:
+    def __init__(self, store: Store, clock: Clock, fitting: Fitting, versions: Versions, settings: Settings) -> None:
         self.store, self.clock, self.fitting, self.versions = store, clock, fitting, versions
+        self.settings = settings
         self.running: dict[tuple[str, str], Job] = {}
         self._ids: list[str] | None = None
 
@@ -217,23 +219,24 @@ class Analyses:
     async def join(self, older: str, newer: str, participant: str) -> Recording:
         """Two recordings as one, itself a recording (`origin` joined), to which all else applies."""
         paths = [await asyncio.to_thread(self.path, part) for part in (older, newer)]
-        identity = f"joined-{secrets.token_hex(8)}"
-        out = str(await asyncio.to_thread(lambda: self._beside(newer, identity)))
-        job = self.fitting.submit("join", urgent=True, parts=paths, out=out)
-        found = await asyncio.shield(job.result)
-        digest = found["file_sha256"]
-        return await asyncio.to_thread(self._store_joined, identity, out, digest, participant, older, newer)
+        identity = f"{uploads.JOINED}{secrets.token_hex(8)}"
+        made = self.settings.exports_dir / f"{identity}.csv"  # all that a worker may write to
+        kept = self.settings.recordings_dir / made.name
+        try:
+            job = self.fitting.submit("join", urgent=True, parts=paths, out=str(made))
+            digest = (await asyncio.shield(job.result))["file_sha256"]
+            await asyncio.to_thread(made.replace, uploads.part_of(kept))
+        except BaseException:
+            made.unlink(missing_ok=True)
+            raise
+        stored = asyncio.to_thread(self._store_joined, kept, digest, participant, older, newer)
+        return await asyncio.shield(stored)
 
-    def _beside(self, recording_id: str, identity: str) -> str:
-        return str(Path(self.path(recording_id)).with_name(f"{identity}.csv"))
-
-    def _store_joined(
-        self, identity: str, out: str, digest: str, participant: str, older: str, newer: str
-    ) -> Recording:
-        now = self.clock.utc()
-        row = Recording(id=identity, participant=participant, path=out, file_sha256=digest, origin="joined")
+    def _store_joined(self, kept: Path, digest: str, participant: str, older: str, newer: str) -> Recording:
+        now, identity = self.clock.utc(), kept.stem
+        row = Recording(id=identity, participant=participant, path=str(kept), file_sha256=digest, origin="joined")
         row.test_id, row.created_utc = None, now
-        with self.store.write() as session:
+        with uploads.taken_in(kept), self.store.write() as session:
             session.add(row)
             session.flush()
             audit.write(session, now, "service", "join recordings", identity, parts=[older, newer], sha256=digest)

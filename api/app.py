@@ -7,12 +7,15 @@ from contextlib import asynccontextmanager
 from importlib.metadata import PackageNotFoundError, version
 
 from fastapi import FastAPI
+from starlette.types import ASGIApp
 
-from api import errors, pages, routes
+from api import errors, pages, routes, strict_body
 from api.body_limit import BodyLimit
 from api.clock import Clock
 from api.context import Context, build
 from api.fitting import WORKER
+from api.headers import Headers
+from api.lock import ServiceLock
 from api.settings import Settings
 
 
@@ -24,9 +27,18 @@ def software_version() -> str:
         return "0"
 
 
+class Service(FastAPI):
+    """The application, with its headers outermost: an unforeseen error's answer has them, too."""
+
+    def build_middleware_stack(self) -> ASGIApp:
+        """Starlette's, within the headers."""
+        return Headers(super().build_middleware_stack())
+
+
 def create_app(
-    settings: Settings | None = None, *, clock: Clock | None = None, worker: tuple[str, ...] = WORKER
-) -> FastAPI:
+    settings: Settings | None = None, *, clock: Clock | None = None, worker: tuple[str, ...] = WORKER,
+    lock: ServiceLock | None = None,
+) -> FastAPI:  # fmt: skip
     """The application.
 
     Parameters
@@ -37,14 +49,18 @@ def create_app(
         Another clock, for tests.
     worker : tuple of str
         How to start a worker process.
+    lock : ServiceLock, optional
+        Held already; default: taken now.
 
     Raises
     ------
     ApiError
         The database cannot be opened.
+    HeldError
+        Another service holds the data folder or the database.
     """
-    context = build(settings or Settings(), clock, worker)
-    app = FastAPI(
+    context = build(settings or Settings(), clock, worker, lock)
+    app = Service(
         title="stimrig",
         version=software_version(),
         summary="Pre-session tests, models of stimulated muscle, and the approved one for the controller.",
@@ -54,10 +70,12 @@ def create_app(
         openapi_url="/openapi.json",
     )
     app.state.context = context
-    app.add_middleware(BodyLimit, context=context)
+    app.add_middleware(strict_body.StrictBody)
+    app.add_middleware(BodyLimit, context=context)  # the last one added stands outside
     errors.install(app)
     for router in [*routes.routers(), *pages.routers()]:
         app.include_router(router)
+    strict_body.describe(app)
     return app
 
 

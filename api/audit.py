@@ -45,3 +45,9 @@ def first_broken(entries: list[AuditEntry]) -> int | None:
             return entry.seq
         previous = entry.hash
     return None
+
+
+def newest(session: Session, subject: str, *actions: str) -> AuditEntry | None:
+    """The last entry about a subject among some actions: who did that, and when."""
+    of = select(AuditEntry).where(AuditEntry.subject == subject, AuditEntry.action.in_(actions))
+    return session.scalars(of.order_by(AuditEntry.seq.desc()).limit(1)).first()

@@ -3,32 +3,34 @@
 from __future__ import annotations
 
 import hashlib
-import hmac
 import secrets
-from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Any
 
-from fastapi import Request
-from sqlalchemy import select
+from sqlalchemy import delete, select
+from sqlalchemy.orm import Session
 from starlette.requests import HTTPConnection
 
 from api import audit
 from api.clock import Clock
 from api.errors import ApiError
+from api.pace import Guesses, place_of
 from api.store import Store
-from api.store.tables import PageSession, Token
+from api.store.tables import Confirmation, PageSession, Token
 
 COOKIE = "stimrig_session"
-SAFE_METHODS = {"GET", "HEAD", "OPTIONS"}
 
 
 class Scope(StrEnum):
-    """What a token may be used for."""
+    """What a token may be used for.
+
+    ``rearm`` is in no role and no controller's key: after a stop a person looks first. Who signed in with a password
+    and may run tests holds it for the session; a program holds it only if it was asked for by name.
+    """
 
     READ_LIVE = "read-live"
     RUN_TEST = "run-test"
+    REARM = "rearm"
     APPROVE_MODEL = "approve-model"
     READ_MODEL = "read-model"
     ADMINISTER = "administer"
@@ -72,8 +74,8 @@ class Principal:
 class Auth:
     """Issues and checks tokens and sessions; keeps only hashes."""
 
-    def __init__(self, store: Store, clock: Clock, session_hours: float = 12.0) -> None:
-        self.store, self.clock, self.session_s = store, clock, session_hours * 3600
+    def __init__(self, store: Store, clock: Clock, guesses: Guesses, session_hours: float = 12.0) -> None:
+        self.store, self.clock, self.guesses, self.session_s = store, clock, guesses, session_hours * 3600
         self._known: dict[str, Token] = {}
 
     def issue(self, name: str, scopes: list[Scope], by: str, *, text: str | None = None, origin: str = "issued",
@@ -120,15 +122,23 @@ class Auth:
                 token.revoked = True
         self._known.clear()
 
-    def bearer(self, text: str) -> Principal:
-        """The holder of a bearer token.
+    def bearer(self, text: str, address: str = "", *, forgive_age: bool = False) -> Principal:
+        """The holder of a bearer token; `forgive_age` lets one that ran out still press stop.
+
+        Guesses are held to a pace by the place they come from. A token that was drawn opens all the same: nobody
+        guesses its 256 bits, and others' guesses must not keep a controller out. A right token always presses stop.
 
         Raises
         ------
         ApiError
-            401: unknown, revoked or expired.
+            401: unknown, revoked or expired; 429: too many that were none.
         """
-        return self._principal(self._token(digest(text)))
+        token, place = self._token(digest(text)), place_of(address)
+        if token is None:
+            self.guesses.unknown_token(place)
+        elif token.origin == "settings" and not forgive_age:  # a stop waits for no pace
+            self.guesses.chosen_token(token.hash, place)
+        return self._principal(token, forgive_age=forgive_age)
 
     def _token(self, token_hash: str) -> Token | None:
         """A token's row; kept in memory, since a controller asks often, and forgotten at every change."""
@@ -139,16 +149,16 @@ class Auth:
                 self._known[token_hash] = found
         return found
 
-    def _principal(self, token: Token | None, csrf: str | None = None) -> Principal:
+    def _principal(self, token: Token | None, csrf: str | None = None, *, forgive_age: bool = False) -> Principal:
         if token is None or token.revoked:
             raise unauthorized("The token is unknown or has been revoked. Ask an administrator for a new one.")
-        if token.expires_utc is not None and token.expires_utc <= self.clock.utc():
+        if token.expires_utc is not None and token.expires_utc <= self.clock.utc() and not forgive_age:
             raise unauthorized("The token has expired. Ask an administrator for a new one.")
         return Principal(token.name, frozenset(token.scopes), csrf)
 
-    def sign_in(self, token_text: str) -> str:
-        """Open a page session; return its cookie."""
-        return self.open_session(digest(token_text), self.bearer(token_text).name)
+    def sign_in(self, token_text: str, address: str) -> str:
+        """Open a page session for a token's holder; its cookie. Raises as `bearer` does."""
+        return self.open_session(digest(token_text), self.bearer(token_text, address).name)
 
     def open_session(self, token_hash: str, name: str) -> str:
         """Open a page session for the holder of a token; its cookie."""
@@ -166,6 +176,28 @@ class Auth:
             audit.write(session, self.clock.utc(), name, "sign in", "page")
         return cookie
 
+    def token_of_person(self, session: Session, name: str, scopes: list[Scope]) -> Token:
+        """The token that says what a person may do; nobody holds its text."""
+        token = Token(hash=secrets.token_hex(32), prefix="(user)", name=name, origin="user", revoked=False)
+        token.scopes, token.created_utc = [str(scope) for scope in scopes], self.clock.utc()
+        session.add(token)
+        session.flush()
+        return token
+
+    def end_sessions(self, session: Session, token_hash: str, but: str | None = None) -> str | None:
+        """End the sessions of a token's holder; the one of the hash `but` goes on under a new cookie, which is given.
+
+        Its forms stay good: they are worth nothing without the new cookie.
+        """
+        cookie = None
+        for row in session.scalars(select(PageSession).where(PageSession.token_hash == token_hash)).all():
+            if row.hash == but:
+                cookie = secrets.token_urlsafe(32)
+                session.add(PageSession(**{**row.as_dict(), "hash": digest(cookie)}))
+            session.execute(delete(Confirmation).where(Confirmation.session_hash == row.hash))
+            session.delete(row)
+        return cookie
+
     def sign_out(self, cookie: str) -> None:
         """Forget a page session."""
         with self.store.write() as session:
@@ -179,8 +211,11 @@ class Auth:
         if row is None or (row.expires_unix_s <= self.clock.unix_s() and not forgive_age):
             raise unauthorized("The session has ended. Sign in again.")
         token = self._token(row.token_hash)
-        principal = self._principal(token, row.csrf)
-        return replace(principal, session_hash=row.hash) if token and token.origin == "user" else principal
+        principal = self._principal(token, row.csrf, forgive_age=forgive_age)
+        if token is None or token.origin != "user":
+            return principal
+        more = {Scope.REARM} if principal.may(Scope.RUN_TEST) else set()
+        return replace(principal, session_hash=row.hash, scopes=principal.scopes | more)
 
     def identify(self, connection: HTTPConnection, *, forgive_age: bool = False) -> Principal:
         """Who stands behind a request or a WebSocket."""
@@ -189,7 +224,8 @@ class Auth:
             kind, _, text = header.partition(" ")
             if kind.lower() != "bearer" or not text.strip():
                 raise unauthorized("Send `Authorization: Bearer <token>`.")
-            return self.bearer(text.strip())
+            address = connection.client.host if connection.client else ""
+            return self.bearer(text.strip(), address, forgive_age=forgive_age)
         cookie = connection.cookies.get(COOKIE)
         if cookie:
             return self.cookie(cookie, forgive_age=forgive_age)
@@ -206,46 +242,3 @@ def unauthorized(detail: str, code: str = "unauthorized", title: str = "Not sign
     problem = ApiError(401, code, title, detail)
     problem.headers["WWW-Authenticate"] = 'Bearer realm="stimrig"'
     return problem
-
-
-def require(scope: Scope) -> Callable[[Request], Awaitable[Principal]]:
-    """A dependency: the principal, if the scope is held and a session's form carries its CSRF token."""
-
-    async def check(request: Request) -> Principal:
-        principal = request.app.state.context.auth.identify(request)
-        if not principal.may(scope):
-            detail = f"This needs the scope {scope}; {principal.name} holds {', '.join(sorted(principal.scopes))}."
-            raise ApiError(403, "forbidden", "Not allowed", detail)
-        await check_csrf(request, principal)
-        if scope is Scope.APPROVE_MODEL and request.method not in SAFE_METHODS:
-            await request.app.state.context.people.confirmed(request, principal)
-        return principal
-
-    check.__name__ = f"require_{scope.name.lower()}"
-    return check
-
-
-async def anyone_signed_in(request: Request) -> Principal:
-    """A dependency: anyone with a valid token or session."""
-    principal = request.app.state.context.auth.identify(request)
-    await check_csrf(request, principal)
-    return principal
-
-
-async def anyone_who_may_stop(request: Request) -> Principal:
-    """A dependency for stop: a session that ran out, or a form gone stale, must not keep a person from stopping.
-
-    The cookie is SameSite=Strict, so another site cannot press the button either way.
-    """
-    return request.app.state.context.auth.identify(request, forgive_age=True)
-
-
-async def check_csrf(request: Request, principal: Principal) -> None:
-    """Refuse a session's write whose form or header does not carry the session's CSRF token."""
-    if principal.csrf is None or request.method in SAFE_METHODS:
-        return
-    sent: Any = request.headers.get("x-csrf-token")
-    if sent is None and "form" in request.headers.get("content-type", ""):
-        sent = (await request.form()).get("csrf")
-    if not isinstance(sent, str) or not hmac.compare_digest(sent.encode(), principal.csrf.encode()):
-        raise ApiError(403, "csrf", "The form is out of date", "Load the page again and repeat what you did.")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextvars import ContextVar
 from datetime import UTC, datetime, timedelta
 
 
@@ -31,3 +32,12 @@ class Clock:
 def utc_label(unix_s: float) -> str:
     """An ISO 8601 label, to the millisecond."""
     return datetime.fromtimestamp(unix_s, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+def unix_of(label: str) -> float:
+    """Seconds since 1970 of an ISO 8601 label."""
+    return datetime.fromisoformat(label.replace("Z", "+00:00")).timestamp()
+
+
+asked_s: ContextVar[float] = ContextVar("asked_s")
+"""When the request that is being answered came in, on the monotonic clock."""

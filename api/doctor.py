@@ -276,3 +276,17 @@ def check_door(settings: Settings) -> Iterator[Finding]:
         taken = line.connect_ex((settings.host, settings.port)) == 0
     says = f"{settings.host}:{settings.port} {'answers: the service, or another one' if taken else 'is free'}"
     yield Finding("address", "ok", says)
+
+
+def check_workers(_settings: Settings) -> Iterator[Finding]:
+    """Can the processes that read other people's files be shut in?"""
+    command = [sys.executable, "-m", "api.confinement"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=30)
+    left_open = json.loads(done.stdout)
+    if not left_open:
+        says = "shut in: no network, no file but recordings, bounds on memory and time"
+        yield Finding("workers", "ok", says)
+    for what, why in left_open.items():
+        mend = "a kernel from 5.13 on with Landlock" if what == "files" else "Linux on x86_64 or aarch64 with seccomp"
+        says = f"{what}: workers that read uploads cannot be shut off from them here ({why})"
+        yield Finding("workers", "care", says, f"{mend}; until then take in files of people you trust only")

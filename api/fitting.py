@@ -3,129 +3,18 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import itertools
-import json
 import logging
-import sys
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from typing import Any
 
 from api.errors import ApiError
 from api.logs import current_test
+from api.worker_process import WORKER, Job, Places, Worker
 
 log = logging.getLogger("stimrig.fitting")
-
-WORKER = (sys.executable, "-m", "api.worker")
-BACKGROUND_NICE = "15"
-"""How far a worker for what nobody waits for stands back."""
-LINE_LIMIT = 64 * 1024 * 1024
-
-
-@dataclass
-class Job:
-    """One job: what, how far, and a future for its result."""
-
-    id: int
-    verb: str
-    arguments: dict[str, Any]
-    urgent: bool = False
-    background: bool = False
-    state: str = "queued"
-    progress: float = 0.0
-    text: str = ""
-    started_s: float | None = None
-    result: asyncio.Future[dict[str, Any]] = field(default_factory=lambda: asyncio.get_running_loop().create_future())
-    on_progress: Callable[[Job], None] | None = None
-    test_id: str | None = field(default_factory=current_test.get)
-
-    @property
-    def elapsed_s(self) -> float:
-        """Time since it began, s; 0 while it is queued."""
-        return 0.0 if self.started_s is None else time.monotonic() - self.started_s
-
-    @property
-    def time_left_s(self) -> float | None:
-        """What its pace so far says, s; None before there is a pace."""
-        if self.state != "running" or self.progress < 0.05:
-            return None
-        return self.elapsed_s * (1.0 - self.progress) / self.progress
-
-    def public(self) -> dict[str, Any]:
-        """What a client sees of it."""
-        left = self.time_left_s
-        return {
-            "verb": self.verb,
-            "state": self.state,
-            "progress": round(self.progress, 3),
-            "text": self.text,
-            "elapsed_s": round(self.elapsed_s, 1),
-            "time_left_s": None if left is None else round(left, 1),
-        }
-
-
-class Worker:
-    """One worker process, started when first needed and again after a job was cancelled."""
-
-    def __init__(self, command: tuple[str, ...], *, background: bool = False) -> None:
-        self.command, self.background = command, background
-        self.process: asyncio.subprocess.Process | None = None
-        self.job: Job | None = None
-
-    async def start(self) -> asyncio.subprocess.Process:
-        """The running process, fresh if there is none."""
-        if self.process is None or self.process.returncode is not None:
-            command = ("nice", "-n", BACKGROUND_NICE, *self.command) if self.background else self.command
-            self.process = await asyncio.create_subprocess_exec(
-                *command, stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, limit=LINE_LIMIT
-            )
-        return self.process
-
-    async def run(self, job: Job) -> dict[str, Any]:
-        """Do a job to its end; its result, or its error raised."""
-        process = await self.start()
-        assert process.stdin is not None and process.stdout is not None
-        request = {"job": job.id, "verb": job.verb, "arguments": job.arguments}
-        process.stdin.write(json.dumps(request).encode() + b"\n")
-        while line := await process.stdout.readline():
-            message = json.loads(line)
-            if message.get("job") != job.id:
-                continue
-            if "result" in message:
-                return message["result"]
-            if "error" in message:
-                raise job_error(job.verb, message["error"])
-            job.progress, job.text = message["progress"], message["text"]
-            if job.on_progress is not None:
-                job.on_progress(job)
-        await process.wait()
-        if job.state == "cancelled":
-            raise ApiError(409, "cancelled", "The job was cancelled", "Start it again if it is still wanted.")
-        raise ApiError(500, "worker-died", "The worker process died", "The data are safe; ask again. See logs/api.log.")
-
-    def kill(self) -> None:
-        """End the process at once."""
-        if self.process is not None and self.process.returncode is None:
-            with contextlib.suppress(ProcessLookupError):
-                self.process.kill()
-
-    async def close(self) -> None:
-        """End the process and wait for it."""
-        self.kill()
-        if self.process is not None:
-            await self.process.wait()
-
-
-def job_error(verb: str, error: dict[str, Any]) -> ApiError:
-    """A worker's error as a problem."""
-    if error.get("expected"):
-        extra = {key: error[key] for key in ("place", "mend") if error.get(key)}
-        return ApiError(422, "data", "The data do not allow it", error["detail"], **extra)
-    detail = f"{error['detail']}. The data are safe. See logs/api.log."
-    return ApiError(500, "analysis-failed", f"The {verb} failed", detail)
 
 
 class Fitting:
@@ -139,11 +28,14 @@ class Fitting:
         How many processes.
     command : tuple of str
         How to start one; tests put another in its place.
+    places : Places
+        The folders that they may reach.
     """
 
-    def __init__(self, workers: int = 2, command: tuple[str, ...] = WORKER) -> None:
-        self.workers = [Worker(command) for _ in range(workers)]
-        self.workers.append(Worker(command, background=True))
+    def __init__(self, workers: int = 2, command: tuple[str, ...] = WORKER, places: Places | None = None) -> None:
+        places = places or Places()
+        self.workers = [Worker(command, places) for _ in range(workers)]
+        self.workers.append(Worker(command, places, background=True))
         self.queue: deque[Job] = deque()
         self.done_count = 0
         self.failed_count = 0

@@ -5,6 +5,7 @@ Imported by the worker only; the web process never loads numpy, and never fits.
 
 from __future__ import annotations
 
+import csv
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +14,7 @@ from typing import Any
 from api.cleaning import clean
 from api.forecasts import forecast
 from api.missing import diagnosis, improve, joined
+from api.recorded import recorded
 
 Progress = Callable[[float, str], None]
 POINTS = 2400
@@ -125,15 +127,11 @@ def effects(progress: Progress) -> dict[str, Any]:
 
 def warm(progress: Progress) -> dict[str, Any]:
     """Load identify and its compiled parts, so that the fit after a test starts at once."""
-    import tempfile
-
     import identify
+    from identify.csv_record import read_csv
 
     progress(0.1, "loading")
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "warm.csv"
-        path.write_text(_warm_csv())
-        identify.fit(identify.read(path))
+    identify.fit(read_csv(_warm_csv().encode(), Path("warm.csv")))
     return {}
 
 
@@ -161,40 +159,39 @@ def export_csv(data: str, progress: Progress, out: str) -> dict[str, Any]:
     if abs(record.pulse_rate_hz - 40.0) > 1e-6:
         message = f"{record.pulse_rate_hz:g} pulses/s; a CSV file would be read as 40"
         raise identify.BadRecord(message, mend="Take the HDF5 file.")
-    columns = {"time_s": record.time_s, "pulse_width_us": record.pulse_width_us, "torque_nm": record.torque_nm}
-    texts: list[Any] = [[f"{value:.6f}" for value in record.time_s.tolist()]]
-    texts += [[f"{value:.8g}" for value in columns[name].tolist()] for name in ("pulse_width_us", "torque_nm")]
-    texts.append([record.segment_names[index] for index in record.segment])
-    names = [*columns, "segment"]
-    for name in ("angle_rad", "velocity_rad_s"):
-        values = getattr(record, name)
-        if values is not None:
-            names.append(name)
-            texts.append([f"{value:.8g}" for value in values.tolist()])
+    names = ["time_s", "pulse_width_us", "torque_nm"]
+    also = [name for name in ("angle_rad", "velocity_rad_s") if getattr(record, name) is not None]
+    columns = [getattr(record, name).tolist() for name in (*names, *also)]
+    segments = [record.segment_names[index] for index in record.segment.tolist()]
     progress(0.7, "writing")
     with Path(out).open("w", encoding="utf-8", newline="") as file:
-        file.write(",".join(names) + "\n")
-        file.writelines(",".join(row) + "\n" for row in zip(*texts, strict=True))
-    return {"rows": len(texts[0])}
+        table = csv.writer(file, lineterminator="\n")
+        table.writerow([*names, "segment", *also])
+        for seconds, width, torque, segment, *more in zip(*columns[:3], segments, *columns[3:], strict=True):
+            values = [f"{value:.8g}" for value in (width, torque, *more)]
+            table.writerow([f"{seconds:.6f}", *values[:2], segment, *values[2:]])
+    return {"rows": len(segments)}
 
 
 def find_recording(progress: Progress, folder: str, test_id: str) -> dict[str, Any]:
     """The sealed recording of a test, when the service did not hear of its end."""
     import hashlib
 
-    import h5py
+    import identify
+    from api.uploads import PREFIX
+    from identify.recording import attributes
 
     progress(0.1, "looking through the recordings")
     for path in sorted(Path(folder).glob("**/*.h5")):
+        if path.name.startswith(PREFIX):
+            continue  # what somebody sent in is no recording of this rig, whatever test it names
         try:
-            with h5py.File(path) as file:
-                attributes = {key: str(file.attrs[key]) for key in ("test_id", "recording_id", "outcome", "reason")}
-        except (OSError, KeyError):
+            found = attributes(path, ["test_id", "recording_id", "outcome", "reason"])
+        except identify.IdentifyError:
             continue
-        if attributes["test_id"] == test_id:
+        if found.pop("test_id") == test_id:
             digest = hashlib.sha256(path.read_bytes()).hexdigest()
-            kept = {key: attributes[key] for key in ("recording_id", "outcome", "reason")}
-            return {"found": {**kept, "recording_path": str(path), "file_sha256": digest}}
+            return {"found": {**found, "recording_path": str(path), "file_sha256": digest}}
     return {"found": None}
 
 
@@ -210,4 +207,5 @@ VERBS: dict[str, Callable[..., dict[str, Any]]] = {
     "forecast": forecast,
     "export_csv": export_csv,
     "find_recording": find_recording,
+    "recorded": recorded,
 }

@@ -7,6 +7,8 @@ joined record without it would show them wrong. Nothing is made up to fill it: i
 
 from __future__ import annotations
 
+import csv
+import io
 from collections.abc import Sequence
 from typing import Any
 
@@ -49,8 +51,12 @@ def table(records: Sequence[Any], pause_s: Sequence[float] = ()) -> str:
     ends = np.cumsum([part[0].size for part in columns])
     for end, pause in zip(ends[:-1], pause_s, strict=False):
         time_s[end:] += np.round(pause * PULSE_RATE_HZ) / PULSE_RATE_HZ
-    rows = zip(time_s, width, torque, names, strict=True)
-    return "\n".join([HEADER, *(f"{t:.6f},{u:g},{y:.6f},{name}" for t, u, y, name in rows)]) + "\n"
+    text = io.StringIO(newline="")
+    text.write(HEADER + "\n")
+    rows = csv.writer(text, lineterminator="\n")
+    for seconds, width_us, torque_nm, name in zip(time_s, width, torque, names, strict=True):
+        rows.writerow([f"{seconds:.6f}", f"{width_us:g}", f"{torque_nm:.6f}", name])
+    return text.getvalue()
 
 
 def check(record: Any, number: int) -> None:
@@ -83,7 +89,7 @@ def resampled(record: Any, rate_hz: float) -> tuple[Any, Any, Any]:
         span = max(1, round(own_hz / rate_hz))
         torque = np.convolve(torque, np.ones(span) / span, "same")
     last = np.clip(np.searchsorted(record.time_s, time_s + 0.25 / own_hz, side="right") - 1, 0, None)
-    names = np.array(record.segment_names)[record.segment[last]]
+    names = np.array(record.segment_names, dtype=object)[record.segment[last]]
     return record.pulse_width_us[last], np.interp(time_s, record.time_s, torque), names
 
 

@@ -20,6 +20,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from api import private
+from api.lock import HeldError, refuse_if_held
 from api.settings import Settings
 
 READY_S = 60.0
@@ -159,7 +161,7 @@ class Services:
         attach: Path | None = None,
     ) -> None:
         self.settings, self.attached = settings, attach is not None
-        settings.logs_dir.mkdir(parents=True, exist_ok=True)
+        private.folder(private.folder(settings.data_dir) / settings.logs_dir.name)
         self.runtime = Path(tempfile.mkdtemp(prefix="stimrig-"))  # a Unix socket's path holds 107 characters only
         self.socket = attach.absolute() if attach else self.runtime / "rig.sock"
         self.emulator: Child | None = None
@@ -185,6 +187,11 @@ class Services:
         self.stop()
 
     @property
+    def emulated(self) -> bool:
+        """Whether no person is connected: the emulator was started here, or runs behind the rig that is attached to."""
+        return self.emulator is not None or (self.attached and self.settings.emulated)
+
+    @property
     def url(self) -> str:
         """Where the service answers."""
         return str(self.api.ready["url"])
@@ -197,6 +204,10 @@ class Services:
     def start(self) -> None:
         """Start everything, the devices first."""
         data = str(self.settings.data_dir.absolute())
+        try:
+            refuse_if_held(self.settings)
+        except HeldError as error:
+            raise LaunchError(str(error), 2) from error
         if not self.attached:
             self._start_devices(data)
         self.api.environment = {
@@ -204,6 +215,7 @@ class Services:
             "STIMRIG_RIG_SOCKET": str(self.socket),
             "STIMRIG_HOST": self.settings.host,
             "STIMRIG_PORT": str(self.settings.port),
+            "STIMRIG_EMULATED": str(self.emulated).lower(),
         }
         if self.admin_token is not None:
             self.api.environment["STIMRIG_ADMIN_TOKEN"] = self.admin_token

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from typing import Any
 
+from api.clock import Clock
 from rig.messages import LiveEvent
 
 QUEUE_LENGTH = 200
@@ -21,9 +22,11 @@ def within_test(event: LiveEvent) -> LiveEvent:
 
 
 class Hub:
-    """Keeps the current test's drawn history, so that a page opened late sees all of it."""
+    """Keeps the current test's drawn history, so that a page opened late sees all of it, and the newest torque."""
 
-    def __init__(self) -> None:
+    def __init__(self, clock: Clock) -> None:
+        self.clock = clock
+        self._torque: tuple[float, float] | None = None
         self.test_id: str | None = None
         self.history: dict[str, list[float]] = {name: [] for name in SERIES}
         self.newest: LiveEvent | None = None
@@ -36,12 +39,22 @@ class Hub:
 
     def live(self, event: LiveEvent) -> None:
         """Take a frame, keep it, pass it on."""
+        if event.torque_max_nm:
+            middle_nm = (event.torque_min_nm[-1] + event.torque_max_nm[-1]) / 2
+            self._torque = middle_nm, self.clock.monotonic_s() - event.torque_age_s
         if event.test_id == self.test_id and event.test_id is not None:
             event = within_test(event)
             self.newest = event
             for name in SERIES:
                 self.history[name].extend(getattr(event, name))
         self.send({"type": "live", **event.model_dump(exclude={"event"})})
+
+    def torque(self) -> tuple[float | None, float | None]:
+        """The newest torque, N·m, and its age, s; None for both where none ever came."""
+        if self._torque is None:
+            return None, None
+        torque_nm, measured_s = self._torque
+        return torque_nm, self.clock.monotonic_s() - measured_s
 
     def position(self, test_id: str) -> tuple[float, float, str | None] | None:
         """Elapsed and total seconds, and the segment, of the running test."""

@@ -111,19 +111,19 @@ def joined(parts: Sequence[str], out: str, progress: Progress) -> dict[str, Any]
 
     progress(0.1, "joining the recordings")
     records = [identify.read(Path(part)) for part in parts]
-    text = table(records, pauses([begun(Path(part)) for part in parts], records))
-    Path(out).write_text(text)
-    return {"file_sha256": hashlib.sha256(text.encode()).hexdigest()}
+    content = table(records, pauses([begun(Path(part)) for part in parts], records)).encode()
+    Path(out).write_bytes(content)
+    return {"file_sha256": hashlib.sha256(content).hexdigest()}
 
 
 def begun(path: Path) -> float | None:
     """When a sealed recording's clock was 0, as Unix time; None for a file that doesn't say."""
     from datetime import datetime
 
-    import h5py
+    import identify
+    from identify.recording import attributes
 
     try:
-        with h5py.File(path) as file:
-            return datetime.fromisoformat(str(file.attrs["created_utc"])).timestamp()
-    except (OSError, KeyError, ValueError):
+        return datetime.fromisoformat(attributes(path, ["created_utc"])["created_utc"]).timestamp()
+    except (identify.IdentifyError, ValueError, OverflowError):
         return None

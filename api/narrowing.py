@@ -5,18 +5,16 @@ from __future__ import annotations
 from typing import Any
 
 from api.errors import ApiError
+from api.profiles import LIMITS
 from api.schemas import TestIn
 from rig.messages import Profile
-
-UNITS = {"current_ma": "mA", "max_pulse_width_us": "µs", "max_torque_nm": "N·m"}
 
 
 def limits_of(body: TestIn, own: dict[str, Any] | None) -> dict[str, Any]:
     """The limits of a test, as fields of a `TestPlan`.
 
     The participant's profile stays whole (thresholds, day, rest), so that the rig judges the calibration that a person
-    made; what the request narrows is added to it. Where there is no profile, the request's is sent as it is, and the
-    rig refuses it if it asks for a calibration.
+    made; what the request narrows is added to it.
 
     Parameters
     ----------
@@ -28,13 +26,16 @@ def limits_of(body: TestIn, own: dict[str, Any] | None) -> dict[str, Any]:
     Raises
     ------
     ApiError
-        422: a limit is wider than the participant's, which it is and by how much.
+        422: the participant has no limits; a limit is wider than the participant's, which it is and by how much.
     """
     width_us, torque_nm = body.max_pulse_width_us, body.max_torque_nm
-    asked = body.profile.model_dump(exclude_unset=True) if body.profile else {}
-    if not own:
-        full = body.profile.model_dump() if body.profile else {}
-        return {"profile": Profile(**full), "max_pulse_width_us": width_us, "max_torque_nm": torque_nm}
+    asked = body.profile.sent() if body.profile else {}
+    if lacking := [name for name in LIMITS if (own or {}).get(name) is None]:
+        detail = (
+            f"{body.participant} has no {', '.join(lacking)}. Set all of them: PUT /v1/participants/{{code}}/profile."
+        )
+        raise ApiError(422, "no-limits", "The participant has no limits", detail)
+    assert own is not None
     profile = Profile(**own)
     wider = [words for name, value in asked.items() if (words := _wider(name, value, getattr(profile, name)))]
     if wider:
@@ -51,7 +52,7 @@ def limits_of(body: TestIn, own: dict[str, Any] | None) -> dict[str, Any]:
 def _wider(name: str, asked: float, own: float) -> str | None:
     if asked <= own:  # a number that compares with nothing is wider
         return None
-    unit = UNITS[name]
+    unit = LIMITS[name].unit
     return f"{name} {asked:g} {unit} is above the participant's {own:g} {unit} by {asked - own:g}"
 
 

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 from identify import compare, diagnose, fit, improve, predict, read
 
 if TYPE_CHECKING:
-    import plotly.graph_objects as go
-
+    from api.local_figure import LocalFigure
     from identify import Model, Record
 
 __all__ = ["compare", "diagnose", "fit", "improve", "plot", "predict", "read"]
@@ -20,7 +19,7 @@ MEASURED, MODEL, STIMULUS = "#a9b4be", "#0b6b75", "#b4690e"
 POINTS = 4000
 
 
-def plot(what: Model | dict[str, Any], record: Record | None = None) -> go.Figure:
+def plot(what: Model | dict[str, Any], record: Record | None = None) -> LocalFigure:
     """Draw a model beside its measurement, or how the error fell.
 
     Parameters
@@ -32,7 +31,8 @@ def plot(what: Model | dict[str, Any], record: Record | None = None) -> go.Figur
 
     Returns
     -------
-    plotly.graph_objects.Figure
+    LocalFigure
+        A `plotly.graph_objects.Figure` without a button to upload it.
 
     Raises
     ------
@@ -46,9 +46,11 @@ def plot(what: Model | dict[str, Any], record: Record | None = None) -> go.Figur
     return _comparison(what, record)
 
 
-def _comparison(model: Any, record: Record) -> go.Figure:
+def _comparison(model: Any, record: Record) -> LocalFigure:
     import numpy as np
     from plotly.subplots import make_subplots
+
+    from api.local_figure import LocalFigure
 
     pick = slice(None, None, max(1, -(-record.time_s.size // POINTS)))
     predicted, time_s = np.asarray(predict(model, record))[pick], record.time_s[pick]
@@ -70,18 +72,19 @@ def _comparison(model: Any, record: Record) -> go.Figure:
     figure.update_xaxes(title_text="Time (s)", row=3, col=1)
     figure.update_xaxes(title_text="Pulse width (µs)", row=1, col=2)
     figure.update_yaxes(title_text="Recruitment (N·m)", row=1, col=2)
-    return figure.update_layout(template="plotly_white", height=600, showlegend=False)
+    return LocalFigure(figure.update_layout(template="plotly_white", height=600, showlegend=False))
 
 
-def _errors(found: dict[str, Any]) -> go.Figure:
-    import plotly.graph_objects as go
+def _errors(found: dict[str, Any]) -> LocalFigure:
+    from api.local_figure import LocalFigure
 
     names = [step["added"] or "base model" for step in found["steps"]]
-    figure = go.Figure()
+    figure = LocalFigure()
     for key, name, colour in (("rms_nm", "fitted rows", MEASURED), ("held_out_rms_nm", "held out", MODEL)):
         values = [step[key] for step in found["steps"]]
         figure.add_scatter(x=names, y=values, name=name, mode="lines+markers", line_color=colour)
     figure.add_hline(found["noise_sd_nm"], line_dash="dash", line_color=STIMULUS, annotation_text="noise")
     figure.update_xaxes(title_text="Effect added", type="category")
     figure.update_yaxes(title_text="RMS error (N·m)", rangemode="tozero")
-    return figure.update_layout(template="plotly_white", height=420)
+    figure.update_layout(template="plotly_white", height=420)
+    return figure

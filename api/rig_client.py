@@ -17,15 +17,19 @@ from pydantic import TypeAdapter, ValidationError
 from api.clock import Clock
 from api.errors import ApiError, from_rig
 from rig.messages import (
+    LONGEST_LINE,
     Event,
     FinishedEvent,
     LiveEvent,
+    PreviewRequest,
     Reply,
     Request,
     StateEvent,
     Status,
     StatusRequest,
+    StopRequest,
     SubscribeRequest,
+    stop_socket,
 )
 
 log = logging.getLogger("stimrig.rig_client")
@@ -86,16 +90,18 @@ class RigClient:
         Raises
         ------
         ApiError
-            503: no rig, or it does not answer in time.
+            503: no rig, or it does not answer in time. 422: longer than the rig hears out.
         """
         timeout_s = self.patience_s if timeout_s is None else timeout_s
-        if self._writer is None:
+        if isinstance(message, StopRequest) or self._writer is None:
+            return await self._request_apart(message, timeout_s)
+        if isinstance(message, PreviewRequest):  # long, both ways: the lasting connection carries a test's live signals
             return await self._request_apart(message, timeout_s)
         message = message.model_copy(update={"id": next(self._numbers)})
         future: asyncio.Future[Reply] = asyncio.get_running_loop().create_future()
         self._waiting[message.id] = future
         try:
-            self._writer.write(message.model_dump_json().encode() + b"\n")
+            self._writer.write(line_of(message))
             return await asyncio.wait_for(future, timeout_s)
         except TimeoutError:
             raise no_rig(f"It did not answer within {timeout_s:g} s.") from None
@@ -118,14 +124,17 @@ class RigClient:
         return self.status
 
     async def _request_apart(self, message: Any, timeout_s: float) -> Reply:
-        """Ask on a connection of its own: a stop must not wait for the lasting one to come back."""
+        """Ask on a connection of its own; a stop at the rig's own door for stops, which nothing else can fill."""
         if self.path is None:
             raise no_rig("This service was started without one.")
+        door = stop_socket(self.path)
+        path = door if isinstance(message, StopRequest) and door.exists() else self.path
+        request = line_of(message)
         try:
             async with asyncio.timeout(timeout_s):
-                reader, writer = await asyncio.open_unix_connection(str(self.path), limit=LINE_LIMIT)
+                reader, writer = await asyncio.open_unix_connection(str(path), limit=LINE_LIMIT)
                 try:
-                    writer.write(message.model_dump_json().encode() + b"\n")
+                    writer.write(request)
                     line = await reader.readline()
                     return Reply.model_validate_json(line)
                 finally:
@@ -209,6 +218,15 @@ class RigClient:
         future = self._waiting.get(reply.id)
         if future is not None and not future.done():
             future.set_result(reply)
+
+
+def line_of(message: Any) -> bytes:
+    """A request as a line. Raises ApiError (422) where the rig would not hear it out."""
+    line = message.model_dump_json().encode() + b"\n"
+    if len(line) > LONGEST_LINE:
+        detail = f"{len(line)} bytes are sent to the rig, at most {LONGEST_LINE} are heard. Make the test shorter."
+        raise ApiError(422, "too-long", "The plan is too long", detail)
+    return line
 
 
 def no_rig(detail: str) -> ApiError:

@@ -1,6 +1,6 @@
 """`python -m api.server`: the web process. Prints one JSON line when it answers; ends at SIGTERM.
 
-Exit 2: a setting does not hold, the port is taken, or the database does not open.
+Exit 2: a setting does not hold, another service holds the data, the port is taken, or the database does not open.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ import asyncio
 import contextlib
 import ipaddress
 import json
+import os
 import socket
 import sys
 
@@ -19,17 +20,24 @@ from starlette.types import ASGIApp
 from api import logs
 from api.app import create_app
 from api.errors import ApiError
+from api.lock import ServiceLock
 from api.settings import Settings
+from api.visitors import protocol, raise_file_limit
 
 
 def main() -> int:
     """Run the service; the exit code."""
     logs.configure()
+    raise_file_limit()
+    os.umask(os.umask(0o077) | 0o077)  # what the service and its workers write is for their user only
     try:
         settings = Settings()
         refuse_open_door(settings)
+        lock = ServiceLock(settings)  # before the port: who runs already says more than a port that is taken
         listener = bind(settings.host, settings.port)
-        app = create_app(settings)
+        url = address_of(listener)
+        lock.tell(url)
+        app = create_app(settings, lock=lock)
     except ValidationError as error:
         first = error.errors()[0]
         name = "STIMRIG_" + "_".join(str(part) for part in first["loc"]).upper()
@@ -38,8 +46,7 @@ def main() -> int:
     except (ApiError, OSError) as error:
         print(f"stimrig: {error}", file=sys.stderr)
         return 2
-    host, port = listener.getsockname()[:2]
-    ready = {"url": f"http://{host}:{port}", "port": port, "drawn_token": app.state.context.drawn_token}
+    ready = {"url": url, "port": listener.getsockname()[1], "drawn_token": app.state.context.drawn_token}
     with contextlib.suppress(KeyboardInterrupt):
         asyncio.run(serve(uvicorn.Server(configuration(app)), listener, ready))
     return 0
@@ -53,7 +60,7 @@ def configuration(app: ASGIApp) -> uvicorn.Config:
     """
     return uvicorn.Config(
         app, log_config=None, access_log=False, timeout_graceful_shutdown=2, ws_max_size=2**20, server_header=False,
-        proxy_headers=True, forwarded_allow_ips=["127.0.0.1", "::1"],
+        http=protocol(), proxy_headers=True, forwarded_allow_ips=["127.0.0.1", "::1"],
     )  # fmt: skip
 
 
@@ -94,6 +101,12 @@ def bind(host: str, port: int) -> socket.socket:
         detail = f"{host}:{port}: {error.strerror or error}; take another port with --port"
         raise OSError(detail) from error
     return listener
+
+
+def address_of(listener: socket.socket) -> str:
+    """Where the service answers."""
+    host, port = listener.getsockname()[:2]
+    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
 
 
 async def serve(server: uvicorn.Server, listener: socket.socket, ready: dict[str, object]) -> None:

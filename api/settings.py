@@ -18,12 +18,13 @@ class Settings(BaseSettings):
     model_config = SettingsConfigDict(env_prefix="STIMRIG_", extra="ignore")
 
     data_dir: Path = Field(default=Path("var"), description="database, recordings, journals and logs")
-    database_url: str | None = Field(default=None, description="SQLAlchemy URL; default: SQLite in the data folder")
+    database_url: str | None = Field(default=None, description="URL of a SQLite database; default: in the data folder")
     host: str = Field(default="127.0.0.1", description="address to listen on")
     port: Annotated[int, Field(ge=0, le=65535)] = 8000
     admin_token: SecretStr | None = Field(default=None, description="first administrator's token; default: drawn")
     rig_socket: Path | None = Field(default=None, description="Unix socket of the rig process")
     rig_file: Path | None = Field(default=None, description="rig.toml; default: the emulated rig")
+    emulated: bool = Field(default=False, description="True: no person is connected, an emulator stands in for the rig")
     workers: Annotated[int, Field(ge=1, le=16)] = 2
     session_hours: Annotated[float, Field(gt=0, le=24)] = 12.0
     secure_cookies: bool = Field(default=False, description="True behind a TLS proxy: cookies over HTTPS only")

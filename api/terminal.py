@@ -10,6 +10,8 @@ from typing import Annotated, Any
 
 import typer
 
+LARGEST_MODEL_BYTES = 32 * 2**20
+
 
 class InputError(Exception):
     """Bad input: one line on standard error, exit 2."""
@@ -38,11 +40,10 @@ def load_model(path: Path) -> Any:
     import identify
 
     try:
-        return identify.Model.from_json(path.read_text("utf-8"))
+        with path.open("rb") as file:
+            return identify.Model.from_json(file.read(LARGEST_MODEL_BYTES))
     except OSError as error:
         raise InputError(f"{path}: {error.strerror}. Give a file written by `stimrig fit -o`.") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not a text file. Give a file written by `stimrig fit -o`.") from error
     except identify.IdentifyError as error:
         raise InputError(f"{path}: {error}") from error
 

@@ -5,14 +5,18 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
+import math
 import secrets
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from api import audit
+from sqlalchemy.exc import SQLAlchemyError
+
+from api import audit, profiles
 from api.analyses import Analyses
-from api.clock import Clock
+from api.clock import Clock, asked_s
 from api.errors import ApiError, NotFoundError
 from api.fitting import Fitting
 from api.live import Hub
@@ -39,8 +43,15 @@ from rig.messages import (
 
 log = logging.getLogger("stimrig.trials")
 NOT_CONFIRMED = "The stop is not confirmed"
+HALTED = ("latched", "uncertain", "disconnected")
+START_S = 10.0
+"""From the request to the command to the rig: nobody waits with a hand on the button for longer."""
+PREVIEW_S = 35.0
+"""More than the rig takes for one before it says that the computer is too busy."""
 MISSED_POLLS = 3
 """After so many states that don't name the test, its end was lost: it comes within milliseconds of the state."""
+NOTE_S = 0.3
+"""So long the answer to a stop waits for its entry in the audit trail; the entry is made all the same."""
 EMERGENCY = "Use the stimulator's own emergency switch now."
 
 
@@ -60,6 +71,18 @@ class Current:
     """How often in a row the rig, asked for its state, did not name it."""
 
 
+@dataclass(frozen=True)
+class Seen:
+    """What a person was shown before saying yes; a test that would be another one is not started."""
+
+    profile_version: str
+    preview: dict[str, Any]
+
+    def same(self, preview: dict[str, Any]) -> bool:
+        """Whether the rig would play what was shown; the torque it is estimated to give may be known better by now."""
+        return {**preview, "torque_time_nms": None} == {**self.preview, "torque_time_nms": None}
+
+
 class Trials:
     """Starts tests, one at a time, and follows each to its model."""
 
@@ -68,10 +91,12 @@ class Trials:
         recordings_dir: Path,
     ) -> None:  # fmt: skip
         self.store, self.clock, self.rig, self.versions, self.fitting = store, clock, rig, versions, fitting
-        self.hub = Hub()
+        self.hub = Hub(clock)
         self.current: Current | None = None
         self.outcomes = Outcomes(store, clock, rig, fitting, versions, analyses, recordings_dir, self.announce)
         self._lock = asyncio.Lock()
+        self._halted_s = -math.inf
+        self._notes = ThreadPoolExecutor(2, "notes-of-stops")
         self._tasks: set[asyncio.Task[Any]] = set()
         rig.listeners.append(self._on_event)
         rig.link_listeners.append(self._on_link)
@@ -79,25 +104,43 @@ class Trials:
 
     # ---- start and stop -------------------------------------------------------------------------------------
 
-    async def start(self, body: TestIn, by: str) -> Test:
+    async def start(self, body: TestIn, by: str, seen: Seen | None = None) -> Test:
         """Begin a test.
+
+        Parameters
+        ----------
+        body : TestIn
+            The test.
+        by : str
+            Who answers for it.
+        seen : Seen, optional
+            What a person has confirmed; None: a program's request, which nobody was shown.
 
         Raises
         ------
         ApiError
-            404 no such participant; 409 another test runs, the holder named; what the rig refuses.
+            404 no such participant; 409 another test runs, the holder named; 409 it would not be what was seen, or a
+            stop came since it was asked for; 503 that was too long ago; what the rig refuses.
         """
+        self.refuse_second()
+        async with self._lock:
+            self.refuse_second()
+            return await self._start(body, await self._participant(body), by, seen)
+
+    def refuse_second(self) -> None:
+        """409 while a test runs, its holder named."""
+        if self.current is not None:
+            raise busy(self.current)
+
+    async def _participant(self, body: TestIn) -> Participant:
         participant = await asyncio.to_thread(self.store.get, Participant, body.participant)
         if participant is None:
             raise NotFoundError("participant", body.participant, "POST /v1/participants makes one.")
-        if self.current is not None:
-            raise busy(self.current)
-        async with self._lock:
-            if self.current is not None:
-                raise busy(self.current)
-            return await self._start(body, participant, by)
+        return participant
 
-    async def _start(self, body: TestIn, participant: Participant, by: str) -> Test:
+    async def _start(self, body: TestIn, participant: Participant, by: str, seen: Seen | None) -> Test:
+        if seen is not None and seen.profile_version != profiles.version(participant.profile):
+            raise not_what_was_seen(f"The limits of {participant.code} were changed meanwhile.")
         plan = self._plan(body, participant)
         if body.joins is not None:
             await asyncio.to_thread(self._check_joins, body)
@@ -105,18 +148,25 @@ class Trials:
         current_test.set(plan.test_id)
         self.fitting.cancel_background()
         try:
-            preview = await self.rig.ask(PreviewRequest(plan=plan, recruitment=self._recruitment(plan.participant)))
+            preview = await self._previewed(plan)
+            if seen is not None and not seen.same(preview):
+                raise not_what_was_seen("The rig would now play something else: it was set up anew.")
             row = await asyncio.to_thread(self._write_intent, plan, preview, by, body.joins)
             self.hub.begin(plan.test_id)
-            await self._command(plan)
+            await self._command(plan, body, profiles.version(participant.profile))
             current.started = True
         except BaseException:
             self.current = None
             raise
         return await asyncio.to_thread(self.outcomes.update, row.id, state="running")
 
-    async def _command(self, plan: TestPlan) -> None:
+    async def _command(self, plan: TestPlan, body: TestIn, version: str) -> None:
         try:
+            if profiles.version((await self._participant(body)).profile) != version:
+                raise not_what_was_seen(f"The limits of {plan.participant} were changed meanwhile.")
+            self._refuse_overtaken(
+                asked_s.get(self.clock.monotonic_s())
+            )  # nothing is waited for between this and the command
             await self.rig.ask(StartRequest(plan=plan), timeout_s=15.0)
         except ApiError as error:
             await asyncio.to_thread(
@@ -128,6 +178,15 @@ class Trials:
             if error.code == "rig-busy" and status is not None:
                 error.extra["holder"] = {"test_id": status.test_id, "participant": status.participant}
             raise
+
+    def _refuse_overtaken(self, since_s: float) -> None:
+        """A start that a stop has overtaken, or whose asker has long given up, is not played."""
+        if self._halted_s >= since_s:
+            detail = "Nothing was played. Look at the participant and the rig, re-arm it, and start again."
+            raise ApiError(409, "stopped-meanwhile", "A stop came after this start was asked for", detail)
+        if not (self.clock.monotonic_s() - since_s <= START_S):
+            detail = f"It could not begin within {START_S:g} s. Nothing was played. Start again."
+            raise ApiError(503, "too-late", "The start took too long", detail)
 
     async def _stop_quietly(self, reason: str) -> None:
         try:
@@ -172,11 +231,11 @@ class Trials:
 
     async def preview(self, body: TestIn) -> dict[str, Any]:
         """A test's duration, dose and pulse widths; nothing is played."""
-        participant = await asyncio.to_thread(self.store.get, Participant, body.participant)
-        if participant is None:
-            raise NotFoundError("participant", body.participant, "POST /v1/participants makes one.")
-        plan = self._plan(body, participant)
-        return await self.rig.ask(PreviewRequest(plan=plan, recruitment=self._recruitment(plan.participant)))
+        return await self._previewed(self._plan(body, await self._participant(body)))
+
+    async def _previewed(self, plan: TestPlan) -> dict[str, Any]:
+        curve = await asyncio.to_thread(self._recruitment, plan.participant)
+        return await self.rig.ask(PreviewRequest(plan=plan, recruitment=curve), timeout_s=PREVIEW_S)
 
     def _recruitment(self, participant: str) -> RecruitmentTable | None:
         """The approved model's recruitment curve, to estimate the torque-time of a plan with."""
@@ -194,24 +253,34 @@ class Trials:
         ApiError
             503: the rig cannot be reached, or it could not confirm that stimulation has stopped.
         """
+        self._halted_s = self.clock.monotonic_s()
+        subject = self.current.test_id if self.current else "rig"
         try:
             evidence = StopEvidence.model_validate(
                 await self.rig.ask(StopRequest(reason=reason or "stop pressed", by=by), timeout_s=8.0)
             )
         except ApiError as error:
-            await asyncio.to_thread(self._audit, by, "stop failed", detail=error.detail)
+            await self._note(by, "stop failed", subject, detail=error.detail)
             error.title, error.detail = NOT_CONFIRMED, f"{EMERGENCY} {error.title}: {error.detail}"
             raise
-        await asyncio.to_thread(self._audit, by, "stop", reason=reason, confirmed=evidence.confirmed)
+        await self._note(by, "stop", subject, reason=reason, confirmed=evidence.confirmed)
         if not evidence.confirmed:
             detail = f"{EMERGENCY} The rig says: {evidence.detail}"
             raise ApiError(503, "stop-not-confirmed", NOT_CONFIRMED, detail, evidence=evidence.model_dump())
         return evidence
 
-    def _audit(self, by: str, action: str, **detail: Any) -> None:
-        subject = self.current.test_id if self.current else "rig"
-        with self.store.write() as session:
-            audit.write(session, self.clock.utc(), by, action, subject, **detail)
+    async def _note(self, by: str, action: str, subject: str, **detail: Any) -> None:
+        """Write a stop down; a database that is slow or gone does not keep its answer back."""
+
+        def write() -> None:
+            try:
+                with self.store.write() as session:
+                    audit.write(session, self.clock.utc(), by, action, subject, **detail)
+            except SQLAlchemyError:
+                log.exception("%s by %s could not be written into the audit trail", action, by)
+
+        noted = asyncio.get_running_loop().run_in_executor(self._notes, write)  # threads that nothing else can fill
+        await asyncio.wait({noted}, timeout=NOTE_S)
 
     # ---- what the rig says ----------------------------------------------------------------------------------
 
@@ -221,6 +290,8 @@ class Trials:
         elif isinstance(event, FinishedEvent):
             self._spawn(self._finish(event))
         else:
+            if event.status.state in HALTED:
+                self._halted_s = self.clock.monotonic_s()
             self.hub.send({"type": "state", "rig": event.status.model_dump(exclude={"finished"})})
 
     def _on_link(self, connected: bool) -> None:
@@ -242,10 +313,11 @@ class Trials:
             current.ending = True
             self._spawn(self._recover(current.test_id, f"the rig is {status.state} and no longer plays this test"))
 
-    def _spawn(self, work: Any) -> None:
+    def _spawn(self, work: Any) -> asyncio.Task[Any]:
         task = asyncio.create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
+        return task
 
     async def _finish(self, event: FinishedEvent) -> None:
         """Take over a finished test: store the recording, identify, store the model."""
@@ -351,6 +423,14 @@ class Trials:
         for task in list(self._tasks):
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
+        await asyncio.to_thread(self._notes.shutdown)
+
+
+def not_what_was_seen(why: str) -> ApiError:
+    """409: a person said yes to something else."""
+    return ApiError(
+        409, "not-what-was-seen", "This is no longer what you saw", f"{why} Nothing was started; look again."
+    )
 
 
 def busy(current: Current) -> ApiError:

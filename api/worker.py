@@ -1,15 +1,24 @@
 """A worker process: one job at a time from standard input, one JSON object a line each way.
 
 ``{"job": 1, "verb": "fit", "arguments": {…}}`` in; ``progress``, then ``result`` or ``error`` out.
-It ends when its input closes, so it never outlives the service; a cancelled job's worker is killed.
+It ends when its input closes, so it never outlives the service; a cancelled job's worker is killed. Before the first
+job it shuts itself in (`api.confinement`): what it reads, others may have made. ``--reads`` and ``--writes`` name the
+folders that stay open.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import sys
+from pathlib import Path
 from typing import Any, TextIO
+
+from api import confinement
+
+PROCESSOR_S = 900.0
+"""Of processor time for a job that names no other bound."""
 
 
 def main() -> None:
@@ -18,10 +27,20 @@ def main() -> None:
     os.dup2(2, 1)  # whatever a library prints must not fall into the protocol
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as in `api.cli`: small matrices gain nothing from a second
     os.nice(5)  # the rig's sender goes first
-    say(out, {"ready": True})
+    say(out, {"ready": True, "left_open": shut_in()})
     for line in sys.stdin:
         request = json.loads(line)
+        confinement.limit_time(request.get("processor_s", PROCESSOR_S))
         say(out, {"job": request["job"], **run(request, out)})
+
+
+def shut_in() -> dict[str, str]:
+    """Leave open only what the command line names; what could not be shut."""
+    parser = argparse.ArgumentParser(prog="api.worker")
+    parser.add_argument("--reads", type=Path, action="append", default=[])
+    parser.add_argument("--writes", type=Path, action="append", default=[])
+    options = parser.parse_args()
+    return confinement.confine(options.reads, options.writes)
 
 
 def run(request: dict[str, Any], out: TextIO) -> dict[str, Any]:
@@ -44,6 +63,11 @@ def describe(error: Exception) -> dict[str, Any]:
     if any(kind.__name__ == "IdentifyError" for kind in type(error).__mro__):
         place, mend = getattr(error, "place", None), getattr(error, "mend", None)
         return {"expected": True, "detail": one_line(error), "place": text_or_none(place), "mend": text_or_none(mend)}
+    if isinstance(error, MemoryError):
+        megabytes = confinement.MEMORY_BYTES // 2**20
+        mend = "Cut the record, or resample it to a lower rate."
+        detail = f"it takes more than the {megabytes} MB that a worker may have. {mend}"
+        return {"expected": True, "detail": detail, "place": None, "mend": mend}
     traceback.print_exc(file=sys.stderr)
     return {"expected": False, "detail": f"{type(error).__name__}: {one_line(error)}"}
 

@@ -116,9 +116,9 @@ def restore(backup: Path, rig_data: Path, api_data: Path, force: bool) -> list[s
         The backup does not hold, a process uses the data, or there are data and no `force`. Nothing was touched.
     """
     verify(backup)
-    if _rig_runs(rig_data):
+    if _locked(rig_data / "rig.lock"):
         raise BackupError(f"{rig_data}: a rig runs on it; systemctl stop stimrig-rig stimrig-api first")
-    if _is_open(api_data / "stimrig.db"):
+    if _locked(api_data / "service.lock") or _is_open(api_data / "stimrig.db"):
         raise BackupError(f"{api_data / 'stimrig.db'}: a service uses it; systemctl stop stimrig-api first")
     targets = list(dict.fromkeys((rig_data, api_data)))
     used = [folder for folder in targets if _holds_data(folder)]
@@ -146,8 +146,18 @@ def _stage(source: Path, fresh: Path, folders: tuple[str, ...]) -> None:
 
 
 def _latch(path: Path, reason: str) -> None:
-    """A rig on restored data waits for a person; one that died in a test stays uncertain, which says more."""
-    if not (path.exists() and json.loads(path.read_text("utf-8")).get("state") == "running"):
+    """A rig on restored data waits for a person; one that died in a test stays uncertain, which says more.
+
+    A latch that cannot be read keeps nobody from the restore: the rig waits for a person then, too, and is told why.
+    """
+    state: object = "none"
+    if path.exists():
+        try:
+            content = json.loads(path.read_bytes())
+            state = content["state"]
+        except (ValueError, KeyError, TypeError, RecursionError):
+            reason += "; its latch could not be read, a test may have been under way"
+    if state != "running":
         _write(path, json.dumps({"state": "latched", "reason": reason}).encode())
 
 
@@ -250,10 +260,10 @@ def _sha256(path: Path) -> str:
 def _manifest(backup: Path) -> dict[str, str]:
     try:
         content = json.loads((backup / MANIFEST).read_text("utf-8"))
-        sums = content["sha256"]
+        sums = {str(name): str(digest) for name, digest in content["sha256"].items()}
     except FileNotFoundError:
         raise BackupError(f"{backup}: no {MANIFEST}; not a backup, or one that was cut short", 2) from None
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise BackupError(f"{backup / MANIFEST}: cannot be read ({error})") from None
     if content.get("format") != 1 or DATABASE not in sums:
         raise BackupError(f"{backup / MANIFEST}: not a backup of this format")
@@ -262,9 +272,10 @@ def _manifest(backup: Path) -> dict[str, str]:
     return sums
 
 
-def _rig_runs(rig_data: Path) -> bool:
+def _locked(path: Path) -> bool:
+    """Whether the process whose lock this is runs."""
     try:
-        with (rig_data / "rig.lock").open() as file:  # never made here: it would be of another owner
+        with path.open() as file:  # never made here: it would be of another owner
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except FileNotFoundError:
         return False
@@ -283,7 +294,7 @@ def _is_open(path: Path) -> bool:
 
 
 def _holds_data(folder: Path) -> bool:
-    return any(path.is_file() and path.name != "rig.lock" for path in folder.rglob("*"))
+    return any(path.is_file() and path.suffix != ".lock" for path in folder.rglob("*"))
 
 
 def main(arguments: list[str] | None = None) -> int:

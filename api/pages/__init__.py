@@ -11,8 +11,12 @@ from api.pages import (
     forms,
     home,
     model_view,
+    participant_view,
+    questions_view,
     report_view,
+    rig_view,
     static,
+    stopped_view,
     views,
 )
 
@@ -20,6 +24,7 @@ from api.pages import (
 def routers() -> list[APIRouter]:
     """The routers of the page."""
     subjects = (
-        home, views, model_view, report_view, compare_view, calibration_view, administration_view, forms, static,
+        home, rig_view, views, participant_view, questions_view, model_view, report_view, compare_view,
+        calibration_view, administration_view, forms, static, stopped_view,
     )  # fmt: skip
     return [subject.router for subject in subjects]

@@ -8,13 +8,14 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Form, Request
 from fastapi.responses import PlainTextResponse, RedirectResponse, Response
-from pydantic import ValidationError
 
 from api import audit
 from api.auth import Scope
 from api.context import Administrator, Context, Ctx
-from api.errors import ApiError
-from api.pages.render import environment, page
+from api.pages import typed
+from api.pages.checked import checked
+from api.pages.environment import environment
+from api.pages.render import page
 from api.routes import people, tokens
 from api.store.tables import AuditEntry
 
@@ -69,7 +70,7 @@ async def add_user(
 ) -> Response:  # fmt: skip
     """A new person."""
     body = checked(people.UserIn, name=name.strip(), password=password, scopes=ROLES.get(role, []))
-    await asyncio.to_thread(context.people.add, body.name, body.password, body.scopes, who.name)
+    await context.people.add(body.name, body.password, body.scopes, who.name)
     return back()
 
 
@@ -77,8 +78,7 @@ async def add_user(
 async def set_password(context: Ctx, who: Administrator, name: str, password: Annotated[str, Form()] = "") -> Response:
     """A new password."""
     body = checked(people.PasswordIn, password=password)
-    await asyncio.to_thread(context.people.change_password, name, body.password, who.name)
-    return back()
+    return await people.with_new_password(context, who, name, body.password, back())
 
 
 @router.post("/users/{name}/remove")
@@ -94,7 +94,7 @@ async def make_key(
     days: Annotated[str, Form()] = "30",
 ) -> Response:  # fmt: skip
     """A key for a controller; its text is shown on the answering page only."""
-    body = checked(people.KeyIn, name=name.strip(), days=days)
+    body = checked(people.KeyIn, name=name.strip(), days=typed.whole(days))
     made = await asyncio.to_thread(people.controller_key, context, who, body)
     return await shown(request, context, {**made, "name": body.name})
 
@@ -132,24 +132,6 @@ def told(detail: dict[str, Any]) -> str:
 
 
 environment.filters["told"] = told
-
-
-def checked(model: Any, **fields: Any) -> Any:
-    """A form's fields as the route takes them; 422 in one sentence, and never a password in it."""
-    try:
-        return model(**fields)
-    except ValidationError as error:
-        first = error.errors()[0]
-        field = str(first["loc"][0]).replace("scopes", "role")
-        detail = f"{field}: {first['msg']}. {HINTS.get(field, '')}".strip()
-        raise ApiError(422, "invalid-input", "This cannot be used", detail) from None
-
-
-HINTS = {
-    "name": "Take letters, digits, and . _ @ - without spaces.",
-    "password": "Take at least 10 characters; a few words do well.",
-    "days": "From 1 to 366.",
-}
 
 
 def back() -> Response:

@@ -7,15 +7,21 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Form, Request
 from fastapi.responses import RedirectResponse, Response
-from pydantic import ValidationError
 
-from api.context import Ctx, Tester
+from api import profiles
+from api.context import Context, Ctx, Tester
 from api.errors import ApiError
+from api.pages import typed
+from api.pages.checked import checked
 from api.pages.render import page
+from api.questions import Question, Row
 from api.routes import calibration, participants
 from api.schemas import CalibrationIn, MarkIn, StepIn
+from api.store.tables import Participant
+from rig.messages import Status
 
 router = APIRouter(include_in_schema=False, prefix="/participants/{code}/calibration")
+DEFAULTS = CalibrationIn.model_validate({})
 MARKS = {
     "sensory": ("It is felt", "the narrowest pulse the participant feels"),
     "motor": ("The muscle moves", "the narrowest pulse at which the muscle visibly moves"),
@@ -26,6 +32,14 @@ MARKS = {
 @router.get("")
 async def show(request: Request, context: Ctx, _who: Tester, code: str) -> Response:
     """Where the calibration stands; the form that begins one where none is open."""
+    return await shown(request, context, code)
+
+
+async def shown(
+    request: Request, context: Context, code: str, texts: dict[str, str] | None = None,
+    errors: dict[str, str] | None = None,
+) -> Response:  # fmt: skip
+    """The page, with the form as it was sent where something was wrong with it."""
     row = await asyncio.to_thread(participants.find, context, code)
     try:
         found: dict[str, Any] | None = await calibration.standing(context, code)
@@ -33,28 +47,81 @@ async def show(request: Request, context: Ctx, _who: Tester, code: str) -> Respo
         if error.status != 404:
             raise
         found = None
-    return page(request, "calibration.html", participant=row, found=found, marks=MARKS, defaults=CalibrationIn())
+    own = {"current_ma": typed.shown(row.profile["current_ma"]), "step_us": typed.shown(DEFAULTS.step_us)}
+    limits = context.rig.status.limits if context.rig.status else {}
+    return page(
+        request, "calibration.html", 422 if errors else 200,
+        participant=row, found=found, marks=MARKS,
+        texts=texts or own, errors=errors or {},
+        help={"current_ma": profiles.takes("current_ma", limits), "step_us": "1 to 25 µs"},
+    )  # fmt: skip
 
 
 @router.post("")
-async def begin(
-    context: Ctx, who: Tester, code: str, current_ma: Annotated[str, Form()] = "", step_us: Annotated[str, Form()] = ""
-) -> Response:
-    """Open one."""
-    try:
-        body = CalibrationIn.model_validate({"current_ma": current_ma, "step_us": step_us})
-    except ValidationError as error:
-        first = error.errors()[0]
-        detail = f"{str(first['loc'][0]).replace('_', ' ')}: {first['msg']}, not {first['input']!r}. Nothing was sent."
-        raise ApiError(422, "invalid-input", "The calibration cannot begin like this", detail) from None
-    await calibration.begin(context, code, body, who.name)
-    return back(code)
+async def begin(request: Request, context: Ctx, who: Tester, code: str) -> Response:
+    """Open one; a current that is far above the participant's is asked about first."""
+    row = await asyncio.to_thread(participants.find, context, code)
+    sent = await request.form()
+    texts = {name: str(sent.get(name, ""))[:60] for name in ("current_ma", "step_us")}
+    values, errors = read(texts, row, context.rig.status)
+    if errors:
+        return await shown(request, context, code, texts, errors)
+    body, seen = checked(CalibrationIn, **values), profiles.version(row.profile)
+
+    async def open_it() -> str:
+        await calibration.begin(context, code, body, who.name, seen)
+        return address(code)
+
+    doubts = profiles.jumps(row.profile, {**row.profile, "current_ma": values["current_ma"]})
+    if not doubts:
+        return RedirectResponse(await open_it(), 303)
+    current = f"{values['current_ma']:g} mA"
+    question = Question(
+        participant=code,
+        title=f"Calibrate {code} with {current}?",
+        button=f"Yes, calibrate with {current}",
+        deed=open_it,
+        rows=[
+            Row("Current of every pulse", current, f"{row.profile['current_ma']:g} mA"),
+            Row("One step", f"{values['step_us']:g} µs"),
+        ],
+        warnings=doubts,
+        back=address(code),
+    )
+    return RedirectResponse(context.questions.ask(question, who), 303)
+
+
+def read(
+    texts: dict[str, str], row: Participant, status: Status | None
+) -> tuple[dict[str, float], dict[str, str]]:  # fmt: skip
+    """The form's numbers, and what is wrong with it, a line a field."""
+    values, errors = {}, {}
+    for name, text in texts.items():
+        try:
+            values[name] = typed.number(text)
+        except ValueError as error:
+            errors[name] = str(error)
+    if "step_us" in values and not (1 <= values["step_us"] <= 25):
+        errors["step_us"] = f"{texts['step_us']!r} is not 1 to 25 µs"
+    current = {name: value for name, value in values.items() if name == "current_ma"}
+    limits = {name: bound for name, bound in (status.limits if status else {}).items() if name == "current_ma"}
+    for name, words in profiles.outside(current, row.profile, limits).items():
+        errors[name] = f"{texts[name]!r}: {words}"
+    return values, errors
 
 
 @router.post("/step/{direction}")
-async def step(context: Ctx, _who: Tester, code: str, direction: str) -> Response:
-    """Play one train."""
-    await calibration.step(context, code, checked(StepIn, direction=direction).direction)
+async def step(
+    context: Ctx, _who: Tester, code: str, direction: str, trains: Annotated[str | None, Form()] = None
+) -> Response:
+    """Play one train; `trains`, how many the page knew of, says whether the train is still the one on its button."""
+    wanted = checked(StepIn, direction=direction).direction
+    if trains is not None:
+        found = await calibration.standing(context, code)
+        if trains != str(len(found["trains"])):
+            detail = "Another train was played since this page was shown. Nothing was sent. Go back and look again."
+            raise ApiError(409, "not-what-was-seen", "This is no longer what you saw", detail)
+    await calibration.step(context, code, wanted)
     return back(code)
 
 
@@ -79,14 +146,11 @@ async def discard(context: Ctx, who: Tester, code: str) -> Response:
     return RedirectResponse(f"/participants/{code}", 303)
 
 
-def checked(model: Any, **fields: str) -> Any:
-    """A body from a path's words; 422 where they do not hold."""
-    try:
-        return model(**fields)
-    except ValidationError as error:
-        raise ApiError(422, "invalid-input", "This cannot be done", str(error.errors()[0]["msg"])) from None
+def address(code: str) -> str:
+    """The calibration's page."""
+    return f"/participants/{code}/calibration"
 
 
 def back(code: str) -> Response:
     """To the calibration's page."""
-    return RedirectResponse(f"/participants/{code}/calibration", 303)
+    return RedirectResponse(address(code), 303)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from api.pages import directions
+from api.pages.chart_config import said
 
 INK, MEASURED, MODEL, BAND, STIMULUS, GRID = (
     "#1b2733",
@@ -15,6 +16,9 @@ INK, MEASURED, MODEL, BAND, STIMULUS, GRID = (
     "#b4690e",
     "#e6eaee",
 )
+FAINT = "#d3dae0"
+SHOWN_BEYOND = 1.5
+"""Of the plan that was not played so much is drawn, in parts of what was."""
 SEGMENT_FILL = {"validate": "rgba(180,105,14,.07)", "rest": "rgba(0,0,0,0)"}
 FONT = {"family": "system-ui, -apple-system, 'Segoe UI', 'DejaVu Sans', sans-serif", "size": 13, "color": INK}
 
@@ -121,7 +125,7 @@ def segment_marks(segments: list[dict[str, Any]]) -> tuple[list[dict[str, Any]],
         shapes.append({"type": "rect", "xref": "x", "yref": "paper", "x0": start_s, "x1": end_s, "y0": 0, "y1": 1,
                        "fillcolor": SEGMENT_FILL.get(name, "rgba(27,39,51,.035)"), "line": {"width": 0},
                        "layer": "below"})  # fmt: skip
-        words = "validate (held out)" if name == "validate" else name
+        words = "validate (held out)" if name == "validate" else said(name)
         labels.append({"xref": "x", "yref": "paper", "x": (start_s + end_s) / 2, "y": 1.0, "yanchor": "bottom",
                        "text": words, "showarrow": False, "font": {"size": 12, "color": "#52606d"}})  # fmt: skip
     return shapes, labels
@@ -164,20 +168,30 @@ def step(document: dict[str, Any], response: dict[str, list[float]]) -> dict[str
     return {"data": data, "layout": layout(height=340, xaxis=x, yaxis=y, showlegend=bool(known))}
 
 
-def steps(found: dict[str, Any]) -> dict[str, Any]:
-    """The falling error over the versions, with the noise as a line to fall to."""
-    names = [step["added"] or "base model" for step in found["steps"]]
-    dots = {"mode": "lines+markers", "marker": {"size": 9}}
+def recorded(found: dict[str, Any], plan_us: list[float], rate_hz: float, how: str) -> dict[str, Any]:
+    """A test without a model: what was measured and sent until its end, and what was planned beyond it, faint."""
+    end_s = found["pulses_end_s"]
+    last_s = max([end_s, *found["time_s"][-1:]])
     data = [
-        line(names, [step["rms_nm"] for step in found["steps"]], "error on fitted rows", MEASURED, 2.0, **dots),
-        line(names, [step["held_out_rms_nm"] for step in found["steps"]], "held-out error", MODEL, 2.4, **dots),
-    ]
-    noise = {"type": "line", "xref": "paper", "x0": 0, "x1": 1, "y0": found["noise_sd_nm"], "y1": found["noise_sd_nm"],
-             "line": {"color": STIMULUS, "width": 1.5, "dash": "dash"}}  # fmt: skip
-    label = {"xref": "paper", "x": 1, "y": found["noise_sd_nm"], "text": "noise", "showarrow": False,
-             "yanchor": "bottom", "xanchor": "right", "font": {"color": STIMULUS}}  # fmt: skip
+        line(found["time_s"], found["torque_nm"], "torque, measured", MODEL, 1.8),
+        line(found["pulse_time_s"], found["sent_pulse_width_us"], "pulse width, sent", STIMULUS, 1.8, yaxis="y2",
+             line={"shape": "hv"}),
+    ]  # fmt: skip
+    rest = [(k / rate_hz, width_us) for k, width_us in enumerate(plan_us) if k / rate_hz >= end_s - 0.5 / rate_hz]
+    shapes, labels = segment_marks(found["segments"])
+    if rest:
+        last_s = max(last_s, min(rest[-1][0] + 1.0 / rate_hz, SHOWN_BEYOND * end_s + 2.0))
+        kept = [(at_s, width_us) for at_s, width_us in rest if at_s <= last_s]
+        data.append(line([at_s for at_s, _ in kept], [width_us for _, width_us in kept], "planned, not played", FAINT,
+                         1.2, yaxis="y2", line={"shape": "hv"}))  # fmt: skip
+        shapes.append({"type": "line", "xref": "x", "yref": "paper", "x0": end_s, "x1": end_s, "y0": 0, "y1": 1,
+                       "line": {"color": INK}})  # fmt: skip
+        labels.append({"xref": "x", "yref": "paper", "x": end_s, "y": 0.42, "text": said(f"{how} at {end_s:.1f} s")})
     return {
         "data": data,
-        "layout": layout(height=420, shapes=[noise], annotations=[label], xaxis=axis("Effect added", type="category"),
-                         yaxis=axis("RMS error (N·m)", rangemode="tozero")),
+        "layout": layout(
+            shapes=shapes, annotations=labels,
+            xaxis=axis("Time (s)", range=[0.0, last_s]), yaxis=axis("Torque (N·m)", domain=[0.48, 1.0]),
+            yaxis2=axis("Pulse width (µs)", domain=[0.0, 0.36], rangemode="tozero"),
+        ),
     }  # fmt: skip

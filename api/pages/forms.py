@@ -7,13 +7,13 @@ from typing import Annotated
 
 from fastapi import APIRouter, File, Form, UploadFile
 from fastapi.responses import RedirectResponse, Response
-from pydantic import ValidationError
 
-from api.context import Approver, Context, Ctx, Tester
+from api.context import Approver, Context, Ctx, Rearmer, Tester
 from api.errors import ApiError
+from api.pages.checked import checked
 from api.routes import participants, recordings
 from api.routes.rig import rearm_rig
-from api.schemas import ParticipantIn, ProfileIn, TestIn
+from api.schemas import ParticipantIn
 
 router = APIRouter(include_in_schema=False)
 
@@ -21,47 +21,9 @@ router = APIRouter(include_in_schema=False)
 @router.post("/participants")
 async def create_participant(context: Ctx, who: Tester, code: Annotated[str, Form()] = "") -> Response:
     """A new participant."""
-    try:
-        body = ParticipantIn(code=code.strip(), profile=ProfileIn())
-    except ValidationError:
-        detail = (
-            f"{code.strip()[:40]!r} is not a code. Take 1 to 32 letters, digits, - or _ (for example P017). "
-            "Please no names: the link from a code to a person is kept elsewhere."
-        )
-        raise ApiError(422, "invalid-input", "This code cannot be used", detail) from None
+    body = checked(ParticipantIn, code=code.strip())
     row = await asyncio.to_thread(participants.create, context, body, who.name)
     return RedirectResponse(f"/participants/{row.code}", 303)
-
-
-@router.post("/participants/{code}/profile")
-async def set_limits(
-    context: Ctx,
-    who: Tester,
-    code: str,
-    current_ma: Annotated[str, Form()] = "",
-    max_pulse_width_us: Annotated[str, Form()] = "",
-    max_torque_nm: Annotated[str, Form()] = "",
-) -> Response:
-    """The limits for the day."""
-    given = {"current_ma": current_ma, "max_pulse_width_us": max_pulse_width_us, "max_torque_nm": max_torque_nm}
-    try:
-        body = ProfileIn.model_validate(given)
-    except ValidationError as error:
-        first = error.errors()[0]
-        detail = (
-            f"{str(first['loc'][0]).replace('_', ' ')}: {first['msg']}, not {first['input']!r}. Nothing was changed."
-        )
-        raise ApiError(422, "invalid-input", "These limits cannot be used", detail) from None
-    await asyncio.to_thread(participants.change_profile, context, code, body, who.name)
-    return RedirectResponse(f"/participants/{code}", 303)
-
-
-@router.post("/participants/{code}/tests")
-async def start_test(context: Ctx, who: Tester, code: str) -> Response:
-    """Start the default pre-session test."""
-    await asyncio.to_thread(participants.find, context, code)
-    row = await context.trials.start(TestIn.model_validate({"participant": code}), who.name)
-    return RedirectResponse(f"/tests/{row.id}", 303)
 
 
 @router.post("/participants/{code}/recordings")
@@ -103,7 +65,7 @@ async def decide(context: Context, by: str, model_id: str, approved: bool, reaso
 
 
 @router.post("/rearm")
-async def rearm(context: Ctx, who: Tester, back: Annotated[str, Form()] = "/") -> Response:
+async def rearm(context: Ctx, who: Rearmer, back: Annotated[str, Form()] = "/") -> Response:
     """A person has looked, and lets the rig work again."""
     from api.pages.home import local
 

@@ -71,13 +71,12 @@ async def sign_in(
 ) -> Response:  # fmt: skip
     """Open a session with name and password, or with a token."""
     address = request.client.host if request.client else ""
-    people = context.people
     try:
         same_origin(request)
         if token.strip():
-            cookie = await asyncio.to_thread(people.sign_in_with_token, token.strip(), address)
+            cookie = await asyncio.to_thread(context.auth.sign_in, token.strip(), address)
         else:
-            cookie = await asyncio.to_thread(people.sign_in, name.strip()[:80], password[:200], address)
+            cookie = await context.people.sign_in(name.strip()[:80], password[:200], address)
     except ApiError as error:
         return await door(request, context, next, error, name[:80])
     response = RedirectResponse(local(next), 303)

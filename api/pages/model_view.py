@@ -13,7 +13,8 @@ from api import reading
 from api.auth import Scope
 from api.context import Approver, Context, Ctx, ModelReader, Tester
 from api.errors import ApiError
-from api.pages import charts, why, why_charts
+from api.pages import charts, starting, why, why_charts
+from api.pages.checked import checked
 from api.pages.render import page
 from api.routes import criticism
 from api.schemas import EffectsIn, TestIn
@@ -112,7 +113,7 @@ def gather(context: Context, row: Model, measured: dict[str, Any], diagnosis: di
 
 
 @router.post("/models/{model_id}/diagnosis/cancel")
-async def cancel_diagnosis(context: Ctx, _who: ModelReader, model_id: str) -> Response:
+async def cancel_diagnosis(context: Ctx, _who: Tester, model_id: str) -> Response:
     """Stop diagnosing; the page then offers to begin anew."""
     for task in list(context.tasks.all.values()):
         if (task.kind, task.subject) == ("diagnosis", model_id):
@@ -131,7 +132,7 @@ async def add_effect(
 ) -> Response:
     """Add one effect."""
     row = await asyncio.to_thread(context.versions.get, model_id)
-    body = EffectsIn(effects=[effect], reason=reason[:500], force=bool(force))
+    body = checked(EffectsIn, effects=[effect], reason=reason[:500], force=bool(force))
     return await to_task(criticism.begin_adding(context, row, body, who.name))
 
 
@@ -151,7 +152,7 @@ async def undo(context: Ctx, who: Approver, model_id: str) -> Response:
 
 @router.post("/models/{model_id}/experiment")
 async def run_experiment(context: Ctx, who: Tester, model_id: str) -> Response:
-    """Play the next experiment of the diagnosis; its recording is joined to this model's."""
+    """To the question before the diagnosis' next experiment; its recording is joined to this model's."""
     row = await asyncio.to_thread(context.versions.get, model_id)
     found = await asyncio.to_thread(context.analyses.known_diagnosis, row)
     experiment = (found or {}).get("experiment")
@@ -161,8 +162,7 @@ async def run_experiment(context: Ctx, who: Tester, model_id: str) -> Response:
     body = TestIn.model_validate(
         {"participant": row.participant, "kind": "next-experiment", "segments": experiment["segments"], "joins": row.id}
     )
-    test = await context.trials.start(body, who.name)
-    return RedirectResponse(f"/tests/{test.id}", 303)
+    return RedirectResponse(await starting.ask(context, who, body, back=f"/models/{model_id}#experiment"), 303)
 
 
 # ---- long work ----------------------------------------------------------------------------------------------
@@ -197,7 +197,7 @@ async def job(request: Request, context: Ctx, _who: ModelReader, job_id: str) ->
 
 
 @router.post("/jobs/{job_id}/cancel")
-async def cancel(context: Ctx, _who: ModelReader, job_id: str) -> Response:
+async def cancel(context: Ctx, _who: Tester, job_id: str) -> Response:
     """Cancel it."""
     task = context.tasks.get(job_id)
     context.tasks.cancel(task)

@@ -1,83 +1,76 @@
-"""Templates to responses; what every page shows; problems and the stop's evidence as pages."""
+"""Templates to responses; what every page shows; problems as pages."""
 
 from __future__ import annotations
 
-import math
-from datetime import datetime
-from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
 from fastapi import Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from sqlalchemy.exc import SQLAlchemyError
 
+from api.auth import Principal, Scope
+from api.context import Context
 from api.errors import ApiError
-from rig.messages import StopEvidence
+from api.pages import rig_state
+from api.pages.environment import environment
 
-HERE = Path(__file__).parent
-SECURITY_HEADERS = {
-    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; "
-    "img-src 'self' data: blob:; connect-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'",
-    "X-Content-Type-Options": "nosniff",
-    "Referrer-Policy": "same-origin",  # with no-referrer a form's Origin is "null", and the door asks for it
-    "Cache-Control": "no-store",
-}
+environment.filters["mend"] = rig_state.mend
 
 BACK = {"models": "Back to the model", "participants": "Back to the participant", "tests": "Back to the test"}
-
-environment = Environment(
-    loader=FileSystemLoader(HERE / "templates"), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
-    lstrip_blocks=True,
-)  # fmt: skip
-
-
-def number(value: float | None, digits: int = 1, unit: str = "") -> str:
-    """A number for people; a dash where there is none."""
-    if value is None:
-        return "–"
-    text = f"{value:.{digits}f}".replace("-", "−")
-    return f"{text} {unit}" if unit else text
-
-
-def when(label: str | None) -> str:
-    """A UTC label in the machine's local time, to the minute."""
-    if not label:
-        return "–"
-    return datetime.fromisoformat(label.replace("Z", "+00:00")).astimezone().strftime("%d %b %Y, %H:%M")
-
-
-def figures(value: float | None) -> str:
-    """A number to three significant figures, without powers of ten where they can be done without."""
-    if value is None:
-        return "–"
-    if value == 0:
-        return "0"
-    digits = max(0, 2 - math.floor(math.log10(abs(value))))
-    text = f"{value:.{digits}f}" if digits <= 6 else f"{value:.2g}"
-    return text.replace("-", "−")
-
-
-environment.filters["number"] = number
-environment.filters["figures"] = figures
-environment.filters["when"] = when
 
 
 def page(request: Request, template: str, status: int = 200, **values: Any) -> HTMLResponse:
     """A page, with the bar that every page has."""
     context = request.app.state.context
-    bar = {
+    principal = known(request)
+    right = stop_right(request, principal)
+    bar = {**bar_of(context, principal), "right": right, "version": request.app.version}
+    shown = {"bar": bar, "principal": principal, "here": here(request)}
+    html = environment.get_template(template).render(request=request, **shown, **values)
+    return HTMLResponse(html, status_code=status)
+
+
+def known(request: Request) -> Principal | None:
+    """Who looks at the page; nobody where the database does not answer: what a stop did is said all the same."""
+    try:
+        return request.app.state.context.auth.identify(request, forgive_age=True)
+    except (ApiError, SQLAlchemyError):
+        return None
+
+
+def stop_right(request: Request, principal: Principal | None) -> str | None:
+    """What the page's stop button is good for; the answer to a stop keeps the right that was used, and no longer."""
+    context = request.app.state.context
+    if principal is None:
+        return getattr(request.state, "stop_right", None)
+    current = context.trials.current
+    return context.stop_rights.give(principal.name, current.test_id if current else None)
+
+
+def fragment(context: Context, template: str, principal: Principal, place: str) -> str:
+    """A part of a page by itself, for a script that renews it; `place`: the page it is on."""
+    bar = bar_of(context, principal)
+    return environment.get_template(template).render(bar=bar, principal=principal, here=place)
+
+
+def bar_of(context: Context, principal: Principal | None) -> dict[str, Any]:
+    """What every page has at its top."""
+    return {
         "rig": context.rig.status,
         "connected": context.rig.connected,
         "current": context.trials.current,
-        "version": request.app.version,
+        "now": rig_state.now(context, principal),
+        "may_rearm": principal is not None and principal.may(Scope.REARM),
     }
-    try:
-        principal = context.auth.identify(request, forgive_age=True)
-    except ApiError:
-        principal = None
-    html = environment.get_template(template).render(request=request, bar=bar, principal=principal, **values)
-    return HTMLResponse(html, status_code=status, headers=SECURITY_HEADERS)
+
+
+def here(request: Request) -> str:
+    """The address of the page that is shown; of the one with the form where a form was refused."""
+    if request.method == "GET":
+        return request.url.path + (f"?{request.url.query}" if request.url.query else "")
+    back = back_from(request.url.path)
+    return back[0] if back else "/"
 
 
 def wants_html(request: Request) -> bool:
@@ -100,8 +93,3 @@ def back_from(path: str) -> tuple[str, str] | None:
     if len(parts) < 3 or parts[0] not in BACK:
         return None
     return f"/{parts[0]}/{quote(parts[1])}", BACK[parts[0]]
-
-
-def stop_page(request: Request, evidence: StopEvidence) -> Response:
-    """The rig's evidence that stimulation has stopped."""
-    return page(request, "stop.html", evidence=evidence)

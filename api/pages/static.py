@@ -12,7 +12,7 @@ from fastapi import APIRouter, Request
 from fastapi.responses import Response
 
 from api.errors import NotFoundError
-from api.pages.render import HERE, environment
+from api.pages.environment import HERE, environment
 
 router = APIRouter(include_in_schema=False)
 
@@ -58,7 +58,6 @@ def static(request: Request, name: str) -> Response:
     path = locate(name)
     body, packed, tag = contents(path, path.stat().st_mtime)
     headers = {"Cache-Control": "public, max-age=31536000, immutable", "ETag": f'"{tag}"', "Vary": "Accept-Encoding"}
-    headers["X-Content-Type-Options"] = "nosniff"
     if request.headers.get("if-none-match") == f'"{tag}"':
         return Response(status_code=304, headers=headers)
     if "gzip" in request.headers.get("accept-encoding", ""):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from api.pages.chart_config import said
 from api.pages.charts import BAND, INK, MEASURED, MODEL, STIMULUS, axis, layout, line, segment_marks
 
 MARK, MARK_LINE = "rgba(179,18,29,.10)", "#b3121d"
@@ -52,7 +53,7 @@ def signature(time_s: list[float], found: dict[str, list[float]]) -> dict[str, A
 
 def falling(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Error over the versions, with the noise as the line to fall to."""
-    names = [f"{number}. {row['label']}" for number, row in enumerate(rows, start=1)]
+    names = [f"{number}. {said(row['label'])}" for number, row in enumerate(rows, start=1)]
     sizes = [13 if row["current"] else 8 for row in rows]
     noise = next((row["noise_sd_nm"] for row in reversed(rows) if row.get("noise_sd_nm")), None)
     held = [row["held_out_rms_nm"] for row in rows]

@@ -8,7 +8,7 @@ from typing import Any
 
 from fastapi import APIRouter
 
-from api import audit
+from api import audit, profiles
 from api.context import PROBLEM, Context, Ctx, Tester
 from api.errors import ApiError
 from api.routes import participants
@@ -20,35 +20,61 @@ from rig.messages import (
     CalibrateStartRequest,
     CalibrateStepRequest,
     CalibrationResult,
+    CalibrationStatus,
     Status,
 )
 
 router = APIRouter(prefix="/v1/participants/{code}/calibration", tags=["calibration"], responses=PROBLEM)
 
 
-async def begin(context: Context, code: str, body: CalibrationIn, by: str) -> dict[str, Any]:
-    """Open a calibration; nothing is sent yet."""
-    await asyncio.to_thread(participants.find, context, code)
-    if context.trials.current is not None:
-        from api.trials import busy
+async def begin(
+    context: Context, code: str, body: CalibrationIn, by: str, seen: str | None = None
+) -> dict[str, Any]:  # fmt: skip
+    """Open a calibration; nothing is sent yet. What is not asked for is the participant's own, so never wider.
 
-        raise busy(context.trials.current)
-    identity = f"C{context.clock.utc()[:19].replace('-', '').replace(':', '')}-{secrets.token_hex(3)}"
-    await asyncio.to_thread(note, context, by, "begin calibration", code, calibration=identity, **body.model_dump())
-    await context.rig.ask(CalibrateStartRequest(calibration_id=identity, participant=code, by=by, **body.model_dump()))
-    return await standing(context, code)
+    It is bound to the limits that it is begun with; `seen`, their version that a person was shown.
+    """
+    async with context.limits_turn:
+        row = await asyncio.to_thread(participants.find, context, code)
+        context.trials.refuse_second()
+        version = profiles.version(row.profile)
+        if seen not in (None, version):
+            raise participants.stale(row)
+        stamp = context.clock.utc()[:19].replace("-", "").replace(":", "")
+        identity = f"C{stamp}-{secrets.token_hex(3)}-{version}"
+        asked = settings(body, row.profile)
+        await asyncio.to_thread(note, context, by, "begin calibration", code, calibration=identity, **asked)
+        await context.rig.ask(CalibrateStartRequest(calibration_id=identity, participant=code, by=by, **asked))
+        return await standing(context, code)
+
+
+def settings(body: CalibrationIn, profile: dict[str, Any]) -> dict[str, Any]:
+    """How the calibration goes: what was asked for, and the participant's own current and torque where it was not.
+
+    Raises
+    ------
+    ApiError
+        422: neither the request nor the participant says one of them.
+    """
+    asked = body.model_dump()
+    for name in ("current_ma", "max_torque_nm"):
+        asked[name] = profile.get(name) if asked[name] is None else asked[name]
+        if asked[name] is None:
+            raise ApiError(422, "no-limits", "The participant has no limits", f"Send {name}; {name} is not known yet.")
+    return asked
 
 
 async def step(context: Context, code: str, direction: Any) -> dict[str, Any]:
     """Play one train."""
-    await standing(context, code)
-    await context.rig.ask(CalibrateStepRequest(direction=direction))
+    async with context.limits_turn:
+        await sound(context, code)
+        await context.rig.ask(CalibrateStepRequest(direction=direction))
     return await standing(context, code)
 
 
 async def mark(context: Context, code: str, threshold: Any, by: str) -> dict[str, Any]:
     """Mark the last train's width."""
-    found = await standing(context, code)
+    found = await sound(context, code)
     await context.rig.ask(CalibrateMarkRequest(threshold=threshold))
     await asyncio.to_thread(note, context, by, f"mark {threshold}", code, pulse_width_us=found["pulse_width_us"])
     return await standing(context, code)
@@ -56,12 +82,14 @@ async def mark(context: Context, code: str, threshold: Any, by: str) -> dict[str
 
 async def finish(context: Context, code: str, discard: bool, by: str) -> dict[str, Any]:
     """Close it; unless discarded, what it found is the participant's profile for the day."""
-    await standing(context, code)
-    reply = await context.rig.ask(CalibrateFinishRequest(by=by, discard=discard))
-    result = CalibrationResult.model_validate(reply)
-    await context.rig.fresh_status()
-    await asyncio.to_thread(_store, context, code, result, by)
-    return {"profile": result.profile.model_dump() if result.profile else None, "recordings": result.recordings}
+    async with context.limits_turn:
+        found = await (standing if discard else sound)(context, code)
+        reply = await context.rig.ask(CalibrateFinishRequest(by=by, discard=discard))
+        result = CalibrationResult.model_validate(reply)
+        await context.rig.fresh_status()
+        version = profiles.of_calibration(found["calibration_id"])
+        profile = await asyncio.to_thread(_store, context, code, result, by, version)
+    return {"profile": profile, "recordings": result.recordings}
 
 
 async def standing(context: Context, code: str) -> dict[str, Any]:
@@ -78,7 +106,34 @@ async def standing(context: Context, code: str) -> dict[str, Any]:
         ended = f" The rig is {status.state}: {status.reason}." if status.state == "latched" else ""
         detail = f"No calibration of {code} is open.{ended} POST /v1/participants/{code}/calibration begins one."
         raise ApiError(404, "no-calibration", "No calibration is open", detail)
-    return {**found.model_dump(), "rig_state": status.state, "playing": status.state != "calibrating"}
+    row = await asyncio.to_thread(participants.find, context, code)
+    playing = status.state != "calibrating"
+    return {**found.model_dump(), "rig_state": status.state, "playing": playing, "outdated": outdated(row, found)}
+
+
+def outdated(row: Participant, found: CalibrationStatus) -> str:
+    """Why a calibration that is open goes no further: the participant's limits are no longer those of its beginning."""
+    if profiles.of_calibration(found.calibration_id) == profiles.version(row.profile):
+        return ""
+    now = ", ".join(f"{row.profile[name]:g} {limit.unit}" for name, limit in profiles.LIMITS.items())
+    return (
+        f"{row.code} now has other limits ({now}) than when this calibration was begun with {found.current_ma:g} mA. "
+        "It sends no further train and gives no profile. Discard it and begin anew."
+    )
+
+
+async def sound(context: Context, code: str) -> dict[str, Any]:
+    """Where the calibration stands, as long as it may go on.
+
+    Raises
+    ------
+    ApiError
+        404: none is open for this participant; 409: the participant's limits were changed since it was begun.
+    """
+    found = await standing(context, code)
+    if found["outdated"]:
+        raise ApiError(409, "changed-meanwhile", "The limits were changed meanwhile", found["outdated"])
+    return found
 
 
 def note(context: Context, by: str, action: str, code: str, **detail: Any) -> None:
@@ -87,21 +142,29 @@ def note(context: Context, by: str, action: str, code: str, **detail: Any) -> No
         audit.write(session, context.clock.utc(), by, action, code, **detail)
 
 
-def _store(context: Context, code: str, result: CalibrationResult, by: str) -> None:
+def _store(
+    context: Context, code: str, result: CalibrationResult, by: str, version: str
+) -> dict[str, Any] | None:  # fmt: skip
+    """What was found is the profile, if that is still of this version; what a calibration does not look for (the rest
+    between tests) stays."""
+    found = result.profile.model_dump() if result.profile else None
     with context.store.write() as session:
-        action = "finish calibration" if result.profile else "discard calibration"
-        profile = result.profile.model_dump() if result.profile else None
-        if profile is not None:
-            row = session.get(Participant, code)
-            assert row is not None
-            row.profile = profile
-        audit.write(session, context.clock.utc(), by, action, code, profile=profile, recordings=result.recordings)
+        row = session.get(Participant, code)
+        assert row is not None
+        if found is not None:
+            if profiles.version(row.profile) != version:
+                raise participants.stale(row)
+            kept = {name: value for name, value in row.profile.items() if found.get(name) is None}
+            found = row.profile = {**found, **kept}
+        action = "finish calibration" if found else "discard calibration"
+        audit.write(session, context.clock.utc(), by, action, code, profile=found, recordings=result.recordings)
+    return found
 
 
 @router.post("", status_code=201)
 async def begin_calibration(context: Ctx, who: Tester, code: str, body: CalibrationIn | None = None) -> dict[str, Any]:
     """Open a guided calibration: nothing is sent until a step is asked for."""
-    return await begin(context, code, body or CalibrationIn(), who.name)
+    return await begin(context, code, body or CalibrationIn.model_validate({}), who.name)
 
 
 @router.get("")

@@ -11,6 +11,7 @@ from fastapi import APIRouter, Header, Response
 from api.context import PROBLEM, Approver, Ctx, ModelReader
 from api.documents import VersionOut
 from api.errors import ApiError
+from api.headers import entity_tags
 from api.routes import participants
 from api.schemas import DecisionIn
 
@@ -38,7 +39,7 @@ async def approved_model(
 
 def matches(if_none_match: str, etag: str) -> bool:
     """RFC 9110, section 13.1.2: weak comparison against a list, or `*`."""
-    tags = [tag.strip().removeprefix("W/") for tag in if_none_match.split(",")]
+    tags = entity_tags(if_none_match)
     return "*" in tags or etag in tags
 
 

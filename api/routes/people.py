@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from typing import Annotated, Any
 from urllib.parse import urlsplit
 
@@ -10,7 +9,7 @@ from fastapi import APIRouter, Request
 from fastapi.responses import JSONResponse, RedirectResponse, Response
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 
-from api.auth import COOKIE, Scope, unauthorized
+from api.auth import COOKIE, Principal, Scope, unauthorized
 from api.clock import utc_label
 from api.context import PROBLEM, Administrator, Anyone, Context, Ctx
 from api.errors import ApiError, NotFoundError
@@ -61,13 +60,13 @@ class KeyIn(_Body):
     """A key for a controller."""
 
     name: Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_. -]{1,80}$")]
-    days: Annotated[int, Field(ge=1, le=366, description="it expires after these")] = 30
+    days: Annotated[int, Field(strict=True, ge=1, le=366, description="it expires after these")] = 30
 
 
 @router.post("/users", status_code=201)
-def add_user(context: Ctx, who: Administrator, body: UserIn) -> dict[str, Any]:
+async def add_user(context: Ctx, who: Administrator, body: UserIn) -> dict[str, Any]:
     """Add a person; the default scopes are a clinician's."""
-    row = context.people.add(body.name, body.password, body.scopes, who.name)
+    row = await context.people.add(body.name, body.password, body.scopes, who.name)
     return {"name": row.name, "scopes": body.scopes, "created_utc": row.created_utc}
 
 
@@ -78,9 +77,17 @@ def list_users(context: Ctx, _who: Administrator) -> list[dict[str, Any]]:
 
 
 @router.put("/users/{name}/password", status_code=204)
-def set_password(context: Ctx, who: Administrator, name: str, body: PasswordIn) -> None:
-    """A new password; the person's sessions end."""
-    context.people.change_password(name, body.password, who.name)
+async def set_password(context: Ctx, who: Administrator, name: str, body: PasswordIn) -> Response:
+    """A new password; the person's sessions end. One that changes its own goes on under the cookie of the answer."""
+    return await with_new_password(context, who, name, body.password, Response(status_code=204))
+
+
+async def with_new_password(context: Context, who: Principal, name: str, password: str, answer: Response) -> Response:
+    """Change it; the answer carries the cookie of the session that made the change, where it is the person's own."""
+    cookie = await context.people.change_password(name, password, who)
+    if cookie is not None:
+        set_cookie(context, answer, cookie)
+    return answer
 
 
 @router.delete("/users/{name}", status_code=204)
@@ -101,7 +108,7 @@ async def sign_in(context: Ctx, request: Request) -> Response:
     form = "form" in request.headers.get("content-type", "")
     given = await _given(request, form)
     address = request.client.host if request.client else ""
-    cookie = await asyncio.to_thread(context.people.sign_in, given.name, given.password, address)
+    cookie = await context.people.sign_in(given.name, given.password, address)
     principal = context.auth.cookie(cookie)
     answer: Response
     if form:
@@ -139,9 +146,9 @@ def set_cookie(context: Context, answer: Response, cookie: str) -> None:
 
 
 @router.post("/sessions/confirm", status_code=204, responses=TOO_MANY)
-def confirm(context: Ctx, who: Anyone, body: ConfirmIn) -> None:
+async def confirm(context: Ctx, who: Anyone, body: ConfirmIn) -> None:
     """The password once more, before a model is approved."""
-    context.people.confirm(who, body.password)
+    await context.people.confirm(who, body.password)
 
 
 @router.delete("/sessions/current", status_code=204)

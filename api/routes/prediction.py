@@ -6,19 +6,19 @@ import asyncio
 from typing import Annotated, Any
 
 from fastapi import APIRouter
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
+from pydantic import Field, FiniteFloat
 
 from api.context import PROBLEM, Ctx, ModelReader
+from api.schemas import Body
 
 router = APIRouter(prefix="/v1", tags=["models"], responses=PROBLEM)
 
 WidthUs = Annotated[FiniteFloat, Field(ge=0, le=500)]
 
 
-class WidthsIn(BaseModel):
+class WidthsIn(Body):
     """One pulse width for each pulse."""
 
-    model_config = ConfigDict(extra="forbid")
     pulse_width_us: Annotated[list[WidthUs], Field(min_length=1, max_length=12_000, description="µs")]
     pulse_rate_hz: Annotated[FiniteFloat, Field(ge=10, le=100)] = 40.0
 

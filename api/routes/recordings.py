@@ -12,7 +12,7 @@ from fastapi import APIRouter, Request, Response
 from fastapi.responses import FileResponse
 from starlette.background import BackgroundTask
 
-from api import audit
+from api import audit, uploads
 from api.context import PROBLEM, Context, Ctx, ModelReader, Tester
 from api.errors import ApiError, NotFoundError
 from api.routes import participants
@@ -20,6 +20,7 @@ from api.store.tables import Model, Recording
 
 router = APIRouter(prefix="/v1", tags=["recordings"], responses=PROBLEM)
 
+UPLOAD = {"requestBody": {"required": True, "content": {"application/octet-stream": {"schema": {"type": "string"}}}}}
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 
 
@@ -66,7 +67,7 @@ def held(context: Context, recording_id: str) -> tuple[Recording, Path]:
     return row, path
 
 
-@router.post("/participants/{code}/recordings", status_code=201)
+@router.post("/participants/{code}/recordings", status_code=201, openapi_extra=UPLOAD)
 async def upload(context: Ctx, who: Tester, code: str, request: Request, response: Response) -> dict[str, Any]:
     """Take in a recording of another tool (CSV or HDF5 as the request's body) and identify a model from it."""
     await asyncio.to_thread(participants.find, context, code)
@@ -84,15 +85,29 @@ async def take_in(context: Context, code: str, data: bytes, by: str) -> tuple[Re
     ApiError
         422: it cannot be read or fitted; nothing is kept of it.
     """
-    path = await asyncio.to_thread(_write, context, data)
+    whole = await asyncio.to_thread(_write, context, data)
+    part = uploads.part_of(whole)
     try:
-        found = await context.fitting.submit("fit", data=str(path)).result
-    except ApiError as error:
-        path.unlink(missing_ok=True)
-        error.detail = error.detail.replace(str(path), "the upload")
+        found = await _identified(context, part)
+    except BaseException:  # refused, or nobody waits for it any more
+        part.unlink(missing_ok=True)
         raise
-    row = await asyncio.to_thread(_store, context, code, path, data, by)
+    row = await asyncio.shield(asyncio.to_thread(_store, context, code, whole, data, by))
     return row, await asyncio.to_thread(context.versions.add, found["json"], code, row.id, by)
+
+
+async def _identified(context: Context, path: Path) -> dict[str, Any]:
+    """The model of an upload; every reason why there is none is about the upload, and tells nothing of this machine."""
+    try:
+        return await context.fitting.submit("fit", data=str(path)).result
+    except ApiError as error:
+        if error.code == "worker-died":
+            detail = f"{error.detail.partition('. ')[0]}. Is the file damaged? Nothing of it was kept."
+            raise ApiError(422, "data", "The upload cannot be read", detail) from error
+        error.detail = error.detail.replace(str(path), "the upload").replace(path.name, "the upload")
+        if "place" in error.extra:
+            error.extra["place"] = error.extra["place"].replace(str(path), "the upload")
+        raise
 
 
 async def bounded_body(request: Request, limit_mb: float) -> bytes:
@@ -109,8 +124,8 @@ async def bounded_body(request: Request, limit_mb: float) -> bytes:
 
 def _write(context: Context, data: bytes) -> Path:
     suffix = ".h5" if data.startswith(HDF5_MAGIC) else ".csv"
-    path = context.settings.recordings_dir / f"upload-{secrets.token_hex(8)}{suffix}"
-    path.write_bytes(data)
+    path = context.settings.recordings_dir / f"{uploads.PREFIX}{secrets.token_hex(8)}{suffix}"
+    uploads.part_of(path).write_bytes(data)
     return path
 
 
@@ -118,7 +133,7 @@ def _store(context: Context, code: str, path: Path, data: bytes, by: str) -> Rec
     now = context.clock.utc()
     row = Recording(id=path.stem, participant=code, test_id=None, path=str(path), origin="upload", created_utc=now)
     row.file_sha256 = hashlib.sha256(data).hexdigest()
-    with context.store.write() as session:
+    with uploads.taken_in(path), context.store.write() as session:
         session.add(row)
         session.flush()
         audit.write(session, now, by, "upload recording", row.id, participant=code, sha256=row.file_sha256)

@@ -6,16 +6,15 @@ import asyncio
 from typing import Any
 
 from fastapi import APIRouter, Request
-from fastapi.responses import JSONResponse, Response
-from pydantic import ValidationError
-from starlette.exceptions import HTTPException
-from starlette.requests import ClientDisconnect
+from fastapi.responses import JSONResponse, RedirectResponse, Response
 
 from api import audit
-from api.context import PROBLEM, Context, Ctx, LiveReader, MayStop, Tester
+from api.context import PROBLEM, Context, Ctx, LiveReader, MayStop, Rearmer, Tester
 from api.errors import ApiError
-from api.schemas import StopIn, TestIn
-from rig.messages import RearmRequest
+from api.schemas import TestIn
+from api.stop_right import Press
+from api.stops_told import Told
+from rig.messages import RearmRequest, StopEvidence
 
 router = APIRouter(prefix="/v1", tags=["rig"], responses=PROBLEM)
 
@@ -45,35 +44,30 @@ def rig(context: Ctx, _who: LiveReader) -> dict[str, Any]:
 
 
 @router.post("/stop")
-async def stop(request: Request, context: Ctx, who: MayStop) -> Response:
-    """Stop stimulation: anyone signed in, at any time; JSON, a plain form, or no body at all.
+async def stop(request: Request, context: Ctx, press: MayStop) -> Response:
+    """Stop stimulation: anyone signed in, and any page that shows the button; JSON, a plain form, or no body at all.
 
     200 only on the rig's evidence that stimulation has stopped; otherwise a problem that says so.
     """
-    reason = await _reason(request, patience_s=0.5)
-    evidence = await context.trials.stop(reason, who.name)
-    from api.pages.render import stop_page, wants_html
+    from api.pages.render import wants_html
 
     if wants_html(request):
-        return stop_page(request, evidence)
+        return await stop_on_page(request, context, press)
+    evidence = await context.trials.stop(press.reason, press.by)
     return JSONResponse({"stopped": evidence.confirmed, "evidence": evidence.model_dump(), "rig": rig_state(context)})
 
 
-async def _reason(request: Request, patience_s: float) -> str:
-    """The stated reason; whatever the body holds, and however slowly it comes, a stop is a stop."""
-    default = "stop pressed"
+async def stop_on_page(request: Request, context: Context, press: Press) -> Response:
+    """Stop, and lead to the page that tells what came of it: that one can be loaded again and stops nothing."""
+    current = context.trials.current
+    answer: StopEvidence | ApiError
     try:
-        async with asyncio.timeout(patience_s):
-            return await _stated(request, default)
-    except (ValidationError, ValueError, ApiError, HTTPException, TimeoutError, ClientDisconnect):
-        return default
-
-
-async def _stated(request: Request, default: str) -> str:
-    if "form" in request.headers.get("content-type", ""):
-        return str((await request.form()).get("reason") or default)[:200]
-    body = await request.body()
-    return StopIn.model_validate_json(body).reason if body.strip() else default
+        answer = await context.trials.stop(press.reason, press.by)
+    except ApiError as error:
+        answer = error
+    right, test_id = getattr(request.state, "stop_right", None), current.test_id if current else None
+    told = Told(press.by, press.reason, context.clock.utc(), test_id, right, answer)
+    return RedirectResponse(f"/stopped/{context.stops.keep(told)}", 303)
 
 
 async def rearm_rig(context: Context, by: str) -> dict[str, Any]:
@@ -90,12 +84,15 @@ async def rearm_rig(context: Context, by: str) -> dict[str, Any]:
 
 
 @router.post("/rearm")
-async def rearm(context: Ctx, who: Tester) -> dict[str, Any]:
-    """After a stop, a fault or a restart the rig stays still until a person re-arms it."""
+async def rearm(context: Ctx, who: Rearmer) -> dict[str, Any]:
+    """After a stop, a fault or a restart the rig stays still until a person re-arms it: who signed in with a password.
+
+    A program needs the scope `rearm`, which `run-test` does not imply and no controller's key holds.
+    """
     return await rearm_rig(context, who.name)
 
 
-@router.post("/preview")
-async def preview(context: Ctx, _who: Tester, body: TestIn) -> dict[str, Any]:
-    """A test's duration, dose and pulse widths, without playing it."""
-    return await context.trials.preview(body)
+@router.post("/preview", response_model=dict[str, Any])
+async def preview(context: Ctx, _who: Tester, body: TestIn) -> Response:
+    """A test's duration, dose and pulse widths, without playing it. 503 where too many are asked for at once."""
+    return JSONResponse(await context.trials.preview(body))

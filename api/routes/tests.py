@@ -97,7 +97,7 @@ async def _pump(socket: WebSocket, context: Context, row: Test, queue: asyncio.Q
                 if message["test"]["id"] != row.id:
                     continue
                 document = message["test"]
-            if message["type"] == "live" and message["test_id"] not in (None, row.id):
+            if message["type"] == "live" and message["test_id"] != row.id:
                 continue
             await socket.send_json(message)
         with contextlib.suppress(RuntimeError):

@@ -1,4 +1,4 @@
-"""One door to the database: SQLite by default (WAL, every commit on the disk), PostgreSQL by URL."""
+"""One door to the database: SQLite (WAL, every commit on the disk), for its owner only."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote, urlsplit
 
 from sqlalchemy import create_engine, event, select
-from sqlalchemy.engine import make_url
+from sqlalchemy.engine import URL, make_url
 from sqlalchemy.exc import ArgumentError, DatabaseError, OperationalError
 from sqlalchemy.orm import Session, sessionmaker
 
+from api import private
 from api.errors import ApiError
 from api.store import migrations
 
@@ -34,8 +36,9 @@ class Store:
     def __init__(self, url: str) -> None:
         try:
             parsed = make_url(url)
-            if parsed.get_backend_name() == "sqlite" and parsed.database:
-                Path(parsed.database).parent.mkdir(parents=True, exist_ok=True)
+            path = sqlite_file(parsed)
+            if path is not None:
+                close_to_others(path)
             self.engine = create_engine(parsed)
             if parsed.get_backend_name() == "sqlite":
                 event.listen(self.engine, "connect", _durable_sqlite)
@@ -80,6 +83,22 @@ class Store:
     def close(self) -> None:
         """Let the connections go."""
         self.engine.dispose()
+
+
+def sqlite_file(url: URL) -> Path | None:
+    """The file behind a URL; None where there is none."""
+    name = url.database or ""
+    if url.get_backend_name() != "sqlite" or name in ("", ":memory:") or "mode=memory" in name:
+        return None
+    return Path(unquote(urlsplit(name).path)) if name.startswith("file:") else Path(name)
+
+
+def close_to_others(path: Path) -> None:
+    """The database is for its owner only: SQLite gives what it makes beside it the same rights."""
+    private.folder(path.parent)
+    private.file(path)
+    for beside in ("-wal", "-shm", "-journal"):
+        private.close(path.with_name(path.name + beside), 0o600)
 
 
 def _durable_sqlite(connection: Any, _record: Any) -> None:

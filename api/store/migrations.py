@@ -12,7 +12,7 @@ from sqlalchemy import Column, Connection, Engine, inspect, text
 
 from api.store import tables
 
-VERSION = 2
+VERSION = 3
 """Raised whenever a table changes; the step that brings an older database there goes into `STEPS`."""
 
 
@@ -43,7 +43,7 @@ def bring_up(engine: Engine) -> int:
 
 
 def make_tables(connection: Connection) -> None:
-    """1: the tables, where they are not there."""
+    """1, 3: the tables, where they are not there; the places that people sign in from came with 3."""
     tables.Table.metadata.create_all(connection)
 
 
@@ -51,6 +51,8 @@ def add_columns(connection: Connection) -> None:
     """2: columns that tables made before versions were kept may lack, such as the end of an approval."""
     seen = inspect(connection)
     for table in tables.Table.metadata.sorted_tables:
+        if not seen.has_table(table.name):
+            continue  # a later step makes it
         there = {column["name"] for column in seen.get_columns(table.name)}
         for column in table.columns:
             if column.name not in there:
@@ -66,4 +68,4 @@ def _add(connection: Connection, table: str, column: Column[object]) -> None:
     connection.execute(text(f"ALTER TABLE {table} ADD COLUMN {column.name} {kind}"))
 
 
-STEPS: dict[int, Callable[[Connection], None]] = {1: make_tables, 2: add_columns}
+STEPS: dict[int, Callable[[Connection], None]] = {1: make_tables, 2: add_columns, 3: make_tables}

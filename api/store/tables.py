@@ -139,6 +139,15 @@ class User(Table):
     changed_utc: Mapped[str] = mapped_column(String(32))
 
 
+class KnownPlace(Table):
+    """Where a person has signed in from: guesses from elsewhere do not hold them back there."""
+
+    __tablename__ = "known_places"
+    name: Mapped[str] = mapped_column(ForeignKey("users.name"), primary_key=True)
+    place: Mapped[str] = mapped_column(String(60), primary_key=True)
+    at_unix_s: Mapped[float] = mapped_column(Float)
+
+
 class Confirmation(Table):
     """A signed-in person has given the password once more; good for one approval."""
 

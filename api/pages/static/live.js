@@ -25,17 +25,8 @@ function take(message) {
     showTest(message.test);
   } else if (message.type === "link" || message.type === "idle") {
     state.connected = message.type === "link" ? message.connected : message.rig_connected;
-    if (!state.connected) showRig("disconnected");
-  } else if (message.type === "state") {
-    showRig(message.rig.state);
   }
   state.dirty = true;
-}
-
-function showRig(name) {
-  const pill = byId("rig-state");
-  pill.className = "pill state-" + name;
-  pill.lastElementChild.textContent = name;
 }
 
 function addFrame(message) {
@@ -56,6 +47,10 @@ function showNumbers(message) {
   byId("progress").value = message.duration_s ? message.elapsed_s / message.duration_s : 0;
 }
 
+let leaving = false;  // a form was sent, be it the stop: its answer is what comes next, not this page's own
+addEventListener("submit", () => { leaving = true; });
+addEventListener("pageshow", () => { leaving = false; });
+
 function showTest(test) {
   const wasOpen = !state.test.done;
   state.test = test;
@@ -64,7 +59,7 @@ function showTest(test) {
   const job = test.identification;
   if (test.state === "identifying") { say("left", "identifying"); say("segment", job ? job.text || job.state : "identifying"); byId("progress").value = 1; }
   if (test.reason) { say("reason", test.reason); byId("reason").hidden = false; }
-  if (test.done && wasOpen) location.replace(test.model_id ? "/models/" + test.model_id : location.pathname);
+  if (test.done && wasOpen && !leaving) location.replace(test.model_id ? "/models/" + test.model_id : location.pathname);
 }
 
 function age() {
@@ -196,6 +191,6 @@ function connect() {
 
 addEventListener("resize", () => { state.dirty = true; });
 drawTrack();
-if (state.test.done && !state.time.length) { byId("torque-chart").hidden = true; }
-if (!state.test.done) { connect(); setInterval(age, 100); }
+connect();
+setInterval(age, 100);
 requestAnimationFrame(draw);

@@ -1,0 +1,57 @@
+"""What every answer tells a browser: load from and post to this service alone, guess nothing, keep nothing private."""
+
+from __future__ import annotations
+
+from starlette.datastructures import MutableHeaders
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+PAGE_POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; "
+    "connect-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
+)
+"""A page's. plotly writes styles into its drawings, and keeps a picture of a chart as data of the page's own."""
+DATA_POLICY = "default-src 'none'; form-action 'none'; base-uri 'none'; frame-ancestors 'none'"
+"""Everything else's, should a browser be led to show it."""
+ALWAYS = {
+    "X-Content-Type-Options": "nosniff",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cache-Control": "no-store",  # where the route knows nothing better
+}
+PAGE = {
+    **ALWAYS,
+    "Content-Security-Policy": PAGE_POLICY,
+    "Referrer-Policy": "same-origin",  # with no-referrer a form's Origin is "null", and the door asks for it
+}
+DATA = {**ALWAYS, "Content-Security-Policy": DATA_POLICY, "Referrer-Policy": "no-referrer"}
+
+
+def entity_tags(field: str) -> list[str]:
+    """The tags of `If-Match` or `If-None-Match`, each in its quotes; a proxy that compresses marks them as weak.
+
+    `If-Match` asks for strong ones (RFC 9110, section 13.1.1). Ours stand for what was said, not for its bytes: a weak
+    one means the same.
+    """
+    return [tag.strip().removeprefix("W/") for tag in field.split(",")]
+
+
+class Headers:
+    """ASGI middleware: a header that a route has set itself stays as it is."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self.app(scope, receive, send)
+            return
+
+        async def told(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                page = headers.get("content-type", "").startswith("text/html")
+                for name, value in (PAGE if page else DATA).items():
+                    headers.setdefault(name, value)
+            await send(message)
+
+        await self.app(scope, receive, told)

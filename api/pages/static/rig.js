@@ -1,0 +1,88 @@
+// What the rig does now, on every page and in every tab: asked for twice a second, never shown older than 2 s.
+// Asked for, not sent: an answer is always newer than its question, also after a laptop has slept.
+"use strict";
+{
+  const EVERY_MS = 500, PATIENCE_MS = 1500, OLD_MS = 2000, TORQUE_OLD_S = 1.0;
+  const clock = () => [performance.now(), Date.now()]; // the first stands still while a machine sleeps, the second may be set
+  const since = (then) => Math.max(performance.now() - then[0], Date.now() - then[1]);
+  const pill = document.getElementById("rig-state"), notice = document.getElementById("rig-notice");
+  const boxes = (name) => document.querySelectorAll(`[data-now="${name}"]`);
+  const begun = clock();
+  let known = null, asked = null, last = null, busy = false, fetching = "";
+
+  const say = (name, text) => { for (const box of boxes(name)) if (box.textContent !== text) box.textContent = text; };
+  const old = () => since(asked || begun) > OLD_MS;
+
+  function get(address) { // aborted in time, its body too; AbortSignal.timeout is missing in browsers before 2022
+    const ending = new AbortController();
+    setTimeout(() => ending.abort(), PATIENCE_MS);
+    return fetch(address, { cache: "no-store", signal: ending.signal });
+  }
+
+  async function ask() {
+    if (busy) return;
+    busy = true;
+    const moment = last = clock();
+    try {
+      const answer = await get("/rig/now");
+      if (answer.ok) { known = await answer.json(); asked = moment; }
+    } catch { /* what is shown grows old, and says so */ }
+    busy = false;
+    show();
+  }
+
+  function show() {
+    if (old()) return bar("unknown", "Not known", "no answer from the service", false);
+    if (!known) return; // what the service wrote into the page stands, with its time
+    bar(known.state, known.flow, known.more, known.ready);
+    if (known.test !== undefined) test(known.test);
+    if (known.notice !== undefined) renew(known.notice);
+  }
+
+  function bar(state, flow, more, ready) {
+    const name = "pill state-" + state;
+    if (pill.className !== name) pill.className = name;
+    say("flow", flow); say("more", more); say("at", ""); say("torque", torque());
+    for (const box of document.querySelectorAll("[data-needs-ready]")) box.disabled = !ready;
+  }
+
+  function torque() {
+    if (old() || !known) return "not known";
+    if (typeof known.torque_age_s !== "number") return "none yet";
+    const age = known.torque_age_s + since(asked) / 1000;
+    if (known.torque_nm === null || age > TORQUE_OLD_S) return "no torque for " + age.toFixed(1) + " s";
+    return known.torque_nm.toFixed(2).replace("-", "−") + " N·m, " + age.toFixed(1) + " s old";
+  }
+
+  function test(current) {
+    for (const box of document.querySelectorAll("[data-when]")) box.hidden = (box.dataset.when === "busy") !== (current !== null);
+    for (const tag of document.querySelectorAll("[data-running]")) {
+      if (current && current.id === tag.dataset.running) continue;
+      tag.textContent = "ended"; tag.className = "tag"; delete tag.dataset.running; // how, the page says when it is loaded
+    }
+    if (!current) return;
+    for (const link of boxes("test")) link.setAttribute("href", "/tests/" + current.id);
+    say("participant", current.participant);
+  }
+
+  async function renew(key) {
+    if (!notice || notice.dataset.key === key || fetching === key) return;
+    fetching = key;
+    try {
+      const answer = await get("/rig/notice?back=" + encodeURIComponent(notice.dataset.back));
+      if (answer.ok) { notice.innerHTML = await answer.text(); notice.dataset.key = key; }
+    } catch { /* the next answer asks again */ }
+    fetching = "";
+  }
+
+  function look() {
+    show();
+    if (!document.hidden && (!last || since(last) >= EVERY_MS)) ask();
+  }
+  const now = () => { show(); if (!document.hidden) ask(); };
+  setInterval(look, 250);
+  addEventListener("pageshow", (event) => { if (event.persisted) location.reload(); else now(); }); // kept by Back: all of it is old
+  document.addEventListener("visibilitychange", now);
+  addEventListener("online", now);
+  now();
+}

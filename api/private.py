@@ -1,0 +1,50 @@
+"""Files and folders for their owner's eyes only, those that were there before included."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+import stat
+from pathlib import Path
+
+KEY_BYTES = 32
+
+
+def close(path: Path, mode: int) -> None:
+    """Take away what `mode` does not allow; what is another user's is left to its owner."""
+    with contextlib.suppress(FileNotFoundError, PermissionError):
+        now = stat.S_IMODE(path.stat().st_mode)
+        if now & ~mode:
+            path.chmod(now & mode)
+
+
+def folder(path: Path) -> Path:
+    """A folder: nobody else looks into one that is made here; one that was there stays as its owner made it."""
+    path.mkdir(parents=True, exist_ok=True, mode=0o700)
+    return path
+
+
+def file(path: Path) -> None:
+    """A file, made empty where it is not there, which its owner alone may read and write."""
+    with contextlib.suppress(FileExistsError):
+        os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600))
+    close(path, 0o600)
+
+
+def key(path: Path) -> bytes:
+    """A secret of the service: read, or drawn at the first start."""
+    with contextlib.suppress(FileNotFoundError):
+        close(path, 0o600)
+        kept = path.read_bytes()
+        if len(kept) == KEY_BYTES:
+            return kept
+    drawn, new = secrets.token_bytes(KEY_BYTES), path.with_suffix(".new")
+    new.unlink(missing_ok=True)
+    file(new)
+    with new.open("wb") as out:
+        out.write(drawn)
+        out.flush()
+        os.fsync(out.fileno())
+    new.replace(path)
+    return drawn

@@ -1,0 +1,155 @@
+"""What a participant's limits become when a person changes some: what they keep, what they void, what must be asked."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from api.clock import unix_of
+from rig.messages import Bound
+
+Profile = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Named:
+    """How people call a limit, its unit, the rig's name of its bound, and the least and the most that any rig takes.
+
+    Below the least there is no limit but a slip: the finest step in which a stimulator tells currents and widths apart,
+    and a torque that every muscle at rest has.
+    """
+
+    words: str
+    unit: str
+    bound: str
+    least: float
+    most: float
+
+
+LIMITS: dict[str, Named] = {
+    "current_ma": Named("current", "mA", "current_ma", 0.5, 130.0),
+    "max_pulse_width_us": Named("comfort maximum", "µs", "pulse_width_us", 1.0, 500.0),
+    "max_torque_nm": Named("torque that stops a test", "N·m", "torque_nm", 0.1, 200.0),
+}
+FOUND = ("sensory_pulse_width_us", "motor_pulse_width_us", "set_at_utc", "expires_at_utc")
+"""What only a calibration finds."""
+JUMP = 1.25
+"""More than a quarter above the last value is a jump: a slip of the keyboard is mostly a factor of two or ten."""
+
+
+def version(profile: Profile) -> str:
+    """A short name of exactly these limits: the same limits have the same one."""
+    text = json.dumps(dict(profile), sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def of_calibration(calibration_id: str) -> str:
+    """The version of the limits that a calibration was begun with.
+
+    It ends the calibration's id, and so is kept by the rig, which may outlive this service.
+    """
+    return calibration_id.rpartition("-")[2]
+
+
+def calibration(profile: Profile, now_utc: str) -> Literal["none", "valid", "expired"]:
+    """How the calibration stands."""
+    if all(profile.get(name) is None for name in FOUND):
+        return "none"
+    expires = profile.get("expires_at_utc")
+    valid = expires is not None and unix_of(now_utc) < unix_of(expires)
+    return "valid" if valid else "expired"
+
+
+def changed(profile: Profile, asked: Mapping[str, float]) -> tuple[dict[str, Any], str]:
+    """The profile with some limits changed, and what that voids.
+
+    What a calibration found stays where no limit is wider than it was; it goes where one is, and where the comfort
+    maximum falls below the motor threshold.
+
+    Returns
+    -------
+    profile : dict
+        The new one.
+    voids : str
+        Why the calibration does not hold with it; empty where nothing is lost.
+    """
+    new = {**profile, **asked}
+    if all(profile.get(name) is None for name in FOUND):
+        return new, ""
+    voids = next((_above(name, new[name], profile[name]) for name in LIMITS if not (new[name] <= profile[name])), "")
+    motor_us = profile.get("motor_pulse_width_us") or 0.0
+    if not voids and not (new["max_pulse_width_us"] >= motor_us):
+        voids = f"the muscle moves from {motor_us:g} µs on, above the new {new['max_pulse_width_us']:g} µs"
+    return ({**new, **dict.fromkeys(FOUND)} if voids else new), voids
+
+
+def _above(name: str, value: float, was: float) -> str:
+    limit = LIMITS[name]
+    return f"{limit.words} {value:g} {limit.unit} is above the {was:g} {limit.unit} that it was found with"
+
+
+def jumps(profile: Profile, new: Profile) -> list[str]:
+    """What rises by more than a quarter, in words: a limit, or the charge of a pulse, to which two small rises add."""
+    found = [
+        _rise(limit.words, profile[name], new[name], limit.unit)
+        for name, limit in LIMITS.items()
+        if not (new[name] <= JUMP * profile[name])
+    ]
+    was_uc, charge_uc = charge(profile), charge(new)
+    if not found and not (charge_uc <= JUMP * was_uc):
+        found.append(_rise("charge of the widest pulse", was_uc, charge_uc, "µC"))
+    return found
+
+
+def charge(profile: Profile) -> float:
+    """Charge of the widest pulse that a profile allows, µC."""
+    return profile["current_ma"] * profile["max_pulse_width_us"] * 1e-3
+
+
+def _rise(words: str, was: float, now: float, unit: str) -> str:
+    return f"The {words} rises from {was:.4g} to {now:.4g} {unit}, {now / was:.3g} times as much."
+
+
+def highest(limits: Mapping[str, Bound], name: str) -> tuple[float, str]:
+    """The most that this rig takes of a limit, and whose bound that is."""
+    bound = limits.get(LIMITS[name].bound)
+    if bound is None or bound.hi is None:
+        return LIMITS[name].most, "any rig's"
+    return bound.hi, bound.owner
+
+
+def takes(name: str, limits: Mapping[str, Bound]) -> str:
+    """What this rig takes of a limit, beside its field."""
+    limit, (most, owner) = LIMITS[name], highest(limits, name)
+    return f"at least {limit.least:g}, at most {most:g} {limit.unit} ({owner})"
+
+
+def outside(asked: Mapping[str, float], profile: Profile, limits: Mapping[str, Bound]) -> dict[str, str]:
+    """Which of the limits that are asked for this rig would refuse, by name, in words.
+
+    Parameters
+    ----------
+    asked
+        The ones that change.
+    profile
+        The participant's, with the others.
+    limits
+        As the rig tells them; where it has not, the widest of any rig.
+    """
+    found = {}
+    for name, value in asked.items():
+        limit, (most, owner) = LIMITS[name], highest(limits, name)
+        if not (limit.least <= value <= most):
+            bounds = f"at least {limit.least:g} and at most {most:g} {limit.unit}"
+            found[name] = f"{value:g} {limit.unit} is not {bounds}, as this rig asks ({owner})"
+    phase = limits.get("charge_per_phase_uc")
+    of_charge = [name for name in ("max_pulse_width_us", "current_ma") if name in asked]
+    if not found and of_charge and phase is not None and phase.hi is not None:
+        charge_uc = charge({**profile, **asked})
+        if not (charge_uc <= phase.hi):
+            most = f"above the {phase.hi:g} µC that this rig takes ({phase.owner})"
+            found[of_charge[0]] = f"with it a pulse carries {charge_uc:.3g} µC, {most}"
+    return found
