@@ -33,8 +33,13 @@ def open_tab(browser: Any, service: Service, signed_in: bool = True, **options: 
         sign_in(page, service)
     yield page
     context.close()
+    bring_to_rest(service)
+
+
+def bring_to_rest(service: Service) -> None:
+    """Whatever it does, stopped; then re-armed."""
     with service.client() as http:
-        end = time.monotonic() + 30
+        end = time.monotonic() + 60
         stopped = http.post("/v1/stop")
         while (rig := http.get("/v1/rig").json())["holder"] or service.rig.state == "running":
             assert time.monotonic() < end, (stopped.text, rig, http.get("/v1/tests").json()[:2], service.rig.status())
@@ -68,7 +73,14 @@ def participant(page: Any, service: Service, code: str) -> None:
 
 
 def start(page: Any) -> None:
+    """As a clinician does: press *Start*, read what is about to happen, say yes."""
     page.get_by_role("button", name="Start the pre-session test").click()
+    say_yes(page)
+
+
+def say_yes(page: Any) -> None:
+    """The question before current flows."""
+    page.get_by_role("button", name="Start now").click()
     page.wait_for_url("**/tests/T*")
 
 

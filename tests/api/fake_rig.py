@@ -90,6 +90,17 @@ class FakeRig:
         self.stopped_by: str | None = None
         self.loses_ends = False
         self.warnings: list[str] = []
+        self.torque_age_s = 0.004
+        self.cell_speaks = True
+        self.mended = True
+        self._idle: asyncio.Task[None] | None = None
+        self.require_calibration = False
+        self.limits = {
+            "current_ma": m.Bound(lo=0, hi=60, unit="mA", owner="rig file"),
+            "pulse_width_us": m.Bound(lo=0, hi=500, unit="µs", owner="hard limit"),
+            "torque_nm": m.Bound(lo=-60, hi=60, unit="N·m", owner="hard limit"),
+            "charge_per_phase_uc": m.Bound(lo=0, hi=20, unit="µC", owner="rig file"),
+        }
         self._stop = asyncio.Event()
         self._writers: set[asyncio.StreamWriter] = set()
         self._play: asyncio.Task[None] | None = None
@@ -101,16 +112,36 @@ class FakeRig:
             participant=self.plan.participant if self.plan else None, segment=self.segment,
             elapsed_s=self.elapsed_s, duration_s=self.duration_s,
             stimulator={"device": "fake P24", "firmware": "1.0"}, load_cell={"device": "fake cell", "rate_hz": 400.0},
-            torque_age_s=0.004, torque_nm=0.01, calibration=self.calibration,
+            torque_age_s=self.torque_age_s, torque_nm=0.01,
+            calibration=self.calibration and told_next(self.calibration),
+            limits=self.limits, require_calibration=self.require_calibration,
         )  # fmt: skip
 
     async def serve(self) -> None:
         self.path.unlink(missing_ok=True)
         self._server = await asyncio.start_unix_server(self._client, str(self.path), limit=2**25)
+        self._idle = asyncio.create_task(self._speak())
+
+    async def _speak(self) -> None:
+        """What the load cell says while no test is on."""
+        while True:
+            await asyncio.sleep(FRAME_S)
+            if self.cell_speaks and not self.mute and self.state != "running":
+                self._send(m.LiveEvent(
+                    test_id=None, segment=None, elapsed_s=0.0, duration_s=0.0, time_s=[0.0], torque_min_nm=[0.42],
+                    torque_max_nm=[0.44], pulse_time_s=[], pulse_width_us=[], torque_age_s=self.torque_age_s,
+                    lost_samples=0, dropped_pulses=0,
+                ))  # fmt: skip
+
+    def become(self, state: Any, reason: str = "") -> None:
+        """Another state, told at once."""
+        self.state, self.reason = state, reason
+        self._send(m.StateEvent(status=self.status()))
 
     async def close(self) -> None:
-        if self._play:
-            self._play.cancel()
+        for task in (self._play, self._idle):
+            if task:
+                task.cancel()
         if self._server:
             self._server.close()
         for writer in list(self._writers):
@@ -231,8 +262,9 @@ class FakeRig:
         ).model_dump()
 
     async def _on_rearm(self, request: Any, writer: Any) -> dict[str, Any]:
-        self.state, self.reason = "ready", ""
-        self._send(m.StateEvent(status=self.status()))
+        if not self.mended:
+            raise m_refusal("disconnected", "A device does not answer", "load cell: no torque comes; check its cable")
+        self.become("ready")
         return self.status().model_dump()
 
     def _send(self, event: Any) -> None:
@@ -305,6 +337,15 @@ class FakeRig:
         )  # fmt: skip
 
 
+def told_next(known: m.CalibrationStatus) -> m.CalibrationStatus:
+    """With the widths that each step would send."""
+    widths = {"up": known.pulse_width_us + known.step_us}
+    if known.trains:
+        widths |= {"repeat": known.pulse_width_us, "down": known.pulse_width_us - known.step_us}
+    found = {name: width for name, width in widths.items() if 1 <= width <= known.ceiling_us}
+    return m.CalibrationStatus.model_validate({**known.model_dump(), "next_us": found})
+
+
 class m_refusal(Exception):
     """code, title, detail."""
 
@@ -374,8 +415,12 @@ class RigThread:
 
         self.thread = threading.Thread(target=run, daemon=True)
         self.thread.start()
-        assert ready.wait(5)
+        assert ready.wait(60)
         return self
+
+    def become(self, state: str, reason: str = "") -> None:
+        """Another state of the rig, from another thread."""
+        self.loop.call_soon_threadsafe(self.rig.become, state, reason)
 
     def __exit__(self, *_: object) -> None:
         if not self.thread.is_alive():

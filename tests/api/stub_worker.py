@@ -53,6 +53,7 @@ WHERE = [{
     "segment": "prbs", "start_s": 3.0, "end_s": 4.5, "pulse_width_us": [0.0, 300.0], "direction": "falling",
     "share_of_excess": 0.31, "text": "falling prbs, 0-300 µs: model too high by 0.4 N·m, 31 % of what is left",
 }]  # fmt: skip
+SIGNATURES = {"time_s": [0.0, 1.0, 2.0], "fatigue": {"seen_nm": [0.0, 0.1, 0.2], "expected_nm": [0.0, 0.1, 0.15]}}
 EXPERIMENT = {
     "effect": "fatigue", "rivals": ["fatigue", "threshold_drift"], "duration_s": 6.0, "decides": True,
     "text": "A ramp.",
@@ -72,7 +73,7 @@ def diagnosis() -> dict[str, Any]:
     tried = [{"effect": name, "log_evidence_gain": gain} for name, gain in (("fatigue", 90.0), ("tremor", -4.0))]
     return {
         "verdict": "effect_missing", "noise_sd_nm": 0.04, "base": {}, "missing": [missing], "where": WHERE,
-        "candidates": [tried], "experiment": EXPERIMENT, "signatures": {}, "library": {}, "notes": [],
+        "candidates": [tried], "experiment": EXPERIMENT, "signatures": SIGNATURES, "library": {}, "notes": [],
     }  # fmt: skip
 
 
@@ -126,6 +127,10 @@ def answer(verb: str, arguments: dict[str, Any], say: Any) -> dict[str, Any]:
         from api.jobs import find_recording
 
         return {"result": find_recording(lambda *_: None, **arguments)}
+    if verb == "recorded":
+        from api.recorded import recorded
+
+        return {"result": recorded(progress=lambda *_: None, **arguments)}
     return {"result": {}}
 
 

@@ -51,7 +51,7 @@ def test_made_up_requests_meet_no_server_error(abused: Service) -> None:
         @limits
         @hypothesis.given(case=operation.as_strategy())
         def attack(case: schemathesis.Case) -> None:
-            answer = case.call(headers=AUTHORIZED, timeout=20)
+            answer = case.call(headers=AUTHORIZED, timeout=60)
             tried[case.operation.label] += 1
             try:
                 case.validate_response(answer, checks=[CHECKS.get_one(name) for name in CHECKED])
@@ -64,7 +64,7 @@ def test_made_up_requests_meet_no_server_error(abused: Service) -> None:
 
 
 def test_fifty_starts_at_once_give_one_test_and_forty_nine_refusals(service: Service) -> None:
-    service.rig.speed = 6.0
+    service.rig.speed = 0.5  # it runs until all fifty are answered
     with service.client(limits=httpx.Limits(max_connections=50)) as client:
         client.post("/v1/participants", json={"code": "P017"})
         with concurrent.futures.ThreadPoolExecutor(50) as pool:
@@ -79,6 +79,7 @@ def test_fifty_starts_at_once_give_one_test_and_forty_nine_refusals(service: Ser
                 assert problem["holder"]["test_id"] == winner and winner in problem["detail"]
         assert service.rig.starts == 1
         assert len(client.get("/v1/tests").json()) == 1
+        service.rig.speed = 30.0
         assert wait_done(client, winner)["state"] == "completed"
 
 
@@ -116,4 +117,4 @@ def test_a_body_without_an_end_is_not_taken_in(service: Service, path: str) -> N
         else:
             assert answer.startswith(b"HTTP/1.1 413") and b"application/problem+json" in answer, answer[:200]
         assert client.get("/health").status_code == 200
-        assert not list((service.data / "recordings").glob("upload-*"))
+        assert not list((service.data / "recordings").rglob("upload-*"))

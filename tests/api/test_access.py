@@ -37,7 +37,7 @@ ROUTES = [
     ("POST", "/v1/participants", Scope.RUN_TEST),
     ("POST", "/v1/tests", Scope.RUN_TEST),
     ("POST", "/v1/preview", Scope.RUN_TEST),
-    ("POST", "/v1/rearm", Scope.RUN_TEST),
+    ("POST", "/v1/rearm", Scope.REARM),
     ("GET", "/v1/tests", Scope.READ_LIVE),
     ("GET", "/v1/tests/x", Scope.READ_LIVE),
     ("GET", "/v1/rig", Scope.READ_LIVE),
@@ -118,7 +118,9 @@ def test_first_start_draws_a_token_once(tmp_path) -> None:
     from api.context import build
 
     settings = Settings(data_dir=tmp_path)
-    first, second = build(settings), build(settings)
+    first = build(settings)
+    first.lock.release()
+    second = build(settings)
     assert first.drawn_token is not None and len(first.drawn_token) > 40
     assert second.drawn_token is None
     assert second.auth.bearer(first.drawn_token).may(Scope.ADMINISTER)
@@ -128,7 +130,7 @@ def test_changing_the_set_token_withdraws_the_old_one(tmp_path) -> None:
     from api.context import build
     from api.errors import ApiError
 
-    build(Settings(data_dir=tmp_path, admin_token="first-one"))  # pyright: ignore[reportArgumentType]
+    build(Settings(data_dir=tmp_path, admin_token="first-one")).lock.release()  # pyright: ignore[reportArgumentType]
     later = build(Settings(data_dir=tmp_path, admin_token="second-one"))  # pyright: ignore[reportArgumentType]
     assert later.auth.bearer("second-one").may(Scope.ADMINISTER)
     with pytest.raises(ApiError, match="revoked"):
@@ -172,7 +174,7 @@ def test_sign_in_leads_nowhere_else(service: Service) -> None:
 def test_stop_by_json_and_without_a_body_says_the_rigs_evidence(
     client: httpx.Client, service: Service, participant: str
 ) -> None:
-    service.rig.speed = 4.0
+    service.rig.speed = 0.5
     client.post("/v1/tests", json={"participant": participant})
     answer = client.post("/v1/stop", json={"reason": "pain"}).json()
     assert answer["stopped"] and answer["evidence"]["device_state"] == "stopped"
@@ -188,14 +190,14 @@ def test_stop_is_open_to_anyone_signed_in_and_to_nobody_else(service: Service) -
 def test_stop_by_plain_form_works_without_csrf_and_after_the_session_ran_out(
     service: Service, participant: str
 ) -> None:
-    service.rig.speed = 4.0
+    service.rig.speed = 0.5
     with signed_in(service) as browser:
         with service.client() as client:
             client.post("/v1/tests", json={"participant": participant})
         with service.app.state.context.store.write() as session:
             session.connection().exec_driver_sql("UPDATE page_sessions SET expires_unix_s = 0")
         assert browser.get("/v1/rig").status_code in (303, 401)
-        page = browser.post("/v1/stop", data={"reason": "stop pressed on the page"})
+        page = browser.post("/v1/stop", data={"reason": "stop pressed on the page"}, follow_redirects=True)
         assert page.status_code == 200
         assert "The rig confirms that stimulation is off" in page.text
     assert service.rig.stopped_by == "administrator"
@@ -207,7 +209,7 @@ def test_unconfirmed_stop_is_never_called_stopped(client: httpx.Client, service:
     assert answer.status_code == 503
     assert answer.json()["title"] == "The stop is not confirmed" and "emergency switch" in answer.json()["detail"]
     with signed_in(service) as browser:
-        page = browser.post("/v1/stop", data={})
+        page = browser.post("/v1/stop", data={}, follow_redirects=True)
         assert page.status_code == 503 and "not confirmed" in page.text and "confirms" not in page.text
 
 
@@ -230,7 +232,7 @@ def test_stopped_test_keeps_its_recording_and_makes_no_model(
 ) -> None:
     from tests.api.conftest import wait_done
 
-    service.rig.speed = 6.0
+    service.rig.speed = 0.5
     test_id = client.post("/v1/tests", json={"participant": participant}).json()["id"]
     client.post("/v1/stop", json={"reason": "pain"})
     document = wait_done(client, test_id)

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import asyncio
+import threading
+from typing import Any
+
 import httpx
+import pytest
 
 from tests.api.conftest import Service, wait_done
 from tests.api.test_access import csrf, signed_in
+from tests.api.test_problems import problem
 
 WHERE = "/v1/participants/P017/calibration"
 
@@ -54,7 +60,7 @@ def test_words_that_do_not_hold_are_refused_before_the_rig_hears_of_them(
 
 
 def test_no_calibration_during_a_test(client: httpx.Client, service: Service, participant: str) -> None:
-    service.rig.speed = 4.0
+    service.rig.speed = 0.5
     client.post("/v1/tests", json={"participant": participant})
     refused = client.post(WHERE)
     assert refused.status_code == 409 and refused.json()["holder"]["participant"] == participant
@@ -85,3 +91,141 @@ def test_whole_calibration_by_plain_forms(service: Service, participant: str) ->
         led = browser.post(f"{page}/finish", data=token)
         assert led.headers["location"] == "/participants/P017"
         assert "felt at 10 µs, moves at 20 µs" in browser.get("/participants/P017").text
+
+
+# ---- limits that change while one is open -------------------------------------------------------------------
+
+
+PROFILE = "/v1/participants/P017/profile"
+LOWER = {"current_ma": 5, "max_pulse_width_us": 60, "max_torque_nm": 5}
+
+
+def up(client: httpx.Client) -> httpx.Response:
+    return client.post(f"{WHERE}/step", json={"direction": "up"})
+
+
+@pytest.mark.parametrize("asked", [LOWER, {"current_ma": 19.5}, {"max_torque_nm": 29}, {"max_pulse_width_us": 290}])
+def test_lowered_limits_end_an_open_calibration_and_stay(
+    client: httpx.Client, service: Service, participant: str, asked: dict[str, float]
+) -> None:
+    client.post(WHERE, json={"current_ma": 20})
+    for threshold in ("sensory", "motor", "comfort"):
+        assert up(client).status_code == 202
+        client.post(f"{WHERE}/mark", json={"threshold": threshold})
+    lowered = client.put(PROFILE, json=asked)
+    assert lowered.status_code == 200 and "sends no further train" in lowered.json()["meanwhile"]
+    assert service.rig.calibration is not None
+    trains = service.rig.calibration.trains
+    for path, body in [("step", {"direction": d}) for d in ("up", "repeat", "down")] + [
+        ("mark", {"threshold": "comfort"}), ("finish", {})
+    ]:  # fmt: skip
+        refused = problem(client.post(f"{WHERE}/{path}", json=body), 409)
+        assert "Discard it and begin anew" in refused["detail"], path
+    assert service.rig.calibration.trains == trains, "not one train more"
+    assert "Discard it" in client.get(WHERE).json()["outdated"]
+    kept = lowered.json()["profile"]
+    assert client.get("/v1/participants/P017").json()["profile"] == kept
+    assert client.post(f"{WHERE}/finish", json={"discard": True}).status_code == 200
+    assert client.get("/v1/participants/P017").json()["profile"] == kept
+    anew = client.post(WHERE)
+    assert anew.status_code == 201 and not anew.json()["outdated"] and up(client).status_code == 202
+
+
+def test_what_changes_no_limit_leaves_the_calibration_open(
+    client: httpx.Client, service: Service, participant: str
+) -> None:
+    client.post("/v1/participants", json={"code": "P018"})
+    client.post(WHERE)
+    assert client.put(PROFILE, json={"current_ma": 20}).status_code == 200
+    other = client.put("/v1/participants/P018/profile", json={"current_ma": 5})
+    assert other.status_code == 200 and other.json()["meanwhile"] == ""
+    assert up(client).status_code == 202
+
+
+def test_one_that_the_service_did_not_begin_is_discarded_alone(
+    client: httpx.Client, service: Service, participant: str
+) -> None:
+    """The version is part of the id that the rig tells, so it outlives this service; no version, no train."""
+    client.post(WHERE)
+    known = service.rig.calibration
+    assert known is not None
+    service.rig.calibration = known.model_copy(update={"calibration_id": known.calibration_id.rpartition("-")[0]})
+    assert problem(up(client), 409) and problem(client.post(f"{WHERE}/finish"), 409)
+    assert client.post(f"{WHERE}/finish", json={"discard": True}).status_code == 200
+
+
+def test_a_change_waits_for_the_step_on_its_way_and_the_next_one_sees_it(
+    client: httpx.Client, service: Service, participant: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Once a change is answered, no train begins with what was before."""
+    client.post(WHERE)
+    asked, go = threading.Event(), threading.Event()
+    order: list[str] = []
+    play: Any = service.rig._on_calibrate_step
+
+    async def slow(request: Any, writer: Any) -> Any:
+        asked.set()
+        await asyncio.to_thread(go.wait, 20)
+        order.append("train")
+        return await play(request, writer)
+
+    monkeypatch.setattr(service.rig, "_on_calibrate_step", slow)
+
+    def change() -> None:
+        with service.client() as other:
+            order.append(str(other.put(PROFILE, json=LOWER).status_code))
+
+    stepping, changing = threading.Thread(target=up, args=[client]), threading.Thread(target=change)
+    stepping.start()
+    assert asked.wait(20)
+    changing.start()
+    changing.join(0.3)  # it would have been answered by now, had it not waited
+    go.set()
+    stepping.join(20), changing.join(20)
+    assert order == ["train", "200"]
+    assert up(client).status_code == 409 and order == ["train", "200"]
+
+
+def test_the_page_says_that_it_goes_no_further(client: httpx.Client, service: Service, participant: str) -> None:
+    page = "/participants/P017/calibration"
+    with signed_in(service) as browser:
+        token = {"csrf": csrf(browser)}
+        browser.post(page, data={**token, "current_ma": "20", "step_us": "10"})
+        browser.post(f"{page}/step/up", data=token)
+        assert "A calibration is open." in browser.get("/participants/P017").text
+        assert client.put(PROFILE, json=LOWER).status_code == 200
+        shown = browser.get(page).text
+        assert "P017 now has other limits (5 mA, 60 µs, 5 N·m)" in shown
+        buttons = [part.split("<")[0] for part in shown.split("<button")[1:] if "/calibration/" in part.split(">")[0]]
+        assert len(buttons) == 8 and [b for b in buttons if "disabled" not in b] == [
+            next(b for b in buttons if "/discard" in b)
+        ]
+        assert browser.post(f"{page}/step/up", data=token).status_code == 409
+        assert browser.post(f"{page}/finish", data=token).status_code == 409
+        assert browser.post(f"{page}/discard", data=token).status_code == 303
+
+
+def test_a_question_about_a_calibration_is_bound_to_the_limits_it_showed(
+    client: httpx.Client, service: Service, participant: str
+) -> None:
+    with signed_in(service) as browser:
+        token = {"csrf": csrf(browser)}
+        asked = browser.post("/participants/P017/calibration", data={**token, "current_ma": "26", "step_us": "10"})
+        assert "/confirm/" in asked.headers["location"]
+        assert client.put(PROFILE, json=LOWER).status_code == 200
+        assert browser.post(asked.headers["location"], data=token).status_code == 412
+        assert service.rig.calibration is None
+
+
+def test_lowered_during_a_test_says_that_it_holds_from_the_next_one(
+    client: httpx.Client, service: Service, participant: str
+) -> None:
+    service.rig.speed = 2.0
+    started = client.post("/v1/tests", json={"participant": participant}).json()["id"]
+    words = "hold from the next test on"
+    assert words in client.put(PROFILE, json=LOWER).json()["meanwhile"]
+    with signed_in(service) as browser:
+        assert words in browser.get("/participants/P017").text
+    client.post("/v1/stop")
+    wait_done(client, started)
+    assert client.put(PROFILE, json=LOWER).json()["meanwhile"] == ""

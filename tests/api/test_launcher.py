@@ -27,11 +27,12 @@ def settings(tmp_path: Path, **more: object) -> Settings:
 
 
 def client(services: Services) -> httpx.Client:
-    return httpx.Client(base_url=services.url, headers={"Authorization": f"Bearer {TOKEN}"}, timeout=30)
+    return httpx.Client(base_url=services.url, headers={"Authorization": f"Bearer {TOKEN}"}, timeout=60)
 
 
 def test_a_test_on_the_wire_ends_in_a_served_model(tmp_path: Path) -> None:
     with Services(settings(tmp_path), FAST, TOKEN) as services, client(services) as http:
+        assert http.get("/rig/now").json()["emulated"] is True
         assert http.post("/v1/participants", json={"code": "P1"}).status_code == 201
         document = run_test(http, "P1")
         assert document["summary"]["lost_samples"] == 0
@@ -45,6 +46,14 @@ def test_a_test_on_the_wire_ends_in_a_served_model(tmp_path: Path) -> None:
         http.post(f"{document['model_url']}/approve")
         assert http.post("/v1/preview", json={"participant": "P1"}).json()["torque_time_nms"] > 5
     assert [child.alive() for child in (services.rig, services.api)] == [False, False]
+
+
+def test_only_the_emulator_makes_an_emulated_rig(tmp_path: Path) -> None:
+    """A rig file names devices of the world, whatever was left in the environment."""
+    assert Services(settings(tmp_path)).emulated
+    assert not Services(settings(tmp_path, rig_file=tmp_path / "rig.toml", emulated=True)).emulated
+    attached = {emulated: settings(tmp_path, emulated=emulated) for emulated in (True, False)}
+    assert [Services(s, attach=tmp_path / "s").emulated for s in attached.values()] == [True, False]
 
 
 def test_killed_rig_comes_back_uncertain_and_the_test_is_a_fault(tmp_path: Path) -> None:

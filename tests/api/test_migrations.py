@@ -93,4 +93,4 @@ def test_health_answers_after_an_upgrade(tmp_path: Path, short_dir: Path) -> Non
     Store(f"sqlite:///{tmp_path}/stimrig.db").close()
     change(tmp_path / "stimrig.db", "DROP TABLE schema_version")
     for service in run_service(tmp_path, short_dir, STUB):
-        assert httpx.get(f"{service.url}/health").json()["database"] == "ok"
+        assert httpx.get(f"{service.url}/health", timeout=60).json()["database"] == "ok"

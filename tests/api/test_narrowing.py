@@ -8,6 +8,7 @@ from typing import Any
 import httpx
 import pytest
 
+from api.errors import ApiError
 from api.narrowing import limits_of
 from api.schemas import ProfileIn, TestIn
 from tests.api.conftest import Service, wait_done
@@ -50,13 +51,14 @@ def test_a_wider_limit_is_refused_and_nothing_starts(
 
 
 def test_a_narrower_limit_reaches_the_rig(client: httpx.Client, service: Service, limited: str) -> None:
-    service.rig.speed = 5.0
+    service.rig.speed = 0.5  # still running where its plan is looked at
     body = {"participant": limited, "profile": {"current_ma": 10}, "max_pulse_width_us": 200, "max_torque_nm": 11}
     test_id = client.post("/v1/tests", json=body).json()["id"]
     plan = service.rig.plan
     assert plan is not None
     assert (plan.profile.current_ma, plan.profile.max_pulse_width_us, plan.profile.max_torque_nm) == (10, 220, 12)
     assert (plan.max_pulse_width_us, plan.max_torque_nm) == (200, 11)
+    assert client.post("/v1/stop").status_code == 200
     wait_done(client, test_id)
     assert client.get(f"/v1/participants/{limited}").json()["profile"]["current_ma"] == 18, "for that test alone"
 
@@ -75,10 +77,11 @@ def test_without_a_profile_of_the_request_the_participants_holds() -> None:
     assert found["max_pulse_width_us"] is None and found["max_torque_nm"] is None
 
 
-def test_without_a_participants_profile_the_rig_decides() -> None:
-    """No thresholds in it: a rig that asks for a calibration refuses it."""
-    found = limits_of(a_test(profile=ProfileIn(current_ma=25)), None)
-    assert found["profile"].current_ma == 25 and found["profile"].sensory_pulse_width_us is None
+@pytest.mark.parametrize("own", [None, {}, {"current_ma": 18.0, "max_pulse_width_us": 220.0}])
+def test_what_neither_says_is_not_made_up(own: dict[str, Any] | None) -> None:
+    """A participant without limits, or with some alone: no width or torque of a default comes in their place."""
+    with pytest.raises(ApiError, match="max_torque_nm"):
+        limits_of(a_test(profile=ProfileIn(current_ma=10)), own)
 
 
 def test_what_is_no_number_is_wider() -> None:

@@ -11,7 +11,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from tests.api.browser import NARROW, PASSWORD, PHONE, WIDE, open_tab, painted_soon, participant, start
+from tests.api.browser import NARROW, PASSWORD, PHONE, WIDE, open_tab, painted_soon, participant, say_yes, start
 from tests.api.conftest import STUB, Service, run_service, run_test
 
 pytestmark = pytest.mark.browser
@@ -160,15 +160,14 @@ def test_two_browsers_see_the_same_test(browser: Any, tab: Any, service: Service
 
 def test_limits_for_today_are_set_and_checked(tab: Any, service: Service) -> None:
     participant(tab, service, f"L{time.time_ns() % 10**9}")
-    tab.get_by_text("Limits for today", exact=True).click()
-    tab.get_by_label("Current of every pulse").fill("17.5")
-    tab.get_by_role("button", name="Set").click()
+    tab.get_by_label("Current of every pulse").fill("17,5")
+    tab.keyboard.press("Enter")
     tab.get_by_text("17.5 mA").wait_for()
-    tab.get_by_text("Limits for today", exact=True).click()
-    tab.evaluate("document.querySelectorAll('.limits input').forEach((i) => i.removeAttribute('max'))")
     tab.get_by_label("Comfort maximum").fill("5000")
     tab.get_by_role("button", name="Set").click()
     tab.get_by_text("Nothing was changed").wait_for()
+    assert tab.get_by_label("Comfort maximum").input_value() == "5000"
+    assert "'5000': 5000 µs" in tab.locator(".wrong").inner_text()
 
 
 def test_a_name_is_refused_politely(tab: Any, service: Service) -> None:
@@ -222,6 +221,7 @@ def test_next_experiment_runs_from_its_button(tab: Any, service: Service) -> Non
         model = run_test(http, "P104")["model_id"]
     tab.goto(f"{service.url}/models/{model}")
     tab.get_by_role("button", name="Run it now").click()
-    tab.wait_for_url("**/tests/*")
+    tab.get_by_role("heading", name="Start the next experiment of P104?").wait_for()
+    say_yes(tab)
     tab.wait_for_url("**/models/*", timeout=60_000)
     assert model not in tab.url

@@ -237,3 +237,22 @@ def test_the_command_line(machine: Machine, tmp_path: Path) -> None:
     absent = call("make", "--api-data", str(tmp_path / "nowhere"), "--to", str(tmp_path / "b"))
     assert absent.returncode == 2
     assert "no database" in absent.stderr
+
+
+@pytest.mark.parametrize("latch", [b"", b"\xff", b"[]", b"{}", b"3", b"[" * 100_000])
+def test_a_latch_that_cannot_be_read_is_no_hindrance_and_is_told(
+    machine: Machine, tmp_path: Path, latch: bytes
+) -> None:
+    (machine.rig / "latch.json").write_bytes(latch)
+    made = backup.make(machine.rig, machine.api, tmp_path / "backups")
+    rig, api = tmp_path / "new" / "rig", tmp_path / "new" / "api"
+    backup.restore(made, rig, api, force=False)
+    found = json.loads((rig / "latch.json").read_text())
+    assert found["state"] == "latched" and "its latch could not be read" in found["reason"]
+
+
+@pytest.mark.parametrize("content", ['{"format": 1, "sha256": []}', "[]", "3", "[" * 100_000, '{"sha256": {"a": 1}}'])
+def test_a_manifest_of_nonsense_is_told_in_one_line(tmp_path: Path, content: str) -> None:
+    (tmp_path / "manifest.json").write_text(content)
+    done = subprocess.run([sys.executable, SCRIPT, "verify", str(tmp_path)], capture_output=True, text=True)
+    assert done.returncode in (1, 2) and len(done.stderr.splitlines()) == 1, done.stderr

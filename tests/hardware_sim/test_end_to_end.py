@@ -27,7 +27,8 @@ def test_the_wire_carries_what_the_muscle_does(patient: str) -> None:
         assert bus.recv(1.0) is not None
         line = serial.Serial(rig.ready["stimulator"], 3_000_000, stopbits=2, rtscts=True)
         line.write(encode(Packet(1, LL_INIT, b"\x00")))
-        time.sleep(0.1)
+        line.timeout = 10.0
+        assert len(line.read(13)) == 13  # its answer: it is initialised now
         messages, start_s = [], time.monotonic()
         for k in range(40):
             line.write(encode(Packet(k, LL_CONFIG, config(*biphasic(300 if k % 10 < 7 else 200, 20)))))

@@ -38,6 +38,9 @@ class Host:
 
     def ask(self, command: int, data: bytes = b"", wait_s: float = 0.25) -> list[Packet]:
         self.line.write(encode(Packet(1, command, data)))
+        return self.read(wait_s)
+
+    def read(self, wait_s: float) -> list[Packet]:
         packets, end_s = [], time.monotonic() + wait_s
         while not packets and time.monotonic() < end_s:
             packets += self._decoder.feed(self.line.read(self.line.in_waiting or 1), 0.0)
@@ -50,6 +53,9 @@ class Host:
     def listen(self, seconds: float) -> list[can.Message]:
         while self.bus.recv(0.0) is not None:
             pass
+        return self.tail(seconds)
+
+    def tail(self, seconds: float = 0.2) -> list[can.Message]:
         messages, end_s = [], time.monotonic() + seconds
         while time.monotonic() < end_s:
             message = self.bus.recv(0.05)
@@ -102,6 +108,32 @@ def test_late_ack(host: Host) -> None:
         start_s = time.monotonic()
         assert host.result(LL_CONFIG, PULSE) == 0
         assert time.monotonic() - start_s > 0.15
+
+
+def delivered(host: Host) -> int:
+    return host.rig.ask(cmd="state")["pulses_delivered"]
+
+
+def test_a_stalled_line_holds_and_lets_go_of_what_it_held(host: Host) -> None:
+    before = delivered(host)
+    with broken(host, "line_stalled", to_host=False):
+        assert host.ask(LL_CONFIG, PULSE, wait_s=0.1) == []
+        assert delivered(host) == before
+    assert host.read(0.25) != []
+    assert delivered(host) == before + 1
+    with broken(host, "line_stalled", to_device=False):
+        assert host.ask(LL_CONFIG, PULSE, wait_s=0.1) == []
+        assert delivered(host) == before + 2
+    assert host.read(0.25) != []
+    assert host.result(LL_CONFIG, PULSE) == 0
+
+
+def test_a_doubled_command_is_done_twice(host: Host) -> None:
+    before = delivered(host)
+    with broken(host, "frames_doubled"):
+        host.ask(LL_CONFIG, PULSE)
+        wait_for(lambda: delivered(host) == before + 2)
+    host.read(0.05)
 
 
 def test_corrupt_both_ways(host: Host) -> None:
@@ -196,7 +228,7 @@ def test_bus_errors(host: Host) -> None:
     while host.bus.recv(0.0) is not None:
         pass
     with broken(host, "bus_off"):
-        errors = [m for m in host_tail(host) if m.is_error_frame]
+        errors = [m for m in host.tail() if m.is_error_frame]
         assert [m.arbitration_id for m in errors] == [0x40]
         assert host.samples() == []
 
@@ -204,19 +236,20 @@ def test_bus_errors(host: Host) -> None:
 def test_counter_jump(host: Host) -> None:
     while host.bus.recv(0.0) is not None:
         pass
-    counters = []
+    steps: list[int] = []
     with broken(host, "counter_jump", step=1000):
-        counters = [LAYOUT.unpack(m.data)[1] for m in host_tail(host)]
-    assert sorted({(b - a) & 0xFFFF for a, b in pairwise(counters)}) == [1, 1001]
+        before = counter(host)
+        while len(steps) < 200:
+            after = counter(host)
+            steps.append((after - before) & 0xFFFF)
+            before = after
+    assert sorted(steps) == [1] * 199 + [1001]
 
 
-def host_tail(host: Host) -> list[can.Message]:
-    messages, end_s = [], time.monotonic() + 0.2
-    while time.monotonic() < end_s:
-        message = host.bus.recv(0.05)
-        if message is not None:
-            messages.append(message)
-    return messages
+def counter(host: Host) -> int:
+    message = host.bus.recv(5.0)
+    assert message is not None
+    return LAYOUT.unpack(message.data)[1]
 
 
 def test_rate_off(host: Host) -> None:

@@ -79,7 +79,7 @@ def test_bad_models_are_refused(case):
         ("{}", "schema version"),
         (json.dumps(document | {"schema_version": "9.0"}), "schema version 9.0"),
         (json.dumps({k: v for k, v in document.items() if k != "linear"}), "linear: key is missing"),
-        (json.dumps(document | {"linear": {"kind": "second-order", "time_constant_s": "x"}}), "malformed"),
+        (json.dumps(document | {"linear": {"kind": "second-order", "time_constant_s": "x"}}), "'x' is no number"),
         (json.dumps(document | {"recruitment": {"basis": {"kind": "magic"}}}), "unknown basis"),
     ):
         with pytest.raises(identify.BadModel, match=says):
@@ -153,3 +153,15 @@ def test_predicts_at_the_records_own_rate(case):
     predicted = identify.predict(model, other)
     assert predicted.shape == other.time_s.shape
     assert np.sqrt(np.mean((predicted - clean) ** 2)) < 0.05
+
+
+def test_a_polynomial_whose_parts_do_not_go_together_is_refused(case):
+    document = case[1].to_dict()
+    narx = {
+        "variables": [[0, 1]], "terms": [[0]], "weights": [1.0], "torque_scale_nm": 1.0, "width_scale_us": 1.0,
+        "baseline_nm": 0.0,
+    }  # fmt: skip
+    identify.Model.from_dict(document | {"extra": {"narx": narx}})
+    for change, says in (({"terms": [[0], []]}, "differ in number"), ({"terms": [[1]]}, "not there")):
+        with pytest.raises(identify.BadModel, match=says):
+            identify.Model.from_dict(document | {"extra": {"narx": narx | change}})

@@ -33,6 +33,7 @@ class FakeStimulator:
     def __init__(self, clock: VirtualClock) -> None:
         self.clock = clock
         self.sent: list[tuple[float, Admitted]] = []
+        self.acked_s: list[float] = []
         self.fed_s: list[float] = []
         self.armed = False
         self.stops = 0
@@ -68,8 +69,12 @@ class FakeStimulator:
         self.on_send(len(self.sent))
         if self.ack_delay_s is not None:
             at = self.clock.now_s() + self.ack_delay_s
-            self.clock.call_at(at, lambda: self.on_ack(Ack(number, self.clock.now_s(), error)))
+            self.clock.call_at(at, lambda: self._acknowledge(number, error))
         return number
+
+    def _acknowledge(self, number: int, error: str | None) -> None:
+        self.acked_s.append(self.clock.now_s())
+        self.on_ack(Ack(number, self.clock.now_s(), error))
 
     def stop(self) -> None:
         self.stops += 1

@@ -25,7 +25,7 @@ from rig.signals import SAMPLE, Ack, LateError, TorqueBlock
 
 RATE_HZ = 1600.0
 SPEED = 4.0
-LINE = {"stimulator": "/dev/null", "can": {"interface": "virtual"}, "speed": SPEED}
+LINE = {"stimulator": "/dev/pts/gone", "can": {"interface": "virtual"}, "speed": SPEED}
 
 
 class LiveStimulator:
@@ -36,7 +36,7 @@ class LiveStimulator:
 
     def __init__(self, clock: MonotonicClock) -> None:
         self.clock = clock
-        self.missing = self.deaf = False
+        self.missing = self.deaf = self.stalled = False
         self.error: str | None = None
         self.armed = False
         self.sent: list[tuple[float, Admitted]] = []
@@ -55,6 +55,8 @@ class LiveStimulator:
     def _answer(self) -> None:
         while True:
             number = self._acks.get()
+            while self.stalled:
+                time.sleep(0.001)
             self.on_ack(Ack(number, self.clock.now_s(), self.error))
 
     def arm(self) -> None:
@@ -72,10 +74,12 @@ class LiveStimulator:
         return self._number
 
     def stop(self) -> None:
+        if self.stalled:
+            raise DeviceError("stimulator: no answer")
         self.armed = False
 
     def state(self) -> tuple[bool, str]:
-        if self.deaf:
+        if self.deaf or self.stalled:
             raise DeviceError("stimulator: no answer")
         return not self.armed, "armed" if self.armed else "not initialised"
 

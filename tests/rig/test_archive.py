@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from rig import journal
-from rig.archive import _pulses
+from rig.assembly import _Pulses
 from rig.journal import JournalContents, Kind
 
 
@@ -19,7 +19,8 @@ def test_a_sender_that_lost_the_processor_wrote_before_the_ack() -> None:
         blocks.append((Kind.WRITTEN, journal.WRITTEN.pack(index, index, written_s)))
         if acked_s is not None:
             blocks.append((Kind.ACKED, journal.ACKED.pack(index, acked_s)))
-    columns, written_s = _pulses(JournalContents(Path("j"), blocks, 0, 0), np.full(3, 120.0), 40.0, 10.0, 0.075)
+    pulses = _Pulses(np.full(3, 120.0), 20.0, 10.0)
+    pulses.take(JournalContents(Path("j"), blocks, 0, 0))
+    columns = pulses.columns(40.0, 0.075, blocks_missing=False, notes=[])
     expected_s = [0.0013, 0.0251, 0.0503]
     np.testing.assert_allclose(columns["pulses/written_time_s"], expected_s, atol=1e-9)
-    np.testing.assert_allclose(written_s, expected_s, atol=1e-9)

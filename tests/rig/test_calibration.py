@@ -12,7 +12,7 @@ from rig import limits, plan
 from rig.clock import utc_text
 from rig.control.calibration import Calibration, check_profile, end_of_day_s
 from rig.errors import PlanError, RefusedError
-from rig.limits import HARD_LIMITS
+from rig.limits import HARD_LIMITS, Steps
 from rig.messages import CalibrateStartRequest, FinishedEvent, Profile
 
 NOON_S = datetime(2026, 3, 4, 12, tzinfo=UTC).timestamp()
@@ -20,7 +20,7 @@ NOON_S = datetime(2026, 3, 4, 12, tzinfo=UTC).timestamp()
 
 def opened(**fields: Any) -> Calibration:
     request = CalibrateStartRequest(calibration_id="c1", participant="P01", by="therapist", **fields)
-    return Calibration(request, HARD_LIMITS)
+    return Calibration(request, HARD_LIMITS, NOON_S)
 
 
 def play(calibration: Calibration, *directions: str) -> float:
@@ -84,7 +84,7 @@ def test_never_above_the_request_the_rig_or_the_hard_limits():
     assert wide.status().ceiling_us == 500.0
     table = limits.tightened(HARD_LIMITS, "pulse_width_us", 200.0, "rig file")
     request = CalibrateStartRequest(calibration_id="c", participant="P", by="t", max_pulse_width_us=300.0)
-    assert Calibration(request, table).status().ceiling_owner == "rig file"
+    assert Calibration(request, table, NOON_S).status().ceiling_owner == "rig file"
 
 
 def test_the_dose_of_all_trains_together_is_limited():
@@ -112,11 +112,67 @@ def test_the_dose_of_all_trains_together_is_limited():
         ({"pulse_rate_hz": 61.0}, "pulse_rate_hz 61"),
         ({"max_pulse_width_us": math.nan}, "pulse_width_us nan"),
         ({"max_torque_nm": 0.0}, "max_torque_nm"),
+        ({"train_s": 0.1, "pulse_rate_hz": 4.0}, "has no pulse"),
+        ({"train_s": 0.4, "pulse_rate_hz": 1.0}, "has no pulse"),
+        ({"train_s": math.nan}, "calibration_train_s nan"),
+        ({"pulse_rate_hz": math.nan}, "pulse_rate_hz nan"),
+        ({"current_ma": math.nan}, "current_ma nan"),
     ],
 )
 def test_a_calibration_outside_the_limits_is_refused(fields: dict[str, float], words: str):
     with pytest.raises(RefusedError, match=words):
         opened(**fields)
+
+
+def test_what_a_coarse_stimulator_would_not_send_is_no_train():
+    """A RehaStim 2 takes currents in steps of 2 mA and sends nothing below 20 µs."""
+    coarse = Steps(1.0, 2.0, 20.0)
+    request = CalibrateStartRequest(calibration_id="c1", participant="P01", by="t", current_ma=1.5)
+    with pytest.raises(RefusedError, match=r"current_ma 1.5 mA stimulates nothing; this stimulator begins at 2 mA"):
+        Calibration(request, HARD_LIMITS, NOON_S, coarse)
+    calibration = Calibration(request.model_copy(update={"current_ma": 10.0}), HARD_LIMITS, NOON_S, coarse)
+    with pytest.raises(PlanError, match="first step goes up"):
+        calibration.next_width_us("repeat")
+    assert play(calibration, "up", "up") == 30.0
+    assert play(calibration, "down") == 20.0
+    with pytest.raises(PlanError, match="narrower than 20"):
+        calibration.next_width_us("down")
+
+
+def test_what_each_step_would_send_is_told_before():
+    """So that a button can say it: the width that the device sends, and none where the step would be refused."""
+    request = CalibrateStartRequest(
+        calibration_id="c1", participant="P01", by="therapist", step_us=10.5, max_pulse_width_us=45.0
+    )
+    calibration = Calibration(request, HARD_LIMITS, NOON_S, Steps(shortest_us=20.0))
+    assert calibration.status().next_us == {"up": 20.0}
+    play(calibration, "up")
+    assert calibration.status().next_us == {"up": 30.0, "repeat": 20.0}
+    play(calibration, "up", "up")
+    assert calibration.status().next_us == {"repeat": 41.0, "down": 30.0}
+    calibration.mark("comfort")
+    play(calibration, "down")
+    assert calibration.status().next_us == {"up": 41.0, "repeat": 30.0, "down": 20.0}
+
+
+def test_midnight_ends_an_open_calibration_and_says_so():
+    calibration = opened()
+    for threshold in ("sensory", "motor", "comfort"):
+        play(calibration, "up")
+        calibration.mark(threshold)
+    midnight_s = end_of_day_s(NOON_S)
+    calibration.check_day(midnight_s - 1)
+    assert calibration.profile(midnight_s - 1).expires_at_utc == utc_text(midnight_s)
+    for late in (calibration.check_day, calibration.profile):
+        with pytest.raises(RefusedError, match="begun on the day before"):
+            late(midnight_s)
+
+
+def test_a_test_that_would_outlast_its_profile_is_refused_at_its_start():
+    calibrated = profile(expires_at_utc=utc_text(NOON_S + 30.0))
+    check_profile(calibrated, NOON_S, required=True, duration_s=29.0)
+    with pytest.raises(RefusedError, match="before this test of 39 s would end"):
+        check_profile(calibrated, NOON_S, required=True, duration_s=38.7)
 
 
 def test_marks_keep_their_order():

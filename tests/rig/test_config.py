@@ -65,7 +65,12 @@ MISTAKES = {
     "no TOML": (("[limits]", "[limits"), "not TOML"),
     "missing table": (("[load_cell]", "[cell]"), "[load_cell] is missing"),
     "missing key": (('socket = "var/rig.sock"', ""), "socket: missing"),
-    "bad speed": (("data_dir", "clock_speed = 0\ndata_dir"), "clock_speed"),
+    "a faster clock": (("data_dir", "clock_speed = 2\ndata_dir"), "clock_speed: only an emulator's clock"),
+    "the world's clock": (("data_dir", "clock_speed = 1.0\ndata_dir"), "clock_speed: only an emulator's clock"),
+    "truth for a number": (("400", "true"), "limits.pulse_width_us: Input should be a valid number"),
+    "a number for truth": (("data_dir", "require_calibration = 0\ndata_dir"), "require_calibration"),
+    "patience without end": (("[limits]", "[watch]\nmissing_ack_s = inf\n[limits]"), "watch.missing_ack_s"),
+    "truth for patience": (("[limits]", "[watch]\nstale_disk_s = true\n[limits]"), "watch.stale_disk_s"),
     "channel": (("port =", "channel = 9\nport ="), "stimulator.channel"),
     "start frame": (("bus =", 'start_frames = ["0-0100"]\nbus ='), "write id#data in hex"),
     "scale": (("bus =", "scale_nm = 0\nbus ="), "scale of 0"),
@@ -117,6 +122,22 @@ def test_the_emulators_line(tmp_path: Path):
     for wrong in ("{}", "[1]", str(tmp_path / "none")):
         with pytest.raises(ConfigError, match="--emulator-json"):
             config.for_emulator(wrong, **where)
+
+
+def test_the_emulators_line_never_leads_to_a_real_stimulator(tmp_path: Path):
+    """It sets the clock's speed and asks for no calibration: 600 pulses in a second would be its doing."""
+    real = tmp_path / "ttyACM0"
+    real.touch()
+    for port in (str(real), "/dev/null"):
+        line = json.dumps({"stimulator": port, "can": {"interface": "virtual"}, "speed": 20})
+        with pytest.raises(ConfigError, match="is no pseudo-terminal of an emulator"):
+            config.for_emulator(line, data_dir=tmp_path, socket=tmp_path / "s")
+
+
+def test_the_command_line_makes_no_rig_file_faster(tmp_path: Path):
+    (tmp_path / "rig.toml").write_text(GOOD)
+    with pytest.raises(ConfigError, match=r"--clock-speed with .*only an emulator's clock"):
+        config.load(tmp_path / "rig.toml", clock_speed=2.0)
 
 
 CELLS = {

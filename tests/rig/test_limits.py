@@ -12,7 +12,7 @@ from bench.rig_fuzz import fuzz, fuzz_plans
 from rig import limits
 from rig.errors import RefusedError
 from rig.limits import HARD_LIMITS, Admitted, Refusal, admit
-from rig.messages import Profile, TestPlan
+from rig.messages import Profile, Status, TestPlan
 from rig.signals import Pulse
 
 anything = st.one_of(
@@ -93,11 +93,11 @@ def test_every_limit_has_its_reason_and_source():
         assert row.lo < row.hi
 
 
-def test_a_million_mad_requests_at_the_gate():
-    """On a seed of its own; `python -m bench.rig_fuzz` runs others."""
-    found = fuzz(1_000_000, seed=20)
+def test_mad_requests_at_the_gate_are_not_felt():
+    """On a seed of its own, through both drivers; `python -m bench.rig_fuzz` makes a million on others."""
+    found = fuzz(100_000, seed=20)
     assert found.outside == 0, found.example
-    assert found.sent > 50_000  # it is no wall
+    assert found.felt == found.sent > 10_000  # it is no wall
     assert found.refused_profiles > 10
 
 
@@ -150,3 +150,15 @@ def test_of_hard_limit_rig_file_profile_and_request_the_tightest_wins():
             limits.for_plan(HARD_LIMITS, request(Profile(), **wrong))
     with pytest.raises(RefusedError, match="rest_between_tests_s"):
         limits.for_plan(HARD_LIMITS, request(Profile(rest_between_tests_s=math.nan)))
+
+
+def test_clients_are_told_the_bounds_of_this_rig():
+    """Finite numbers or none, so that they pass through JSON; whose bound it is beside each."""
+    table = limits.tightened(HARD_LIMITS, "current_ma", 60.0, "rig file")
+    told = limits.bounds(table)
+    assert set(told) == set(HARD_LIMITS)
+    assert (told["current_ma"].hi, told["current_ma"].owner) == (60.0, "rig file")
+    assert (told["pulse_width_us"].hi, told["pulse_width_us"].owner) == (500.0, "hard limit")
+    assert told["width_rise_us"].lo is None and told["rest_between_tests_s"].hi is None
+    status = Status(state="ready", limits=told)
+    assert Status.model_validate_json(status.model_dump_json()) == status

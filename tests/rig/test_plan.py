@@ -106,6 +106,60 @@ def test_the_requests_own_maximum_scales_the_sequences():
     assert plan.build(plan_of, limits.for_plan(HARD_LIMITS, plan_of)).pulse_width_us.max() == 120.0
 
 
+LONG = {
+    "four of steps": (
+        [("steps", {"on_s": 120.0, "off_s": 120.0, "repeats": 1000})] * 4,
+        "segment 1: duration_s 240000",
+    ),
+    "prbs": ([("prbs", {"chips": 100_000, "clock_pulses": 200})], "segment 1: duration_s 500000"),
+    "staircase": ([("staircase", {"levels": 100, "hold_s": 60.0})], "segment 1: duration_s 12000"),
+    "many rests": ([("rest", {"duration_s": 100.0})] * 4, "segment 4: duration_s 400"),
+    "many segments": ([("rest", {"duration_s": 0.1})] * 201, "201 segments, at most 200"),
+    "a long list": ([("widths", {"pulse_width_us": [0.0] * 18_001})], "at most 18000"),
+    "holds without end": ([("multilevel", {"max_hold_s": 1e300})], "max_hold_s"),
+}
+
+
+@pytest.mark.parametrize("name", LONG)
+def test_what_is_too_long_is_refused_before_it_is_built(name: str, monkeypatch: pytest.MonkeyPatch):
+    asked, words = LONG[name]
+    segments = [SegmentPlan(name="x", sequence=sequence, settings=settings) for sequence, settings in asked]
+    monkeypatch.setattr(plan.sequences, "build", lambda *_: pytest.fail("it was built"))
+    with pytest.raises((RefusedError, PlanError), match=words):
+        built(segments)
+
+
+NONE = {
+    "rest": {"duration_s": 0.001},
+    "steps": {"on_s": 0.001, "off_s": 0.0},
+    "staircase": {"hold_s": 0.001},
+    "multilevel": {"duration_s": 0.001},
+    "ramp": {"up_s": 0.001, "down_s": 0.001},
+}
+
+
+@pytest.mark.parametrize("sequence", NONE)
+def test_a_segment_without_a_pulse_is_a_mistake_in_the_plan(sequence: str):
+    short = SegmentPlan(name="x", sequence=sequence, settings=NONE[sequence])
+    for segments in ([short], [*plan.default_segments(), short], [short, *plan.default_segments()]):
+        with pytest.raises(PlanError, match=r"segment \d \(x\): it is too short for one pulse at 40 pulses/s"):
+            built(segments)
+
+
+@pytest.mark.parametrize(
+    ("sequence", "settings"),
+    [
+        ("steps", {"on_s": True}),
+        ("rest", {"duration_s": "2"}),
+        ("widths", {"pulse_width_us": [True]}),
+        ("prbs", {"bits": True}),
+    ],
+)
+def test_what_is_no_number_is_no_setting(sequence: str, settings: dict[str, object]):
+    with pytest.raises(PlanError, match="valid"):
+        built([SegmentPlan(name="x", sequence=sequence, settings=settings)])
+
+
 def test_mistakes_name_the_segment():
     with pytest.raises(PlanError, match="segments is empty"):
         built([])

@@ -6,12 +6,18 @@ import math
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import h5py
 import pytest
 
+from rig import limits
+from rig.clock import utc_text
 from rig.control import core
+from rig.control.building import previewed
+from rig.control.calibration import end_of_day_s
 from rig.errors import BusyError, DeviceError, LatchedError, PlanError, RefusedError, UncertainError
 from rig.messages import CalibrateStartRequest, PreviewRequest, Profile, SegmentPlan
 from tests.rig.live import LiveRig
@@ -40,6 +46,7 @@ def test_from_ready_to_ready_with_a_sealed_file(make: Make):
         live.rig.start(live.plan("two"))
     status = live.rig.status()
     assert (status.test_id, status.participant, status.duration_s) == ("one", "P", 3.0)
+    assert status.limits["current_ma"].hi == 100 and status.require_calibration is not None
     assert live.rig.live() is not None
     assert live.rig.trouble() is None
     live.wait("ready")
@@ -64,7 +71,63 @@ def test_the_rest_between_two_tests_is_asked_for_and_says_how_long(make: Make):
     rested = Profile(rest_between_tests_s=60.0)
     with pytest.raises(RefusedError, match=r"rest_between_tests_s .*participant's profile, under by .*; wait 5\d"):
         live.rig.start(live.plan("two", profile=rested))
-    assert live.rig.preview(PreviewRequest(plan=live.plan("p", profile=rested))).duration_s == 3.0
+    asked = PreviewRequest(plan=live.plan("p", profile=rested))
+    assert previewed(asked, live.rig.table, time.time()).duration_s == 3.0
+
+
+def test_the_rest_outlives_a_clean_restart_and_a_wall_clock_set_ahead(make: Make, monkeypatch: pytest.MonkeyPatch):
+    live = make()
+    live.rig.start(live.plan("one", hold_s=0.5))
+    live.wait("ready")
+    live.rig.close()
+    monkeypatch.setattr(time, "time", lambda now=time.time: now() + 86_400)
+    again = make()
+    again.wait("ready")
+    with pytest.raises(RefusedError, match=r"rest_between_tests_s .*wait 5\d"):
+        again.rig.start(again.plan("two", profile=Profile(rest_between_tests_s=60.0)))
+
+
+def test_a_calibration_does_not_shorten_the_rest_after_a_test(make: Make):
+    live = make()
+    live.rig._table = limits.at_least(live.rig._table, "rest_between_tests_s", 60.0, "rig file")
+    live.rig.start(live.plan("one", hold_s=0.5))
+    live.wait("ready")
+    live.rig.calibrate(CalibrateStartRequest(calibration_id="c", participant="P", by="t"))
+    with pytest.raises(RefusedError, match=r"rest_between_tests_s .*wait 5\d"):
+        live.rig.calibrate_step("up")
+
+
+def test_midnight_ends_nothing_in_its_middle_without_a_reason(make: Make, monkeypatch: pytest.MonkeyPatch):
+    live = make()
+    midnight_s = end_of_day_s(time.time())
+    wall = {"s": midnight_s - 10.0}
+    monkeypatch.setattr(live.clock, "unix_s", lambda: wall["s"])
+    day = {
+        "sensory_pulse_width_us": 20.0, "motor_pulse_width_us": 60.0,
+        "set_at_utc": utc_text(midnight_s - 3600), "expires_at_utc": utc_text(midnight_s),
+    }  # fmt: skip
+    with pytest.raises(RefusedError, match="before this test of 11 s would end"):
+        live.rig.start(live.plan("late", hold_s=42.0, profile=Profile(**day)))
+    assert live.stimulator.sent == []
+    live.rig.calibrate(CalibrateStartRequest(calibration_id="c", participant="P", by="t", train_s=2.0))
+    live.rig.calibrate_step("up")
+    live.wait_pulses(5)
+    wall["s"] = midnight_s + 1.0
+    live.wait("calibrating")
+    assert 70 <= len(live.stimulator.sent) <= 80  # the train that had begun was played to its end
+    for late in (lambda: live.rig.calibrate_step("up"), lambda: live.rig.calibrate_mark("sensory")):
+        with pytest.raises(RefusedError, match="begun on the day before"):
+            late()
+    with pytest.raises(RefusedError, match="begun on the day before"):
+        live.rig.calibrate_finish("t", discard=False)
+    assert live.rig.calibrate_finish("t", discard=True).profile is None
+    assert live.rig.status().state == "ready"
+
+
+def test_a_test_of_which_the_stimulator_would_send_nothing_is_refused(make: Make):
+    live = make()
+    with pytest.raises(PlanError, match=r"300 µs at 0.4 mA stimulates nothing"):
+        live.rig.start(live.plan("weak", profile=Profile(current_ma=0.4)))
 
 
 def test_a_stop_latches_over_the_rigs_death_until_a_person_rearms(make: Make):
@@ -211,6 +274,24 @@ def test_a_journal_without_an_end_comes_back_uncertain(make: Make, tmp_path: Pat
         again.rig.start(again.plan("three", profile=Profile(rest_between_tests_s=60.0)))
 
 
+def test_a_damaged_journal_is_sealed_and_kept(make: Make, tmp_path: Path):
+    live = make()
+    live.rig.start(live.plan("one", hold_s=20.0))
+    live.wait_pulses(10)
+    left = bytearray((tmp_path / "journals" / "one.journal").read_bytes())
+    live.rig.close()
+    left[40] ^= 1  # in the header
+    (tmp_path / "journals" / "dead.journal").write_bytes(left)
+    (tmp_path / "recordings").rename(tmp_path / "elsewhere")  # the stopped test's own
+    again = make()
+    again.wait("uncertain")
+    assert again.rig.finished is not None
+    assert again.rig.finished.recording_path is not None
+    assert any("the journal is damaged" in words for words in again.rig.finished.summary["warnings"])
+    assert (tmp_path / "journals" / "dead.damaged").read_bytes() == left
+    assert not (tmp_path / "journals" / "dead.journal").exists()
+
+
 def test_a_wall_clock_that_jumps_in_a_test_changes_nothing(make: Make, monkeypatch: pytest.MonkeyPatch):
     live = make()
     now = time.time
@@ -281,3 +362,48 @@ def test_what_hangs_or_died_is_trouble(make: Make, monkeypatch: pytest.MonkeyPat
     assert receiver is not None
     monkeypatch.setattr(type(receiver), "living", False)
     assert "receiver" in str(rig.trouble())
+
+
+def test_a_rest_counts_from_when_a_stalled_line_has_answered_again(make: Make):
+    """The pulse that it held may have been felt only then."""
+    live = make()
+    live.rig.start(live.plan("held"))
+    live.wait("running")
+    live.wait_pulses(10)
+    live.stimulator.stalled = True
+    live.wait("latched")
+    time.sleep(1.2 / live.clock.speed)
+    live.stimulator.stalled = False
+    assert live.rig.rearm("nurse").state == "ready"
+    with pytest.raises(RefusedError, match="rest_between_tests_s"):
+        live.rig.start(live.plan("soon", segments=[SegmentPlan(name="hold", sequence="steps", settings={"on_s": 1.0})]))
+
+
+def test_a_stop_is_confirmed_though_the_disk_is_slow(make: Make):
+    live = make()
+    free, keep = threading.Event(), live.rig._rest.pulse_at
+
+    def slowly(*arguments: Any, **more: Any) -> None:
+        free.wait(20)
+        keep(*arguments, **more)
+
+    live.rig._rest.pulse_at = slowly
+    live.rig.start(live.plan("slow"))
+    live.wait("running")
+    live.wait_pulses(5)
+    assert live.rig.stop("enough", "nurse").confirmed
+    with pytest.raises(BusyError):
+        live.rig.start(live.plan("next"))
+    free.set()
+    live.wait("latched")
+
+
+def test_a_start_that_was_asked_while_stopped_is_not_played_once_rearmed(make: Make):
+    live = make()
+    live.rig.stop("look first", "nurse")
+    with ThreadPoolExecutor(1) as pool, live.rig._lock:  # as re-arming holds it, for as long as the devices take
+        asked = pool.submit(live.rig.start, live.plan("early"))
+        with pytest.raises(LatchedError):
+            asked.result(timeout=20)
+    assert live.rig.rearm("nurse").state == "ready"
+    assert live.stimulator.sent == []

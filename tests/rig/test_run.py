@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 import pytest
 
-from rig import archive, journal
+from rig import archive, assembly, journal
 from rig.errors import RecordingError
 from rig.journal import Kind
 from rig.messages import SegmentPlan
@@ -35,7 +35,7 @@ def test_a_test_plays_to_its_end(tmp_path: Path):
 def test_the_sealed_file_holds_what_was_played(tmp_path: Path):
     rig = VirtualRig(tmp_path)
     rig.execute()
-    sealed = archive.seal(journal.read(rig.path), tmp_path)
+    sealed = archive.seal(assembly.assemble(journal.read(rig.path)), tmp_path)
     with h5py.File(sealed.path) as file:
         assert file.attrs["outcome"] == "completed"
         assert file.attrs["content_sha256"] == sealed.content_sha256 == archive.verify(sealed.path)
@@ -63,7 +63,7 @@ def test_a_late_pulse_is_dropped_and_recorded_never_burst(tmp_path: Path):
     assert result.dropped in (1, 2)
     times = np.array([t for t, _ in rig.stimulator.sent])
     assert np.min(np.diff(times)) > 0.025 - 0.4 * 0.025 - 1e-9
-    recording = archive.assemble(journal.read(rig.path))
+    recording = assembly.assemble(journal.read(rig.path))
     status, sent = recording.columns["pulses/status"], recording.columns["pulses/sent_pulse_width_us"]
     assert np.sum(status == PulseStatus.DROPPED) == result.dropped
     assert np.all(np.isnan(sent[status == PulseStatus.DROPPED]))
@@ -105,7 +105,7 @@ def test_every_fault_stops_the_test(tmp_path: Path, name: str):
     assert rig.stimulator.stops >= 1
     assert rig.stimulator.sent[-1][0] - at[0] < 0.15  # watch period of 100 ms and two pulses
     assert rig.gate.fire(99, Pulse(100.0, 20.0), rig.clock.now_s(), math.inf) == PulseStatus.REFUSED
-    recording = archive.assemble(journal.read(rig.path))
+    recording = assembly.assemble(journal.read(rig.path))
     assert recording.attributes["outcome"] == "fault"
     assert len(recording.columns["pulses/status"]) < len(rig.test.pulse_width_us)
 
@@ -119,6 +119,16 @@ def test_a_stop_is_confirmed_by_the_torque_falling(tmp_path: Path):
     assert result.evidence.confirmed
     assert "torque fell from 6.00" in result.evidence.detail
     assert rig.stimulator.sent[-1][0] <= rig.halt.time_s
+
+
+def test_a_stop_among_the_first_pulses_says_no_more_than_the_torque_does(tmp_path: Path):
+    hold = [SegmentPlan(name="hold", sequence="steps", settings={"on_s": 3.0, "off_s": 0.0})]
+    rig = VirtualRig(tmp_path, hold)
+    rig.at(0.003, lambda: rig.halt.set("stopped", "enough"))
+    result = rig.execute()
+    assert result.evidence.confirmed
+    assert "too small to tell more" in result.evidence.detail
+    assert "fell" not in result.evidence.detail
 
 
 def test_a_stop_without_effect_is_not_called_confirmed(tmp_path: Path):
@@ -142,7 +152,7 @@ def test_no_torque_no_test(tmp_path: Path):
     assert result.outcome == "fault"
     assert "no fresh torque" in result.reason
     assert rig.stimulator.sent == []
-    recording = archive.assemble(journal.read(rig.path))
+    recording = assembly.assemble(journal.read(rig.path))
     assert recording.names == []
     assert all(len(column) == 0 for column in recording.columns.values())
 
@@ -157,7 +167,7 @@ def test_a_journal_cut_anywhere_seals_what_it_holds(tmp_path: Path):
         cut.write_bytes(whole[:length])
         try:
             contents = journal.read(cut)
-            recording = archive.assemble(contents, "fault", "killed")
+            recording = assembly.assemble(contents, "fault", "killed")
         except RecordingError as error:
             assert length < 6000, error  # header and plan
             continue

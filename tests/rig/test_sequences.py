@@ -87,6 +87,7 @@ def test_widths_are_taken_as_they_are():
 def test_every_sequence_stays_between_zero_and_c(name: str, rate_hz: float, c_us: float):
     settings = {} if name == "rest" else {"max_pulse_width_us": c_us}
     widths = sequences.build(name, settings, rate_hz)
+    assert len(widths) == sequences.pulse_count(name, settings, rate_hz)
     assert widths.dtype == np.float64
     assert np.all((widths >= 0) & (widths <= c_us * (1 + 1e-12)))
     assert np.array_equal(widths, sequences.build(name, settings, rate_hz))  # pure

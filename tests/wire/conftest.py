@@ -9,7 +9,7 @@ import pytest
 
 from tests.wire.processes import Bench, RigClient
 
-SPEED = 4.0
+SPEED = 2.0
 
 
 @pytest.fixture
@@ -28,11 +28,26 @@ def make_bench(tmp_path: Path) -> Iterator[Callable[..., Bench]]:
 
 
 @pytest.fixture(scope="module")
-def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Bench, RigClient]]:
-    """One emulator and one rig for a whole file: each test also shows that the rig came back from the one before."""
+def pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Bench, RigClient]]:
+    """One emulator and one rig for a whole file."""
     bench = Bench(tmp_path_factory.mktemp("shared"), "--noise-seed", "7", speed=SPEED)
     yield bench, bench.start_rig()
     bench.close()
+
+
+@pytest.fixture
+def shared(pair: tuple[Bench, RigClient]) -> tuple[Bench, RigClient]:
+    """The file's pair, ready: what one test left behind is no other test's failure."""
+    bench, client = pair
+    for name in bench.fault(cmd="faults")["active"]:
+        bench.fault(cmd="fault", name=name, on=False)
+    if client.status()["state"] != "ready":
+        client.ask("stop", reason="the test before left it so", by="test")
+        client.wait_state("latched", "disconnected")
+        assert client.ask("rearm", by="test")["ok"]
+    while not client.events.empty():
+        client.events.get_nowait()
+    return pair
 
 
 @pytest.fixture

@@ -96,6 +96,15 @@ class RigClient:
         self.send_raw(json.dumps({"kind": kind, "id": self._id, **fields}))
         return self._replies[self._id].get(timeout=timeout_s)
 
+    def start(self, plan: dict[str, Any], timeout_s: float = 15.0) -> dict[str, Any]:
+        """Ask for a test, once the rest between two tests is over; the whole reply."""
+        end = time.monotonic() + 30
+        while True:
+            reply = self.ask("start", timeout_s, plan=plan)
+            if reply["ok"] or "rest_between_tests_s" not in reply["problem"]["detail"] or time.monotonic() > end:
+                return reply
+            time.sleep(0.05)
+
     def send_raw(self, line: str) -> None:
         """Send a line as it is."""
         self._socket.sendall(line.encode() + b"\n")

@@ -16,13 +16,15 @@ FAULTS = (
     "host_killed",
     "corrupt_commands",
     "cell_silent",
+    "line_stalled",
+    "line_stalled_70_ms",
 )
 """Those that the other tests of this folder do not make, and one of the load cell."""
 
 
 def test_a_short_campaign_finds_nothing_wrong():
     jobs = [(fault, PHASES[1:4][number % 3], 77) for number, fault in enumerate(FAULTS)]
-    found = campaign(jobs, workers=1, speed=4.0, minutes=1.5)
+    found = campaign(jobs, workers=1, speed=4.0, minutes=2.5)
     assert len(found) == len(FAULTS)
     for verdict in found:
         assert not verdict.failed, verdict

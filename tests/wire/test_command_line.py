@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -39,6 +40,7 @@ def run(*arguments: str) -> subprocess.CompletedProcess[str]:
         ("bus =", 'signal = "Torq"\nbus =', "load_cell.signal: message"),
         ("bus =", 'sample_rate_hz = "fast"\nbus =', "load_cell.sample_rate_hz"),
         ("/data", "/rig.toml/data", "data_dir"),
+        ("data_dir", "clock_speed = 20\ndata_dir", "clock_speed"),
         ("{folder}/rig.sock", "{folder}/" + "x" * 120, "socket"),
     ],
 )
@@ -77,12 +79,13 @@ def test_the_rig_ends_with_its_parent_where_asked(bench: Bench, tmp_path: Path):
         time.sleep(0.05)
 
 
-def test_a_port_that_is_not_there_is_told_until_it_is(bench: Bench, tmp_path: Path):
+def test_a_port_that_is_not_there_is_told_until_it_is(make_bench: Callable[..., Bench], tmp_path: Path):
+    bench = make_bench("--noise-seed", "7", speed=1.0)  # a rig file runs at the speed of the world
     link = tmp_path / "no-such-port"
     can = bench.emulator.ready["can"]
     path = tmp_path / "rig.toml"
     path.write_text(CONFIG.format(folder=tmp_path).replace("port = 9", f"port = {can['port']}"))
-    rig = Process("rig", "--config", str(path), "--clock-speed", f"{bench.speed:g}", log=tmp_path / "rig.log")
+    rig = Process("rig", "--config", str(path), log=tmp_path / "rig.log")
     try:
         assert rig.ready["state"] == "disconnected"
         client = RigClient(tmp_path / "rig.sock")

@@ -22,9 +22,8 @@ PAIRS = [
 
 @pytest.mark.parametrize(("stimulator", "cell", "transport"), PAIRS)
 def test_a_pair_behaves(make_bench: Callable[..., Bench], stimulator: str, cell: str, transport: str):
-    # the emulated RehaStim 2 reads what came while it was not scheduled at once and then calls the second pulse busy
-    speed = 4.0 if stimulator == "p24" else 2.0
-    figures = check_all(make_bench(*options(stimulator, cell, transport), speed=speed))
+    # at the speed of the world: a backlog of text frames is read hardly faster than twice that
+    figures = check_all(make_bench(*options(stimulator, cell, transport), speed=1.0))
     assert figures["stop_ms"] < 100
 
 
@@ -34,7 +33,7 @@ def test_a_rehastim2_is_kept_alive_through_a_rest_and_lets_go_of_a_dead_host(mak
     client = bench.start_rig()
     client.ask("subscribe")
     rest = {"name": "rest", "sequence": "rest", "settings": {"duration_s": 3.0}}
-    assert client.ask("start", plan=short_plan("rests", segments=[rest, *HOLD[1:], rest]))["ok"]
+    assert client.start(short_plan("rests", segments=[rest, *HOLD[1:], rest]))["ok"]
     client.wait_state("running")
     while len(felt(bench)) < 20:
         time.sleep(0.02)

@@ -21,7 +21,7 @@ def test_a_page_sees_torque_before_and_during_a_test(shared: tuple[Bench, RigCli
     assert live["event"] == "live"
     assert live["test_id"] is None
     assert len(live["time_s"]) == len(live["torque_min_nm"]) == len(live["torque_max_nm"]) > 0
-    assert client.ask("start", plan=short_plan("live"))["ok"]
+    assert client.start(short_plan("live"))["ok"]
     events, end = [], time.monotonic() + 30
     while not events or events[-1]["event"] != "finished":
         events.append(client.events.get(timeout=end - time.monotonic()))
@@ -53,6 +53,20 @@ def test_refusals_name_the_reason(shared: tuple[Bench, RigClient]):
     assert client.status()["state"] == "ready"
 
 
+def test_what_comes_to_no_pulse_is_a_mistake_and_not_an_internal_one(shared: tuple[Bench, RigClient]):
+    _bench, client = shared
+    none = [{"name": "x", "sequence": "steps", "settings": {"on_s": 0.001, "off_s": 0.0}}]
+    for kind in ("preview", "start"):
+        problem = client.ask(kind, plan=default_plan("none", segments=none))["problem"]
+        assert problem["code"] == "bad-plan"
+        assert "segment 1 (x): it is too short for one pulse" in problem["detail"]
+    train = {"calibration_id": "none", "participant": "P01", "by": "t", "train_s": 0.1, "pulse_rate_hz": 1.0}
+    assert "has no pulse" in client.ask("calibrate-start", **train)["problem"]["detail"]
+    for wrong in (True, "20"):
+        assert client.ask("calibrate-start", **{**train, "current_ma": wrong})["problem"]["code"] == "bad-plan"
+    assert client.status()["state"] == "ready"
+
+
 def test_malformed_requests_are_answered_not_fatal(shared: tuple[Bench, RigClient]):
     bench, client = shared
     for line in ("not json", '{"kind": "dance"}', '{"kind": "start", "plan": {"test_id": 5}}', "[]"):
@@ -79,7 +93,7 @@ def test_preview_gives_duration_and_dose(shared: tuple[Bench, RigClient]):
 def test_a_second_start_is_refused_and_names_the_holder(shared: tuple[Bench, RigClient]):
     bench, client = shared
     other = bench.client()
-    assert client.ask("start", plan=default_plan("mine"))["ok"]
+    assert client.start(default_plan("mine"))["ok"]
     reply = other.ask("start", plan=default_plan("yours"))
     assert reply["problem"]["code"] == "busy"
     assert "mine" in reply["problem"]["detail"]

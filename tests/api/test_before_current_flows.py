@@ -1,0 +1,233 @@
+"""Before current flows a person sees who, how much, how long, and says yes: once, soon, and to exactly that."""
+
+from __future__ import annotations
+
+import asyncio
+import concurrent.futures
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import httpx
+import pytest
+
+from api.auth import Principal
+from api.clock import Clock
+from api.questions import LIFE_S, MOST, Question, Questions
+from rig import messages as m
+from tests.api.conftest import Service, run_test, wait_done
+from tests.api.test_access import csrf, signed_in
+from tests.api.test_forms import fields
+from tests.api.test_profiles import calibrate
+
+PAGE = "/participants/P017"
+
+
+class SetClock(Clock):
+    """Both clocks as a test sets them."""
+
+    def __init__(self) -> None:
+        self.unix, self.monotonic = 1_800_000_000.0, 1000.0
+
+    def unix_s(self) -> float:
+        return self.unix
+
+    def monotonic_s(self) -> float:
+        return self.monotonic
+
+
+@pytest.fixture
+def tab(service: Service, participant: str) -> Iterator[httpx.Client]:
+    with signed_in(service) as browser:
+        yield browser
+
+
+def ask(tab: httpx.Client) -> str:
+    """Press *Start*; the address of the question."""
+    asked = tab.post(f"{PAGE}/tests", data=fields(tab))
+    assert asked.status_code == 303 and "/confirm/" in asked.headers["location"], asked.text
+    return asked.headers["location"]
+
+
+def yes(tab: httpx.Client, question: str) -> httpx.Response:
+    return tab.post(question, data={"csrf": csrf(tab)})
+
+
+def rows(page: str) -> dict[str, str]:
+    found = re.findall(r'<th scope="row">([^<]*)</th><td>(?:<b>)?([^<]*)', page)
+    return dict(found)
+
+
+def status_heard(service: Service) -> m.Status:
+    """The service knows what the rig says now."""
+    context = service.app.state.context
+    return asyncio.run_coroutine_threadsafe(context.rig.fresh_status(), context.rig._task.get_loop()).result(10)
+
+
+def test_start_shows_who_and_how_much_and_plays_nothing(tab: httpx.Client, service: Service) -> None:
+    page = tab.get(ask(tab)).text
+    assert "Start the pre-session test of P017?" in page and "P017 is not calibrated" in page
+    told = rows(page)
+    assert (told["Who"], told["Current of every pulse"], told["How long"]) == ("P017", "20 mA", "25 s")
+    assert told["Widest pulse"] == "300 µs, comfort maximum 300 µs" and told["Stops at"] == "30.0 N·m"
+    assert re.fullmatch(r"\d+ pulses, \d\.\d\d mC", told["Dose"]) and "FAKE P24" in told["Rig"]
+    assert told["Calibration"] == "not calibrated"
+    assert re.search(r'class="stimulate big" data-needs-ready[^>]*>Start now: 20 mA, 300 µs<', page)
+    assert service.rig.starts == 0 and service.app.state.context.trials.current is None
+
+
+def test_who_calibrated_and_until_when_is_told(tab: httpx.Client, client: httpx.Client) -> None:
+    calibrate(client)
+    page = tab.get(ask(tab)).text
+    assert "by administrator, valid until" in rows(page)["Calibration"] and "not calibrated" not in page
+
+
+def test_yes_starts_once_however_often_it_is_said(tab: httpx.Client, client: httpx.Client, service: Service) -> None:
+    question = ask(tab)
+    form = {"csrf": csrf(tab)}
+    with concurrent.futures.ThreadPoolExecutor(5) as pool:
+        answers = list(pool.map(lambda _: tab.post(question, data=form), range(5)))
+    addresses = {answer.headers["location"] for answer in answers}
+    (address,) = addresses
+    assert address.startswith("/tests/T") and service.rig.starts == 1
+    assert tab.get(question).headers["location"] == address, "Back leads to the test"
+    wait_done(client, address.split("/")[-1])
+    assert yes(tab, question).headers["location"] == address, "Back, and once more yes"
+    assert service.rig.starts == 1
+
+
+@pytest.mark.parametrize(("unix_s", "monotonic_s"), [(0, LIFE_S + 1), (LIFE_S + 1, 0), (-60, 10)])
+def test_a_question_is_open_for_five_minutes_by_either_clock(
+    tab: httpx.Client, service: Service, unix_s: float, monotonic_s: float
+) -> None:
+    clock = service.app.state.context.questions.clock = SetClock()
+    question = ask(tab)
+    clock.unix, clock.monotonic = clock.unix + unix_s, clock.monotonic + monotonic_s
+    for answer in (tab.get(question), yes(tab, question)):
+        assert (
+            answer.status_code == 410 and "Nothing was done" in answer.text and "Back to the participant" in answer.text
+        )
+    assert service.rig.starts == 0
+    clock.unix, clock.monotonic = 1_800_000_000.0 + LIFE_S, 1000.0 + LIFE_S
+    assert tab.get(question).status_code == 200
+
+
+def test_a_question_belongs_to_whom_it_was_asked(tab: httpx.Client, client: httpx.Client, service: Service) -> None:
+    question = ask(tab)
+    client.post("/v1/participants", json={"code": "P018"})
+    with signed_in(service) as other:
+        assert yes(other, question).status_code == 410
+    assert yes(tab, question.replace("P017", "P018")).status_code == 410
+    assert tab.post(question).status_code == 403, "a yes carries the session's CSRF token"
+    assert yes(tab, f"{PAGE}/confirm/made-up").status_code == 410
+    assert service.rig.starts == 0
+
+
+def test_limits_changed_meanwhile_are_not_played(tab: httpx.Client, client: httpx.Client, service: Service) -> None:
+    question = ask(tab)
+    client.put("/v1/participants/P017/profile", json={"current_ma": 10})
+    refused = yes(tab, question)
+    assert refused.status_code == 409 and "limits of P017 were changed meanwhile" in refused.text
+    assert service.rig.starts == 0 and service.app.state.context.trials.current is None
+
+
+def test_a_rig_set_up_anew_meanwhile_is_asked_about_again(
+    tab: httpx.Client, service: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    question = ask(tab)
+    widths, segments = service.rig._widths(m.TestPlan(test_id="T", participant="P", profile=m.Profile()))
+    monkeypatch.setattr(service.rig, "_widths", lambda _plan: ([*widths, 300.0], segments))
+    refused = yes(tab, question)
+    assert refused.status_code == 409 and "would now play something else" in refused.text
+    assert service.rig.starts == 0 and service.app.state.context.trials.current is None
+
+
+def test_a_rig_that_asks_for_a_calibration_offers_that_first(
+    tab: httpx.Client, client: httpx.Client, service: Service
+) -> None:
+    model = run_test(client, "P017")["model_id"]
+    client.get(f"/v1/models/{model}/diagnosis")
+    starts = service.rig.starts
+    service.rig.require_calibration = True
+    assert status_heard(service).require_calibration
+    page = tab.get(PAGE).text
+    assert "Calibrate first" in page and "Start the pre-session test" not in page
+    for path in (f"{PAGE}/tests", f"/models/{model}/experiment"):
+        refused = tab.post(path, data={"csrf": csrf(tab)})
+        assert refused.status_code == 409 and "Calibrate first" in refused.text
+    assert service.rig.starts == starts
+    calibrate(client)
+    assert "Start the pre-session test" in tab.get(PAGE).text and "Start now" in tab.get(ask(tab)).text
+
+
+def test_a_calibration_of_yesterday_starts_nothing(tab: httpx.Client, client: httpx.Client, service: Service) -> None:
+    calibrate(client)
+    with service.app.state.context.store.write() as session:
+        from api.store.tables import Participant
+
+        row = session.get(Participant, "P017")
+        row.profile = {**row.profile, "expires_at_utc": "2026-01-02T00:00:00Z"}
+    assert "Calibrate first" in tab.get(PAGE).text and "expired" in tab.get(PAGE).text
+    assert tab.post(f"{PAGE}/tests", data=fields(tab)).status_code == 409
+
+
+def test_the_next_experiment_is_asked_about_the_same_way(
+    tab: httpx.Client, client: httpx.Client, service: Service
+) -> None:
+    model = run_test(client, "P017")["model_id"]
+    client.get(f"/v1/models/{model}/diagnosis")
+    page = tab.get(f"/models/{model}").text
+    assert re.search(r'<button class="stimulate big"[^>]*>Run it now', page)
+    asked = tab.post(f"/models/{model}/experiment", data={"csrf": csrf(tab)})
+    text = tab.get(asked.headers["location"]).text
+    assert "Start the next experiment of P017?" in text and f'href="/models/{model}#experiment"' in text
+    assert service.rig.starts == 1
+    address = yes(tab, asked.headers["location"]).headers["location"]
+    assert service.rig.starts == 2
+    assert wait_done(client, address.split("/")[-1])["joins"] == model
+
+
+def test_a_busy_rig_asks_nobody(tab: httpx.Client, client: httpx.Client, service: Service) -> None:
+    service.rig.speed = 0.2  # runs until it is stopped below
+    form = fields(tab)
+    question = ask(tab)
+    test_id = client.post("/v1/tests", json={"participant": "P017"}).json()["id"]
+    for answer in (tab.post(f"{PAGE}/tests", data=form), yes(tab, question)):
+        assert answer.status_code == 409 and f"/tests/{test_id}" in answer.text
+    assert service.rig.starts == 1
+    assert client.post("/v1/stop").status_code == 200
+    assert wait_done(client, test_id)["state"] == "stopped"
+
+
+def test_many_questions_of_one_drop_no_one_elses() -> None:
+    questions = Questions(SetClock())
+    ada, ben = (Principal(name, frozenset(), csrf=name) for name in ("Ada", "Ben"))
+
+    async def deed() -> str:
+        return "/done"
+
+    def of(who: Principal) -> str:
+        address = questions.ask(Question("P1", "Yes?", "Yes", deed), who)
+        return address.split("/")[-1]
+
+    first, own = of(ben), [of(ada) for _ in range(3 * MOST)]
+    assert questions.find("P1", first, ben).title == "Yes?"
+    assert questions.find("P1", own[-MOST], ada) and len(questions._all) == MOST + 1
+    with pytest.raises(Exception, match="no longer open"):
+        questions.find("P1", own[-MOST - 1], ada)
+
+
+def test_a_deed_that_failed_is_not_done_again() -> None:
+    questions, done = Questions(SetClock()), []
+    who = Principal("Ada", frozenset(), csrf="x")
+
+    async def deed() -> str:
+        done.append(1)
+        raise RuntimeError("no")
+
+    async def twice() -> list[Any]:
+        number = questions.ask(Question("P1", "Yes?", "Yes", deed), who).split("/")[-1]
+        question = questions.find("P1", number, who)
+        return await asyncio.gather(questions.yes(question), questions.yes(question), return_exceptions=True)
+
+    assert [str(error) for error in asyncio.run(twice())] == ["no", "no"] and done == [1]

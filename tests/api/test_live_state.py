@@ -1,0 +1,202 @@
+"""The rig's state is live on every page and in every tab, is never old, and there is a way back from each."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.api.browser import bring_to_rest, open_tab, participant, start
+from tests.api.conftest import STUB, Service, run_service, run_test
+
+pytestmark = pytest.mark.browser
+SPEED, SLOW = 4.0, 0.2
+"""A test at SLOW lasts two minutes: each tab sees it, however busy the machine is, and a stop ends it."""
+SILENT_CELL = "load cell on can0: no frame for 1.0 s"
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
+    yield from run_service(tmp_path_factory.mktemp("state"), short_dir, STUB, speed=SPEED, emulated=True)
+
+
+@pytest.fixture
+def tab(browser: Any, service: Service) -> Iterator[Any]:
+    yield from open_tab(browser, service)
+    service.rig.mute, service.rig.cell_speaks, service.rig.mended, service.rig.speed = False, True, True, SPEED
+
+
+@pytest.fixture(scope="module")
+def done(service: Service) -> dict[str, Any]:
+    """A finished test with its model."""
+    with service.client() as http:
+        http.post("/v1/participants", json={"code": "E1"})
+        return run_test(http, "E1")
+
+
+def every_page(service: Service, done: dict[str, Any]) -> list[str]:
+    """An address of each kind of page that has the bar."""
+    model = done["model_id"]
+    paths = (
+        "/", "/participants/E1", "/participants/E1/calibration", f"/tests/{done['id']}", f"/models/{model}?diagnose=0",
+        f"/compare?model={model}&model={model}", "/nothing-here", "/administration",
+    )  # fmt: skip
+    return [service.url + path for path in paths]
+
+
+def says(page: Any, words: str) -> None:
+    page.locator("#rig-state", has_text=re.compile(words)).wait_for(timeout=60_000)
+
+
+def test_every_page_in_every_tab_follows_the_rig(tab: Any, service: Service, done: dict[str, Any]) -> None:
+    pages = [tab.context.new_page() for _ in every_page(service, done)]
+    for page, address in zip(pages, every_page(service, done), strict=True):
+        answer = page.goto(address)
+        expected = 404 if "nothing-here" in address else 403 if "administration" in address else 200
+        assert answer.status == expected, address
+        says(page, "No stimulation ready")
+        assert page.get_by_text("Emulated rig: no person is connected").is_visible(), address
+    row = pages[0].get_by_role("row", name="E1")
+    start_button = pages[1].get_by_role("button", name="Start the pre-session test")
+    assert start_button.is_enabled()
+    service.rig.speed = SLOW
+    with service.client() as http:
+        test = http.post("/v1/tests", json={"participant": "E1"}).json()["id"]
+    for page in pages:
+        says(page, "Stimulating")
+    assert start_button.count() == 0, "hidden while a test runs"
+    pages[0].reload()
+    row.get_by_text("running", exact=True).wait_for()
+    assert pages[1].get_by_role("link", name="the test of E1").get_attribute("href") == f"/tests/{test}"
+    bring_to_rest(service)
+    for page in pages:
+        says(page, "No stimulation ready")
+    row.get_by_text("ended", exact=True).wait_for()
+    assert start_button.is_enabled(), "all without loading the page again"
+
+
+def test_back_to_a_page_that_was_loaded_before_the_start_shows_what_flows(tab: Any, service: Service) -> None:
+    service.rig.speed = SLOW
+    participant(tab, service, f"B{time.time_ns() % 10**9}")
+    says(tab, "No stimulation")
+    start(tab)
+    tab.go_back()
+    says(tab, "Stimulating")
+    assert tab.get_by_role("button", name="Start the pre-session test").count() == 0
+    tab.go_forward()
+    says(tab, "Stimulating")
+
+
+def test_a_page_that_the_browser_had_kept_is_loaded_anew(tab: Any, service: Service) -> None:
+    says(tab, "ready")
+    with tab.expect_navigation():
+        tab.evaluate("dispatchEvent(new PageTransitionEvent('pageshow', {persisted: true}))")
+    says(tab, "ready")
+
+
+def test_without_an_answer_the_state_is_not_known_within_2_s(tab: Any, service: Service) -> None:
+    tab.clock.install()
+    tab.goto(service.url)
+    tab.clock.run_for(600)
+    says(tab, "No stimulation ready")
+    tab.route("**/rig/now", lambda route: route.abort())
+    tab.clock.run_for(2300)  # 2 s, and the page looks every 0.25 s
+    assert "Not known" in tab.locator("#rig-state").inner_text()
+    assert tab.locator("dd [data-now=torque]").inner_text() == "not known"
+    tab.unroute("**/rig/now")
+    tab.clock.run_for(600)
+    says(tab, "No stimulation ready")
+
+
+def test_after_a_sleep_nothing_old_is_shown_as_current(tab: Any, service: Service) -> None:
+    tab.clock.install()
+    tab.goto(service.url)
+    tab.clock.run_for(600)
+    says(tab, "No stimulation ready")
+    tab.route("**/rig/now", lambda route: route.abort())  # the line has not come back yet
+    tab.clock.fast_forward("01:00:00")
+    assert "Not known" in tab.locator("#rig-state").inner_text()
+
+
+def test_a_rig_that_does_not_answer_is_not_called_ready(tab: Any, service: Service) -> None:
+    tab.goto(service.url)
+    says(tab, "No stimulation ready")
+    service.rig.mute = True
+    says(tab, "Not known the rig does not answer")
+    tab.get_by_text("What it does now is not known").wait_for()
+    service.rig.mute = False
+    says(tab, "No stimulation ready")
+
+
+def test_torque_now_is_now_or_blank(tab: Any, service: Service) -> None:
+    torque = tab.locator("dd [data-now=torque]")
+    torque.get_by_text(re.compile(r"0\.43 N·m, \d\.\d s old")).wait_for()
+    service.rig.cell_speaks = False
+    torque.get_by_text(re.compile(r"^no torque for \d+\.\d s$")).wait_for()
+    service.rig.cell_speaks = True
+    torque.get_by_text("0.43 N·m").wait_for()
+
+
+def test_a_silent_load_cell_leaves_a_way_back_on_every_page(tab: Any, service: Service, done: dict[str, Any]) -> None:
+    for address in every_page(service, done):
+        tab.goto(address)
+        says(tab, "No stimulation ready")
+        service.rig_thread.become("disconnected", SILENT_CELL)
+        says(tab, "Disconnected")
+        tab.get_by_text(SILENT_CELL).wait_for()
+        tab.get_by_text("Check the load cell's cable and supply, then press Reconnect").wait_for()
+        tab.get_by_role("button", name="Reconnect").click()
+        says(tab, "No stimulation ready")
+        assert tab.get_by_role("button", name="Reconnect").count() == 0
+        if "nothing-here" not in address:
+            assert tab.url == address, "back where it was pressed"
+
+
+def test_a_reconnect_in_vain_says_why_and_can_be_tried_again(tab: Any, service: Service) -> None:
+    service.rig_thread.become("disconnected", SILENT_CELL)
+    service.rig.mended = False
+    tab.get_by_role("button", name="Reconnect").click()
+    tab.get_by_text("no torque comes; check its cable").wait_for()
+    service.rig.mended = True
+    tab.get_by_role("button", name="Reconnect").click()
+    says(tab, "No stimulation ready")
+
+
+def test_a_latched_or_restarted_rig_is_re_armed_from_the_page_that_shows_it(tab: Any, service: Service) -> None:
+    for state in ("latched", "uncertain"):
+        tab.goto(service.url + "/participants/E1")
+        service.rig_thread.become(state, SILENT_CELL)
+        tab.get_by_role("button", name="I have looked: re-arm").click()
+        says(tab, "No stimulation ready")
+        assert tab.url.endswith("/participants/E1")
+
+
+def test_without_scripts_the_state_carries_its_time(browser: Any, service: Service) -> None:
+    for page in open_tab(browser, service, java_script_enabled=False):
+        assert re.search(r"No stimulation\s+ready\s+at \d\d:\d\d:\d\d", page.locator("#rig-state").inner_text())
+        assert re.search(r"0\.43 N·m at \d\d:\d\d:\d\d", page.locator("dd:has([data-now=torque])").inner_text())
+
+
+def test_who_is_not_signed_in_learns_the_state_and_no_participant(service: Service, done: dict[str, Any]) -> None:
+    with service.client() as http, service.client(None) as stranger:
+        http.post("/v1/tests", json={"participant": "E1"})
+        end = time.monotonic() + 20
+        while (seen := stranger.get("/rig/now")).json()["flow"] != "Stimulating":
+            assert time.monotonic() < end
+        assert "E1" not in seen.text and seen.headers["cache-control"] == "no-store"
+        assert http.get("/rig/now").json()["test"]["participant"] == "E1"
+        http.post("/v1/stop")
+        while http.get("/rig/now").json()["test"]:
+            assert time.monotonic() < end
+        http.post("/v1/rearm")
+
+
+def test_browsers_of_before_2022_ask_for_the_state_too(tab: Any, service: Service) -> None:
+    tab.add_init_script("delete AbortSignal.timeout")
+    with tab.expect_response("**/rig/now") as answer:
+        tab.goto(f"{service.url}/")
+    assert answer.value.ok

@@ -1,0 +1,177 @@
+"""Whatever is pressed in whatever chart, no request leaves: on pages, in report files, in notebooks."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import pytest
+
+import identify
+from api import notebook
+from api.cleaning import clean
+from api.jobs import curves, thinned
+from api.pages.chart_config import CHART_CONFIG
+from api.report import comparison_html, improvement_html
+from tests.api.browser import open_tab
+from tests.api.conftest import STUB, Service, run_service, run_test
+from tests.api.test_worker import made_up_csv
+
+pytestmark = pytest.mark.browser
+LINK = '<a href="https://elsewhere.example/">here</a>'
+PNG = b"\x89PNG"
+
+BUTTONS = ".js-plotly-plot :is(.modebar-btn, button, a, [role=button])"
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
+    yield from run_service(tmp_path_factory.mktemp("leaves"), short_dir, STUB, speed=8.0)
+
+
+@pytest.fixture
+def tab(browser: Any, service: Service) -> Iterator[Any]:
+    for page in open_tab(browser, service):
+        watch(page)
+        yield page
+
+
+def watch(page: Any) -> None:
+    """Take down what any tab of the browser's asks another machine for, and what is saved here."""
+    page.left, page.downloads, context = [], [], page.context
+    own = urlsplit(page.url).netloc
+
+    def stop(route: Any) -> None:
+        address = urlsplit(route.request.url)
+        if address.scheme in ("file", "data", "blob") or address.netloc == own:
+            route.continue_()
+        else:
+            page.left.append(route.request.url)
+            route.abort()
+
+    context.route("**/*", stop)
+    context.on("page", lambda other: page.left.append(f"a new window: {other.url}"))
+    page.on("download", lambda found: page.downloads.append(found))
+
+
+def press_everything(page: Any, figures: int) -> None:
+    """Every button and link of every chart, as found there, and those that a press brings up; then the chart itself."""
+    page.locator(".js-plotly-plot .main-svg").first.wait_for()
+    page.wait_for_function("n => document.querySelectorAll('.js-plotly-plot .modebar').length >= n", arg=figures)
+    buttons = page.locator(BUTTONS).element_handles()
+    for button in buttons:
+        button.evaluate("(e) => e.setAttribute('data-first', '')")
+    assert len(buttons) >= 6 * figures
+    for button in buttons:
+        button.click(force=True, no_wait_after=True)
+        press_what_came_up(page, button)
+    for chart in page.locator(".js-plotly-plot").all():
+        for entry in chart.locator(".legendtoggle").all():
+            entry.click(force=True)
+            entry.dblclick(force=True)
+        for plane in chart.locator(".nsewdrag").all():
+            plane.click(force=True, position={"x": 20, "y": 20})
+            plane.dblclick(force=True, position={"x": 30, "y": 20})
+    saved_here(page, figures)
+    assert page.left == [] and page.errors == []
+
+
+def press_what_came_up(page: Any, button: Any) -> None:
+    """A dialog goes with its first button: it is brought up again for each of the others."""
+    pressed = 0
+    while (newcomers := page.locator(f"{BUTTONS}:not([data-first])")).count() > pressed:
+        newcomers.nth(pressed).click(force=True, no_wait_after=True)
+        pressed += 1
+        if not newcomers.count():
+            button.click(force=True, no_wait_after=True)
+
+
+def saved_here(page: Any, figures: int) -> None:
+    """The picture of each chart was made by the browser itself."""
+    for _ in range(600):
+        if len(page.downloads) >= figures:
+            break
+        page.wait_for_timeout(100)
+    assert len(page.downloads) == figures
+    assert all(Path(found.path()).read_bytes().startswith(PNG) for found in page.downloads)
+
+
+def test_no_request_leaves_a_page_whatever_is_pressed(tab: Any, service: Service) -> None:
+    with service.client() as http:
+        http.post("/v1/participants", json={"code": "N1"})
+        model = run_test(http, "N1")["model_id"]
+        added = http.post(f"/v1/models/{model}/effects", json={"effects": ["fatigue"]}).json()
+    added = added.get("id") or added["model"]["id"]
+    paths = (f"/models/{model}?diagnose=1", f"/models/{added}", f"/compare?model={model}&model={added}")
+    seen: set[str] = set()
+    for path in paths:
+        tab.goto(service.url + path)
+        if path == paths[0]:
+            tab.locator("[data-figure=signature-fatigue] .main-svg").first.wait_for()
+        tab.downloads.clear()
+        boxes = tab.locator("[data-figure]").all()
+        press_everything(tab, len(boxes))
+        seen |= {str(box.get_attribute("data-figure")) for box in boxes}
+    assert seen == {"comparison", "recruitment", "step", "residual", "falling", "signature-fatigue"}
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A report of each kind, and a notebook's figure, of a recording that tries to bring links into its charts."""
+    folder = tmp_path_factory.mktemp("reports")
+    record = made_up_csv(folder / "record.csv")
+    record.write_text(record.read_text().replace(",prbs", ',"' + LINK.replace('"', '""') + '"'))
+    read = identify.read(record)
+    model = identify.fit(read)
+    drawn, against = curves(model, read), thinned(clean(dict(identify.compare(model, read))))
+    (folder / "compare.html").write_text(comparison_html(model.to_dict(), drawn, LINK, None, against))
+    found = {"verdict": "effect_missing", "noise_sd_nm": 0.04, "refused": [], "steps": [
+        {"added": added, "fit_percent": 97.0, "rms_nm": rms, "held_out_rms_nm": rms, "held_out_fit_percent": 97.0}
+        for added, rms in ((None, 0.12), (LINK, 0.041))
+    ]}  # fmt: skip
+    improved = improvement_html(found, LINK, None, against, against, drawn["segments"])
+    (folder / "improve.html").write_text(improved)
+    (folder / "notebook.html").write_text(f"<!doctype html><body>{notebook.plot(model, read)._repr_html_()}")
+    return folder
+
+
+@pytest.mark.parametrize(("name", "figures"), [("compare", 4), ("improve", 3), ("notebook", 1)])
+def test_no_request_leaves_a_file_whatever_is_pressed(tab: Any, files: Path, name: str, figures: int) -> None:
+    tab.goto((files / f"{name}.html").as_uri())
+    press_everything(tab, figures)
+    assert tab.locator(".js-plotly-plot a[href]").count() == 0, "words of a recording are words, no links"
+
+
+def test_a_report_lets_nothing_out_by_itself(tab: Any, files: Path) -> None:
+    """What runs in a report can reach no other machine, whatever it tries."""
+    for name in ("compare", "improve"):
+        tab.goto((files / f"{name}.html").as_uri())
+        tried = tab.evaluate(
+            """async () => {
+              const asked = await fetch('https://elsewhere.example/').then(() => 'sent', () => 'refused');
+              const picture = await new Promise((done) => { const image = new Image();
+                image.onload = () => done('sent'); image.onerror = () => done('refused');
+                image.src = 'https://elsewhere.example/a.png'; });
+              return [asked, picture]; }"""
+        )
+        assert tried == ["refused", "refused"] and tab.left == []
+        assert "connect-src 'none'" in (files / f"{name}.html").read_text().split("<style>")[0].replace("&#39;", "'")
+
+
+def test_each_way_of_showing_a_notebooks_figure_is_without_the_upload() -> None:
+    import plotly.io as pio
+
+    figure = notebook.plot({"steps": [{"added": None, "rms_nm": 1.0, "held_out_rms_nm": 2.0}], "noise_sd_nm": 0.1})
+    html = figure.to_html(include_plotlyjs=False, config={"showSendToCloud": True})
+    assert '"showSendToCloud": false' in html and '"modeBarButtons": [["toImage"]' in html
+    for renderer in ("colab", "plotly_mimetype"):
+        before, pio.renderers.default = pio.renderers.default, renderer
+        try:
+            shown = str(figure._repr_mimebundle_())
+        finally:
+            pio.renderers.default = before
+        assert re.search(r"showSendToCloud\W+false", shown, re.IGNORECASE), renderer
+    assert CHART_CONFIG["plotlyServerURL"] == "" and not CHART_CONFIG["showSendToCloud"]

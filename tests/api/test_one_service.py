@@ -1,0 +1,190 @@
+"""One service on a data folder and a database; the second is told who holds it. What it writes is its owner's alone."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import sqlite3
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from api import cli, lock
+from api.launcher import LaunchError, Services
+from api.lock import HeldError, ServiceLock
+from api.settings import Settings
+from api.store import Store
+from tests.api.conftest import PATIENCE_S, TOKEN, Service, run_test
+
+ROOT = Path(__file__).parents[2]
+
+
+def command(data: Path, **more: str) -> dict[str, Any]:
+    given = {"DATA_DIR": str(data), "PORT": "0", "ADMIN_TOKEN": TOKEN, **more}
+    environment = {**os.environ, **{f"STIMRIG_{name}": value for name, value in given.items()}}
+    return {"args": [sys.executable, "-m", "tests.api.served"], "env": environment, "cwd": ROOT, "text": True}
+
+
+@contextmanager
+def served(data: Path, **more: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """A service as a process; it and its address."""
+    process = subprocess.Popen(**command(data, **more), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+    try:
+        assert process.stdout is not None
+        yield process, json.loads(process.stdout.readline())["url"]
+    finally:
+        process.kill()
+        process.wait(20)
+
+
+def test_a_second_service_is_told_who_holds_the_data_and_a_kill_lets_go(tmp_path: Path) -> None:
+    data, other, link = tmp_path / "data", tmp_path / "other", tmp_path / "link.db"
+    with served(data) as (first, url):
+        link.symlink_to(data / "stimrig.db")
+        for folder, more in ((data, {}), (other, {"DATABASE_URL": f"sqlite:///{link}"})):
+            done = subprocess.run(**command(folder, **more), capture_output=True, timeout=60)
+            (line,) = [line for line in done.stderr.splitlines() if not line.startswith("{")]
+            assert done.returncode == 2 and done.stdout == ""
+            assert f"process {first.pid} on {socket.gethostname()}, since 20" in line and f"at {url}; stop it" in line
+        assert cli.run(["audit", "verify", "--data", str(data)]) == 0, "who only reads is let in"
+        http = httpx.Client(base_url=url, headers={"Authorization": f"Bearer {TOKEN}"}, timeout=PATIENCE_S)
+        assert http.post("/v1/participants", json={"code": "P1"}).status_code == 201, "the first works on"
+        first.send_signal(signal.SIGKILL)
+        first.wait(20)
+    with served(other, DATABASE_URL=f"sqlite:///{link}") as (_, url):
+        http = httpx.Client(base_url=url, headers={"Authorization": f"Bearer {TOKEN}"}, timeout=PATIENCE_S)
+        assert [row["code"] for row in http.get("/v1/participants").json()] == ["P1"]
+
+
+def held(**given: Any) -> ServiceLock:
+    return ServiceLock(Settings(**given))
+
+
+def test_whichever_way_leads_to_it_it_is_held_once(tmp_path: Path) -> None:
+    one, two, link = tmp_path / "one", tmp_path / "two", tmp_path / "link"
+    first = held(data_dir=one)
+    Store(f"sqlite:///{one}/stimrig.db").close()
+    link.symlink_to(one)
+    (tmp_path / "link.db").symlink_to(one / "stimrig.db")
+    (two).mkdir()
+    ways: list[dict[str, Any]] = [
+        {"data_dir": one},
+        {"data_dir": link},
+        {"data_dir": two / ".." / "one"},
+        {"data_dir": two, "database_url": f"sqlite:///{one}/stimrig.db"},
+        {"data_dir": two, "database_url": f"sqlite:///{link}/stimrig.db"},
+        {"data_dir": two, "database_url": f"sqlite:///{tmp_path}/link.db"},
+        {"data_dir": two, "database_url": f"sqlite:///file:{tmp_path}/link.db?uri=true"},
+        {"data_dir": one, "database_url": "sqlite://"},
+    ]
+    for way in ways:
+        with pytest.raises(HeldError, match=f"another service runs on it: process {os.getpid()} on"):
+            held(**way)
+    apart = held(data_dir=two)
+    apart.release()
+    first.release()
+    held(data_dir=two, database_url=f"sqlite:///{one}/stimrig.db").release()
+
+
+def test_what_cannot_be_held_is_refused(tmp_path: Path) -> None:
+    Store(f"sqlite:///{tmp_path}/stimrig.db").close()
+    os.link(tmp_path / "stimrig.db", tmp_path / "again.db")
+    with pytest.raises(HeldError, match="2 names"):
+        held(data_dir=tmp_path)
+    with pytest.raises(HeldError, match="leave STIMRIG_DATABASE_URL out") as caught:
+        held(data_dir=tmp_path / "b", database_url="postgresql://ann:secret@db.example/stimrig")
+    assert "secret" not in str(caught.value)
+    (tmp_path / "c").mkdir()
+    (tmp_path / "c" / "service.lock").mkdir()
+    with pytest.raises(HeldError, match="this user may write"):
+        held(data_dir=tmp_path / "c")
+
+
+def test_serve_says_so_before_it_starts_a_rig(tmp_path: Path) -> None:
+    first = held(data_dir=tmp_path)
+    services = Services(Settings(data_dir=tmp_path, port=0))  # pyright: ignore[reportCallIssue]
+    with pytest.raises(LaunchError, match="another service runs on it") as caught, services:
+        pass
+    assert caught.value.code == 2 and services.emulator is not None and services.emulator.process is None
+    first.release()
+
+
+def test_a_service_that_does_not_come_up_lets_go(tmp_path: Path) -> None:
+    from api.context import build
+    from api.errors import ApiError
+
+    (tmp_path / "stimrig.db").write_bytes(b"not a database at all" * 100)
+    with pytest.raises(ApiError, match="does not open"):
+        build(Settings(data_dir=tmp_path))
+    held(data_dir=tmp_path).release()
+
+
+# ---- for its owner only -------------------------------------------------------------------------------------
+
+
+def mode(path: Path) -> int:
+    return path.stat().st_mode & 0o777
+
+
+def test_what_a_service_keeps_is_its_owners_alone(service: Service, client: httpx.Client, participant: str) -> None:
+    run_test(client, participant)
+    private = ["stimrig.db", "stimrig.db-wal", "stimrig.db-shm", "stop-right.key", "service.lock", "stimrig.db.lock"]
+    assert {name: mode(service.data / name) for name in private} == dict.fromkeys(private, 0o600)
+    assert mode(service.data / "exports") == 0o700 and not mode(service.data / "recordings") & 0o007
+
+
+def test_a_database_that_was_open_to_others_is_closed(tmp_path: Path) -> None:
+    path = tmp_path / "stimrig.db"
+    with sqlite3.connect(path) as database:  # as an older version left it after a kill
+        database.execute("PRAGMA journal_mode=WAL")
+        database.execute("CREATE TABLE t (x)")
+        database.commit()
+        for name in ("stimrig.db", "stimrig.db-wal", "stimrig.db-shm"):
+            (tmp_path / name).chmod(0o664)
+        Store(f"sqlite:///{path}").close()
+        assert {mode(found) for found in tmp_path.glob("stimrig.db*")} == {0o600}
+    assert mode(tmp_path / "stimrig.db") == 0o600
+
+
+def test_new_folders_are_closed_and_shared_ones_stay_as_they_are(tmp_path: Path) -> None:
+    held(data_dir=tmp_path / "new").release()
+    assert mode(tmp_path / "new") == 0o700
+    shared = tmp_path / "shared"
+    shared.mkdir(mode=0o770)
+    shared.chmod(0o770)
+    held(data_dir=shared).release()
+    assert mode(shared) == 0o770
+
+
+def test_files_of_the_process_are_its_owners_alone(tmp_path: Path) -> None:
+    """Uploads, exports and logs too: by the process's own mask, whatever it was started with."""
+    before = os.umask(0)
+    try:
+        with served(tmp_path / "data") as (_, url):
+            http = httpx.Client(base_url=url, headers={"Authorization": f"Bearer {TOKEN}"}, timeout=PATIENCE_S)
+            http.post("/v1/participants", json={"code": "P1"})
+            sent = http.post("/v1/participants/P1/recordings", content=b"time_s,pulse_width_us,torque_nm,segment\n")
+            files = [path for path in (tmp_path / "data").rglob("*") if path.is_file()]
+            assert sent.status_code in (201, 422) and files
+            assert [path for path in files if mode(path) & 0o077] == []
+    finally:
+        os.umask(before)
+
+
+def test_the_message_names_nobody_who_is_gone(tmp_path: Path) -> None:
+    first = held(data_dir=tmp_path)
+    first.tell("http://127.0.0.1:1234")
+    first.release()
+    second = held(data_dir=tmp_path)
+    with pytest.raises(HeldError) as caught:
+        lock.refuse_if_held(Settings(data_dir=tmp_path))
+    assert "1234" not in str(caught.value)
+    second.release()

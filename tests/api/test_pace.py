@@ -1,0 +1,236 @@
+"""Guesses are slowed down, and lock nobody out but who makes them."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import httpx
+import pytest
+
+from api.clock import Clock
+from api.errors import ApiError
+from api.pace import FORGOTTEN_S, FREE_FOR_A_NAME, FREE_TRIES, LONGEST_WAIT_S, Guesses, Pace, place_of
+from api.passwords import MOST_STRANGERS, Passwords
+from tests.api.conftest import TOKEN, Service, run_test
+from tests.api.test_people import PASSWORD, SetClock, standing_still
+
+OWN, ELSEWHERE = "10.0.0.1", "10.9.9.9"
+
+
+def held(ask: Callable[[], object]) -> int:
+    """0 where it is admitted, else the wait that is asked for, s."""
+    try:
+        ask()
+    except ApiError as problem:
+        assert problem.status == 429
+        return int(problem.headers["Retry-After"])
+    return 0
+
+
+# ---- one pace -----------------------------------------------------------------------------------------------
+
+
+def test_waits_double_up_to_five_minutes_and_end() -> None:
+    clock = SetClock()
+    pace = Pace(clock)
+    waits = []
+    for _ in range(FREE_TRIES + 12):
+        pace.count("a")
+        waits.append(pace.wait_s("a"))
+        clock.now_s += waits[-1]
+    assert waits[:FREE_TRIES] == [0] * (FREE_TRIES - 1) + [1]
+    assert waits[FREE_TRIES:][:4] == [2, 4, 8, 16] and waits[-1] == max(waits) == LONGEST_WAIT_S
+    clock.now_s += FORGOTTEN_S + 1
+    pace.count("a")
+    assert pace.wait_s("a") == 0, "after an hour it starts anew"
+    assert pace.wait_s("b") == 0
+
+
+def test_who_waits_to_be_forgotten_is_no_faster_than_who_tries_on() -> None:
+    assert FREE_TRIES / FORGOTTEN_S <= 1 / LONGEST_WAIT_S
+
+
+def test_no_flood_of_keys_forgets_one_that_counts() -> None:
+    clock = SetClock()
+    pace = Pace(clock, most_keys=100)
+    for _ in range(12):
+        pace.count("guessed")
+    for number in range(20_000):
+        pace.count(f"n{number}")
+        clock.now_s += 0.001
+    assert pace.wait_s("guessed") > 80, "what counts is kept"
+    assert len(pace) <= 101, "in memory that does not grow"
+    assert pace.wait_s("new") > 200, "who comes new shares one pace while there is no room"
+    clock.now_s += FORGOTTEN_S + 1
+    assert pace.wait_s("new") == 0 and len(pace) == 0, "room is made of what has run out"
+
+
+# ---- whose guess it is --------------------------------------------------------------------------------------
+
+
+def test_strangers_hold_back_nobody_at_their_usual_place() -> None:
+    clock = SetClock()
+    guesses = Guesses(clock)
+    for number in range(3 * FREE_FOR_A_NAME):
+        held(lambda number=number: guesses.password("Ada", f"10.1.{number}.1", known=False))
+        held(lambda: guesses.password("Ada", OWN, known=False))
+    for number in range(200):
+        held(lambda number=number: guesses.password(f"n{number}", OWN, known=False))
+    assert held(lambda: guesses.password("Ada", OWN, known=True)) == 0
+    assert held(lambda: guesses.confirmation("her session")) == 0
+    assert held(lambda: guesses.password("Ada", "10.2.0.1", known=False)) > 0, "many places, one name: slowed down"
+    assert held(lambda: guesses.password("Bob", OWN, known=False)) > 0, "many names, one place: slowed down"
+    assert held(lambda: guesses.password("Bob", "10.2.0.1", known=False)) == 0
+
+
+def test_a_name_that_is_nobodys_is_held_back_like_one_that_is() -> None:
+    """Else the pace would tell who is there."""
+    for name in ("Ada", "Nobody"):
+        guesses = Guesses(SetClock())
+        ask = partial(guesses.password, name, OWN, known=False)
+        waits = [held(ask) for _ in range(8)]
+        assert waits == [0] * 5 + [2] * 3
+
+
+def test_one_right_sign_in_gives_no_new_guesses_to_its_place() -> None:
+    clock = SetClock()
+    guesses = Guesses(clock)
+    for round_ in range(4):
+        for number in range(2):
+            held(lambda name=f"n{round_}-{number}": guesses.password(name, ELSEWHERE, known=False))
+        if held(lambda: guesses.password("Eve", ELSEWHERE, known=False)) == 0:
+            guesses.password_was_right("Eve", ELSEWHERE, known=False)
+    assert held(lambda: guesses.password("next", ELSEWHERE, known=False)) > 0
+
+
+PLACES = {
+    "10.0.0.1": "10.0.0.1", "::ffff:10.0.0.1": "10.0.0.1", "::1": "::", "2001:db8:1:2:3:4:5:6": "2001:db8:1:2::",
+    "2001:db8:1:2:ffff::1": "2001:db8:1:2::", "": "", "testclient": "testclient",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("address", "place"), PLACES.items())
+def test_a_place_is_what_one_customer_gets(address: str, place: str) -> None:
+    assert place_of(address) == place
+
+
+# ---- over HTTP ----------------------------------------------------------------------------------------------
+
+
+def sign_in(service: Service, name: str, password: str, address: str) -> int:
+    with service.client(token=None, headers={"X-Forwarded-For": address}) as http:
+        return http.post("/v1/sessions", json={"name": name, "password": password}).status_code
+
+
+def test_the_owner_signs_in_and_approves_whatever_others_try(
+    service: Service, client: httpx.Client, participant: str
+) -> None:
+    clock = standing_still(service)
+    client.post("/v1/users", json={"name": "Ada", "password": PASSWORD})
+    model = run_test(client, participant)["model_url"]
+    ada = service.client(token=None, headers={"X-Forwarded-For": OWN})
+    csrf = ada.post("/v1/sessions", json={"name": "Ada", "password": PASSWORD}).json()["csrf"]
+    ada.headers["X-CSRF-Token"] = csrf
+    answers = [sign_in(service, "Ada", f"guess {number}", ELSEWHERE) for number in range(7)]
+    assert answers == [401] * 5 + [429] * 2
+    answers = [sign_in(service, "Ada", "guess", f"10.3.0.{number}") for number in range(FREE_FOR_A_NAME)]
+    assert answers[-1] == 429, "from many places, too"
+    assert ada.post("/v1/sessions/confirm", json={"password": PASSWORD}).status_code == 204
+    assert ada.post(f"{model}/approve", json={"reason": "good"}).status_code == 200
+    assert sign_in(service, "Ada", PASSWORD, OWN) == 201
+    assert [sign_in(service, "Ada", "slip", OWN) for _ in range(6)] == [401] * 5 + [429], "her own tries are counted"
+    assert [ada.post("/v1/sessions/confirm", json={"password": "slip"}).status_code for _ in range(6)] == [
+        *[401] * 5, 429,
+    ]  # fmt: skip
+    clock.now_s += LONGEST_WAIT_S
+    assert sign_in(service, "Ada", PASSWORD, OWN) == 201
+
+
+def test_guesses_of_tokens_are_slowed_down_and_keep_no_controller_out(
+    service: Service, client: httpx.Client, participant: str
+) -> None:
+    standing_still(service)
+    drawn, path = service.token("ilc", "read-model"), f"/v1/participants/{participant}/models"
+
+    def asked(token: str, address: str) -> int:
+        with service.client(token, headers={"X-Forwarded-For": address}) as http:
+            return http.get(path).status_code
+
+    assert [asked(f"guess {number}", ELSEWHERE) for number in range(7)] == [401] * 5 + [429] * 2
+    assert asked("guess", OWN) == 401, "another place is not held back"
+    assert asked(drawn, ELSEWHERE) == 200, "nobody guesses a drawn token, and nobody keeps it out"
+    assert asked(TOKEN, ELSEWHERE) == 429, "one that a person chose could be guessed"
+    assert asked(TOKEN, OWN) == 200
+    assert [asked(f"guess {number}", OWN) for number in range(5)][-1] == 429
+    assert asked(TOKEN, OWN) == 200, "where it opened before, it goes on opening"
+    with service.client(token=None, headers={"X-Forwarded-For": "10.0.0.7"}) as page:
+        answers = [page.post("/sign-in", data={"token": f"guess {number}"}).status_code for number in range(6)]
+        assert answers == [401] * 5 + [429], "the page's door is held to the same pace"
+        assert page.get(path, headers={"Authorization": "Bearer guess"}).status_code == 429
+        assert page.post("/v1/stop", headers={"Authorization": f"Bearer {drawn}"}).status_code == 200
+
+
+def test_a_known_place_is_remembered_over_a_restart_and_forgotten_with_the_password(
+    service: Service, client: httpx.Client
+) -> None:
+    people = service.app.state.context.people
+    client.post("/v1/users", json={"name": "Ada", "password": PASSWORD})
+    assert people._look_up("Ada", OWN)[1] is False
+    for number in range(25):
+        people._remember("Ada", f"10.4.0.{number}")
+    assert sign_in(service, "Ada", PASSWORD, OWN) == 201 and people._look_up("Ada", OWN)[1] is True
+    assert people._look_up("Ada", "10.4.0.1")[1] is False, "so many places are kept, not more"
+    client.put("/v1/users/Ada/password", json={"password": "another passphrase"})
+    assert people._look_up("Ada", OWN)[1] is False
+
+
+# ---- what a guess costs -------------------------------------------------------------------------------------
+
+
+def test_guesses_fill_no_thread_that_others_need() -> None:
+    """Strangers wait in a lane of their own; when it is full they are told so. A known person is checked at once."""
+    passwords, gate = Passwords(), threading.Event()
+    slow: Any = passwords.hasher
+
+    class Slow:
+        def verify(self, hashed: str, password: str) -> bool:
+            if password == "guess":
+                gate.wait(30)
+            return slow.verify(hashed, password)
+
+    async def checked(hashed: str, password: str, known: bool) -> bool:
+        with passwords.room(known) as lane:
+            return await passwords.verify(lane, hashed, password)
+
+    async def attack() -> None:
+        hashed = await passwords.hash("right")
+        passwords.hasher = Slow()  # pyright: ignore[reportAttributeAccessIssue]
+        guesses = [asyncio.create_task(checked(hashed, "guess", False)) for _ in range(50)]
+        await asyncio.sleep(0)
+        refused = [task for task in guesses if task.done()]
+        assert len(refused) == 50 - MOST_STRANGERS
+        for task in refused:
+            problem = task.exception()
+            assert isinstance(problem, ApiError) and problem.status == 429 and problem.headers["Retry-After"]
+        assert await checked(hashed, "right", True)
+        assert await asyncio.to_thread(lambda: "a thread for others") == "a thread for others"
+        gate.set()
+        assert await asyncio.gather(*(task for task in guesses if task not in refused)) == [False] * MOST_STRANGERS
+        assert await checked(hashed, "right", False), "then there is room again"
+
+    asyncio.run(attack())
+    passwords.close()
+
+
+def test_the_clock_of_the_world_is_monotonic_for_a_pace() -> None:
+    """A wall clock that is set back ends no wait and begins none."""
+    clock = Clock()
+    clock.unix_s = lambda: 0.0
+    pace = Pace(clock)
+    for _ in range(8):
+        pace.count("a")
+    assert 6 < pace.wait_s("a") <= 8

@@ -1,0 +1,133 @@
+"""Whatever is posted to the page's own routes, by whom it may be: a page, or a problem in words; never a 500."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from fastapi.routing import APIRoute
+
+from api import pages
+from tests.api.conftest import STUB, TOKEN, Service, run_service, run_test
+
+HTML = {"Accept": "text/html"}
+NAMES = (
+    "csrf", "code", "file", "reason", "effect", "force", "back", "name", "password", "token", "next", "role", "days",
+    "current_ma", "step_us", "max_pulse_width_us", "max_torque_nm", "version", "trains", "right",
+)  # fmt: skip
+"""Every field of every form; `test_no_field_is_forgotten` looks."""
+ODD = [
+    "",
+    " ",
+    "0",
+    "-1",
+    "1e-320",
+    "1e999",
+    "nan",
+    "9,5",
+    "\0",
+    "\ufeff",
+    "٣",
+    "ä" * 600,
+    "../..",
+    "{}",
+    "<b>",
+    "\ud7ff",
+]
+FORM, PARTS = "application/x-www-form-urlencoded", "multipart/form-data; boundary=x"
+
+
+def part(name: str, value: bytes, more: str = "") -> bytes:
+    head = f'--x\r\nContent-Disposition: form-data; name="{name}"{more}\r\n\r\n'
+    return head.encode() + value + b"\r\n--x--\r\n"
+
+
+BODIES: list[tuple[str, bytes]] = [
+    ("", b""), (FORM, b""), (PARTS, b""), ("multipart/form-data", b"x"), ("application/json", b"{}"),
+    ("application/json", b"[1]"), ("text/plain", b"x"), (FORM, b"&&==&%zz=%"), (FORM, b"\xff=\xfe"),
+    (FORM, b"a=1&" * 2000), (PARTS, part("effect", b"\xff\xfe")), (PARTS, part("effect", b"x", '; filename="x.csv"')),
+    *((f"{PARTS}; charset={charset}", part("effect", b"+2AA-")) for charset in ("none", "idna", "utf-7", "punycode")),
+    (f"{FORM}; charset=utf-7", b"effect=%ff"),
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
+    yield from run_service(tmp_path_factory.mktemp("forms"), short_dir, STUB)
+
+
+@pytest.fixture(scope="module")
+def known(service: Service) -> dict[str, str]:
+    """What is there, by the name it has in an address."""
+    with service.client() as client:
+        client.post("/v1/participants", json={"code": "P017"})
+        test = run_test(client, "P017")
+        client.post("/v1/participants/P017/calibration")
+    return {"code": "P017", "model_id": test["model_id"], "direction": "up", "threshold": "sensory", "job_id": "none"}
+
+
+def posts() -> list[str]:
+    """Every address of the page that takes a POST; a calibration first, while one is open."""
+    found = {
+        route.path
+        for router in pages.routers()
+        for route in router.routes
+        if isinstance(route, APIRoute) and "POST" in route.methods
+    }
+    return sorted(found, key=lambda path: ("calibration" not in path, path.endswith("discard"), path))
+
+
+def filled(path: str, known: dict[str, str]) -> str:
+    return re.sub(r"\{(\w+)[^}]*\}", lambda match: known.get(match[1], "none"), path)
+
+
+def test_no_field_is_forgotten() -> None:
+    folder = Path(pages.__file__).parent
+    text = "".join(path.read_text("utf-8") for path in (folder / "templates").glob("*.html"))
+    asked = set(re.findall(r'<(?:input|select|textarea)[^>]*\bname="(\w+)"', text))
+    asked |= {
+        name for path in folder.glob("*.py") for name in re.findall(r"(\w+): Annotated\[.*Form\(", path.read_text())
+    }
+    assert asked - {"model"} <= set(NAMES), asked - set(NAMES)
+
+
+def test_an_odd_form_is_a_problem_in_words(service: Service, known: dict[str, str]) -> None:
+    """With an administrator's token, so that no form is out of date before its fields are looked at."""
+    fields = [dict.fromkeys(NAMES, value) for value in ODD]
+    failed, tried = [], 0
+    with service.client(TOKEN, headers=HTML) as client:
+        for path in (filled(each, known) for each in posts()):
+            sent = [client.post(path, content=body, headers={"content-type": kind}) for kind, body in BODIES]
+            sent += [client.post(path, data=each) for each in fields]
+            tried += len(sent)
+            failed += [
+                (path, answer.status_code, answer.request.headers.get("content-type"), answer.request.content[:60])
+                for answer in sent
+                if answer.status_code >= 500
+            ]
+    assert not failed, (len(failed), tried, failed[:20])
+    assert tried > 700
+
+
+@pytest.mark.parametrize("effect", [None, "", "No Effect", "../x", "x" * 65])
+def test_an_effect_that_is_none_is_told_in_one_sentence(
+    service: Service, known: dict[str, str], effect: str | None
+) -> None:
+    token = service.token(f"tester-{effect}"[:20].replace("/", "-"), "run-test", "read-model")
+    with service.client(token, headers=HTML) as client:
+        data = {} if effect is None else {"effect": effect}
+        answer = client.post(f"/models/{known['model_id']}/effects", data=data)
+    assert answer.status_code == 422 and "<h1>This cannot be used</h1>" in answer.text
+    assert "effect: " in answer.text and "Nothing was changed" in answer.text and "^[a-z" not in answer.text
+
+
+def test_a_form_is_utf_8(service: Service, known: dict[str, str]) -> None:
+    with service.client(headers=HTML) as client:
+        kind = f"{PARTS}; charset=utf-7"
+        answer = client.post("/participants", content=part("code", b"+2AA-"), headers={"content-type": kind})
+        assert answer.status_code == 400 and "UTF-8" in answer.text
+        kind = f'{PARTS}; charset="UTF-8"'
+        answer = client.post("/participants", content=part("code", b"P018"), headers={"content-type": kind})
+        assert answer.status_code == 303, answer.text

@@ -1,0 +1,220 @@
+"""Limits over REST: what is left out stays, nothing is read as a number that is none, nobody is overrun."""
+
+from __future__ import annotations
+
+import concurrent.futures
+from collections import Counter
+from typing import Any
+
+import httpx
+import pytest
+
+from api import profiles
+from tests.api.conftest import Service
+from tests.api.test_problems import problem
+
+P = "/v1/participants/P017"
+TIGHT = {"current_ma": 12.0, "max_pulse_width_us": 150.0, "max_torque_nm": 20.0}
+
+
+@pytest.fixture
+def tight(client: httpx.Client) -> dict[str, float]:
+    assert client.post("/v1/participants", json={"code": "P017", "profile": TIGHT}).status_code == 201
+    return TIGHT
+
+
+def limits(client: httpx.Client) -> dict[str, Any]:
+    profile = client.get(P).json()["profile"]
+    return {name: profile[name] for name in profiles.LIMITS}
+
+
+def calibrate(client: httpx.Client, **asked: Any) -> dict[str, Any]:
+    """Sensory at 10 µs, motor at 20, comfort at 30."""
+    assert client.post(f"{P}/calibration", json=asked).status_code == 201
+    for threshold in ("sensory", "motor", "comfort"):
+        client.post(f"{P}/calibration/step", json={"direction": "up"})
+        client.post(f"{P}/calibration/mark", json={"threshold": threshold})
+    return client.post(f"{P}/calibration/finish").json()["profile"]
+
+
+@pytest.mark.parametrize("name", list(TIGHT))
+def test_what_is_left_out_keeps_its_value(client: httpx.Client, tight: dict[str, float], name: str) -> None:
+    answer = client.put(f"{P}/profile", json={name: 10})
+    assert answer.status_code == 200
+    assert limits(client) == {**tight, name: 10}
+    assert client.put(f"{P}/profile", json={}).status_code == 200
+    assert limits(client) == {**tight, name: 10}
+
+
+def test_first_limits_are_whole_or_none(client: httpx.Client) -> None:
+    refused = problem(client.post("/v1/participants", json={"code": "P018", "profile": {"current_ma": 10}}), 422)
+    assert {error["field"] for error in refused["errors"]} == {"profile.max_pulse_width_us", "profile.max_torque_nm"}
+    assert client.get("/v1/participants/P018").status_code == 404
+
+
+NO_NUMBERS = [
+    "true",
+    "false",
+    '"20"',
+    '"9,5"',
+    "null",
+    "NaN",
+    "Infinity",
+    "1e999",
+    "0",
+    "-1",
+    "[20]",
+    "{}",
+    "1e-320",
+    "0.04",
+]
+
+
+@pytest.mark.parametrize("text", NO_NUMBERS)
+def test_what_is_no_number_is_refused_everywhere(
+    client: httpx.Client, service: Service, tight: dict[str, float], text: str
+) -> None:
+    def refused(method: str, path: str, body: str) -> None:
+        answer = client.request(method, path, content=body, headers={"content-type": "application/json"})
+        assert problem(answer, 422)["errors"], (path, body)
+
+    test = '"participant": "P017"'
+    for name in TIGHT:
+        refused("PUT", f"{P}/profile", f'{{"{name}": {text}}}')
+        whole = ", ".join(f'"{each}": {text if each == name else 10}' for each in TIGHT)
+        refused("POST", "/v1/participants", f'{{"code": "P019", "profile": {{{whole}}}}}')
+        for path in ("/v1/tests", "/v1/preview"):
+            refused("POST", path, f'{{{test}, "profile": {{"{name}": {text}}}}}')
+    for name in ("pulse_rate_hz", "max_pulse_width_us", "max_torque_nm"):
+        if not (text == "null" and name != "pulse_rate_hz"):  # null is what "no tighter limit" is called there
+            refused("POST", "/v1/tests", f'{{{test}, "{name}": {text}}}')
+    for name in ("step_us", "train_s", "current_ma", "max_torque_nm"):
+        if not (text == "null" and name in TIGHT):
+            refused("POST", f"{P}/calibration", f'{{"{name}": {text}}}')
+    assert limits(client) == tight and service.rig.starts == 0 and service.rig.calibration is None
+
+
+@pytest.mark.parametrize(("name", "least"), [("current_ma", 0.5), ("max_pulse_width_us", 1), ("max_torque_nm", 0.1)])
+def test_a_limit_begins_where_a_stimulator_does(
+    client: httpx.Client, tight: dict[str, float], name: str, least: float
+) -> None:
+    refused = problem(client.put(f"{P}/profile", json={name: least * 0.99}), 422)
+    assert refused["detail"] == f"{name}: Input should be greater than or equal to {least:g}"
+    assert limits(client) == tight
+    assert client.put(f"{P}/profile", json={name: least}).status_code == 200
+    assert limits(client) == {**tight, name: least}
+
+
+def test_the_least_limits_are_the_stimulators_finest_steps() -> None:
+    from rig.limits import FINEST
+
+    least = {name: limit.least for name, limit in profiles.LIMITS.items()}
+    assert (least["current_ma"], least["max_pulse_width_us"]) == (FINEST.current_ma, FINEST.shortest_us)
+
+
+def test_a_byte_order_mark_is_refused(client: httpx.Client, tight: dict[str, float]) -> None:
+    body = '\ufeff{"current_ma": 5}'.encode()
+    refused = problem(client.put(f"{P}/profile", content=body, headers={"content-type": "application/json"}), 400)
+    assert "byte-order mark" in refused["detail"] and "\n" not in refused["detail"]
+    assert limits(client) == tight
+
+
+def test_a_typing_slip_is_seen(client: httpx.Client, tight: dict[str, float]) -> None:
+    assert "current" in problem(client.put(f"{P}/profile", json={"current": 10}), 422)["detail"]
+    assert limits(client) == tight
+
+
+def test_what_this_rig_would_refuse_is_refused_at_once(client: httpx.Client, tight: dict[str, float]) -> None:
+    """60 mA and 20 µC a phase by the rig file; one alone is not looked at, the other stays the participant's."""
+    assert "60 mA" in problem(client.put(f"{P}/profile", json={"current_ma": 61}), 422)["detail"]
+    both = {"current_ma": 60, "max_pulse_width_us": 400}
+    assert "24 µC" in problem(client.put(f"{P}/profile", json=both), 422)["detail"]
+    assert limits(client) == tight
+    assert client.put(f"{P}/profile", json={"current_ma": 60}).status_code == 200
+
+
+def test_who_has_not_seen_the_newest_limits_does_not_set_them(client: httpx.Client, tight: dict[str, float]) -> None:
+    seen = client.get(P).headers["etag"]
+    assert client.put(f"{P}/profile", json={"current_ma": 9}, headers={"If-Match": seen}).status_code == 200
+    late = client.put(f"{P}/profile", json={"max_torque_nm": 40}, headers={"If-Match": seen})
+    refused = problem(late, 412)
+    assert refused["profile"]["current_ma"] == 9 and "current_ma 9" in refused["detail"]
+    assert limits(client) == {**tight, "current_ma": 9}
+
+
+def test_a_tag_that_a_proxy_marked_as_weak_is_the_same_tag(client: httpx.Client, tight: dict[str, float]) -> None:
+    seen = client.get(P).headers["etag"]
+    for tags, code in ((f"W/{seen}", 200), (f"W/{seen}", 412), (f'"other", {seen}', 412)):
+        assert client.put(f"{P}/profile", json={"current_ma": 9}, headers={"If-Match": tags}).status_code == code
+    now = client.get(P).headers["etag"]
+    assert client.put(f"{P}/profile", json={"current_ma": 8}, headers={"If-Match": f'"x", W/{now}'}).status_code == 200
+
+
+def test_of_many_at_once_one_wins_and_the_others_are_told(client: httpx.Client, tight: dict[str, float]) -> None:
+    seen = {"If-Match": client.get(P).headers["etag"]}
+    with concurrent.futures.ThreadPoolExecutor(8) as pool:
+        bodies = [{"current_ma": 5 + number / 10} for number in range(16)]
+        codes = Counter(pool.map(lambda b: client.put(f"{P}/profile", json=b, headers=seen).status_code, bodies))
+    assert codes == {200: 1, 412: 15}
+
+
+def test_a_tighter_limit_keeps_the_calibration(client: httpx.Client, tight: dict[str, float]) -> None:
+    found = calibrate(client)
+    assert client.put(f"{P}/profile", json={"current_ma": 10, "max_pulse_width_us": 25}).status_code == 200
+    assert client.get(P).json()["profile"] == {**found, "current_ma": 10, "max_pulse_width_us": 25}
+
+
+@pytest.mark.parametrize(
+    ("asked", "words"),
+    [({"current_ma": 12.5}, "above the 12 mA"), ({"max_torque_nm": 21}, "above the 20 N·m"),
+     ({"max_pulse_width_us": 31}, "above the 30 µs"), ({"max_pulse_width_us": 19}, "moves from 20 µs on")],
+)  # fmt: skip
+def test_a_calibration_is_lost_knowingly_alone(
+    client: httpx.Client, tight: dict[str, float], asked: dict[str, float], words: str
+) -> None:
+    found = calibrate(client)
+    assert words in problem(client.put(f"{P}/profile", json=asked), 409)["detail"]
+    assert client.get(P).json()["profile"] == found
+    assert client.put(f"{P}/profile", params={"void_calibration": True}, json=asked).status_code == 200
+    profile = client.get(P).json()["profile"]
+    assert [profile[name] for name in profiles.FOUND] == [None] * 4 and profile | asked == profile
+
+
+def test_a_calibration_takes_the_participants_own_limits(
+    client: httpx.Client, service: Service, tight: dict[str, float]
+) -> None:
+    """Not 20 mA and 30 N·m because nothing was said; and what it doesn't look for is kept."""
+    context = service.app.state.context
+    with context.store.write() as session:
+        from api.store.tables import Participant
+
+        row = session.get(Participant, "P017")
+        row.profile = {**row.profile, "rest_between_tests_s": 60.0}
+    found = calibrate(client)
+    assert (found["current_ma"], found["max_torque_nm"], found["rest_between_tests_s"]) == (12, 20, 60)
+    assert client.get(P).json()["profile"] == found
+
+
+@pytest.mark.parametrize("body", ['{"pulse_width_us": [true]}', '{"pulse_width_us": [10], "pulse_rate_hz": "40"}'])
+def test_a_prediction_takes_numbers_alone(shared_client: httpx.Client, body: str) -> None:
+    headers = {"content-type": "application/json"}
+    assert shared_client.post("/v1/models/none/prediction", content=body, headers=headers).status_code == 422
+
+
+# ---- the rules themselves -----------------------------------------------------------------------------------
+
+
+def test_two_small_rises_add_to_a_jump() -> None:
+    one = {**TIGHT, "current_ma": 14.0}
+    assert profiles.jumps(TIGHT, one) == []
+    (words,) = profiles.jumps(TIGHT, {**one, "max_pulse_width_us": 180.0})
+    assert words == "The charge of the widest pulse rises from 1.8 to 2.52 µC, 1.4 times as much."
+    assert profiles.jumps(TIGHT, {**TIGHT, "current_ma": 15.0}) == [], "a quarter is not more than a quarter"
+    assert profiles.jumps(TIGHT, {name: value / 2 for name, value in TIGHT.items()}) == []
+
+
+def test_a_day_ends_whichever_way_its_end_is_written() -> None:
+    profile = {**TIGHT, "set_at_utc": "2026-01-01T08:00:00Z", "expires_at_utc": "2026-01-01T23:00:00Z"}
+    assert profiles.calibration(profile, "2026-01-01T22:59:59.999Z") == "valid"
+    assert profiles.calibration(profile, "2026-01-01T23:00:00.000Z") == "expired"
+    assert profiles.calibration(TIGHT, "2026-01-01T23:00:00Z") == "none"

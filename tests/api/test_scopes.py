@@ -1,0 +1,251 @@
+"""Every route x every scope, against a table written apart from the code; and what the head of every answer says."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import pytest
+from fastapi.routing import APIRoute
+
+from api import pages, routes
+from api.auth import Scope
+from tests.api.conftest import STUB, TOKEN, Service, run_service, run_test
+
+SCOPES = ("read-live", "run-test", "rearm", "approve-model", "read-model", "administer")
+TABLE = """
+GET    /health                                             anybody        200
+GET    /metrics                                            anybody        200
+GET    /static/page.css                                    anybody        200
+GET    /                                                   anybody        200
+GET    /rig/now                                            anybody        200
+GET    /stopped/x                                          anybody        404
+GET    /sign-in                                            anybody        200
+POST   /sign-in                                            anybody        401
+POST   /v1/sessions                                        anybody        401
+POST   /v1/stop                                            anyone         200
+GET    /rig/notice                                         anyone         200
+POST   /sign-out                                           anyone         303
+POST   /v1/sessions/confirm                                anyone         422
+DELETE /v1/sessions/current                                anyone         404
+GET    /v1/rig                                             read-live      200
+GET    /v1/tests                                           read-live      200
+GET    /v1/tests/x                                         read-live      404
+GET    /tests/x                                            read-live      404
+GET    /v1/models/x                                        read-model     404
+GET    /v1/models/x/file                                   read-model     404
+GET    /v1/models/x/comparison                             read-model     404
+GET    /v1/models/x/curves                                 read-model     404
+GET    /v1/models/x/diagnosis                              read-model     404
+POST   /v1/models/x/prediction                             read-model     422
+GET    /v1/participants/x/model                            read-model     404
+GET    /v1/participants/x/models                           read-model     404
+GET    /v1/recordings/x                                    read-model     404
+GET    /v1/recordings/x/csv                                read-model     404
+GET    /v1/effects                                         read-model     200
+GET    /v1/jobs/x                                          read-model     404
+GET    /models/x                                           read-model     404
+GET    /models/x/report                                    read-model     404
+GET    /compare                                            read-model     422
+GET    /jobs/x                                             read-model     404
+GET    /v1/participants                                    run-test       200
+POST   /v1/participants                                    run-test       422
+GET    /v1/participants/x                                  run-test       404
+PUT    /v1/participants/x/profile                          run-test       422
+GET    /v1/participants/x/tests                            run-test       404
+POST   /v1/participants/x/recordings                       run-test       404
+GET    /v1/participants/x/calibration                      run-test       404
+POST   /v1/participants/x/calibration                      run-test       404
+POST   /v1/participants/x/calibration/step                 run-test       422
+POST   /v1/participants/x/calibration/mark                 run-test       422
+POST   /v1/participants/x/calibration/finish               run-test       404
+POST   /v1/tests                                           run-test       422
+POST   /v1/preview                                         run-test       422
+POST   /v1/models/x/effects                                run-test       422
+POST   /v1/models/x/improve                                run-test       404
+DELETE /v1/jobs/x                                          run-test       404
+GET    /participants/x                                     run-test       404
+POST   /participants                                       run-test       4xx
+POST   /participants/x/profile                             run-test       4xx
+POST   /participants/x/tests                               run-test       4xx
+POST   /participants/x/recordings                          run-test       4xx
+GET    /participants/x/calibration                         run-test       404
+POST   /participants/x/calibration                         run-test       4xx
+POST   /participants/x/calibration/step/up                 run-test       4xx
+POST   /participants/x/calibration/mark/motor              run-test       4xx
+POST   /participants/x/calibration/finish                  run-test       4xx
+POST   /participants/x/calibration/discard                 run-test       4xx
+GET    /participants/x/confirm/x                            run-test       410
+POST   /participants/x/confirm/x                           run-test       410
+POST   /models/x/effects                                   run-test       4xx
+POST   /models/x/improve                                   run-test       4xx
+POST   /models/x/experiment                                run-test       4xx
+POST   /models/x/diagnosis/cancel                          run-test       303
+POST   /jobs/x/cancel                                      run-test       404
+POST   /v1/rearm                                           rearm          200
+POST   /rearm                                              rearm          303
+POST   /v1/models/x/approve                                approve-model  404
+POST   /v1/models/x/reject                                 approve-model  404
+POST   /v1/models/x/undo                                   approve-model  404
+POST   /models/x/approve                                   approve-model  422
+POST   /models/x/reject                                    approve-model  422
+POST   /models/x/undo                                      approve-model  404
+POST   /v1/tokens                                          administer     422
+GET    /v1/tokens                                          administer     200
+DELETE /v1/tokens/x                                        administer     404
+GET    /v1/audit                                           administer     200
+POST   /v1/users                                           administer     422
+GET    /v1/users                                           administer     200
+PUT    /v1/users/x/password                                administer     422
+DELETE /v1/users/x                                         administer     404
+POST   /v1/controller-keys                                 administer     422
+GET    /administration                                     administer     200
+POST   /administration/users                               administer     422
+POST   /administration/users/x/password                    administer     422
+POST   /administration/users/x/remove                      administer     404
+POST   /administration/keys                                administer     422
+POST   /administration/tokens/x/revoke                     administer     404
+GET    /administration/audit.jsonl                         administer     200
+"""
+"""Method, path, who may, and what they are answered, where nothing of the name x is there and no body is sent.
+
+4xx: whatever the form says is missing."""
+ROWS = [tuple(line.split()) for line in TABLE.strip().splitlines()]
+IN_PATHS = {"{name}": "x", "{direction}": "up", "{threshold}": "motor"}
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
+    yield from run_service(tmp_path_factory.mktemp("scopes"), short_dir, STUB)
+
+
+def filled(path: str) -> str:
+    return re.sub(r"\{\w+\}", lambda found: IN_PATHS.get(found[0], "x"), path)
+
+
+def test_the_table_names_every_route() -> None:
+    """A new route goes into the table, with who may use it: that is decided there first, then in the code."""
+    there = {
+        (method, filled(route.path).replace("/static/x", "/static/page.css"))
+        for router in [*routes.routers(), *pages.routers()]
+        for route in router.routes
+        if isinstance(route, APIRoute)  # the live channel has a test of its own
+        for method in route.methods
+    }
+    assert there == {(method, path) for method, path, _, _ in ROWS}
+    assert set(SCOPES) == {scope.value for scope in Scope}
+
+
+@pytest.fixture(scope="module")
+def holders(shared: Service) -> dict[str, str]:
+    return {scope: f"Bearer {shared.token(scope, scope)}" for scope in SCOPES}
+
+
+@pytest.fixture(scope="module")
+def http(shared: Service) -> Iterator[httpx.Client]:
+    with shared.client(token=None) as client:
+        yield client
+
+
+def let_in(status: int) -> bool:
+    return status < 500 and status not in (401, 403)
+
+
+@pytest.mark.parametrize(("method", "path", "who", "status"), ROWS, ids=[f"{row[0]} {row[1]}" for row in ROWS])
+def test_each_scope_gets_what_the_table_says(
+    http: httpx.Client, holders: dict[str, str], method: str, path: str, who: str, status: str
+) -> None:
+    expected = dict.fromkeys(SCOPES, "403") | {"nobody": "401"}
+    for scope in SCOPES:
+        if who in (scope, "anybody", "anyone") or scope == "administer":
+            expected[scope] = status
+    if who == "anybody":
+        expected["nobody"] = status
+    found = {}
+    for number, holder in enumerate(expected):
+        head = {"Authorization": holders[holder]} if holder in holders else {}
+        head["X-Forwarded-For"] = f"10.0.0.{number}"  # nobody is held back for another's tries
+        form = {"data": {"name": holder}} if path == "/sign-in" else {}
+        code = http.request(method, path, headers=head, **form).status_code
+        found[holder] = "4xx" if expected[holder] == "4xx" and code >= 400 and let_in(code) else str(code)
+    assert found == expected
+
+
+def test_forms_of_another_page_change_nothing(shared: Service) -> None:
+    """A session without its CSRF token may look and may stop: every route that writes is tried."""
+    with shared.client(token=None) as page:
+        assert page.post("/sign-in", data={"token": TOKEN}).status_code == 303
+        tried = 0
+        for method, path, who, _ in ROWS:
+            if method == "GET" or who == "anybody" or path == "/v1/stop":
+                continue
+            answer = page.request(method, path)
+            assert (answer.status_code, answer.json()["type"]) == (403, "/problems/csrf"), (method, path)
+            tried += 1
+        assert tried > 40 and page.post("/v1/stop").status_code == 200
+
+
+def test_a_key_that_only_reads_cancels_nothing(service: Service, client: httpx.Client, participant: str) -> None:
+    model = run_test(client, participant)["model_id"]
+    reader = service.client(service.token("reader", "read-model", "read-live"))
+    job = client.post(f"/v1/models/{model}/improve", params={"wait": "false"})
+    location = job.headers["location"]
+    assert reader.get(location).status_code == 200
+    assert reader.delete(location).status_code == 403
+    assert reader.post(location.replace("/v1", "") + "/cancel").status_code == 403
+    assert reader.post(f"/models/{model}/diagnosis/cancel").status_code == 403
+    assert client.get(location).json()["state"] != "cancelled"
+
+
+# ---- heads --------------------------------------------------------------------------------------------------
+
+
+def policy(answer: httpx.Response) -> dict[str, list[str]]:
+    parts = [part.split() for part in answer.headers["content-security-policy"].split(";")]
+    return {part[0]: part[1:] for part in parts if part}
+
+
+@pytest.mark.parametrize(("method", "path"), [row[:2] for row in ROWS], ids=[f"{row[0]} {row[1]}" for row in ROWS])
+def test_every_answer_says_load_from_here_alone_and_keep_nothing(http: httpx.Client, method: str, path: str) -> None:
+    token = {"Authorization": f"Bearer {TOKEN}"}
+    for asks in ({}, token, {"Accept": "text/html"}, token | {"Accept": "text/html"}):
+        answer = http.request(method, path, headers=asks)
+        head, said = answer.headers, policy(answer)
+        assert head["x-content-type-options"] == "nosniff"
+        assert head["cross-origin-resource-policy"] == head["cross-origin-opener-policy"] == "same-origin"
+        assert said["default-src"] == said["base-uri"] == said["frame-ancestors"] == ["'none'"]
+        assert "script-src" not in said or said["script-src"] == ["'self'"]
+        if head.get("content-type", "").startswith("text/html"):
+            assert said["connect-src"] == said["form-action"] == ["'self'"]
+            assert head["referrer-policy"] == "same-origin", "its own address goes to this service alone"
+        else:
+            assert said["form-action"] == ["'none'"] and head["referrer-policy"] == "no-referrer"
+        assert head["cache-control"] == ("public, max-age=31536000, immutable" if "/static/" in path else "no-store")
+        assert "*" not in head["content-security-policy"] and "http" not in head["content-security-policy"]
+
+
+def test_what_goes_wrong_has_the_same_head(
+    service: Service, client: httpx.Client, participant: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken() -> None:
+        raise RuntimeError("unforeseen")
+
+    monkeypatch.setattr(service.app.state.context.people, "public", broken)
+    model = run_test(client, participant)
+    client.post(f"{model['model_url']}/approve")
+    for answer, status in (
+        (client.get("/v1/users", headers={"Connection": "close"}), 500),
+        (client.get("/nowhere"), 404),
+        (client.put("/v1/tests"), 405),
+        (client.get("/openapi.json"), 200),
+        (client.get(model["recording_url"]), 200),
+        (client.get(f"{model['recording_url']}/csv"), 200),
+        (client.get(f"{model['model_url']}/file"), 200),
+    ):
+        assert answer.status_code == status
+        assert answer.headers["x-content-type-options"] == "nosniff" and answer.headers["cache-control"] == "no-store"
+        assert policy(answer)["default-src"] == ["'none'"]
+    fetched = client.get(f"/v1/participants/{participant}/model")
+    assert fetched.headers["cache-control"] == "private, no-cache", "a controller asks with its ETag"

@@ -1,0 +1,290 @@
+"""Whoever has the stop button in view may stop; after a person's stop only a person lets the rig work again."""
+
+from __future__ import annotations
+
+import re
+import socket
+import time
+from collections.abc import Callable
+from typing import Any
+from urllib.parse import urlsplit
+
+import httpx
+import pytest
+from sqlalchemy.exc import OperationalError
+
+from api import private
+from api.auth import Scope
+from api.clock import Clock
+from api.stop_right import RIGHT_S, StopRights
+from tests.api.conftest import TOKEN, Service
+from tests.api.test_people import standing_still
+
+HTML = {"Accept": "text/html,application/xhtml+xml"}
+PASSWORD = "correct horse battery"
+CONFIRMED = "The rig confirms that stimulation is off"
+
+
+class SetClock(Clock):
+    now_s = 1_000_000.0
+
+    def unix_s(self) -> float:
+        return self.now_s
+
+
+def person(service: Service, name: str = "Ada") -> httpx.Client:
+    """A browser in which a clinician has signed in."""
+    with service.client() as client:
+        client.post("/v1/users", json={"name": name, "password": PASSWORD})
+    browser = service.client(token=None, headers=HTML)
+    assert browser.post("/sign-in", data={"name": name, "password": PASSWORD}).status_code == 303
+    return browser
+
+
+def right_on(page: str) -> str:
+    (form,) = re.findall(r'<form method="post" action="/v1/stop".*?</form>', page, re.S)
+    return re.findall(r'name="right" value="([^"]+)"', form)[0]
+
+
+def running(service: Service, participant: str) -> str:
+    service.rig.speed = 0.2  # two minutes: the stop ends it, however long the checks of passwords take
+    with service.client() as client:
+        return client.post("/v1/tests", json={"participant": participant}).json()["id"]
+
+
+def press(service: Service, right: str, **more: Any) -> httpx.Response:
+    """From a page that is open, by a browser that holds nothing else."""
+    with service.client(token=None, headers=HTML, follow_redirects=True, **more) as browser:
+        return browser.post("/v1/stop", data={"right": right, "reason": "stop pressed on the page"})
+
+
+def stops_noted(client: httpx.Client) -> list[dict[str, Any]]:
+    """The stops in the audit trail; the entry may come after the answer."""
+    end = time.monotonic() + 60
+    while True:
+        entries = client.get("/v1/audit").json()["entries"]
+        found = [entry for entry in entries if entry["action"] == "stop"]
+        if found or time.monotonic() > end:
+            return found
+        time.sleep(0.05)
+
+
+def sign_out(browser: httpx.Client, _client: httpx.Client, _service: Service) -> None:
+    csrf = re.findall(r'name="csrf" value="([^"]+)"', browser.get("/").text)[0]
+    assert browser.post("/sign-out", data={"csrf": csrf}).status_code == 303
+
+
+def run_out(_browser: httpx.Client, _client: httpx.Client, service: Service) -> None:
+    with service.app.state.context.store.write() as session:
+        session.connection().exec_driver_sql("UPDATE page_sessions SET expires_unix_s = 0")
+
+
+def new_password(_browser: httpx.Client, client: httpx.Client, _service: Service) -> None:
+    assert client.put("/v1/users/Ada/password", json={"password": "another passphrase"}).status_code == 204
+
+
+def remove(_browser: httpx.Client, client: httpx.Client, _service: Service) -> None:
+    assert client.delete("/v1/users/Ada").status_code == 204
+
+
+def locked_out(browser: httpx.Client, client: httpx.Client, service: Service) -> None:
+    standing_still(service)
+    sign_out(browser, client, service)
+    for number in range(8):
+        service.client(f"guess {number}").get("/v1/rig")
+        browser.post("/sign-in", data={"name": "Ada", "password": "wrong"})
+    assert browser.post("/sign-in", data={"name": "Ada", "password": PASSWORD}).status_code == 429
+
+
+@pytest.mark.parametrize("end", [sign_out, run_out, new_password, remove, locked_out])
+@pytest.mark.parametrize("shown", ["test", "home"])
+def test_a_page_that_shows_the_button_stops_whatever_became_of_its_session(
+    service: Service, client: httpx.Client, participant: str, end: Callable[..., None], shown: str
+) -> None:
+    browser = person(service)
+    home = browser.get("/").text
+    test_id = running(service, participant)
+    right = right_on(browser.get(f"/tests/{test_id}").text if shown == "test" else home)
+    end(browser, client, service)
+    answer = press(service, right, cookies=dict(browser.cookies))
+    assert answer.status_code == 200 and CONFIRMED in answer.text
+    assert service.rig.stopped_by == "Ada"
+    (entry,) = stops_noted(client)
+    assert (entry["who"], entry["subject"]) == ("Ada", test_id)
+
+
+def test_where_nothing_runs_a_stop_does_no_harm(service: Service) -> None:
+    browser = person(service)
+    right = right_on(browser.get("/").text)
+    assert [press(service, right).status_code for _ in range(3)] == [200] * 3
+
+
+def test_a_stop_waits_for_no_database(service: Service, participant: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    right = right_on(person(service).get("/").text)
+    running(service, participant)
+    store = service.app.state.context.store
+
+    def gone(*_: Any) -> Any:
+        raise OperationalError("SELECT", {}, Exception("disk I/O error"))
+
+    with store.write_lock:  # another writer does not let go
+        monkeypatch.setattr(store, "get", gone)
+        monkeypatch.setattr(store, "all", gone)
+        answer = press(service, right, cookies={"stimrig_session": "old"})
+        assert answer.status_code == 200 and CONFIRMED in answer.text
+    monkeypatch.undo()
+
+
+def test_the_answer_to_a_stop_that_is_not_confirmed_has_the_button_still(service: Service) -> None:
+    browser = person(service)
+    right = right_on(browser.get("/").text)
+    service.rig.confirms_stop = False
+    answer = press(service, right)
+    assert answer.status_code == 503 and "emergency switch" in answer.text and right_on(answer.text) == right
+    service.rig.confirms_stop = True
+    assert press(service, right_on(answer.text)).status_code == 200
+
+
+def test_nobody_makes_a_right(service: Service) -> None:
+    rights: StopRights = service.app.state.context.stop_rights
+    real = rights.give("Ada", None)
+    words, _, mark = real.partition(".")
+    other = StopRights(b"k" * 32, Clock()).give("Eve", None)
+    for wrong in ("", "x", ".", "a.b", words, f"{words}.", f".{mark}", f"x{real}", f"{words}.{mark[:-4]}", other,
+                  f"{other.partition('.')[0]}.{mark}", "A" * 5000, "ä.ö", real + "\N{SNOWMAN}"):  # fmt: skip
+        answer = press(service, wrong)
+        assert answer.status_code == 401, wrong
+        assert "Nothing was stopped" in answer.text and "emergency switch" in answer.text
+    assert service.rig.stopped_by is None
+    with service.client(token=None) as http:
+        assert http.post("/v1/stop", headers={"X-Stop-Right": real}).json()["stopped"]
+        assert http.post("/v1/stop", headers={"X-Stop-Right": other}).status_code == 401
+
+
+def test_a_right_opens_nothing_but_stop(service: Service) -> None:
+    right = service.app.state.context.stop_rights.give("Ada", None)
+    with service.client(token=None, headers={"X-Stop-Right": right}) as http:
+        for path, methods in http.get("/openapi.json").json()["paths"].items():
+            for method in methods:
+                if path.startswith("/v1") and path not in ("/v1/stop", "/v1/sessions"):
+                    answer = http.request(method.upper(), re.sub(r"\{\w+\}", "x", path), data={"right": right})
+                    assert answer.status_code == 401, path
+
+
+def test_a_right_lasts_a_day_or_as_long_as_its_test() -> None:
+    clock = SetClock()
+    rights = StopRights(b"k" * 32, clock)
+    of_test, of_home = rights.give("Ada", "T1"), rights.give("Ada", None)
+    clock.now_s += RIGHT_S
+    assert rights.holder(of_test) == rights.holder(of_home) == "Ada"
+    clock.now_s += 1
+    assert rights.holder(of_test, {"T1"}) == "Ada"
+    assert rights.holder(of_test, {"T2", None}) is None
+    assert rights.holder(of_home, {"T1", None}) is None
+    clock.now_s -= 3 * RIGHT_S
+    assert rights.holder(of_home) == "Ada", "a clock that is set back takes the right from nobody"
+
+
+def test_a_restart_of_the_service_keeps_the_rights_of_open_pages(service: Service) -> None:
+    path = service.data / "stop-right.key"
+    right = service.app.state.context.stop_rights.give("Ada", None)
+    assert path.stat().st_mode & 0o777 == 0o600
+    path.chmod(0o644)
+    assert StopRights(private.key(path), Clock()).holder(right) == "Ada"
+    assert path.stat().st_mode & 0o777 == 0o600
+
+
+def test_a_token_that_ran_out_in_a_test_still_stops(service: Service, client: httpx.Client) -> None:
+    late = client.post(
+        "/v1/tokens", json={"name": "late", "scopes": ["run-test"], "expires_utc": "2020-01-01T00:00:00Z"}
+    ).json()["token"]
+    with service.client(late) as program:
+        assert program.post("/v1/preview", json={"participant": "P1"}).status_code == 401
+        assert program.post("/v1/stop").status_code == 200
+
+
+def test_a_right_token_stops_whatever_was_guessed_at_its_address(service: Service) -> None:
+    """The configured token, after a restart, while a client with an old token tries on at the same address."""
+    pace = service.app.state.context.auth.guesses._tokens
+    for _ in range(20):
+        pace.count("127.0.0.1")
+    with service.client() as program:
+        assert program.get("/v1/rig").status_code == 429
+        assert program.post("/v1/stop").status_code == 200
+        assert program.get("/v1/rig").status_code == 429, "a stop opens nothing else"
+    assert service.client("guess").post("/v1/stop").status_code == 429
+
+
+def test_a_right_in_a_form_that_comes_slowly_is_waited_for(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("api.stop_right.PATIENCE_S", 0.01)
+    monkeypatch.setattr("api.stop_right.LONGEST_PATIENCE_S", 60.0, raising=False)
+    right = service.app.state.context.stop_rights.give("Ada", None)
+    with slow_form(service, f"right={right}", "Cookie: stimrig_session=ended\r\n") as connection:
+        connection.sendall(right[-1:].encode())
+        assert connection.recv(12) == b"HTTP/1.1 200"
+    assert service.rig.stopped_by == "Ada"
+
+
+def test_a_stop_that_is_allowed_anyway_waits_for_no_form(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("api.stop_right.LONGEST_PATIENCE_S", 60.0)
+    with slow_form(service, "reason=x", f"Authorization: Bearer {TOKEN}\r\n") as connection:
+        assert connection.recv(12) == b"HTTP/1.1 200"
+
+
+def slow_form(service: Service, form: str, header: str) -> socket.socket:
+    """A stop of which all has come but the last letter of its form: the caller sends it."""
+    place = urlsplit(service.url)
+    connection = socket.create_connection((place.hostname, place.port), timeout=20)
+    kind = "Content-Type: application/x-www-form-urlencoded"
+    head = f"POST /v1/stop HTTP/1.1\r\nHost: x\r\n{header}{kind}\r\nContent-Length: {len(form)}\r\n\r\n"
+    connection.sendall((head + form[:-1]).encode())
+    time.sleep(0.2)
+    return connection
+
+
+# ---- re-arming ----------------------------------------------------------------------------------------------
+
+
+def test_after_a_persons_stop_no_program_lets_the_rig_work_again(
+    service: Service, client: httpx.Client, participant: str
+) -> None:
+    browser = person(service)
+    assert press(service, right_on(browser.get("/").text)).status_code == 200
+    most = [scope.value for scope in Scope if scope not in (Scope.REARM, Scope.ADMINISTER)]
+    token = service.token("controller", *most)
+    start = {"participant": participant}
+    calibration = f"/v1/participants/{participant}/calibration"
+    with service.client(token) as program, service.client(token=None, headers=HTML) as page:
+        refused = program.post("/v1/rearm")
+        assert refused.status_code == 403 and "rearm" in refused.json()["detail"]
+        assert program.post("/rearm").status_code == 403
+        page.post("/sign-in", data={"token": token})
+        csrf = re.findall(r'name="csrf" value="([^"]+)"', page.get("/").text)[0]
+        assert page.post("/rearm", data={"csrf": csrf}).status_code == 403, "a token that signs in is no person"
+        assert "I have looked" not in page.get("/").text
+        assert program.post("/v1/tests", json=start).status_code == 409
+        assert program.post(calibration).status_code == 409
+        assert program.post(f"{calibration}/finish", json={"discard": True}).status_code == 404
+        assert program.post(f"{calibration}/step", json={}).status_code == 404
+        assert program.get("/v1/rig").json()["state"] == "latched" and service.rig.starts == 0
+        assert "I have looked" in browser.get("/").text
+        csrf = re.findall(r'name="csrf" value="([^"]+)"', browser.get("/").text)[0]
+        assert browser.post("/rearm", data={"csrf": csrf}).status_code == 303
+        assert program.post("/v1/tests", json=start).status_code == 202
+
+
+def test_a_program_rearms_only_where_it_was_asked_for_by_name(service: Service, client: httpx.Client) -> None:
+    for name, scopes, status in (
+        ("asked", ["rearm"], 200), ("not asked", ["run-test", "read-live", "read-model", "approve-model"], 403),
+    ):  # fmt: skip
+        client.post("/v1/stop")
+        assert service.client(service.token(name, *scopes)).post("/v1/rearm").status_code == status
+    key = client.post("/v1/controller-keys", json={"name": "ilc"}).json()["key"]
+    assert service.client(key).post("/v1/rearm").status_code == 403
+
+
+def test_a_person_who_runs_no_tests_does_not_rearm(service: Service, client: httpx.Client) -> None:
+    client.post("/v1/users", json={"name": "Eve", "password": PASSWORD, "scopes": ["read-live", "read-model"]})
+    browser = person(service, "Eve")
+    csrf = re.findall(r'name="csrf" value="([^"]+)"', browser.get("/").text)[0]
+    assert browser.post("/rearm", data={"csrf": csrf}).status_code == 403

@@ -1,0 +1,106 @@
+"""A stopped test's page shows what was recorded, who stopped it and when; loading a stop's page again stops nothing."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+from api.pages import charts
+from api.recorded import recorded
+from tests.api.browser import open_tab, participant, start
+from tests.api.conftest import STUB, Service, run_service
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
+    yield from run_service(tmp_path_factory.mktemp("stopped"), short_dir, STUB, speed=0.5)
+
+
+@pytest.fixture
+def tab(browser: Any, service: Service) -> Iterator[Any]:
+    yield from open_tab(browser, service)
+
+
+def stops(service: Service) -> int:
+    with service.client() as http:
+        return sum(entry["action"] == "stop" for entry in http.get("/v1/audit").json()["entries"])
+
+
+@pytest.mark.browser
+def test_a_stopped_tests_page_shows_what_was_recorded(tab: Any, service: Service) -> None:
+    participant(tab, service, f"W{time.time_ns() % 10**9}")
+    start(tab)
+    tab.locator("#segment", has_text="prbs").wait_for(timeout=60_000)
+    test_page = tab.url
+    tab.get_by_role("button", name="Stop stimulation").click()
+    tab.get_by_role("heading", name=re.compile(r"Stopped at \d\d:\d\d:\d\d")).wait_for()
+    assert "/stopped/" in tab.url and tab.get_by_text("Ada: stop pressed on the page").is_visible()
+    before = stops(service)
+    with tab.expect_request(lambda request: request.is_navigation_request()) as asked:
+        tab.reload()
+    assert asked.value.method == "GET"
+    tab.get_by_text("The rig confirms that stimulation is off.").wait_for()
+    assert stops(service) == before, "loading the page again stops nothing again"
+    tab.get_by_role("link", name="See what was recorded").click()
+    tab.wait_for_url(test_page)
+    tab.locator("#recorded svg.still").wait_for()
+    tab.locator("#rig-state", has_text="Stopped").wait_for()
+    shown = tab.locator("#recorded").inner_text()
+    for words in ("torque, measured", "pulse width, sent", "planned, not played", "stopped at"):
+        assert words in shown, words
+    reason = tab.locator("#reason").inner_text()
+    assert re.search(r"Stopped at \d\d:\d\d:\d\d, after \d+\.\d s\..*by Ada", reason), reason
+    assert tab.locator("canvas").count() == 0 and tab.get_by_text("What was planned", exact=True).count() == 0
+
+
+def test_an_unconfirmed_stop_keeps_its_warning_when_loaded_again(service: Service) -> None:
+    from tests.api.test_access import signed_in
+
+    service.rig.confirms_stop = False
+    with signed_in(service) as browser:
+        led = browser.post("/v1/stop", data={})
+        assert led.status_code == 303
+        for _ in range(2):
+            told = browser.get(led.headers["location"])
+            assert told.status_code == 503 and "emergency switch" in told.text
+        unknown = browser.get("/stopped/none")  # as after a restart of the service
+        assert unknown.status_code == 404 and "The bar above says what the rig does now" in unknown.text
+        assert 'id="rig-state"' in unknown.text and 'action="/v1/stop"' in unknown.text
+    service.rig.confirms_stop = True
+    with service.client() as http:
+        http.post("/v1/rearm")
+
+
+def made_up(path: Path, sent_us: list[float], seconds: float) -> Path:
+    time_s = np.arange(int(400 * seconds)) / 400
+    with h5py.File(path, "w") as file:
+        file["torque/time_s"], file["torque/torque_nm"] = time_s, np.where(np.arange(time_s.size) == 777, 9.0, 1.0)
+        file["pulses/planned_time_s"], file["pulses/sent_pulse_width_us"] = np.arange(len(sent_us)) / 40, sent_us
+        file.create_dataset("segments/name", data=["prbs"], dtype=h5py.string_dtype())
+        file["segments/start_s"], file["segments/end_s"] = [0.0], [len(sent_us) / 40]
+        file.attrs["pulse_rate_hz"] = 40.0
+    return path
+
+
+def test_no_peak_is_lost_and_a_dropped_pulse_is_a_gap(tmp_path: Path) -> None:
+    found = recorded(str(made_up(tmp_path / "r.h5", [100.0, 100.0, np.nan, 200.0], 30.0)), lambda *_: None)
+    assert max(found["torque_nm"]) == 9.0 and len(found["time_s"]) <= 2000
+    assert found["sent_pulse_width_us"] == [100.0, None, 200.0, 200.0] and found["pulses_end_s"] == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("sent_us", [[], [0.0], [100.0] * 40])
+def test_what_was_not_played_begins_where_the_pulses_end(tmp_path: Path, sent_us: list[float]) -> None:
+    found = recorded(str(made_up(tmp_path / "r.h5", sent_us, 1.2 if sent_us else 0.0)), lambda *_: None)
+    plan_us = [100.0] * 400
+    figure = charts.recorded(found, plan_us, 40.0, "stopped")
+    (faint,) = [trace for trace in figure["data"] if trace["name"] == "planned, not played"]
+    assert faint["x"][0] == pytest.approx(len(sent_us) / 40) and faint["line"]["color"] == charts.FAINT
+    whole = charts.recorded(found, plan_us[: len(sent_us)], 40.0, "completed")
+    assert not [trace for trace in whole["data"] if trace["name"] == "planned, not played"]

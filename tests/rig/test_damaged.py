@@ -1,0 +1,211 @@
+"""A damaged journal: what was felt is in what is sealed, or the text says that it may be missing."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from api import cli
+from rig import archive, assembly, journal, recover
+from rig.control.latch import lock_folder
+from rig.errors import RecordingError
+from rig.journal import Journal, Kind
+from rig.messages import SegmentPlan
+from tests.rig.fakes import VirtualRig, header
+
+ROOT = Path(__file__).parents[2]
+SECTOR = 4096
+FELT = (0, 4, 5)
+PLAYED = [
+    SegmentPlan(name="rest", sequence="rest", settings={"duration_s": 0.3}),
+    SegmentPlan(name="prbs", sequence="prbs", settings={"bits": 5, "clock_pulses": 4}),
+]
+
+
+@pytest.fixture(scope="module")
+def played(tmp_path_factory: pytest.TempPathFactory) -> tuple[bytes, int, float]:
+    """A test's journal as the rig writes it, how many pulses were felt, and their charge."""
+    rig = VirtualRig(tmp_path_factory.mktemp("played"), PLAYED)
+    rig.journal.close()
+    rig.path.unlink()
+    book = Journal(rig.path)
+    book.begin(header(rig.test, rig.clock), rig.test.pulse_width_us.astype("<f8").tobytes())
+    rig.journal = rig.run._journal = book
+    assert rig.execute().outcome == "completed"
+    felt = [pulse for _, pulse in rig.stimulator.sent]
+    assert len(felt) > 50
+    return rig.path.read_bytes(), len(felt), sum(pulse.charge_uc for pulse in felt)
+
+
+def sealed(tmp_path: Path, data: bytes) -> assembly.Recording:
+    (tmp_path / "t.journal").write_bytes(data)
+    return assembly.assemble(journal.read(tmp_path / "t.journal"))
+
+
+def felt(recording: assembly.Recording) -> tuple[int, float]:
+    """Pulses that were sent or may have been, and their charge."""
+    columns = recording.columns
+    sent = np.isin(columns["pulses/status"], FELT)
+    charge_uc = columns["pulses/sent_pulse_width_us"] * columns["pulses/current_ma"] * 1e-3
+    return int(np.sum(sent)), float(np.nansum(charge_uc[sent]))
+
+
+def blocks_of(data: bytes, *kinds: Kind) -> list[int]:
+    """Where the blocks of these kinds begin."""
+    found, at = [], len(journal.MAGIC)
+    while at < len(data):
+        block = journal._block_at(data, at)
+        assert block is not None
+        if block[0] in kinds:
+            found.append(at)
+        at = block[3]
+    return found
+
+
+def test_one_flipped_bit_anywhere_loses_no_pulse(tmp_path: Path, played: tuple[bytes, int, float]):
+    data, pulses, charge_uc = played
+    rng = np.random.default_rng(9)
+    spacer = blocks_of(data, Kind.SPACER)[0]
+    copies = [*range(spacer), *range(spacer + journal.APART_BYTES, blocks_of(data, Kind.START)[0])]
+    places = {*rng.choice(copies, 150).tolist(), *rng.integers(len(data), size=250).tolist(), *range(24)}
+    for at in sorted(places):
+        spoiled = bytearray(data)
+        spoiled[at] ^= 1 << int(rng.integers(8))
+        recording = sealed(tmp_path, bytes(spoiled))
+        assert felt(recording) == (pulses, pytest.approx(charge_uc)), at
+        assert recording.attributes["participant"] == "P"
+        assert "damaged" in recording.attributes["journal_note"]
+
+
+def test_a_sector_that_is_gone_loses_no_pulse(tmp_path: Path, played: tuple[bytes, int, float]):
+    data, pulses, charge_uc = played
+    for at in range(0, len(data), SECTOR // 2):
+        spoiled = data[:at] + bytes(min(SECTOR, len(data) - at)) + data[at + SECTOR :]
+        recording = sealed(tmp_path, spoiled)
+        found, found_uc = felt(recording)
+        note = recording.attributes["journal_note"]
+        assert found >= pulses or "blocks are missing" in note, at
+        if at + SECTOR < len(data):  # not at the tail, where a cut and a damage look the same
+            assert found >= pulses, (at, note)
+            assert found_uc >= charge_uc - 1e-6, (at, note)
+        assert recording.attributes["participant"] == "P"
+
+
+@pytest.mark.parametrize(
+    ("kinds", "words"),
+    [
+        ((Kind.HEADER,), "both copies of the header are lost"),
+        ((Kind.PLAN,), "both copies of the plan are lost"),
+        ((Kind.HEADER, Kind.PLAN), "both copies of the plan are lost"),
+        ((Kind.HEADER, Kind.PLAN, Kind.START, Kind.END), "both copies of the header are lost"),
+        ((Kind.INTENT,), "pulses were sent whose intents are lost"),
+        ((Kind.INTENT, Kind.PLAN), "the width is not known"),
+        ((Kind.INTENT, Kind.WRITTEN, Kind.ACKED), "planned pulses left no trace"),
+        ((Kind.START,), "damaged"),
+        ((Kind.END,), "damaged"),
+    ],
+)
+def test_with_whole_kinds_of_blocks_lost_the_others_tell(
+    tmp_path: Path, played: tuple[bytes, int, float], kinds: tuple[Kind, ...], words: str
+):
+    data, pulses, charge_uc = played
+    spoiled = bytearray(data)
+    for at in blocks_of(data, *kinds):
+        spoiled[at + 12] ^= 0xFF
+    recording = sealed(tmp_path, bytes(spoiled))
+    assert words in recording.attributes["journal_note"]
+    found, found_uc = felt(recording)
+    assert found == pulses
+    assert found_uc == pytest.approx(charge_uc) or "not known" in recording.attributes["journal_note"]
+    assert recording.attributes["pulse_rate_hz"] == pytest.approx(40.0)
+    assert len(recording.columns["torque/time_s"]) > 1000
+    assert recording.attributes["test_id"] == "t"
+    assert archive.seal(recording, tmp_path).path.is_file()
+
+
+def test_it_is_never_said_that_no_pulse_was_sent_beside_what_cannot_be_read(tmp_path: Path):
+    (tmp_path / "j").write_bytes(journal.MAGIC + b"\xa5BLK" + b"x" * 400)
+    with pytest.raises(RecordingError, match="404 bytes cannot be read, and what is left tells of no pulse") as told:
+        assembly.assemble(journal.read(tmp_path / "j"))
+    assert "no pulse was sent" not in str(told.value)
+    (tmp_path / "k").write_bytes(journal.MAGIC)
+    with pytest.raises(RecordingError, match="ends before its plan, no pulse was sent"):
+        assembly.assemble(journal.read(tmp_path / "k"))
+
+
+def test_the_two_copies_lie_further_apart_than_a_sector(played: tuple[bytes, int, float]):
+    headers = blocks_of(played[0], Kind.HEADER)
+    plans = blocks_of(played[0], Kind.PLAN)
+    first_end, second = blocks_of(played[0], Kind.SPACER)[0], headers[1]
+    assert (len(headers), len(plans)) == (2, 2)
+    assert second - first_end > SECTOR
+
+
+def test_recover_seals_says_what_is_missing_and_leaves_the_journal(
+    tmp_path: Path, played: tuple[bytes, int, float], capsys: pytest.CaptureFixture[str]
+):
+    data, pulses, _ = played
+    spoiled = bytearray(data)
+    for at in blocks_of(data, Kind.HEADER):
+        spoiled[at] ^= 1
+    for name in ("journals", "recordings"):
+        (tmp_path / name).mkdir()
+    path = tmp_path / "journals" / "t.unsealed"
+    path.write_bytes(spoiled)
+    assert recover.main([str(path), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["pulses"], found["test_id"], found["participant"]) == (pulses, "t", "unknown")
+    assert "both copies of the header are lost" in found["note"]
+    assert path.read_bytes() == spoiled
+    with h5py.File(found["recording"]) as file:
+        assert file.attrs["recording_id"] == found["recording_id"]
+        assert file.attrs["journal_note"] == found["note"]
+    assert Path(found["recording"]).parent == tmp_path / "recordings"
+    assert recover.main([str(path)]) == 0
+    assert "was sealed already" in capsys.readouterr().out
+    path.write_bytes(data[: len(data) // 2])
+    other = Path(found["recording"]).with_name(archive.place(assembly.assemble(journal.read(path)), path).name)
+    other.write_bytes(Path(found["recording"]).read_bytes())
+    assert recover.main([str(path)]) == 2
+    assert "another recording of this test is there" in capsys.readouterr().err
+
+
+def test_recover_refuses_what_a_living_rig_has(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    rig = VirtualRig(tmp_path)
+    assert recover.main([str(rig.path)]) == 2
+    assert "a rig that is alive has it" in capsys.readouterr().err
+    rig.journal.close()
+    (tmp_path / "journals").mkdir()
+    path = rig.path.rename(tmp_path / "journals" / "t.journal")
+    with lock_folder(tmp_path):
+        assert recover.main([str(path)]) == 2
+        assert "a rig that is alive has it" in capsys.readouterr().err
+    assert recover.main([str(path)]) == 0
+
+
+def test_the_verb_gives_one_line_and_an_exit_code(
+    tmp_path: Path,
+    played: tuple[bytes, int, float],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+):
+    monkeypatch.chdir(ROOT)
+    (tmp_path / "t.journal").write_bytes(played[0])
+    assert cli.run(["recover", str(tmp_path / "t.journal"), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["pulses"], found["note"]) == (played[1], "")
+    (tmp_path / "noise").write_bytes(b"no journal")
+    for wrong in ("noise", "nowhere", "-x"):
+        assert cli.run(["recover", "--", str(tmp_path / wrong)]) == 2
+        told = capsys.readouterr()
+        assert told.out == ""
+        assert told.err.startswith("stimrig recover: journal ")
+        assert len(told.err.splitlines()) == 1
+    ended = subprocess.run([sys.executable, "-m", "rig.recover"], cwd=ROOT, capture_output=True, text=True)
+    assert ended.returncode == 2
