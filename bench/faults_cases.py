@@ -34,6 +34,10 @@ class Case:
         Where it happens.
     resting
         What it must lead to in a rest, where no pulse is sent that could fail.
+    fault
+        The emulator's name of it, where that is another.
+    may_follow
+        How many pulses may be felt long after: what the line itself held back.
     """
 
     name: str
@@ -43,10 +47,13 @@ class Case:
     settings: dict[str, Any] = field(default_factory=dict)
     resting: Must | None = None
     loses_samples: bool = False
+    fault: str = ""
+    may_follow: int = 0
 
-    def at_speed(self, speed: float) -> dict[str, Any]:
-        """The settings, delays in emulated seconds: a rig that runs faster still waits for real ones."""
-        return {key: value * speed if key == "delay_s" else value for key, value in self.settings.items()}
+    def command(self, speed: float) -> dict[str, Any]:
+        """For the emulator's control line; delays in emulated seconds: a rig that runs faster waits for real ones."""
+        settings = {key: value * speed if key.endswith("_s") else value for key, value in self.settings.items()}
+        return {"cmd": "fault", "name": self.fault or self.name, "on": True, **settings}
 
 
 CASES: dict[str, Case] = {
@@ -55,6 +62,8 @@ CASES: dict[str, Case] = {
         Case("stimulator_unplugged", "stop"),
         Case("no_ack", "stop", WATCH_S),
         Case("late_ack", "stop", WATCH_S, settings={"delay_s": 0.2}),
+        Case("line_stalled", "stop", WATCH_S, may_follow=1),
+        Case("line_stalled_70_ms", "go on", fault="line_stalled", settings={"for_s": 0.07}),
         Case("corrupt_answers", "stop", WATCH_S),
         Case("corrupt_commands", "stop", WATCH_S),
         Case("electrode_error", "stop", resting="either"),

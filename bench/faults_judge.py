@@ -14,6 +14,8 @@ from rig import archive
 from rig.errors import RecordingError
 
 BOUND_MS = 50.0
+SHORTEST_MS = 8.0
+"""Of the intervals at the electrode, in emulated time: written down here again on purpose."""
 
 
 @dataclass
@@ -31,6 +33,7 @@ class Verdict:
     evidence: str = ""
     felt: int = 0
     kept: int = 0
+    shortest_ms: float | None = None
     acknowledged: int = 0
     tail_ms: float | None = None
     opens: bool | None = None
@@ -71,6 +74,7 @@ def judge_times(verdict: Verdict, felt_s: list[float], injected_s: float) -> Non
     must = case.must if verdict.phase not in ("rest", "sealing") else (case.resting or case.must)
     if not felt_s or verdict.phase == "sealing" or must == "go on" or verdict.outcome == "completed":
         return
+    felt_s = felt_s[: len(felt_s) - case.may_follow] or felt_s
     verdict.last_pulse_ms = 1e3 * (felt_s[-1] - injected_s)
     hidden_s = case.hidden_s
     if verdict.fault in ("no_ack", "late_ack", "corrupt_answers", "corrupt_commands"):
@@ -79,6 +83,15 @@ def judge_times(verdict: Verdict, felt_s: list[float], injected_s: float) -> Non
     verdict.after_known_ms = verdict.last_pulse_ms - 1e3 * hidden_s
     if must == "stop" and verdict.after_known_ms > BOUND_MS:
         verdict.wrong.append(f"a pulse {verdict.after_known_ms:.0f} ms after the fault could be known")
+
+
+def judge_intervals(verdict: Verdict, felt_s: list[float]) -> None:
+    """Whatever the fault: no two pulses closer than the limit."""
+    if len(felt_s) < 2:
+        return
+    verdict.shortest_ms = 1e3 * float(np.min(np.diff(felt_s)))
+    if verdict.shortest_ms < SHORTEST_MS:
+        verdict.wrong.append(f"two pulses felt {verdict.shortest_ms:.2f} ms apart")
 
 
 def judge_outcome(verdict: Verdict) -> None:

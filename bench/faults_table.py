@@ -8,7 +8,7 @@ from itertools import groupby
 import numpy as np
 
 from bench.faults_cases import CASES, PHASES
-from bench.faults_judge import BOUND_MS, Verdict
+from bench.faults_judge import BOUND_MS, SHORTEST_MS, Verdict
 
 HEAD = (
     "| fault | phase | n | ended | last pulse after fault, ms | after it was known, ms | confirmed | file opens "
@@ -53,10 +53,13 @@ def _together(found: list[Verdict]) -> list[str]:
     )
     why = Counter(_unconfirmed(v.evidence) for v in ended if v.confirmed is False)
     reasons = "; not confirmed: " + ", ".join(f"{n} {reason}" for reason, n in why.most_common()) if why else ""
+    apart = [v.shortest_ms for v in found if v.shortest_ms is not None]
     tails = [v.tail_ms for v in found if v.tail_ms is not None]
     return [
         f"- pulses later than {BOUND_MS:.0f} ms after the host could know of the fault: {late} of {len(stops)} stopped "
         f"tests ({spread})",
+        f"- tests with two pulses felt less than {SHORTEST_MS:g} ms apart: {sum(ms < SHORTEST_MS for ms in apart)} of "
+        f"{len(apart)} (shortest {min(apart, default=float('nan')):.1f} ms)",
         f"- felt pulses that no file holds: {sum(max(0, v.felt - v.kept) for v in found if v.opens)} of "
         f"{sum(v.felt for v in found)}; acknowledged in a file and not felt: "
         f"{sum(max(0, v.acknowledged - v.felt) for v in found if v.opens)}",

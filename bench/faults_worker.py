@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.faults_cases import CASES, WINDOW_S, Case, plan_of
-from bench.faults_judge import Verdict, judge_file, judge_outcome, judge_times
+from bench.faults_judge import Verdict, judge_file, judge_intervals, judge_outcome, judge_times
 from tests.wire.processes import Bench, RigClient, busy_process, control, default_plan, kill_hard
 
 DISK_MB = 96
@@ -115,6 +115,7 @@ class Worker:
             return  # it died before it had said that there is a test: no pulse, and no file to open
         content = judge_file(verdict, event["recording_path"])
         judge_times(verdict, [p["monotonic_s"] for p in felt], injected_s)
+        judge_intervals(verdict, [p["time_s"] for p in felt])
         judge_outcome(verdict)
         ended = verdict.phase == "sealing"
         if case.name == "host_killed" and not ended and content is not None and len(content["written_s"]) and felt:
@@ -129,12 +130,7 @@ class Worker:
             verdict.wrong.append(f"{lost} samples lost")
 
     def _start(self, client: RigClient, plan: dict[str, Any]) -> dict[str, Any]:
-        for _ in range(20):
-            reply = client.ask("start", plan=plan, timeout_s=20)
-            if reply["ok"] or "rest_between_tests_s" not in reply["problem"]["detail"]:
-                return reply
-            time.sleep(0.1)
-        return reply
+        return client.start(plan, timeout_s=20)
 
     def _refused(self, case: Case, verdict: Verdict, reply: dict[str, Any], undo: Any) -> None:
         verdict.outcome, verdict.reason = "refused", reply["problem"]["detail"]
@@ -168,9 +164,10 @@ class Worker:
         bench = self.bench
         assert bench is not None
         if case.of == "emulator":
-            answer = bench.fault(cmd="fault", name=case.name, on=True, **case.at_speed(self.speed))
+            command = case.command(self.speed)
+            answer = bench.fault(**command)
             assert answer["ok"], answer
-            return answer["monotonic_s"], lambda: bench.fault(cmd="fault", name=case.name, on=False)
+            return answer["monotonic_s"], lambda: bench.fault(cmd="fault", name=command["name"], on=False)
         return getattr(self, f"_{case.name}")()
 
     def _disk_full(self) -> tuple[float, Any]:

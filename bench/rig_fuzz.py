@@ -1,11 +1,12 @@
-"""A million requests at the gate, most of them mad: how many pulses outside the limits came out? There must be none.
+"""A million requests at the gate, most of them mad: how many pulses outside the limits were felt? There must be none.
 
     python -m bench.rig_fuzz [--requests N] [--plans N] [--seed N]
 
 Widths and currents are NaN, infinite, negative, huge, tiny, at and beside every bound and every rounding step of both
-stimulators; times come too close, too late and at random; profiles change every 500 requests. Then whole plans of the
-same kind: rates, currents, lists of widths, durations. What reaches the stimulator, and what a plan that was admitted
-would play, is judged by this file's own arithmetic, not by the rig's.
+stimulators; times come too close, too late and at random; profiles change every 500 requests. Between the gate and the
+emulated stimulators' electrodes stand the real drivers and a line that sometimes stalls. Then whole plans of the same
+kind: rates, currents, lists of widths, durations. What the electrodes felt, and what a plan that was admitted would
+play, is judged by this file's own arithmetic, not by the rig's.
 """
 
 from __future__ import annotations
@@ -19,20 +20,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bench.rig_fuzz_line import WiredDevice
+from hardware_sim.electrodes import FiredPulse
 from rig import limits, plan
 from rig.clock import VirtualClock
 from rig.errors import PlanError, RefusedError
 from rig.gate import Gate
-from rig.limits import HARD_LIMITS, Admitted, Steps
+from rig.limits import HARD_LIMITS
 from rig.messages import Profile, SegmentPlan, TestPlan
 from rig.signals import Pulse
-from tests.rig.fakes import FakeStimulator
 
 MOST = {"width_us": 500.0, "current_ma": 100.0, "charge_uc": 40.0, "charge_per_s_uc": 1600.0, "pulses_per_s": 61}
 """What no table may exceed, written down here again on purpose."""
 MOST_OF_A_TEST = {"duration_s": 300.0, "charge_uc": 50_000.0, "rise_us": 50.0, "rate_hz": 60.0}
-STIMULATORS = (Steps(1.0, 0.5, 1.0), Steps(1.0, 2.0, 20.0))
-"""What a P24 and a RehaStim 2 can tell apart."""
+STIMULATORS = {"p24": (0.5, 1), "rehastim2": (2.0, 20)}
+"""What each can tell apart: steps of current in mA, shortest pulse in µs."""
 BLOCK = 500
 
 
@@ -52,6 +54,7 @@ class Found:
 
     requests: int = 0
     sent: int = 0
+    felt: int = 0
     outside: int = 0
     refused_profiles: int = 0
     example: str = ""
@@ -107,10 +110,9 @@ def _block(
     rng: np.random.Generator, table: dict[str, limits.Limit], tightest: tuple[float, float], found: Found
 ) -> None:
     clock = VirtualClock()
-    stimulator = FakeStimulator(clock)
-    stimulator.ack_delay_s = None
-    stimulator.steps = STIMULATORS[int(rng.integers(len(STIMULATORS)))]
-    gate = Gate(stimulator, clock, lambda _: None, lambda _: None)
+    name = str(rng.choice(list(STIMULATORS)))
+    device = WiredDevice(name, clock, rng)
+    gate = Gate(device.driver, clock, lambda _: None, lambda _: None)
     gate.open(NoJournal(), table)  # pyright: ignore[reportArgumentType]
     widths, currents = values(rng, BLOCK, tightest[0]), values(rng, BLOCK, tightest[1])
     steady = rng.random(BLOCK) < 0.5  # half of them sane, so that doses and rates are reached
@@ -121,26 +123,32 @@ def _block(
     for index, (width_us, current_ma, pause_s) in enumerate(zip(widths, currents, pauses, strict=True)):
         now_s = clock.now_s()
         latest_s = now_s + (-0.001 if index % 97 == 0 else 1.0)
+        gate.feed()
         gate.fire(index, Pulse(float(width_us), float(current_ma)), now_s, latest_s)
-        clock.advance(float(pause_s))
+        clock.wait(now_s + float(pause_s))
+    clock.wait(clock.now_s() + 1.0)  # what is still in the line
     found.requests += BLOCK
-    found.sent += len(stimulator.sent)
-    for words in _judge(stimulator.sent, tightest, stimulator.steps):
+    found.sent += len(gate.lateness_s)
+    found.felt += len(device.felt)
+    if len(device.felt) != len(gate.lateness_s):
+        found.outside += 1
+        found.example = found.example or f"{len(gate.lateness_s)} sent, {len(device.felt)} felt"
+    for words in _judge(device.felt, tightest, *STIMULATORS[name]):
         found.outside += 1
         found.example = found.example or words
 
 
-def _judge(sent: list[tuple[float, Admitted]], tightest: tuple[float, float], steps: Steps) -> list[str]:
-    """One line for each pulse that should not have been sent."""
+def _judge(felt: list[FiredPulse], tightest: tuple[float, float], step_ma: float, shortest_us: float) -> list[str]:
+    """One line for each pulse that should not have been felt."""
     wrong: list[str] = []
-    for time_s, pulse in sent:
-        width_us, current_ma = pulse.pulse_width_us, pulse.current_ma
+    for pulse in felt:
+        width_us, current_ma = pulse.width_us, pulse.current_ma
         fine = 0 < width_us <= tightest[0] and 0 < current_ma <= tightest[1] and width_us * current_ma <= 40_000
-        whole = isinstance(width_us, int) and float(current_ma / steps.current_ma).is_integer()
-        if not (fine and whole and width_us >= steps.shortest_us):
-            wrong.append(f"{width_us} µs {current_ma} mA at {time_s}")
-    times = np.array([t for t, _ in sent])
-    charges_uc = np.array([p.pulse_width_us * p.current_ma * 1e-3 for _, p in sent])
+        whole = float(width_us).is_integer() and float(current_ma / step_ma).is_integer()
+        if not (fine and whole and width_us >= shortest_us and pulse.balanced and pulse.delivered):
+            wrong.append(str(pulse))
+    times = np.array([pulse.time_s for pulse in felt])
+    charges_uc = np.array([pulse.width_us * pulse.current_ma * 1e-3 for pulse in felt])
     wrong += [f"{b - a} s apart" for a, b in itertools.pairwise(times) if b - a < 0.008 - 1e-9]
     first = np.searchsorted(times, times - 1.0, side="right")
     total = np.concatenate([[0.0], np.cumsum(charges_uc)])
@@ -220,8 +228,9 @@ def main() -> None:
     began_s = time.monotonic()
     found = fuzz(options.requests, options.seed)
     print(
-        f"seed {options.seed}: {found.requests} requests, {found.sent} pulses sent, {found.outside} outside, "
-        f"{found.refused_profiles} mad profiles refused, {time.monotonic() - began_s:.0f} s {found.example}"
+        f"seed {options.seed}: {found.requests} requests, {found.sent} pulses sent, {found.felt} felt, "
+        f"{found.outside} outside, {found.refused_profiles} mad profiles refused, "
+        f"{time.monotonic() - began_s:.0f} s {found.example}"
     )
     plans = fuzz_plans(options.plans, options.seed)
     print(

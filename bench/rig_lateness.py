@@ -30,7 +30,7 @@ def measure(busy: int, tests: int, emulator_options: list[str], fit: bool = Fals
             stack.enter_context(busy_process())
         events = []
         for number in range(tests):
-            reply = client.ask("start", plan=default_plan(f"bench{number}"))
+            reply = client.start(default_plan(f"bench{number}"))
             if not reply["ok"]:
                 raise SystemExit(reply["problem"]["detail"])
             events.append(client.wait_finished(f"bench{number}"))
@@ -57,15 +57,18 @@ def main() -> None:
         return
     beside = f"{options.busy} busy processes" + (" and a fit" if options.fit else "")
     print(f"{beside}, {options.load_cell}, {'no ' if options.no_sync else ''}sync line")
-    print("| pulses | dropped | late median ms | p99 | max | samples | lost | rig CPU % | alignment | error ms |")
-    print("|---|---|---|---|---|---|---|---|---|---|")
+    print(
+        "| pulses | dropped | late median ms | p99 | max | ack p99 ms | max | samples | lost | rig CPU % | alignment "
+        "| error ms |"
+    )
+    print("|---|---|---|---|---|---|---|---|---|---|---|---|")
     for s in summaries:
         if not s["lateness_ms"]:
             continue  # ended before its first pulse; said above
-        late, alignment = s["lateness_ms"], s["alignment"]
+        late, ack, alignment = s["lateness_ms"], s["ack_delay_ms"], s["alignment"]
         print(
             f"| {s['pulses']} | {s['dropped_pulses']} | {late['median']:.3f} | {late['p99']:.3f} | {late['max']:.3f} "
-            f"| {s['samples']} | {s['lost_samples']} | {s['cpu_percent']:.1f} "
+            f"| {ack['p99']:.3f} | {ack['max']:.3f} | {s['samples']} | {s['lost_samples']} | {s['cpu_percent']:.1f} "
             f"| {alignment['method']} | {alignment['error_ms']:.3f} |"
         )
 

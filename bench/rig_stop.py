@@ -37,7 +37,7 @@ def measure(busy: int, stops: int, fit: bool = False) -> tuple[list[float], list
         for _ in range(busy):
             stack.enter_context(busy_process())
         for number in range(stops):
-            assert client.ask("start", plan=default_plan(f"stop{number}", segments=STEPS))["ok"]
+            assert client.start(default_plan(f"stop{number}", segments=STEPS))["ok"]
             client.wait_state("running")
             time.sleep(1.8 + random.random() * 0.5)  # past the rest, which the limit between two tests asks for
             asked_s = time.monotonic()

@@ -30,14 +30,14 @@ FITTER = """
 import sys, time
 from pathlib import Path
 from identify.estimate import fit
-from identify.recording import read_recording
+from identify import read
 fits = 0
 while True:
     newest = sorted(Path(sys.argv[1]).glob('*.h5'))[-1:]
     if not newest:
         sum(range(10000))  # before the first recording: busy all the same
         continue
-    fit(read_recording(newest[0]))
+    fit(read(newest[0]))
     fits += 1
     print(fits, flush=True)
 """
@@ -72,7 +72,7 @@ def fitting_one(bench: Bench, client: RigClient, wanted: bool) -> Iterator[list[
     folder = bench.folder / "to-fit"
     folder.mkdir()
     if wanted:
-        assert client.ask("start", plan=default_plan("to-fit"))["ok"]
+        assert client.start(default_plan("to-fit"))["ok"]
         path = client.wait_finished("to-fit")["recording_path"]
         shutil.copy(path, folder)
     with fitting(folder, wanted) as fits:
@@ -111,7 +111,7 @@ def _session(bench: Bench, client: Any, minutes: float, every_minutes: float) ->
     while time.monotonic() - began_s < 60 * minutes:
         next_s = time.monotonic() + 60 * every_minutes
         name = f"soak{len(tests)}"
-        reply = client.ask("start", plan=default_plan(name))
+        reply = client.start(default_plan(name))
         if not reply["ok"]:
             tests.append({"outcome": "refused", "reason": reply["problem"]["detail"], "summary": {}})
             client.ask("rearm", by="soak")
