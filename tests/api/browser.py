@@ -32,8 +32,22 @@ def open_tab(browser: Any, service: Service, signed_in: bool = True, **options: 
     if signed_in:
         sign_in(page, service)
     yield page
-    context.close()
+    close(context)
     bring_to_rest(service)
+
+
+def close(context: Any) -> None:
+    """Each page brought to rest first: chromium never closes a context one of whose pages is loading the next one."""
+    from playwright.sync_api import Error
+
+    for page in context.pages:
+        end = time.monotonic() + 60
+        while page.url != "about:blank":
+            try:
+                page.goto("about:blank")
+            except Error:  # the page itself went elsewhere meanwhile
+                assert time.monotonic() < end
+    context.close()
 
 
 def bring_to_rest(service: Service) -> None:
