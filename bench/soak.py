@@ -90,12 +90,12 @@ def memory_mb(pid: int) -> float:
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
-def soak(minutes: float, every_minutes: float, fit: bool = True) -> dict[str, Any]:
-    """Run a session and give its figures."""
+def soak(minutes: float, every_minutes: float, fit: bool = True, patient: bool = False) -> dict[str, Any]:
+    """Run a session and give its figures; `patient`: with a rig that does not end a test for a torque 0.1 s old."""
     with tempfile.TemporaryDirectory(prefix="rig-soak-") as folder:
         bench = Bench(Path(folder))
         try:
-            client = bench.start_rig()
+            client = bench.start_patient_rig() if patient else bench.start_rig()
             client.ask("subscribe")
             with fitting(bench.data / "recordings", fit) as fits:
                 return _session(bench, client, minutes, every_minutes) | {"fits_beside": len(fits)}

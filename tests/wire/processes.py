@@ -19,6 +19,17 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 READY_TIMEOUT_S = 30.0
+RIG_FILE = """
+require_calibration = false
+[stimulator]
+device = "p24"
+port = "{stimulator}"
+[load_cell]
+device = "can_load_cell"
+bus = {{ interface = "{interface}", host = "{host}", port = {port}, channel = "{channel}" }}
+[watch]
+stale_torque_s = 0.5
+"""
 
 
 class Process:
@@ -163,19 +174,21 @@ class Bench:
 
     def start_rig(self, *options: str, module: str = "rig") -> RigClient:
         """Start the rig and connect to it; `module` is what runs it, for benches that break its host."""
-        self.rig = Process(
-            module,
-            "--emulator-json",
-            json.dumps(self.emulator.ready),
-            "--data",
-            str(self.data),
-            "--socket",
-            str(self.socket),
-            "--clock-speed",
-            f"{self.speed:g}",
-            *options,
-            log=self.folder / "rig.log",
-        )
+        speed = f"{self.speed:g}"
+        return self._start(module, "--emulator-json", json.dumps(self.emulator.ready), "--clock-speed", speed, *options)
+
+    def start_patient_rig(self) -> RigClient:
+        """A rig that waits half a second for a torque sample before it calls it stale, on a P24 at the world's speed.
+
+        For tests of what is not in time: a machine that gives the rig no time to read is no part of them.
+        """
+        path = self.folder / "rig.toml"
+        path.write_text(RIG_FILE.format(stimulator=self.emulator.ready["stimulator"], **self.emulator.ready["can"]))
+        return self._start("rig", "--config", str(path))
+
+    def _start(self, module: str, *options: str) -> RigClient:
+        places = ("--data", str(self.data), "--socket", str(self.socket))
+        self.rig = Process(module, *options, *places, log=self.folder / "rig.log")
         return self.client()
 
     def client(self) -> RigClient:

@@ -18,14 +18,15 @@ from tests.wire.processes import Bench, RigClient, control, default_plan, kill_h
 pytestmark = pytest.mark.wire
 
 FAULTS = {
-    "electrode_error": "electrode error",
-    "no_ack": "not acknowledged",
-    "cell_silent": "stale",
-    "torque_nan": "no number",
-    "torque_step": "outside",
-    "counter_jump": "jumped",
-    "stimulator_unplugged": "stimulator",
-    "device_reset": "not initialised",
+    "electrode_error": ("electrode error",),
+    "no_ack": ("not acknowledged",),
+    "cell_silent": ("stale",),
+    "torque_nan": ("no number",),
+    "torque_step": ("outside",),
+    "counter_jump": ("jumped",),
+    "stimulator_unplugged": ("stimulator",),
+    # a reset within a pulse takes its acknowledgement with it; no further pulse is sent that it could refuse
+    "device_reset": ("not initialised", "not acknowledged"),
 }
 
 
@@ -76,13 +77,13 @@ def test_a_fault_stops_is_told_and_latches(shared: tuple[Bench, RigClient], faul
     assert injected["ok"], injected
     event = client.wait_finished(fault, timeout_s=20)
     check_kept(event, "fault")
-    assert FAULTS[fault] in event["reason"]
+    assert any(words in event["reason"] for words in FAULTS[fault]), event["reason"]
     felt = control(bench.emulator.ready["control"], {"cmd": "pulses", "since": 0})["pulses"]
     # real milliseconds from the fault to the last pulse: watch period, plus slack for a shared machine
     late_ms = [1e3 * (p["monotonic_s"] - injected["monotonic_s"]) for p in felt]
     assert max(late_ms) < 250, max(late_ms)
     status = client.wait_state("latched")
-    assert FAULTS[fault] in status["reason"]
+    assert status["reason"] == event["reason"]
     refused = client.ask("start", plan=short_plan("refused"))
     assert refused["problem"]["code"] == "latched"
     bench.fault(cmd="fault", name=fault, on=False)
