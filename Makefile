@@ -17,7 +17,7 @@ serve: setup ## service and page on 127.0.0.1:8000 (emulated rig unless RIG=file
 	@$(BIN)/stimrig serve $(if $(RIG),--rig $(RIG))
 
 test: setup-test lint ## every check and every test
-	@$(BIN)/python -m pytest $(PYTEST_ARGS)
+	@$(BIN)/python -m $(if $(PYTEST_ARGS),pytest $(PYTEST_ARGS),tests)
 
 lint: setup-test ## style, types, layers
 	@echo "== ruff"; $(BIN)/ruff check . ; $(BIN)/ruff format --check .
