@@ -12,7 +12,8 @@ import threading
 import time
 
 SIDE_BY_SIDE = {
-    "api": ("-m", "not wire", "tests/api"),
+    "api": ("-m", "not wire and not browser", "tests/api"),
+    "pages": ("-m", "not wire and browser", "tests/api"),
     "rest": ("-m", "not wire", "tests", "--ignore=tests/api"),
 }
 ALONE = {"wire": ("-m", "wire", "tests")}
