@@ -18,6 +18,8 @@ RATE_WINDOW_S = 3.0
 """Real seconds over which the rate is taken: a hiccup of the host of 60 ms is then 2 %."""
 RATE_TOLERANCE = 0.035
 HOLE_S = 0.06
+BACKLOG_S = 1.0
+"""Real seconds after a hole in which what had piled up meanwhile comes too fast and says nothing of the rate."""
 BIN_S = 0.1
 """Rig seconds of which the earliest block is kept for the rate over the whole test."""
 FASTEST_NM_S = 1000.0
@@ -42,7 +44,8 @@ class Plausible:
 
     def __init__(self, jump_nm: float, stuck_s: float, rate_hz: float, speed: float, noisy: int = 0) -> None:
         self._jump_nm, self._stuck_s, self._rate_hz = jump_nm, stuck_s, rate_hz
-        self._window_s, self._hole_s = RATE_WINDOW_S * speed, HOLE_S * speed
+        self._window_s, self._hole_s, self._backlog_s = RATE_WINDOW_S * speed, HOLE_S * speed, BACKLOG_S * speed
+        self._counts_from_s = -np.inf
         self._last: tuple[float, float] | None = None
         self._noisy = noisy
         self._same_since_s: float | None = None
@@ -56,6 +59,10 @@ class Plausible:
         found = self._jumped(torque_nm, now_s) or self._stuck(torque_nm, now_s) or self._off_rate(samples, now_s)
         self._last = float(torque_nm[-1]), now_s
         return found
+
+    def count_from(self, time_s: float) -> None:
+        """Let what came before say nothing of the rate; from any thread."""
+        self._counts_from_s = time_s
 
     def _jumped(self, torque_nm: NDArray[np.float64], now_s: float) -> str | None:
         before_nm, before_s = self._last or (float(torque_nm[0]), now_s)
@@ -87,11 +94,13 @@ class Plausible:
         number = int(samples["counter"][-1])
         number = number if number >= 0 else self._count
         self._keep_earliest(now_s, number)
-        self._arrived.append((now_s, number))
-        if len(self._arrived) > 1 and now_s - self._arrived[-2][0] > self._hole_s:
-            self._arrived.clear()  # the host or the line stood still: begin anew
+        if self._last is not None and now_s - self._last[1] > self._hole_s:
+            self.count_from(now_s + self._backlog_s)  # the host or the line stood still: begin anew
+        from_s = self._counts_from_s  # looked at once: another thread may set it
+        if now_s < from_s:
             return None
-        while self._arrived[0][0] < now_s - 1.5 * self._window_s:
+        self._arrived.append((now_s, number))
+        while self._arrived[0][0] < max(now_s - 1.5 * self._window_s, from_s):
             self._arrived.popleft()
         first_s, first = self._arrived[0]
         if now_s - first_s < self._window_s:

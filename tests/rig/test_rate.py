@@ -69,6 +69,21 @@ def test_a_rig_that_runs_faster_than_the_world_still_sees_half_a_rate(tmp_path: 
     assert "800 samples/s come" in result.reason
 
 
+@pytest.mark.parametrize(("rate", "told"), [(1.0, False), (1.05, True)])
+def test_what_piled_up_while_the_host_stood_still_is_no_rate(rate: float, told: bool):
+    judge = Plausible(5.0, 1e9, 1600.0, 1.0)
+    arrival_s = [i * 0.01 for i in range(100)]
+    arrival_s += [3.0 + i * 0.002 for i in range(200)]  # two seconds of samples come within 0.4 s
+    arrival_s += [3.4 + i * 0.01 for i in range(600)]
+    found = []
+    for i, now_s in enumerate(arrival_s):
+        block = np.zeros(16, SAMPLE)
+        block["counter"], block["host_time_s"], block["torque_nm"] = -1, now_s / rate, i % 2
+        found.append(judge.wrong(block))
+    assert any(found) == told, [words for words in found if words]
+    assert not any(found[:500])
+
+
 def test_a_cell_without_a_counter_is_judged_by_what_came():
     found = {}
     for rate in (0.9, 1.0):
