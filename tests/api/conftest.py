@@ -118,6 +118,14 @@ def browser() -> Iterator[Any]:
 
 
 @pytest.fixture
+def tab(browser: Any, service: Service) -> Iterator[Any]:
+    """A signed-in tab that takes down every request, error and console message."""
+    from tests.api.browser import open_tab
+
+    yield from open_tab(browser, service)
+
+
+@pytest.fixture
 def client(service: Service) -> Iterator[httpx.Client]:
     """The administrator's client."""
     with service.client() as client:

@@ -29,11 +29,6 @@ def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterat
     yield from run_service(tmp_path_factory.mktemp("axe"), short_dir, STUB, speed=8.0)
 
 
-@pytest.fixture
-def tab(browser: Any, service: Service) -> Iterator[Any]:
-    yield from open_tab(browser, service)
-
-
 def violations(page: Any) -> list[str]:
     """What axe finds, rule by rule, with the elements. The page's own policy keeps foreign scripts out of its world."""
     if not page.evaluate("typeof window.axe === 'object'"):

@@ -23,11 +23,6 @@ def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterat
 
 
 @pytest.fixture
-def tab(browser: Any, service: Service) -> Iterator[Any]:
-    yield from open_tab(browser, service)
-
-
-@pytest.fixture
 def blank(browser: Any, service: Service) -> Iterator[Any]:
     """A tab in which nobody has signed in."""
     yield from open_tab(browser, service, signed_in=False)

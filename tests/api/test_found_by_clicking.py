@@ -12,7 +12,7 @@ from urllib.parse import urlsplit
 import pytest
 
 from api.fitting import WORKER
-from tests.api.browser import PASSWORD, open_tab, participant
+from tests.api.browser import PASSWORD, participant
 from tests.api.conftest import Service, run_service
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
@@ -24,11 +24,6 @@ PATIENCE_MS = 100_000
 @pytest.fixture(scope="module")
 def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
     yield from run_service(tmp_path_factory.mktemp("clicking"), short_dir, WORKER)
-
-
-@pytest.fixture
-def tab(browser: Any, service: Service) -> Iterator[Any]:
-    yield from open_tab(browser, service)
 
 
 def error_of(row: Any) -> float:

@@ -98,12 +98,17 @@ def test_a_page_that_the_browser_had_kept_is_loaded_anew(tab: Any, service: Serv
     says(tab, "ready")
 
 
-def test_without_an_answer_the_state_is_not_known_within_2_s(tab: Any, service: Service) -> None:
+def without_answers(tab: Any, service: Service) -> None:
+    """A page that has shown the rig's state, on a clock of its own, and hears no more of it."""
     tab.clock.install()
     tab.goto(service.url)
     tab.clock.run_for(600)
     says(tab, "No stimulation ready")
     tab.route("**/rig/now", lambda route: route.abort())
+
+
+def test_without_an_answer_the_state_is_not_known_within_2_s(tab: Any, service: Service) -> None:
+    without_answers(tab, service)
     tab.clock.run_for(2300)  # 2 s, and the page looks every 0.25 s
     assert "Not known" in tab.locator("#rig-state").inner_text()
     assert tab.locator("dd [data-now=torque]").inner_text() == "not known"
@@ -113,11 +118,7 @@ def test_without_an_answer_the_state_is_not_known_within_2_s(tab: Any, service: 
 
 
 def test_after_a_sleep_nothing_old_is_shown_as_current(tab: Any, service: Service) -> None:
-    tab.clock.install()
-    tab.goto(service.url)
-    tab.clock.run_for(600)
-    says(tab, "No stimulation ready")
-    tab.route("**/rig/now", lambda route: route.abort())  # the line has not come back yet
+    without_answers(tab, service)  # the line has not come back yet
     tab.clock.fast_forward("01:00:00")
     assert "Not known" in tab.locator("#rig-state").inner_text()
 

@@ -22,12 +22,6 @@ def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterat
     yield from run_service(tmp_path_factory.mktemp("page"), short_dir, STUB, speed=8.0)
 
 
-@pytest.fixture
-def tab(browser: Any, service: Service) -> Iterator[Any]:
-    """A signed-in tab that takes down every request, error and console message."""
-    yield from open_tab(browser, service)
-
-
 def test_a_clinicians_whole_way(tab: Any, service: Service) -> None:
     service.rig.speed = 4.0
     participant(tab, service, "P100")

@@ -14,18 +14,13 @@ import pytest
 
 from api.pages import charts
 from api.recorded import recorded
-from tests.api.browser import open_tab, participant, start
+from tests.api.browser import participant, start
 from tests.api.conftest import STUB, Service, run_service
 
 
 @pytest.fixture(scope="module")
 def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
     yield from run_service(tmp_path_factory.mktemp("stopped"), short_dir, STUB, speed=0.5)
-
-
-@pytest.fixture
-def tab(browser: Any, service: Service) -> Iterator[Any]:
-    yield from open_tab(browser, service)
 
 
 def stops(service: Service) -> int:
