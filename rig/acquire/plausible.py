@@ -19,7 +19,7 @@ RATE_WINDOW_S = 3.0
 RATE_TOLERANCE = 0.035
 HOLE_S = 0.06
 BACKLOG_S = 1.0
-"""Real seconds after a hole in which what had piled up meanwhile comes too fast and says nothing of the rate."""
+"""After a hole, what had piled up comes too fast: for so many real seconds nothing is counted."""
 BIN_S = 0.1
 """Rig seconds of which the earliest block is kept for the rate over the whole test."""
 FASTEST_NM_S = 1000.0

@@ -195,7 +195,7 @@ def warnings(recording: assembly.Recording) -> list[str]:
     return found
 
 
-def _disturbed_line(recording: archive.Recording) -> list[str]:
+def _disturbed_line(recording: assembly.Recording) -> list[str]:
     """Pulses that the stimulator acknowledged late, or that nobody sent, and those that were dropped meanwhile."""
     named = [event.get("event") for event in recording.events]
     late_s = [event["delay_s"] for event in recording.events if event.get("event") == "late_ack"]
