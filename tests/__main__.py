@@ -19,8 +19,12 @@ SIDE_BY_SIDE = {
 ALONE = {"wire": ("-m", "wire", "tests")}
 
 
-def run(lanes: dict[str, tuple[str, ...]]) -> dict[str, int]:
-    """Start all lanes, print what they print as it comes, return their exit codes."""
+TELLING = ("FAILED ", "ERROR ", "E  ")
+"""How the lines begin that say what failed: printed once more at the end, where people look first."""
+
+
+def run(lanes: dict[str, tuple[str, ...]], failures: list[str]) -> dict[str, int]:
+    """Start all lanes, print what they print as it comes, add what failed, return their exit codes."""
     codes = dict.fromkeys(lanes, 1)  # until it is known to be another
 
     def follow(name: str, arguments: tuple[str, ...]) -> None:
@@ -31,6 +35,8 @@ def run(lanes: dict[str, tuple[str, ...]]) -> dict[str, int]:
             assert process.stdout is not None
             for line in process.stdout:
                 print(f"[{name}] {line}", end="", flush=True)
+                if line.startswith(TELLING):
+                    failures.append(f"[{name}] {line.rstrip():.300}")
         codes[name] = process.returncode
 
     threads = [threading.Thread(target=follow, args=lane) for lane in lanes.items()]
@@ -44,7 +50,9 @@ def run(lanes: dict[str, tuple[str, ...]]) -> dict[str, int]:
 def main() -> int:
     """Exit code 0 only if each lane ran tests and all of them passed."""
     began_s = time.monotonic()
-    codes = run(SIDE_BY_SIDE) | run(ALONE)
+    failures: list[str] = []
+    codes = run(SIDE_BY_SIDE, failures) | run(ALONE, failures)
+    print("\n".join(failures[-40:]))
     print(f"{time.monotonic() - began_s:.0f} s; exit codes {codes}")
     return 0 if set(codes.values()) == {0} else 1
 

@@ -6,7 +6,8 @@ muscle here; the identification sees those.
 
 from __future__ import annotations
 
-from collections import deque
+import sys
+from bisect import bisect_left, bisect_right
 from typing import Any
 
 import numpy as np
@@ -15,13 +16,12 @@ from numpy.typing import NDArray
 from rig.align import robust_rate
 
 RATE_WINDOW_S = 3.0
-"""Real seconds over which the rate is taken: a hiccup of the host of 60 ms is then 2 %."""
+"""Real seconds over which the rate is taken, between the promptest blocks of its first and last third."""
 RATE_TOLERANCE = 0.035
 HOLE_S = 0.06
-BACKLOG_S = 1.0
-"""After a hole, what had piled up comes too fast: for so many real seconds nothing is counted."""
+"""A host or line that stood still for longer leaves a backlog; it is read in less time than it took to pile up."""
 BIN_S = 0.1
-"""Rig seconds of which the earliest block is kept for the rate over the whole test."""
+"""Rig seconds of which the promptest block is kept for the rate."""
 FASTEST_NM_S = 1000.0
 
 
@@ -44,14 +44,14 @@ class Plausible:
 
     def __init__(self, jump_nm: float, stuck_s: float, rate_hz: float, speed: float, noisy: int = 0) -> None:
         self._jump_nm, self._stuck_s, self._rate_hz = jump_nm, stuck_s, rate_hz
-        self._window_s, self._hole_s, self._backlog_s = RATE_WINDOW_S * speed, HOLE_S * speed, BACKLOG_S * speed
-        self._counts_from_s = -np.inf
+        self._window_s, self._hole_s = RATE_WINDOW_S * speed, HOLE_S * speed
+        self._piled_until_s = -np.inf
         self._last: tuple[float, float] | None = None
         self._noisy = noisy
         self._same_since_s: float | None = None
-        self._arrived: deque[tuple[float, int]] = deque()
         self._count = 0
-        self._earliest: list[tuple[float, int]] = []
+        self._first_s: float | None = None
+        self._prompt: list[tuple[float, int]] = []
 
     def wrong(self, samples: NDArray[Any]) -> str | None:
         """What is wrong with this block, None if nothing is."""
@@ -59,10 +59,6 @@ class Plausible:
         found = self._jumped(torque_nm, now_s) or self._stuck(torque_nm, now_s) or self._off_rate(samples, now_s)
         self._last = float(torque_nm[-1]), now_s
         return found
-
-    def count_from(self, time_s: float) -> None:
-        """Let what came before say nothing of the rate; from any thread."""
-        self._counts_from_s = time_s
 
     def _jumped(self, torque_nm: NDArray[np.float64], now_s: float) -> str | None:
         before_nm, before_s = self._last or (float(torque_nm[0]), now_s)
@@ -93,29 +89,37 @@ class Plausible:
         self._count += len(samples)
         number = int(samples["counter"][-1])
         number = number if number >= 0 else self._count
-        self._keep_earliest(now_s, number)
-        if self._last is not None and now_s - self._last[1] > self._hole_s:
-            self.count_from(now_s + self._backlog_s)  # the host or the line stood still: begin anew
-        from_s = self._counts_from_s  # looked at once: another thread may set it
-        if now_s < from_s:
+        gap_s = now_s - self._last[1] if self._last is not None else 0.0
+        if gap_s > self._hole_s:
+            self._piled_until_s = max(self._piled_until_s, now_s + gap_s)
+        if now_s < self._piled_until_s:
             return None
-        self._arrived.append((now_s, number))
-        while self._arrived[0][0] < max(now_s - 1.5 * self._window_s, from_s):
-            self._arrived.popleft()
-        first_s, first = self._arrived[0]
-        if now_s - first_s < self._window_s:
+        if self._first_s is None:
+            self._first_s = now_s
+        self._keep_promptest(now_s, number)
+        from_s, third_s = now_s - self._window_s, self._window_s / 3
+        first, last = self._promptest(from_s, from_s + third_s), self._promptest(now_s - third_s, now_s)
+        if now_s - self._first_s < self._window_s or first is None or last is None:
             return None
-        rate_hz = (self._arrived[-1][1] - first) / (now_s - first_s)
+        rate_hz = (last[1] - first[1]) / (last[0] - first[0])
         if abs(rate_hz / self._rate_hz - 1) <= RATE_TOLERANCE:
             return None
         return self._told(rate_hz)
 
-    def _keep_earliest(self, now_s: float, number: int) -> None:
-        """Of each bin of time the block that came with the least delay."""
-        kept = self._earliest
+    def _delay_s(self, block: tuple[float, int]) -> float:
+        """By how much a block came late, up to a constant, if the rate is the nominal one."""
+        return block[0] - block[1] / self._rate_hz
+
+    def _promptest(self, from_s: float, to_s: float) -> tuple[float, int] | None:
+        """The block that came with the least delay: one that piled up, or that a busy host read late, is not it."""
+        low, high = bisect_left(self._prompt, (from_s, 0)), bisect_right(self._prompt, (to_s, sys.maxsize))
+        return min(self._prompt[low:high], key=self._delay_s, default=None)
+
+    def _keep_promptest(self, now_s: float, number: int) -> None:
+        kept = self._prompt
         if not kept or int(kept[-1][0] / BIN_S) != int(now_s / BIN_S):
             kept.append((now_s, number))
-        elif now_s - number / self._rate_hz < kept[-1][0] - kept[-1][1] / self._rate_hz:
+        elif self._delay_s((now_s, number)) < self._delay_s(kept[-1]):
             kept[-1] = now_s, number
 
     def wrong_at_end(self) -> str | None:
@@ -124,7 +128,7 @@ class Plausible:
         The window of `wrong` sees nothing in a test that is shorter, or where the host stood still again and again.
         A host that stood still may bend this line by that much, which is allowed for.
         """
-        kept = np.array(tuple(self._earliest), dtype=float).reshape(-1, 2)
+        kept = np.array(tuple(self._prompt), dtype=float).reshape(-1, 2)
         if len(kept) < 3:
             return None
         rate_hz = robust_rate(kept[:, 1] / self._rate_hz, kept[:, 0]) * self._rate_hz

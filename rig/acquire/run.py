@@ -176,7 +176,6 @@ class TestRun:
                 self._fault("load cell: samples come far faster than the rig file says; check sample_rate_hz and bus")
             if self._clock.wait(self._clock.now_s() + 0.005 * speed, self.halt.event):
                 return False
-        self._plausible.count_from(self._clock.now_s())  # what had piled up before is through
         self._rest_nm = self._receiver.torque_around(0.1 * speed)
         self._gate.open(self._journal, self._table)
         if self.halt.event.is_set():

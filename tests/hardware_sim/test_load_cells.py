@@ -257,8 +257,10 @@ def test_a_pseudo_terminal_that_nobody_reads_never_blocks() -> None:
             text += os.read(reader, 65536)
         except BlockingIOError:
             break
-    lines = text.splitlines()
-    assert lines == [b"%06d" % n for n in range(len(lines))]  # whole messages, in order
+    lines = text.splitlines()  # the kernel may take more while messages are dropped, so there may be holes
+    assert len(lines) > 1000
+    assert all(len(line) == 6 for line in lines)  # whole messages, in order
+    assert sorted(set(lines)) == lines
     os.close(reader)
     port.close()
     port.write(b"x")

@@ -69,19 +69,48 @@ def test_a_rig_that_runs_faster_than_the_world_still_sees_half_a_rate(tmp_path: 
     assert "800 samples/s come" in result.reason
 
 
-@pytest.mark.parametrize(("rate", "told"), [(1.0, False), (1.05, True)])
-def test_what_piled_up_while_the_host_stood_still_is_no_rate(rate: float, told: bool):
+def heard(arrival_s: list[float]) -> list[str | None]:
+    """What is said after each block of 16 samples, given when each of them came."""
     judge = Plausible(5.0, 1e9, 1600.0, 1.0)
-    arrival_s = [i * 0.01 for i in range(100)]
-    arrival_s += [3.0 + i * 0.002 for i in range(200)]  # two seconds of samples come within 0.4 s
-    arrival_s += [3.4 + i * 0.01 for i in range(600)]
     found = []
     for i, now_s in enumerate(arrival_s):
         block = np.zeros(16, SAMPLE)
-        block["counter"], block["host_time_s"], block["torque_nm"] = -1, now_s / rate, i % 2
+        block["counter"], block["host_time_s"], block["torque_nm"] = -1, now_s, i % 2
         found.append(judge.wrong(block))
-    assert any(found) == told, [words for words in found if words]
-    assert not any(found[:500])
+    return found
+
+
+@pytest.mark.parametrize("still_s", [0.07, 0.3, 2.0])
+@pytest.mark.parametrize("began_s", [0.0, 1.0, 2.9, 3.5])
+def test_what_piled_up_while_the_host_stood_still_is_no_rate(began_s: float, still_s: float):
+    before_s = [i * 0.01 for i in range(int(began_s * 100))]
+    piled = int(still_s * 100 * 1.25)
+    piled_s = [began_s + still_s + i * 0.002 for i in range(piled)]  # until all that piled up is read
+    after_s = [began_s + 0.01 * (piled + i) for i in range(800)]
+    assert not any(heard(before_s + piled_s + after_s))
+
+
+@pytest.mark.parametrize("every_s", [0.5, 1.5, 3.5])
+@pytest.mark.parametrize("rate", [0.5, 0.95, 1.0, 1.05, 2.0])
+def test_holes_again_and_again_hide_no_rate(rate: float, every_s: float):
+    due_s = [i * 0.01 / rate for i in range(int(1200 * rate))]
+    held_s = [max(t_s, every_s * (t_s // every_s) + 0.07) for t_s in due_s]  # then all at once
+    told = [(t_s, words) for t_s, words in zip(held_s, heard(held_s), strict=True) if words]
+    if rate == 1.0:
+        assert told == []
+        return
+    at_s, words = told[0]
+    assert at_s < 4.0
+    assert float(words.split()[2]) == pytest.approx(1600 * rate, rel=0.01), words
+
+
+@pytest.mark.parametrize("every_s", [1.5, 3.5, 100.0])
+@pytest.mark.parametrize("rate", [0.5, 0.94, 1.06])
+def test_a_rate_that_changes_in_the_test_is_told(rate: float, every_s: float):
+    due_s = [i * 0.01 for i in range(800)] + [8.0 + i * 0.01 / rate for i in range(500)]
+    held_s = [max(t_s, every_s * (t_s // every_s) + 0.07) for t_s in due_s]
+    told_s = [t_s for t_s, words in zip(held_s, heard(held_s), strict=True) if words]
+    assert 8.0 < told_s[0] < 12.0
 
 
 def test_a_cell_without_a_counter_is_judged_by_what_came():

@@ -55,7 +55,8 @@ def test_from_ready_to_ready_with_a_sealed_file(make: Make):
     assert finished is not None
     assert (finished.outcome, finished.reason) == ("completed", "")
     assert finished in live.events
-    assert finished.summary["warnings"] == []
+    slow_machine = "stimulator: "  # acknowledgements read late: told, and no fault of the rig's
+    assert [words for words in finished.summary["warnings"] if not words.startswith(slow_machine)] == []
     with h5py.File(str(finished.recording_path)) as file:
         assert file.attrs["test_id"] == "one"
     with pytest.raises(PlanError, match="used before"):
