@@ -21,6 +21,8 @@ MEDIAN_EFFICIENCY = 1.2533
 MAX_POINTS = 400
 MISFIT_WINDOWS = 8
 COARSE_MISFIT_S = 0.005
+BELIEVED_RATES = 0.25, 4.0
+"""No two clocks differ by more: then samples of seconds came in a moment, and the rate is not known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,13 +112,15 @@ def _robust_line(cell_s: Array, host_s: Array) -> _Line:
     centre_s = float(np.mean(cell_s))
     lead_s = host_s - cell_s
     chosen = np.unique(np.linspace(0, len(cell_s) - 1, min(len(cell_s), MAX_POINTS)).round().astype(int))
-    slope = 0.0
+    slope, known = 0.0, True
     if np.ptp(cell_s[chosen]) > 0 and len(chosen) >= 3:
         slope = _median_slope(cell_s[chosen], lead_s[chosen])
+        known = BELIEVED_RATES[0] <= 1 + slope <= BELIEVED_RATES[1]
+        slope = slope if known else 0.0
     residual_s = lead_s - slope * (cell_s - centre_s)
-    offset_s = float(np.median(residual_s))
+    offset_s = float(np.median(residual_s)) if known else float(np.min(residual_s))  # none came before it was taken
     spread_s = 1.4826 * float(np.median(np.abs(residual_s - offset_s)))
-    error_s = MEDIAN_EFFICIENCY * spread_s / np.sqrt(len(cell_s))
+    error_s = MEDIAN_EFFICIENCY * spread_s / np.sqrt(len(cell_s)) if known else np.nan
     return _Line(offset_s, 1 + slope, centre_s, float(error_s))
 
 
@@ -148,7 +152,8 @@ def robust_rate(cell_s: Array, host_s: Array) -> float:
     Parameters
     ----------
     cell_s, host_s
-        As `align` takes them, a few hundred at most being looked at; 1 where fewer than three are given.
+        As `align` takes them, a few hundred at most being looked at; 1 where fewer than three are given or the rate is
+        not known.
     """
     return 1 / _robust_line(cell_s, host_s).rate
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rig.align import align, cell_time
+from rig.align import align, cell_time, robust_rate
 
 RATE_HZ = 1600.0
 
@@ -127,3 +127,15 @@ def test_a_host_that_falls_behind_does_not_mismatch_edges():
         time_s, found = align(cell_s, host_s, flag, written_s, RATE_HZ)
         assert np.max(np.abs(time_s - true_s)) < 1e-3
         assert found.error_ms < 1.0
+
+
+@pytest.mark.parametrize("apart_s", [0.0, 1e-4])
+def test_samples_that_all_came_in_a_moment_say_nothing_of_the_rate(apart_s: float):
+    cell_s = np.arange(3200) / 1600.0
+    host_s = 2.0 + apart_s * np.repeat(np.arange(4), 800)
+    time_s, alignment = align(cell_s, host_s, np.full(3200, 255, np.uint8), np.zeros(0), 1600.0)
+    assert np.isnan(alignment.error_ms)
+    assert alignment.rate_ppm == 0.0
+    assert np.diff(time_s) == pytest.approx(1 / 1600.0)
+    assert time_s[-1] == pytest.approx(2.0, abs=1e-3)
+    assert robust_rate(cell_s, host_s) == 1.0

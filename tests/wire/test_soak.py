@@ -8,7 +8,7 @@ import pytest
 
 from bench.soak import soak
 
-MINUTES = float(os.environ.get("STIMRIG_SOAK_MINUTES", "3"))
+MINUTES = float(os.environ.get("STIMRIG_SOAK_MINUTES", "2"))
 
 
 @pytest.mark.wire
