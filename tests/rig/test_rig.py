@@ -309,7 +309,7 @@ def test_a_wall_clock_that_jumps_in_a_test_changes_nothing(make: Make, monkeypat
     with h5py.File(str(live.rig.finished.recording_path)) as file:
         times = file["pulses/written_time_s"][:]
         assert 0.4 < times[times == times].min() < times[times == times].max() < 3.0
-        assert file["torque/time_s"][-1] == pytest.approx(3.0, abs=0.5)  # a busy machine reads late; the jumps are hours
+        assert file["torque/time_s"][-1] == pytest.approx(3.0, abs=0.5)  # the jumps are of hours
 
 
 WILD: dict[str, list[float]] = {
