@@ -112,7 +112,7 @@ def _robust_line(cell_s: Array, host_s: Array) -> _Line:
     centre_s = float(np.mean(cell_s))
     lead_s = host_s - cell_s
     chosen = np.unique(np.linspace(0, len(cell_s) - 1, min(len(cell_s), MAX_POINTS)).round().astype(int))
-    slope, known = 0.0, True
+    slope, known = 0.0, False
     if np.ptp(cell_s[chosen]) > 0 and len(chosen) >= 3:
         slope = _median_slope(cell_s[chosen], lead_s[chosen])
         known = BELIEVED_RATES[0] <= 1 + slope <= BELIEVED_RATES[1]
@@ -137,25 +137,13 @@ def _misfit(line: _Line, cell_s: Array, host_s: Array) -> float:
     What medians of so few points scatter by themselves is not counted.
     """
     residual_s = host_s - line.at(cell_s)
-    parts = [part for part in np.array_split(residual_s, MISFIT_WINDOWS) if len(part) >= 5]
+    parts = np.array_split(residual_s, int(np.clip(len(residual_s) // 5, 1, MISFIT_WINDOWS)))
     if len(parts) < 3:
         return 0.0
     worst_s = max(abs(float(np.median(part))) for part in parts)
     scatter_s = 1.4826 * float(np.median([np.median(np.abs(part - np.median(part))) for part in parts]))
     by_chance_s = 3.0 * MEDIAN_EFFICIENCY * scatter_s / np.sqrt(min(len(part) for part in parts))
     return max(0.0, worst_s - by_chance_s)
-
-
-def robust_rate(cell_s: Array, host_s: Array) -> float:
-    """Seconds of the cell's own clock a second of the host's; of the points up to a quarter may be far off.
-
-    Parameters
-    ----------
-    cell_s, host_s
-        As `align` takes them, a few hundred at most being looked at; 1 where fewer than three are given or the rate is
-        not known.
-    """
-    return 1 / _robust_line(cell_s, host_s).rate
 
 
 def _lower_envelope(cell_s: Array, host_s: Array) -> _Line:

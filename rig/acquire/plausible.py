@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.align import robust_rate
-
 RATE_WINDOW_S = 3.0
 """Real seconds over which the rate is taken, between the promptest blocks of its first and last third."""
 RATE_TOLERANCE = 0.035
-HOLE_S = 0.06
-"""A host or line that stood still for longer leaves a backlog; it is read in less time than it took to pile up."""
+JITTER_S = 0.06
+"""How late even the promptest block of a third of a test may come."""
+STANDSTILL_S = 0.3
+"""A host or line that stood still for longer may leave a third of the window without a prompt block: begin anew."""
 BIN_S = 0.1
 """Rig seconds of which the promptest block is kept for the rate."""
 FASTEST_NM_S = 1000.0
@@ -44,13 +44,15 @@ class Plausible:
 
     def __init__(self, jump_nm: float, stuck_s: float, rate_hz: float, speed: float, noisy: int = 0) -> None:
         self._jump_nm, self._stuck_s, self._rate_hz = jump_nm, stuck_s, rate_hz
-        self._window_s, self._hole_s = RATE_WINDOW_S * speed, HOLE_S * speed
-        self._piled_until_s = -np.inf
+        self._window_s, self._jitter_s, self._standstill_s = (
+            real_s * speed for real_s in (RATE_WINDOW_S, JITTER_S, STANDSTILL_S)
+        )
+        self._longest_s = 0.0
         self._last: tuple[float, float] | None = None
         self._noisy = noisy
         self._same_since_s: float | None = None
         self._count = 0
-        self._first_s: float | None = None
+        self._from_s: float | None = None
         self._prompt: list[tuple[float, int]] = []
 
     def wrong(self, samples: NDArray[Any]) -> str | None:
@@ -89,22 +91,33 @@ class Plausible:
         self._count += len(samples)
         number = int(samples["counter"][-1])
         number = number if number >= 0 else self._count
-        gap_s = now_s - self._last[1] if self._last is not None else 0.0
-        if gap_s > self._hole_s:
-            self._piled_until_s = max(self._piled_until_s, now_s + gap_s)
-        if now_s < self._piled_until_s:
-            return None
-        if self._first_s is None:
-            self._first_s = now_s
         self._keep_promptest(now_s, number)
-        from_s, third_s = now_s - self._window_s, self._window_s / 3
-        first, last = self._promptest(from_s, from_s + third_s), self._promptest(now_s - third_s, now_s)
-        if now_s - self._first_s < self._window_s or first is None or last is None:
+        from_s, third_s = self._counted_from(len(samples), now_s), self._window_s / 3
+        if now_s - from_s < self._window_s:
             return None
-        rate_hz = (last[1] - first[1]) / (last[0] - first[0])
-        if abs(rate_hz / self._rate_hz - 1) <= RATE_TOLERANCE:
+        begin_s = now_s - self._window_s
+        rate_hz = self._rate((begin_s, begin_s + third_s), (now_s - third_s, now_s))
+        if rate_hz is None or abs(rate_hz / self._rate_hz - 1) <= RATE_TOLERANCE:
             return None
         return self._told(rate_hz)
+
+    def _counted_from(self, count: int, now_s: float) -> float:
+        """From when on the rate is counted: anew once what piled up in a standstill is read."""
+        gap_s = 0.0 if self._last is None else now_s - self._last[1]
+        behind_s = gap_s - count / self._rate_hz
+        self._longest_s = max(self._longest_s, behind_s)
+        if self._from_s is None:
+            self._from_s = now_s
+        elif behind_s > self._standstill_s:
+            self._from_s = max(self._from_s + gap_s, now_s) + behind_s
+        return self._from_s
+
+    def _rate(self, early: tuple[float, float], late: tuple[float, float]) -> float | None:
+        """Samples a second between the promptest blocks of two spans of time, s; None where one has no block."""
+        first, last = self._promptest(*early), self._promptest(*late)
+        if first is None or last is None or last[0] <= first[0]:
+            return None
+        return (last[1] - first[1]) / (last[0] - first[0])
 
     def _delay_s(self, block: tuple[float, int]) -> float:
         """By how much a block came late, up to a constant, if the rate is the nominal one."""
@@ -126,14 +139,15 @@ class Plausible:
         """Was the rate over the whole test another than the rig file's? None: no, or too little came to tell.
 
         The window of `wrong` sees nothing in a test that is shorter, or where the host stood still again and again.
-        A host that stood still may bend this line by that much, which is allowed for.
+        The longest standstill may bend this rate by that much, which is allowed for.
         """
-        kept = np.array(tuple(self._prompt), dtype=float).reshape(-1, 2)
-        if len(kept) < 3:
+        if len(self._prompt) < 3:
             return None
-        rate_hz = robust_rate(kept[:, 1] / self._rate_hz, kept[:, 0]) * self._rate_hz
-        tolerance = RATE_TOLERANCE + self._hole_s / float(np.ptp(kept[:, 0]))
-        if abs(rate_hz / self._rate_hz - 1) <= tolerance:
+        begin_s, end_s = self._prompt[0][0], self._prompt[-1][0]
+        third_s = (end_s - begin_s) / 3
+        rate_hz = self._rate((begin_s, begin_s + third_s), (end_s - third_s, end_s))
+        tolerance = RATE_TOLERANCE + max(self._jitter_s, self._longest_s) / (end_s - begin_s)
+        if rate_hz is None or abs(rate_hz / self._rate_hz - 1) <= tolerance:
             return None
         return self._told(rate_hz)
 

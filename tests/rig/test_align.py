@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rig.align import align, cell_time, robust_rate
+from rig.align import align, cell_time
 
 RATE_HZ = 1600.0
 
@@ -138,4 +138,21 @@ def test_samples_that_all_came_in_a_moment_say_nothing_of_the_rate(apart_s: floa
     assert alignment.rate_ppm == 0.0
     assert np.diff(time_s) == pytest.approx(1 / 1600.0)
     assert time_s[-1] == pytest.approx(2.0, abs=1e-3)
-    assert robust_rate(cell_s, host_s) == 1.0
+
+
+@pytest.mark.parametrize("duration_s", [12, 16])
+def test_lost_samples_of_a_cell_without_a_counter_are_not_called_exact(duration_s: int):
+    true_s = np.arange(duration_s * 1600) / 1600.0
+    came = np.abs(true_s - duration_s / 2) > 0.05  # a tenth of a second is lost
+    cell_s = np.arange(came.sum()) / 1600.0
+    host_s = np.ceil(true_s[came] / 0.005) * 0.005 + 0.001
+    time_s, alignment = align(cell_s, host_s, np.full(cell_s.size, 255, np.uint8), np.zeros(0), 1600.0)
+    assert np.max(np.abs(time_s - true_s[came])) > 0.01
+    assert alignment.error_ms > 5.0
+
+
+def test_what_came_in_one_read_is_not_called_exact_however_short():
+    cell_s = np.arange(800) / 1600.0
+    time_s, alignment = align(cell_s, np.full(800, 0.5), np.full(800, 255, np.uint8), np.zeros(0), 1600.0)
+    assert np.isnan(alignment.error_ms)
+    assert time_s[-1] == pytest.approx(0.5, abs=1e-3)
