@@ -22,7 +22,7 @@ MAX_POINTS = 400
 MISFIT_WINDOWS = 8
 COARSE_MISFIT_S = 0.005
 BELIEVED_RATES = 0.25, 4.0
-"""No two clocks differ by more: then samples of seconds came in a moment, and the rate is not known."""
+"""No two clocks differ by more. Outside, samples of seconds were read in a moment: the rate is not known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +118,9 @@ def _robust_line(cell_s: Array, host_s: Array) -> _Line:
         known = BELIEVED_RATES[0] <= 1 + slope <= BELIEVED_RATES[1]
         slope = slope if known else 0.0
     residual_s = lead_s - slope * (cell_s - centre_s)
-    offset_s = float(np.median(residual_s)) if known else float(np.min(residual_s))  # none came before it was taken
+    offset_s = (
+        float(np.median(residual_s)) if known else float(np.min(residual_s))
+    )  # no sample arrives before it is taken
     spread_s = 1.4826 * float(np.median(np.abs(residual_s - offset_s)))
     error_s = MEDIAN_EFFICIENCY * spread_s / np.sqrt(len(cell_s)) if known else np.nan
     return _Line(offset_s, 1 + slope, centre_s, float(error_s))

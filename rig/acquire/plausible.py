@@ -17,9 +17,9 @@ RATE_WINDOW_S = 3.0
 """Real seconds over which the rate is taken, between the promptest blocks of its first and last third."""
 RATE_TOLERANCE = 0.035
 JITTER_S = 0.06
-"""How late even the promptest block of a third of a test may come."""
+"""At the test's end: how late even the promptest block of a third may be, or as late as the longest standstill."""
 STANDSTILL_S = 0.3
-"""A host or line that stood still for longer may leave a third of the window without a prompt block: begin anew."""
+"""After a longer standstill of host or line a third of the window may hold late blocks alone: begin anew."""
 BIN_S = 0.1
 """Rig seconds of which the promptest block is kept for the rate."""
 FASTEST_NM_S = 1000.0
@@ -52,6 +52,7 @@ class Plausible:
         self._noisy = noisy
         self._same_since_s: float | None = None
         self._count = 0
+        self._anew = False
         self._from_s: float | None = None
         self._prompt: list[tuple[float, int]] = []
 
@@ -61,6 +62,10 @@ class Plausible:
         found = self._jumped(torque_nm, now_s) or self._stuck(torque_nm, now_s) or self._off_rate(samples, now_s)
         self._last = float(torque_nm[-1]), now_s
         return found
+
+    def begin(self) -> None:
+        """Let what came before say nothing of the rate: an old backlog may have been read. From any thread."""
+        self._anew = True
 
     def _jumped(self, torque_nm: NDArray[np.float64], now_s: float) -> str | None:
         before_nm, before_s = self._last or (float(torque_nm[0]), now_s)
@@ -88,6 +93,8 @@ class Plausible:
         return f"load cell: its value has stood at exactly {torque_nm[0]:.3f} N·m; it is stuck, check its amplifier"
 
     def _off_rate(self, samples: NDArray[Any], now_s: float) -> str | None:
+        if self._anew:
+            self._anew, self._from_s, self._prompt = False, None, []
         self._count += len(samples)
         number = int(samples["counter"][-1])
         number = number if number >= 0 else self._count
@@ -102,7 +109,7 @@ class Plausible:
         return self._told(rate_hz)
 
     def _counted_from(self, count: int, now_s: float) -> float:
-        """From when on the rate is counted: anew once what piled up in a standstill is read."""
+        """Time from which the rate is counted: after a standstill, when what piled up has been read."""
         gap_s = 0.0 if self._last is None else now_s - self._last[1]
         behind_s = gap_s - count / self._rate_hz
         self._longest_s = max(self._longest_s, behind_s)
@@ -138,7 +145,7 @@ class Plausible:
     def wrong_at_end(self) -> str | None:
         """Was the rate over the whole test another than the rig file's? None: no, or too little came to tell.
 
-        The window of `wrong` sees nothing in a test that is shorter, or where the host stood still again and again.
+        `wrong` says nothing in a test shorter than its window, or where longer standstills follow one another.
         The longest standstill may bend this rate by that much, which is allowed for.
         """
         if len(self._prompt) < 3:

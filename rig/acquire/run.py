@@ -176,6 +176,7 @@ class TestRun:
                 self._fault("load cell: samples come far faster than the rig file says; check sample_rate_hz and bus")
             if self._clock.wait(self._clock.now_s() + 0.005 * speed, self.halt.event):
                 return False
+        self._plausible.begin()
         self._rest_nm = self._receiver.torque_around(0.1 * speed)
         self._gate.open(self._journal, self._table)
         if self.halt.event.is_set():
