@@ -52,7 +52,8 @@ def main() -> int:
     began_s = time.monotonic()
     failures: list[str] = []
     codes = run(SIDE_BY_SIDE, failures) | run(ALONE, failures)
-    print("\n".join(failures[-40:]))
+    if failures:
+        print("\n".join(failures[-40:]))
     print(f"{time.monotonic() - began_s:.0f} s; exit codes {codes}")
     return 0 if set(codes.values()) == {0} else 1
 

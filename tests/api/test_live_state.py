@@ -25,8 +25,8 @@ def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterat
 
 
 @pytest.fixture
-def tab(browser: Any, service: Service) -> Iterator[Any]:
-    yield from open_tab(browser, service)
+def tab(tab: Any, service: Service) -> Iterator[Any]:
+    yield tab
     service.rig.mute, service.rig.cell_speaks, service.rig.mended, service.rig.speed = False, True, True, SPEED
 
 

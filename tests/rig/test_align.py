@@ -140,10 +140,11 @@ def test_samples_that_all_came_in_a_moment_say_nothing_of_the_rate(apart_s: floa
     assert time_s[-1] == pytest.approx(2.0, abs=1e-3)
 
 
+@pytest.mark.parametrize("place", [0.3, 0.5, 0.7])
 @pytest.mark.parametrize("duration_s", [12, 16])
-def test_lost_samples_of_a_cell_without_a_counter_are_not_called_exact(duration_s: int):
+def test_lost_samples_of_a_cell_without_a_counter_are_not_called_exact(duration_s: int, place: float):
     true_s = np.arange(duration_s * 1600) / 1600.0
-    came = np.abs(true_s - duration_s / 2) > 0.05  # a tenth of a second is lost
+    came = np.abs(true_s - duration_s * place) > 0.05  # a tenth of a second is lost
     cell_s = np.arange(came.sum()) / 1600.0
     host_s = np.ceil(true_s[came] / 0.005) * 0.005 + 0.001
     time_s, alignment = align(cell_s, host_s, np.full(cell_s.size, 255, np.uint8), np.zeros(0), 1600.0)

@@ -9,6 +9,7 @@ import pytest
 
 from rig import archive, assembly, journal
 from rig.acquire.plausible import Plausible
+from rig.acquire.receiver import Receiver
 from rig.control.sealing import warnings
 from rig.messages import SegmentPlan
 from rig.signals import SAMPLE
@@ -20,7 +21,7 @@ def hold(duration_s: float) -> list[SegmentPlan]:
 
 
 def restless(rig: VirtualRig) -> None:
-    """70 ms of every second and a half without a sample: longer than a hole, shorter than what counts as silence."""
+    """70 ms of every second and a half without a sample: shorter than what counts as silence."""
     rig.cell.noise_nm = 0.01
     rig.cell.held = lambda now_s: now_s % 1.5 < 0.07
 
@@ -80,14 +81,17 @@ def heard(arrival_s: list[float], size: int = 16) -> list[str | None]:
     return [*found, judge.wrong_at_end()]
 
 
+@pytest.mark.parametrize("rate", [1.0, 1.05])
 @pytest.mark.parametrize("still_s", [0.07, 0.3, 2.0])
 @pytest.mark.parametrize("began_s", [0.0, 1.0, 2.9, 3.5])
-def test_what_piled_up_while_the_host_stood_still_is_no_rate(began_s: float, still_s: float):
+def test_what_piled_up_while_the_host_stood_still_is_no_rate(began_s: float, still_s: float, rate: float):
     before_s = [i * 0.01 for i in range(int(began_s * 100))]
     piled = int(still_s * 100 * 1.25)
     piled_s = [began_s + still_s + i * 0.002 for i in range(piled)]  # until all that piled up is read
     after_s = [began_s + 0.01 * (piled + i) for i in range(800)]
-    assert not any(heard(before_s + piled_s + after_s))
+    told = [words for words in heard([t_s / rate for t_s in before_s + piled_s + after_s]) if words]
+    assert bool(told) == (rate != 1.0)
+    assert all(float(words.split()[2]) == pytest.approx(1600 * rate, rel=0.01) for words in told), told
 
 
 @pytest.mark.parametrize("every_s", [0.5, 1.5, 3.5])
@@ -134,15 +138,57 @@ def test_a_rate_that_changes_in_the_test_is_told(rate: float, every_s: float):
 def test_a_cell_without_a_counter_is_judged_by_what_came():
     found = {}
     for rate in (0.9, 1.0):
-        judge = Plausible(5.0, 1e9, 1600.0, 1.0)
-        for i in range(200):
-            block = np.zeros(16, SAMPLE)
-            block["counter"], block["host_time_s"], block["torque_nm"] = -1, i * 0.01 / rate, i % 2
-            assert judge.wrong(block) is None
-        found[rate] = judge.wrong_at_end()
+        *in_the_test, found[rate] = heard([i * 0.01 / rate for i in range(200)])
+        assert not any(in_the_test)
     assert found[1.0] is None
     assert found[0.9]
     assert "1440 samples/s" in found[0.9]
+
+
+@pytest.mark.parametrize(("duration_s", "step_s"), [(1.0, 0.05), (2.0, 0.12)])
+def test_a_line_that_slows_down_in_a_short_test_is_no_rate(duration_s: float, step_s: float):
+    """It may bend the rate by that much; without such a step the same rate is told."""
+    due_s = [i * 0.01 for i in range(int(duration_s * 100))]
+    assert not any(heard([t_s + step_s * (t_s > 0.65 * duration_s) for t_s in due_s]))
+    stretched = 1 + step_s / (0.65 * duration_s) + 0.06
+    assert heard([t_s * stretched for t_s in due_s])[-1] is not None
+
+
+@pytest.mark.parametrize("holes_s", [[(5.0, 5.3), (5.4, 5.5)], [(5.0, 5.5), (5.6, 6.0)], [(5.0, 5.9), (5.95, 6.85)]])
+def test_a_backlog_that_is_read_slowly_is_no_rate(holes_s: list[tuple[float, float]]):
+    arrival_s: list[float] = []
+    for i in range(1400):
+        ready_s = max(i * 0.01, arrival_s[-1] + 0.004 if arrival_s else 0.0)  # read at 2.5 times the rate
+        arrival_s.append(next((end_s for begin_s, end_s in holes_s if begin_s <= ready_s < end_s), ready_s))
+    assert not any(heard(arrival_s))
+
+
+def test_a_backlog_read_before_the_test_is_no_rate():
+    judge, found = Plausible(5.0, 1e9, 1600.0, 1.0), []
+    for i in range(1000):
+        block = np.zeros(16, SAMPLE)
+        now_s = i * 0.005 if i < 300 else 1.5 + (i - 300) * 0.01  # 1.5 s read at twice the rate
+        block["counter"], block["host_time_s"], block["torque_nm"] = -1, now_s, i % 2
+        if i == 300:
+            judge.begin()
+        found.append(judge.wrong(block))
+    assert not any([*found, judge.wrong_at_end()])
+
+
+def test_a_backlog_read_while_arming_does_not_end_the_test(tmp_path: Path):
+    rig = VirtualRig(tmp_path, hold(8.0))
+    feed = rig.cell.feed
+
+    def slowly(receiver: Receiver, until_s: float) -> None:
+        """For 2 s old samples come at twice the rate: the rig waits for the fresh ones."""
+        rig.cell.rate = 2.0
+        feed(receiver, rig.clock.now_s() + 2.0)
+        rig.cell.rate = 1.0
+        rig.clock.call_at(rig.clock.now_s() + 2.0, lambda: feed(receiver, until_s))
+
+    rig.cell.feed, rig.cell.noise_nm = slowly, 0.01
+    result = rig.execute()
+    assert result.outcome == "completed", result.reason
 
 
 def test_what_came_too_little_is_not_judged():

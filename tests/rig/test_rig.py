@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import h5py
+import numpy as np
 import pytest
 
 from rig import limits
@@ -55,8 +57,8 @@ def test_from_ready_to_ready_with_a_sealed_file(make: Make):
     assert finished is not None
     assert (finished.outcome, finished.reason) == ("completed", "")
     assert finished in live.events
-    busy = ("acknowledgements came late", "stood still")  # told of a busy machine, and no fault of the rig's
-    assert [told for told in finished.summary["warnings"] if not any(words in told for words in busy)] == []
+    busy = re.compile(r"acknowledgements came late|alignment's error is \d")  # of a busy machine, no fault of the rig's
+    assert [words for words in finished.summary["warnings"] if not busy.search(words)] == []
     with h5py.File(str(finished.recording_path)) as file:
         assert file.attrs["test_id"] == "one"
     with pytest.raises(PlanError, match="used before"):
@@ -309,6 +311,8 @@ def test_a_wall_clock_that_jumps_in_a_test_changes_nothing(make: Make, monkeypat
     with h5py.File(str(live.rig.finished.recording_path)) as file:
         times = file["pulses/written_time_s"][:]
         assert 0.4 < times[times == times].min() < times[times == times].max() < 3.0
+        assert np.all(np.diff(times[times == times]) > 0)
+        assert np.diff(file["torque/time_s"][:]) == pytest.approx(1 / 1600, rel=0.02)
         assert file["torque/time_s"][-1] == pytest.approx(3.0, abs=0.5)  # the jumps are of hours
 
 
