@@ -17,7 +17,7 @@ from typing import Any
 
 from bench.faults_cases import CASES, WINDOW_S, Case, plan_of
 from bench.faults_judge import Verdict, judge_file, judge_intervals, judge_outcome, judge_times
-from tests.wire.processes import Bench, RigClient, busy_process, control, default_plan, kill_hard
+from tests.wire.processes import CLINIC_WATCH, Bench, RigClient, busy_process, control, default_plan, kill_hard
 
 DISK_MB = 96
 MODULE = "bench.faults_host"
@@ -318,7 +318,7 @@ class Worker:
 
     def _rig_on(self) -> RigClient:
         assert self.bench is not None
-        client = self.bench.start_rig(module=MODULE)
+        client = self.bench.start_rig(module=MODULE, watch=CLINIC_WATCH)
         client.ask("subscribe")
         return client
 

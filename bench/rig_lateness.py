@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.soak import fitting_one
-from tests.wire.processes import Bench, busy_process, default_plan
+from tests.wire.processes import CLINIC_WATCH, Bench, busy_process, default_plan
 
 
 def measure(busy: int, tests: int, emulator_options: list[str], fit: bool = False) -> list[dict[str, Any]]:
@@ -23,7 +23,7 @@ def measure(busy: int, tests: int, emulator_options: list[str], fit: bool = Fals
     with tempfile.TemporaryDirectory(prefix="rig-bench-") as folder, contextlib.ExitStack() as stack:
         bench = Bench(Path(folder), *emulator_options)
         stack.callback(bench.close)
-        client = bench.start_rig()
+        client = bench.start_rig(watch=CLINIC_WATCH)
         client.ask("subscribe")
         stack.enter_context(fitting_one(bench, client, fit))
         for _ in range(busy):

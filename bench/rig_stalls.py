@@ -26,7 +26,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from tests.wire.processes import Bench, RigClient, default_plan
+from tests.wire.processes import CLINIC_WATCH, Bench, RigClient, default_plan
 
 INTERVAL_S = 0.008
 """Shortest interval at the electrode: written down here again on purpose."""
@@ -80,7 +80,7 @@ class Rig:
 
     def __init__(self, folder: Path, stimulator: str) -> None:
         self.bench = Bench(folder, "--stimulator", stimulator, "--noise-seed", "3")
-        self.client: RigClient = self.bench.start_rig()
+        self.client: RigClient = self.bench.start_rig(watch=CLINIC_WATCH)
         self.client.ask("subscribe")
         self.other = self.bench.client()
         self._number = 0

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from bench.soak import fitting_one
-from tests.wire.processes import Bench, busy_process, control, default_plan
+from tests.wire.processes import CLINIC_WATCH, Bench, busy_process, control, default_plan
 
 STEPS = [
     {"name": "rest", "sequence": "rest", "settings": {"duration_s": 1.0}},
@@ -31,7 +31,7 @@ def measure(busy: int, stops: int, fit: bool = False) -> tuple[list[float], list
     with tempfile.TemporaryDirectory(prefix="rig-bench-") as folder, contextlib.ExitStack() as stack:
         bench = Bench(Path(folder))
         stack.callback(bench.close)
-        client = bench.start_rig()
+        client = bench.start_rig(watch=CLINIC_WATCH)
         client.ask("subscribe")
         stack.enter_context(fitting_one(bench, client, fit))
         for _ in range(busy):

@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from tests.wire.processes import ROOT, Bench, RigClient, control, default_plan
+from tests.wire.processes import CLINIC_WATCH, ROOT, Bench, RigClient, control, default_plan
 
 FITTER = """
 import sys, time
@@ -95,7 +95,7 @@ def soak(minutes: float, every_minutes: float, fit: bool = True, patient: bool =
     with tempfile.TemporaryDirectory(prefix="rig-soak-") as folder:
         bench = Bench(Path(folder))
         try:
-            client = bench.start_patient_rig() if patient else bench.start_rig()
+            client = bench.start_rig(watch=None if patient else CLINIC_WATCH)
             client.ask("subscribe")
             with fitting(bench.data / "recordings", fit) as fits:
                 return _session(bench, client, minutes, every_minutes) | {"fits_beside": len(fits)}

@@ -142,13 +142,16 @@ EMULATED_CELLS: dict[str, Callable[[int], dict[str, Any]]] = {
     "canopen": lambda _: {"start_frames": ["000#0101"], "stop_frames": ["000#0201"]},
 }
 """How a rig file describes the emulator's cells, by their names and samples a frame."""
+EMULATOR_WATCH = {"stale_torque_s": 0.5, "missing_ack_s": 0.5}
+"""Nobody sits at an emulator, and it shares its processors with whatever else runs: a laptop's pause of 0.1 s, which
+would stop a rig that drives a person, does not end a demo."""
 
 
 def for_emulator(ready: str, **overrides: Any) -> RigConfig:
     """A rig on the emulator's devices, from the JSON line that it prints (or a file holding that line).
 
-    The line may set the clock's speed and asks for no calibration, so it must not lead to a real stimulator: its port
-    is a pseudo-terminal.
+    The line may set the clock's speed and the watch, and asks for no calibration, so it must not lead to a real
+    stimulator: its port is a pseudo-terminal.
 
     Raises
     ------
@@ -174,6 +177,7 @@ def for_emulator(ready: str, **overrides: Any) -> RigConfig:
     content: dict[str, Any] = {
         "clock_speed": line.get("speed", 1.0),
         "require_calibration": False,  # nobody sits at an emulator
+        "watch": line.get("watch", EMULATOR_WATCH),
         "stimulator": {"device": line.get("stimulator_device", "p24"), "port": stimulator},
         "load_cell": {
             "device": "can_load_cell",

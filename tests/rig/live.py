@@ -142,9 +142,7 @@ class LiveRig:
         made = {"stimulator": self.stimulator, "load_cell": self.cell}
         found = SimpleNamespace(find=lambda kind, _: SimpleNamespace(create=lambda _settings, _clock: made[kind]))
         monkeypatch.setattr(pair, "devices", found)
-        settings = config.for_emulator(json.dumps(LINE), data_dir=folder, socket=folder / "s")
-        patient = config.WatchSettings(stale_torque_s=0.5, missing_ack_s=0.5)  # pyright: ignore[reportCallIssue]
-        self.config = settings.model_copy(update={"watch": patient})  # this process has no priority over others
+        self.config = config.for_emulator(json.dumps(LINE), data_dir=folder, socket=folder / "s")
         self.cell.rate, self.stimulator.armed = rate, armed
         self.events: list[Event] = []
         self.rig = Rig(self.config, self.clock, self.events.append)

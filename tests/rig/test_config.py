@@ -116,6 +116,7 @@ def test_the_emulators_line(tmp_path: Path):
     where = {"data_dir": tmp_path, "socket": tmp_path / "s"}
     loaded = config.for_emulator(line, **where)
     assert loaded.clock_speed == 5
+    assert loaded.watch.model_dump() | config.EMULATOR_WATCH == loaded.watch.model_dump()
     assert loaded.stimulator.model_dump()["port"] == "/dev/pts/3"
     (tmp_path / "ready.json").write_text(line)
     assert config.for_emulator(str(tmp_path / "ready.json"), **where) == loaded

@@ -19,17 +19,8 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 READY_TIMEOUT_S = 30.0
-RIG_FILE = """
-require_calibration = false
-[stimulator]
-device = "p24"
-port = "{stimulator}"
-[load_cell]
-device = "can_load_cell"
-bus = {{ interface = "{interface}", host = "{host}", port = {port}, channel = "{channel}" }}
-[watch]
-stale_torque_s = 0.5
-"""
+CLINIC_WATCH: dict[str, float] = {}
+"""The watch of a rig file that says nothing of it: for benches that measure how soon silence stops a test."""
 
 
 class Process:
@@ -172,24 +163,16 @@ class Bench:
         self.rig: Process | None = None
         self._clients: list[RigClient] = []
 
-    def start_rig(self, *options: str, module: str = "rig") -> RigClient:
-        """Start the rig and connect to it; `module` is what runs it, for benches that break its host."""
-        speed = f"{self.speed:g}"
-        return self._start(module, "--emulator-json", json.dumps(self.emulator.ready), "--clock-speed", speed, *options)
+    def start_rig(self, *options: str, module: str = "rig", watch: dict[str, float] | None = None) -> RigClient:
+        """Start the rig and connect to it.
 
-    def start_patient_rig(self) -> RigClient:
-        """A rig that waits half a second for a torque sample before it calls it stale, on a P24 at the world's speed.
-
-        For tests of something else than time: a busy machine does not end them.
+        `module` is what runs it, for benches that break its host; `watch` takes the place of an emulated rig's, which
+        waits half a second, so that a busy machine does not end a test of something else than time.
         """
-        assert self.speed == 1.0, "a rig file has no clock speed"
-        path = self.folder / "rig.toml"
-        path.write_text(RIG_FILE.format(stimulator=self.emulator.ready["stimulator"], **self.emulator.ready["can"]))
-        return self._start("rig", "--config", str(path))
-
-    def _start(self, module: str, *options: str) -> RigClient:
+        ready = self.emulator.ready if watch is None else {**self.emulator.ready, "watch": watch}
+        source = ("--emulator-json", json.dumps(ready), "--clock-speed", f"{self.speed:g}")
         places = ("--data", str(self.data), "--socket", str(self.socket))
-        self.rig = Process(module, *options, *places, log=self.folder / "rig.log")
+        self.rig = Process(module, *source, *options, *places, log=self.folder / "rig.log")
         return self.client()
 
     def client(self) -> RigClient:

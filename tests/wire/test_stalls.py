@@ -35,7 +35,7 @@ def test_a_stalled_line_lets_go_one_pulse_at_most(stimulator: str):
 def test_a_line_that_doubles_a_command_is_not_gone_on_with(make_bench: Callable[..., Bench]):
     """Two pulses of one cannot be prevented here: it is seen by its acks, and stays at that."""
     bench = make_bench("--noise-seed", "7", speed=1.0)
-    client = bench.start_patient_rig()
+    client = bench.start_rig()
     client.ask("subscribe")
     event, felt = doubled(bench, client, "doubled")
     assert event["outcome"] == "fault"
