@@ -13,8 +13,8 @@ DECAY_S = 3.0
 NEAR_REST_NM = 0.5
 AROUND_S = 0.05
 """Real seconds over which a torque's median is taken."""
-SILENT_S = 0.2
-"""Real seconds to wait for a torque at all."""
+SILENT_S = 0.4
+"""Real seconds to wait for a torque at all: a host that pauses for a tenth of a second has its backlog read by then."""
 ATTEMPTS = 2
 
 
