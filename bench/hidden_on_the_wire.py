@@ -38,14 +38,15 @@ def play(client: httpx.Client) -> dict[str, Any]:
     """The whole path; nothing in it knows the seed."""
     ensure_participant(client, PARTICIPANT)
     test = run_test(client, PARTICIPANT)
-    model = test["model_id"]
+    model, tests = test["model_id"], [test]
     found = checked(client.get(f"/v1/models/{model}/diagnosis")).json()
     steps = [summary(client, model)]
     first, experiment = found, None
     if found["verdict"] == "effect_missing" and found.get("experiment"):
         experiment = found["experiment"]
         body = {"kind": "next-experiment", "segments": experiment["segments"], "joins": model}
-        model = run_test(client, PARTICIPANT, **body)["model_id"]
+        tests.append(run_test(client, PARTICIPANT, **body))
+        model = tests[-1]["model_id"]
         found = checked(client.get(f"/v1/models/{model}/diagnosis")).json()
         steps.append(summary(client, model))
     if found["verdict"] == "effect_missing":
@@ -61,7 +62,16 @@ def play(client: httpx.Client) -> dict[str, Any]:
         "named_before_experiment": [entry["effect"] for entry in first["missing"]],
         "experiment": experiment and experiment["text"],
         "steps": steps,
-        "lateness_ms": (test.get("summary") or {}).get("lateness_ms"),
+        **punctuality([each["summary"] for each in tests]),
+    }
+
+
+def punctuality(summaries: list[dict[str, Any]]) -> dict[str, Any]:
+    """How late pulses were in the worst of the tests, and how many were dropped in all."""
+    late = [each["lateness_ms"] for each in summaries]
+    return {
+        "lateness_ms": {key: max(each[key] for each in late) for key in ("median", "p99", "max")},
+        "dropped_pulses": sum(each["dropped_pulses"] for each in summaries),
     }
 
 
@@ -133,7 +143,8 @@ def main() -> None:
             f"{seed}  hidden {hidden} ({row['strength']}{', outside' if row['outside_library'] else ''})  "
             f"verdict {row['verdict']}: {', '.join(row['named']) or '-'}  before the experiment "
             f"{', '.join(row['named_before_experiment']) or '-'}  error/noise {row['times_noise']}  "
-            f"pulses late {row['lateness_ms']} ms  {'agrees' if row['agrees'] else 'DIFFERS'}",
+            f"pulses late {row['lateness_ms']} ms, {row['dropped_pulses']} dropped  "
+            f"{'agrees' if row['agrees'] else 'DIFFERS'}",
             flush=True,
         )
     print(f"{sum(row['agrees'] for row in rows)} of {len(rows)} agree")

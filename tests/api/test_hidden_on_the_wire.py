@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from bench.hidden_on_the_wire import reveal, run
+from bench.hidden_on_the_wire import NOISE_LIKE, reveal, run
 
 FIRST_SEED = 1000
 TIMELY_MS = 1.5
@@ -26,12 +26,12 @@ def seed_by_what_it_hides() -> int:
 @pytest.mark.wire
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_hidden_effect_is_named_added_and_the_error_falls(tmp_path: Path) -> None:
-    """How near to the noise is the bench's figure: on a busy machine the record itself has more than its noise."""
+def test_hidden_effect_is_named_added_and_the_error_falls_to_the_noise(tmp_path: Path) -> None:
     found = run(seed_by_what_it_hides(), 1.0, tmp_path)
-    late = found["lateness_ms"]
-    if not found["agrees"] and not (late["p99"] < TIMELY_MS and late["max"] < 10 * TIMELY_MS):
-        pytest.skip(f"pulses were late (p99 {late['p99']:.1f}, worst {late['max']:.1f} ms): this machine is too busy")
+    good = found["agrees"] and found["steps"][-1]["times_noise"] <= NOISE_LIKE
+    late, dropped = found["lateness_ms"], found["dropped_pulses"]
+    if not good and (dropped or not (late["p99"] < TIMELY_MS and late["max"] < 10 * TIMELY_MS)):
+        pytest.skip(f"pulses late (p99 {late['p99']:.1f}, worst {late['max']:.1f} ms), {dropped} dropped: too busy")
     assert found["agrees"], found
-    first, last = found["steps"][0]["times_noise"], found["steps"][-1]["times_noise"]
-    assert first > 5 and last < 0.3 * first, found["times_noise"]
+    assert found["steps"][0]["times_noise"] > 5, found["times_noise"]
+    assert found["steps"][-1]["times_noise"] <= NOISE_LIKE, found["times_noise"]
