@@ -164,12 +164,14 @@ def for_emulator(ready: str, **overrides: Any) -> RigConfig:
         # the link, like udev's names by id, outlives a replugging
         stimulator, can = line.get("stimulator_link", line["stimulator"]), line["can"]
         cell = EMULATED_CELLS[line.get("cell", "plain")](int(line.get("samples_per_frame", 1)))
-        place = Path(str(stimulator)).resolve()  # one that was unplugged is not there: its opening looks again
+        # a link is gone while the emulator's stimulator is unplugged: then its port is what the line says
+        linked = Path(str(stimulator)).is_symlink() or Path(str(stimulator)).exists()
+        place = Path(str(stimulator if linked else line["stimulator"])).resolve()
     except OSError as error:
         raise ConfigError(f"--emulator-json {ready}: {error.strerror}") from None
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise ConfigError(f"--emulator-json: not the line that `stimrig emulate` prints ({error})") from None
-    if place.exists() and place.parent != PSEUDO_TERMINALS:
+    if place.parent != PSEUDO_TERMINALS:
         raise ConfigError(
             f"--emulator-json: stimulator {stimulator} is no pseudo-terminal of an emulator; real "
             "devices need a rig file"

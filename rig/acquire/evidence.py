@@ -14,7 +14,7 @@ NEAR_REST_NM = 0.5
 AROUND_S = 0.05
 """Real seconds over which a torque's median is taken."""
 SILENT_S = 0.4
-"""Real seconds to wait for a torque at all: a host that pauses for a tenth of a second has its backlog read by then."""
+"""Real seconds to wait for a torque at all: after a pause of a tenth of a second a backlog is read first."""
 ATTEMPTS = 2
 
 
@@ -47,16 +47,16 @@ def watch_decay(
     if rest_nm is None:
         return False, "no torque to confirm the stop by"
     above_nm = 0.0 if at_stop_nm is None else at_stop_nm - rest_nm  # unknown: then it must come close to its rest
-    side = 1.0 if above_nm >= 0 else -1.0
     deadline_s, silent_s = clock.now_s() + DECAY_S, clock.now_s() + SILENT_S * clock.speed
     while True:
-        now_nm = receiver.torque_around(AROUND_S * clock.speed)
+        # what a buffer gives up is old, the rest before the test at worst: it says nothing of now
+        now_nm = receiver.torque_around(AROUND_S * clock.speed) if receiver.settled() else None
         if now_nm is None:
             if clock.now_s() >= silent_s:
                 return False, "no torque to confirm the stop by"
             clock.wait(clock.now_s() + 0.01 * clock.speed)
             continue
-        if side * (now_nm - rest_nm) <= max(NEAR_REST_NM, 0.5 * abs(above_nm)):
+        if abs(now_nm - rest_nm) <= max(NEAR_REST_NM, 0.5 * abs(above_nm)):
             return True, _near_rest(at_stop_nm, abs(above_nm), now_nm)
         if clock.now_s() >= deadline_s:
             return False, f"torque is still {now_nm:.2f} N·m {DECAY_S:g} s after the stop"

@@ -196,8 +196,7 @@ class TestRun:
         for index, width_us in enumerate(self.test.pulse_width_us.tolist()):
             due_s = t0_s + index * period_s
             if index == first:
-                at_rest_nm = self._receiver.torque_around(0.1 * clock.speed)  # at rest, if ever
-                self._rest_nm = self._rest_nm if at_rest_nm is None else at_rest_nm
+                self._rest_nm = self._receiver.torque_around(0.1 * clock.speed)  # at rest, if ever
             if clock.wait(due_s, self.halt.event):
                 return
             self._asked_s = clock.now_s()

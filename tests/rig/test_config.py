@@ -10,6 +10,7 @@ import pytest
 from rig import config
 from rig.devices import find
 from rig.errors import ConfigError
+from tests.wire.processes import CLINIC_WATCH
 
 GOOD = """
 data_dir = "var"
@@ -116,7 +117,6 @@ def test_the_emulators_line(tmp_path: Path):
     where = {"data_dir": tmp_path, "socket": tmp_path / "s"}
     loaded = config.for_emulator(line, **where)
     assert loaded.clock_speed == 5
-    assert loaded.watch.model_dump() | config.EMULATOR_WATCH == loaded.watch.model_dump()
     assert loaded.stimulator.model_dump()["port"] == "/dev/pts/3"
     (tmp_path / "ready.json").write_text(line)
     assert config.for_emulator(str(tmp_path / "ready.json"), **where) == loaded
@@ -125,11 +125,23 @@ def test_the_emulators_line(tmp_path: Path):
             config.for_emulator(wrong, **where)
 
 
+def test_half_a_second_is_the_emulators_alone(tmp_path: Path):
+    """A rig file waits 0.1 s; so does a bench that gives the emulator's line the watch of a rig file."""
+    line = {"stimulator": "/dev/pts/3", "can": {"interface": "slcan", "channel": "/dev/pts/4"}}
+    where = {"data_dir": tmp_path, "socket": tmp_path / "s"}
+    made = [config.for_emulator(json.dumps(line | more), **where) for more in ({}, {"watch": CLINIC_WATCH})]
+    waits = [(m.watch.stale_torque_s, m.watch.missing_ack_s) for m in (load(tmp_path, GOOD), *made)]
+    assert waits == [(0.1, 0.1), (0.5, 0.5), (0.1, 0.1)]
+
+
 def test_the_emulators_line_never_leads_to_a_real_stimulator(tmp_path: Path):
     """It sets the clock's speed and asks for no calibration: 600 pulses in a second would be its doing."""
     real = tmp_path / "ttyACM0"
     real.touch()
-    for port in (str(real), "/dev/null"):
+    (tmp_path / "link").symlink_to(real)
+    (tmp_path / "dangling").symlink_to("/dev/ttyACM9")
+    absent = ("/dev/ttyACM9", "/dev/pts/../ttyACM9", str(tmp_path / "dangling"))  # there is one when it is opened
+    for port in (str(real), "/dev/null", str(tmp_path / "link"), *absent):
         line = json.dumps({"stimulator": port, "can": {"interface": "virtual"}, "speed": 20})
         with pytest.raises(ConfigError, match="is no pseudo-terminal of an emulator"):
             config.for_emulator(line, data_dir=tmp_path, socket=tmp_path / "s")

@@ -414,3 +414,12 @@ def test_a_start_that_was_asked_while_stopped_is_not_played_once_rearmed(make: M
             asked.result(timeout=20)
     assert live.rig.rearm("nurse").state == "ready"
     assert live.stimulator.sent == []
+
+
+def test_the_watch_of_the_configuration_is_the_one_that_waits(make: Make):
+    live = make()
+    assert live.config.watch.stale_torque_s == 0.5
+    live.rig.start(live.plan("one", hold_s=20.0))
+    live.wait_pulses(10)
+    live.cell.silent = True
+    assert int(live.wait("latched").split(" ms old")[0].split()[-1]) > 450

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from rig import archive, assembly, journal
+from rig.acquire.evidence import watch_decay
 from rig.errors import RecordingError
 from rig.journal import Kind
 from rig.messages import SegmentPlan
@@ -198,3 +199,58 @@ def test_halting_between_pulses_sends_none_after(tmp_path: Path, n: int):
     rig.stimulator.on_send = halt_soon
     rig.execute()
     assert len(rig.stimulator.sent) == sent_at_halt[0] == n
+
+
+@pytest.mark.parametrize(("held_s", "confirmed"), [(0.2, True), (0.6, False)])
+def test_a_stop_waits_for_the_torque_of_a_host_that_paused(tmp_path: Path, held_s: float, confirmed: bool):
+    hold = [SegmentPlan(name="hold", sequence="steps", settings={"on_s": 3.0, "off_s": 0.0})]
+    rig = VirtualRig(tmp_path, hold)
+    rig.at(1.5, lambda: rig.halt.set("stopped", "enough"))
+    rig.cell.held = lambda now_s: 0.0 < now_s - rig.halt.time_s < held_s if rig.halt.cause else False
+    result = rig.execute()
+    assert result.evidence.confirmed is confirmed, result.evidence.detail
+
+
+def test_a_rest_is_measured_again_at_the_first_pulse(tmp_path: Path):
+    """The limb moved between arming and the first pulse: by what is not the muscle's."""
+    rig = VirtualRig(tmp_path)
+    rig.at(0.1, lambda: setattr(rig.cell, "add_nm", 3.0))
+    result = rig.execute()
+    assert result.rise_nm == pytest.approx(result.peak_nm - 3.0, abs=0.01)
+
+
+class Heard:
+    """A receiver of which the torque is always the same."""
+
+    def __init__(self, torque_nm: float, settled: bool = True) -> None:
+        self._torque_nm, self._settled = torque_nm, settled
+
+    def torque_around(self, _duration_s: float) -> float:
+        return self._torque_nm
+
+    def settled(self) -> bool:
+        return self._settled
+
+
+def watched(tmp_path: Path, heard: Heard, at_stop_nm: float | None) -> tuple[bool, str]:
+    rig = VirtualRig(tmp_path)
+    rig.execute()
+    return watch_decay(rig.gate, heard, rig.clock, 0.0, at_stop_nm)  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize(
+    ("at_stop_nm", "now_nm", "confirmed"),
+    [
+        (8.0, 3.9, True), (-8.0, -3.9, True), (8.0, 4.1, False), (-8.0, -8.0, False), (6.0, -14.0, False),
+        (None, 0.4, True), (None, -0.4, True), (None, 10.0, False), (None, -10.0, False),
+    ],
+)  # fmt: skip
+def test_a_torque_far_from_its_rest_on_either_side_confirms_no_stop(
+    tmp_path: Path, at_stop_nm: float | None, now_nm: float, confirmed: bool
+):
+    assert watched(tmp_path, Heard(now_nm), at_stop_nm)[0] is confirmed
+
+
+def test_what_a_buffer_gives_up_confirms_no_stop(tmp_path: Path):
+    """Its oldest samples are of the rest before the first pulse."""
+    assert watched(tmp_path, Heard(0.0, settled=False), 8.0) == (False, "no torque to confirm the stop by")

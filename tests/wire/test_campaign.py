@@ -14,12 +14,15 @@ FAULTS = (
     "disk_full",
     "host_stopped_2s",
     "host_killed",
-    "corrupt_commands",
     "cell_silent",
+    "corrupt_commands",
     "line_stalled",
     "line_stalled_70_ms",
 )
-"""Those that the other tests of this folder do not make, and one of the load cell."""
+"""Those that the other tests of this folder do not make, and one of the load cell, played amid pulses (PRBS).
+
+That one holds the 0.1 s of a rig file: a campaign's rigs have its watch.
+"""
 
 
 def test_a_short_campaign_finds_nothing_wrong():
