@@ -11,6 +11,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
+from api import pages
 from tests.api.browser import NARROW, PASSWORD, PHONE, WIDE, open_tab, painted_soon, participant, say_yes, start
 from tests.api.conftest import STUB, Service, run_service, run_test
 
@@ -201,6 +202,7 @@ def test_hidden_effect_is_found_and_added_by_clicking(tab: Any, service: Service
     tab.get_by_role("heading", name="The error over the versions").wait_for()
     tab.locator("[data-figure=falling] .main-svg").first.wait_for()
     assert tab.locator("tr.current").inner_text().startswith("2. + fatigue")
+    tab.locator("[data-job]").wait_for(state="detached")
     tab.locator(".undo").get_by_label("Your password, once more").fill(PASSWORD)
     tab.get_by_role("button", name="Undo").click()
     tab.wait_for_url(f"**/models/{model}#why")
@@ -219,3 +221,25 @@ def test_next_experiment_runs_from_its_button(tab: Any, service: Service) -> Non
     say_yes(tab)
     tab.wait_for_url("**/models/*", timeout=60_000)
     assert model not in tab.url
+
+
+def test_a_page_that_waits_takes_nothing_away_that_somebody_writes(tab: Any) -> None:
+    """Work that ends while a password is typed must not read the page anew: the next click would be lost."""
+    script = (Path(pages.__file__).parent / "static" / "wait.js").read_text(encoding="utf-8")
+    body = (
+        '<input id="mine"><div data-job="J"><b data-words></b><span data-left></span><progress></progress></div>'
+        f"<script>{script}</script>"
+    )
+    job = {"progress": 0.5, "text": "at work", "time_left_s": 2.0, "done": False}
+    tab.route("http://wait.test/v1/jobs/J", lambda route: route.fulfill(json=job))
+    tab.route("http://wait.test/", lambda route: route.fulfill(body=body, content_type="text/html"))
+    tab.goto("http://wait.test/")
+    tab.get_by_text("at work").wait_for()
+    tab.locator("#mine").fill("half a passw")
+    job["done"] = True
+    tab.get_by_role("button", name="Show it").wait_for()
+    assert tab.locator("#mine").input_value() == "half a passw"
+    job["done"] = False
+    tab.get_by_role("button", name="Show it").click()
+    tab.wait_for_function("document.getElementById('mine').value === ''")
+    assert tab.get_by_role("button", name="Show it").count() == 0

@@ -9,12 +9,28 @@ async function follow(box) {
     let job;
     try {
       const answer = await fetch("/v1/jobs/" + box.dataset.job, { headers: { Accept: "application/json" } });
-      if (!answer.ok) { location.reload(); return; }
+      if (!answer.ok) { arrive(words, left); return; }
       job = await answer.json();
     } catch { continue; } // the service may be starting again
     bar.value = job.progress;
     words.textContent = job.text || words.textContent;
     left.textContent = job.time_left_s === null ? "" : job.time_left_s < 1 ? "nearly done" : "about " + Math.ceil(job.time_left_s) + " s left";
-    if (job.done) { location.reload(); return; } // the page says what comes next
+    if (job.done) { arrive(words, left); return; } // the page says what comes next
   }
+}
+
+// What somebody has begun to write is not taken away: then they say when the page is read anew.
+function arrive(words, left) {
+  if (!begun()) { location.reload(); return; }
+  const button = document.createElement("button");
+  button.type = "button";
+  button.textContent = "Show it";
+  button.addEventListener("click", () => location.reload());
+  words.textContent = "It is done. ";
+  left.replaceChildren(button);
+}
+
+function begun() {
+  const fields = [...document.querySelectorAll("input:not([type=hidden]):not([type=checkbox]):not([type=radio]), textarea")];
+  return fields.some((field) => field === document.activeElement || field.value !== field.defaultValue);
 }
