@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import numpy as np
 
 from rig import limits, plan
 from rig.acquire.halt import Halt
+from rig.acquire.health import DEFAULT_WATCH, Watch
 from rig.acquire.receiver import Receiver
 from rig.acquire.run import RunResult, TestRun
 from rig.clock import VirtualClock
@@ -22,6 +24,8 @@ from rig.messages import Profile, SegmentPlan, TestPlan
 from rig.signals import SAMPLE, Ack, LateError, TorqueBlock
 
 RATE_HZ = 1600.0
+ON_A_BUSY_DISK = replace(DEFAULT_WATCH, stale_disk_s=60.0)
+"""The disk alone is real here: where others write to it, it may stand still for seconds of the world's time."""
 
 
 class FakeStimulator:
@@ -160,7 +164,9 @@ class FakeCell:
 class VirtualRig:
     """Gate, receiver and run on fakes and a virtual clock."""
 
-    def __init__(self, folder: Path, segments: list[SegmentPlan] | None = None, **profile: float) -> None:
+    def __init__(
+        self, folder: Path, segments: list[SegmentPlan] | None = None, watch: Watch = ON_A_BUSY_DISK, **profile: float
+    ) -> None:
         self.clock = VirtualClock()
         self.stimulator = FakeStimulator(self.clock)
         self.cell = FakeCell(self.clock, self.stimulator)
@@ -183,7 +189,7 @@ class VirtualRig:
         self.journal = Journal(self.path)
         self.journal.append_json(Kind.HEADER, header(self.test, self.clock))
         self.journal.append(Kind.PLAN, self.test.pulse_width_us.astype("<f8").tobytes())
-        self.run = TestRun(self.test, self.table, self.journal, self.gate, self.receiver, self.clock, self.halt)
+        self.run = TestRun(self.test, self.table, self.journal, self.gate, self.receiver, self.clock, self.halt, watch)
 
     def at(self, time_s: float, action: Callable[[], object]) -> None:
         """Do something at a time on the test's clock (its start: torque settled, then the lead)."""

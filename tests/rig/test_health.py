@@ -34,7 +34,7 @@ def test_through_a_rest_the_device_is_fed_at_every_pulses_time(tmp_path: Path):
 @pytest.mark.parametrize("fault", WORDS)
 def test_without_a_proof_nothing_is_fed(tmp_path: Path, fault: str):
     hold = [SegmentPlan(name="hold", sequence="steps", settings={"on_s": 4.0, "off_s": 0.0, "repeats": 1})]
-    rig = VirtualRig(tmp_path, hold)
+    rig = VirtualRig(tmp_path, hold, watch=health.DEFAULT_WATCH)
     at: list[float] = []
     disk = health.Disk.__dict__["age_s"], health.MIN_FREE_BYTES
 
