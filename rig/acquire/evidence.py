@@ -14,7 +14,7 @@ NEAR_REST_NM = 0.5
 AROUND_S = 0.05
 """Real seconds over which a torque's median is taken."""
 SILENT_S = 0.4
-"""Real seconds to wait for a torque at all: after a pause of a tenth of a second a backlog is read first."""
+"""Real seconds to wait for a torque at all. While a backlog is read the wait goes on: what comes after it counts."""
 ATTEMPTS = 2
 
 
@@ -52,7 +52,8 @@ def watch_decay(
         # what a buffer gives up is old, the rest before the test at worst: it says nothing of now
         now_nm = receiver.torque_around(AROUND_S * clock.speed) if receiver.settled() else None
         if now_nm is None:
-            if clock.now_s() >= silent_s:
+            reading = receiver.age_s(clock.now_s()) <= AROUND_S * clock.speed
+            if clock.now_s() >= (deadline_s if reading else silent_s):
                 return False, "no torque to confirm the stop by"
             clock.wait(clock.now_s() + 0.01 * clock.speed)
             continue
