@@ -57,8 +57,7 @@ def test_from_ready_to_ready_with_a_sealed_file(make: Make):
     assert finished is not None
     assert (finished.outcome, finished.reason) == ("completed", "")
     assert finished in live.events
-    # Of a busy machine, no fault of the rig's.
-    busy = re.compile(r"acknowledgements came late|alignment's error is \d|\d samples/s came")
+    busy = re.compile(r"acknowledgements came late|alignment's error is \d")  # of a busy machine, no fault of the rig's
     assert [words for words in finished.summary["warnings"] if not busy.search(words)] == []
     with h5py.File(str(finished.recording_path)) as file:
         assert file.attrs["test_id"] == "one"

@@ -220,10 +220,10 @@ def test_a_rest_is_measured_again_at_the_first_pulse(tmp_path: Path):
 
 
 class Heard:
-    """A receiver of which the torque is always the same."""
+    """A receiver of which the torque is always the same, after a backlog of `settles_s`."""
 
-    def __init__(self, torque_nm: float, settled: bool = True, settles_s: float = 0.0, silent: bool = False) -> None:
-        self._torque_nm, self._settled, self._settles_s, self._silent = torque_nm, settled, settles_s, silent
+    def __init__(self, torque_nm: float, settles_s: float = 0.0, silent: bool = False) -> None:
+        self._torque_nm, self._settles_s, self._silent = torque_nm, settles_s, silent
         self.asked_s: list[float] = []
 
     def torque_around(self, _duration_s: float) -> float:
@@ -234,9 +234,9 @@ class Heard:
         return float("inf") if self._silent else 0.001
 
     def settled(self) -> bool:
-        return self._settled and (not self._settles_s or self._waited_s() > self._settles_s)
+        return self.waited_s() >= self._settles_s
 
-    def _waited_s(self) -> float:
+    def waited_s(self) -> float:
         return self.asked_s[-1] - self.asked_s[0] if self.asked_s else 0.0
 
 
@@ -261,16 +261,16 @@ def test_a_torque_far_from_its_rest_on_either_side_confirms_no_stop(
 
 def test_what_a_buffer_gives_up_confirms_no_stop(tmp_path: Path):
     """Its oldest samples are of the rest before the first pulse."""
-    assert watched(tmp_path, Heard(0.0, settled=False), 8.0) == (False, "no torque to confirm the stop by")
+    assert watched(tmp_path, Heard(0.0, settles_s=np.inf), 8.0) == (False, "no torque to confirm the stop by")
 
 
 def test_a_stop_waits_while_a_backlog_is_read_and_not_where_nothing_comes(tmp_path: Path):
     """What comes after a backlog is of now; a cable that is out gives no such hope."""
     late = Heard(0.0, settles_s=1.5)
     assert watched(tmp_path, late, 8.0)[0]
-    assert late.asked_s[-1] - late.asked_s[0] == pytest.approx(1.5, abs=0.1)
+    assert late.waited_s() == pytest.approx(1.5, abs=0.1)
     for silent, longest_s in ((False, DECAY_S), (True, SILENT_S)):
         (folder := tmp_path / str(silent)).mkdir()
-        endless = Heard(0.0, settled=False, silent=silent)
+        endless = Heard(0.0, settles_s=np.inf, silent=silent)
         assert not watched(folder, endless, 8.0)[0]
-        assert endless.asked_s[-1] - endless.asked_s[0] == pytest.approx(longest_s, abs=0.05)
+        assert endless.waited_s() == pytest.approx(longest_s, abs=0.05)

@@ -26,7 +26,7 @@ function arrive(words, left) {
   button.type = "button";
   button.textContent = "Show it";
   button.addEventListener("click", () => location.reload());
-  words.textContent = "It is done. ";
+  words.textContent = "This page has news. "; // a result, or that it was cancelled, or that nobody is signed in
   left.replaceChildren(button);
 }
 
