@@ -128,7 +128,7 @@ def effects(progress: Progress) -> dict[str, Any]:
 def warm(progress: Progress) -> dict[str, Any]:
     """Load identify and its compiled parts, so that the fit after a test starts at once."""
     import identify
-    from identify.csv_record import read_csv
+    from identify.records.csv import read_csv
 
     progress(0.1, "loading")
     identify.fit(read_csv(_warm_csv().encode(), Path("warm.csv")))
@@ -179,7 +179,7 @@ def find_recording(progress: Progress, folder: str, test_id: str) -> dict[str, A
 
     import identify
     from api.uploads import PREFIX
-    from identify.recording import attributes
+    from identify.records.recording import attributes
 
     progress(0.1, "looking through the recordings")
     for path in sorted(Path(folder).glob("**/*.h5")):

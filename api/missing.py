@@ -56,7 +56,7 @@ def signatures(record: Any, effects: Sequence[str]) -> dict[str, Any]:
     import numpy as np
 
     import identify
-    from identify.engine import fit_with_effects
+    from identify.estimation.with_effects import fit_with_effects
 
     pick = slice(None, None, max(1, -(-record.time_s.size // POINTS)))
     found: dict[str, Any] = {"time_s": record.time_s[pick].round(4)}
@@ -121,7 +121,7 @@ def begun(path: Path) -> float | None:
     from datetime import datetime
 
     import identify
-    from identify.recording import attributes
+    from identify.records.recording import attributes
 
     try:
         return datetime.fromisoformat(attributes(path, ["created_utc"])["created_utc"]).timestamp()

@@ -70,7 +70,7 @@ def improvement_html(
     Parameters
     ----------
     found : dict
-        As `identify.improve` gives it.
+        As `identify.diagnosis.improvement` gives it.
     name : str
         The record's.
     diagnosis : dict or None

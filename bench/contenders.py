@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 from scipy.signal import cont2discrete, lfilter
 
 import identify
-from identify.record import Record
+from identify.records.record import Record
 
 PULSE_RATE_HZ = 40.0
 SPLINES = 8

@@ -23,7 +23,7 @@ import numpy as np
 from identify.diagnosis import candidates as workers
 from identify.diagnosis import diagnose
 from identify.effects import registry
-from identify.record import Record
+from identify.records.record import Record
 
 STRENGTHS = ("weak", "middle", "strong")
 PAIRS = (

@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 
 import identify
-from identify import paper_muscle as muscle
-from identify import table1
-from identify.linear import SecondOrder
+from identify.dynamics.linear import SecondOrder
+from identify.paper import muscle, table1
 
 FOLDER = Path(__file__).parent.parent / "docs" / "img"
 TRIALS = 20

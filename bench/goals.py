@@ -20,12 +20,12 @@ from typing import Any
 import numpy as np
 
 import identify
-from identify import paper_muscle as muscle
-from identify.figures import best_fit_percent
-from identify.linear import SecondOrder
-from identify.record import Record
-from identify.table1 import simulate
-from identify.uncertainty import prediction_band
+from identify.dynamics.linear import SecondOrder
+from identify.estimation.figures import best_fit_percent
+from identify.estimation.uncertainty import prediction_band
+from identify.paper import muscle
+from identify.paper.table1 import simulate
+from identify.records.record import Record
 
 TARGET = Path(__file__).parent.parent / "docs" / "identification.md"
 ACCURACY_SEEDS = range(710_000, 710_040)

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from bench.contenders import CONTENDERS, Contender, Task
-from identify import paper_muscle as muscle
-from identify.figures import best_fit_percent
-from identify.record import Record
+from identify.estimation.figures import best_fit_percent
+from identify.paper import muscle
+from identify.records.record import Record
 
 NOISE_NM = (0.0, 0.02, 0.10)
 SEEDS = {40.0: (90_001, 90_002, 90_003, 90_004, 90_005), 1600.0: (90_001, 90_002)}

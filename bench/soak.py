@@ -29,7 +29,7 @@ from tests.wire.processes import CLINIC_WATCH, ROOT, Bench, RigClient, control, 
 FITTER = """
 import sys, time
 from pathlib import Path
-from identify.estimate import fit
+from identify.fitting import fit
 from identify import read
 fits = 0
 while True:

@@ -7,11 +7,10 @@ from pathlib import Path
 import numpy as np
 
 import identify
-from identify import paper_muscle as muscle
-from identify import table1
-from identify.figures import best_fit_percent
-from identify.linear import Discrete, SecondOrder
-from identify.record import Record
+from identify.dynamics.linear import Discrete, SecondOrder
+from identify.estimation.figures import best_fit_percent
+from identify.paper import muscle, table1
+from identify.records.record import Record
 
 TARGET = Path(__file__).parent.parent / "docs" / "table1.md"
 TRIALS = 100

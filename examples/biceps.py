@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 
 import identify
-from identify.figures import best_fit_percent
-from identify.record import Record
+from identify.estimation.figures import best_fit_percent
+from identify.records.record import Record
 
 WIDTH_US = 300.0
 """As a file name at the origin suggests; any constant does, since it never changes."""

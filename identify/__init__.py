@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from identify.criticism import compare
     from identify.diagnosis import diagnose
+    from identify.diagnosis.improvement import improve
     from identify.errors import (
         BadModel,
         BadRecord,
@@ -19,22 +20,21 @@ if TYPE_CHECKING:
         IdentifyError,
         NotIdentifiable,
     )
-    from identify.estimate import fit
-    from identify.improve import improve
+    from identify.fitting import fit
     from identify.model import Model
-    from identify.record import Record
-    from identify.records import read
-    from identify.simulate import predict
+    from identify.records.read import read
+    from identify.records.record import Record
+    from identify.simulation.predict import predict
 
 _PLACES = {
-    "read": "identify.records",
-    "Record": "identify.record",
-    "fit": "identify.estimate",
-    "predict": "identify.simulate",
+    "read": "identify.records.read",
+    "Record": "identify.records.record",
+    "fit": "identify.fitting",
+    "predict": "identify.simulation.predict",
     "Model": "identify.model",
     "compare": "identify.criticism",
     "diagnose": "identify.diagnosis",
-    "improve": "identify.improve",
+    "improve": "identify.diagnosis.improvement",
     "BadModel": "identify.errors",
     "BadRecord": "identify.errors",
     "BadRequest": "identify.errors",
@@ -42,7 +42,7 @@ _PLACES = {
     "IdentifyError": "identify.errors",
     "NotIdentifiable": "identify.errors",
 }
-_MODULES = {"effects", "methods", "table1"}
+_MODULES = {"effects", "methods"}
 
 __all__ = [
     "BadModel",

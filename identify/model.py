@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from identify import model_shape
+from identify.dynamics.linear import Discrete, Linear, SecondOrder, linear_from_dict
 from identify.errors import BadModel
-from identify.linear import Discrete, Linear, SecondOrder, linear_from_dict
 from identify.recruitment.curve import Curve, basis_from_dict
 from identify.strict_json import BadJson, parse
 
 if TYPE_CHECKING:
-    from identify.record import Record
+    from identify.records.record import Record
 
 SCHEMA_VERSION = "1.0"
 LARGEST_TEXT = 16 * 2**20
@@ -124,7 +124,7 @@ class Model:
 
     def predict(self, record: Record) -> np.ndarray:
         """Free-run torque at the record's samples, N·m, shape (N,)."""
-        from identify.simulate import predict
+        from identify.simulation.predict import predict
 
         return predict(self, record)
 

@@ -19,7 +19,7 @@ def table1(
     as_json: Json = False,
 ) -> None:
     """Best-fit rates at each noise level, ours beside the paper's."""
-    from identify import table1 as table_one
+    from identify.paper import table1 as table_one
 
     found = table_one.run(trials, progress_line())
     if as_json:

@@ -8,12 +8,12 @@ import numpy as np
 
 from identify.criticism.correlation import correlation_tests
 from identify.criticism.shares import by_direction, by_frequency, by_level, by_segment, by_time
-from identify.diagnosis.where import worst_places
-from identify.engine.prepare import inspect
-from identify.figures import best_fit_percent, ceiling_percent, rms
-from identify.grid import make_grid
+from identify.criticism.where import worst_places
+from identify.dynamics.pulse_grid import make_grid
+from identify.estimation.figures import best_fit_percent, ceiling_percent, rms
+from identify.estimation.prepare import inspect
 from identify.model import Model
-from identify.record import Record
+from identify.records.record import Record
 
 POINTS = 4000
 """Points of a plotted series at most."""
@@ -96,7 +96,7 @@ def _band(model: Model, record: Record, predicted: np.ndarray, noise: float) -> 
     """95 % band for a measured sample: the model's uncertainty, where it carries one, and the noise."""
     half = np.full(predicted.size, BAND * noise)
     if model.covariance is not None and not model.effects:
-        from identify.uncertainty import prediction_band
+        from identify.estimation.uncertainty import prediction_band
 
         lower, upper = prediction_band(model, record)
         half = np.hypot(half, 0.5 * (upper - lower))

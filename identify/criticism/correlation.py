@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from identify.engine.core import profile_noise
-from identify.engine.prepare import block_means
-from identify.grid import Grid, runs
+from identify.dynamics.pulse_grid import Grid, runs
+from identify.estimation.prepare import block_means
+from identify.noise.slow_and_white import profile_noise
 
 LAGS = 25
 DRAWS = 1500

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from identify.diagnosis.where import direction_of
-from identify.grid import runs
-from identify.record import Record
+from identify.criticism.where import direction_of
+from identify.dynamics.pulse_grid import runs
+from identify.records.record import Record
 
 LEVELS = 6
 SPANS = 10

@@ -8,7 +8,7 @@ from identify.diagnosis.analysis import Analysis, analyse
 from identify.diagnosis.candidates import Progress
 from identify.diagnosis.report import report
 from identify.diagnosis.verdict import Verdict, judge
-from identify.record import Record
+from identify.records.record import Record
 
 
 def diagnose(record: Record, progress: Progress | None = None) -> dict[str, Any]:

@@ -12,11 +12,11 @@ from identify.diagnosis.structure import Left, left_over, quiet_rows
 from identify.diagnosis.unknown import WANDER
 from identify.effects import get, registry
 from identify.effects.base import Effect, Form
-from identify.engine.fit import Fitted, solve, start_from
-from identify.engine.noise_level import NoiseLevel
-from identify.engine.prepare import Raw, inspect, prepare
-from identify.engine.problem import Problem
-from identify.record import Record
+from identify.estimation.joint import Fitted, solve, start_from
+from identify.estimation.prepare import Raw, inspect, prepare
+from identify.noise.level import NoiseLevel
+from identify.records.record import Record
+from identify.simulation.problem import Problem
 
 FIRST_MARGIN = 4.5
 """Log evidence that the first effect must gain."""

@@ -10,10 +10,10 @@ import numpy as np
 
 from identify.effects import registry
 from identify.effects.base import Effect, Form, Scene
-from identify.engine.fit import Fitted, solve, start_from
-from identify.engine.noise_level import find_band
-from identify.engine.problem import Problem
-from identify.engine.setup import Setup
+from identify.estimation.joint import Fitted, solve, start_from
+from identify.noise.level import find_band
+from identify.simulation.problem import Problem
+from identify.simulation.setup import Setup
 
 WORKERS = 2
 FORMS = 3

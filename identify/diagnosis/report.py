@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
+from identify.criticism.where import worst_places
 from identify.diagnosis.analysis import Analysis
 from identify.diagnosis.steps import Step, steps
 from identify.diagnosis.verdict import Verdict
-from identify.diagnosis.where import worst_places
 from identify.effects import get
-from identify.engine.export import describe_parameters, predict_fitted, with_band
+from identify.estimation.to_model import describe_parameters, predict_fitted, with_band
 from identify.experiments import plan
 
 CLOSE = 0.8

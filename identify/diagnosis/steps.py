@@ -7,9 +7,9 @@ from typing import Any
 
 from identify.diagnosis.analysis import Analysis
 from identify.effects import get
-from identify.engine.figures import figures
-from identify.engine.fit import Fitted, solve, start_from
-from identify.engine.problem import Problem
+from identify.estimation.joint import Fitted, solve, start_from
+from identify.estimation.statistics import figures
+from identify.simulation.problem import Problem
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Step:
     fitted : Fitted
         The model.
     figures : dict
-        See `identify.engine.figures.figures`.
+        See `identify.estimation.statistics.figures`.
     """
 
     added: str | None

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from identify.engine.core import profile_noise
-from identify.engine.fit import Fitted
-from identify.engine.noise_level import band_part
-from identify.grid import runs
-from identify.record import Record
+from identify.dynamics.pulse_grid import runs
+from identify.estimation.joint import Fitted
+from identify.noise.level import band_part
+from identify.noise.slow_and_white import profile_noise
+from identify.records.record import Record
 
 QUIET = 0.025
 """Share of the largest torque below which the muscle counts as resting."""

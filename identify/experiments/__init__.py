@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 
+from identify.dynamics.pulse_grid import make_grid
 from identify.effects import get
-from identify.engine import fit_candidate
-from identify.engine.fit import Fitted
-from identify.engine.noise_level import whitened
-from identify.engine.problem import Problem
 from identify.errors import BadRequest
+from identify.estimation.joint import Fitted
+from identify.estimation.with_effects import fit_candidate
 from identify.experiments.designs import Design, designs
-from identify.grid import make_grid
-from identify.record import Record
+from identify.noise.level import whitened
+from identify.records.record import Record
+from identify.simulation.problem import Problem
 
 ENOUGH = 7.0
 """Expected log evidence that decides: odds of a thousand to one."""

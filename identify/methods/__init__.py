@@ -11,8 +11,8 @@ from functools import cache
 from importlib import import_module
 from typing import Any, Protocol, runtime_checkable
 
+from identify.dynamics.pulse_grid import Grid
 from identify.errors import BadRequest
-from identify.grid import Grid
 from identify.model import Model
 
 

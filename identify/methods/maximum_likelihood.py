@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 
+from identify.dynamics.pulse_grid import Grid
 from identify.errors import BadRequest
-from identify.finish import finish
-from identify.grid import Grid
-from identify.methods.common import fitted_rows, flag, order_option
+from identify.estimation.finish import finish
+from identify.estimation.projected import Solution, begins_at_rest, designed, pilot_solution, search
+from identify.methods.support.common import fitted_rows, flag, order_option
 from identify.model import Model
-from identify.noise import noise_evidence
-from identify.projection import Solution, begins_at_rest, designed, pilot_solution, search
+from identify.noise.ar1 import noise_evidence
 from identify.recruitment.knots import KNOTS
 
 ROUNDING = 2e-5
@@ -59,7 +59,7 @@ class MaximumLikelihood:
                 f"spline of {solution.problem.basis.size} coefficients, smoothed to {solution.freedom:.1f} effective"
             )
             if flag(options.get("monotone", False), "monotone"):
-                from identify.alternatives import monotone
+                from identify.methods.support.alternatives import monotone
 
                 solution = monotone(solution)
                 reasons.append("recruitment held monotone")
@@ -74,7 +74,7 @@ METHOD = MaximumLikelihood()
 
 
 def _other(kind: str, solution: Solution, options: Mapping[str, Any]) -> tuple[Solution, str]:
-    from identify.alternatives import power_series, sigmoid
+    from identify.methods.support.alternatives import power_series, sigmoid
 
     if kind == "power-series":
         return power_series(solution, int(options["power"]) if "power" in options else None)

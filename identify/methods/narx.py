@@ -14,17 +14,16 @@ from typing import Any
 
 import numpy as np
 
-from identify.finish import finish_discrete
-from identify.grid import Grid
-from identify.linear import Discrete
-from identify.methods.common import fitted_rows, quiet_level
+from identify.dynamics.linear import Discrete
+from identify.dynamics.narx import run
+from identify.dynamics.pulse_grid import Grid
+from identify.estimation.finish import finish_discrete
+from identify.methods.support.common import fitted_rows, quiet_level
 from identify.model import Model
 from identify.recruitment.curve import Curve
 from identify.recruitment.spline import SplineBasis
 
 MOST_TERMS = 14
-LIMIT = 20.0
-"""Scaled torque beyond which a free run counts as run away."""
 
 
 class Narx:
@@ -103,32 +102,6 @@ def forward_regression(candidates: np.ndarray, target: np.ndarray, most: int) ->
         rest = rest - direction[:, None] * (direction @ rest)
     weights = np.linalg.lstsq(candidates[:, chosen], target, rcond=None)[0] if chosen else np.zeros(0)
     return chosen, weights
-
-
-def run(recipe: dict[str, Any], width_us: np.ndarray) -> np.ndarray:
-    """Free run above the baseline for one width a pulse, from rest, N·m; held where it runs away."""
-    variables, terms, weights = recipe["variables"], recipe["terms"], recipe["weights"]
-    width = (np.asarray(width_us, float) / recipe["width_scale_us"]).tolist()
-    lead = max((lag for _, lag in variables), default=1)
-    width, torque = [0.0] * lead + width, [0.0] * (lead + len(width))
-    for k in range(lead, len(width)):
-        value = [(torque if kind == 0 else width)[k - lag] for kind, lag in variables]
-        total = 0.0
-        for term, weight in zip(terms, weights, strict=True):
-            product = weight
-            for v in term:
-                product *= value[v]
-            total += product
-        torque[k] = min(max(total, -LIMIT), LIMIT)
-    return np.array(torque[lead:]) * recipe["torque_scale_nm"]
-
-
-def free_run(model: Model, grid: Grid) -> np.ndarray:
-    """Free run at the record's samples, above the model's baseline, N·m, shape (N,)."""
-    recipe = model.extra["narx"]
-    means = run(recipe, grid.pulse_width_us) + recipe["baseline_nm"] - model.baseline_nm
-    held = Discrete((1.0,), (1.0,), 0, grid.step_s, model.linear.centre if isinstance(model.linear, Discrete) else 0.0)
-    return held.at_samples(grid, means)
 
 
 def steady_curve(recipe: dict[str, Any], largest_us: float) -> Curve:

@@ -13,14 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from identify.dynamics import free_states
+from identify.dynamics.linear import SecondOrder
+from identify.dynamics.pulse_grid import Grid, runs
+from identify.dynamics.second_order import free_states
 from identify.errors import BadRequest, NotIdentifiable
-from identify.finish import completed
-from identify.grid import Grid, runs
-from identify.linear import SecondOrder
-from identify.methods.common import near_rest, quiet_level, segment_rows
+from identify.estimation.finish import completed
+from identify.methods.support.common import near_rest, quiet_level, segment_rows
 from identify.model import Model, Noise
-from identify.noise import noise_evidence
+from identify.noise.ar1 import noise_evidence
 from identify.recruitment.sigmoid_fit import fit_points
 from identify.recruitment.smoothing import choose_weight
 from identify.recruitment.spline import SplineBasis

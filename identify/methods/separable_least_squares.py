@@ -13,13 +13,13 @@ from typing import Any
 
 import numpy as np
 
+from identify.dynamics.linear import Discrete
+from identify.dynamics.pulse_grid import Grid
 from identify.errors import BadRequest, NotIdentifiable
-from identify.finish import finish_discrete
-from identify.grid import Grid
-from identify.linear import Discrete
-from identify.methods.common import fitted_rows
+from identify.estimation.finish import finish_discrete
+from identify.methods.support.common import fitted_rows
+from identify.methods.support.output_error import shifted
 from identify.model import Model
-from identify.output_error import shifted
 from identify.recruitment.curve import Curve
 from identify.recruitment.sigmoid import SigmoidBasis
 from identify.recruitment.sigmoid_fit import fit_shape

@@ -19,15 +19,23 @@ from typing import Any
 
 import numpy as np
 
+from identify.dynamics.linear import Discrete, SecondOrder
+from identify.dynamics.pulse_grid import Grid
 from identify.errors import BadRequest
-from identify.finish import finish, finish_discrete
-from identify.grid import Grid
-from identify.linear import Discrete, SecondOrder
-from identify.methods.common import active_level, flag, near_rest, order_option, quiet_level, segment_rows
+from identify.estimation.finish import finish, finish_discrete
+from identify.estimation.projected import (
+    Problem,
+    Solution,
+    begins_at_rest,
+    pilot_curve,
+    pilot_solution,
+    project,
+    search,
+)
+from identify.methods.support.common import active_level, flag, near_rest, order_option, quiet_level, segment_rows
+from identify.methods.support.output_error import OutputError, choose_order, equation_error, output_error, stable
 from identify.model import Model
-from identify.noise import noise_evidence
-from identify.output_error import OutputError, choose_order, equation_error, output_error, stable
-from identify.projection import Problem, Solution, begins_at_rest, pilot_curve, pilot_solution, project, search
+from identify.noise.ar1 import noise_evidence
 from identify.recruitment.curve import Curve
 from identify.recruitment.fixed import FixedShape
 from identify.recruitment.knots import KNOTS, PILOT_KNOTS, adapted_knots, even_knots, spline_roughness
@@ -184,6 +192,6 @@ def joint_drive(grid: Grid, rows: np.ndarray) -> np.ndarray:
 def _curve_through(
     grid: Grid, block: Discrete, rows: np.ndarray, knots: int, baseline_nm: float, inverse: bool
 ) -> Curve:
-    from identify.discrete_recruitment import invert, through
+    from identify.methods.support.discrete_recruitment import invert, through
 
     return (invert if inverse else through)(grid, block, rows, knots, baseline_nm)

@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from identify.recruitment.spline import SplineBasis
-
-if TYPE_CHECKING:
-    from identify.grid import Grid
 
 KNOTS = 31
 SMOOTH_KNOTS = 19
@@ -31,41 +26,6 @@ def knots_for(pilot_curve: tuple[np.ndarray, np.ndarray]) -> int:
     level = np.abs(torque) / max(float(np.max(np.abs(torque))), 1e-300)
     rise = u[np.argmax(level >= 0.9)] - u[np.argmax(level >= 0.1)]
     return SMOOTH_KNOTS if rise > u[-1] / 4 else KNOTS
-
-
-def design_knots(grid: Grid, count: int = KNOTS) -> np.ndarray:
-    """Knots for a record, µs, shape (m,), first 0, last the largest pulse width of all rows.
-
-    Half of the knots are spread evenly, half go where a pilot fit says that the curve bends, so that a rise within
-    5 µs is met as well as one over 200 µs. The same knots serve every candidate: what one model may bend, all may.
-    """
-    return design_spline(grid, count=count)[0].knots_us
-
-
-def design_spline(grid: Grid, rows: np.ndarray | None = None, count: int = KNOTS) -> tuple[SplineBasis, np.ndarray]:
-    """Basis and penalty of a record's recruitment spline: the common design for every candidate.
-
-    Parameters
-    ----------
-    grid : Grid
-        The record.
-    rows : ndarray of bool, shape (K,), optional
-        Rows that are fitted; by default all that may be.
-    count : int
-        Knots.
-
-    Returns
-    -------
-    basis : SplineBasis
-    roughness : ndarray, shape (size, size)
-        Penalty without units, to be weighted by `choose_weight`.
-    """
-    from identify.projection import begins_at_rest, designed, pilot_solution
-
-    rows = grid.fitted if rows is None else rows
-    problem = designed(pilot_solution(grid, rows, begins_at_rest(grid)), count)[0]
-    assert isinstance(problem.basis, SplineBasis)
-    return problem.basis, problem.roughness
 
 
 def adapted_knots(pilot_curve: tuple[np.ndarray, np.ndarray], largest_us: float, count: int = KNOTS) -> np.ndarray:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import cont2discrete, lfilter
 
-from identify.record import Record
+from identify.records.record import Record
 
 FINE_HZ = 8000
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import identify
 from identify.methods import methods
-from identify.record import Record
+from identify.records.record import Record
 from tests.identify.patients import Patient, make_record
 
 METHODS = tuple(methods())

@@ -9,12 +9,12 @@ import pytest
 
 from identify.effects import get, library, registry
 from identify.effects.base import STAGES
-from identify.engine import fit_candidate, fit_with_effects, to_model
-from identify.engine.prepare import first_setup, inspect
-from identify.engine.problem import Problem
 from identify.errors import BadRequest, NotIdentifiable
+from identify.estimation.prepare import first_setup, inspect
+from identify.estimation.with_effects import fit_candidate, fit_with_effects, to_model
 from identify.model import Model
-from identify.record import Record
+from identify.records.record import Record
+from identify.simulation.problem import Problem
 from tests.identify import hidden_muscles
 
 CONTRACT = {

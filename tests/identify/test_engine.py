@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from identify.effects import get
-from identify.engine import fit_candidate, fit_with_effects
-from identify.engine.core import whiten_rows
-from identify.engine.export import predict_fitted
-from identify.engine.noise_level import NoiseLevel, band_part, profile, whitened
-from identify.engine.prepare import first_setup, inspect
-from identify.engine.problem import Problem
-from identify.record import Record
+from identify.estimation.prepare import first_setup, inspect
+from identify.estimation.to_model import predict_fitted
+from identify.estimation.with_effects import fit_candidate, fit_with_effects
+from identify.noise.level import NoiseLevel, band_part, profile, whitened
+from identify.noise.slow_and_white import whiten_rows
+from identify.records.record import Record
+from identify.simulation.problem import Problem
 from tests.identify import hidden_muscles
 
 
@@ -96,7 +96,7 @@ def test_held_out_rows_change_nothing_of_a_fit():
 
 
 def test_warming_up_touches_every_compiled_part():
-    from identify.engine import warm
+    from identify.estimation.with_effects import warm
 
     warm()
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import identify
-from identify.records import read
+from identify.records.read import read
 from tests.identify.patients import Patient, make_record
 
 HEADER = "time_s,pulse_width_us,torque_nm,segment"

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 import identify
-from identify.crossvalidation import BLOCK_S, FOLDS
-from identify.figures import best_fit_percent
-from identify.grid import make_grid
-from identify.linear import SecondOrder
+from identify.dynamics.linear import SecondOrder
+from identify.dynamics.pulse_grid import make_grid
+from identify.estimation.cross_validation import BLOCK_S, FOLDS
+from identify.estimation.figures import best_fit_percent
+from identify.estimation.projected import Problem, search
 from identify.methods.maximum_likelihood import estimate
-from identify.projection import Problem, search
-from identify.record import Record
+from identify.records.record import Record
 from tests.identify.patients import Patient, make_record
 
 NOISY = 0.05

@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from identify.dynamics import boundary_states, transition
+from identify.dynamics.pulse_grid import make_grid, runs
+from identify.dynamics.second_order import boundary_states, transition
 from identify.errors import BadRecord
-from identify.grid import make_grid, runs
-from identify.noise import best_ar1, log_likelihood, whiten
-from identify.record import Record
+from identify.noise.ar1 import best_ar1, log_likelihood, whiten
+from identify.records.record import Record
 
 PULSE_RATE_HZ = 40.0
 FINE = 200  # steps of the reference integration in each pulse interval

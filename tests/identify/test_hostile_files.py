@@ -12,8 +12,8 @@ import pytest
 
 import identify
 from bench import hostile_shapes as shapes
-from identify import bounds
-from identify.hdf5 import StrictFile
+from identify.records import bounds
+from identify.records.hdf5 import StrictFile
 from identify.strict_json import BadJson, parse
 
 

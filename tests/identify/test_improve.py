@@ -9,8 +9,8 @@ import pytest
 
 import identify
 from identify.errors import BadRequest
+from identify.estimation.uncertainty import prediction_band
 from identify.model import Model
-from identify.uncertainty import prediction_band
 from tests.identify import hidden_muscles
 
 

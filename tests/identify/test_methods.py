@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 import identify
-from identify import table1
-from identify.figures import best_fit_percent
-from identify.grid import make_grid
-from identify.linear import Discrete, SecondOrder
+from identify.dynamics.linear import Discrete, SecondOrder
+from identify.dynamics.pulse_grid import make_grid
+from identify.estimation.figures import best_fit_percent
 from identify.methods import Method, method_of, methods
-from identify.output_error import choose_order, output_error
+from identify.methods.support.output_error import choose_order, output_error
+from identify.paper import table1
 from tests.identify.patients import Patient, make_record, multilevel, prbs
 
 ALL = ("maximum-likelihood", "narx", "ramp-deconvolution", "separable-least-squares", "two-stage")

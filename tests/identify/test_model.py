@@ -10,13 +10,13 @@ import pytest
 from scipy.signal import lfilter
 
 import identify
-from identify.linear import Discrete, SecondOrder
-from identify.record import Record
+from identify.dynamics.linear import Discrete, SecondOrder
+from identify.estimation.quality import check
+from identify.records.record import Record
 from identify.recruitment.curve import Curve
 from identify.recruitment.power import PowerBasis
 from identify.recruitment.sigmoid import SigmoidBasis
 from identify.recruitment.spline import SplineBasis
-from identify.validity import check
 from tests.identify.patients import Patient, make_record
 
 KEYS = {

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import identify
-from identify.linear import SecondOrder
-from identify.noise import best_ar1, log_likelihood, noise_evidence, whiten
-from identify.residual_tests import chi_square_p
-from identify.uncertainty import prediction_band
+from identify.dynamics.linear import SecondOrder
+from identify.estimation.residual_tests import chi_square_p
+from identify.estimation.uncertainty import prediction_band
+from identify.noise.ar1 import best_ar1, log_likelihood, noise_evidence, whiten
 from tests.identify.patients import Patient, make_record
 
 RECORDS = 60
@@ -123,7 +123,7 @@ def test_chi_square_tail_against_scipy():
 def test_starting_is_cheap():
     code = (
         "import sys, identify; assert 'numpy' not in sys.modules;"
-        "import identify.estimate, identify.records, identify.csv_record, identify.finish;"
+        "import identify.fitting, identify.records.read, identify.records.csv, identify.estimation.finish;"
         "import identify.methods.maximum_likelihood;"
         "slow = [m for m in ('scipy.signal', 'scipy.optimize', 'scipy.stats', 'scipy.interpolate', 'numba', 'h5py')"
         " if m in sys.modules]; assert not slow, slow"

@@ -1,0 +1,131 @@
+"""Adding what is missing, one effect after the other, while the evidence lasts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from identify.diagnosis.analysis import MOST, Analysis, analyse
+from identify.diagnosis.candidates import Progress, names, try_effect
+from identify.diagnosis.steps import Step, steps
+from identify.diagnosis.verdict import judge
+from identify.effects import get
+from identify.estimation.statistics import figures
+from identify.estimation.to_model import to_model
+from identify.records.record import Record
+
+COLUMNS = ("fit_percent", "rms_nm", "held_out_rms_nm", "held_out_fit_percent")
+
+
+def improve(
+    record: Record,
+    progress: Progress | None = None,
+    max_effects: int | None = None,
+    force: Sequence[str] = (),
+) -> dict[str, Any]:
+    """Models of a record, each with one effect more, up to as many as are there.
+
+    Parameters
+    ----------
+    record : Record
+        Pulse widths and torque.
+    progress : callable or None
+        Called with a share of 0 to 1 and a line of text.
+    max_effects : int or None
+        Effects at most.
+    force : sequence of str
+        Effects that a person wants added although the record doesn't ask for them; the held-out error then shows it.
+
+    Returns
+    -------
+    dict
+        As `improve --json` in the contract, with `models` (MODEL.json of each step, `extra.parent` its forebear's id),
+        `refused` (effects not added, with the reason) and each step's `reason`.
+
+    Raises
+    ------
+    BadRequest
+        A forced effect is unknown.
+    """
+    for effect in force:
+        get(effect)
+    work = analyse(record, progress, most=MOST if max_effects is None else min(max_effects, MOST))
+    verdict = judge(work)
+    row = steps(work)
+    if max_effects is not None:
+        row = row[: max_effects + 1]
+    reasons = [_reason(work, step) for step in row]
+    for effect in force:
+        step = _forced(row[-1], effect, record)
+        if step is not None:
+            row.append(step)
+            reasons.append("Added because a person asked for it; the record doesn't.")
+    models = _models(row, record)
+    return {
+        "noise_sd_nm": work.raw.noise_sd_nm,
+        "verdict": verdict.kind,
+        "steps": [
+            {"added": step.added}
+            | {key: step.figures[key] for key in COLUMNS}
+            | {"model_id": model["model_id"], "reason": reason, "ceiling_percent": step.figures["ceiling_percent"]}
+            for step, model, reason in zip(row, models, reasons, strict=True)
+        ],
+        "models": models,
+        "refused": refused(work),
+    }
+
+
+def _reason(work: Analysis, step: Step) -> str:
+    if step.added is None:
+        return "Recruitment and linear dynamics alone."
+    if step.added in work.given:
+        return "Seen in the raw samples."
+    number = work.added.index(step.added)
+    gain = work.rounds[number][0].gain if number < len(work.rounds) else 0.0
+    return f"Log evidence rises by {gain:.0f}; {work.margins[number]:.0f} would do."
+
+
+def refused(work: Analysis) -> list[dict[str, Any]]:
+    """Effects that were tried on the last model and not added, best first, with the reason."""
+    present = set(names(work.last))
+    if not work.rounds:
+        return []
+    number = min(len(work.added), len(work.rounds) - 1)
+    margin = work.margins[number] if number < len(work.margins) else 0.0
+    rows = []
+    for candidate in work.rounds[number]:
+        if candidate.effect.id in present:
+            continue
+        if candidate.gain <= 0.0:
+            reason = f"The record speaks against it: log evidence {candidate.gain:+.1f}."
+        elif candidate.gain < margin:
+            reason = (
+                f"Too little speaks for it: log evidence {candidate.gain:+.1f}, at least {margin:.0f} is asked for."
+            )
+        else:
+            reason = "Another effect explains the same better."
+        rows.append({"effect": candidate.effect.id, "log_evidence_gain": candidate.gain, "reason": reason})
+    return rows
+
+
+def _forced(last: Step, effect: str, record: Record) -> Step | None:
+    if effect in names(last.fitted):
+        return None
+    candidate = try_effect(get(effect), last.fitted)
+    if candidate is None:
+        return None
+    return Step(effect, candidate.fitted, figures(candidate.fitted, record))
+
+
+def _models(row: list[Step], record: Record) -> list[dict[str, Any]]:
+    models: list[dict[str, Any]] = []
+    for number, step in enumerate(row):
+        parent = models[-1]["model_id"] if models else None
+        model = to_model(
+            step.fitted,
+            record,
+            step.figures,
+            extra={"parent": parent, "added": step.added, "step": number},
+        )
+        models.append(model.to_dict())
+    return models

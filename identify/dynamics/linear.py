@@ -1,0 +1,190 @@
+"""The linear block G(q): second order in physical terms, or the general (l, n, d) of equations (1) to (3)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from identify.dynamics.second_order import boundary_states, read_at, transition
+
+if TYPE_CHECKING:
+    from identify.dynamics.pulse_grid import Grid
+
+
+@dataclass(frozen=True)
+class SecondOrder:
+    """T² y'' + 2 ζ T y' + y = w(t - delay): unit gain at DC (section V of the paper).
+
+    Parameters
+    ----------
+    time_constant_s : float
+        T, s (Tω in the paper).
+    damping : float
+        ζ, 1 is critical.
+    delay_s : float
+        Lag behind the pulses, s.
+    """
+
+    time_constant_s: float
+    damping: float
+    delay_s: float = 0.0
+
+    @property
+    def memory_s(self) -> float:
+        """Time after which an impulse is forgotten to about 1 part in 1000, s."""
+        slowest = self.damping - np.sqrt(max(self.damping**2 - 1.0, 0.0))
+        return self.delay_s + 7.0 * self.time_constant_s / max(slowest, 1e-3)
+
+    def on_grid(self, grid: Grid, drive_nm: np.ndarray) -> np.ndarray:
+        """Block means of the response to a held drive, (K,) or (K, M) N·m, from rest."""
+        torque, rate = boundary_states(self.time_constant_s, self.damping, grid.step_s, drive_nm)
+        return grid.block_mean(torque, rate, self.delay_s)
+
+    def at_samples(self, grid: Grid, drive_nm: np.ndarray) -> np.ndarray:
+        """The response at the record's samples, shape (N,)."""
+        torque, rate = boundary_states(self.time_constant_s, self.damping, grid.step_s, drive_nm)
+        position = grid.interval + grid.fraction - self.delay_s / grid.step_s
+        return read_at(torque, rate, position, grid.step_s)
+
+    def discrete(self, sample_rate_hz: float) -> tuple[np.ndarray, np.ndarray, int]:
+        """(b, a, d) of equations (1) to (3) at a sampling rate, exact for an input held between samples.
+
+        A delay that is no whole number of samples goes into b, as a third coefficient.
+        """
+        step = 1.0 / sample_rate_hz
+        whole = int(np.floor(self.delay_s / step + 1e-9))
+        rest = max(self.delay_s - whole * step, 0.0)
+        phi, gamma = transition(self.time_constant_s, self.damping, step)
+        # The input changes `rest` after the sample: the older value acts first, then the newer for step - rest.
+        newer = transition(self.time_constant_s, self.damping, step - rest)[1]
+        older = gamma - newer
+        a = np.array([1.0, -np.trace(phi), np.linalg.det(phi)])
+        turn = phi - np.trace(phi) * np.eye(2)
+        b = np.array([newer[0], (turn @ newer)[0] + older[0], (turn @ older)[0]])
+        return (b[:2] if rest < 1e-9 * step else b) * (a.sum() / b.sum()), a, whole + 1
+
+    def step_response(self, time_s: np.ndarray) -> np.ndarray:
+        """Response to a unit step at zero, shape of `time_s`."""
+        t = np.maximum(np.asarray(time_s, float) - self.delay_s, 0.0) / self.time_constant_s
+        zeta = self.damping
+        if abs(zeta - 1.0) < 1e-6:
+            return 1.0 - (1.0 + t) * np.exp(-t)
+        root = np.sqrt(complex(zeta * zeta - 1.0))
+        p, q = -zeta + root, -zeta - root
+        return np.real(1.0 + (q * np.exp(p * t) - p * np.exp(q * t)) / (p - q))
+
+    def to_dict(self) -> dict:
+        return {
+            "kind": "second-order",
+            "time_constant_s": self.time_constant_s,
+            "damping": self.damping,
+            "delay_s": self.delay_s,
+        }
+
+
+@dataclass(frozen=True)
+class Discrete:
+    """B(q)/A(q) from the drive of an interval to the mean torque of an interval, equations (1) to (3).
+
+    Parameters
+    ----------
+    b : tuple of float
+        b0 … bn.
+    a : tuple of float
+        1, a1 … al.
+    delay_samples : int
+        d, in pulse intervals.
+    step_s : float
+        Pulse interval, s.
+    centre : float
+        Where in the interval its mean stands, 0 to 1: 0 for one sample a pulse, near 0.5 for many.
+    """
+
+    b: tuple[float, ...]
+    a: tuple[float, ...]
+    delay_samples: int
+    step_s: float
+    centre: float = 0.0
+
+    @property
+    def poles(self) -> np.ndarray:
+        """Roots of A."""
+        return np.roots(self.a) if len(self.a) > 1 else np.zeros(0)
+
+    @property
+    def stable(self) -> bool:
+        """Whether every pole is inside the unit circle."""
+        return bool(np.all(np.abs(self.poles) < 1.0 - 1e-9))
+
+    @property
+    def memory_s(self) -> float:
+        """Time after which an impulse is forgotten to about 1 part in 1000, s."""
+        slowest = min(float(np.max(np.abs(self.poles), initial=0.0)), 1.0 - 1e-6)
+        decay = 7.0 / -np.log(slowest) if slowest > 0 else 0.0
+        return self.step_s * (self.delay_samples + len(self.b) + decay)
+
+    def on_grid(self, grid: Grid, drive_nm: np.ndarray) -> np.ndarray:
+        """Block means of the response to a held drive, (K,) or (K, M) N·m, from rest."""
+        if abs(grid.step_s - self.step_s) > 1e-9:
+            return _resampled(self, grid, drive_nm)
+        return self.filter(drive_nm)
+
+    def filter(self, drive_nm: np.ndarray) -> np.ndarray:
+        """B(q)/A(q) applied along the first axis, from rest."""
+        from scipy.signal import lfilter
+
+        return np.asarray(lfilter(np.r_[np.zeros(self.delay_samples), self.b], self.a, drive_nm, axis=0))
+
+    def at_samples(self, grid: Grid, drive_nm: np.ndarray) -> np.ndarray:
+        """The response at the record's samples: a cubic through the block means at their centres, shape (N,)."""
+        mean = self.on_grid(grid, drive_nm)
+        position = grid.interval + grid.fraction - self.centre
+        if np.allclose(position, np.round(position), atol=1e-6):
+            return mean[np.clip(np.round(position).astype(np.int64), 0, mean.size - 1)]
+        slope = np.gradient(mean) / grid.step_s
+        return read_at(np.r_[mean, mean[-1]], np.r_[slope, 0.0], position, grid.step_s)
+
+    def discrete(self, sample_rate_hz: float) -> tuple[np.ndarray, np.ndarray, int]:  # noqa: ARG002
+        """(b, a, d) at the pulse rate, the only rate at which this block is defined."""
+        return np.array(self.b), np.array(self.a), self.delay_samples
+
+    def step_response(self, time_s: np.ndarray) -> np.ndarray:
+        """Response to a unit step at zero, linear between pulses."""
+        time_s = np.asarray(time_s, float)
+        size = int(np.ceil(max(float(np.max(time_s, initial=0.0)) / self.step_s, 1.0))) + 2
+        response = self.filter(np.ones(size))
+        return np.interp(time_s / self.step_s, np.arange(size) + self.centre, response)
+
+    def to_dict(self) -> dict:
+        return {"kind": "discrete", "step_s": self.step_s, "centre": self.centre}
+
+
+def _resampled(block: Discrete, grid: Grid, drive_nm: np.ndarray) -> np.ndarray:
+    """A discrete block on a grid of another pulse interval: run at its own, read at the other."""
+    size = int(np.ceil(grid.size * grid.step_s / block.step_s))
+    own = np.arange(size) * block.step_s
+    source = np.clip(np.floor((own + 1e-9) / grid.step_s).astype(np.int64), 0, grid.size - 1)
+    response = block.filter(drive_nm[source])
+    at = (np.arange(grid.size) + block.centre) * grid.step_s
+    if response.ndim == 1:
+        return np.interp(at, own + block.centre * block.step_s, response)
+    columns = [np.interp(at, own + block.centre * block.step_s, column) for column in response.T]
+    return np.stack(columns, axis=1)
+
+
+Linear = SecondOrder | Discrete
+
+
+def linear_from_dict(data: dict) -> Linear:
+    """The block that `to_dict` and the coefficients b, a, delay_samples describe."""
+    if data.get("kind", "discrete") == "second-order":
+        return SecondOrder(float(data["time_constant_s"]), float(data["damping"]), float(data.get("delay_s", 0.0)))
+    return Discrete(
+        b=tuple(float(x) for x in data["b"]),
+        a=tuple(float(x) for x in data["a"]),
+        delay_samples=int(data["delay_samples"]),
+        step_s=float(data["step_s"]),
+        centre=float(data.get("centre", 0.0)),
+    )

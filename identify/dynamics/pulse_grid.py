@@ -1,0 +1,330 @@
+"""From samples to pulse intervals: one row a pulse, whatever the sampling rate.
+
+Everything is estimated on the grid of pulses: 40 rows a second carry all that a muscle of 0.1 s and slower can show,
+memory is a time and not a count of samples, and the mean over an interval keeps the information of its samples.
+Half a sample counts (1.25 ms cost 36 log-likelihood units in a trial), so the mean is modelled as what it is, the mean
+of the model's curve at the very times at which the samples of that interval were taken.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from identify.dynamics.second_order import hermite
+from identify.errors import BadRecord
+from identify.records.record import Record
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A record on the grid of its pulses.
+
+    Parameters
+    ----------
+    record : Record
+        What it was made from.
+    start_s : float
+        Time of the first pulse slot, s.
+    step_s : float
+        Pulse interval, s.
+    pulse_width_us : ndarray, shape (K,)
+        Width held in each interval, µs.
+    torque_nm : ndarray, shape (K,)
+        Mean of the samples in each interval, N·m.
+    count : ndarray of int, shape (K,)
+        Samples in each interval; 0 where there is none (its torque is then NaN, and it is never fitted).
+    interval, fraction : ndarray, shape (N,)
+        For each sample: its interval, and where in it, 0 to 1.
+    held_out : ndarray of bool, shape (K,)
+        Intervals with any held-out sample.
+    segment : ndarray of int, shape (K,)
+        Index into the record's `segment_names`.
+    angle_rad, velocity_rad_s : ndarray or None, shape (K,)
+        Means over each interval.
+    """
+
+    record: Record
+    start_s: float
+    step_s: float
+    pulse_width_us: np.ndarray
+    torque_nm: np.ndarray
+    count: np.ndarray
+    interval: np.ndarray
+    fraction: np.ndarray
+    held_out: np.ndarray
+    segment: np.ndarray
+    angle_rad: np.ndarray | None
+    velocity_rad_s: np.ndarray | None
+
+    @property
+    def size(self) -> int:
+        """Number of intervals, K."""
+        return self.pulse_width_us.size
+
+    @cached_property
+    def time_s(self) -> np.ndarray:
+        """Start of each interval, s, shape (K,)."""
+        return self.start_s + self.step_s * np.arange(self.size)
+
+    @cached_property
+    def fitted(self) -> np.ndarray:
+        """bool, shape (K,): intervals that may be used to fit and to choose.
+
+        An interval with fewer than half of its samples (an edge, a gap) is left out: its mean is noisier than the rest.
+        """
+        usual = float(np.median(self.count[self.count > 0])) if np.any(self.count) else 1.0
+        return ~self.held_out & (self.count > 0) & (2 * self.count >= usual)
+
+    @cached_property
+    def stretches(self) -> list[slice]:
+        """Contiguous runs of fitted intervals: noise is correlated inside one, not across."""
+        return runs(self.fitted)
+
+    def mean_weights(self, delay_s: float = 0.0) -> tuple[int, np.ndarray]:
+        """How an interval's mean is read off the boundary states, for a model that lags by `delay_s`.
+
+        Returns
+        -------
+        first : int
+            Offset of the earliest boundary used, relative to the interval (0 or negative).
+        weights : ndarray, shape (K, B, 2)
+            Weights of (y, y') at boundaries first, first + 1, … relative to each interval: the mean of interval k is
+            sum over b of weights[k, b, 0] * y[k + first + b] + weights[k, b, 1] * y'[k + first + b].
+        """
+        if delay_s not in self._weights:
+            if len(self._weights) >= 4:  # a search asks for the same delay several times, then never again
+                self._weights.clear()
+            self._weights[delay_s] = self._even_weights(delay_s) if self._pattern.size else self._any_weights(delay_s)
+        return self._weights[delay_s]
+
+    @cached_property
+    def _pattern(self) -> np.ndarray:
+        """Places of the samples in every interval, where all intervals are sampled alike; else empty."""
+        each = int(self.count[0])
+        if not each or np.any(self.count != each):
+            return np.zeros(0)
+        places = self.fraction.reshape(-1, each)
+        return places[0] if np.max(np.abs(places - places[0])) < 1e-9 else np.zeros(0)
+
+    def _even_weights(self, delay_s: float) -> tuple[int, np.ndarray]:
+        """Weights where every interval has the same: one row, standing for all."""
+        shifted = self._pattern - delay_s / self.step_s
+        offset = np.floor(shifted).astype(np.int64)
+        cubic = hermite(shifted - offset, self.step_s)
+        first = int(offset.min())
+        row = np.zeros((int(offset.max()) - first + 2, 2))
+        np.add.at(row, offset - first, cubic[:, :2])
+        np.add.at(row, offset - first + 1, cubic[:, 2:])
+        return first, np.broadcast_to(row / self._pattern.size, (self.size, *row.shape))
+
+    def _any_weights(self, delay_s: float) -> tuple[int, np.ndarray]:
+        """Weights from running sums, whatever the samples' places."""
+        shift = delay_s / self.step_s
+        whole = int(np.floor(shift))
+        part = shift - whole
+        # Samples past `part` of their interval are read in the interval `whole` before, the others one earlier still.
+        split = np.searchsorted(self._position, np.arange(self.size) + part, side="left")
+        split = np.clip(split, self._edges[:-1], self._edges[1:])
+        groups = []
+        for offset, start, stop, lag in (
+            (-whole - 1, self._edges[:-1], split, part - 1.0),
+            (-whole, split, self._edges[1:], part),
+        ):
+            if np.any(stop > start):
+                groups.append((offset, _mean_hermite(self._powers[:, stop] - self._powers[:, start], lag, self.step_s)))
+        first = groups[0][0]
+        weights = np.zeros((self.size, groups[-1][0] - first + 2, 2))
+        for offset, cubic in groups:
+            weights[:, offset - first] += cubic[:, :2]
+            weights[:, offset - first + 1] += cubic[:, 2:]
+        return first, weights / np.maximum(self.count, 1)[:, None, None]
+
+    @cached_property
+    def _weights(self) -> dict[float, tuple[int, np.ndarray]]:
+        return {}
+
+    @cached_property
+    def _position(self) -> np.ndarray:
+        """Each sample's place in steps since the first pulse slot, rising."""
+        return self.interval + self.fraction
+
+    @cached_property
+    def _edges(self) -> np.ndarray:
+        """First sample of each interval, and the number of samples; shape (K + 1,)."""
+        return np.searchsorted(self.interval, np.arange(self.size + 1))
+
+    @cached_property
+    def _powers(self) -> np.ndarray:
+        """Running sums of 1, f, f², f³ over the samples, f their place in the interval; shape (4, N + 1)."""
+        sums = np.zeros((4, self.fraction.size + 1))
+        term = np.ones(self.fraction.size)
+        for power in range(4):
+            np.cumsum(term, out=sums[power, 1:])
+            term = term * self.fraction
+        return sums
+
+    def block_mean(self, torque_nm: np.ndarray, rate_nm_s: np.ndarray, delay_s: float = 0.0) -> np.ndarray:
+        """Mean over each interval's samples of the curve through boundary states.
+
+        Parameters
+        ----------
+        torque_nm, rate_nm_s : ndarray, shape (K + 1,) or (K + 1, M)
+            States at the ends of the intervals; the muscle is taken to be at `torque_nm[0]` before the first.
+        delay_s : float
+            Lag of the curve behind the pulses, s; may be negative by less than a step.
+
+        Returns
+        -------
+        ndarray, shape (K,) or (K, M)
+        """
+        first, weights = self.mean_weights(delay_s)
+        before, after = max(-first, 0), max(weights.shape[1] + first - 2, 0)
+        y = _padded(torque_nm, before, after, hold=True)
+        v = _padded(rate_nm_s, before, after, hold=False)
+        size = self.size
+        # As the states come, column by column; and in place, since fresh arrays of this size cost more than the sums.
+        result = np.zeros((size, *torque_nm.shape[1:]), order="F")
+        term = np.empty_like(result)
+        lift = (slice(None),) + (None,) * (torque_nm.ndim - 1)
+        for b in range(weights.shape[1]):
+            rows = slice(before + first + b, before + first + b + size)
+            for state, weight in ((y, weights[:, b, 0]), (v, weights[:, b, 1])):
+                factor = weight[0] if weight.strides == (0,) else weight[lift]
+                if np.any(factor):
+                    np.multiply(state[rows], factor, out=term)
+                    result += term
+        return result
+
+
+def _mean_hermite(sums: np.ndarray, lag: float, step_s: float) -> np.ndarray:
+    """Sums of the cubic's four weights over samples at f - lag, from their sums of powers of f; shape (K, 4)."""
+    s0, s1, s2, s3 = sums
+    x1 = s1 - lag * s0
+    x2 = s2 - 2 * lag * s1 + lag * lag * s0
+    x3 = s3 - 3 * lag * s2 + 3 * lag * lag * s1 - lag**3 * s0
+    rise = 3 * x2 - 2 * x3
+    return np.stack([s0 - rise, step_s * (x1 - 2 * x2 + x3), rise, step_s * (x3 - x2)], axis=1)
+
+
+def _padded(values: np.ndarray, before: int, after: int, *, hold: bool) -> np.ndarray:
+    if not before and not after:
+        return values
+    head = np.repeat(values[:1], before, axis=0) if hold else np.zeros((before, *values.shape[1:]))
+    tail = np.repeat(values[-1:], after, axis=0) if hold else np.zeros((after, *values.shape[1:]))
+    return np.concatenate([head, values, tail])
+
+
+def runs(flags: np.ndarray) -> list[slice]:
+    """Contiguous runs of true values, as slices."""
+    edges = np.flatnonzero(np.diff(np.r_[0, flags.astype(np.int8), 0]))
+    return [slice(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def make_grid(record: Record) -> Grid:
+    """Put a record on the grid of its pulses.
+
+    Raises
+    ------
+    BadRecord
+        Fewer than eight pulse intervals, or sampled more slowly than the pulses.
+    """
+    refuse_nonsense(record)
+    step_s = 1.0 / record.pulse_rate_hz
+    rate_hz = record.sample_rate_hz
+    if not rate_hz >= 0.999 * record.pulse_rate_hz:
+        raise BadRecord(
+            f"sampled at {rate_hz:.4g} Hz, below the {record.pulse_rate_hz:g} pulses a second",
+            mend="Record at 40 Hz or faster.",
+        )
+    start_s = record.time_s[0] + pulse_phase_s(record)
+    # A hair early, so that a sample taken at the pulse itself falls into the interval that the pulse opens.
+    position = (record.time_s - start_s) / step_s + 1e-6 + 1e-3 * min(1.0, record.pulse_rate_hz / rate_hz)
+    interval = np.floor(position).astype(np.int64)
+    lowest = int(interval[0])
+    start_s, position, interval = start_s + lowest * step_s, position - lowest, interval - lowest
+    size = int(interval[-1]) + 1
+    if size < 8:
+        raise BadRecord(f"only {size} pulse intervals long", mend="Give at least a few seconds of data.")
+    count = np.bincount(interval, minlength=size)
+    filled = np.maximum(count, 1)
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        total = np.bincount(interval, values, minlength=size) / filled
+        return np.where(count > 0, total, np.nan)
+
+    first_of = np.searchsorted(interval, np.arange(size))
+    # The middle sample of an interval: not touched by a pulse that came a sample early or late.
+    middle = np.minimum(first_of + count // 2, record.time_s.size - 1)
+    # Where samples are missing the last width seen is taken to be in force still.
+    middle = np.where(count > 0, middle, np.maximum(first_of - 1, 0))
+    return Grid(
+        record=record,
+        start_s=start_s,
+        step_s=step_s,
+        pulse_width_us=record.pulse_width_us[middle],
+        torque_nm=mean(record.torque_nm),
+        count=count,
+        interval=interval,
+        fraction=np.clip((record.time_s - start_s) / step_s - interval, 0.0, 1.0),
+        held_out=np.bincount(interval, record.held_out, minlength=size) > 0,
+        segment=record.segment[middle],
+        angle_rad=None if record.angle_rad is None else mean(record.angle_rad),
+        velocity_rad_s=None if record.velocity_rad_s is None else mean(record.velocity_rad_s),
+    )
+
+
+LONGEST_S = 24 * 3600.0
+
+
+def refuse_nonsense(record: Record) -> None:
+    """Refuse arrays that no measurement gives, whatever front door they came through.
+
+    Raises
+    ------
+    BadRecord
+        Not finite, negative widths, time that doesn't rise, a pulse rate that is none, or more than a day.
+    """
+    if not 1.0 <= record.pulse_rate_hz <= 200.0:
+        raise BadRecord(f"{record.pulse_rate_hz:g} pulses a second", place="pulse_rate_hz", mend="Give 1 to 200 Hz.")
+    columns = {"time_s": record.time_s, "pulse_width_us": record.pulse_width_us, "torque_nm": record.torque_nm}
+    for name, column in columns.items():
+        finite = np.isfinite(column)
+        if not finite.all():
+            raise BadRecord(
+                "not finite", place=f"{name}, sample {int(np.argmin(finite))}", mend="Cut the record there."
+            )
+    if np.any(record.pulse_width_us < 0):
+        place = f"pulse_width_us, sample {int(np.argmax(record.pulse_width_us < 0))}"
+        raise BadRecord("negative", place=place, mend="A pulse width is 0 (no pulse) or positive.")
+    if np.any(np.diff(record.time_s) <= 0):
+        place = f"time_s, sample {int(np.argmax(np.diff(record.time_s) <= 0)) + 1}"
+        raise BadRecord("time doesn't rise", place=place, mend="Sort the samples by time, once each.")
+    if record.time_s[-1] - record.time_s[0] > LONGEST_S:
+        raise BadRecord("longer than a day", place="time_s", mend="Give time in seconds.")
+
+
+def pulse_phase_s(record: Record) -> float:
+    """Time of the pulse slots after the first sample, modulo the pulse interval, s.
+
+    A change of width seen first in the sample at t puts a pulse into (t - 1/rate, t]. The phase that satisfies the
+    most changes is taken; of those, the latest (the pulse coincides with the sample that shows it).
+    """
+    changes = np.flatnonzero(np.diff(record.pulse_width_us)) + 1
+    step_s, sample_s = 1.0 / record.pulse_rate_hz, 1.0 / record.sample_rate_hz
+    if changes.size == 0 or sample_s > 0.999 * step_s:
+        return 0.0
+    latest = np.mod(record.time_s[changes] - record.time_s[0], step_s)
+    trial = np.linspace(0.0, step_s, 401)[:-1]
+    # How many changes each trial phase explains, with a tolerance of a hair for rounding.
+    lag = np.mod(latest[:, None] - trial[None, :] + 1e-3 * sample_s, step_s)
+    explained = (lag < sample_s * 1.002).sum(axis=0)
+    best = np.flatnonzero(explained == explained.max())
+    anchor = trial[best[best.size // 2]]
+    # From the anchor the earliest 'latest' time is the bound; take it exactly, free of the trial's spacing.
+    ahead = np.mod(latest - anchor + 1e-3 * sample_s, step_s)
+    inside = ahead[ahead < sample_s * 1.002]
+    phase = float(np.mod(anchor + np.min(inside) - 1e-3 * sample_s, step_s))
+    return 0.0 if step_s - phase < 1e-9 else phase

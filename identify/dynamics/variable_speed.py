@@ -1,0 +1,291 @@
+"""Second-order muscle dynamics whose speed may vary from pulse to pulse, compiled.
+
+T² y'' + 2 ζ T y' + y = w with w held over each pulse interval, and T there multiplied by a factor that depends on the
+state at its start. Where the factor is exactly 1 the transition of the base is used, bit for bit.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+PARTS = 3
+"""Steps in which a speed law is followed through a pulse interval."""
+LAWS = 27
+"""Columns of the speed law: see `factor`."""
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _transition(time_constant_s, damping, step_s):  # pragma: no cover
+    h = step_s / time_constant_s
+    decay = np.exp(-damping * h)
+    gap = damping * damping - 1.0
+    root = np.sqrt(abs(gap))
+    arg = root * h
+    if abs(gap) < 1e-10:
+        c, s = 1.0, h
+    elif gap < 0:
+        c, s = np.cos(arg), np.sin(arg) / root
+    else:
+        c, s = np.cosh(arg), np.sinh(arg) / root
+    return (
+        decay * (c + damping * s),
+        decay * s * time_constant_s,
+        -decay * s / time_constant_s,
+        decay * (c - damping * s),
+    )
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _uptake(slope, w, a):  # pragma: no cover
+    """Lag of a pump that saturates, w/(1 + s w) - a/(1 + s a) being what drives a towards w."""
+    w, a = min(max(w, 0.0), 1.2), min(max(a, 0.0), 1.2)
+    return max(1.0 + slope * w, 0.08) * max(1.0 + slope * a, 0.08)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _factor(law, w, y, v, scale_nm, slow_s, quick_s, bound):  # pragma: no cover
+    """Factors on T, on the slower and on the quicker lag. `law` holds, each neutral at 0:
+
+    0 log ratio where the drive is below the torque (relaxing), 1 log ratio where torque falls,
+    2 linear in torque, 3 linear in drive, 4 exponential in torque, 5 inverse linear in torque,
+    6 inverse linear in drive; on the slower of the two lags alone:
+    7 linear in torque, 8 log ratio where the drive is below the torque, 9 inverse linear in drive,
+    10 linear in activation (the state between the two lags), 11 on T, linear in activation, 12 on T, power of
+    0.5 + 1.5 a: slower to rise and quicker to fall at high levels, 13 linear in a drive that saturates;
+    on the quicker lag: 14 linear in activation, 15 log ratio where torque falls, 16 log ratio where the drive is
+    below the torque; 17 as 15 on the slower lag; 18 slower lag, linear in bound calcium c (c follows whether there is
+    drive at all, with the quicker lag), 19 quicker lag, linear in c (with the slower lag);
+    20 as 12 on the slower lag; two lags in a row, of which the second keeps its input a when its speed changes:
+    21 the slower second and linear in a, 22 the slower second and inverse linear in torque, 23 and 24 the same with
+    the quicker second; of which the first is a pump that saturates, linear in a and in drive: 25 the slower, 26 the
+    quicker first.
+    """
+    m = 1.0
+    if law[0] != 0.0:
+        d = (w - y) / (0.02 * scale_nm)
+        m *= np.exp(law[0] * 0.5 * (1.0 - d / np.sqrt(1.0 + d * d)))
+    if law[1] != 0.0:
+        d = v / (0.1 * scale_nm)
+        m *= np.exp(law[1] * 0.5 * (1.0 - d / np.sqrt(1.0 + d * d)))
+    level = abs(y) / scale_nm
+    if law[2] != 0.0:
+        m *= max(1.0 + law[2] * level, 0.08)
+    if law[3] != 0.0:
+        m *= max(1.0 + law[3] * abs(w) / scale_nm, 0.08)
+    if law[4] != 0.0:
+        m *= np.exp(law[4] * level)
+    if law[5] != 0.0:
+        m *= 1.0 / max(1.0 + law[5] * level, 0.08)
+    if law[6] != 0.0:
+        m *= 1.0 / max(1.0 + law[6] * abs(w) / scale_nm, 0.08)
+    d = 1.0
+    if law[7] != 0.0:
+        d *= max(1.0 + law[7] * level, 0.08)
+    if law[8] != 0.0:
+        gap = (w - y) / (0.02 * scale_nm)
+        d *= np.exp(law[8] * 0.5 * (1.0 - gap / np.sqrt(1.0 + gap * gap)))
+    if law[9] != 0.0:
+        d *= 1.0 / max(1.0 + law[9] * abs(w) / scale_nm, 0.08)
+    if law[10] != 0.0 or law[11] != 0.0:
+        between = min(max((y + slow_s * v) / scale_nm, 0.0), 1.2)
+        d *= max(1.0 + law[10] * between, 0.08)
+        m *= max(1.0 + law[11] * between, 0.08)
+    if law[12] != 0.0 or law[20] != 0.0:
+        gap = (w - y) / (0.02 * scale_nm)
+        side = np.log(0.5 + 1.5 * min(level, 1.2)) * gap / np.sqrt(1.0 + gap * gap)
+        m *= np.exp(law[12] * side)
+        d *= np.exp(law[20] * side)
+    if law[13] != 0.0:
+        part = abs(w) / scale_nm
+        d *= max(1.0 + law[13] * 1.15 * part / (part + 0.15), 0.08)
+    q = 1.0
+    if law[14] != 0.0:
+        between = min(max((y + quick_s * v) / scale_nm, 0.0), 1.2)
+        q *= max(1.0 + law[14] * between, 0.08)
+    if law[15] != 0.0 or law[17] != 0.0:
+        gap = v / (0.1 * scale_nm)
+        side = 0.5 * (1.0 - gap / np.sqrt(1.0 + gap * gap))
+        q *= np.exp(law[15] * side)
+        d *= np.exp(law[17] * side)
+    if law[16] != 0.0:
+        gap = (w - y) / (0.02 * scale_nm)
+        q *= np.exp(law[16] * 0.5 * (1.0 - gap / np.sqrt(1.0 + gap * gap)))
+    if law[18] != 0.0:
+        d *= max(1.0 + law[18] * bound, 0.08)
+    if law[19] != 0.0:
+        q *= max(1.0 + law[19] * bound, 0.08)
+    if law[25] != 0.0:
+        d *= _uptake(law[25], w / scale_nm, (y + quick_s * v) / scale_nm)
+    if law[26] != 0.0:
+        q *= _uptake(law[26], w / scale_nm, (y + slow_s * v) / scale_nm)
+    return min(max(m, 0.02), 50.0), min(max(d, 0.02), 50.0), min(max(q, 0.02), 50.0)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _second(law, linear, inverse, y, v, lag_s, scale_nm):  # pragma: no cover
+    """Factor on the second of two lags; `lag_s` is what it is now."""
+    factor = 1.0
+    if law[linear] != 0.0:
+        factor *= max(1.0 + law[linear] * min(max((y + lag_s * v) / scale_nm, 0.0), 1.2), 0.08)
+    if law[inverse] != 0.0:
+        factor *= 1.0 / max(1.0 + law[inverse] * min(max(y / scale_nm, 0.0), 1.2), 0.08)
+    return min(max(factor, 0.02), 50.0)
+
+
+@njit(cache=True, nogil=True)
+def run_core(drive, time_constant_s, damping, law, multiplier, scale_nm, step_s, shared):  # pragma: no cover
+    """Boundary states of rows of drives.
+
+    Parameters
+    ----------
+    drive : ndarray, shape (M, K)
+        Held drive of each interval, N·m.
+    time_constant_s, damping : ndarray, shape (M,)
+        T, s, and ζ.
+    law : ndarray, shape (M, LAWS)
+        Coefficients of the speed law.
+    multiplier : ndarray, shape (M or 1 or 0, K)
+        A further factor on T, given; no rows where there is none.
+    scale_nm : float
+        Torque that counts as full, N·m.
+    step_s : float
+        Pulse interval, s.
+    shared : bool
+        Rows that differ from row 0 by their drive alone go through row 0's transitions: a derivative by the drive
+        without that of the speed, ten times cheaper and good enough to descend by.
+
+    Returns
+    -------
+    torque_nm, rate_nm_s : ndarray, shape (M, K + 1)
+    """
+    rows, size = drive.shape
+    given = multiplier.shape[0]
+    torque = np.zeros((rows, size + 1))
+    rate = np.zeros((rows, size + 1))
+    first = np.empty((4, size))
+    varied = False
+    for m in range(rows):
+        base = time_constant_s[m]
+        b11, b12, b21, b22 = _transition(base, damping[m], step_s)
+        slow_s = base * (damping[m] + np.sqrt(max(damping[m] * damping[m] - 1.0, 0.0)))
+        quick_s = 2.0 * damping[m] * base - slow_s
+        lawful = False
+        for j in range(law.shape[1]):
+            lawful = lawful or law[m, j] != 0.0
+        alike = shared and m > 0 and base == time_constant_s[0] and damping[m] == damping[0]
+        for j in range(law.shape[1]):
+            alike = alike and law[m, j] == law[0, j]
+        y, v, bound = 0.0, 0.0, 0.0
+        slow_second = law[m, 21] != 0.0 or law[m, 22] != 0.0
+        quick_second = law[m, 23] != 0.0 or law[m, 24] != 0.0
+        last = 1.0
+        forget = np.exp(-step_s / PARTS / max(quick_s if law[m, 18] != 0.0 else slow_s, 1e-4))
+        if alike and varied:
+            for k in range(size):
+                w = drive[m, k]
+                gap = y - w
+                y, v = w + first[0, k] * gap + first[1, k] * v, first[2, k] * gap + first[3, k] * v
+                torque[m, k + 1] = y
+                rate[m, k + 1] = v
+            continue
+        if not lawful and given == 0:
+            for k in range(size):
+                w = drive[m, k]
+                gap = y - w
+                y, v = w + b11 * gap + b12 * v, b21 * gap + b22 * v
+                torque[m, k + 1] = y
+                rate[m, k + 1] = v
+            continue
+        h = step_s / PARTS
+        for k in range(size):
+            w = drive[m, k]
+            given_f = multiplier[m if given > 1 else 0, k] if given > 0 else 1.0
+            p11, p12, p21, p22 = 1.0, 0.0, 0.0, 1.0
+            # The law is asked several times in an interval: its side may turn in between.
+            for _ in range(PARTS):
+                f, d, q = 1.0, 1.0, 1.0
+                if lawful:
+                    f, d, q = _factor(law[m], w, y, v, scale_nm, slow_s, quick_s, bound)
+                turned = 1.0
+                if slow_second:
+                    second = _second(law[m], 21, 22, y, v, last * slow_s, scale_nm)
+                    d *= second
+                    turned, last = last / second, second
+                elif quick_second:
+                    second = _second(law[m], 23, 24, y, v, last * quick_s, scale_nm)
+                    q *= second
+                    turned, last = last / second, second
+                v *= turned  # y' = (a - y) / lag: what is kept is a
+                f *= given_f
+                # The slower lag times d, the quicker times q: T² = quick·slow, 2 ζ T = quick + slow.
+                t = base * f * np.sqrt(d * q)
+                z = 0.5 * f * (quick_s * q + slow_s * d) / t
+                q11, q12, q21, q22 = _transition(t, z, h)
+                gap = y - w
+                y, v = w + q11 * gap + q12 * v, q21 * gap + q22 * v
+                p21, p22 = turned * p21, turned * p22
+                p11, p12, p21, p22 = (
+                    q11 * p11 + q12 * p21,
+                    q11 * p12 + q12 * p22,
+                    q21 * p11 + q22 * p21,
+                    q21 * p12 + q22 * p22,
+                )
+                goal = abs(w) / (abs(w) + 0.05 * scale_nm)
+                bound = goal + (bound - goal) * forget
+            if m == 0:
+                varied = True
+                first[0, k], first[1, k], first[2, k], first[3, k] = p11, p12, p21, p22
+            torque[m, k + 1] = y
+            rate[m, k + 1] = v
+    return torque, rate
+
+
+@njit(cache=True, nogil=True)
+def mean_weights(fraction, interval, count, shift):  # pragma: no cover
+    """Weights of the boundary states in each interval's mean of samples read `shift` steps late.
+
+    Returns
+    -------
+    first : int
+        Offset of the earliest boundary.
+    weights : ndarray, shape (K, B, 2)
+        For (y, y' times step).
+    """
+    low, high = 1 << 30, -(1 << 30)
+    for n in range(fraction.size):
+        o = int(np.floor(fraction[n] - shift))
+        low, high = min(low, o), max(high, o)
+    width = high - low + 2
+    weights = np.zeros((count.size, width, 2))
+    for n in range(fraction.size):
+        at = fraction[n] - shift
+        o = int(np.floor(at))
+        s = at - o
+        k, b = interval[n], o - low
+        r = 1.0 / count[k]
+        weights[k, b, 0] += r * (1 + 2 * s) * (1 - s) ** 2
+        weights[k, b, 1] += r * s * (1 - s) ** 2
+        weights[k, b + 1, 0] += r * s * s * (3 - 2 * s)
+        weights[k, b + 1, 1] += r * s * s * (s - 1)
+    return low, weights
+
+
+@njit(cache=True, nogil=True)
+def read_means(torque, rate, first, weights, step_s):  # pragma: no cover
+    """Means over intervals, shape (M, K), from boundary states of shape (M, K + 1)."""
+    rows, size = torque.shape[0], weights.shape[0]
+    out = np.zeros((rows, size))
+    for m in range(rows):
+        for k in range(size):
+            total = 0.0
+            for b in range(weights.shape[1]):
+                at = k + first + b
+                if at < 0:
+                    total += weights[k, b, 0] * torque[m, 0]
+                elif at > size:
+                    total += weights[k, b, 0] * torque[m, size]
+                else:
+                    total += weights[k, b, 0] * torque[m, at] + weights[k, b, 1] * rate[m, at] * step_s
+            out[m, k] = total
+    return out

@@ -1,0 +1,122 @@
+"""Figures of a fit: best-fit %, errors, white noise, and the ceiling that noise sets."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from identify.dynamics.pulse_grid import Grid
+
+
+def best_fit_percent(measured_nm: np.ndarray, predicted_nm: np.ndarray) -> float:
+    """100 (1 - ||y - ŷ|| / ||y - mean y||), as in the paper; NaN where y is constant."""
+    spread = float(np.linalg.norm(measured_nm - np.mean(measured_nm))) if measured_nm.size else 0.0
+    if not spread > 0:
+        return float("nan")
+    return 100.0 * (1.0 - float(np.linalg.norm(measured_nm - predicted_nm)) / spread)
+
+
+def rms(residual_nm: np.ndarray) -> float:
+    """Root mean square, N·m."""
+    return float(np.sqrt(np.mean(residual_nm**2))) if residual_nm.size else float("nan")
+
+
+def white_sd(grid: Grid, predicted_nm: np.ndarray, block_sd_nm: float, freedom: float, white: bool) -> float:
+    """White measurement noise at the record's own rate, N·m.
+
+    Where the residual is white on the grid and as large there as white samples would make it, from all of it, which is
+    the efficient way. Else something slower is left in it (a missing effect, correlated noise, hum), and the noise is
+    estimated from second differences, which hardly see what is slow.
+
+    Parameters
+    ----------
+    grid : Grid
+        The record.
+    predicted_nm : ndarray, shape (N,)
+        Of the model.
+    block_sd_nm : float
+        Standard deviation of the residual on the grid.
+    freedom : float
+        Effective number of parameters.
+    white : bool
+        Whether the residual on the grid is better called white than correlated.
+    """
+    rows = grid.fitted[grid.interval] & ~grid.record.held_out
+    residual = grid.record.torque_nm - predicted_nm
+    used = residual[rows]
+    plain = float(np.sqrt(used @ used / max(used.size - freedom, 1.0)))
+    jump = np.diff(residual, 2)[rows[2:] & rows[1:-1] & rows[:-2]]
+    if white and abs(block_sd_nm * np.sqrt(np.median(grid.count[grid.fitted])) / max(plain, 1e-300) - 1.0) < 0.2:
+        return plain
+    return plain if jump.size < 16 else float(min(np.sqrt(np.mean(jump**2) / 6.0), plain))
+
+
+def ceiling_percent(measured_nm: np.ndarray, sd_nm: float) -> float:
+    """Best-fit % that the true system would reach on this noisy record: 100 (1 - ||noise|| / ||y - mean y||)."""
+    spread = float(np.linalg.norm(measured_nm - np.mean(measured_nm))) if measured_nm.size else 0.0
+    if not spread > 0:
+        return float("nan")
+    return 100.0 * (1.0 - sd_nm * float(np.sqrt(measured_nm.size)) / spread)
+
+
+def figures(
+    grid: Grid, rows: np.ndarray, predicted_nm: np.ndarray, sd_nm: float, held_out_change: np.ndarray | None = None
+) -> dict[str, Any]:
+    """What MODEL.json tells under `fit`, at the record's own rate.
+
+    Without `validate`, `held_out_change` (N·m, shape (K,)) turns the fit into that of blocked cross-validation.
+    """
+    record = grid.record
+    measured = record.torque_nm
+    used = rows[grid.interval] & ~record.held_out
+    held = record.held_out
+    result: dict[str, Any] = {
+        "fit_percent": best_fit_percent(measured[used], predicted_nm[used]),
+        "ceiling_percent": ceiling_percent(measured[used], sd_nm),
+        "rms_nm": rms((measured - predicted_nm)[used]),
+        "noise_sd_nm": sd_nm,
+        "held_out_fit_percent": None,
+        "held_out_ceiling_percent": None,
+        "held_out_rms_nm": None,
+        "held_out_by": "none",
+        "samples": int(used.sum()),
+        "held_out_samples": int(held.sum()),
+        "segments": segment_figures(grid, predicted_nm, sd_nm),
+    }
+    if held.any():
+        result |= {
+            "held_out_fit_percent": best_fit_percent(measured[held], predicted_nm[held]),
+            "held_out_ceiling_percent": ceiling_percent(measured[held], sd_nm),
+            "held_out_rms_nm": rms((measured - predicted_nm)[held]),
+            "held_out_by": "validate",
+        }
+    elif held_out_change is not None:
+        left_out = predicted_nm[used] + held_out_change[grid.interval[used]]
+        result |= {
+            "held_out_fit_percent": best_fit_percent(measured[used], left_out),
+            "held_out_ceiling_percent": result["ceiling_percent"],
+            "held_out_rms_nm": rms(measured[used] - left_out),
+            "held_out_by": "cross-validation",
+            "held_out_samples": int(used.sum()),
+        }
+    return result
+
+
+def segment_figures(grid: Grid, predicted_nm: np.ndarray, sd_nm: float) -> list[dict[str, Any]]:
+    """Fit and ceiling of each segment, in order."""
+    record, rows = grid.record, []
+    edges = np.searchsorted(record.segment, np.arange(len(record.segment_names) + 1))
+    for name, start, end in zip(record.segment_names, edges[:-1], edges[1:], strict=True):
+        measured, predicted = record.torque_nm[start:end], predicted_nm[start:end]
+        rows.append(
+            {
+                "segment": name,
+                "start_s": float(record.time_s[start]),
+                "end_s": float(record.time_s[end - 1]),
+                "rms_nm": rms(measured - predicted),
+                "fit_percent": best_fit_percent(measured, predicted),
+                "ceiling_percent": ceiling_percent(measured, sd_nm),
+            }
+        )
+    return rows

@@ -1,0 +1,291 @@
+"""Maximum a posteriori by Gauss-Newton on whitened residuals, with the noise profiled, and the evidence by Laplace."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
+from identify.effects.base import Form
+from identify.estimation.gram import gram
+from identify.noise.level import NoiseLevel, profile, whitened
+from identify.simulation.problem import FIRST_COEFFICIENT, Problem
+from identify.simulation.setup import Setup
+
+OCCAM = 60.0
+"""Least by which the evidence of a fit lies below its log posterior, about."""
+GIVE_UP = 4.0
+"""Steps as good as the last that a losing run is credited with before it is given up."""
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A candidate at its most probable parameters.
+
+    Parameters
+    ----------
+    problem : Problem
+        Stages and parameters.
+    theta : ndarray, shape (P,)
+        On the scale of variation.
+    noise : NoiseLevel
+        Profiled.
+    log_likelihood : float
+        At the optimum.
+    log_evidence : float
+        Laplace's approximation with the priors of `Problem.prior`.
+    residual_nm : ndarray, shape (K,)
+        Target minus prediction, all intervals.
+    hessian : ndarray, shape (P, P)
+        Of minus the log posterior.
+    iterations : int
+        Steps taken.
+    """
+
+    problem: Problem
+    theta: np.ndarray
+    noise: NoiseLevel
+    log_likelihood: float
+    log_evidence: float
+    residual_nm: np.ndarray
+    hessian: np.ndarray
+    iterations: int
+
+    @property
+    def effects(self) -> list[tuple[str, Form]]:
+        """Effects and their forms."""
+        return [(chosen.effect, chosen.form) for chosen in self.problem.chosen]
+
+    @property
+    def physical(self) -> np.ndarray:
+        """Parameters in their units."""
+        return self.problem.physical(self.theta)
+
+    @property
+    def rms_nm(self) -> float:
+        """Of the fitted intervals' residual, N·m."""
+        return float(np.sqrt(np.mean(self.residual_nm[self.problem.setup.fitted] ** 2)))
+
+    def parameters_of(self, effect: str) -> dict[str, float]:
+        """An effect's parameters by name."""
+        values = self.physical
+        for chosen in self.problem.chosen:
+            if chosen.effect == effect:
+                return {p.name: float(values[i]) for i, p in zip(chosen.places, chosen.parameters, strict=True)}
+        return {}
+
+    def covariance(self) -> np.ndarray:
+        """Covariance of the parameters in their units, shape (P, P)."""
+        inverse = np.linalg.pinv(self.hessian, hermitian=True)
+        slope = np.where(self.problem.log, self.physical, 1.0)
+        return inverse * slope[:, None] * slope[None, :]
+
+
+def _noise(problem: Problem, residual: np.ndarray, near: NoiseLevel) -> tuple[NoiseLevel, float]:
+    return profile(residual, problem.setup.stretches, near)
+
+
+def _whiten(problem: Problem, rows: np.ndarray, noise: NoiseLevel) -> np.ndarray:
+    return whitened(rows, problem.setup.stretches, noise)
+
+
+def _residual(problem: Problem, mean: np.ndarray) -> np.ndarray:
+    return problem.setup.target_nm - mean
+
+
+def _penalty(problem: Problem, theta: np.ndarray) -> float:
+    mean, precision = problem.prior
+    away = theta - mean
+    return 0.5 * float(away @ precision @ away)
+
+
+def solve(
+    problem: Problem,
+    theta: np.ndarray,
+    noise: NoiseLevel,
+    *,
+    most: int = 20,
+    tolerance: float = 0.02,
+    floor: float | None = None,
+) -> Fitted:
+    """Most probable parameters, from a start.
+
+    Parameters
+    ----------
+    problem : Problem
+        The candidate.
+    theta : ndarray, shape (P,)
+        Start, on the scale of variation.
+    noise : NoiseLevel
+        Start of the noise.
+    most : int
+        Steps at most.
+    tolerance : float
+        Gain in log posterior below which it stops.
+    floor : float or None
+        Log evidence of a rival start: a run that stays far below it and hardly gains is given up.
+    """
+    at = _at(problem, np.clip(theta, problem.lower, problem.upper), noise)
+    assert at is not None
+    frozen = np.zeros(problem.size, bool)
+    for chosen in problem.chosen:
+        if chosen.effect == "mains_hum":
+            frozen[chosen.places.start : chosen.places.stop] = True
+    damping, iterations = 1e-3, 0
+    prior_mean, precision = problem.prior
+    jacobian = _slopes(problem, at.theta)
+    while iterations < most:
+        iterations += 1
+        products = gram(_whiten(problem, np.vstack([at.residual, jacobian]), at.noise))
+        gradient = products[0, 1:] - precision @ (at.theta - prior_mean)
+        found, damping = _advance(problem, at, products[1:, 1:] + precision, gradient, damping, frozen)
+        if found is None:
+            break
+        gain, at = found.value - at.value, found
+        jacobian = _slopes(problem, at.theta)
+        if gain < tolerance and iterations >= 2:
+            break
+        if floor is not None and iterations >= 3 and at.value - OCCAM + GIVE_UP * gain < floor - 12.0:
+            break
+    hessian = gram(_whiten(problem, jacobian, at.noise)) + precision
+    return Fitted(
+        problem=problem,
+        theta=at.theta,
+        noise=at.noise,
+        log_likelihood=at.log_likelihood,
+        log_evidence=at.value - 0.5 * _log_det_ratio(hessian, precision),
+        residual_nm=at.residual,
+        hessian=hessian,
+        iterations=iterations,
+    )
+
+
+@dataclass(frozen=True)
+class _Point:
+    """Where a run stands: parameters, residual, noise, log-likelihood, and the log posterior."""
+
+    theta: np.ndarray
+    residual: np.ndarray
+    noise: NoiseLevel
+    log_likelihood: float
+    value: float
+
+
+def _at(problem: Problem, theta: np.ndarray, noise: NoiseLevel) -> _Point | None:
+    mean, _ = problem.run(theta)
+    if not np.all(np.isfinite(mean)):
+        return None
+    residual = _residual(problem, mean)
+    level, log_likelihood = _noise(problem, residual, noise)
+    return _Point(theta, residual, level, log_likelihood, log_likelihood - _penalty(problem, theta))
+
+
+def _slopes(problem: Problem, theta: np.ndarray) -> np.ndarray:
+    _, jacobian = problem.run(theta, derivatives=True)
+    assert jacobian is not None
+    return jacobian
+
+
+def _advance(
+    problem: Problem, at: _Point, hessian: np.ndarray, gradient: np.ndarray, damping: float, frozen: np.ndarray
+) -> tuple[_Point | None, float]:
+    """The next point that is no worse, with the damping to go on with; None where there is none near."""
+    for _ in range(6):
+        step = _step(hessian, gradient, damping, at.theta, problem, frozen)
+        trial = _at(problem, np.clip(at.theta + step, problem.lower, problem.upper), at.noise)
+        if trial is not None and trial.value > at.value - 1e-9:
+            return trial, max(damping / 6.0, 1e-7)
+        damping = max(damping * 8.0, 1e-3)
+    return None, damping
+
+
+def _step(
+    hessian: np.ndarray, gradient: np.ndarray, damping: float, theta: np.ndarray, problem: Problem, frozen: np.ndarray
+) -> np.ndarray:
+    """Damped Newton step; parameters at a bound that want further out stay."""
+    stuck = frozen | ((theta <= problem.lower) & (gradient < 0)) | ((theta >= problem.upper) & (gradient > 0))
+    free = np.flatnonzero(~stuck)
+    scale = np.sqrt(np.diag(hessian)[free])
+    system = hessian[np.ix_(free, free)] / scale[:, None] / scale[None, :]
+    system[np.diag_indices_from(system)] += damping
+    step = np.zeros(theta.size)
+    step[free] = cho_solve(cho_factor(system, check_finite=False), gradient[free] / scale, check_finite=False) / scale
+    # Time constants and damping move by a factor of 2 at most, effects by a third of their range.
+    limit = np.full(theta.size, np.inf)
+    limit[:2] = 0.7
+    for chosen in problem.chosen:
+        for place in chosen.places:
+            limit[place] = (problem.upper[place] - problem.lower[place]) / 3.0
+    over = float(np.max(np.abs(step) / limit))
+    return step / over if over > 1.0 else step
+
+
+def _log_det_ratio(hessian: np.ndarray, precision: np.ndarray) -> float:
+    return float(np.linalg.slogdet(hessian)[1] - np.linalg.slogdet(precision)[1])
+
+
+def start_from(problem: Problem, base: Fitted, values: dict[int, dict[str, float]]) -> np.ndarray:
+    """A start for a larger problem: what a smaller one found, and values for the effects it lacks.
+
+    Parameters
+    ----------
+    problem : Problem
+        The larger.
+    base : Fitted
+        The smaller; its effects come first in `problem.chosen` in the same order, unless given in `values`.
+    values : dict
+        Parameters in their units by index in `problem.chosen`.
+    """
+    theta = np.zeros(problem.size)
+    common = problem.coefficients.stop
+    theta[:common] = base.theta[:common]
+    old = {chosen.effect: base.parameters_of(chosen.effect) for chosen in base.problem.chosen}
+    physical = problem.physical(theta)
+    for index, chosen in enumerate(problem.chosen):
+        known = values.get(index) or old.get(chosen.effect) or {}
+        for place, p in zip(chosen.places, chosen.parameters, strict=True):
+            physical[place] = np.clip(known.get(p.name, p.start[0]), p.lower, p.upper)
+    for known in values.values():
+        physical[0] = known.get("base.time_constant_s", physical[0])
+        physical[1] = known.get("base.damping", physical[1])
+    theta = problem.from_physical(physical)
+    if any("base.time_constant_s" in known for known in values.values()):
+        return linear_start(problem, theta, base.noise)
+    return theta
+
+
+def base_fit(setup: Setup, noise: NoiseLevel | None = None, starts: tuple[float, ...] = (0.06, 0.2, 0.5)) -> Fitted:
+    """The Hammerstein model without effects, from several time constants."""
+    problem = Problem(setup, [])
+    noise = noise or NoiseLevel(0.5, 0.5, 0.1 * setup.scale_nm)
+    best: Fitted | None = None
+    for time_constant_s in starts:
+        theta = np.zeros(problem.size)
+        theta[0], theta[1] = np.log(time_constant_s), np.log(0.9)
+        theta = linear_start(problem, theta, noise)
+        fitted = solve(problem, theta, noise, most=12, tolerance=0.5)
+        if best is None or fitted.log_evidence > best.log_evidence:
+            best = fitted
+    assert best is not None
+    return solve(problem, best.theta, best.noise, most=25)
+
+
+def linear_start(problem: Problem, theta: np.ndarray, noise: NoiseLevel) -> np.ndarray:
+    """Coefficients and baseline solved for, at given other parameters."""
+    mean, jacobian = problem.run(theta, derivatives=True)
+    assert jacobian is not None
+    free = np.r_[3, np.arange(FIRST_COEFFICIENT, problem.coefficients.stop)]
+    white = _whiten(problem, np.vstack([_residual(problem, mean), jacobian[free]]), noise)
+    prior_mean, precision = problem.prior
+    part = precision[np.ix_(free, free)]
+    products = gram(white)
+    gradient = products[0, 1:] - part @ (theta[free] - prior_mean[free])
+    result = theta.copy()
+    result[free] += np.linalg.solve(products[1:, 1:] + part, gradient)
+    return np.clip(result, problem.lower, problem.upper)
+
+
+def relabel(fitted: Fitted, **changes: object) -> Fitted:
+    """The same with some fields changed."""
+    return replace(fitted, **changes)  # type: ignore[arg-type]

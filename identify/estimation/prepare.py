@@ -1,0 +1,247 @@
+"""From a record to a set-up: hum, clipping and white noise at the record's own rate, then the common spline."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from identify.dynamics.pulse_grid import Grid, make_grid, runs
+from identify.effects.mains_hum import HARMONICS
+from identify.estimation.joint import Fitted, base_fit
+from identify.records.record import Record
+from identify.simulation.setup import Setup, refined_basis, uniform_basis
+
+LEAST_LINE = 30.0
+"""Power of a mains line over its neighbours' median that counts as hum."""
+FOLLOWED_S = 1.0
+"""Window over which hum's amplitude and phase are taken as even: the grid's frequency wanders more slowly."""
+MOST_HARMONICS = 8
+LEAST_EQUAL = 20
+"""Samples at exactly the greatest (or smallest) value that count as clipping."""
+
+
+@dataclass(frozen=True)
+class Raw:
+    """What is seen before averaging.
+
+    Parameters
+    ----------
+    torque_nm : ndarray, shape (N,)
+        Without the hum, N·m.
+    noise_sd_nm : float
+        White noise of a sample, N·m.
+    hum : dict or None
+        Parameters of `mains_hum`; None where there is no line.
+    hum_ratio : float
+        Power of the line over its neighbours.
+    ceiling_nm, floor_nm : float or None
+        Clipping level, N·m.
+    """
+
+    torque_nm: np.ndarray
+    noise_sd_nm: float
+    hum: dict[str, float] | None
+    hum_ratio: float
+    ceiling_nm: float | None
+    floor_nm: float | None
+
+
+def inspect(record: Record) -> Raw:
+    """Hum, clipping and white noise of a record; held-out rows are left out, as everywhere."""
+    kept = ~record.held_out
+    torque = record.torque_nm
+    ceiling, floor = _flat(torque[kept]), _flat(-torque[kept])
+    hum, ratio = _find_hum(record, kept)
+    if hum is not None:
+        torque = torque - hum_at(hum, record.time_s - record.time_s[0])
+        torque = torque - _wander(record, torque, hum["frequency_hz"], kept)
+    noise = white_noise(record, torque[kept])
+    return Raw(torque, noise, hum, ratio, ceiling, None if floor is None else -floor)
+
+
+def _flat(torque: np.ndarray) -> float | None:
+    """The greatest value, where it comes far too often for a noisy signal."""
+    top = float(torque.max())
+    equal = int(np.sum(torque == top))
+    if equal < LEAST_EQUAL or top == float(torque.min()):
+        return None
+    # Coarse quantisation repeats every value: the ceiling must repeat far more than the next values below it.
+    values, counts = np.unique(torque[torque > top - 0.25 * (top - float(np.median(torque)))], return_counts=True)
+    below = counts[values < top]
+    # A quiet record resting at its greatest value isn't clipped.
+    if below.size == 0 or equal < 4 * np.max(below):
+        return None
+    return top
+
+
+def white_noise(record: Record, torque: np.ndarray) -> float:
+    """White noise of a sample, from third differences, robustly, N·m.
+
+    At the pulse rate itself the torque moves between samples; there the estimate is an upper bound.
+    """
+    if torque.size < 16:
+        return float(np.std(torque))
+    order = 3 if record.sample_rate_hz > 3.0 * record.pulse_rate_hz else 4
+    difference = np.diff(torque, order)
+    gain = {3: 20.0, 4: 70.0}[order]
+    return float(np.sqrt(np.median(difference**2) / 0.4549 / gain))
+
+
+def hum_at(hum: dict[str, float], time_s: np.ndarray) -> np.ndarray:
+    """The hum at given times, N·m."""
+    total = np.zeros(time_s.shape)
+    for h in range(1, HARMONICS + 1):
+        turn = 2 * np.pi * h * hum["frequency_hz"] * time_s
+        total += hum[f"cos_{h}_nm"] * np.cos(turn) + hum[f"sin_{h}_nm"] * np.sin(turn)
+    return total
+
+
+def _find_hum(record: Record, kept: np.ndarray) -> tuple[dict[str, float] | None, float]:
+    """A line at 50 or 60 Hz that stands out of its neighbours, with its harmonics."""
+    rate_hz = record.sample_rate_hz
+    if rate_hz < 99.0 or kept.sum() < 4 * rate_hz:
+        return None, 0.0
+    longest = max(runs(kept), key=lambda run: run.stop - run.start)
+    # Differences whiten the muscle's own spectrum, so that neighbours are comparable.
+    signal = np.diff(record.torque_nm[longest], 2)
+    window = np.hanning(signal.size)
+    power = np.abs(np.fft.rfft((signal - signal.mean()) * window)) ** 2
+    frequency = np.fft.rfftfreq(signal.size, 1.0 / rate_hz)
+    best: tuple[float, float] = (0.0, 0.0)
+    for mains in (50.0, 60.0):
+        ratio = max(
+            _line(power, frequency, h * mains, h * 0.3) / (1.0 if h == 1 else 1.5)
+            for h in range(1, HARMONICS + 1)
+            if h * mains < 0.5 * rate_hz - 1e-6 or h == 1
+        )
+        best = max(best, (ratio, mains))
+    ratio, mains = best
+    if ratio < LEAST_LINE or mains > 0.5 * rate_hz + 1e-6:
+        return None, ratio
+    return _fit_hum(record, mains, kept), ratio
+
+
+def _line(power: np.ndarray, frequency: np.ndarray, centre_hz: float, reach_hz: float) -> float:
+    inside = np.abs(frequency - centre_hz) <= reach_hz
+    # The 40 Hz pulses have harmonics of their own; neighbours within 8 Hz but outside of the line.
+    around = (np.abs(frequency - centre_hz) <= 8.0) & (np.abs(frequency - centre_hz) > 2 * reach_hz + 0.2)
+    if not inside.any() or not around.any():
+        return 0.0
+    return float(power[inside].max() / max(np.mean(power[around]), 1e-30))
+
+
+def _wander(record: Record, torque: np.ndarray, mains_hz: float, kept: np.ndarray) -> np.ndarray:
+    """What amplitude and phase of hum do beside the even line, N·m: each harmonic followed over a second."""
+    rate_hz = record.sample_rate_hz
+    width = 2 * max(round(rate_hz / record.pulse_rate_hz), 2) + 1
+    box = np.ones(width) / width
+    window = np.hanning(max(round(FOLLOWED_S * rate_hz), 8) + 2)[1:-1]
+    found = np.zeros(torque.size)
+    for run in runs(kept):
+        part = torque[run]
+        if part.size < 2 * window.size:
+            continue
+        high = part - np.convolve(np.convolve(part, box, "same"), box, "same")
+        high[: 2 * width] = high[-2 * width :] = 0.0
+        weight = np.convolve(np.abs(high) > 0, window, "same")
+        h = 1
+        while h * mains_hz < 0.5 * rate_hz - 1.0 and h <= MOST_HARMONICS:
+            turn = np.exp(2j * np.pi * h * mains_hz * record.time_s[run])
+            half = np.pi * h * mains_hz / rate_hz
+            passed = 1.0 - (np.sin(width * half) / (width * np.sin(half))) ** 2
+            slow = np.convolve(high * np.conj(turn), window, "same") / np.maximum(weight, 1e-9)
+            found[run] += 2.0 * np.real(slow * turn) / passed
+            h += 1
+    return found
+
+
+def _fit_hum(record: Record, mains_hz: float, kept: np.ndarray) -> dict[str, float]:
+    """Frequency and amplitudes by least squares on the high-passed torque."""
+    rate_hz, time_s = record.sample_rate_hz, record.time_s - record.time_s[0]
+    width = max(round(rate_hz / record.pulse_rate_hz), 2)
+    harmonics = [h for h in range(1, HARMONICS + 1) if h * mains_hz <= 0.5 * rate_hz + 1e-6]
+
+    def smooth_out(values: np.ndarray) -> np.ndarray:
+        box = np.ones(2 * width + 1) / (2 * width + 1)
+        return values - np.apply_along_axis(lambda c: np.convolve(np.convolve(c, box, "same"), box, "same"), 0, values)
+
+    target = smooth_out(record.torque_nm)[kept]
+
+    def design(frequency_hz: float) -> np.ndarray:
+        turn = 2 * np.pi * frequency_hz * time_s[:, None] * np.array(harmonics)
+        return np.concatenate([np.cos(turn), np.sin(turn)], axis=1)
+
+    def remaining(frequency_hz: float) -> tuple[float, np.ndarray]:
+        columns = smooth_out(design(frequency_hz))[kept]
+        solution = np.linalg.lstsq(columns, target, rcond=1e-6)[0]
+        return float(np.sum((target - columns @ solution) ** 2)), solution
+
+    centre, reach = mains_hz, 0.3
+    for _ in range(3):
+        trials = np.linspace(centre - reach, centre + reach, 13)
+        centre = float(trials[np.argmin([remaining(f)[0] for f in trials])])
+        reach /= 5.0
+    _, solution = remaining(centre)
+    hum = {"frequency_hz": centre}
+    for h in range(1, HARMONICS + 1):
+        for offset, part in ((0, "cos"), (len(harmonics), "sin")):
+            hum[f"{part}_{h}_nm"] = float(solution[harmonics.index(h) + offset]) if h in harmonics else 0.0
+    return hum
+
+
+def block_means(grid: Grid, torque_nm: np.ndarray) -> np.ndarray:
+    """Means over intervals, N·m, NaN where there is no sample."""
+    total = np.bincount(grid.interval, torque_nm, minlength=grid.size) / np.maximum(grid.count, 1)
+    return np.where(grid.count > 0, total, np.nan)
+
+
+def first_setup(record: Record, raw: Raw, grid: Grid | None = None, fitted: np.ndarray | None = None) -> Setup:
+    """A set-up with evenly spread knots."""
+    grid = grid or make_grid(record)
+    target = block_means(grid, raw.torque_nm)
+    rows = grid.fitted if fitted is None else fitted
+    smooth = np.convolve(np.where(np.isfinite(target), target, 0.0), np.ones(3) / 3, "same")
+    scale = max(float(np.percentile(np.abs(smooth[rows] - np.median(smooth[rows][:8])), 99.5)), 1e-3)
+    sample_s = 1.0 / record.sample_rate_hz
+    open_s = min(1.02 * sample_s, 1.02 * grid.step_s)
+    largest = float(max(grid.pulse_width_us.max(), 1.0))
+    return Setup(
+        grid=grid,
+        target_nm=target,
+        fitted=rows,
+        basis=uniform_basis(largest),
+        stiffness=1e3,
+        scale_nm=scale,
+        noise_sd_nm=raw.noise_sd_nm,
+        delay_bounds_s=(-open_s, open_s),
+        reference_s=_reference(grid, rows),
+    )
+
+
+def _reference(grid: Grid, rows: np.ndarray) -> float:
+    """Middle of the fitted pulses that recruit in part, s; of all pulses where there is none."""
+    width = grid.pulse_width_us
+    partly = rows & (width > 0) & (width < 0.97 * width.max())
+    at = np.flatnonzero(partly if partly.any() else rows & (width > 0))
+    return float(np.mean(at) * grid.step_s) if at.size else 0.0
+
+
+def prepare(record: Record, raw: Raw, fitted: np.ndarray | None = None) -> tuple[Setup, Fitted]:
+    """The set-up that all candidates of a record share, and the base model in it.
+
+    Knots and stiffness are chosen by the evidence of the base model alone, then never again.
+    """
+    setup = first_setup(record, raw, fitted=fitted)
+    base = base_fit(setup)
+    best = base
+    refined = refined_basis(setup.basis, base.theta[base.problem.coefficients])
+    for basis in (setup.basis, refined):
+        for stiffness in (1e1, 1e2, 1e3, 1e4, 1e5):
+            if basis is setup.basis and stiffness == setup.stiffness:
+                continue
+            trial = first_setup(record, raw, setup.grid, fitted).with_(basis=basis, stiffness=stiffness)
+            found = base_fit(trial, best.noise, (float(np.exp(base.theta[0])),))
+            if found.log_evidence > best.log_evidence:
+                best = found
+    return best.problem.setup, best

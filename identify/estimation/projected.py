@@ -1,0 +1,491 @@
+"""Variable projection: recruitment in linear coefficients, dynamics in three numbers, one joint estimate.
+
+For given (T, ζ, delay) the model is linear in the recruitment's coefficients, the baseline and, where the record
+doesn't begin at rest, the initial state. They are solved for exactly; only the three numbers are searched
+(Golub & Pereyra 1973, with Kaufman's Jacobian: the Gauss-Newton step of the joint problem).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from identify.dynamics.linear import SecondOrder
+from identify.dynamics.pulse_grid import Grid
+from identify.dynamics.second_order import boundary_states
+from identify.errors import NotIdentifiable
+from identify.noise.ar1 import whiten
+from identify.recruitment.curve import Basis
+from identify.recruitment.knots import (
+    PILOT_KNOTS,
+    adapted_knots,
+    bending_order,
+    even_knots,
+    knots_for,
+    spline_roughness,
+)
+from identify.recruitment.smoothing import choose_weight, straight_lines
+from identify.recruitment.spline import SplineBasis
+
+T_BOUNDS_S = (0.012, 4.0)
+ZETA_BOUNDS = (0.15, 4.0)
+LONGEST_DELAY_S = 0.2
+STARTS_S = (0.12, 0.4)
+CURVE_POINTS = 201
+REWEIGHTED = 2
+"""Steps of a search after which the penalty's weight stays: a moving target has no minimum."""
+
+
+@dataclass
+class Problem:
+    """One record, one basis: what doesn't change while the dynamics are searched.
+
+    Parameters
+    ----------
+    grid : Grid
+        The record on the grid of pulses.
+    basis : Basis
+        Of the recruitment curve.
+    roughness : ndarray, shape (P, P)
+        Penalty on the coefficients.
+    rows : ndarray of bool, shape (K,)
+        Rows that are fitted.
+    from_rest : bool
+        Whether the muscle is at rest before the first pulse; else two columns carry the initial state.
+    delay_s : float or None
+        A fixed delay; None to estimate it.
+    """
+
+    grid: Grid
+    basis: Basis
+    roughness: np.ndarray
+    rows: np.ndarray
+    from_rest: bool = True
+    delay_s: float | None = None
+    stretches: list[slice] = field(init=False)
+
+    def __post_init__(self) -> None:
+        from identify.dynamics.pulse_grid import runs
+
+        self.stretches = runs(self.rows)
+        if not self.stretches:
+            raise NotIdentifiable("no row may be fitted", mend="Give rows outside `validate`.")
+
+    @cached_property
+    def drive(self) -> np.ndarray:
+        """Basis functions of each interval's width, shape (K, P)."""
+        widths, place = np.unique(self.grid.pulse_width_us, return_inverse=True)
+        return np.asfortranarray(self.basis.design(widths)[place])
+
+    @cached_property
+    def null(self) -> int:
+        """Dimension of the curves that the penalty leaves alone."""
+        return straight_lines(self.roughness)
+
+    @cached_property
+    def target(self) -> np.ndarray:
+        """Torque, with zeros where there is none (such rows are never fitted)."""
+        return np.nan_to_num(self.grid.torque_nm)
+
+    @property
+    def extras(self) -> int:
+        """Linear columns that aren't recruitment: baseline, and the initial state."""
+        return 1 if self.from_rest else 3
+
+    def columns(self, linear: SecondOrder) -> np.ndarray:
+        """Block means of the response to each linear coefficient, shape (K, P + extras)."""
+        response = linear.on_grid(self.grid, self.drive)
+        return np.concatenate([response, *self._extra_columns(linear)], axis=1)
+
+    def _extra_columns(self, linear: SecondOrder) -> list[np.ndarray]:
+        baseline = np.ones((self.grid.size, 1))
+        if self.from_rest:
+            return [baseline]
+        from identify.simulation.predict import initial_response
+
+        return [baseline, initial_response(linear, self.grid, at_samples=False)]
+
+    @property
+    def searched(self) -> int:
+        """How many numbers of the dynamics are searched."""
+        return 3 if self.delay_s is None else 2
+
+    def slopes(self, linear: SecondOrder, coefficients: np.ndarray) -> np.ndarray:
+        """Derivatives of the block means by log T, log ζ and (if searched) the delay, shape (K, 2 or 3)."""
+        step, size = 1e-6, self.basis.size
+        t, z, d = linear.time_constant_s, linear.damping, linear.delay_s
+        held, grid = self.drive @ coefficients[:size], self.grid
+        # The delay shifts only where the curve is read: the states are those of the other two's base.
+        torque, rate = boundary_states(t, z, grid.step_s, held)
+        near = [SecondOrder(t * np.exp(step), z, d), SecondOrder(t, z * np.exp(step), d)]
+        values = [at.on_grid(grid, held) for at in near]
+        if self.delay_s is None:
+            near.append(SecondOrder(t, z, d + step))
+            values.append(grid.block_mean(torque, rate, d + step))
+        change = np.stack(values, axis=1) - grid.block_mean(torque, rate, d)[:, None]
+        if not self.from_rest:
+            here = self._extra_columns(linear)[1]
+            tails = [(self._extra_columns(at)[1] - here) @ coefficients[size + 1 :] for at in near]
+            change += np.stack(tails, axis=1)
+        return change / step
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Where a search ended.
+
+    Parameters
+    ----------
+    problem : Problem
+        What was solved.
+    linear : SecondOrder
+        Dynamics.
+    coefficients : ndarray, shape (P + extras,)
+        Recruitment, baseline, initial state.
+    weight : float
+        Of the roughness.
+    ar1 : float
+        Correlation of the noise that rows were whitened with.
+    columns, slopes : ndarray, shape (K, P + extras), (K, 2 or 3)
+        The model's derivatives there.
+    gram : ndarray
+        A'A of the whitened [columns, slopes], penalty added: the information, times the noise variance.
+    freedom : float
+        Effective number of coefficients in all.
+    variance : float
+        Innovation variance on the grid, N²m².
+    iterations : int
+        Steps taken.
+    converged : bool
+        Whether the last step was far below its standard error.
+    """
+
+    problem: Problem
+    linear: SecondOrder
+    coefficients: np.ndarray
+    weight: float
+    ar1: float
+    columns: np.ndarray
+    slopes: np.ndarray
+    gram: np.ndarray
+    freedom: float
+    variance: float
+    iterations: int
+    converged: bool
+
+    @cached_property
+    def fitted_nm(self) -> np.ndarray:
+        """Block means of the model, shape (K,)."""
+        return self.columns @ self.coefficients
+
+    @cached_property
+    def residual_nm(self) -> np.ndarray:
+        """Measured less model on the grid, shape (K,); meaningful in rows with samples."""
+        return self.problem.target - self.fitted_nm
+
+
+def search(
+    problem: Problem,
+    start: SecondOrder,
+    *,
+    ar1: float = 0.0,
+    weight: float | None = None,
+    most: int = 25,
+    tolerance: float = 0.01,
+) -> Solution:
+    """Gauss-Newton on the dynamics with the coefficients projected out, damped where a step fails.
+
+    Parameters
+    ----------
+    problem : Problem
+        Record and basis.
+    start : SecondOrder
+        Where to begin.
+    ar1 : float
+        Correlation of the noise.
+    weight : float, optional
+        Of the roughness; None to choose it by REML on the way.
+    most : int
+        Steps at most.
+    tolerance : float
+        Converged once a step is this small in standard errors.
+    """
+    target = whiten(problem.target, problem.stretches, ar1)
+    state = _assess(problem, _bounded(problem, start), target, ar1, weight)
+    return _descend(state, weight, most, tolerance)
+
+
+def _descend(state: _State, weight: float | None, most: int, tolerance: float) -> Solution:
+    problem, linear, target, ar1 = state.problem, state.linear, state.target, state.ar1
+    damping, taken, converged = 0.0, 0, False
+    while taken < most:
+        taken += 1
+        step = state.step(damping)
+        trial = _bounded(problem, _moved(linear, step))
+        moved = _difference(linear, trial)[: problem.searched]
+        # Steps in units of standard errors, from the information itself.
+        size = float(np.sqrt(max(moved @ state.information @ moved, 0.0) * target.size / state.squares))
+        if size < tolerance or np.max(np.abs(moved)) < 1e-9:
+            converged = True
+            break
+        keep = None if (weight is None and taken <= REWEIGHTED) else state.weight
+        attempt = _assess(problem, trial, target, ar1, keep)
+        against = state.cost if keep is not None else state.cost_at(attempt.weight)
+        if attempt.cost <= against * (1 + 1e-9):
+            linear, state, damping = trial, attempt, damping / 10 if damping > 1e-4 else 0.0
+        else:
+            damping = max(10 * damping, 1e-2)
+            if damping > 1e8:
+                break
+    return state.solution(taken, converged)
+
+
+def project(problem: Problem, linear: SecondOrder, *, ar1: float = 0.0, weight: float | None = None) -> Solution:
+    """Coefficients for given dynamics: the linear half of the problem alone."""
+    return _assess(problem, linear, whiten(problem.target, problem.stretches, ar1), ar1, weight).solution(0, True)
+
+
+class _State:
+    """The joint linear problem at one point of the search."""
+
+    def __init__(
+        self, problem: Problem, linear: SecondOrder, target: np.ndarray, ar1: float, weight: float | None
+    ) -> None:
+        self.problem, self.linear, self.target, self.ar1 = problem, linear, target, ar1
+        self.columns = problem.columns(linear)
+        white = whiten(self.columns, problem.stretches, ar1)
+        self.zz, self.zy = white.T @ white, white.T @ target
+        self.energy = float(target @ target)
+        size, extras = problem.basis.size, problem.extras
+        self.size, self.extras = size, extras
+        if weight is None:
+            weight = self._chosen(size)
+        self.weight = weight
+        self.penalty = np.zeros_like(self.zz)
+        self.penalty[:size, :size] = problem.roughness
+        self.coefficients = _solve(self.zz + weight * self.penalty, self.zy)
+        self.cost = self.energy - float(self.zy @ self.coefficients)
+        self.white = white
+
+    @cached_property
+    def slopes(self) -> np.ndarray:
+        """Derivatives by the searched numbers, shape (K, 2 or 3)."""
+        return self.problem.slopes(self.linear, self.coefficients)
+
+    @cached_property
+    def _bent(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        bent = whiten(self.slopes, self.problem.stretches, self.ar1)
+        return self.white.T @ bent, bent.T @ bent, bent.T @ self.target
+
+    @cached_property
+    def _inner(self) -> np.ndarray:
+        return _solve(self.zz + self.weight * self.penalty, self._bent[0])
+
+    @cached_property
+    def full(self) -> np.ndarray:
+        """The joint information of coefficients and searched numbers, times the noise variance."""
+        cross, square, _ = self._bent
+        return np.block([[self.zz + self.weight * self.penalty, cross], [cross.T, square]])
+
+    @cached_property
+    def information(self) -> np.ndarray:
+        """That of the searched numbers, coefficients projected out."""
+        cross, square, _ = self._bent
+        return square - cross.T @ self._inner
+
+    @cached_property
+    def freedom(self) -> float:
+        """Effective number of parameters."""
+        return float(np.trace(_solve(self.zz + self.weight * self.penalty, self.zz))) + self.slopes.shape[1]
+
+    @cached_property
+    def squares(self) -> float:
+        """Sum of squared innovations, not below what rounding leaves."""
+        c = self.coefficients
+        left = self.energy - 2 * float(self.zy @ c) + float(c @ self.zz @ c)
+        return max(left, 1e-14 * self.energy, 1e-24 * self.target.size)
+
+    @cached_property
+    def variance(self) -> float:
+        """Innovation variance, N²m²."""
+        return self.squares / max(self.target.size - self.freedom, 1.0)
+
+    def _chosen(self, size: int) -> float:
+        outer = self.zz[size:, size:]
+        right = np.concatenate([self.zz[size:, :size], self.zy[size:, None]], axis=1)
+        inner = right / outer if self.extras == 1 else _solve(outer, right)
+        gram = self.zz[:size, :size] - self.zz[:size, size:] @ inner[:, :-1]
+        moment = self.zy[:size] - self.zz[:size, size:] @ inner[:, -1]
+        energy = self.energy - float(self.zy[size:] @ inner[:, -1])
+        if not np.any(self.problem.roughness):
+            return 0.0
+        known = {"free": self.extras, "null": self.problem.null}
+        size_fitted = self.target.size
+        return choose_weight((gram + gram.T) / 2, moment, energy, size_fitted, self.problem.roughness, **known).weight
+
+    def cost_at(self, weight: float) -> float:
+        """The penalised cost here under another weight."""
+        return self.energy - float(self.zy @ _solve(self.zz + weight * self.penalty, self.zy))
+
+    def step(self, damping: float) -> np.ndarray:
+        """Step in (log T, log ζ, delay), along the bounds where it would leave them."""
+        moment = self._bent[2]
+        gradient = moment - self._inner.T @ self.zy
+        free = ~_held(self.problem, self.linear, gradient)
+        step = np.zeros(gradient.size)
+        if free.any():
+            information = self.information[np.ix_(free, free)]
+            step[free] = _solve(information + damping * np.diag(np.diag(information)), gradient[free])
+        return step
+
+    def solution(self, taken: int, converged: bool) -> Solution:
+        return Solution(
+            problem=self.problem,
+            linear=self.linear,
+            coefficients=self.coefficients,
+            weight=self.weight,
+            ar1=self.ar1,
+            columns=self.columns,
+            slopes=self.slopes,
+            gram=self.full,
+            freedom=self.freedom,
+            variance=self.variance,
+            iterations=taken,
+            converged=converged,
+        )
+
+
+def _assess(problem: Problem, linear: SecondOrder, target: np.ndarray, ar1: float, weight: float | None) -> _State:
+    return _State(problem, linear, target, ar1, weight)
+
+
+def _solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Solve a symmetric system, scaled to a unit diagonal, with a hair of ridge against empty columns."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    scaled = matrix * scale[:, None] * scale[None, :]
+    scaled[np.diag_indices_from(scaled)] = 1.0 + 1e-12
+    lift = scale if right.ndim == 1 else scale[:, None]
+    return lift * np.linalg.solve(scaled, lift * right)
+
+
+def _moved(linear: SecondOrder, step: np.ndarray) -> SecondOrder:
+    t, z = np.exp(np.clip(step[:2], -0.7, 0.7))
+    delay = float(np.clip(step[2], -0.03, 0.03)) if step.size > 2 else 0.0
+    return SecondOrder(linear.time_constant_s * float(t), linear.damping * float(z), linear.delay_s + delay)
+
+
+def _difference(before: SecondOrder, after: SecondOrder) -> np.ndarray:
+    return np.array(
+        [
+            np.log(after.time_constant_s / before.time_constant_s),
+            np.log(after.damping / before.damping),
+            after.delay_s - before.delay_s,
+        ]
+    )
+
+
+def _held(problem: Problem, linear: SecondOrder, gradient: np.ndarray) -> np.ndarray:
+    """Which of the searched numbers stand at a bound and are pulled beyond it."""
+    values = np.array([linear.time_constant_s, linear.damping, linear.delay_s])[: gradient.size]
+    lower = np.array([T_BOUNDS_S[0], ZETA_BOUNDS[0], _earliest(problem)])[: gradient.size]
+    upper = np.array([T_BOUNDS_S[1], ZETA_BOUNDS[1], LONGEST_DELAY_S])[: gradient.size]
+    return ((values <= lower) & (gradient < 0)) | ((values >= upper) & (gradient > 0))
+
+
+def _earliest(problem: Problem) -> float:
+    # A record's first sample after a pulse is off by up to one sample, so the delay may be negative by as much.
+    return -min(1.0 / problem.grid.record.sample_rate_hz, problem.grid.step_s)
+
+
+def _bounded(problem: Problem, linear: SecondOrder) -> SecondOrder:
+    delay = (
+        float(np.clip(linear.delay_s, _earliest(problem), LONGEST_DELAY_S))
+        if problem.delay_s is None
+        else problem.delay_s
+    )
+    return SecondOrder(
+        float(np.clip(linear.time_constant_s, *T_BOUNDS_S)), float(np.clip(linear.damping, *ZETA_BOUNDS)), delay
+    )
+
+
+def pilot_solution(grid: Grid, rows: np.ndarray, from_rest: bool, delay_s: float | None = None) -> Solution:
+    """A first fit with few knots, from several time constants, the best start taken.
+
+    Raises
+    ------
+    NotIdentifiable
+        The pulse width never changes, or the torque never does.
+    """
+    largest = float(np.max(grid.pulse_width_us))
+    seen = grid.pulse_width_us[rows]
+    if not largest > 0 or np.ptp(seen) <= 0:
+        raise NotIdentifiable(
+            "the pulse width never changes in the rows that are fitted" if largest > 0 else "no pulse is in the record",
+            mend="Record a PRBS and a ramp.",
+        )
+    if np.ptp(grid.torque_nm[rows]) <= 0:
+        raise NotIdentifiable("the torque never changes", mend="Check the load cell and the electrodes.")
+    basis = SplineBasis(even_knots(largest, PILOT_KNOTS))
+    order = bending_order(grid.pulse_width_us[rows])
+    problem = Problem(grid, basis, spline_roughness(basis, order=order), rows, from_rest, delay_s)
+    target = whiten(problem.target, problem.stretches, 0.0)
+    delay = 0.02 if delay_s is None else delay_s
+    starts = [_assess(problem, _bounded(problem, SecondOrder(t, 0.9, delay)), target, 0.0, None) for t in STARTS_S]
+    best = min(starts, key=lambda state: state.cost)
+    return _descend(best, None, most=12, tolerance=0.5)
+
+
+def designed(first: Solution, count: int | None = None) -> tuple[Problem, SecondOrder]:
+    """The problem with its final spline, in two steps from a pilot, and where to begin its search.
+
+    The pilot's few knots say roughly where the curve bends; a curve with all knots says it better, and how much; a
+    second such look sharpens a steep rise.
+    """
+    old = first.problem
+    curve = pilot_curve(first)
+    count = knots_for(curve) if count is None else count
+    basis = SplineBasis(adapted_knots(curve, float(np.max(old.grid.pulse_width_us)), count))
+    order = bending_order(old.grid.pulse_width_us[old.rows])
+    problem = Problem(old.grid, basis, spline_roughness(basis, order=order), old.rows, old.from_rest, old.delay_s)
+    target = whiten(problem.target, problem.stretches, 0.0)
+    for _ in range(2):
+        coefficients = _assess(problem, first.linear, target, 0.0, None).coefficients[: basis.size]
+        problem, basis = _redesigned(problem, basis, coefficients, count)
+    return problem, first.linear
+
+
+def _redesigned(old: Problem, basis: SplineBasis, coefficients: np.ndarray, count: int) -> tuple[Problem, SplineBasis]:
+    """The problem with knots and penalty from a first curve."""
+    u = np.linspace(0.0, basis.largest_us, CURVE_POINTS)
+    new = SplineBasis(adapted_knots((u, basis.design(u) @ coefficients), basis.largest_us, count))
+    order = bending_order(old.grid.pulse_width_us[old.rows])
+    roughness = spline_roughness(new, (basis, coefficients), order)
+    return Problem(old.grid, new, roughness, old.rows, old.from_rest, old.delay_s), new
+
+
+def pilot_curve(solution: Solution) -> tuple[np.ndarray, np.ndarray]:
+    """The curve of a solution on 201 pulse widths."""
+    basis = solution.problem.basis
+    u = np.linspace(0.0, basis.largest_us, CURVE_POINTS)
+    return u, basis.design(u) @ solution.coefficients[: basis.size]
+
+
+def begins_at_rest(grid: Grid) -> bool:
+    """Whether the muscle may be taken to be at rest before the first pulse slot.
+
+    True where the record opens with torque near its lowest (held-out rows aren't looked at): within a quarter of the
+    range if the opening is without stimulation, within a tenth if pulses come at once.
+    """
+    seen = grid.torque_nm[grid.fitted]
+    opening = grid.fitted[:4]
+    if not seen.size or not opening.any():
+        return True
+    first = float(np.mean(grid.torque_nm[:4][opening]))
+    still = not np.any(grid.pulse_width_us[:4] > 0)
+    # Stimulation may pull either way: rest is the side on which torque lies when no pulse comes.
+    rest = grid.fitted & (grid.pulse_width_us == 0)
+    level = float(np.median(grid.torque_nm[rest])) if rest.any() else float(np.median(seen))
+    lowest = float(np.min(seen)) if level < (np.min(seen) + np.max(seen)) / 2 else float(np.max(seen))
+    return bool(abs(first - lowest) <= (0.25 if still else 0.1) * float(np.ptp(seen)))

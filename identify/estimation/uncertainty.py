@@ -1,0 +1,138 @@
+"""95 % bands on the recruitment curve, the step response and the prediction, from the parameters' covariance.
+
+Two kinds: the pointwise band covers the truth at any one place 95 % of the time; the whole band covers it everywhere at
+once in 95 % of records, its factor found by drawing curves from the covariance.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from identify.dynamics.linear import SecondOrder
+from identify.dynamics.pulse_grid import Grid, make_grid
+from identify.model import Covariance, Model
+from identify.records.record import Record
+from identify.recruitment.curve import Basis
+
+POINTWISE = 1.959964
+DRAWS = 256
+DYNAMICS = ("time_constant_s", "damping", "delay_s")
+
+
+def bands(model: Model, points: int = 41) -> dict[str, Any]:
+    """Bands on both curves, as MODEL.json carries them; empty where the method gives no covariance."""
+    covariance, linear = model.covariance, model.linear
+    if covariance is None or not isinstance(linear, SecondOrder):
+        return {}
+    width = np.linspace(0.0, model.recruitment.basis.largest_us, points)
+    time_s = np.linspace(0.0, linear.memory_s, points)
+    curve = _band(model.recruitment(width), recruitment_slopes(model.recruitment.basis, covariance, width), covariance)
+    step = _band(linear.step_response(time_s), step_slopes(linear, covariance, time_s), covariance)
+    return {
+        "level_percent": 95,
+        "recruitment": {"pulse_width_us": width} | curve,
+        "step_response": {"time_s": time_s} | step,
+    }
+
+
+def recruitment_slopes(basis: Basis, covariance: Covariance, width_us: np.ndarray) -> np.ndarray:
+    """Derivatives of f(u) by all parameters, shape (len(width_us), P)."""
+    slopes = np.zeros((width_us.size, len(covariance.names)))
+    slopes[:, _coefficients(basis, covariance)] = basis.design(width_us)
+    return slopes
+
+
+def _coefficients(basis: Basis, covariance: Covariance) -> slice:
+    """Where f's coefficients stand: behind the dynamics, before the effects (`effect.parameter`)."""
+    last = len(covariance.names) - sum("." in name for name in covariance.names)
+    return slice(last - basis.size, last)
+
+
+def step_slopes(linear: SecondOrder, covariance: Covariance, time_s: np.ndarray) -> np.ndarray:
+    """Derivatives of the step response by all parameters, shape (len(time_s), P)."""
+    slopes = np.zeros((time_s.size, len(covariance.names)))
+    for name in DYNAMICS:
+        if name in covariance.names:
+            up, down, width = _neighbours(linear, name)
+            change = up.step_response(time_s) - down.step_response(time_s)
+            slopes[:, covariance.names.index(name)] = change / width
+    return slopes
+
+
+def prediction_band(model: Model, record: Record) -> tuple[np.ndarray, np.ndarray]:
+    """Pointwise 95 % band on the clean torque that the model predicts, N·m: lower and upper, each shape (N,).
+
+    Noise of the measurement isn't in it: it is what is uncertain in the model.
+
+    Raises
+    ------
+    ValueError
+        The model has no covariance (another method).
+    """
+    covariance, linear = model.covariance, model.linear
+    if covariance is None or not isinstance(linear, SecondOrder):
+        raise ValueError("this model carries no covariance")
+    grid = make_grid(record)
+    if model.effects:
+        from identify.estimation.to_model import grid_slopes  # the engine stands on this module's curves
+
+        return _around(model, record, grid, _sd(grid_slopes(model, record), covariance))
+    drive = model.recruitment.basis.design(grid.pulse_width_us)
+    slopes = np.zeros((grid.size, len(covariance.names)))
+    slopes[:, _coefficients(model.recruitment.basis, covariance)] = linear.on_grid(grid, drive)
+    if "baseline_nm" in covariance.names:
+        slopes[:, covariance.names.index("baseline_nm")] = 1.0
+    held = drive @ model.recruitment.coefficients_nm
+    for name in DYNAMICS:
+        if name in covariance.names:
+            up, down, width = _neighbours(linear, name)
+            slopes[:, covariance.names.index(name)] = (up.on_grid(grid, held) - down.on_grid(grid, held)) / width
+    return _around(model, record, grid, _sd(slopes, covariance))
+
+
+def _around(model: Model, record: Record, grid: Grid, sd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The band at the samples, from the standard deviation of each interval's mean."""
+    middle = grid.start_s + (np.arange(grid.size) + float(np.mean(grid.fraction))) * grid.step_s
+    half = POINTWISE * np.interp(record.time_s, middle, sd)
+    predicted = model.predict(record)
+    return predicted - half, predicted + half
+
+
+def _neighbours(linear: SecondOrder, name: str) -> tuple[SecondOrder, SecondOrder, float]:
+    values = {key: getattr(linear, key) for key in DYNAMICS}
+    step = 1e-5 if name == "delay_s" else 1e-4 * values[name]
+    up = SecondOrder(**(values | {name: values[name] + step}))
+    down = SecondOrder(**(values | {name: values[name] - step}))
+    return up, down, 2 * step
+
+
+def _sd(slopes: np.ndarray, covariance: Covariance) -> np.ndarray:
+    return np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", slopes, covariance.matrix, slopes, optimize=True), 0.0))
+
+
+def _band(value: np.ndarray, slopes: np.ndarray, covariance: Covariance) -> dict[str, np.ndarray]:
+    matrix = slopes @ covariance.matrix @ slopes.T
+    sd = np.sqrt(np.maximum(np.diag(matrix), 0.0))
+    factor = whole_factor(matrix, sd)
+    return {
+        "value": value,
+        "lower": value - POINTWISE * sd,
+        "upper": value + POINTWISE * sd,
+        "whole_lower": value - factor * sd,
+        "whole_upper": value + factor * sd,
+    }
+
+
+def whole_factor(matrix: np.ndarray, sd: np.ndarray) -> float:
+    """How many standard deviations hold a whole curve in 95 % of draws from its covariance."""
+    known = sd > 1e-9 * max(float(sd.max()), 1e-300)
+    if not known.any():
+        return POINTWISE
+    scaled = matrix[np.ix_(known, known)] / sd[known][:, None] / sd[known][None, :]
+    values, vectors = np.linalg.eigh(scaled)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    # Fixed draws: the same record gives the same band.
+    draws = np.random.default_rng(1).standard_normal((DRAWS, root.shape[1]))
+    return float(np.quantile(np.max(np.abs(draws @ root.T), axis=1), 0.95))

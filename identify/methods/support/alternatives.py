@@ -1,0 +1,94 @@
+"""Other recruitment bases and constraints for the joint estimate: power series (6), sigmoid (30), monotone spline."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from identify.dynamics.linear import SecondOrder
+from identify.estimation.projected import T_BOUNDS_S, ZETA_BOUNDS, Problem, Solution, project, search
+from identify.noise.ar1 import log_likelihood, whiten
+from identify.recruitment.power import PowerBasis
+from identify.recruitment.sigmoid import SigmoidBasis
+from identify.recruitment.sigmoid_fit import basis_at
+
+HIGHEST_POWER = 9
+
+
+def power_series(first: Solution, order: int | None = None) -> tuple[Solution, str]:
+    """Joint estimate with the power series (6), of given order or of least BIC, and why."""
+    old = first.problem
+    largest = float(np.max(old.grid.pulse_width_us))
+    found: dict[int, tuple[float, Solution]] = {}
+    linear = first.linear
+    for power in [order] if order else range(1, HIGHEST_POWER + 1):
+        basis = PowerBasis(power, largest)
+        problem = Problem(old.grid, basis, np.zeros((power, power)), old.rows, old.from_rest, old.delay_s)
+        solution = search(problem, linear)
+        rows = sum(s.stop - s.start for s in problem.stretches)
+        likelihood = log_likelihood(solution.residual_nm, problem.stretches, 0.0)
+        found[power] = (-2 * likelihood + power * np.log(rows), solution)
+        linear = solution.linear
+    best = min(found, key=lambda power: found[power][0])
+    return found[best][1], f"power series of order {best}" + ("" if order else ": least BIC")
+
+
+def sigmoid(first: Solution) -> Solution:
+    """Joint estimate with the sigmoid (30): shape and dynamics searched, gain and baseline projected out."""
+    from scipy.optimize import least_squares
+
+    old, start = first.problem, first.linear
+    largest = float(np.max(old.grid.pulse_width_us))
+    curve = old.basis.design(np.linspace(0.0, largest, 401)) @ first.coefficients[: old.basis.size]
+    half = curve[np.argmax(np.abs(curve))] / 2
+    middle = largest * float(np.argmin(np.abs(curve - half))) / 400
+    rise = np.ptp(np.flatnonzero((curve / (2 * half) > 0.2) & (curve / (2 * half) < 0.8))) if half else 100
+    steep = float(np.log(2.8 / max(largest * float(rise) / 400, largest / 400)))
+
+    def problem(x: np.ndarray) -> Problem:
+        basis: SigmoidBasis = basis_at(x[3], x[4] * largest, largest)
+        return Problem(old.grid, basis, np.zeros((1, 1)), old.rows, old.from_rest, old.delay_s)
+
+    def linear(x: np.ndarray) -> SecondOrder:
+        return SecondOrder(
+            float(np.exp(x[0])), float(np.exp(x[1])), float(x[2]) if old.delay_s is None else old.delay_s
+        )
+
+    def residual(x: np.ndarray) -> np.ndarray:
+        trial = problem(x)
+        solution = project(trial, linear(x), ar1=first.ar1)
+        return whiten(solution.residual_nm, trial.stretches, first.ar1)
+
+    lower = [*np.log([T_BOUNDS_S[0], ZETA_BOUNDS[0]]), -old.grid.step_s, np.log(0.5 / largest), 0.0]
+    upper = [*np.log([T_BOUNDS_S[1], ZETA_BOUNDS[1]]), 0.2, np.log(2000.0 / largest), 1.2]
+    x0 = [np.log(start.time_constant_s), np.log(start.damping), start.delay_s, steep, middle / largest]
+    x0 = np.clip(x0, np.array(lower) + 1e-9, np.array(upper) - 1e-9)
+    found = least_squares(residual, x0, bounds=(lower, upper), x_scale=[0.05, 0.05, 0.005, 0.1, 0.02], xtol=1e-10)
+    return search(problem(found.x), linear(found.x), ar1=first.ar1, most=3)
+
+
+def monotone(solution: Solution) -> Solution:
+    """The solution with a recruitment curve that never falls (or never rises, where stimulation pulls the other way).
+
+    A B-spline curve rises where its coefficients do: the coefficients are sums of steps of one sign, found by
+    non-negative least squares of the same penalised problem, at the same dynamics.
+    """
+    from scipy.optimize import nnls
+
+    problem, size = solution.problem, solution.problem.basis.size
+    white = whiten(solution.columns, problem.stretches, solution.ar1)
+    target = whiten(problem.target, problem.stretches, solution.ar1)
+    penalty = np.zeros((white.shape[1], white.shape[1]))
+    penalty[:size, :size] = solution.weight * problem.roughness
+    hessian = white.T @ white + penalty
+    hessian += 1e-12 * np.diag(np.diag(hessian))
+    root = np.linalg.cholesky(hessian).T
+    right = np.linalg.solve(root.T, white.T @ target)
+    sign = 1.0 if np.sum(solution.coefficients[:size]) >= 0 else -1.0
+    steps = np.zeros((white.shape[1], size + 2 * problem.extras))
+    steps[:size, :size] = sign * np.tril(np.ones((size, size)))
+    for extra in range(problem.extras):  # these may have either sign
+        steps[size + extra, size + 2 * extra : size + 2 * extra + 2] = 1.0, -1.0
+    coefficients = steps @ nnls(root @ steps, right, maxiter=50 * steps.shape[1])[0]
+    return replace(solution, coefficients=coefficients)

@@ -1,0 +1,151 @@
+"""What several methods need: rows by segment name."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from identify.dynamics.pulse_grid import Grid, runs
+from identify.errors import BadRequest, NotIdentifiable
+from identify.records.record import HELD_OUT
+
+
+def rows_of(grid: Grid, names: tuple[str, ...]) -> np.ndarray:
+    """bool, shape (K,): intervals of segments with these names."""
+    wanted = np.array([name in names for name in grid.record.segment_names])
+    return wanted[grid.segment]
+
+
+def fitted_rows(grid: Grid, fit_on: tuple[str, ...] | None) -> np.ndarray:
+    """Rows to fit: those of the named segments (and the rests, which anchor the baseline), never held-out ones.
+
+    Raises
+    ------
+    BadRequest
+        A named segment isn't in the record, or is the held-out one.
+    NotIdentifiable
+        Nothing is left to fit.
+    """
+    if fit_on is not None:
+        check_segments(grid, fit_on)
+        rows = grid.fitted & rows_of(grid, (*fit_on, "rest"))
+    else:
+        rows = grid.fitted
+    if rows.sum() < 8:
+        raise NotIdentifiable(
+            f"only {int(rows.sum())} pulse intervals may be fitted", mend="Give rows of segments other than `validate`."
+        )
+    return rows
+
+
+def check_segments(grid: Grid, names: tuple[str, ...]) -> None:
+    """Refuse names of segments that the record doesn't have, and the held-out one.
+
+    Raises
+    ------
+    BadRequest
+    """
+    there = tuple(dict.fromkeys(grid.record.segment_names))
+    for name in names:
+        if name == HELD_OUT:
+            raise BadRequest("`validate` is never fitted on", place="fit_on", mend="Name other segments.")
+        if name not in there:
+            raise BadRequest(f"no segment {name!r} in the record", place="fit_on", mend=f"It has: {', '.join(there)}.")
+
+
+def segment_rows(grid: Grid, names: tuple[str, ...], method_id: str) -> np.ndarray:
+    """Rows of the named segments, without held-out ones.
+
+    Raises
+    ------
+    NotIdentifiable
+        The record has none; says what the method needs.
+    """
+    there = tuple(dict.fromkeys(grid.record.segment_names))
+    rows = grid.fitted & rows_of(grid, names)
+    if not rows.any():
+        raise NotIdentifiable(
+            f"{method_id} needs a segment {' or '.join(names)}; the record has {', '.join(there)}",
+            mend="Name the segments to use with fit_on, or use maximum-likelihood, which takes any.",
+        )
+    return rows
+
+
+def near_rest(grid: Grid, rows: np.ndarray) -> np.ndarray:
+    """The rows with the rests that touch them: they hold the baseline, the rise and the tail."""
+    result = rows.copy()
+    rest = grid.fitted & rows_of(grid, ("rest",))
+    for _ in range(2):
+        for stretch in runs(rest):
+            before, after = max(stretch.start - 1, 0), min(stretch.stop, grid.size - 1)
+            if rows[before] or rows[after]:
+                result[stretch] = True
+    return result
+
+
+QUIET_AFTER_S = 4.0
+
+
+def quiet_level(grid: Grid) -> float:
+    """Zero-torque baseline from the rests, N·m: before the first pulse, else long after one, else the lowest torques.
+
+    Two seconds after a pulse don't do: an underdamped muscle of 0.5 s then swings through below zero.
+    """
+    still = grid.pulse_width_us == 0
+    before = grid.fitted & np.logical_and.accumulate(still)
+    if before.sum() >= 4:
+        return float(np.mean(grid.torque_nm[before]))
+    last_pulse = np.maximum.accumulate(np.where(still, -grid.size, np.arange(grid.size)))
+    quiet = still & grid.fitted & ((np.arange(grid.size) - last_pulse) * grid.step_s > QUIET_AFTER_S)
+    if quiet.sum() >= 4:
+        return float(np.mean(grid.torque_nm[quiet]))
+    some = grid.fitted & still if (grid.fitted & still).any() else grid.fitted
+    return float(np.percentile(grid.torque_nm[some], 5))
+
+
+def active_level(grid: Grid, rows: np.ndarray) -> float:
+    """Largest pulse width in the rows, µs.
+
+    Raises
+    ------
+    NotIdentifiable
+        There is no pulse, or the width never changes.
+    """
+    widths = grid.pulse_width_us[rows]
+    if not np.ptp(widths) > 0:
+        raise NotIdentifiable("the pulse width never changes in the segment for the dynamics", mend="Record a PRBS.")
+    return float(np.max(widths))
+
+
+def order_option(value: object) -> str | tuple[int, int, int]:
+    """`second-order`, `auto`, or (l, n, d) from `2,1,1` or a sequence.
+
+    Raises
+    ------
+    BadRequest
+    """
+    if value in ("second-order", "auto"):
+        return str(value)
+    parts = value.split(",") if isinstance(value, str) else list(value) if isinstance(value, (list, tuple)) else []
+    try:
+        poles, zeros, delay = (int(part) for part in parts)
+    except ValueError:
+        poles = -1
+        zeros = delay = 0
+    if not (1 <= poles <= 6 and 0 <= zeros <= 6 and 0 <= delay <= 40):
+        raise BadRequest(
+            f"order {value!r}", place="order", mend="Give second-order, auto, or poles,zeros,delay such as 2,1,1."
+        )
+    return poles, zeros, delay
+
+
+def flag(value: object, name: str) -> bool:
+    """true or false, from a bool or from text.
+
+    Raises
+    ------
+    BadRequest
+    """
+    text = str(value).lower()
+    if text not in {"true", "false", "1", "0", "yes", "no"}:
+        raise BadRequest(f"{name}={value!r}", place=name, mend="Give true or false.")
+    return text in {"true", "1", "yes"}

@@ -1,0 +1,198 @@
+"""White noise plus slow AR(1) noise of interval means: exact likelihood and whitening, compiled."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+MEAN_OF_SLOW = 0.27
+"""Correlation of neighbouring innovations that averaging over an interval brings, at most."""
+SHORTEST = 0.006
+"""1 - ar1 of the slowest noise (a memory of 4 s at 40 pulses/s): what is slower is a drift, and has a cause."""
+
+
+@njit(cache=True, nogil=True)
+def _ratio(ar1, mean):  # pragma: no cover
+    """Variance of means of slow noise over that of their innovations."""
+    return (1.0 + 2.0 * ar1 * mean + mean * mean) / (1.0 - ar1 * ar1)
+
+
+@njit(cache=True, nogil=True)
+def _whiten_means(rows, start, stop, ar1, mean, total):  # pragma: no cover
+    """Innovations of means of slow noise, x[k] = ar1 x[k-1] + e[k] + mean e[k-1], by the innovations algorithm."""
+    white = np.empty((rows.shape[0], total))
+    first = _ratio(ar1, mean)
+    logdet = 0.0
+    for i in range(start.size):
+        r = first
+        for _ in range(stop[i] - start[i]):
+            logdet += 0.5 * np.log(r / first)
+            r = 1.0 + mean * mean - mean * mean / r
+    for m in range(rows.shape[0]):
+        f = 0
+        for i in range(start.size):
+            r, x = first, 0.0
+            for k in range(start[i], stop[i]):
+                e = rows[m, k] - x
+                white[m, f] = e * np.sqrt(first / r)
+                x = ar1 * rows[m, k] + mean * e / r
+                r = 1.0 + mean * mean - mean * mean / r
+                f += 1
+    return white, logdet
+
+
+@njit(cache=True, nogil=True)
+def whiten_rows(rows, start, stop, ar1, share):  # pragma: no cover
+    """Innovations of white plus AR(1) noise, scaled to equal variance, by an exact Kalman filter.
+
+    Parameters
+    ----------
+    rows : ndarray, shape (M, K)
+        Residuals or derivatives on the grid.
+    start, stop : ndarray of int, shape (S,)
+        Stretches of fitted intervals.
+    ar1 : float
+        Correlation of neighbours of the slow part.
+    share : float
+        Share of the variance that is slow, 0 … 1; the rest is white. Above 1: means of slow noise over an interval,
+        which are smoother than slow noise read at instants.
+
+    Returns
+    -------
+    white : ndarray, shape (M, F)
+        Fitted intervals in order, unit variance where the total variance is 1.
+    half_log_det : float
+        0.5 log det of the correlation matrix.
+    """
+    total = 0
+    for i in range(start.size):
+        total += stop[i] - start[i]
+    if share > 1.0:
+        return _whiten_means(rows, start, stop, ar1, (share - 1.0) * MEAN_OF_SLOW, total)
+    white = np.empty((rows.shape[0], total))
+    gain = np.empty(total)
+    scale = np.empty(total)
+    logdet = 0.0
+    f = 0
+    noise = (1.0 - ar1 * ar1) * share
+    for i in range(start.size):
+        p = share
+        for _ in range(stop[i] - start[i]):
+            s = p + 1.0 - share
+            s = max(s, 1e-12)
+            gain[f] = p / s
+            scale[f] = 1.0 / np.sqrt(s)
+            logdet += 0.5 * np.log(s)
+            p = ar1 * ar1 * (p - p * p / s) + noise
+            f += 1
+    for m in range(rows.shape[0]):
+        f = 0
+        for i in range(start.size):
+            x = 0.0
+            for k in range(start[i], stop[i]):
+                e = rows[m, k] - x
+                white[m, f] = e * scale[f]
+                x = ar1 * (x + gain[f] * e)
+                f += 1
+    return white, logdet
+
+
+@njit(cache=True, nogil=True)
+def _squares(row, start, stop, ar1, share):  # pragma: no cover
+    """Sum of squared innovations, half the log determinant, count; the filter's gain settles within some steps."""
+    total, squares, logdet = 0, 0.0, 0.0
+    if share > 1.0:
+        mean = (share - 1.0) * MEAN_OF_SLOW
+        first = _ratio(ar1, mean)
+        for i in range(start.size):
+            r, x = first, 0.0
+            for k in range(start[i], stop[i]):
+                e = row[k] - x
+                squares += e * e * first / r
+                if r != 1.0:
+                    logdet += 0.5 * np.log(r / first)
+                else:
+                    logdet -= 0.5 * np.log(first)
+                x = ar1 * row[k] + mean * e / r
+                r = 1.0 + mean * mean - mean * mean / r
+                total += 1
+        return squares, logdet, total
+    noise = (1.0 - ar1 * ar1) * share
+    for i in range(start.size):
+        p, x, k, end = share, 0.0, start[i], stop[i]
+        total += end - k
+        s = 1.0
+        while k < end:
+            s = max(p + 1.0 - share, 1e-12)
+            e = row[k] - x
+            squares += e * e / s
+            logdet += 0.5 * np.log(s)
+            x = ar1 * (x + p / s * e)
+            fresh = ar1 * ar1 * (p - p * p / s) + noise
+            k += 1
+            if abs(fresh - p) < 1e-10 * (1e-6 + p):
+                break
+            p = fresh
+        if k < end:
+            gain, sum_e = p / s, 0.0
+            logdet += 0.5 * (end - k) * np.log(s)
+            for j in range(k, end):
+                e = row[j] - x
+                sum_e += e * e
+                x = ar1 * (x + gain * e)
+            squares += sum_e / s
+    return squares, logdet, total
+
+
+@njit(cache=True, nogil=True)
+def _minus_log_likelihood(row, start, stop, ar1, share):  # pragma: no cover
+    """Minus the profiled log-likelihood of one residual, up to a constant."""
+    squares, logdet, total = _squares(row, start, stop, ar1, share)
+    return 0.5 * total * np.log(max(squares / max(total, 1), 1e-24)) + logdet
+
+
+@njit(cache=True, nogil=True)
+def profile_noise(row, start, stop, ar1, share):  # pragma: no cover
+    """Correlation and slow share that make a residual most likely, by a pattern search from where it stands.
+
+    Returns
+    -------
+    ar1, share, sd, log_likelihood : float
+        `sd` is the total standard deviation, slow and white together.
+    """
+    total = 0
+    for i in range(start.size):
+        total += stop[i] - start[i]
+    # On the scale of memory: a = log(1 - ar1), from SHORTEST (long memory) to 1 (none).
+    low, high = np.log(SHORTEST), 0.0
+    a = min(max(np.log(1.0 - min(ar1, 1.0 - SHORTEST)), low), high)
+    b = min(max(share, 0.0), 2.0)
+    best = _minus_log_likelihood(row, start, stop, 1.0 - np.exp(a), b)
+    for guess_a, guess_b in (
+        (np.log(0.3), 0.9),
+        (np.log(0.03), 0.3),
+        (np.log(0.03), 1.0),
+        (np.log(0.5), 0.02),
+        (np.log(0.3), 1.7),
+    ):
+        value = _minus_log_likelihood(row, start, stop, 1.0 - np.exp(guess_a), guess_b)
+        if value < best:
+            best, a, b = value, guess_a, guess_b
+    da, db = 0.6, 0.2
+    while da > 0.01:
+        moved = False
+        for i in range(8):
+            na = a + da * (1.0 if i in (0, 4, 5) else -1.0 if i in (1, 6, 7) else 0.0)
+            nb = b + db * (1.0 if i in (2, 4, 6) else -1.0 if i in (3, 5, 7) else 0.0)
+            na, nb = min(max(na, low), high), min(max(nb, 0.0), 2.0)
+            if na == a and nb == b:
+                continue
+            value = _minus_log_likelihood(row, start, stop, 1.0 - np.exp(na), nb)
+            if value < best - 1e-9:
+                best, a, b, moved = value, na, nb, True
+        if not moved:
+            da, db = 0.5 * da, 0.5 * db
+    ar1 = 1.0 - np.exp(a)
+    squares = _squares(row, start, stop, ar1, b)[0]
+    sd = np.sqrt(max(squares / max(total, 1), 1e-24))
+    return ar1, b, sd, -best - 0.5 * total * (np.log(2 * np.pi) + 1.0)

@@ -1,0 +1,185 @@
+"""The strict reader of HDF5 files: numbers and names that stand in the file itself, and nothing else.
+
+An HDF5 file may name other files (external storage, external and soft links, virtual datasets), declare a terabyte in a
+few bytes, or carry code's input in unusual types. So libhdf5 is asked only how a dataset is laid out, of a copy in
+memory. The numbers are then taken from the file's own bytes, each bound checked before memory is taken for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import h5py
+import numpy as np
+from h5py import h5a, h5d, h5f, h5g, h5l, h5o, h5s, h5t, h5z  # pyright: ignore[reportAttributeAccessIssue]
+
+from identify.errors import BadRecord
+from identify.records import hdf5_chunks
+from identify.records.bounds import LARGEST_ROWS, MOST_SEGMENTS
+
+MEND = "Give a sealed recording, as written by the rig at the end of a test."
+LONGEST_TEXT = 10_000
+FILTERS = (h5z.FILTER_DEFLATE, h5z.FILTER_SHUFFLE, h5z.FILTER_FLETCHER32)
+
+
+class StrictFile:
+    """An HDF5 file that somebody else may have made, opened from its bytes.
+
+    Parameters
+    ----------
+    content : bytes
+        The whole file.
+    name : str
+        How messages call it.
+    """
+
+    def __init__(self, content: bytes, name: str) -> None:
+        self.content, self.name = content, name
+        with self._asking(""):
+            self._file = h5f.open_file_image(content)
+            self._root = h5g.open(self._file, b"/")
+
+    def text(self, name: str, default: str | None = None) -> str:
+        """A text attribute of the root.
+
+        Raises
+        ------
+        BadRecord
+            Not there and no default, or no text.
+        """
+        value = self._attribute(name, default)
+        if not isinstance(value, str | bytes) or len(value) > LONGEST_TEXT:
+            raise self._bad("no text, or one without an end", f"attribute {name}")
+        return _sound(value)
+
+    def number(self, name: str, default: float) -> float:
+        """A numeric attribute of the root; NaN where it holds something else."""
+        value = self._attribute(name, default)
+        return float(value) if isinstance(value, int | float | np.number) else float("nan")
+
+    def numbers(self, path: str) -> np.ndarray:
+        """A dataset of one dimension as float64.
+
+        Raises
+        ------
+        BadRecord
+            Not there, not inside the file, not plain numbers, or longer than any record.
+        """
+        dataset = self._dataset(path)
+        with self._asking(path):
+            kind = dataset.get_type()
+            plain = kind.get_class() in (h5t.INTEGER, h5t.FLOAT) and kind.get_size() <= 8
+            if not plain or h5t.py_create(kind.dtype) != kind:
+                raise self._bad("no plain numbers", path)
+            size = self._size(dataset, path, LARGEST_ROWS)
+            return np.asarray(self._values(dataset, path, kind.dtype, size), float)
+
+    def names(self, path: str) -> list[str]:
+        """A dataset of one dimension of texts.
+
+        Raises
+        ------
+        BadRecord
+            As for `numbers`.
+        """
+        dataset = self._dataset(path)
+        with self._asking(path):
+            kind = dataset.get_type()
+            if kind.get_class() != h5t.STRING:
+                raise self._bad("no texts", path)
+            size = self._size(dataset, path, MOST_SEGMENTS)
+            if not kind.is_variable_str():
+                if kind.get_size() > LONGEST_TEXT:
+                    raise self._bad("texts without an end", path)
+                values = self._values(dataset, path, np.dtype(f"S{kind.get_size()}"), size)
+                return [_sound(bytes(value)) for value in values]
+            if dataset.get_create_plist().get_nfilters():
+                raise self._bad("compressed texts", path)
+            return [self._variable_text(dataset, index, path) for index in range(size)]
+
+    def _variable_text(self, dataset: Any, index: int, path: str) -> str:
+        """One text by itself: many elements may point to one long text, which is then read once and refused."""
+        selection = dataset.get_space()
+        selection.select_hyperslab((index,), (1,))
+        found = np.empty(1, h5py.string_dtype())
+        dataset.read(h5s.create_simple((1,)), selection, found)
+        if len(found[0]) > LONGEST_TEXT:
+            raise self._bad("a text without an end", path)
+        return _sound(found[0])
+
+    def _attribute(self, name: str, default: Any) -> Any:
+        with self._asking(f"attribute {name}"):
+            if not h5a.exists(self._file, name.encode()):
+                if default is None:
+                    raise self._bad("is missing", f"attribute {name}")
+                return default
+            attribute = h5a.open(self._file, name.encode())
+            kind = attribute.get_type()
+            known = kind.get_class() in (h5t.STRING, h5t.INTEGER, h5t.FLOAT) and kind.get_size() <= 8 * LONGEST_TEXT
+            if not known or attribute.get_space().get_simple_extent_type() != h5s.SCALAR:
+                raise self._bad("no single number or text", f"attribute {name}")
+            return h5py.File(self._file).attrs[name]
+
+    def _dataset(self, path: str) -> Any:
+        """The dataset of a path, by hard links alone, its data inside this file."""
+        here: Any = self._root
+        for part in path.strip("/").encode().split(b"/"):
+            with self._asking(path):
+                if not isinstance(here, h5g.GroupID) or not here.links.exists(part):
+                    raise BadRecord(f"incomplete recording (no {path})", place=self.name, mend=MEND)
+                if here.links.get_info(part).type != h5l.TYPE_HARD:
+                    raise self._bad("a link to somewhere else", path)
+                here = h5o.open(here, part)
+        with self._asking(path):
+            if not isinstance(here, h5d.DatasetID):
+                raise self._bad("no dataset", path)
+            plan = here.get_create_plist()
+            if plan.get_layout() not in (h5d.CONTIGUOUS, h5d.CHUNKED) or plan.get_external_count():
+                raise self._bad("data that are not plainly in this file (virtual or external)", path)
+            return here
+
+    def _size(self, dataset: Any, path: str, most: int) -> int:
+        space = dataset.get_space()
+        if space.get_simple_extent_type() != h5s.SIMPLE or space.get_simple_extent_ndims() != 1:
+            raise self._bad("not of one dimension", path)
+        (size,) = space.get_simple_extent_dims()
+        if not (0 <= size <= most):
+            raise self._bad(f"{size} values are declared, at most {most} are read", path)
+        return int(size)
+
+    def _values(self, dataset: Any, path: str, dtype: np.dtype, size: int) -> np.ndarray:
+        """The values, from the file's own bytes."""
+        if size == 0:
+            return np.empty(0, dtype)
+        plan = dataset.get_create_plist()
+        try:
+            if plan.get_layout() == h5d.CONTIGUOUS:
+                piece = hdf5_chunks.piece(self.content, dataset.get_offset(), size * dtype.itemsize)
+                return np.frombuffer(piece, dtype)
+            filters = [plan.get_filter(index)[0] for index in range(plan.get_nfilters())]
+            if unknown := [number for number in filters if number not in FILTERS]:
+                raise self._bad(f"a filter (number {unknown[0]}) other than gzip, shuffle and fletcher32", path)
+            return hdf5_chunks.read(self.content, dataset, plan.get_chunk()[0], filters, dtype, size)
+        except hdf5_chunks.BadChunk as error:
+            raise self._bad(str(error), path) from error
+
+    @contextmanager
+    def _asking(self, path: str) -> Iterator[None]:
+        """Whatever libhdf5 or h5py raises at a damaged file, as one line."""
+        try:
+            yield
+        except BadRecord:
+            raise
+        except Exception as error:
+            raise self._bad("unreadable or half-written HDF5", path) from error
+
+    def _bad(self, message: str, path: str) -> BadRecord:
+        return BadRecord(message, place=f"{self.name}, {path}" if path else self.name, mend=MEND)
+
+
+def _sound(text: str | bytes) -> str:
+    """Text that can be written anywhere, whatever its bytes were."""
+    raw = text if isinstance(text, bytes) else text.encode("utf-8", "surrogateescape")
+    return raw.decode("utf-8", "replace")

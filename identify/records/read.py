@@ -1,0 +1,39 @@
+"""Records from files: CSV, or a sealed recording (HDF5, docs/recording.md)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from identify.records import bounds
+from identify.records.record import Record
+
+HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
+
+
+def read(path: str | Path, pulse_rate_hz: float | None = None) -> Record:
+    """Read a record.
+
+    Parameters
+    ----------
+    path : str or Path
+        CSV with the header `time_s,pulse_width_us,torque_nm,segment` (and optionally `angle_rad,velocity_rad_s`), or
+        a sealed recording.
+    pulse_rate_hz : float, optional
+        Pulses a second; by default what the recording says, else 40.
+
+    Raises
+    ------
+    BadRecord
+        With file, line and column, and the mend.
+    """
+    path = Path(path)
+    if pulse_rate_hz is not None:
+        bounds.check_rate(pulse_rate_hz, "pulse rate")
+    content = bounds.content_of(path)
+    if content.startswith(HDF5_MAGIC):
+        from identify.records.recording import read_recording
+
+        return read_recording(content, path, pulse_rate_hz)
+    from identify.records.csv import read_csv
+
+    return read_csv(content, path, 40.0 if pulse_rate_hz is None else pulse_rate_hz)

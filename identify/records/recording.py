@@ -1,0 +1,128 @@
+"""A record from a sealed recording (HDF5, docs/recording.md)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from identify.errors import BadRecord
+from identify.records import bounds
+from identify.records.hdf5 import MEND, StrictFile
+from identify.records.record import Record, Source
+
+FORMAT = "stimrig-recording"
+SENT_AND_ACKNOWLEDGED = 0
+
+
+def attributes(path: Path, names: Sequence[str]) -> dict[str, str]:
+    """What a sealed recording says of itself, by the names of its root's attributes.
+
+    Raises
+    ------
+    BadRecord
+        Unreadable, no sealed recording, or one of them is not there.
+    """
+    file = StrictFile(bounds.content_of(path), str(path))
+    _check_format(file)
+    return {name: file.text(name) for name in names}
+
+
+def read_recording(content: bytes, path: Path, pulse_rate_hz: float | None = None) -> Record:
+    """A sealed recording from its bytes; `path` is how it is called.
+
+    The width in force at a sample is that of the last pulse due before it; a pulse that was dropped or refused counts
+    as none. Samples outside every segment are left out.
+
+    Raises
+    ------
+    BadRecord
+        Unreadable, half-written, with data outside the file, or without samples.
+    """
+    name = str(path)
+    file = StrictFile(content, name)
+    _check_format(file)
+    rate = file.number("pulse_rate_hz", 40.0) if pulse_rate_hz is None else pulse_rate_hz
+    bounds.check_rate(rate, f"{name}, attribute pulse_rate_hz")
+    time_s, torque = _samples(file, name)
+    code, names = _segments(file, name, time_s)
+    inside = code >= 0
+    if not inside.any():
+        raise BadRecord("no sample inside a segment", place=f"{name}, /segments", mend=MEND)
+    largest = bounds.LARGEST["torque_nm"]
+    if (bad := np.flatnonzero(inside & ~(np.abs(torque) <= largest))).size:
+        what = "is not finite" if not np.isfinite(torque[bad[0]]) else f"{torque[bad[0]]:g} N·m is no measurement"
+        raise BadRecord(f"torque {what}", place=f"{name}, /torque/torque_nm, sample {bad[0]}", mend=MEND)
+    width = _held_width(file, name, time_s, rate)
+    bounds.check_span(time_s[inside], f"{name}, /torque/time_s")
+    source = Source(path.name, file.text("recording_id", ""), file.text("content_sha256", ""))
+    return Record.from_arrays(
+        time_s[inside], width[inside], torque[inside], code[inside], segment_names=names, pulse_rate_hz=rate,
+        source=source,
+    )  # fmt: skip
+
+
+def _check_format(file: StrictFile) -> None:
+    if file.text("format", "") != FORMAT:
+        raise BadRecord("HDF5, but no stimrig recording", place=file.name, mend=MEND)
+    version = file.number("format_version", 0)
+    if version != 1:
+        raise BadRecord(
+            f"format version {version:g}, this software reads 1", place=file.name, mend="Update the software."
+        )
+
+
+def _samples(file: StrictFile, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Times, rising, and torques."""
+    time_s, torque = file.numbers("/torque/time_s"), file.numbers("/torque/torque_nm")
+    if time_s.size != torque.size or not time_s.size:
+        raise BadRecord("no torque sample", place=f"{name}, /torque", mend=MEND)
+    backwards = np.flatnonzero(~(np.diff(time_s) > 0))
+    if backwards.size:
+        raise BadRecord("time runs backwards", place=f"{name}, /torque/time_s, sample {backwards[0] + 1}", mend=MEND)
+    if not (np.abs(time_s[[0, -1]]) <= bounds.LARGEST["time_s"]).all():
+        raise BadRecord("times that no clock shows", place=f"{name}, /torque/time_s", mend=MEND)
+    if time_s.size > 1:
+        bounds.check_sampling(1 / float(np.median(np.diff(time_s))), f"{name}, /torque/time_s")
+    return time_s, torque
+
+
+def _segments(file: StrictFile, name: str, time_s: np.ndarray) -> tuple[np.ndarray, list[str]]:
+    """For each sample the segment it lies in, −1 for none, and the segments' names."""
+    starts, ends = file.numbers("/segments/start_s"), file.numbers("/segments/end_s")
+    names = file.names("/segments/name")
+    if not (starts.size == ends.size == len(names)):
+        raise BadRecord("names, starts and ends differ in number", place=f"{name}, /segments", mend=MEND)
+    if not ((np.diff(starts) >= 0).all() and (ends >= starts).all()):
+        raise BadRecord("segments do not follow one another", place=f"{name}, /segments", mend=MEND)
+    for index, text in enumerate(names):
+        bounds.check_name(text, f"{name}, /segments/name, segment {index}")
+    if not names:
+        return np.full(time_s.size, -1), names
+    order = np.searchsorted(starts, time_s, side="right") - 1
+    inside = (order >= 0) & (time_s < ends[np.maximum(order, 0)] + 1e-9)
+    return np.where(inside, order, -1), names
+
+
+def _held_width(file: StrictFile, name: str, time_s: np.ndarray, pulse_rate_hz: float) -> np.ndarray:
+    """Width in force at each sample: pulses are put back on their even slots, late by what they were late together."""
+    columns = ("planned_time_s", "sent_pulse_width_us", "written_time_s", "status")
+    planned, sent, written, status = (file.numbers(f"/pulses/{column}") for column in columns)
+    if not (planned.size == sent.size == written.size == status.size):
+        raise BadRecord("columns of different lengths", place=f"{name}, /pulses", mend=MEND)
+    sent = np.where(np.isnan(sent), 0.0, sent)
+    if (bad := np.flatnonzero(~((sent >= 0) & (sent <= bounds.LARGEST["pulse_width_us"])))).size:
+        place = f"{name}, /pulses/sent_pulse_width_us, pulse {bad[0]}"
+        raise BadRecord(f"{sent[bad[0]]:g} µs is no pulse width", place=place, mend=MEND)
+    if not (np.diff(planned) > 0).all() or not np.isfinite(planned).all():
+        raise BadRecord("pulses do not follow one another", place=f"{name}, /pulses/planned_time_s", mend=MEND)
+    if not planned.size:
+        return np.zeros(time_s.size)
+    sound = (status == SENT_AND_ACKNOWLEDGED) & np.isfinite(written)
+    lag = float(np.median(written[sound] - planned[sound])) if sound.any() else 0.0
+    slot = planned + lag
+    last = np.searchsorted(slot, time_s + 1e-9, side="right") - 1
+    width = np.where(last >= 0, sent[np.maximum(last, 0)], 0.0)
+    # A slot without a pulse, at a gap or after the end, is no stimulation.
+    return np.where(time_s - slot[np.maximum(last, 0)] < 1.5 / pulse_rate_hz, width, 0.0)

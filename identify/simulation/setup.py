@@ -1,0 +1,134 @@
+"""What all candidates of a record share: grid, scenes, one recruitment spline with its penalty, timing bounds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from identify.dynamics.pulse_grid import Grid
+from identify.effects.base import Scene
+from identify.recruitment.spline import SplineBasis
+
+INTERVALS = 30
+"""Knot intervals of the common spline: fewer, and effects act as cheap knots."""
+
+
+@dataclass(frozen=True)
+class Setup:
+    """A record made ready for fitting.
+
+    Parameters
+    ----------
+    grid : Grid
+        The record on the grid of pulses, with `target_nm` in place of its torque.
+    target_nm : ndarray, shape (K,)
+        Torque to be explained (hum removed), N·m; NaN where there is none.
+    fitted : ndarray of bool, shape (K,)
+        Intervals that may be used.
+    basis : SplineBasis
+        Common recruitment spline.
+    stiffness : float
+        Weight of ∫f''², (µs³/(N·m)²).
+    scale_nm : float
+        Largest torque, smoothed, N·m.
+    noise_sd_nm : float
+        White noise of a sample, N·m.
+    delay_bounds_s : tuple of float
+        Timing left open to every candidate: about a sample either way.
+    reference_s : float
+        Time to which the recruitment curve belongs where it drifts.
+    """
+
+    grid: Grid
+    target_nm: np.ndarray
+    fitted: np.ndarray
+    basis: SplineBasis
+    stiffness: float
+    scale_nm: float
+    noise_sd_nm: float
+    delay_bounds_s: tuple[float, float]
+    reference_s: float = 0.0
+
+    @cached_property
+    def stretches(self) -> tuple[np.ndarray, np.ndarray]:
+        """Starts and ends of the runs of fitted intervals."""
+        edges = np.flatnonzero(np.diff(np.r_[0, self.fitted.astype(np.int8), 0]))
+        return edges[::2].astype(np.int64), edges[1::2].astype(np.int64)
+
+    @cached_property
+    def scene(self) -> Scene:
+        """At the middle of the samples of each interval."""
+        grid = self.grid
+        mean = np.bincount(grid.interval, grid.fraction, minlength=grid.size) / np.maximum(grid.count, 1)
+        mean = np.where(grid.count > 0, mean, 0.5)
+        scene = self._scene((np.arange(grid.size) + mean) * grid.step_s, grid.pulse_width_us)
+        return replace(scene, fitted=self.fitted)
+
+    @cached_property
+    def scene_at_ends(self) -> Scene:
+        """At the ends of the intervals, shape (K + 1,)."""
+        grid = self.grid
+        return self._scene(np.arange(grid.size + 1) * grid.step_s, np.r_[grid.pulse_width_us, grid.pulse_width_us[-1]])
+
+    @cached_property
+    def scene_at_samples(self) -> Scene:
+        """At the record's samples, shape (N,)."""
+        grid = self.grid
+        time_s = (grid.interval + grid.fraction) * grid.step_s
+        return self._scene(time_s, grid.pulse_width_us[grid.interval])
+
+    def _scene(self, time_s: np.ndarray, width_us: np.ndarray) -> Scene:
+        grid, record = self.grid, self.grid.record
+        angle, velocity = record.angle_rad, record.velocity_rad_s
+        own = record.time_s - grid.start_s
+        if velocity is None and angle is not None:
+            velocity = np.gradient(angle, record.time_s)
+        return Scene(
+            time_s=time_s,
+            pulse_width_us=width_us,
+            step_s=grid.step_s,
+            scale_nm=self.scale_nm,
+            largest_us=self.basis.knots_us[-1],
+            angle_rad=None if angle is None else np.interp(time_s, own, angle),
+            velocity_rad_s=None if velocity is None else np.interp(time_s, own, velocity),
+            noise_sd_nm=self.noise_sd_nm,
+            reference_s=self.reference_s,
+        )
+
+    @cached_property
+    def design(self) -> np.ndarray:
+        """Spline basis at the recorded widths, shape (n, K)."""
+        return np.ascontiguousarray(self.basis.design(self.grid.pulse_width_us).T)
+
+    @cached_property
+    def penalty(self) -> np.ndarray:
+        """Prior precision of the coefficients, shape (n, n)."""
+        ridge = 1.0 / (3.0 * self.scale_nm) ** 2
+        return self.stiffness * self.basis.roughness + ridge * np.eye(self.basis.size)
+
+    def with_(self, **changes: object) -> Setup:
+        """The set-up with some fields changed (derived arrays are made anew)."""
+        return replace(self, **changes)  # type: ignore[arg-type]
+
+
+def uniform_basis(largest_us: float, intervals: int = INTERVALS) -> SplineBasis:
+    """Common spline with evenly spaced knots."""
+    return SplineBasis(np.linspace(0.0, largest_us, intervals + 1))
+
+
+def refined_basis(basis: SplineBasis, coefficients_nm: np.ndarray, intervals: int = INTERVALS) -> SplineBasis:
+    """Knots moved towards where a first curve bends, half of them left evenly spread."""
+    u = np.linspace(0.0, basis.knots_us[-1], 1201)
+    bend = np.abs(basis.design(u, 2) @ coefficients_nm) ** 0.5
+    width = max(int(0.01 * u.size), 3)
+    bend = np.convolve(bend, np.ones(2 * width + 1) / (2 * width + 1), "same")
+    density = 0.45 / u.size + 0.55 * bend / max(bend.sum(), 1e-30)
+    share = np.cumsum(density)
+    share = (share - share[0]) / (share[-1] - share[0])
+    knots = np.interp(np.linspace(0.0, 1.0, intervals + 1), share, u)
+    least = 0.004 * u[-1]
+    knots = np.maximum.accumulate(knots + least * np.arange(knots.size)) - least * np.arange(knots.size)
+    spread = np.cumsum(np.r_[0.0, np.maximum(np.diff(knots), least)])
+    return SplineBasis(spread * (u[-1] / spread[-1]))
