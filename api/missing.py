@@ -56,15 +56,14 @@ def signatures(record: Any, effects: Sequence[str]) -> dict[str, Any]:
     import numpy as np
 
     import identify
-    from identify.estimation.with_effects import fit_with_effects
 
     pick = slice(None, None, max(1, -(-record.time_s.size // POINTS)))
     found: dict[str, Any] = {"time_s": record.time_s[pick].round(4)}
-    before, held = np.asarray(identify.predict(fit_with_effects(record, []), record)), []
+    before, held = np.asarray(identify.predict(identify.fit(record), record)), []
     for effect in effects:
         held.append(effect)
         try:
-            after = np.asarray(identify.predict(fit_with_effects(record, held), record))
+            after = np.asarray(identify.predict(identify.fit(record, effects=held), record))
         except identify.IdentifyError:
             held.pop()
             continue

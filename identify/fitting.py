@@ -7,13 +7,22 @@ from typing import Any
 
 import numpy as np
 
-from identify.dynamics.pulse_grid import Grid, make_grid
+from identify.diagnosis.analysis import analyse
+from identify.dynamics.pulse_grid import Grid
 from identify.errors import BadRequest, NotIdentifiable
+from identify.estimation.adding import names, with_effects
+from identify.estimation.finish import finish
+from identify.estimation.prepare import prepare
+from identify.estimation.rows import fitted_rows
 from identify.methods import known_options, method_of
+from identify.methods.maximum_likelihood import METHOD as MAXIMUM_LIKELIHOOD
 from identify.model import Model
 from identify.records.record import Record
 
 LEAST_ROWS = 8
+AUTO = "auto"
+NO_EFFECTS_WITH = {"monotone", "order"}
+"""Options that shape the plain structure alone."""
 
 
 def fit(
@@ -32,7 +41,8 @@ def fit(
     method : str
         Id of a method.
     effects : sequence of str
-        Ids of effects to add around the Hammerstein core; estimated jointly by maximum likelihood.
+        Ids of effects to add around the Hammerstein core, or "id:form" to settle the form; estimated jointly by maximum
+        likelihood. "auto" adds those that the record asks for, as `improve` does.
     fit_on : sequence of str, optional
         Names of the segments to fit on; by default all but `validate`, or what the method needs.
     **options
@@ -43,17 +53,23 @@ def fit(
     BadRequest, BadRecord, NotIdentifiable
     """
     names = None if fit_on is None else tuple(fit_on)
-    if effects:
-        from identify.estimation.with_effects import fit_with_effects  # type: ignore[import-not-found]
-
-        return fit_with_effects(record, list(effects), fit_on=names, **options)
     chosen = method_of(method)
     known_options(chosen, options)
+    wanted = [effects] if isinstance(effects, str) else list(effects)
     try:
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            grid = make_grid(record)
-            refuse_stillness(grid)
-            return chosen.fit(grid, names, **options)
+            if not wanted:
+                grid = prepare(record)
+                refuse_stillness(grid)
+                return chosen.fit(grid, names, **options)
+            if chosen is not MAXIMUM_LIKELIHOOD or set(options) & NO_EFFECTS_WITH:
+                given = (
+                    method if chosen is not MAXIMUM_LIKELIHOOD else " and ".join(sorted(set(options) & NO_EFFECTS_WITH))
+                )
+                raise BadRequest(
+                    f"effects are not fitted with {given}", place="effects", mend="Use maximum-likelihood without it."
+                )
+            return _with_effects(record, wanted, names, options)
     except np.linalg.LinAlgError as error:
         raise NotIdentifiable(
             f"{method} finds no solution on this record ({error})", mend="Check that torque follows the pulses."
@@ -63,6 +79,20 @@ def fit(
             given = ", ".join(f"{key}={value}" for key, value in options.items())
             raise BadRequest(f"unusable option ({error})", place=given, mend="See the method's options.") from error
         raise
+
+
+def _with_effects(
+    record: Record, wanted: Sequence[str], fit_on: tuple[str, ...] | None, options: dict[str, Any]
+) -> Model:
+    """Maximum likelihood with the effects named, each in its likeliest form, or in the one named after a colon."""
+    grid = prepare(record)
+    refuse_stillness(grid)
+    rows = fitted_rows(grid, fit_on)
+    if list(wanted) == [AUTO]:
+        last = analyse(record, fitted=rows).last
+        return finish(MAXIMUM_LIKELIHOOD.id, last, [f"effects added: {', '.join(names(last)) or 'none'}"])
+    base, reasons = MAXIMUM_LIKELIHOOD.start(grid, rows, options)
+    return finish(MAXIMUM_LIKELIHOOD.id, with_effects(record, wanted, base), reasons)
 
 
 def refuse_stillness(grid: Grid) -> None:

@@ -124,7 +124,7 @@ class Model:
 
     def predict(self, record: Record) -> np.ndarray:
         """Free-run torque at the record's samples, N·m, shape (N,)."""
-        from identify.simulation.predict import predict
+        from identify.simulation.predict import predict  # here, since a service reads models and compiles nothing
 
         return predict(self, record)
 

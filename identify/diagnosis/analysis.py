@@ -7,13 +7,15 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from identify.diagnosis.candidates import Candidate, Progress, fit_form, scan, try_effect
+from identify.diagnosis.candidates import Progress, scan
 from identify.diagnosis.structure import Left, left_over, quiet_rows
 from identify.diagnosis.unknown import WANDER
 from identify.effects import get, registry
-from identify.effects.base import Effect, Form
+from identify.effects.base import Effect
+from identify.estimation.adding import Candidate, fit_form, given_by_samples, try_effect
 from identify.estimation.joint import Fitted, solve, start_from
-from identify.estimation.prepare import Raw, inspect, prepare
+from identify.estimation.prepare import Raw, inspect, plain, prepare
+from identify.estimation.rows import fitted_rows
 from identify.noise.level import NoiseLevel
 from identify.records.record import Record
 from identify.simulation.problem import Problem
@@ -106,7 +108,8 @@ def analyse(
     """Try all effects on a record, add the best, and go on while the evidence lasts."""
     listed = list(registry().values() if effects is None else effects)
     raw = inspect(record)
-    base = prepare(record, raw, fitted)[1]
+    grid = prepare(record, raw)
+    base = plain(grid, fitted_rows(grid, None) if fitted is None else fitted)
     work = Analysis(record, raw, base)
     start = _with_given(work, base)
     work.chain, work.quiet = [start], quiet_rows(start)
@@ -206,20 +209,6 @@ def _with_given(work: Analysis, base: Fitted) -> Fitted:
         base = solve(problem, start_from(problem, base, {len(effects) - 1: values}), base.noise)
         work.given.append(effect)
     return base
-
-
-def given_by_samples(raw: Raw) -> list[tuple[str, Form, dict[str, float]]]:
-    """Effects that the samples show before any fit: a line of the mains, a ceiling; with their parameters."""
-    effects, found = registry(), []
-    if raw.hum is not None and "mains_hum" in effects:
-        found.append(("mains_hum", effects["mains_hum"].forms[0], raw.hum))
-    if "sensor_clipping" in effects:
-        levels = {"ceiling": raw.ceiling_nm, "floor": raw.floor_nm}
-        seen = {name: value for name, value in levels.items() if value is not None}
-        if seen:
-            form = effects["sensor_clipping"].form("both" if len(seen) == 2 else next(iter(seen)))
-            found.append(("sensor_clipping", form, {f"{name}_nm": value for name, value in seen.items()}))
-    return found
 
 
 def _exchange(work: Analysis) -> None:

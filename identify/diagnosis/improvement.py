@@ -6,12 +6,13 @@ from collections.abc import Sequence
 from typing import Any
 
 from identify.diagnosis.analysis import MOST, Analysis, analyse
-from identify.diagnosis.candidates import Progress, names, try_effect
+from identify.diagnosis.candidates import Progress
 from identify.diagnosis.steps import Step, steps
 from identify.diagnosis.verdict import judge
 from identify.effects import get
-from identify.estimation.statistics import figures
-from identify.estimation.to_model import to_model
+from identify.estimation.adding import names, try_effect
+from identify.estimation.finish import finish
+from identify.estimation.statistics import statistics
 from identify.records.record import Record
 
 COLUMNS = ("fit_percent", "rms_nm", "held_out_rms_nm", "held_out_fit_percent")
@@ -56,11 +57,11 @@ def improve(
         row = row[: max_effects + 1]
     reasons = [_reason(work, step) for step in row]
     for effect in force:
-        step = _forced(row[-1], effect, record)
+        step = _forced(row[-1], effect)
         if step is not None:
             row.append(step)
             reasons.append("Added because a person asked for it; the record doesn't.")
-    models = _models(row, record)
+    models = _models(row)
     return {
         "noise_sd_nm": work.raw.noise_sd_nm,
         "verdict": verdict.kind,
@@ -108,24 +109,19 @@ def refused(work: Analysis) -> list[dict[str, Any]]:
     return rows
 
 
-def _forced(last: Step, effect: str, record: Record) -> Step | None:
+def _forced(last: Step, effect: str) -> Step | None:
     if effect in names(last.fitted):
         return None
     candidate = try_effect(get(effect), last.fitted)
     if candidate is None:
         return None
-    return Step(effect, candidate.fitted, figures(candidate.fitted, record))
+    return Step(effect, candidate.fitted, statistics(candidate.fitted))
 
 
-def _models(row: list[Step], record: Record) -> list[dict[str, Any]]:
+def _models(row: list[Step]) -> list[dict[str, Any]]:
     models: list[dict[str, Any]] = []
     for number, step in enumerate(row):
         parent = models[-1]["model_id"] if models else None
-        model = to_model(
-            step.fitted,
-            record,
-            step.figures,
-            extra={"parent": parent, "added": step.added, "step": number},
-        )
-        models.append(model.to_dict())
+        model = finish("maximum-likelihood", step.fitted, figures=step.figures)
+        models.append(model.with_(extra={"parent": parent, "added": step.added, "step": number}).to_dict())
     return models

@@ -11,7 +11,8 @@ from identify.diagnosis.analysis import Analysis
 from identify.diagnosis.steps import Step, steps
 from identify.diagnosis.verdict import Verdict
 from identify.effects import get
-from identify.estimation.to_model import describe_parameters, predict_fitted, with_band
+from identify.estimation.finish import describe_parameters
+from identify.estimation.tremor import predict_fitted, with_band
 from identify.experiments import plan
 
 CLOSE = 0.8
@@ -23,13 +24,13 @@ RIVAL = 0.04
 def report(work: Analysis, verdict: Verdict) -> dict[str, Any]:
     """The contract's JSON."""
     record, raw = work.record, work.raw
-    base_prediction = predict_fitted(work.base, record)
+    base_prediction = predict_fitted(work.base)
     row = steps(work)
     base = row[0].figures
     missing = [_missing(work, verdict, effect, row) for effect in _ranked(work, verdict)]
     final = row[-1].figures
     residual = record.torque_nm - (
-        predict_fitted(work.last, record) if verdict.kind == "unexplained_structure" else base_prediction
+        predict_fitted(work.last) if verdict.kind == "unexplained_structure" else base_prediction
     )
     where = worst_places(record, residual, raw.noise_sd_nm, rows=~record.held_out)
     return {
@@ -47,7 +48,7 @@ def report(work: Analysis, verdict: Verdict) -> dict[str, Any]:
                 "held_out_rms_nm",
                 "ceiling_percent",
                 "held_out_ceiling_percent",
-                "held_out",
+                "held_out_by",
             )
         },
         "verdict": verdict.kind,

@@ -8,7 +8,7 @@ from typing import Any
 from identify.diagnosis.analysis import Analysis
 from identify.effects import get
 from identify.estimation.joint import Fitted, solve, start_from
-from identify.estimation.statistics import figures
+from identify.estimation.statistics import statistics
 from identify.simulation.problem import Problem
 
 
@@ -23,7 +23,7 @@ class Step:
     fitted : Fitted
         The model.
     figures : dict
-        See `identify.estimation.statistics.figures`.
+        See `identify.estimation.statistics`.
     """
 
     added: str | None
@@ -33,13 +33,13 @@ class Step:
 
 def steps(work: Analysis) -> list[Step]:
     """Base, what the samples gave, what was found, in this order."""
-    record, last = work.record, work.last
-    result = [Step(None, work.base, figures(work.base, record))]
+    last = work.last
+    result = [Step(None, work.base, statistics(work.base))]
     previous = work.base
     names = [*work.given, *work.added]
     for number, name in enumerate(names):
         fitted = last if number == len(names) - 1 else _part(last, previous, names[: number + 1])
-        result.append(Step(name, fitted, figures(fitted, record)))
+        result.append(Step(name, fitted, statistics(fitted)))
         previous = fitted
     return result
 

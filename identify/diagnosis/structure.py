@@ -117,8 +117,11 @@ def _lag_one(residual: np.ndarray, fitted: np.ndarray) -> float:
 def quiet_rows(fitted: Fitted) -> np.ndarray:
     """bool, shape (K,): the muscle rests, as the model sees it."""
     setup = fitted.problem.setup
-    torque = fitted.problem.run(fitted.theta)[0] - fitted.physical[3]
-    drive = fitted.physical[fitted.problem.coefficients] @ setup.design
+    problem, physical = fitted.problem, fitted.physical
+    part = setup.part_of(at_samples=False)
+    baseline = physical[problem.baselines.start : problem.baselines.stop]
+    torque = problem.run(fitted.theta)[0] - (baseline[0] if part is None else baseline[part])
+    drive = physical[problem.coefficients] @ setup.design
     level = QUIET * setup.scale_nm
     still = (np.abs(torque) < level) & (np.abs(drive) < level)
     # Half a second after the last torque: slow tails belong to work.

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from identify.diagnosis.analysis import FIRST_MARGIN, SEEN_AT_REST, Analysis, seen_at_rest
-from identify.diagnosis.candidates import Candidate
 from identify.diagnosis.structure import held_readings
 from identify.effects import get
+from identify.estimation.adding import Candidate
 
 TEMPERATURE = 2.0
 """Spread, in log evidence, that the best form of a rival may lose by chance."""

@@ -13,6 +13,11 @@ if TYPE_CHECKING:
     from identify.dynamics.pulse_grid import Grid
 
 
+TIME_CONSTANT_BOUNDS_S = (0.012, 4.0)
+DAMPING_BOUNDS = (0.15, 8.0)
+"""What a muscle's dynamics are looked for in; at the upper damping the second lag is too short to be seen."""
+
+
 @dataclass(frozen=True)
 class SecondOrder:
     """T² y'' + 2 ζ T y' + y = w(t - delay): unit gain at DC (section V of the paper).

@@ -44,6 +44,8 @@ class Grid:
         Index into the record's `segment_names`.
     angle_rad, velocity_rad_s : ndarray or None, shape (K,)
         Means over each interval.
+    noise_sd_nm : float
+        White noise of a sample, as the raw samples show it, N·m; 0 where nobody has looked.
     """
 
     record: Record
@@ -58,6 +60,7 @@ class Grid:
     segment: np.ndarray
     angle_rad: np.ndarray | None
     velocity_rad_s: np.ndarray | None
+    noise_sd_nm: float = 0.0
 
     @property
     def size(self) -> int:
@@ -77,6 +80,12 @@ class Grid:
         """
         usual = float(np.median(self.count[self.count > 0])) if np.any(self.count) else 1.0
         return ~self.held_out & (self.count > 0) & (2 * self.count >= usual)
+
+    @property
+    def delay_bounds_s(self) -> tuple[float, float]:
+        """Timing that every model leaves open: a sample either way; a longer delay is an effect."""
+        sample_s = min(1.02 / self.record.sample_rate_hz, 1.02 * self.step_s)
+        return -sample_s, sample_s
 
     @cached_property
     def stretches(self) -> list[slice]:

@@ -134,7 +134,9 @@ def _second(law, linear, inverse, y, v, lag_s, scale_nm):  # pragma: no cover
 
 
 @njit(cache=True, nogil=True)
-def run_core(drive, time_constant_s, damping, law, multiplier, scale_nm, step_s, shared):  # pragma: no cover
+def run_core(
+    drive, time_constant_s, damping, law, multiplier, begins, initial, scale_nm, step_s, shared
+):  # pragma: no cover
     """Boundary states of rows of drives.
 
     Parameters
@@ -147,6 +149,10 @@ def run_core(drive, time_constant_s, damping, law, multiplier, scale_nm, step_s,
         Coefficients of the speed law.
     multiplier : ndarray, shape (M or 1 or 0, K)
         A further factor on T, given; no rows where there is none.
+    begins : ndarray of int, shape (B,)
+        Intervals at whose start a part of the record begins; the first is 0.
+    initial : ndarray, shape (M, B, 2)
+        Torque, N·m, and its rate, N·m/s, with which each part begins.
     scale_nm : float
         Torque that counts as full, N·m.
     step_s : float
@@ -176,13 +182,17 @@ def run_core(drive, time_constant_s, damping, law, multiplier, scale_nm, step_s,
         alike = shared and m > 0 and base == time_constant_s[0] and damping[m] == damping[0]
         for j in range(law.shape[1]):
             alike = alike and law[m, j] == law[0, j]
-        y, v, bound = 0.0, 0.0, 0.0
+        y, v, bound, part = 0.0, 0.0, 0.0, 0
         slow_second = law[m, 21] != 0.0 or law[m, 22] != 0.0
         quick_second = law[m, 23] != 0.0 or law[m, 24] != 0.0
         last = 1.0
         forget = np.exp(-step_s / PARTS / max(quick_s if law[m, 18] != 0.0 else slow_s, 1e-4))
         if alike and varied:
             for k in range(size):
+                if part < begins.size and k == begins[part]:
+                    y, v = initial[m, part, 0], initial[m, part, 1]
+                    torque[m, k], rate[m, k] = y, v
+                    part += 1
                 w = drive[m, k]
                 gap = y - w
                 y, v = w + first[0, k] * gap + first[1, k] * v, first[2, k] * gap + first[3, k] * v
@@ -191,6 +201,10 @@ def run_core(drive, time_constant_s, damping, law, multiplier, scale_nm, step_s,
             continue
         if not lawful and given == 0:
             for k in range(size):
+                if part < begins.size and k == begins[part]:
+                    y, v = initial[m, part, 0], initial[m, part, 1]
+                    torque[m, k], rate[m, k] = y, v
+                    part += 1
                 w = drive[m, k]
                 gap = y - w
                 y, v = w + b11 * gap + b12 * v, b21 * gap + b22 * v
@@ -199,6 +213,10 @@ def run_core(drive, time_constant_s, damping, law, multiplier, scale_nm, step_s,
             continue
         h = step_s / PARTS
         for k in range(size):
+            if part < begins.size and k == begins[part]:
+                y, v = initial[m, part, 0], initial[m, part, 1]
+                torque[m, k], rate[m, k] = y, v
+                part += 1
             w = drive[m, k]
             given_f = multiplier[m if given > 1 else 0, k] if given > 0 else 1.0
             p11, p12, p21, p22 = 1.0, 0.0, 0.0, 1.0
@@ -242,37 +260,7 @@ def run_core(drive, time_constant_s, damping, law, multiplier, scale_nm, step_s,
 
 
 @njit(cache=True, nogil=True)
-def mean_weights(fraction, interval, count, shift):  # pragma: no cover
-    """Weights of the boundary states in each interval's mean of samples read `shift` steps late.
-
-    Returns
-    -------
-    first : int
-        Offset of the earliest boundary.
-    weights : ndarray, shape (K, B, 2)
-        For (y, y' times step).
-    """
-    low, high = 1 << 30, -(1 << 30)
-    for n in range(fraction.size):
-        o = int(np.floor(fraction[n] - shift))
-        low, high = min(low, o), max(high, o)
-    width = high - low + 2
-    weights = np.zeros((count.size, width, 2))
-    for n in range(fraction.size):
-        at = fraction[n] - shift
-        o = int(np.floor(at))
-        s = at - o
-        k, b = interval[n], o - low
-        r = 1.0 / count[k]
-        weights[k, b, 0] += r * (1 + 2 * s) * (1 - s) ** 2
-        weights[k, b, 1] += r * s * (1 - s) ** 2
-        weights[k, b + 1, 0] += r * s * s * (3 - 2 * s)
-        weights[k, b + 1, 1] += r * s * s * (s - 1)
-    return low, weights
-
-
-@njit(cache=True, nogil=True)
-def read_means(torque, rate, first, weights, step_s):  # pragma: no cover
+def read_means(torque, rate, first, weights):  # pragma: no cover
     """Means over intervals, shape (M, K), from boundary states of shape (M, K + 1)."""
     rows, size = torque.shape[0], weights.shape[0]
     out = np.zeros((rows, size))
@@ -286,6 +274,6 @@ def read_means(torque, rate, first, weights, step_s):  # pragma: no cover
                 elif at > size:
                     total += weights[k, b, 0] * torque[m, size]
                 else:
-                    total += weights[k, b, 0] * torque[m, at] + weights[k, b, 1] * rate[m, at] * step_s
+                    total += weights[k, b, 0] * torque[m, at] + weights[k, b, 1] * rate[m, at]
             out[m, k] = total
     return out

@@ -32,7 +32,7 @@ class Parameter:
         "linear" or "log": how the parameter is varied, and on which scale the prior is flat-ish.
     relative : str
         "torque", "width" or "span": bounds, start and neutral are in units of the record's largest torque, its largest
-        pulse width or its length.
+        pulse width or its length; "level": of its largest torque, above its zero, as the sensor counts.
     about : str
         One line for the page.
     """
@@ -49,15 +49,16 @@ class Parameter:
 
     def on(self, scene: Scene) -> Parameter:
         """The parameter with its bounds in absolute units."""
-        unit = {"torque": scene.scale_nm, "width": scene.largest_us, "span": scene.span_s}.get(self.relative, 1.0)
-        if unit == 1.0:
+        if not self.relative:
             return self
+        unit = {"width": scene.largest_us, "span": scene.span_s}.get(self.relative, scene.scale_nm)
+        zero = scene.zero_nm if self.relative == "level" else 0.0
         return replace(
             self,
-            lower=self.lower * unit,
-            upper=self.upper * unit,
-            neutral=self.neutral * unit,
-            start=tuple(value * unit for value in self.start),
+            lower=zero + self.lower * unit,
+            upper=zero + self.upper * unit,
+            neutral=zero + self.neutral * unit,
+            start=tuple(zero + value * unit for value in self.start),
             relative="",
         )
 
@@ -82,6 +83,8 @@ class Scene:
         Joint angle and velocity, where the record has them.
     noise_sd_nm : float
         White noise of a sample, N·m.
+    zero_nm : float
+        Zero of the record's torque, N·m: the sensor counts from it, everything else above it.
     reference_s : float
         Time to which the recruitment curve belongs where it drifts: the middle of the partly recruited pulses.
     fitted : ndarray of bool or None, shape (K,)
@@ -96,6 +99,7 @@ class Scene:
     angle_rad: np.ndarray | None = None
     velocity_rad_s: np.ndarray | None = None
     noise_sd_nm: float = 0.0
+    zero_nm: float = 0.0
     reference_s: float = 0.0
     fitted: np.ndarray | None = None
 
@@ -157,6 +161,8 @@ class Form:
         `accept(parameters, scene)`: whether a fit makes sense.
     grows : bool
         The form is the next in a chain: it is tried only while the form before it gained.
+    settled : bool
+        Its parameters are found in the raw samples, and the target no longer holds it: nothing of it is fitted.
     source : str
         Paper and equation.
     """
@@ -173,6 +179,7 @@ class Form:
     grows: bool = False
     accept: Callable[[dict[str, float], Scene], bool] | None = None
     restarts: tuple[dict[str, float], ...] = ()
+    settled: bool = False
     source: str = ""
 
     def neutral(self) -> dict[str, float]:

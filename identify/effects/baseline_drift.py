@@ -39,8 +39,8 @@ def _wander(_: None, p: dict[str, Any], scene: Scene) -> np.ndarray:
     return CubicSpline(knots, np.eye(KNOTS + 1), bc_type="natural")(place).dot(values.T).T
 
 
-_SLOPE = Parameter("slope_nm_per_s", "N·m/s", -0.25, 0.25, 0.0, (0.0,), about="drift in a second")
-_WAVE = (-1.5, 1.5, 0.0, (0.02,))
+_SLOPE = Parameter("slope_nm_per_s", "N·m/s", -0.04, 0.04, 0.0, (0.0,), relative="torque", about="drift in a second")
+_WAVE = (-0.22, 0.22, 0.0, (0.003,), "linear", "torque")
 
 EFFECT = Effect(
     id="baseline_drift",
@@ -52,7 +52,7 @@ EFFECT = Effect(
             "additive",
             "y + shift (1 - exp(-t/time_constant))",
             (
-                Parameter("shift_nm", "N·m", -4.0, 4.0, 0.0, (0.0,), about="final shift"),
+                Parameter("shift_nm", "N·m", -0.6, 0.6, 0.0, (0.0,), relative="torque", about="final shift"),
                 Parameter("time_constant_s", "s", 2.0, 80.0, 15.0, (5.0, 20.0), "log", about="how fast it settles"),
             ),
             _warming,
@@ -62,7 +62,10 @@ EFFECT = Effect(
             "bent",
             "additive",
             "y + slope·t + bend (t/60)²",
-            (_SLOPE, Parameter("bend_nm", "N·m", -12.0, 12.0, 0.0, (0.0,), about="bend over a minute")),
+            (
+                _SLOPE,
+                Parameter("bend_nm", "N·m", -1.8, 1.8, 0.0, (0.0,), relative="torque", about="bend over a minute"),
+            ),
             _bent,
             True,
         ),
@@ -83,7 +86,16 @@ EFFECT = Effect(
             "additive",
             "y + s(t), s a natural cubic spline through six knots over the record",
             tuple(
-                Parameter(f"knot_{i}_nm", "N·m", -2.0, 2.0, 0.0, (0.0,), about=f"shift at {i} sixths of the record")
+                Parameter(
+                    f"knot_{i}_nm",
+                    "N·m",
+                    -0.3,
+                    0.3,
+                    0.0,
+                    (0.0,),
+                    relative="torque",
+                    about=f"shift at {i} sixths of the record",
+                )
                 for i in range(1, KNOTS + 1)
             ),
             _wander,

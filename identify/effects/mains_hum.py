@@ -11,8 +11,8 @@ from identify.effects.base import Effect, Form, Parameter, Scene
 HARMONICS = 4
 
 
-def _hum(_: None, p: dict[str, Any], scene: Scene) -> np.ndarray:
-    total = 0.0
+def _hum(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+    total = y
     for h in range(1, HARMONICS + 1):
         turn = 2 * np.pi * h * p["frequency_hz"] * scene.time_s
         total = total + p[f"cos_{h}_nm"] * np.cos(turn) + p[f"sin_{h}_nm"] * np.sin(turn)
@@ -20,7 +20,7 @@ def _hum(_: None, p: dict[str, Any], scene: Scene) -> np.ndarray:
 
 
 _PARTS = tuple(
-    Parameter(f"{part}_{h}_nm", "N·m", -2.0, 2.0, 0.0, (0.0,), about=f"harmonic {h}")
+    Parameter(f"{part}_{h}_nm", "N·m", -0.5, 0.5, 0.0, (0.0,), "linear", "torque", f"harmonic {h}")
     for h in range(1, HARMONICS + 1)
     for part in ("cos", "sin")
 )
@@ -31,11 +31,12 @@ EFFECT = Effect(
     forms=(
         Form(
             "line",
-            "additive",
+            "sensor",
             "y + Σ cos_h cos(2πhft) + sin_h sin(2πhft)",
             (Parameter("frequency_hz", "Hz", 49.0, 61.0, 50.0, (50.0, 60.0), about="mains frequency"), *_PARTS),
             _hum,
             batched=True,
+            settled=True,
         ),
     ),
     signature="Lines at 50 or 60 Hz and multiples; in one mean a pulse they fold to some low frequency.",

@@ -8,7 +8,9 @@ import numpy as np
 
 from identify.effects.base import Effect, Form, Parameter, Scene
 
-_VISCOUS = Parameter("viscosity_nm_s_per_rad", "N·m·s/rad", -4.0, 4.0, 0.0, (0.0,), about="viscous part")
+_VISCOUS = Parameter(
+    "viscosity_nm_s_per_rad", "N·m·s/rad", -0.6, 0.6, 0.0, (0.0,), relative="torque", about="viscous part"
+)
 
 
 def _speed(scene: Scene) -> np.ndarray:
@@ -40,7 +42,9 @@ def _two_sided(_: None, p: dict[str, Any], scene: Scene) -> np.ndarray:
     )
 
 
-_STIFF = Parameter("stiffness_nm_per_rad", "N·m/rad", -20.0, 20.0, 0.0, (0.0, 1.0), about="elastic part, at the start")
+_STIFF = Parameter(
+    "stiffness_nm_per_rad", "N·m/rad", -3.0, 3.0, 0.0, (0.0, 0.15), "linear", "torque", "elastic part, at the start"
+)
 
 EFFECT = Effect(
     id="passive_torque",
@@ -69,8 +73,18 @@ EFFECT = Effect(
             "y + stiffness·Δ + bend·Δ² + hardening·Δ³ + viscosity·velocity",
             (
                 _STIFF,
-                Parameter("bend_nm_per_rad2", "N·m/rad²", -20.0, 20.0, 0.0, (0.0,), about="one-sided part"),
-                Parameter("hardening_nm_per_rad3", "N·m/rad³", -30.0, 30.0, 0.0, (0.0,), about="both ends' stiffening"),
+                Parameter("bend_nm_per_rad2", "N·m/rad²", -3.0, 3.0, 0.0, (0.0,), "linear", "torque", "one-sided part"),
+                Parameter(
+                    "hardening_nm_per_rad3",
+                    "N·m/rad³",
+                    -4.5,
+                    4.5,
+                    0.0,
+                    (0.0,),
+                    "linear",
+                    "torque",
+                    "both ends' stiffening",
+                ),
                 _VISCOUS,
             ),
             _two_sided,

@@ -28,8 +28,8 @@ def _both(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
     return _floored(_clipped(y, p, scene), p, scene)
 
 
-_CEILING = Parameter("ceiling_nm", "N·m", 0.1, 1.5, np.inf, (0.9,), "log", "torque", "largest torque shown")
-_FLOOR = Parameter("floor_nm", "N·m", -1.5, 0.9, -np.inf, (-0.5,), "linear", "torque", "smallest torque shown")
+_CEILING = Parameter("ceiling_nm", "N·m", -1.5, 1.5, np.inf, (0.9,), "linear", "level", "largest torque shown")
+_FLOOR = Parameter("floor_nm", "N·m", -1.5, 1.5, -np.inf, (-0.5,), "linear", "level", "smallest torque shown")
 
 EFFECT = Effect(
     id="sensor_clipping",

@@ -66,7 +66,7 @@ EFFECT = Effect(
             "output",
             "y + gain·θ exp(-decay·θ) θ' under stimulation",
             (
-                Parameter("gain_nm_s_per_rad2", "N·m·s/rad²", -6.0, 6.0, 0.0, (0.2, -0.2), about="V1"),
+                Parameter("gain_nm_s_per_rad2", "N·m·s/rad²", -0.9, 0.9, 0.0, (0.03, -0.03), "linear", "torque", "V1"),
                 Parameter("decay_per_rad", "1/rad", 0.0, 4.0, 1.3, (1.0,), about="V2"),
             ),
             _marion,

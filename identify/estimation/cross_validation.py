@@ -4,40 +4,38 @@ from __future__ import annotations
 
 import numpy as np
 
-from identify.estimation.projected import Solution
+from identify.estimation.joint import Fitted
 
 BLOCK_S = 2.0
 FOLDS = 5
 
 
-def held_out_change(solution: Solution) -> np.ndarray:
+def held_out_change(fitted: Fitted) -> np.ndarray:
     """By how much each fitted row's block mean changes when its fold isn't fitted, N·m, shape (K,).
 
-    Blocks of 2 s go to five folds in turn. The refit without a fold is one Gauss-Newton step from the solution:
-    exact in all that is linear (recruitment, baseline), first order in the dynamics.
+    Blocks of 2 s go to five folds in turn. The refit without a fold is one Gauss-Newton step from the solution: exact
+    in all that is linear (recruitment, baseline), first order in the rest.
     """
-    problem, grid = solution.problem, solution.problem.grid
+    problem = fitted.problem
+    setup, grid = problem.setup, problem.setup.grid
+    rows = setup.fitted
     block = max(round(BLOCK_S / grid.step_s), 2)
-    fold = (np.cumsum(problem.rows) // block) % FOLDS
-    design = np.concatenate([solution.columns, solution.slopes], axis=1)
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(solution.gram), 1e-300))
-    design = design * scale
-    residual = np.where(problem.rows, solution.residual_nm, 0.0)
-    penalty = np.zeros_like(solution.gram)
-    size = problem.basis.size
-    penalty[:size, :size] = solution.weight * problem.roughness
-    penalty = penalty * scale[:, None] * scale[None, :]
-    fitted = design[problem.rows]
-    whole = fitted.T @ fitted + penalty
-    gradient = fitted.T @ residual[problem.rows]
-    start = penalty[:, :size] @ (solution.coefficients[:size] / scale[:size])
+    fold = (np.cumsum(rows) // block) % FOLDS
+    mean, precision = problem.prior
+    penalty = precision * fitted.noise.sd_nm**2
+    whole = fitted.slopes[:, rows] @ fitted.slopes[:, rows].T + penalty
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(whole), 1e-300))
+    design = fitted.slopes.T * scale
+    whole = whole * scale[:, None] * scale[None, :]
+    residual = np.where(rows, fitted.residual_nm, 0.0)
+    gradient = design[rows].T @ residual[rows] - scale * (penalty @ (fitted.theta - mean))
     change = np.zeros(grid.size)
     for number in range(FOLDS):
-        rows = problem.rows & (fold == number)
-        if not rows.any() or rows.sum() == problem.rows.sum():
+        left_out = rows & (fold == number)
+        if not left_out.any() or left_out.sum() == rows.sum():
             continue
-        out = design[rows]
+        out = design[left_out]
         left = whole - out.T @ out
-        step = np.linalg.solve(left + 1e-9 * np.eye(len(left)), gradient - out.T @ residual[rows] - start)
-        change[rows] = out @ step
+        step = np.linalg.solve(left + 1e-9 * np.eye(len(left)), gradient - out.T @ residual[left_out])
+        change[left_out] = out @ step
     return change

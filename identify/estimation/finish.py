@@ -1,4 +1,4 @@
-"""From a solution to a model: noise, ceiling, figures, covariance, validity."""
+"""From a fit to a model: figures, tests, covariance, bands, what it holds for."""
 
 from __future__ import annotations
 
@@ -10,14 +10,15 @@ from uuid import uuid4
 
 import numpy as np
 
-from identify.dynamics.linear import Discrete
+from identify.dynamics.linear import Discrete, SecondOrder
 from identify.dynamics.narx import run
 from identify.dynamics.pulse_grid import Grid, runs
-from identify.estimation.cross_validation import held_out_change
 from identify.estimation.figures import figures, white_sd
-from identify.estimation.projected import Solution
+from identify.estimation.joint import Fitted
 from identify.estimation.quality import quality, valid_for
 from identify.estimation.residual_tests import residual_tests
+from identify.estimation.statistics import statistics
+from identify.estimation.tremor import with_band
 from identify.estimation.uncertainty import bands
 from identify.model import Covariance, Model, Noise
 from identify.noise.ar1 import noise_evidence
@@ -25,26 +26,111 @@ from identify.recruitment.curve import Curve
 from identify.simulation.predict import fingerprint, predict_on
 
 
-def finish(method_id: str, solution: Solution, delta_bic: float, reasons: Sequence[str] = ()) -> Model:
-    """The model of a solution, with everything that MODEL.json tells."""
-    problem, grid = solution.problem, solution.problem.grid
-    size = problem.basis.size
-    coefficients = solution.coefficients
-    block_sd = float(np.sqrt(solution.variance / (1.0 - solution.ar1**2)))
+def finish(method_id: str, fitted: Fitted, reasons: Sequence[str] = (), figures: dict[str, Any] | None = None) -> Model:
+    """The model of a fit, with everything that MODEL.json tells.
+
+    Parameters
+    ----------
+    method_id : str
+        Id of the method.
+    fitted : Fitted
+        With effects or without.
+    reasons : sequence of str
+        Why the structure is as it is.
+    figures : dict, optional
+        Where they are known already.
+    """
+    figures = figures or statistics(fitted)
+    tests = residual_tests(fitted)
+    known = fitted.problem.size
+    written = with_band(fitted)
+    problem, values, setup = written.problem, written.physical, written.problem.setup
+    covariance = _covariance(written, known)
+    torque, rate = setup.sign * values[list(problem.initials)[:2]]
     model = Model(
         method=method_id,
-        recruitment=Curve(problem.basis, coefficients[:size]),
-        linear=solution.linear,
-        pulse_rate_hz=1.0 / grid.step_s,
-        sample_rate_hz=grid.record.sample_rate_hz,
-        baseline_nm=float(coefficients[size]),
-        initial=(0.0, 0.0) if problem.from_rest else (float(coefficients[size + 1]), float(coefficients[size + 2])),
-        covariance=covariance(solution),
-        noise=Noise(block_sd_nm=block_sd, ar1=solution.ar1, delta_bic=delta_bic),
+        recruitment=Curve(setup.basis, setup.sign * values[problem.coefficients]),
+        linear=SecondOrder(*(float(value) for value in values[:3])),
+        pulse_rate_hz=1.0 / setup.grid.step_s,
+        sample_rate_hz=setup.grid.record.sample_rate_hz,
+        baseline_nm=float(setup.unframed(values[problem.baselines.start])),
+        initial=(float(torque), float(rate)),
+        covariance=covariance,
+        noise=Noise(
+            white_sd_nm=figures["noise_sd_nm"],
+            block_sd_nm=fitted.noise.sd_nm,
+            ar1=0.0 if fitted.noise.is_white else fitted.noise.ar1,
+        ),
+        effects=tuple(_effect(written, index) for index in range(len(problem.chosen))),
+        fit=figures,
+        residual_tests=tests,
         reasons=tuple(reasons),
     )
-    model = completed(model, grid, problem.rows, solution.freedom, solution)
-    return model.with_(bands=bands(model))
+    model = _named(model, setup.grid)
+    model = model.with_(bands=bands(model), valid_for=valid_for(model, setup.grid, setup.fitted))
+    return model.with_(quality=quality(model, setup.grid, setup.fitted, fitted.settled))
+
+
+def _named(model: Model, grid: Grid) -> Model:
+    """The model with a name of its own, and where it comes from."""
+    source = grid.record.source
+    return model.with_(
+        model_id=str(uuid4()),
+        created=datetime.now(UTC).isoformat(timespec="seconds"),
+        data={
+            "name": source.name,
+            "recording_id": source.recording_id,
+            "sha256": source.sha256,
+            "fingerprint": fingerprint(grid.record),
+        },
+    )
+
+
+def _covariance(fitted: Fitted, known: int) -> Covariance:
+    """Covariance of all parameters that were estimated, in the record's own sign.
+
+    The penalty stands for a prior, so this is the posterior's covariance; bands from it cover the truth as often as
+    they say, averaged over the curve (Nychka 1988).
+    """
+    problem = fitted.problem
+    sign = np.ones(known)
+    sign[3 : problem.coefficients.stop] = problem.setup.sign
+    values = fitted.physical[:known] * sign
+    first = problem.baselines.start
+    values[first : problem.baselines.stop] += problem.setup.zero_nm
+    matrix = fitted.covariance()[:known, :known] * sign[:, None] * sign[None, :]
+    return Covariance(problem.names[:known], values, matrix)
+
+
+def _effect(fitted: Fitted, index: int) -> dict[str, Any]:
+    chosen = fitted.problem.chosen[index]
+    setup = fitted.problem.setup
+    return {
+        "id": chosen.effect,
+        "form": chosen.form.name,
+        "stage": chosen.form.stage,
+        "equation": chosen.form.equation,
+        "parameters": describe_parameters(fitted, index),
+        "settings": {
+            "scale_nm": setup.scale_nm,
+            "largest_us": float(setup.basis.largest_us),
+            "noise_sd_nm": setup.noise_sd_nm,
+            "zero_nm": setup.zero_nm,
+            "sign": setup.sign,
+            "reference_s": setup.reference_s,
+        },
+    }
+
+
+def describe_parameters(fitted: Fitted, index: int) -> dict[str, dict[str, Any]]:
+    """Value, sd and unit of an effect's parameters by name."""
+    chosen = fitted.problem.chosen[index]
+    matrix = fitted.covariance()
+    values = fitted.physical
+    return {
+        p.name: {"value": float(values[i]), "sd": float(np.sqrt(max(matrix[i, i], 0.0))), "unit": p.unit}
+        for i, p in zip(chosen.places, chosen.parameters, strict=True)
+    }
 
 
 def finish_discrete(
@@ -80,52 +166,14 @@ def finish_discrete(
     return completed(model, grid, rows, free)
 
 
-def completed(model: Model, grid: Grid, rows: np.ndarray, freedom: float, solution: Solution | None = None) -> Model:
-    """The model with its figures, its tests, its validity, its name and its origin."""
-    source = grid.record.source
-    model = model.with_(
-        model_id=str(uuid4()),
-        created=datetime.now(UTC).isoformat(timespec="seconds"),
-        data={
-            "name": source.name,
-            "recording_id": source.recording_id,
-            "sha256": source.sha256,
-            "fingerprint": fingerprint(grid.record),
-        },
-    )
+def completed(model: Model, grid: Grid, rows: np.ndarray, freedom: float) -> Model:
+    """A model without covariance, with its figures, its name, and what it holds for."""
+    model = _named(model, grid)
     predicted = predict_on(model, grid)
-    sd = white_sd(grid, predicted, model.noise.block_sd_nm, freedom, model.noise.ar1 == 0.0)
-    change = None if solution is None or grid.record.has_held_out else held_out_change(solution)
+    noise = white_sd(grid, predicted, model.noise.block_sd_nm, freedom, model.noise.ar1 == 0.0)
     model = model.with_(
-        noise=replace(model.noise, white_sd_nm=sd),
-        fit=figures(grid, rows, predicted, sd, change),
-        residual_tests={} if solution is None else residual_tests(solution),
+        noise=replace(model.noise, white_sd_nm=noise),
+        fit=figures(grid, rows, predicted, noise),
         valid_for=valid_for(model, grid, rows),
     )
-    return model.with_(quality=quality(model, grid, rows, solution is None or solution.converged))
-
-
-def covariance(solution: Solution) -> Covariance:
-    """Covariance of all parameters: noise variance times the inverse of the penalised information.
-
-    The penalty stands for a prior, so this is the posterior's covariance; bands from it cover the truth as often as
-    they say, averaged over the curve (Nychka 1988).
-    """
-    problem = solution.problem
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(solution.gram), 1e-300))
-    scaled = solution.gram * scale[:, None] * scale[None, :]
-    inverse = np.linalg.inv(scaled + 1e-12 * np.eye(len(scale))) * scale[:, None] * scale[None, :]
-    size, extras = problem.basis.size, problem.extras
-    lead = len(scale) - size - extras
-    # From (log T, log ζ) to (T, ζ).
-    turn = np.ones(len(scale))
-    turn[size + extras] = solution.linear.time_constant_s
-    turn[size + extras + 1] = solution.linear.damping
-    matrix = solution.variance * inverse * turn[:, None] * turn[None, :]
-    order = np.r_[size + extras : len(scale), size : size + extras, 0:size]
-    names = ("time_constant_s", "damping", "delay_s")[:lead]
-    names += ("baseline_nm", "initial_torque_nm", "initial_rate_nm_s")[:extras]
-    names += tuple(f"recruitment_{i}_nm" for i in range(size))
-    dynamics = [solution.linear.time_constant_s, solution.linear.damping, solution.linear.delay_s][:lead]
-    values = np.r_[dynamics, solution.coefficients[size:], solution.coefficients[:size]]
-    return Covariance(names, values, matrix[np.ix_(order, order)])
+    return model.with_(quality=quality(model, grid, rows))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -10,8 +10,7 @@ from scipy.linalg import cho_factor, cho_solve
 from identify.effects.base import Form
 from identify.estimation.gram import gram
 from identify.noise.level import NoiseLevel, profile, whitened
-from identify.simulation.problem import FIRST_COEFFICIENT, Problem
-from identify.simulation.setup import Setup
+from identify.simulation.problem import Problem
 
 OCCAM = 60.0
 """Least by which the evidence of a fit lies below its log posterior, about."""
@@ -37,10 +36,14 @@ class Fitted:
         Laplace's approximation with the priors of `Problem.prior`.
     residual_nm : ndarray, shape (K,)
         Target minus prediction, all intervals.
+    slopes : ndarray, shape (P, K)
+        Derivatives of the interval means by the parameters.
     hessian : ndarray, shape (P, P)
         Of minus the log posterior.
     iterations : int
         Steps taken.
+    settled : bool
+        Whether the search ended because nothing more was to be gained.
     """
 
     problem: Problem
@@ -49,8 +52,19 @@ class Fitted:
     log_likelihood: float
     log_evidence: float
     residual_nm: np.ndarray
+    slopes: np.ndarray
     hessian: np.ndarray
     iterations: int
+    settled: bool = True
+
+    @property
+    def freedom(self) -> float:
+        """Effective number of parameters: those that the rows, not the priors, decide."""
+        precision = self.problem.prior[1]
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(self.hessian), 1e-300))
+        scaled = self.hessian * scale[:, None] * scale[None, :] + 1e-12 * np.eye(scale.size)
+        prior = precision * scale[:, None] * scale[None, :]
+        return float(self.theta.size - np.trace(np.linalg.solve(scaled, prior)))
 
     @property
     def effects(self) -> list[tuple[str, Form]]:
@@ -130,7 +144,7 @@ def solve(
     assert at is not None
     frozen = np.zeros(problem.size, bool)
     for chosen in problem.chosen:
-        if chosen.effect == "mains_hum":
+        if chosen.form.settled:
             frozen[chosen.places.start : chosen.places.stop] = True
     damping, iterations = 1e-3, 0
     prior_mean, precision = problem.prior
@@ -156,8 +170,10 @@ def solve(
         log_likelihood=at.log_likelihood,
         log_evidence=at.value - 0.5 * _log_det_ratio(hessian, precision),
         residual_nm=at.residual,
+        slopes=jacobian,
         hessian=hessian,
         iterations=iterations,
+        settled=most == 0 or iterations < most,
     )
 
 
@@ -255,27 +271,11 @@ def start_from(problem: Problem, base: Fitted, values: dict[int, dict[str, float
     return theta
 
 
-def base_fit(setup: Setup, noise: NoiseLevel | None = None, starts: tuple[float, ...] = (0.06, 0.2, 0.5)) -> Fitted:
-    """The Hammerstein model without effects, from several time constants."""
-    problem = Problem(setup, [])
-    noise = noise or NoiseLevel(0.5, 0.5, 0.1 * setup.scale_nm)
-    best: Fitted | None = None
-    for time_constant_s in starts:
-        theta = np.zeros(problem.size)
-        theta[0], theta[1] = np.log(time_constant_s), np.log(0.9)
-        theta = linear_start(problem, theta, noise)
-        fitted = solve(problem, theta, noise, most=12, tolerance=0.5)
-        if best is None or fitted.log_evidence > best.log_evidence:
-            best = fitted
-    assert best is not None
-    return solve(problem, best.theta, best.noise, most=25)
-
-
 def linear_start(problem: Problem, theta: np.ndarray, noise: NoiseLevel) -> np.ndarray:
     """Coefficients and baseline solved for, at given other parameters."""
     mean, jacobian = problem.run(theta, derivatives=True)
     assert jacobian is not None
-    free = np.r_[3, np.arange(FIRST_COEFFICIENT, problem.coefficients.stop)]
+    free = np.arange(problem.baselines.start, problem.coefficients.stop)
     white = _whiten(problem, np.vstack([_residual(problem, mean), jacobian[free]]), noise)
     prior_mean, precision = problem.prior
     part = precision[np.ix_(free, free)]
@@ -284,8 +284,3 @@ def linear_start(problem: Problem, theta: np.ndarray, noise: NoiseLevel) -> np.n
     result = theta.copy()
     result[free] += np.linalg.solve(products[1:, 1:] + part, gradient)
     return np.clip(result, problem.lower, problem.upper)
-
-
-def relabel(fitted: Fitted, **changes: object) -> Fitted:
-    """The same with some fields changed."""
-    return replace(fitted, **changes)  # type: ignore[arg-type]

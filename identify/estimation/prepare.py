@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from identify.dynamics.pulse_grid import Grid, make_grid, runs
 from identify.effects.mains_hum import HARMONICS
-from identify.estimation.joint import Fitted, base_fit
+from identify.estimation.joint import Fitted, solve
+from identify.estimation.projected import Solution, estimate
+from identify.noise.level import NoiseLevel
 from identify.records.record import Record
-from identify.simulation.setup import Setup, refined_basis, uniform_basis
+from identify.simulation.problem import Problem
+from identify.simulation.setup import Setup
 
 LEAST_LINE = 30.0
 """Power of a mains line over its neighbours' median that counts as hum."""
@@ -196,26 +199,56 @@ def block_means(grid: Grid, torque_nm: np.ndarray) -> np.ndarray:
     return np.where(grid.count > 0, total, np.nan)
 
 
-def first_setup(record: Record, raw: Raw, grid: Grid | None = None, fitted: np.ndarray | None = None) -> Setup:
-    """A set-up with evenly spread knots."""
-    grid = grid or make_grid(record)
-    target = block_means(grid, raw.torque_nm)
-    rows = grid.fitted if fitted is None else fitted
+def prepare(record: Record, raw: Raw | None = None) -> Grid:
+    """The record on its grid, hum removed, with its white noise."""
+    raw = raw or inspect(record)
+    grid = make_grid(record)
+    return replace(grid, torque_nm=block_means(grid, raw.torque_nm), noise_sd_nm=raw.noise_sd_nm)
+
+
+def plain(grid: Grid, rows: np.ndarray) -> Fitted:
+    """The plain structure fitted, and with it the set-up that all candidates of a record share.
+
+    Knots and stiffness are chosen for the plain structure, then never again.
+    """
+    return to_fitted(estimate(grid, rows)[0])
+
+
+def to_fitted(solution: Solution, most: int = 20) -> Fitted:
+    """A projected solution as the joint problem's, its noise white and slow, and its parameters polished."""
+    setup = setup_of(solution)
+    problem = Problem(setup, [])
+    size, linear = solution.problem.basis.size, solution.linear
+    values = np.zeros(problem.size)
+    values[:3] = linear.time_constant_s, linear.damping, linear.delay_s
+    values[list(problem.initials)[:2]] = setup.sign * solution.coefficients[size + 1 :]
+    values[problem.coefficients] = setup.sign * solution.coefficients[:size]
+    noise = NoiseLevel(max(solution.ar1, 0.0), 0.5, float(np.sqrt(solution.variance)))
+    return solve(problem, problem.from_physical(values), noise, most=most)
+
+
+def setup_of(solution: Solution) -> Setup:
+    """What all candidates share: the record as the muscle counts it, and one recruitment curve's prior."""
+    problem, grid = solution.problem, solution.problem.grid
+    size = problem.basis.size
+    curve = problem.basis.design(np.linspace(0.0, problem.basis.largest_us, 101)) @ solution.coefficients[:size]
+    sign = 1.0 if curve[np.argmax(np.abs(curve))] >= 0 else -1.0
+    zero = float(solution.coefficients[size])
+    target = sign * (grid.torque_nm - zero)
     smooth = np.convolve(np.where(np.isfinite(target), target, 0.0), np.ones(3) / 3, "same")
-    scale = max(float(np.percentile(np.abs(smooth[rows] - np.median(smooth[rows][:8])), 99.5)), 1e-3)
-    sample_s = 1.0 / record.sample_rate_hz
-    open_s = min(1.02 * sample_s, 1.02 * grid.step_s)
-    largest = float(max(grid.pulse_width_us.max(), 1.0))
+    scale = float(np.percentile(np.abs(smooth[problem.rows]), 99.5))
     return Setup(
         grid=grid,
         target_nm=target,
-        fitted=rows,
-        basis=uniform_basis(largest),
-        stiffness=1e3,
-        scale_nm=scale,
-        noise_sd_nm=raw.noise_sd_nm,
-        delay_bounds_s=(-open_s, open_s),
-        reference_s=_reference(grid, rows),
+        fitted=problem.rows,
+        basis=problem.basis,
+        roughness=solution.weight / max(solution.variance, 1e-300) * problem.roughness,
+        scale_nm=max(scale, 1e-9),
+        noise_sd_nm=grid.noise_sd_nm,
+        delay_bounds_s=grid.delay_bounds_s if problem.delay_s is None else (problem.delay_s, problem.delay_s),
+        zero_nm=zero,
+        sign=sign,
+        reference_s=_reference(grid, problem.rows),
     )
 
 
@@ -225,23 +258,3 @@ def _reference(grid: Grid, rows: np.ndarray) -> float:
     partly = rows & (width > 0) & (width < 0.97 * width.max())
     at = np.flatnonzero(partly if partly.any() else rows & (width > 0))
     return float(np.mean(at) * grid.step_s) if at.size else 0.0
-
-
-def prepare(record: Record, raw: Raw, fitted: np.ndarray | None = None) -> tuple[Setup, Fitted]:
-    """The set-up that all candidates of a record share, and the base model in it.
-
-    Knots and stiffness are chosen by the evidence of the base model alone, then never again.
-    """
-    setup = first_setup(record, raw, fitted=fitted)
-    base = base_fit(setup)
-    best = base
-    refined = refined_basis(setup.basis, base.theta[base.problem.coefficients])
-    for basis in (setup.basis, refined):
-        for stiffness in (1e1, 1e2, 1e3, 1e4, 1e5):
-            if basis is setup.basis and stiffness == setup.stiffness:
-                continue
-            trial = first_setup(record, raw, setup.grid, fitted).with_(basis=basis, stiffness=stiffness)
-            found = base_fit(trial, best.noise, (float(np.exp(base.theta[0])),))
-            if found.log_evidence > best.log_evidence:
-                best = found
-    return best.problem.setup, best

@@ -1,7 +1,7 @@
 """Variable projection: recruitment in linear coefficients, dynamics in three numbers, one joint estimate.
 
-For given (T, ζ, delay) the model is linear in the recruitment's coefficients, the baseline and, where the record
-doesn't begin at rest, the initial state. They are solved for exactly; only the three numbers are searched
+For given (T, ζ, delay) the model is linear in the recruitment's coefficients, the baseline and the state in which the
+record begins. They are solved for exactly; only the three numbers are searched
 (Golub & Pereyra 1973, with Kaufman's Jacobian: the Gauss-Newton step of the joint problem).
 """
 
@@ -12,13 +12,14 @@ from functools import cached_property
 
 import numpy as np
 
-from identify.dynamics.linear import SecondOrder
-from identify.dynamics.pulse_grid import Grid
-from identify.dynamics.second_order import boundary_states
+from identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUNDS_S, SecondOrder
+from identify.dynamics.pulse_grid import Grid, runs
+from identify.dynamics.second_order import boundary_states, free_states
 from identify.errors import NotIdentifiable
-from identify.noise.ar1 import whiten
+from identify.noise.ar1 import noise_evidence, whiten
 from identify.recruitment.curve import Basis
 from identify.recruitment.knots import (
+    KNOTS,
     PILOT_KNOTS,
     adapted_knots,
     bending_order,
@@ -29,17 +30,22 @@ from identify.recruitment.knots import (
 from identify.recruitment.smoothing import choose_weight, straight_lines
 from identify.recruitment.spline import SplineBasis
 
-T_BOUNDS_S = (0.012, 4.0)
-ZETA_BOUNDS = (0.15, 4.0)
-LONGEST_DELAY_S = 0.2
 STARTS_S = (0.12, 0.4)
+ROUNDING = 2e-5
+"""Share of the torque's range below which a residual is not noise."""
+EXTRAS = 3
+"""Linear columns that aren't recruitment: baseline, initial torque, its rate."""
+INITIAL_RIDGE = 1e-5
+"""Of the initial torque: a state as large as the record's torque costs what noise of 0.3 % of it does."""
+RATE_S = 0.1
+"""Initial rate times this counts as a torque."""
 CURVE_POINTS = 201
 REWEIGHTED = 2
 """Steps of a search after which the penalty's weight stays: a moving target has no minimum."""
 
 
 @dataclass
-class Problem:
+class Projection:
     """One record, one basis: what doesn't change while the dynamics are searched.
 
     Parameters
@@ -52,8 +58,6 @@ class Problem:
         Penalty on the coefficients.
     rows : ndarray of bool, shape (K,)
         Rows that are fitted.
-    from_rest : bool
-        Whether the muscle is at rest before the first pulse; else two columns carry the initial state.
     delay_s : float or None
         A fixed delay; None to estimate it.
     """
@@ -62,13 +66,10 @@ class Problem:
     basis: Basis
     roughness: np.ndarray
     rows: np.ndarray
-    from_rest: bool = True
     delay_s: float | None = None
     stretches: list[slice] = field(init=False)
 
     def __post_init__(self) -> None:
-        from identify.dynamics.pulse_grid import runs
-
         self.stretches = runs(self.rows)
         if not self.stretches:
             raise NotIdentifiable("no row may be fitted", mend="Give rows outside `validate`.")
@@ -89,23 +90,19 @@ class Problem:
         """Torque, with zeros where there is none (such rows are never fitted)."""
         return np.nan_to_num(self.grid.torque_nm)
 
-    @property
-    def extras(self) -> int:
-        """Linear columns that aren't recruitment: baseline, and the initial state."""
-        return 1 if self.from_rest else 3
+    @cached_property
+    def ridge(self) -> np.ndarray:
+        """Penalty on baseline and initial state: a state that no row sees stays at rest."""
+        return INITIAL_RIDGE * np.array([0.0, 1.0, RATE_S**2])
 
     def columns(self, linear: SecondOrder) -> np.ndarray:
-        """Block means of the response to each linear coefficient, shape (K, P + extras)."""
+        """Block means of the response to each linear coefficient, shape (K, P + 3)."""
         response = linear.on_grid(self.grid, self.drive)
         return np.concatenate([response, *self._extra_columns(linear)], axis=1)
 
     def _extra_columns(self, linear: SecondOrder) -> list[np.ndarray]:
-        baseline = np.ones((self.grid.size, 1))
-        if self.from_rest:
-            return [baseline]
-        from identify.simulation.predict import initial_response
-
-        return [baseline, initial_response(linear, self.grid, at_samples=False)]
+        states = free_states(linear.time_constant_s, linear.damping, self.grid.step_s, self.grid.size)
+        return [np.ones((self.grid.size, 1)), self.grid.block_mean(*states, linear.delay_s)]
 
     @property
     def searched(self) -> int:
@@ -125,11 +122,9 @@ class Problem:
             near.append(SecondOrder(t, z, d + step))
             values.append(grid.block_mean(torque, rate, d + step))
         change = np.stack(values, axis=1) - grid.block_mean(torque, rate, d)[:, None]
-        if not self.from_rest:
-            here = self._extra_columns(linear)[1]
-            tails = [(self._extra_columns(at)[1] - here) @ coefficients[size + 1 :] for at in near]
-            change += np.stack(tails, axis=1)
-        return change / step
+        here = self._extra_columns(linear)[1]
+        tails = [(self._extra_columns(at)[1] - here) @ coefficients[size + 1 :] for at in near]
+        return (change + np.stack(tails, axis=1)) / step
 
 
 @dataclass(frozen=True)
@@ -138,17 +133,17 @@ class Solution:
 
     Parameters
     ----------
-    problem : Problem
+    problem : Projection
         What was solved.
     linear : SecondOrder
         Dynamics.
-    coefficients : ndarray, shape (P + extras,)
+    coefficients : ndarray, shape (P + 3,)
         Recruitment, baseline, initial state.
     weight : float
         Of the roughness.
     ar1 : float
         Correlation of the noise that rows were whitened with.
-    columns, slopes : ndarray, shape (K, P + extras), (K, 2 or 3)
+    columns, slopes : ndarray, shape (K, P + 3), (K, 2 or 3)
         The model's derivatives there.
     gram : ndarray
         A'A of the whitened [columns, slopes], penalty added: the information, times the noise variance.
@@ -162,7 +157,7 @@ class Solution:
         Whether the last step was far below its standard error.
     """
 
-    problem: Problem
+    problem: Projection
     linear: SecondOrder
     coefficients: np.ndarray
     weight: float
@@ -187,7 +182,7 @@ class Solution:
 
 
 def search(
-    problem: Problem,
+    problem: Projection,
     start: SecondOrder,
     *,
     ar1: float = 0.0,
@@ -199,7 +194,7 @@ def search(
 
     Parameters
     ----------
-    problem : Problem
+    problem : Projection
         Record and basis.
     start : SecondOrder
         Where to begin.
@@ -242,7 +237,7 @@ def _descend(state: _State, weight: float | None, most: int, tolerance: float) -
     return state.solution(taken, converged)
 
 
-def project(problem: Problem, linear: SecondOrder, *, ar1: float = 0.0, weight: float | None = None) -> Solution:
+def project(problem: Projection, linear: SecondOrder, *, ar1: float = 0.0, weight: float | None = None) -> Solution:
     """Coefficients for given dynamics: the linear half of the problem alone."""
     return _assess(problem, linear, whiten(problem.target, problem.stretches, ar1), ar1, weight).solution(0, True)
 
@@ -251,21 +246,21 @@ class _State:
     """The joint linear problem at one point of the search."""
 
     def __init__(
-        self, problem: Problem, linear: SecondOrder, target: np.ndarray, ar1: float, weight: float | None
+        self, problem: Projection, linear: SecondOrder, target: np.ndarray, ar1: float, weight: float | None
     ) -> None:
         self.problem, self.linear, self.target, self.ar1 = problem, linear, target, ar1
         self.columns = problem.columns(linear)
         white = whiten(self.columns, problem.stretches, ar1)
         self.zz, self.zy = white.T @ white, white.T @ target
         self.energy = float(target @ target)
-        size, extras = problem.basis.size, problem.extras
-        self.size, self.extras = size, extras
+        size = problem.basis.size
         if weight is None:
             weight = self._chosen(size)
         self.weight = weight
         self.penalty = np.zeros_like(self.zz)
-        self.penalty[:size, :size] = problem.roughness
-        self.coefficients = _solve(self.zz + weight * self.penalty, self.zy)
+        self.penalty[:size, :size] = weight * problem.roughness
+        self.penalty[np.arange(size, size + EXTRAS), np.arange(size, size + EXTRAS)] = problem.ridge
+        self.coefficients = _solve(self.zz + self.penalty, self.zy)
         self.cost = self.energy - float(self.zy @ self.coefficients)
         self.white = white
 
@@ -281,13 +276,13 @@ class _State:
 
     @cached_property
     def _inner(self) -> np.ndarray:
-        return _solve(self.zz + self.weight * self.penalty, self._bent[0])
+        return _solve(self.zz + self.penalty, self._bent[0])
 
     @cached_property
     def full(self) -> np.ndarray:
         """The joint information of coefficients and searched numbers, times the noise variance."""
         cross, square, _ = self._bent
-        return np.block([[self.zz + self.weight * self.penalty, cross], [cross.T, square]])
+        return np.block([[self.zz + self.penalty, cross], [cross.T, square]])
 
     @cached_property
     def information(self) -> np.ndarray:
@@ -298,7 +293,7 @@ class _State:
     @cached_property
     def freedom(self) -> float:
         """Effective number of parameters."""
-        return float(np.trace(_solve(self.zz + self.weight * self.penalty, self.zz))) + self.slopes.shape[1]
+        return float(np.trace(_solve(self.zz + self.penalty, self.zz))) + self.slopes.shape[1]
 
     @cached_property
     def squares(self) -> float:
@@ -315,19 +310,22 @@ class _State:
     def _chosen(self, size: int) -> float:
         outer = self.zz[size:, size:]
         right = np.concatenate([self.zz[size:, :size], self.zy[size:, None]], axis=1)
-        inner = right / outer if self.extras == 1 else _solve(outer, right)
+        inner = _solve(outer + np.diag(self.problem.ridge), right)
         gram = self.zz[:size, :size] - self.zz[:size, size:] @ inner[:, :-1]
         moment = self.zy[:size] - self.zz[:size, size:] @ inner[:, -1]
         energy = self.energy - float(self.zy[size:] @ inner[:, -1])
         if not np.any(self.problem.roughness):
             return 0.0
-        known = {"free": self.extras, "null": self.problem.null}
+        known = {"free": EXTRAS, "null": self.problem.null}
         size_fitted = self.target.size
         return choose_weight((gram + gram.T) / 2, moment, energy, size_fitted, self.problem.roughness, **known).weight
 
     def cost_at(self, weight: float) -> float:
         """The penalised cost here under another weight."""
-        return self.energy - float(self.zy @ _solve(self.zz + weight * self.penalty, self.zy))
+        size = self.problem.basis.size
+        other = self.penalty.copy()
+        other[:size, :size] = weight * self.problem.roughness
+        return self.energy - float(self.zy @ _solve(self.zz + other, self.zy))
 
     def step(self, damping: float) -> np.ndarray:
         """Step in (log T, log ζ, delay), along the bounds where it would leave them."""
@@ -357,7 +355,7 @@ class _State:
         )
 
 
-def _assess(problem: Problem, linear: SecondOrder, target: np.ndarray, ar1: float, weight: float | None) -> _State:
+def _assess(problem: Projection, linear: SecondOrder, target: np.ndarray, ar1: float, weight: float | None) -> _State:
     return _State(problem, linear, target, ar1, weight)
 
 
@@ -386,31 +384,24 @@ def _difference(before: SecondOrder, after: SecondOrder) -> np.ndarray:
     )
 
 
-def _held(problem: Problem, linear: SecondOrder, gradient: np.ndarray) -> np.ndarray:
+def _held(problem: Projection, linear: SecondOrder, gradient: np.ndarray) -> np.ndarray:
     """Which of the searched numbers stand at a bound and are pulled beyond it."""
     values = np.array([linear.time_constant_s, linear.damping, linear.delay_s])[: gradient.size]
-    lower = np.array([T_BOUNDS_S[0], ZETA_BOUNDS[0], _earliest(problem)])[: gradient.size]
-    upper = np.array([T_BOUNDS_S[1], ZETA_BOUNDS[1], LONGEST_DELAY_S])[: gradient.size]
+    bounds = np.array([TIME_CONSTANT_BOUNDS_S, DAMPING_BOUNDS, problem.grid.delay_bounds_s])[: gradient.size]
+    lower, upper = bounds[:, 0], bounds[:, 1]
     return ((values <= lower) & (gradient < 0)) | ((values >= upper) & (gradient > 0))
 
 
-def _earliest(problem: Problem) -> float:
-    # A record's first sample after a pulse is off by up to one sample, so the delay may be negative by as much.
-    return -min(1.0 / problem.grid.record.sample_rate_hz, problem.grid.step_s)
-
-
-def _bounded(problem: Problem, linear: SecondOrder) -> SecondOrder:
-    delay = (
-        float(np.clip(linear.delay_s, _earliest(problem), LONGEST_DELAY_S))
-        if problem.delay_s is None
-        else problem.delay_s
-    )
+def _bounded(problem: Projection, linear: SecondOrder) -> SecondOrder:
+    delay = float(np.clip(linear.delay_s, *problem.grid.delay_bounds_s)) if problem.delay_s is None else problem.delay_s
     return SecondOrder(
-        float(np.clip(linear.time_constant_s, *T_BOUNDS_S)), float(np.clip(linear.damping, *ZETA_BOUNDS)), delay
+        float(np.clip(linear.time_constant_s, *TIME_CONSTANT_BOUNDS_S)),
+        float(np.clip(linear.damping, *DAMPING_BOUNDS)),
+        delay,
     )
 
 
-def pilot_solution(grid: Grid, rows: np.ndarray, from_rest: bool, delay_s: float | None = None) -> Solution:
+def pilot_solution(grid: Grid, rows: np.ndarray, delay_s: float | None = None) -> Solution:
     """A first fit with few knots, from several time constants, the best start taken.
 
     Raises
@@ -429,15 +420,15 @@ def pilot_solution(grid: Grid, rows: np.ndarray, from_rest: bool, delay_s: float
         raise NotIdentifiable("the torque never changes", mend="Check the load cell and the electrodes.")
     basis = SplineBasis(even_knots(largest, PILOT_KNOTS))
     order = bending_order(grid.pulse_width_us[rows])
-    problem = Problem(grid, basis, spline_roughness(basis, order=order), rows, from_rest, delay_s)
+    problem = Projection(grid, basis, spline_roughness(basis, order=order), rows, delay_s)
     target = whiten(problem.target, problem.stretches, 0.0)
-    delay = 0.02 if delay_s is None else delay_s
+    delay = 0.0 if delay_s is None else delay_s
     starts = [_assess(problem, _bounded(problem, SecondOrder(t, 0.9, delay)), target, 0.0, None) for t in STARTS_S]
     best = min(starts, key=lambda state: state.cost)
     return _descend(best, None, most=12, tolerance=0.5)
 
 
-def designed(first: Solution, count: int | None = None) -> tuple[Problem, SecondOrder]:
+def designed(first: Solution, count: int | None = None) -> tuple[Projection, SecondOrder]:
     """The problem with its final spline, in two steps from a pilot, and where to begin its search.
 
     The pilot's few knots say roughly where the curve bends; a curve with all knots says it better, and how much; a
@@ -448,7 +439,7 @@ def designed(first: Solution, count: int | None = None) -> tuple[Problem, Second
     count = knots_for(curve) if count is None else count
     basis = SplineBasis(adapted_knots(curve, float(np.max(old.grid.pulse_width_us)), count))
     order = bending_order(old.grid.pulse_width_us[old.rows])
-    problem = Problem(old.grid, basis, spline_roughness(basis, order=order), old.rows, old.from_rest, old.delay_s)
+    problem = Projection(old.grid, basis, spline_roughness(basis, order=order), old.rows, old.delay_s)
     target = whiten(problem.target, problem.stretches, 0.0)
     for _ in range(2):
         coefficients = _assess(problem, first.linear, target, 0.0, None).coefficients[: basis.size]
@@ -456,13 +447,15 @@ def designed(first: Solution, count: int | None = None) -> tuple[Problem, Second
     return problem, first.linear
 
 
-def _redesigned(old: Problem, basis: SplineBasis, coefficients: np.ndarray, count: int) -> tuple[Problem, SplineBasis]:
+def _redesigned(
+    old: Projection, basis: SplineBasis, coefficients: np.ndarray, count: int
+) -> tuple[Projection, SplineBasis]:
     """The problem with knots and penalty from a first curve."""
     u = np.linspace(0.0, basis.largest_us, CURVE_POINTS)
     new = SplineBasis(adapted_knots((u, basis.design(u) @ coefficients), basis.largest_us, count))
     order = bending_order(old.grid.pulse_width_us[old.rows])
     roughness = spline_roughness(new, (basis, coefficients), order)
-    return Problem(old.grid, new, roughness, old.rows, old.from_rest, old.delay_s), new
+    return Projection(old.grid, new, roughness, old.rows, old.delay_s), new
 
 
 def pilot_curve(solution: Solution) -> tuple[np.ndarray, np.ndarray]:
@@ -472,20 +465,27 @@ def pilot_curve(solution: Solution) -> tuple[np.ndarray, np.ndarray]:
     return u, basis.design(u) @ solution.coefficients[: basis.size]
 
 
-def begins_at_rest(grid: Grid) -> bool:
-    """Whether the muscle may be taken to be at rest before the first pulse slot.
-
-    True where the record opens with torque near its lowest (held-out rows aren't looked at): within a quarter of the
-    range if the opening is without stimulation, within a tenth if pulses come at once.
-    """
-    seen = grid.torque_nm[grid.fitted]
-    opening = grid.fitted[:4]
-    if not seen.size or not opening.any():
-        return True
-    first = float(np.mean(grid.torque_nm[:4][opening]))
-    still = not np.any(grid.pulse_width_us[:4] > 0)
-    # Stimulation may pull either way: rest is the side on which torque lies when no pulse comes.
-    rest = grid.fitted & (grid.pulse_width_us == 0)
-    level = float(np.median(grid.torque_nm[rest])) if rest.any() else float(np.median(seen))
-    lowest = float(np.min(seen)) if level < (np.min(seen) + np.max(seen)) / 2 else float(np.max(seen))
-    return bool(abs(first - lowest) <= (0.25 if still else 0.1) * float(np.ptp(seen)))
+def estimate(
+    grid: Grid, rows: np.ndarray, knots: int | None = None, delay_s: float | None = None
+) -> tuple[Solution, float]:
+    """The solution, and the evidence for AR(1) over white noise (ΔBIC)."""
+    first = pilot_solution(grid, rows, delay_s)
+    problem, start = designed(first, knots)
+    solution = search(problem, start)
+    ar1, delta_bic = noise_evidence(solution.residual_nm, problem.stretches)
+    if delta_bic > 0 and knots is None and problem.basis.size < KNOTS:
+        # Structure may be a bend that few knots can't follow: look again with all before calling it noise.
+        problem, start = designed(first, KNOTS)
+        solution = search(problem, start)
+        ar1, delta_bic = noise_evidence(solution.residual_nm, problem.stretches)
+    # What is left of a record without noise is rounding and the spline's own error: not worth a noise model.
+    still = solution.variance < (ROUNDING * float(np.ptp(problem.target[rows]))) ** 2
+    for _ in range(0 if still else 3):
+        if delta_bic <= 0:
+            break
+        solution = search(problem, solution.linear, ar1=ar1)
+        before = ar1
+        ar1, delta_bic = noise_evidence(solution.residual_nm, problem.stretches)
+        if abs(ar1 - before) < 0.01:
+            break
+    return solution, delta_bic

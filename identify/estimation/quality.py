@@ -8,12 +8,11 @@ import numpy as np
 
 from identify.dynamics.linear import Discrete
 from identify.dynamics.pulse_grid import Grid
-from identify.errors import BadModel
 from identify.model import Model
 from identify.records.record import Record
+from identify.simulation.predict import refuse_rate
 
 UNDER_CEILING_POINTS = 1.0
-LARGEST_RATE_CHANGE = 0.25
 LARGEST_DIP = 0.05
 LEAST_FIT_PERCENT = 30.0
 NEGLIGIBLE = 5e-4
@@ -59,21 +58,6 @@ def check(model: Model, record: Record) -> list[str]:
             "the recruitment curve is held level there"
         )
     return warnings
-
-
-def refuse_rate(model: Model, record: Record) -> None:
-    """Refuse a record of a pulse rate for which the model says nothing.
-
-    Raises
-    ------
-    BadModel
-    """
-    if not abs(record.pulse_rate_hz / model.pulse_rate_hz - 1.0) <= LARGEST_RATE_CHANGE:
-        raise BadModel(
-            f"the model holds for {model.pulse_rate_hz:g} pulses a second, the record has {record.pulse_rate_hz:g}",
-            place="pulse_rate_hz",
-            mend="Fit a model at that rate.",
-        )
 
 
 def quality(model: Model, grid: Grid, rows: np.ndarray, converged: bool = True) -> dict[str, Any]:

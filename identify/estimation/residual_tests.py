@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from identify.estimation.projected import Solution
-from identify.noise.ar1 import whiten
+from identify.estimation.joint import Fitted
+from identify.noise.level import whitened
 
 LAGS = 20
 ALARM = 0.01
@@ -27,8 +27,8 @@ def chi_square_p(statistic: float, freedom: float) -> float:
     return 0.5 * erfc(z / sqrt(2))
 
 
-def residual_tests(solution: Solution) -> dict[str, Any]:
-    """Whiteness, and structure that a Hammerstein model can't give.
+def residual_tests(fitted: Fitted) -> dict[str, Any]:
+    """Whiteness, and structure that the model's own structure can't give.
 
     Returns
     -------
@@ -37,57 +37,48 @@ def residual_tests(solution: Solution) -> dict[str, Any]:
         signals of missing physics (drift, gain drift, output squared, rate, direction, onset), what the model itself
         explains taken out first. Each with statistic, freedom, p_value, passed.
     """
-    problem = solution.problem
-    white = whiten(solution.residual_nm, problem.stretches, solution.ar1)
-    lengths = [s.stop - s.start for s in problem.stretches]
-    edges = np.r_[0, np.cumsum(lengths)]
-    power = float(white @ white)
-    if not power > 1e-24 * white.size:
+    setup = fitted.problem.setup
+    start, stop = setup.stretches
+    white = whitened(fitted.residual_nm[None, :], setup.stretches, fitted.noise)[0]
+    if not fitted.rms_nm > 1e-12 * setup.scale_nm:
         return {}
-    lags = min(LAGS, max(min(lengths) - 2, 1), white.size // 4)
+    edges = np.r_[0, np.cumsum(stop - start)]
+    power = float(white @ white)
+    lags = min(LAGS, max(int(np.min(stop - start)) - 2, 1), white.size // 4)
     statistic = 0.0
     for lag in range(1, lags + 1):
         pairs = [white[a + lag : b] @ white[a : b - lag] for a, b in pairwise(edges) if b - a > lag]
         statistic += (float(sum(pairs)) / power) ** 2 / (white.size - lag)
     statistic *= white.size * (white.size + 2)
-    # An AR(1) parameter that was estimated takes one freedom; the three numbers of the dynamics hardly any.
-    freedom = lags - (1 if solution.ar1 else 0)
+    # What was estimated of the noise takes a freedom each; the three numbers of the dynamics hardly any.
+    freedom = lags - (0 if fitted.noise.is_white else 2)
     return {
         "whiteness": _verdict(statistic, max(freedom, 1)) | {"lags": lags},
-        "structure": _structure(solution, white),
+        "structure": _structure(fitted, white),
     }
 
 
-def _structure(solution: Solution, white: np.ndarray) -> dict[str, Any]:
-    problem, grid = solution.problem, solution.problem.grid
-    fitted = (
-        solution.fitted_nm - np.median(solution.fitted_nm[grid.pulse_width_us == 0])
-        if np.any(grid.pulse_width_us == 0)
-        else solution.fitted_nm
-    )
-    time = np.linspace(-1.0, 1.0, grid.size)
-    rate = np.gradient(fitted)
-    drive = problem.drive @ solution.coefficients[: problem.basis.size]
-    signals = np.stack(
-        [time, time * fitted, fitted**2, np.abs(rate), np.abs(drive - fitted) * fitted, time * drive], axis=1
-    )
-    scale = np.linalg.norm(signals, axis=0)
-    signals = signals[:, scale > 0] / scale[scale > 0]
-    extra = whiten(signals, problem.stretches, solution.ar1)
-    own = whiten(np.concatenate([solution.columns, solution.slopes], axis=1), problem.stretches, solution.ar1)
+def _structure(fitted: Fitted, white: np.ndarray) -> dict[str, Any]:
+    problem, setup = fitted.problem, fitted.problem.setup
+    mean = np.nan_to_num(setup.target_nm - fitted.residual_nm)
+    drive = fitted.physical[problem.coefficients] @ setup.design
+    time = np.linspace(-1.0, 1.0, setup.grid.size)
+    rate = np.gradient(mean)
+    signals = np.stack([time, time * mean, mean**2, np.abs(rate), np.abs(drive - mean) * mean, time * drive])
+    scale = np.linalg.norm(signals, axis=1)
+    signals = signals[scale > 0] / scale[scale > 0][:, None]
+    extra = whitened(signals, setup.stretches, fitted.noise)
+    own = whitened(fitted.slopes, setup.stretches, fitted.noise)
     # The penalised fit takes out less than a projection: the same smoother is applied to the signals.
-    size = np.sqrt(np.maximum(np.diag(solution.gram), 1e-300))
-    scaled = solution.gram / size[:, None] / size[None, :] + 1e-10 * np.eye(size.size)
-    smoothed = own @ (np.linalg.solve(scaled, (own.T @ extra) / size[:, None]) / size[:, None])
+    size = np.sqrt(np.maximum(np.diag(fitted.hessian), 1e-300))
+    scaled = fitted.hessian / size[:, None] / size[None, :] + 1e-10 * np.eye(size.size)
+    smoothed = (np.linalg.solve(scaled, (own @ extra.T) / size[:, None]) / size[:, None]).T @ own
     left = extra - smoothed
-    variance = solution.variance
-    # Under the null the score left'r has variance about variance * left'left (the smoother is nearly a projection).
-    gram = left.T @ left
-    score = left.T @ white
-    values, vectors = np.linalg.eigh(gram)
+    # Under the null the score left·r has about the variance left·left (the smoother is nearly a projection).
+    values, vectors = np.linalg.eigh(left @ left.T)
     kept = values > 1e-6 * max(float(values.max()), 1e-300)
-    part = (vectors.T @ score)[kept] / np.sqrt(values[kept])
-    return _verdict(float(part @ part) / variance, max(int(kept.sum()), 1))
+    part = (vectors.T @ (left @ white))[kept] / np.sqrt(values[kept])
+    return _verdict(float(part @ part), max(int(kept.sum()), 1))
 
 
 def _verdict(statistic: float, freedom: int) -> dict[str, Any]:

@@ -2,66 +2,20 @@
 
 from __future__ import annotations
 
-import numpy as np
+from typing import Any
 
-from identify.estimation.joint import Fitted, solve
-from identify.estimation.to_model import predict_fitted
-from identify.records.record import Record
-from identify.simulation.problem import Problem
-
-FOLDS = 4
+from identify.estimation.cross_validation import held_out_change
+from identify.estimation.figures import figures, white_sd
+from identify.estimation.joint import Fitted
+from identify.estimation.tremor import predict_fitted
 
 
-def fit_percent(torque_nm: np.ndarray, predicted_nm: np.ndarray) -> float:
-    """100 (1 - ||y - ŷ|| / ||y - mean y||), as in the paper."""
-    spread = float(np.linalg.norm(torque_nm - torque_nm.mean()))
-    return float(100.0 * (1.0 - np.linalg.norm(torque_nm - predicted_nm) / max(spread, 1e-12)))
-
-
-def figures(fitted: Fitted, record: Record, predicted_nm: np.ndarray | None = None) -> dict[str, float | str | None]:
-    """Fit and error on fitted and on held-out rows, and the ceiling that noise sets."""
-    predicted = predict_fitted(fitted, record) if predicted_nm is None else predicted_nm
-    used = fitted.problem.setup.fitted[fitted.problem.setup.grid.interval] & ~record.held_out
-    torque, noise = record.torque_nm, fitted.problem.setup.noise_sd_nm
-    held, guess = record.held_out, predicted
-    source = "validate"
-    if not held.any():
-        guess, held = cross_validated(fitted, record), used
-        source = "blocked cross-validation"
-    spread = float(np.std(torque[used]))
-    return {
-        "fit_percent": fit_percent(torque[used], predicted[used]),
-        "held_out_fit_percent": fit_percent(torque[held], guess[held]),
-        "rms_nm": rms(torque[used] - predicted[used]),
-        "held_out_rms_nm": rms(torque[held] - guess[held]),
-        "ceiling_percent": 100.0 * (1.0 - noise / max(spread, 1e-12)),
-        "held_out_ceiling_percent": 100.0 * (1.0 - noise / max(float(np.std(torque[held])), 1e-12)),
-        "noise_sd_nm": noise,
-        "held_out": source,
-    }
-
-
-def cross_validated(fitted: Fitted, record: Record) -> np.ndarray:
-    """Prediction of each sample by a model fitted without its block; blocks are contiguous quarters of every part."""
+def statistics(fitted: Fitted) -> dict[str, Any]:
+    """What MODEL.json tells under `fit`: errors, best-fit %, and the ceilings that noise sets."""
     setup = fitted.problem.setup
-    result = np.zeros(record.time_s.size)
-    fold = _folds(setup.fitted)
-    for number in range(FOLDS):
-        kept = setup.with_(fitted=setup.fitted & (fold != number))
-        problem = Problem(kept, fitted.effects)
-        found = solve(problem, fitted.theta, fitted.noise, most=6, tolerance=0.3)
-        rows = fold[setup.grid.interval] == number
-        result[rows] = problem.at_samples(found.theta)[rows]
-    return result
-
-
-def _folds(fitted: np.ndarray) -> np.ndarray:
-    """Folds of a second or so in turn, so that each fold holds a piece of every part."""
-    piece = max(int(fitted.sum() / (FOLDS * 6)), 40)
-    count = np.cumsum(fitted) - 1
-    return (count // piece) % FOLDS
-
-
-def rms(values: np.ndarray) -> float:
-    """Root mean square."""
-    return float(np.sqrt(np.mean(values**2))) if values.size else 0.0
+    grid = setup.grid
+    predicted = predict_fitted(fitted)
+    noise = white_sd(grid, predicted, fitted.noise.sd_nm, fitted.freedom, fitted.noise.is_white)
+    change = None if grid.record.has_held_out else held_out_change(fitted)
+    found = figures(grid, setup.fitted, predicted, noise, change)
+    return found | {"log_evidence": fitted.log_evidence, "log_likelihood": fitted.log_likelihood}

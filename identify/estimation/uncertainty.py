@@ -15,6 +15,7 @@ from identify.dynamics.pulse_grid import Grid, make_grid
 from identify.model import Covariance, Model
 from identify.records.record import Record
 from identify.recruitment.curve import Basis
+from identify.simulation.predict import slopes
 
 POINTWISE = 1.959964
 DRAWS = 256
@@ -39,9 +40,9 @@ def bands(model: Model, points: int = 41) -> dict[str, Any]:
 
 def recruitment_slopes(basis: Basis, covariance: Covariance, width_us: np.ndarray) -> np.ndarray:
     """Derivatives of f(u) by all parameters, shape (len(width_us), P)."""
-    slopes = np.zeros((width_us.size, len(covariance.names)))
-    slopes[:, _coefficients(basis, covariance)] = basis.design(width_us)
-    return slopes
+    found = np.zeros((width_us.size, len(covariance.names)))
+    found[:, _coefficients(basis, covariance)] = basis.design(width_us)
+    return found
 
 
 def _coefficients(basis: Basis, covariance: Covariance) -> slice:
@@ -75,21 +76,7 @@ def prediction_band(model: Model, record: Record) -> tuple[np.ndarray, np.ndarra
     if covariance is None or not isinstance(linear, SecondOrder):
         raise ValueError("this model carries no covariance")
     grid = make_grid(record)
-    if model.effects:
-        from identify.estimation.to_model import grid_slopes  # the engine stands on this module's curves
-
-        return _around(model, record, grid, _sd(grid_slopes(model, record), covariance))
-    drive = model.recruitment.basis.design(grid.pulse_width_us)
-    slopes = np.zeros((grid.size, len(covariance.names)))
-    slopes[:, _coefficients(model.recruitment.basis, covariance)] = linear.on_grid(grid, drive)
-    if "baseline_nm" in covariance.names:
-        slopes[:, covariance.names.index("baseline_nm")] = 1.0
-    held = drive @ model.recruitment.coefficients_nm
-    for name in DYNAMICS:
-        if name in covariance.names:
-            up, down, width = _neighbours(linear, name)
-            slopes[:, covariance.names.index(name)] = (up.on_grid(grid, held) - down.on_grid(grid, held)) / width
-    return _around(model, record, grid, _sd(slopes, covariance))
+    return _around(model, record, grid, _sd(slopes(model, grid, len(covariance.names)), covariance))
 
 
 def _around(model: Model, record: Record, grid: Grid, sd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -11,8 +11,8 @@ import numpy as np
 from identify.dynamics.pulse_grid import make_grid
 from identify.effects import get
 from identify.errors import BadRequest
+from identify.estimation.adding import with_effects
 from identify.estimation.joint import Fitted
-from identify.estimation.with_effects import fit_candidate
 from identify.experiments.designs import Design, designs
 from identify.noise.level import whitened
 from identify.records.record import Record
@@ -50,9 +50,9 @@ def next_experiment(record: Record, rivals: Sequence[str]) -> dict[str, Any]:
         raise BadRequest("no rival was named", place="rivals", mend="Name two effects.")
     for name in names:
         get(name)
-    fits = {name: fit_candidate(record, [name]) for name in names}
+    fits = {name: with_effects(record, [name]) for name in names}
     if len(names) == 1:
-        fits["nothing"] = fit_candidate(record, [])
+        fits["nothing"] = with_effects(record, [])
     return plan(record, fits)
 
 
@@ -143,13 +143,11 @@ def _simulate(fitted: Fitted, record: Record, derivatives: bool) -> tuple[np.nda
     setup = fitted.problem.setup.with_(grid=grid, target_nm=np.zeros(grid.size), fitted=np.ones(grid.size, bool))
     kept = [(effect, form) for effect, form in fitted.effects if get(effect).foreseeable]
     problem = Problem(setup, kept)
-    theta = np.zeros(problem.size)
-    take = [np.arange(problem.coefficients.stop)]
-    take += [
-        np.arange(c.first, c.first + len(c.parameters)) for c in fitted.problem.chosen if get(c.effect).foreseeable
-    ]
-    place = np.concatenate(take)
-    theta[:] = fitted.theta[place]
+    # By name: a new test is one part, begins at rest, and lacks what can't be foreseen.
+    known = {name: place for place, name in enumerate(fitted.problem.names)}
+    place = np.array([known[name] for name in problem.names])
+    theta = fitted.theta[place]
+    theta[list(problem.initials)] = 0.0
     mean, slopes = problem.run(theta, derivatives=derivatives)
     if slopes is None:
         return mean, None

@@ -15,14 +15,15 @@ import numpy as np
 from identify.dynamics.pulse_grid import Grid
 from identify.errors import BadRequest
 from identify.estimation.finish import finish
-from identify.estimation.projected import Solution, begins_at_rest, designed, pilot_solution, search
-from identify.methods.support.common import fitted_rows, flag, order_option
+from identify.estimation.joint import Fitted
+from identify.estimation.prepare import to_fitted
+from identify.estimation.projected import estimate
+from identify.estimation.rows import fitted_rows
+from identify.methods.support.alternatives import monotone, power_series, sigmoid
+from identify.methods.support.common import flag, order_option
+from identify.methods.two_stage import general
 from identify.model import Model
-from identify.noise.ar1 import noise_evidence
 from identify.recruitment.knots import KNOTS
-
-ROUNDING = 2e-5
-"""Share of the torque's range below which a residual is not noise."""
 
 
 class MaximumLikelihood:
@@ -45,76 +46,40 @@ class MaximumLikelihood:
         """Fit; see `identify.fit`."""
         rows = fitted_rows(grid, fit_on)
         order = order_option(options.get("order", "second-order"))
-        knots = int(options["knots"]) if "knots" in options else None
         if order != "second-order":
-            from identify.methods.two_stage import general
+            return general(self.id, grid, rows, rows, 8, int(options.get("knots", KNOTS)), order)
+        fitted, reasons = self.start(grid, rows, options)
+        return finish(self.id, fitted, [*reasons, *_why(fitted)])
 
-            return general(self.id, grid, rows, rows, 8, knots or KNOTS, order)
+    def start(self, grid: Grid, rows: np.ndarray, options: Mapping[str, Any]) -> tuple[Fitted, list[str]]:
+        """The structure without effects, fitted: what effects are added to; with the reasons for its shape."""
         delay_s = float(options["delay_s"]) if "delay_s" in options else None
+        solution, _ = estimate(grid, rows, int(options["knots"]) if "knots" in options else None, delay_s)
         kind = str(options.get("recruitment", "spline"))
-        solution, delta_bic = estimate(grid, rows, knots, delay_s)
-        reasons = []
-        if kind == "spline":
-            reasons.append(
+        if kind == "power-series":
+            solution, reason = power_series(solution, int(options["power"]) if "power" in options else None)
+        elif kind == "sigmoid":
+            solution, reason = sigmoid(solution), "sigmoid (30)"
+        elif kind == "spline":
+            reason = (
                 f"spline of {solution.problem.basis.size} coefficients, smoothed to {solution.freedom:.1f} effective"
             )
-            if flag(options.get("monotone", False), "monotone"):
-                from identify.methods.support.alternatives import monotone
-
-                solution = monotone(solution)
-                reasons.append("recruitment held monotone")
         else:
-            solution, reason = _other(kind, solution, options)
-            delta_bic = noise_evidence(solution.residual_nm, solution.problem.stretches)[1]
-            reasons.append(reason)
-        return finish(self.id, solution, delta_bic, [*reasons, *_why(solution, delta_bic)])
+            raise BadRequest(f"recruitment {kind!r}", place="recruitment", mend="Give spline, power-series or sigmoid.")
+        if flag(options.get("monotone", False), "monotone"):
+            return to_fitted(monotone(solution), most=0), [reason, "recruitment held monotone"]
+        return to_fitted(solution, most=20 if kind == "spline" else 0), [reason]
 
 
 METHOD = MaximumLikelihood()
 
 
-def _other(kind: str, solution: Solution, options: Mapping[str, Any]) -> tuple[Solution, str]:
-    from identify.methods.support.alternatives import power_series, sigmoid
-
-    if kind == "power-series":
-        return power_series(solution, int(options["power"]) if "power" in options else None)
-    if kind == "sigmoid":
-        return sigmoid(solution), "sigmoid (30)"
-    raise BadRequest(f"recruitment {kind!r}", place="recruitment", mend="Give spline, power-series or sigmoid.")
-
-
-def _why(solution: Solution, delta_bic: float) -> list[str]:
-    linear = solution.linear
-    noise = "AR(1)" if delta_bic > 0 else "white"
-    enough = "a white residual" if delta_bic <= 0 else "but the residual isn't white: try order=auto, or diagnose"
+def _why(fitted: Fitted) -> list[str]:
+    time_constant_s, damping, delay_s = fitted.physical[:3]
+    noise = fitted.noise
+    said = "white" if noise.is_white else f"slow and white, {100 * min(noise.share, 1.0):.0f} % of its variance slow"
+    enough = "a white residual" if noise.is_white else "but the residual isn't white: run diagnose"
     return [
-        f"second order: T {linear.time_constant_s:.4g} s, damping {linear.damping:.3g}, "
-        f"delay {1e3 * linear.delay_s:.1f} ms; {enough}",
-        f"noise taken as {noise}: BIC of AR(1) is {abs(delta_bic):.1f} {'better' if delta_bic > 0 else 'worse'}",
+        f"second order: T {time_constant_s:.4g} s, damping {damping:.3g}, delay {1e3 * delay_s:.1f} ms; {enough}",
+        f"noise taken as {said}",
     ]
-
-
-def estimate(
-    grid: Grid, rows: np.ndarray, knots: int | None = None, delay_s: float | None = None
-) -> tuple[Solution, float]:
-    """The solution, and the evidence for AR(1) over white noise (ΔBIC)."""
-    first = pilot_solution(grid, rows, begins_at_rest(grid), delay_s)
-    problem, start = designed(first, knots)
-    solution = search(problem, start)
-    ar1, delta_bic = noise_evidence(solution.residual_nm, problem.stretches)
-    if delta_bic > 0 and knots is None and problem.basis.size < KNOTS:
-        # Structure may be a bend that few knots can't follow: look again with all before calling it noise.
-        problem, start = designed(first, KNOTS)
-        solution = search(problem, start)
-        ar1, delta_bic = noise_evidence(solution.residual_nm, problem.stretches)
-    # What is left of a record without noise is rounding and the spline's own error: not worth a noise model.
-    still = solution.variance < (ROUNDING * float(np.ptp(problem.target[rows]))) ** 2
-    for _ in range(0 if still else 3):
-        if delta_bic <= 0:
-            break
-        solution = search(problem, solution.linear, ar1=ar1)
-        before = ar1
-        ar1, delta_bic = noise_evidence(solution.residual_nm, problem.stretches)
-        if abs(ar1 - before) < 0.01:
-            break
-    return solution, delta_bic

@@ -18,7 +18,8 @@ from identify.dynamics.linear import Discrete
 from identify.dynamics.narx import run
 from identify.dynamics.pulse_grid import Grid
 from identify.estimation.finish import finish_discrete
-from identify.methods.support.common import fitted_rows, quiet_level
+from identify.estimation.rows import fitted_rows
+from identify.methods.support.common import quiet_level
 from identify.model import Model
 from identify.recruitment.curve import Curve
 from identify.recruitment.spline import SplineBasis

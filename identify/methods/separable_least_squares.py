@@ -17,7 +17,7 @@ from identify.dynamics.linear import Discrete
 from identify.dynamics.pulse_grid import Grid
 from identify.errors import BadRequest, NotIdentifiable
 from identify.estimation.finish import finish_discrete
-from identify.methods.support.common import fitted_rows
+from identify.estimation.rows import fitted_rows
 from identify.methods.support.output_error import shifted
 from identify.model import Model
 from identify.recruitment.curve import Curve

@@ -23,10 +23,10 @@ from identify.dynamics.linear import Discrete, SecondOrder
 from identify.dynamics.pulse_grid import Grid
 from identify.errors import BadRequest
 from identify.estimation.finish import finish, finish_discrete
+from identify.estimation.prepare import to_fitted
 from identify.estimation.projected import (
-    Problem,
+    Projection,
     Solution,
-    begins_at_rest,
     pilot_curve,
     pilot_solution,
     project,
@@ -35,7 +35,6 @@ from identify.estimation.projected import (
 from identify.methods.support.common import active_level, flag, near_rest, order_option, quiet_level, segment_rows
 from identify.methods.support.output_error import OutputError, choose_order, equation_error, output_error, stable
 from identify.model import Model
-from identify.noise.ar1 import noise_evidence
 from identify.recruitment.curve import Curve
 from identify.recruitment.fixed import FixedShape
 from identify.recruitment.knots import KNOTS, PILOT_KNOTS, adapted_knots, even_knots, spline_roughness
@@ -78,8 +77,7 @@ class TwoStage:
         order = order_option(options.get("order", "second-order"))
         if order == "second-order" and not literal and not inverse:
             solution, reasons = physical(grid, prbs, ramp, iterations, knots)
-            delta_bic = noise_evidence(solution.residual_nm, solution.problem.stretches)[1]
-            return finish(self.id, solution, delta_bic, reasons)
+            return finish(self.id, to_fitted(solution, most=0), reasons)
         return general(self.id, grid, prbs, ramp, iterations, knots, order, literal, inverse)
 
 
@@ -101,35 +99,34 @@ def physical(
         See `TwoStage.options`.
     """
     largest = float(np.max(grid.pulse_width_us))
-    from_rest = begins_at_rest(grid)
     # Preliminary experiment: two levels, so f is a straight line through both (15).
-    straight = Problem(grid, PowerBasis(1, largest), np.zeros((1, 1)), near_rest(grid, prbs), from_rest)
+    straight = Projection(grid, PowerBasis(1, largest), np.zeros((1, 1)), near_rest(grid, prbs))
     starts = [project(straight, SecondOrder(t, 0.9, 0.02)) for t in STARTS_S]
     linear = search(straight, min(starts, key=lambda s: s.variance).linear).linear
     reasons = [f"PRBS alone: T {linear.time_constant_s:.4g} s, damping {linear.damping:.3g}"]
     both = near_rest(grid, prbs) | near_rest(grid, ramp)
-    solution = _recruitment(grid, near_rest(grid, ramp), linear, from_rest, knots)
+    solution = _recruitment(grid, near_rest(grid, ramp), linear, knots)
     for _ in range(iterations):
         basis = solution.problem.basis
         shape = FixedShape(Curve(basis, solution.coefficients[: basis.size]))
-        linear = search(Problem(grid, shape, np.zeros((1, 1)), both, from_rest), linear).linear
-        solution = _recruitment(grid, near_rest(grid, ramp), linear, from_rest, knots)
+        linear = search(Projection(grid, shape, np.zeros((1, 1)), both), linear).linear
+        solution = _recruitment(grid, near_rest(grid, ramp), linear, knots)
     reasons.append(f"after stage two: T {linear.time_constant_s:.4g} s, damping {linear.damping:.3g}")
     # The last curve belongs to the last dynamics; the baseline and the noise are of both segments.
-    final = Problem(grid, solution.problem.basis, solution.problem.roughness, both, from_rest)
+    final = Projection(grid, solution.problem.basis, solution.problem.roughness, both)
     return project(final, linear, weight=solution.weight), reasons
 
 
-def _recruitment(grid: Grid, rows: np.ndarray, linear: SecondOrder, from_rest: bool, knots: int) -> Solution:
+def _recruitment(grid: Grid, rows: np.ndarray, linear: SecondOrder, knots: int) -> Solution:
     """Stage one: the spline for given dynamics, through G forward."""
     largest = float(np.max(grid.pulse_width_us))
     coarse = SplineBasis(even_knots(largest, PILOT_KNOTS))
-    pilot = project(Problem(grid, coarse, spline_roughness(coarse), rows, from_rest), linear)
+    pilot = project(Projection(grid, coarse, spline_roughness(coarse), rows), linear)
     first = SplineBasis(adapted_knots(pilot_curve(pilot), largest, knots))
-    rough = project(Problem(grid, first, spline_roughness(first), rows, from_rest), linear)
+    rough = project(Projection(grid, first, spline_roughness(first), rows), linear)
     basis = SplineBasis(adapted_knots(pilot_curve(rough), largest, knots))
     roughness = spline_roughness(basis, (first, rough.coefficients[: first.size]))
-    return project(Problem(grid, basis, roughness, rows, from_rest), linear)
+    return project(Projection(grid, basis, roughness, rows), linear)
 
 
 def general(
@@ -184,7 +181,7 @@ def straight_drive(grid: Grid, prbs: np.ndarray) -> np.ndarray:
 
 def joint_drive(grid: Grid, rows: np.ndarray) -> np.ndarray:
     """Drive where all segments are used at once: the curve of a pilot fit of second order, unit range."""
-    u, curve = pilot_curve(pilot_solution(grid, rows, begins_at_rest(grid)))
+    u, curve = pilot_curve(pilot_solution(grid, rows))
     drive = np.interp(grid.pulse_width_us, u, curve)
     return drive / max(float(np.ptp(curve)), 1e-300)
 

@@ -41,6 +41,11 @@ class NoiseLevel:
     slowest: float = 0.02
     fastest: float = 2.6
 
+    @property
+    def is_white(self) -> bool:
+        """Whether next to nothing of it is correlated from one interval to the next."""
+        return self.band <= 0.0 and min(self.share, 1.0) * self.ar1 < 0.05
+
 
 def profile(residual: np.ndarray, stretches: Stretches, near: NoiseLevel) -> tuple[NoiseLevel, float]:
     """The likeliest noise of a residual, of the kind of `near`, and its log-likelihood."""

@@ -12,19 +12,13 @@ from functools import cached_property
 
 import numpy as np
 
+from identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUNDS_S
 from identify.dynamics.second_order import read_at
-from identify.dynamics.variable_speed import LAWS, mean_weights, read_means, run_core
+from identify.dynamics.variable_speed import LAWS, read_means, run_core
 from identify.effects.base import Form, Parameter
-from identify.recruitment.spline import SplineBasis
+from identify.recruitment.curve import Basis
 from identify.simulation.setup import Setup
 
-_BASE = (
-    Parameter("time_constant_s", "s", 0.012, 3.0, 0.3, (0.2,), "log"),
-    Parameter("damping", "1", 0.15, 6.0, 1.0, (0.9,), "log"),
-    Parameter("delay_s", "s", -0.03, 0.03, 0.0, (0.0,)),
-    Parameter("baseline_nm", "N·m", -4.0, 4.0, 0.0, (0.0,)),
-)
-FIRST_COEFFICIENT = len(_BASE)
 _NONE = np.zeros((0, 1))
 SHARED = True
 
@@ -44,9 +38,9 @@ class Chosen:
         return range(self.first, self.first + len(self.parameters))
 
 
-def extended(basis: SplineBasis, width_us: np.ndarray) -> np.ndarray:
+def extended(basis: Basis, width_us: np.ndarray) -> np.ndarray:
     """Basis functions at widths that a drift may have moved beyond the largest: there straight on; (K, n)."""
-    top = basis.knots_us[-1]
+    top = basis.largest_us
     design = basis.design(width_us)
     over = np.clip(width_us - top, 0.0, 0.35 * top)
     if np.any(over > 0.0):
@@ -70,12 +64,22 @@ class Problem:
 
     def __init__(self, setup: Setup, effects: list[tuple[str, Form]]) -> None:
         self.setup = setup
-        coefficients = setup.basis.size
-        table = list(_BASE)
-        low, high = setup.delay_bounds_s
-        table[2] = Parameter("delay_s", "s", low, high, 0.0, (0.0,))
-        span = 6.0 * setup.scale_nm
-        table += [Parameter(f"recruitment_{i}_nm", "N·m", -span, span) for i in range(coefficients)]
+        parts, span = setup.begins.size, 6.0 * setup.scale_nm
+        table = [
+            Parameter("time_constant_s", "s", *TIME_CONSTANT_BOUNDS_S, 0.3, (0.2,), "log"),
+            Parameter("damping", "1", *DAMPING_BOUNDS, 1.0, (0.9,), "log"),
+            Parameter("delay_s", "s", *setup.delay_bounds_s),
+        ]
+        numbers = ["", *(f"_{part}" for part in range(2, parts + 1))]
+        table += [Parameter(f"baseline{number}_nm", "N·m", -span, span) for number in numbers]
+        for number in numbers:
+            table.append(Parameter(f"initial_torque{number}_nm", "N·m", -span, span))
+            table.append(Parameter(f"initial_rate{number}_nm_s", "N·m/s", -10 * span, 10 * span))
+        self.delay = range(2, 3)
+        self.baselines = range(3, 3 + parts)
+        self.initials = range(3 + parts, 3 + 3 * parts)
+        self.coefficients = slice(len(table), len(table) + setup.basis.size)
+        table += [Parameter(f"recruitment_{i}_nm", "N·m", -span, span) for i in range(setup.basis.size)]
         self.chosen: list[Chosen] = []
         for effect, form in effects:
             own = tuple(p.on(setup.scene) for p in form.parameters)
@@ -83,11 +87,15 @@ class Problem:
             table += own
         self.table = table
         self.size = len(table)
-        self.coefficients = slice(FIRST_COEFFICIENT, FIRST_COEFFICIENT + coefficients)
         self.log = np.array([p.scale == "log" for p in table])
         self.lower = self._to_scale(np.array([p.lower for p in table]))
         self.upper = self._to_scale(np.array([p.upper for p in table]))
-        self._weights: dict[float, tuple[int, np.ndarray]] = {}
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Of all parameters; those of an effect after its id: `fatigue.onset_s`."""
+        own = [f"{chosen.effect}.{p.name}" for chosen in self.chosen for p in chosen.parameters]
+        return (*(p.name for p in self.table[: self.coefficients.stop]), *own)
 
     def _to_scale(self, values: np.ndarray) -> np.ndarray:
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -107,8 +115,11 @@ class Problem:
         """Mean of the parameters' prior and its precision matrix."""
         mean = 0.5 * (self.lower + self.upper)
         sd = np.maximum((self.upper - self.lower) / 3.0, 1e-9)
-        mean[:4] = [np.log(0.2), 0.0, 0.5 * (self.lower[2] + self.upper[2]), 0.0]
-        sd[:4] = [1.2, 0.8, max((self.upper[2] - self.lower[2]) / 2.0, 1e-5), 1.0]
+        mean[:2], sd[:2] = [np.log(0.2), 0.0], [1.2, 0.8]
+        sd[2] = max((self.upper[2] - self.lower[2]) / 2.0, 1e-5)
+        scale = self.setup.scale_nm
+        sd[list(self.baselines)] = 0.5 * scale
+        sd[list(self.initials)] = np.tile([scale, 5.0 * scale], len(self.baselines))
         precision = np.diag(1.0 / sd**2)
         mean[self.coefficients] = 0.0
         precision[self.coefficients, self.coefficients] = self.setup.penalty
@@ -118,7 +129,7 @@ class Problem:
     def step(self) -> np.ndarray:
         """Perturbations for derivatives."""
         size = np.full(self.size, 1e-5)
-        size[self.coefficients] = 1e-4 * self.setup.scale_nm
+        size[self.baselines.start : self.coefficients.stop] = 1e-4 * self.setup.scale_nm
         for chosen in self.chosen:
             for place, p in zip(chosen.places, chosen.parameters, strict=True):
                 size[place] = 1e-5 * (1.0 if p.scale == "log" else p.upper - p.lower)
@@ -141,23 +152,14 @@ class Problem:
         return mean[0], jacobian
 
     def at_samples(self, theta: np.ndarray, skip: frozenset[str] = frozenset()) -> np.ndarray:
-        """Prediction at the record's samples, N·m, shape (N,); effects named in `skip` are left out of the sum."""
+        """Torque as the record counts it, at its samples, N·m; effects named in `skip` are left out of the sum."""
         walk = _Walk(self, theta, False)
         torque, rate, delay = walk.to_boundaries()
         grid = self.setup.grid
         position = grid.interval + grid.fraction - delay[0] / grid.step_s
         value = read_at(torque[0], rate[0], position, grid.step_s)[None, :]
         value = walk.add(value, self.setup.scene_at_samples, skip)
-        return walk.sense(value, self.setup.scene_at_samples)[0]
-
-    def weights(self, delay_s: float) -> tuple[int, np.ndarray]:
-        """Weights of boundary states in interval means, kept for the last few delays."""
-        if delay_s not in self._weights:
-            if len(self._weights) > 8:
-                self._weights.clear()
-            grid = self.setup.grid
-            self._weights[delay_s] = mean_weights(grid.fraction, grid.interval, grid.count, delay_s / grid.step_s)
-        return self._weights[delay_s]
+        return self.setup.unframed(walk.sense(value, self.setup.scene_at_samples)[0])
 
 
 class _Walk:
@@ -199,7 +201,7 @@ class _Walk:
             drive = np.asarray(chosen.form.call(drive[rows], self.named(chosen, values), scene))
         torque, rate = self.dynamics(drive)
         delay = np.full(torque.shape[0], self.value[2])
-        rows, values = self.join(range(2, 3))
+        rows, values = self.join(self.problem.delay)
         torque, rate, delay = torque[rows], rate[rows], values[:, 0]
         for chosen in self.forms("delay"):
             rows, values = self.join(chosen.places)
@@ -241,11 +243,13 @@ class _Walk:
         setup = self.setup
         rows, core = self.join(range(2))
         drive = drive[rows]
+        rows, initial = self.join(self.problem.initials)
+        drive, core = drive[rows], core[rows]
         law = np.zeros((drive.shape[0], LAWS))
         given: list[tuple[Chosen, np.ndarray]] = []
         for chosen in self.forms("speed"):
             rows, values = self.join(chosen.places)
-            drive, core, law = drive[rows], core[rows], law[rows]
+            drive, core, law, initial = drive[rows], core[rows], law[rows], initial[rows]
             given = [(other, old[rows]) for other, old in given]
             if chosen.form.law:
                 names = [p.name for p in chosen.parameters]
@@ -257,14 +261,14 @@ class _Walk:
         branches = [(drive, np.ones((drive.shape[0], 1)))]
         for chosen in self.forms("branch"):
             rows, values = self.join(chosen.places)
-            core, law, drive = core[rows], law[rows], drive[rows]
+            core, law, drive, initial = core[rows], law[rows], drive[rows], initial[rows]
             given = [(other, old[rows]) for other, old in given]
             split = []
             for part, slower in branches:
                 for new, factor in chosen.form.call(part[rows], self.named(chosen, values), setup.scene):
                     split.append((new, slower[rows] * factor))
             branches = split
-        torque, rate = self.respond(branches, core, law, _NONE)
+        torque, rate = self.respond(branches, core, law, initial, _NONE)
         # A law given as a function of whole arrays is met by a few passes, each with the torque of the last.
         for _ in range(4 if given else 0):
             factor = np.ones_like(drive)
@@ -273,29 +277,34 @@ class _Walk:
                 factor = factor * np.asarray(chosen.form.call((drive, middle), self.named(chosen, values), setup.scene))
             if np.all(factor == 1.0):
                 break
-            torque, rate = self.respond(branches, core, law, np.ascontiguousarray(np.clip(factor, 0.02, 50.0)))
+            factor = np.ascontiguousarray(np.clip(factor, 0.02, 50.0))
+            torque, rate = self.respond(branches, core, law, initial, factor)
         return torque, rate
 
     def respond(
-        self, branches: list, core: np.ndarray, law: np.ndarray, multiplier: np.ndarray
+        self, branches: list, core: np.ndarray, law: np.ndarray, initial: np.ndarray, multiplier: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
+        """Responses of all branches in sum; each begins with its share of the initial state."""
         setup = self.setup
-        torque = rate = None
-        for part, slower in branches:
-            one, two = run_core(
+        begin = initial.reshape(initial.shape[0], -1, 2) / len(branches)
+        responses = [
+            run_core(
                 np.ascontiguousarray(part),
                 np.ascontiguousarray(core[:, 0] * slower[:, 0]),
                 np.ascontiguousarray(core[:, 1]),
                 law,
                 multiplier,
+                setup.begins,
+                begin,
                 setup.scale_nm,
                 setup.grid.step_s,
                 SHARED,
             )
-            torque = one if torque is None else torque + one
-            rate = two if rate is None else rate + two
-        assert torque is not None and rate is not None
-        return torque, rate
+            for part, slower in branches
+        ]
+        if len(responses) == 1:
+            return responses[0]
+        return sum(torque for torque, _ in responses), sum(rate for _, rate in responses)  # type: ignore[return-value]
 
     def bend(
         self, chosen: Chosen, torque: np.ndarray, rate: np.ndarray, values: np.ndarray
@@ -311,24 +320,25 @@ class _Walk:
         return bent, (later - sooner) / (2 * ahead)
 
     def read(self, torque: np.ndarray, rate: np.ndarray, delay: np.ndarray) -> np.ndarray:
-        first, weights = self.problem.weights(float(delay[0]))
-        step_s = self.setup.grid.step_s
-        mean = read_means(torque, rate, first, weights, step_s)
-        for row in np.flatnonzero(delay != delay[0]):
-            first, weights = self.problem.weights(float(delay[row]))
-            mean[row] = read_means(torque[row : row + 1], rate[row : row + 1], first, weights, step_s)[0]
+        grid = self.setup.grid
+        mean = np.empty((torque.shape[0], grid.size))
+        for lag in np.unique(delay):
+            first, weights = grid.mean_weights(float(lag))
+            own = delay == lag
+            rows = slice(None) if own.all() else own
+            mean[rows] = read_means(torque[rows], rate[rows], first, np.ascontiguousarray(weights))
         return mean
 
     def add(self, value: np.ndarray, scene=None, skip: frozenset[str] = frozenset()) -> np.ndarray:
-        at_samples = scene is not None
+        part = self.setup.part_of(scene is not None)
         scene = scene or self.setup.scene
-        rows, values = self.join(range(3, 4))
-        value = value[rows] + values
+        rows, values = self.join(self.problem.baselines)
+        value = value[rows] + (values if part is None else values[:, part])
         for chosen in self.forms("additive"):
             present = value.shape[0]
             rows, values = self.join(chosen.places)
             value = value[rows]
-            if chosen.effect in skip or (not at_samples and chosen.effect == "mains_hum"):
+            if chosen.effect in skip:
                 continue
             # What is added doesn't depend on the signal: rows that differ elsewhere alone share one evaluation.
             own = np.r_[0, np.arange(present, rows.size)]
@@ -338,7 +348,13 @@ class _Walk:
         return value
 
     def sense(self, value: np.ndarray, scene=None) -> np.ndarray:
-        for chosen in self.forms("sensor"):
+        acting, setup = self.forms("sensor"), self.setup
+        if not acting:
+            return value
+        value = setup.unframed(value)  # the sensor knows nothing of the muscle's direction
+        for chosen in acting:
             rows, values = self.join(chosen.places)
-            value = np.asarray(chosen.form.call(value[rows], self.named(chosen, values), scene or self.setup.scene))
-        return value
+            value = value[rows]
+            if scene is not None or not chosen.form.settled:  # the target no longer holds what is settled
+                value = np.asarray(chosen.form.call(value, self.named(chosen, values), scene or setup.scene))
+        return setup.framed(value)

@@ -9,10 +9,7 @@ import numpy as np
 
 from identify.dynamics.pulse_grid import Grid
 from identify.effects.base import Scene
-from identify.recruitment.spline import SplineBasis
-
-INTERVALS = 30
-"""Knot intervals of the common spline: fewer, and effects act as cheap knots."""
+from identify.recruitment.curve import Basis
 
 
 @dataclass(frozen=True)
@@ -24,19 +21,24 @@ class Setup:
     grid : Grid
         The record on the grid of pulses, with `target_nm` in place of its torque.
     target_nm : ndarray, shape (K,)
-        Torque to be explained (hum removed), N·m; NaN where there is none.
+        Torque to be explained, N·m: hum removed, above `zero_nm`, and counted in the direction in which the muscle
+        pulls; NaN where there is none.
     fitted : ndarray of bool, shape (K,)
         Intervals that may be used.
-    basis : SplineBasis
-        Common recruitment spline.
-    stiffness : float
-        Weight of ∫f''², (µs³/(N·m)²).
+    basis : Basis
+        Of the recruitment curve, common to all candidates.
+    roughness : ndarray, shape (n, n)
+        Prior precision of its coefficients, 1/(N·m)²: how much the curve may bend.
     scale_nm : float
         Largest torque, smoothed, N·m.
     noise_sd_nm : float
         White noise of a sample, N·m.
     delay_bounds_s : tuple of float
         Timing left open to every candidate: about a sample either way.
+    zero_nm : float
+        Zero of the record's torque, N·m.
+    sign : float
+        1 where stimulation raises the record's torque, -1 where it lowers it.
     reference_s : float
         Time to which the recruitment curve belongs where it drifts.
     """
@@ -44,11 +46,13 @@ class Setup:
     grid: Grid
     target_nm: np.ndarray
     fitted: np.ndarray
-    basis: SplineBasis
-    stiffness: float
+    basis: Basis
+    roughness: np.ndarray
     scale_nm: float
     noise_sd_nm: float
     delay_bounds_s: tuple[float, float]
+    zero_nm: float = 0.0
+    sign: float = 1.0
     reference_s: float = 0.0
 
     @cached_property
@@ -56,6 +60,18 @@ class Setup:
         """Starts and ends of the runs of fitted intervals."""
         edges = np.flatnonzero(np.diff(np.r_[0, self.fitted.astype(np.int8), 0]))
         return edges[::2].astype(np.int64), edges[1::2].astype(np.int64)
+
+    @cached_property
+    def begins(self) -> np.ndarray:
+        """Intervals at which the parts of the record begin, shape (B,), the first 0."""
+        return np.zeros(1, np.int64)
+
+    def part_of(self, at_samples: bool) -> np.ndarray | None:
+        """Part of each sample or of each interval; None where there is one part."""
+        if self.begins.size == 1:
+            return None
+        at = self.grid.interval if at_samples else np.arange(self.grid.size)
+        return np.searchsorted(self.begins, at, side="right") - 1
 
     @cached_property
     def scene(self) -> Scene:
@@ -90,10 +106,11 @@ class Setup:
             pulse_width_us=width_us,
             step_s=grid.step_s,
             scale_nm=self.scale_nm,
-            largest_us=self.basis.knots_us[-1],
+            largest_us=self.basis.largest_us,
             angle_rad=None if angle is None else np.interp(time_s, own, angle),
             velocity_rad_s=None if velocity is None else np.interp(time_s, own, velocity),
             noise_sd_nm=self.noise_sd_nm,
+            zero_nm=self.zero_nm,
             reference_s=self.reference_s,
         )
 
@@ -106,29 +123,16 @@ class Setup:
     def penalty(self) -> np.ndarray:
         """Prior precision of the coefficients, shape (n, n)."""
         ridge = 1.0 / (3.0 * self.scale_nm) ** 2
-        return self.stiffness * self.basis.roughness + ridge * np.eye(self.basis.size)
+        return self.roughness + ridge * np.eye(self.basis.size)
+
+    def framed(self, torque_nm: np.ndarray) -> np.ndarray:
+        """Torque of the record as the model counts it: above its zero, in the direction in which the muscle pulls."""
+        return self.sign * (torque_nm - self.zero_nm)
+
+    def unframed(self, torque_nm: np.ndarray) -> np.ndarray:
+        """The inverse of `framed`."""
+        return self.zero_nm + self.sign * torque_nm
 
     def with_(self, **changes: object) -> Setup:
         """The set-up with some fields changed (derived arrays are made anew)."""
         return replace(self, **changes)  # type: ignore[arg-type]
-
-
-def uniform_basis(largest_us: float, intervals: int = INTERVALS) -> SplineBasis:
-    """Common spline with evenly spaced knots."""
-    return SplineBasis(np.linspace(0.0, largest_us, intervals + 1))
-
-
-def refined_basis(basis: SplineBasis, coefficients_nm: np.ndarray, intervals: int = INTERVALS) -> SplineBasis:
-    """Knots moved towards where a first curve bends, half of them left evenly spread."""
-    u = np.linspace(0.0, basis.knots_us[-1], 1201)
-    bend = np.abs(basis.design(u, 2) @ coefficients_nm) ** 0.5
-    width = max(int(0.01 * u.size), 3)
-    bend = np.convolve(bend, np.ones(2 * width + 1) / (2 * width + 1), "same")
-    density = 0.45 / u.size + 0.55 * bend / max(bend.sum(), 1e-30)
-    share = np.cumsum(density)
-    share = (share - share[0]) / (share[-1] - share[0])
-    knots = np.interp(np.linspace(0.0, 1.0, intervals + 1), share, u)
-    least = 0.004 * u[-1]
-    knots = np.maximum.accumulate(knots + least * np.arange(knots.size)) - least * np.arange(knots.size)
-    spread = np.cumsum(np.r_[0.0, np.maximum(np.diff(knots), least)])
-    return SplineBasis(spread * (u[-1] / spread[-1]))

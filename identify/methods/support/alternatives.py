@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from identify.dynamics.linear import SecondOrder
-from identify.estimation.projected import T_BOUNDS_S, ZETA_BOUNDS, Problem, Solution, project, search
+from identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUNDS_S, SecondOrder
+from identify.estimation.projected import EXTRAS, Projection, Solution, project, search
 from identify.noise.ar1 import log_likelihood, whiten
 from identify.recruitment.power import PowerBasis
 from identify.recruitment.sigmoid import SigmoidBasis
@@ -24,7 +24,7 @@ def power_series(first: Solution, order: int | None = None) -> tuple[Solution, s
     linear = first.linear
     for power in [order] if order else range(1, HIGHEST_POWER + 1):
         basis = PowerBasis(power, largest)
-        problem = Problem(old.grid, basis, np.zeros((power, power)), old.rows, old.from_rest, old.delay_s)
+        problem = Projection(old.grid, basis, np.zeros((power, power)), old.rows, old.delay_s)
         solution = search(problem, linear)
         rows = sum(s.stop - s.start for s in problem.stretches)
         likelihood = log_likelihood(solution.residual_nm, problem.stretches, 0.0)
@@ -46,9 +46,9 @@ def sigmoid(first: Solution) -> Solution:
     rise = np.ptp(np.flatnonzero((curve / (2 * half) > 0.2) & (curve / (2 * half) < 0.8))) if half else 100
     steep = float(np.log(2.8 / max(largest * float(rise) / 400, largest / 400)))
 
-    def problem(x: np.ndarray) -> Problem:
+    def problem(x: np.ndarray) -> Projection:
         basis: SigmoidBasis = basis_at(x[3], x[4] * largest, largest)
-        return Problem(old.grid, basis, np.zeros((1, 1)), old.rows, old.from_rest, old.delay_s)
+        return Projection(old.grid, basis, np.zeros((1, 1)), old.rows, old.delay_s)
 
     def linear(x: np.ndarray) -> SecondOrder:
         return SecondOrder(
@@ -60,8 +60,10 @@ def sigmoid(first: Solution) -> Solution:
         solution = project(trial, linear(x), ar1=first.ar1)
         return whiten(solution.residual_nm, trial.stretches, first.ar1)
 
-    lower = [*np.log([T_BOUNDS_S[0], ZETA_BOUNDS[0]]), -old.grid.step_s, np.log(0.5 / largest), 0.0]
-    upper = [*np.log([T_BOUNDS_S[1], ZETA_BOUNDS[1]]), 0.2, np.log(2000.0 / largest), 1.2]
+    bounds = np.log([TIME_CONSTANT_BOUNDS_S, DAMPING_BOUNDS])
+    earliest, latest = old.grid.delay_bounds_s
+    lower = [*bounds[:, 0], earliest, np.log(0.5 / largest), 0.0]
+    upper = [*bounds[:, 1], latest, np.log(2000.0 / largest), 1.2]
     x0 = [np.log(start.time_constant_s), np.log(start.damping), start.delay_s, steep, middle / largest]
     x0 = np.clip(x0, np.array(lower) + 1e-9, np.array(upper) - 1e-9)
     found = least_squares(residual, x0, bounds=(lower, upper), x_scale=[0.05, 0.05, 0.005, 0.1, 0.02], xtol=1e-10)
@@ -86,9 +88,9 @@ def monotone(solution: Solution) -> Solution:
     root = np.linalg.cholesky(hessian).T
     right = np.linalg.solve(root.T, white.T @ target)
     sign = 1.0 if np.sum(solution.coefficients[:size]) >= 0 else -1.0
-    steps = np.zeros((white.shape[1], size + 2 * problem.extras))
+    steps = np.zeros((white.shape[1], size + 2 * EXTRAS))
     steps[:size, :size] = sign * np.tril(np.ones((size, size)))
-    for extra in range(problem.extras):  # these may have either sign
+    for extra in range(EXTRAS):  # these may have either sign
         steps[size + extra, size + 2 * extra : size + 2 * extra + 2] = 1.0, -1.0
     coefficients = steps @ nnls(root @ steps, right, maxiter=50 * steps.shape[1])[0]
     return replace(solution, coefficients=coefficients)

@@ -6,50 +6,7 @@ import numpy as np
 
 from identify.dynamics.pulse_grid import Grid, runs
 from identify.errors import BadRequest, NotIdentifiable
-from identify.records.record import HELD_OUT
-
-
-def rows_of(grid: Grid, names: tuple[str, ...]) -> np.ndarray:
-    """bool, shape (K,): intervals of segments with these names."""
-    wanted = np.array([name in names for name in grid.record.segment_names])
-    return wanted[grid.segment]
-
-
-def fitted_rows(grid: Grid, fit_on: tuple[str, ...] | None) -> np.ndarray:
-    """Rows to fit: those of the named segments (and the rests, which anchor the baseline), never held-out ones.
-
-    Raises
-    ------
-    BadRequest
-        A named segment isn't in the record, or is the held-out one.
-    NotIdentifiable
-        Nothing is left to fit.
-    """
-    if fit_on is not None:
-        check_segments(grid, fit_on)
-        rows = grid.fitted & rows_of(grid, (*fit_on, "rest"))
-    else:
-        rows = grid.fitted
-    if rows.sum() < 8:
-        raise NotIdentifiable(
-            f"only {int(rows.sum())} pulse intervals may be fitted", mend="Give rows of segments other than `validate`."
-        )
-    return rows
-
-
-def check_segments(grid: Grid, names: tuple[str, ...]) -> None:
-    """Refuse names of segments that the record doesn't have, and the held-out one.
-
-    Raises
-    ------
-    BadRequest
-    """
-    there = tuple(dict.fromkeys(grid.record.segment_names))
-    for name in names:
-        if name == HELD_OUT:
-            raise BadRequest("`validate` is never fitted on", place="fit_on", mend="Name other segments.")
-        if name not in there:
-            raise BadRequest(f"no segment {name!r} in the record", place="fit_on", mend=f"It has: {', '.join(there)}.")
+from identify.estimation.rows import rows_of
 
 
 def segment_rows(grid: Grid, names: tuple[str, ...], method_id: str) -> np.ndarray:
