@@ -17,7 +17,16 @@ BANDS = {"weak": (2.0, 5.0), "middle": (5.0, 10.0), "strong": (10.0, 25.0)}
 """Excess error over the noise's sd."""
 
 EVERYWHERE = frozenset(
-    {"tremor", "voluntary_effort", "clonus", "gain_jumps", "delay_jitter", "loose_contact", "sensor_gain_swing"}
+    {
+        "tremor",
+        "voluntary_effort",
+        "clonus",
+        "gain_jumps",
+        "delay_jitter",
+        "loose_contact",
+        "sensor_gain_swing",
+        "slipped_electrode",
+    }
 )
 """Not predictable in held-out rows: their excess is the residual over the whole record."""
 
