@@ -25,7 +25,6 @@ EVERYWHERE = frozenset(
         "delay_jitter",
         "loose_contact",
         "sensor_gain_swing",
-        "slipped_electrode",
     }
 )
 """Not predictable in held-out rows: their excess is the residual over the whole record."""
@@ -35,6 +34,9 @@ ADDED = frozenset({"mains_hum"})
 
 EITHER = frozenset({"threshold_drift", "fatigue", "potentiation"})
 """Can hide from the held-out rows: the larger of training and held-out residual counts."""
+
+IN_TRAINING = frozenset({"slipped_electrode"})
+"""Happens while training: what it leaves there counts, since only there it can be seen to happen."""
 
 _REPLACED = ("recruitment", "dynamics")
 
@@ -95,6 +97,8 @@ def excess_nm(effect: str, residual_nm: Floats, held_out: np.ndarray) -> dict[st
     }
     if effect in EVERYWHERE or not held_out.any():
         out["counted_nm"] = out["all_nm"]
+    elif effect in IN_TRAINING:
+        out["counted_nm"] = out["training_nm"]
     elif effect in EITHER:
         out["counted_nm"] = max(out["training_nm"], out["held_out_nm"])
     else:

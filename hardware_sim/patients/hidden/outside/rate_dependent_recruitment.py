@@ -42,7 +42,7 @@ def accommodation(rng: Generator, _base: Base) -> Formulation:
 
 
 def less_when_quick(rng: Generator, _base: Base) -> Formulation:
-    tau, half = float(rng.uniform(0.15, 0.6)), float(rng.uniform(60.0, 300.0))
+    tau, half = float(rng.uniform(0.15, 0.6)), float(rng.uniform(500.0, 2500.0))
     return Formulation(
         "quick changes of width recruit less",
         "no law; recruitment that depends on the rate of change",
