@@ -1,9 +1,11 @@
 """What the diagnosis says of muscles with something hidden: tables, confusions, calibration; see docs/diagnosis.md.
 
-    python -m bench.diagnosis --seeds 1003:1004 [--only single,nothing,…] [--json FILE]
+    python -m bench.diagnosis --seeds 1003:1004 [--only single,nothing,…] [--recorder plain,real] [--json FILE]
 
 Seeds 0 to 99 were developed on; report on seeds from 1000. The records come from the emulator's physics, whose
-equations are not the library's. Each set is scored as the goals of issue 4 ask.
+equations are not the library's. Each set is scored as the goals of issue 4 ask. `--recorder` gives the same records as
+other recorders do (`hardware_sim.recorders`; `both` is plain,real; `joined`: the patient tested twice, a minute apart),
+side by side. Of the set `kept` only totals are told: nobody who tunes should learn what is in it.
 """
 
 from __future__ import annotations
@@ -22,9 +24,15 @@ import numpy as np
 
 from identify.diagnosis import candidates as workers
 from identify.diagnosis import diagnose
+from identify.diagnosis.verdict import STRUCTURE
 from identify.effects import registry
 from identify.records.record import Record
 
+SETS = ("single", "nothing", "outside", "two", "slow", "rates", "kept")
+JOINED_AFTER_S = 60.0
+SURE = 0.9
+"""Probability above which an effect counts as named for sure."""
+CLOSE_TO_NOISE = 1.3
 STRENGTHS = ("weak", "middle", "strong")
 PAIRS = (
     "fatigue+asymmetric_relaxation",
@@ -53,51 +61,71 @@ def as_record(made: dict[str, Any]) -> Record:
 def one(job: tuple[str, str, int, dict[str, Any]]) -> dict[str, Any] | None:
     """One record diagnosed; None where the generator can't make it."""
     from hardware_sim.hidden_records import generate
+    from hardware_sim.recorders import recorded
 
     workers.WORKERS = 1
     effect, strength, seed, options = job
     names = tuple(effect.split("+")) if effect else None
+    settings = dict(options)
+    recorder = settings.pop("recorder", "plain")
+    kinds = recorder.split("+")
+    if "joined" in kinds:
+        settings["again_after_s"] = JOINED_AFTER_S
+        kinds.remove("joined")
     try:
-        made = generate(names, strength, seed, **options)
+        made = recorded(generate(names, strength, seed, **settings), "+".join(kinds) or "plain", seed)
     except ValueError:
         return None
     began, cpu = time.perf_counter(), time.process_time()
     result = diagnose(as_record(made))
     first = result["missing"][0] if result["missing"] else None
-    noise = result["noise_sd_nm"]
+    noise, after = result["noise_sd_nm"], result["with_all"]["held_out_rms_nm"]
     return {
         "effect": effect,
         "strength": strength,
         "seed": seed,
-        "options": options,
+        "options": {key: value for key, value in options.items() if key != "recorder"},
+        "recorder": made["recorder"] | {"kind": recorder},
         "truth": made["truth"]["effects"],
         "formulation": made["truth"]["formulation"],
         "verdict": result["verdict"],
         "named": [entry["effect"] for entry in result["missing"]],
         "probability": first["probability"] if first else result["probability"],
+        "probabilities": [entry["probability"] for entry in result["missing"]],
         "group": [first["effect"], *first["confused_with"]] if first else [],
         "before": result["base"]["held_out_rms_nm"],
-        "after": result["with_all"]["held_out_rms_nm"],
+        "after": after,
         "noise": noise,
+        "noise made": made["truth"]["noise"]["sd_nm"] * abs(made["recorder"]["scale"]),
+        "error over noise after": after / noise if result["base"]["held_out"] and noise > 0.0 else None,
         "explained": result["explained"],
         "structure": result["structure_left"],
+        "structure said": _structure_said(result),
         "gains": [(c["effect"], c["form"], c["log_evidence_gain"]) for c in result["candidates"][0][:4]],
         "seconds": time.perf_counter() - began,
         "cpu_seconds": time.process_time() - cpu,
     }
 
 
+def _structure_said(result: dict[str, Any]) -> bool:
+    """Whether structure is said to be left in any way: verdict, figure or words."""
+    words = " ".join([*result["plain"], *result["notes"]]).lower()
+    left = result["verdict"] == "unexplained_structure" or result["structure_left"] > STRUCTURE
+    return bool(left or "structure left" in words)
+
+
 def jobs(kind: str, seeds: Iterable[int]) -> list[tuple[str, str, int, dict[str, Any]]]:
     """What a set is made of."""
-    from hardware_sim.patients.hidden.draw import effect_ids, outside_ids
+    from hardware_sim.patients.hidden.draw import effect_ids, outside_ids, outside_kept_ids
 
     seeds = list(seeds)
     if kind == "single":
         return [(e, s, seed, {}) for e in effect_ids() for s in STRENGTHS for seed in seeds]
     if kind == "slow":
         return [(e, s, seed, {"noise": "slow"}) for e in effect_ids() for s in STRENGTHS[1:] for seed in seeds[:1]]
-    if kind == "outside":
-        return [(e, s, seed, {}) for e in outside_ids() for s in STRENGTHS[1:] for seed in seeds]
+    if kind in ("outside", "kept"):
+        foreign = outside_ids() if kind == "outside" else outside_kept_ids()
+        return [(e, s, seed, {}) for e in foreign for s in STRENGTHS[1:] for seed in seeds]
     if kind == "two":
         return [(pair, "middle", seed, {}) for pair in PAIRS for seed in seeds]
     if kind == "rates":
@@ -120,39 +148,82 @@ def share(flags: list[bool]) -> str:
 
 
 def tell(kind: str, rows: list[dict[str, Any]]) -> None:
-    """The figures of a set."""
+    """The figures of a set, one column a recorder."""
+    by: dict[str, list[dict[str, Any]]] = defaultdict(list)
+    for row in rows:
+        by[row["recorder"]["kind"]].append(row)
+    columns = [figures(kind, some) for some in by.values()]
+    labels = list(dict.fromkeys(label for column in columns for label in column))
+    if len(columns) == 1:
+        print("\n".join(f"  {label}: {value}" for label, value in columns[0].items()))
+        return
+    cells = [["", *by], *([label, *(column.get(label, "-") for column in columns)] for label in labels)]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    for line in cells:
+        print("  " + "  ".join(text.ljust(width) for text, width in zip(line, widths, strict=True)).rstrip())
+
+
+def figures(kind: str, rows: list[dict[str, Any]]) -> dict[str, str]:
+    """The figures of a set by one recorder: what they are, and how large."""
+    told: dict[str, str] = {"records": str(len(rows))}
     if kind in ("single", "slow", "rates"):
         for strengths in (("middle", "strong"), ("weak",)):
             some = [r for r in rows if r["strength"] in strengths]
             if some:
-                print(f"  named first, {' and '.join(strengths)}: {share([_first(r) for r in some])}")
-                print(f"  named first or in its group: {share([_grouped(r) for r in some])}")
-                print(f"  verdict 'effect missing': {share([r['verdict'] == 'effect_missing' for r in some])}")
-        _calibration(rows)
+                which = " and ".join(strengths)
+                told[f"named first, {which}"] = share([_first(r) for r in some])
+                told[f"named first or in its group, {which}"] = share([_grouped(r) for r in some])
+                told[f"verdict 'effect missing', {which}"] = share([r["verdict"] == "effect_missing" for r in some])
+        told |= _calibration(rows)
         gone = [_removed(r) for r in rows if _first(r) and r["before"] > 1.2 * r["noise"] and _foreseeable(r)]
         if gone:
-            median = 100 * np.median(gone)
-            print(f"  held-out error above noise removed, efforts and tremor aside: median {median:.0f} %")
-        _confusions(rows)
+            told["held-out error above noise removed, efforts and tremor aside"] = (
+                f"median {100 * np.median(gone):.0f} %"
+            )
+        if kind == "single":
+            told |= _over_noise(rows)
+        told |= _confusions(rows)
     elif kind == "nothing":
         by: dict[str, list[bool]] = defaultdict(list)
         for r in rows:
             by[json.dumps(r["options"])].append(r["verdict"] == "nothing_missing")
-        for options, flags in by.items():
-            print(f"  nothing missing, {options}: {share(flags)}")
-    elif kind == "outside":
-        print(f"  structure left: {share([r['verdict'] == 'unexplained_structure' for r in rows])}")
-        for effect in sorted({r["effect"] for r in rows}):
-            some = [r for r in rows if r["effect"] == effect]
-            said = Counter(r["verdict"] if r["verdict"] != "effect_missing" else r["named"][0] for r in some)
-            print(f"    {effect}: {dict(said)}")
+        told |= {f"nothing missing, {options}": share(flags) for options, flags in by.items()}
+    elif kind in ("outside", "kept"):
+        sure = [max(r["probabilities"], default=0.0) > SURE for r in rows]
+        left = [r["verdict"] == "unexplained_structure" for r in rows]
+        told["verdict 'structure left'"] = share(left)
+        told["told: that, or structure said to be left and no effect for sure"] = share(
+            [verdict or (r["structure said"] and not s) for r, verdict, s in zip(rows, left, sure, strict=True)]
+        )
+        told[f"an effect named above {SURE:g}"] = share(sure)
+        for effect in sorted({r["effect"] for r in rows}) if kind == "outside" else []:
+            said = Counter(_said(r) for r in rows if r["effect"] == effect)
+            told[f"  {effect}"] = ", ".join(f"{what} {count}" for what, count in said.most_common())
     elif kind == "two":
-        print(f"  both named: {share([set(r['truth']) <= set(r['named']) for r in rows])}")
-        print(f"  one named: {share([bool(set(r['truth']) & set(r['named'])) for r in rows])}")
-        for r in rows:
-            print(f"    {r['effect']} {r['seed']}: {r['named']} {r['verdict']}")
+        told["both named"] = share([set(r["truth"]) <= set(r["named"]) for r in rows])
+        told["one named"] = share([bool(set(r["truth"]) & set(r["named"])) for r in rows])
+        told |= {f"  {r['effect']} {r['seed']}": f"{', '.join(r['named'])} ({r['verdict']})" for r in rows}
     cpu = [r["cpu_seconds"] for r in rows]
-    print(f"  processor seconds a record: median {np.median(cpu):.1f}, largest {max(cpu):.1f}")
+    told["processor seconds a record"] = f"median {np.median(cpu):.1f}, largest {max(cpu):.1f}"
+    return told
+
+
+def _said(row: dict[str, Any]) -> str:
+    return row["named"][0] if row["verdict"] == "effect_missing" else row["verdict"]
+
+
+def _over_noise(rows: list[dict[str, Any]]) -> dict[str, str]:
+    """Held-out error after the diagnosis over the noise, as estimated and as made."""
+    some = [r for r in rows if r["error over noise after"] is not None]
+    if not some:
+        return {}
+    over = np.array([r["error over noise after"] for r in some])
+    made = np.array([r["after"] / r["noise made"] for r in some])
+    return {
+        "held-out error after over noise": f"median {np.median(over):.2f}",
+        f"held-out error after at most {CLOSE_TO_NOISE:g} × noise": share((over <= CLOSE_TO_NOISE).tolist()),
+        f"the same by the noise made, at most {CLOSE_TO_NOISE:g}": share((made <= CLOSE_TO_NOISE).tolist()),
+    }
 
 
 def _first(row: dict[str, Any]) -> bool:
@@ -174,35 +245,68 @@ def _removed(row: dict[str, Any]) -> float:
     return 1.0 - excess[1] / max(excess[0], 1e-9)
 
 
-def _calibration(rows: list[dict[str, Any]]) -> None:
+def _calibration(rows: list[dict[str, Any]]) -> dict[str, str]:
+    told = {}
     named = [r for r in rows if r["named"] and r["verdict"] == "effect_missing"]
     for low, high in ((0.0, 0.6), (0.6, 0.85), (0.85, 0.97), (0.97, 1.01)):
         some = [r for r in named if low <= r["probability"] < high]
         if some:
             stated = np.mean([r["probability"] for r in some])
-            print(f"  stated {low:g} to {min(high, 1):g} (mean {stated:.2f}): right {share([_first(r) for r in some])}")
+            right = share([_first(r) for r in some])
+            told[f"right where {low:g} to {min(high, 1):g} is stated"] = f"{right}, mean stated {stated:.2f}"
+    return told
 
 
-def _confusions(rows: list[dict[str, Any]]) -> None:
+def _confusions(rows: list[dict[str, Any]]) -> dict[str, str]:
     wrong = Counter((r["truth"][0], r["named"][0] if r["named"] else r["verdict"]) for r in rows if not _first(r))
-    for (truth, named), count in wrong.most_common():
-        print(f"    {truth} named {named}: {count}")
+    return {f"  {truth} named {named}": str(count) for (truth, named), count in wrong.most_common()}
+
+
+def _sealed(row: dict[str, Any]) -> dict[str, Any]:
+    """A row of the set `kept`, without what would tell what is in the set."""
+    return row | {"effect": "kept", "truth": [], "formulation": []}
+
+
+def _recorders(text: str) -> list[str]:
+    from hardware_sim.recorders import KINDS
+
+    found = [name for word in text.split(",") for name in ({"both": ["plain", "real"]}.get(word) or [word])]
+    known = {*KINDS, "joined"}
+    unknown = {part for name in found for part in name.split("+")} - known
+    if unknown:
+        given = ", ".join(sorted(unknown))
+        raise argparse.ArgumentTypeError(f"{given}: give both or some of {', '.join(sorted(known))}")
+    return list(dict.fromkeys(found))
 
 
 def run(arguments: list[str] | None = None) -> None:
     """Make, diagnose, tell."""
     parser = argparse.ArgumentParser(prog="python -m bench.diagnosis", description=__doc__)
     parser.add_argument("--seeds", default="1003:1004", help="first:last, last not included")
-    parser.add_argument("--only", default="single,nothing,outside,two,slow,rates")
+    parser.add_argument("--only", default=",".join(SETS))
+    parser.add_argument(
+        "--recorder",
+        type=_recorders,
+        default=["plain"],
+        help="with commas: both, joined, or as in hardware_sim.recorders",
+    )
     parser.add_argument("--json", type=Path, default=None)
     settings = parser.parse_args(arguments)
     first, last = (int(part) for part in settings.seeds.split(":"))
     everything = {}
     with ProcessPoolExecutor(2) as pool:
         for kind in settings.only.split(","):
-            rows = [row for row in pool.map(one, jobs(kind, range(first, last))) if row is not None]
+            asked = [
+                (effect, strength, seed, options | {"recorder": recorder})
+                for effect, strength, seed, options in jobs(kind, range(first, last))
+                for recorder in settings.recorder
+            ]
+            rows = [row for row in pool.map(one, asked) if row is not None]
+            if kind == "kept":
+                rows = [_sealed(row) for row in rows]
             print(f"{kind}, seeds {first} to {last - 1}, {len(rows)} records")
-            tell(kind, rows)
+            if rows:
+                tell(kind, rows)
             sys.stdout.flush()
             everything[kind] = rows
             if settings.json is not None:

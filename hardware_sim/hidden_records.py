@@ -18,6 +18,7 @@ from numpy.random import Generator
 
 from hardware_sim.patients.hidden.draw import draw_pair, draw_scenario, effect_ids, outside_ids, rng_of
 from hardware_sim.patients.hidden.kernels import Floats
+from hardware_sim.patients.hidden.protocol import UNRECORDED, make_design
 from hardware_sim.patients.hidden.scenario import simulate
 
 NOISES = ("white", "ar1", "slow")
@@ -73,6 +74,7 @@ def generate(
     pulsed: bool = False,
     formulation: int | None = None,
     sampled_late_s: float = 0.0,
+    again_after_s: float | None = None,
 ) -> dict[str, Any]:
     """One record.
 
@@ -101,6 +103,9 @@ def generate(
         Which of the effect's formulations; drawn if None.
     sampled_late_s
         The load cell samples this much later than its time stamps say (negative: earlier), to a simulation step.
+    again_after_s
+        The patient rests that long, unrecorded, and does a second test of the same design: two records joined, with a
+        jump of time between them.
 
     Returns
     -------
@@ -132,6 +137,10 @@ def generate(
     every = math.ceil(1600 / rate_hz)
     step_s = 1.0 / (rate_hz * every)
     sequence = scenario.design
+    if again_after_s is not None:
+        top_us = float(scenario.base.largest_width_us)
+        second = make_design(design, rng_of(seed, "again"), top_us, validate_s=validate_s, with_validate=with_validate)
+        sequence = sequence.then(again_after_s, second)
     rng = rng_of(seed, "noise", *names, strength)
     rho = float(1.0 - np.exp(rng.uniform(np.log(0.01), np.log(0.5)))) if rho_40hz is None else rho_40hz
     width, _, angle, velocity = sequence.fine(step_s)
@@ -156,6 +165,9 @@ def generate(
         conditions["rho_40hz"] = round(rho, 5)
     if noise == "slow":
         conditions |= {"slow_sd_nm": slow_sd_nm, "slow_correlation_s": SLOW_CORRELATION_S}
+    if again_after_s is not None:
+        recorded = record["segment"] != UNRECORDED
+        record = {name: column[recorded] for name, column in record.items()}
     record["truth"] = scenario.truth(noise_sd_nm) | {
         "seed": seed,
         "noise": conditions,

@@ -9,7 +9,14 @@ import pytest
 
 from hardware_sim.patients.hidden.base import Base, draw_base
 from hardware_sim.patients.hidden.chain import Chain
-from hardware_sim.patients.hidden.draw import draw_scenario, effect_ids, formulations, outside_ids, rng_of
+from hardware_sim.patients.hidden.draw import (
+    draw_scenario,
+    effect_ids,
+    formulations,
+    outside_ids,
+    outside_kept_ids,
+    rng_of,
+)
 from hardware_sim.patients.hidden.kernels import Formulation, NotSuited
 from hardware_sim.patients.hidden.protocol import make_design
 from hardware_sim.patients.hidden.scenario import BANDS, combine, excess_nm, simulate
@@ -40,11 +47,11 @@ STEP_S = 1.0 / 1600.0
 NOISE_SD_NM = 0.04
 ALL = [
     pytest.param(effect, index, id=f"{effect}-{index}")
-    for effect in (*effect_ids(), *outside_ids())
+    for effect in (*effect_ids(), *outside_ids(), *outside_kept_ids())
     for index in range(len(formulations(effect)))
 ]
 # random by the step, or with an instant that falls on a step and sets what follows
-BY_STEP = {"tremor", "delay_jitter", "stick_slip", "slow_converter", "clonus"}
+BY_STEP = {"tremor", "delay_jitter", "stick_slip", "slow_converter", "clonus", "kind_b"}
 
 
 def written(effect: str, index: int, seed: int = 3) -> tuple[Base, Formulation]:
@@ -61,8 +68,10 @@ def written(effect: str, index: int, seed: int = 3) -> tuple[Base, Formulation]:
 
 def test_every_id_of_the_contract_has_its_file_and_some_are_foreign() -> None:
     assert set(effect_ids()) == CONTRACT
-    assert len(outside_ids()) >= 8
-    assert not set(outside_ids()) & CONTRACT
+    assert {"rate_dependent_recruitment", "antagonist", "slipped_electrode"} <= set(outside_ids())
+    assert len(outside_ids()) >= 8 and len(outside_kept_ids()) >= 5
+    foreign = [*outside_ids(), *outside_kept_ids()]
+    assert len(set(foreign)) == len(foreign) and not set(foreign) & CONTRACT
 
 
 @pytest.mark.parametrize(("effect", "index"), ALL)
@@ -89,7 +98,7 @@ def test_a_finer_step_gives_the_same_torque(effect: str, index: int) -> None:
 
 
 @pytest.mark.parametrize("strength", BANDS)
-@pytest.mark.parametrize("effect", [*effect_ids(), *outside_ids()])
+@pytest.mark.parametrize("effect", [*effect_ids(), *outside_ids(), *outside_kept_ids()])
 def test_strength_lands_in_its_band(effect: str, strength: str) -> None:
     for seed in (200, 1200):
         scenario = draw_scenario((effect,), strength, seed, noise_sd_nm=NOISE_SD_NM)

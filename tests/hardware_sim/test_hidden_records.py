@@ -93,6 +93,19 @@ def test_a_late_sample_moves_the_torque_and_nothing_else() -> None:
     assert np.abs(late["torque_nm"][:-1] - plain["torque_nm"][1:])[1:-10].max() < 1e-6
 
 
+def test_a_patient_comes_again_after_a_pause_that_is_not_recorded() -> None:
+    once, twice = (generate("fatigue", "middle", 313, rate_hz=100, again_after_s=s) for s in (None, 60.0))
+    size = once["time_s"].size
+    assert twice["truth"] == once["truth"]
+    assert twice["time_s"].size == 2 * size
+    for name in ("time_s", "pulse_width_us", "segment"):
+        assert np.array_equal(twice[name][:size], once[name])
+    assert np.abs(twice["torque_nm"][:size] - once["torque_nm"]).max() < 0.5  # noises of 0.04
+    assert twice["time_s"][size] - twice["time_s"][size - 1] == pytest.approx(60.01)
+    assert np.array_equal(twice["segment"][size:], once["segment"])
+    assert not np.array_equal(twice["pulse_width_us"][size:], once["pulse_width_us"])
+
+
 @pytest.mark.parametrize("effect", ["threshold_drift", "torque_angle"])
 def test_csv_round_trip(effect: str, tmp_path: Path) -> None:
     record = generate(effect, "middle", 309, rate_hz=100)

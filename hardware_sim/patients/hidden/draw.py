@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.random import Generator
 
-from hardware_sim.patients.hidden import effects, kept_back, outside
+from hardware_sim.patients.hidden import effects, kept_back, outside, outside_kept
 from hardware_sim.patients.hidden.base import Base, draw_base
 from hardware_sim.patients.hidden.kernels import Formulation, NotSuited, Stage
 from hardware_sim.patients.hidden.protocol import Protocol40, make_design
@@ -43,6 +43,12 @@ def outside_ids() -> tuple[str, ...]:
     return tuple(sorted(module.name for module in iter_modules(outside.__path__)))
 
 
+@cache
+def outside_kept_ids() -> tuple[str, ...]:
+    """More of them, which nobody who tunes a diagnosis looks at."""
+    return tuple(sorted(module.name for module in iter_modules(outside_kept.__path__)))
+
+
 def formulations(effect: str, seed: int = KEPT_BACK_FROM) -> tuple[Writer, ...]:
     """The ways an effect is written here; under seed 1000 without those kept back from development.
 
@@ -51,8 +57,9 @@ def formulations(effect: str, seed: int = KEPT_BACK_FROM) -> tuple[Writer, ...]:
     ValueError
         No effect of that name.
     """
-    if effect in outside_ids():
-        return import_module(f"{outside.__name__}.{effect}").FORMULATIONS
+    for foreign, known in ((outside, outside_ids()), (outside_kept, outside_kept_ids())):
+        if effect in known:
+            return import_module(f"{foreign.__name__}.{effect}").FORMULATIONS
     if effect not in effect_ids():
         raise ValueError(f"effect {effect!r}: one of {', '.join((*effect_ids(), *outside_ids()))}")
     written = import_module(f"{effects.__name__}.{effect}").FORMULATIONS
@@ -84,7 +91,7 @@ class Scenario:
                 one.effect: jsonable({one.formulation.magnitude: one.magnitude, **one.formulation.parameters})
                 for one in self.hidden
             },
-            "outside_library": any(one.effect in outside_ids() for one in self.hidden),
+            "outside_library": any(one.effect not in effect_ids() for one in self.hidden),
             "excess": {one.effect: jsonable(one.excess) for one in self.hidden},
             "excess_over_noise": [round(one.excess["counted_nm"] / noise_sd_nm, 3) for one in self.hidden],
             "base": jsonable(self.base.describe()),

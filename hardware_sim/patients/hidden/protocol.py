@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.random import Generator
@@ -11,6 +11,8 @@ from hardware_sim.patients.hidden.kernels import Floats
 
 PULSES_PER_S = 40
 DESIGNS = ("full", "short", "long")
+UNRECORDED = "unrecorded"
+"""Segment of a pause between two tests."""
 
 
 @dataclass(frozen=True)
@@ -31,6 +33,13 @@ class Protocol40:
     def duration_s(self) -> float:
         """Length, s."""
         return self.width_us.size / PULSES_PER_S
+
+    def then(self, pause_s: float, second: Protocol40) -> Protocol40:
+        """This test, an unrecorded pause and another test, the joint moving on as it does."""
+        pause = round(pause_s * PULSES_PER_S)
+        width_us = np.concatenate([self.width_us, np.zeros(pause), second.width_us])
+        segment = np.concatenate([self.segment, np.full(pause, UNRECORDED), second.segment])
+        return replace(self, width_us=width_us, segment=segment)
 
     def joint(self, time_s: Floats) -> tuple[Floats, Floats]:
         """Angle, rad, and velocity, rad/s; zeros where the joint is held still."""

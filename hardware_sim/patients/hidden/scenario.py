@@ -17,7 +17,15 @@ BANDS = {"weak": (2.0, 5.0), "middle": (5.0, 10.0), "strong": (10.0, 25.0)}
 """Excess error over the noise's sd."""
 
 EVERYWHERE = frozenset(
-    {"tremor", "voluntary_effort", "clonus", "gain_jumps", "delay_jitter", "loose_contact", "sensor_gain_swing"}
+    {
+        "tremor",
+        "voluntary_effort",
+        "clonus",
+        "gain_jumps",
+        "delay_jitter",
+        "loose_contact",
+        "sensor_gain_swing",
+    }
 )
 """Not predictable in held-out rows: their excess is the residual over the whole record."""
 
@@ -26,6 +34,9 @@ ADDED = frozenset({"mains_hum"})
 
 EITHER = frozenset({"threshold_drift", "fatigue", "potentiation"})
 """Can hide from the held-out rows: the larger of training and held-out residual counts."""
+
+IN_TRAINING = frozenset({"slipped_electrode"})
+"""Happens while training: what it leaves there counts, since only there it can be seen to happen."""
 
 _REPLACED = ("recruitment", "dynamics")
 
@@ -86,6 +97,8 @@ def excess_nm(effect: str, residual_nm: Floats, held_out: np.ndarray) -> dict[st
     }
     if effect in EVERYWHERE or not held_out.any():
         out["counted_nm"] = out["all_nm"]
+    elif effect in IN_TRAINING:
+        out["counted_nm"] = out["training_nm"]
     elif effect in EITHER:
         out["counted_nm"] = max(out["training_nm"], out["held_out_nm"])
     else:

@@ -1,0 +1,67 @@
+# ruff: noqa: ARG001 (every kernel takes the same four arguments)
+"""A slipped electrode: at one moment it comes away from its place, and from then on everything is weaker or later."""
+
+from __future__ import annotations
+
+from numpy.random import Generator
+
+from hardware_sim.patients.hidden.base import Base
+from hardware_sim.patients.hidden.kernels import TIME_S, Formulation, Stage, kernel
+
+MOMENTS_S = ((5.0, 12.0), (14.7, 17.7), (19.0, 25.0))
+"""Within the PRBS, between it and the ramp, within the ramp of a full test."""
+
+
+@kernel
+def _gain_step(x, p, s, c):
+    """p: size with its sign, moment s."""
+    return x * max(1.0 + p[0], 0.0) if c[TIME_S] >= p[1] else x
+
+
+@kernel
+def _threshold_step(x, p, s, c):
+    """p: size with its sign µs, moment s."""
+    return max(x - p[0], 0.0) if x > 0.0 and c[TIME_S] >= p[1] else x
+
+
+def _moment(rng: Generator) -> float:
+    return float(rng.uniform(*MOMENTS_S[int(rng.integers(len(MOMENTS_S)))]))
+
+
+def gain_step(rng: Generator, _base: Base) -> Formulation:
+    moment, sign = _moment(rng), float(rng.choice([-1.0, 1.0], p=[0.7, 0.3]))
+    return Formulation(
+        "the gain steps once",
+        "electrode slip",
+        lambda m: [Stage("gain", _gain_step, (sign * m, moment))],
+        0.7,
+        "size",
+        {"moment_s": moment, "sign": sign},
+    )
+
+
+def threshold_step(rng: Generator, _base: Base) -> Formulation:
+    moment, sign = _moment(rng), float(rng.choice([-1.0, 1.0], p=[0.3, 0.7]))
+    return Formulation(
+        "the threshold steps once",
+        "electrode slip",
+        lambda m: [Stage("electrode", _threshold_step, (sign * m, moment))],
+        90.0,
+        "size_us",
+        {"moment_s": moment, "sign": sign},
+    )
+
+
+def both_step(rng: Generator, _base: Base) -> Formulation:
+    moment, us = _moment(rng), float(rng.uniform(30.0, 90.0))
+    return Formulation(
+        "gain and threshold step once",
+        "electrode slip",
+        lambda m: [Stage("electrode", _threshold_step, (m * us, moment)), Stage("gain", _gain_step, (-m, moment))],
+        0.7,
+        "size",
+        {"moment_s": moment, "us_per_size": us},
+    )
+
+
+FORMULATIONS = (gain_step, threshold_step, both_step)

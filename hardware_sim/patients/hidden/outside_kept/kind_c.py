@@ -1,0 +1,32 @@
+"""A stimulator with a soft start: its pulse width rises (or also falls) only so quickly, whatever is asked."""
+
+from __future__ import annotations
+
+from numpy.random import Generator
+
+from hardware_sim.patients.hidden.base import Base
+from hardware_sim.patients.hidden.kernels import STEP_S, Formulation, Stage, kernel
+
+
+@kernel
+def _slewed(x, p, s, c):
+    """p: s for the largest width up and down as a share of it, largest width µs. s[0]: width in force."""
+    up = p[2] * c[STEP_S] / max(p[0], 1e-9)
+    down = p[2] * c[STEP_S] / max(p[0] * p[1], 1e-9)
+    s[0] += min(max(x - s[0], -down), up)
+    return s[0]
+
+
+def slewed(rng: Generator, base: Base) -> Formulation:
+    down = float(rng.choice([0.0, 0.5, 1.0]))
+    return Formulation(
+        "the width is slewed",
+        "soft start of clinical stimulators",
+        lambda m: [Stage("electrode", _slewed, (m, down, float(base.largest_width_us)))],
+        2.0,
+        "up_s",
+        {"down_share": down},
+    )
+
+
+FORMULATIONS = (slewed,)

@@ -1,0 +1,51 @@
+"""An amplifier that seeks its own zero: the zero follows what is read, always or while little is read."""
+
+from __future__ import annotations
+
+from numpy.random import Generator
+
+from hardware_sim.patients.hidden.base import Base
+from hardware_sim.patients.hidden.kernels import LARGEST_NM, STEP_S, Formulation, Stage, kernel
+
+
+@kernel
+def _coupled(x, p, s, c):
+    """p: rate 1/s. s[0]: zero. Coupled through a capacitor."""
+    out = x - s[0]
+    s[0] += p[0] * c[STEP_S] * out
+    return out
+
+
+@kernel
+def _tracking(x, p, s, c):
+    """p: rate 1/s, window as a share. s[0]: zero. It follows only what lies within the window."""
+    out = x - s[0]
+    window = p[1] * c[LARGEST_NM]
+    if abs(out) < window:
+        s[0] += p[0] * c[STEP_S] * out
+    return out
+
+
+def coupled(_rng: Generator, _base: Base) -> Formulation:
+    return Formulation(
+        "the zero follows the reading",
+        "high-pass coupling of a bridge amplifier",
+        lambda m: [Stage("sensor", _coupled, (m,))],
+        1.0,
+        "rate_per_s",
+    )
+
+
+def tracking(rng: Generator, _base: Base) -> Formulation:
+    window = float(rng.uniform(0.2, 0.6))
+    return Formulation(
+        "the zero follows small readings",
+        "zero tracking of weighing indicators",
+        lambda m: [Stage("sensor", _tracking, (m, window))],
+        4.0,
+        "rate_per_s",
+        {"window_share": window},
+    )
+
+
+FORMULATIONS = (coupled, tracking)

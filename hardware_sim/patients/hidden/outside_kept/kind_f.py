@@ -1,0 +1,36 @@
+# ruff: noqa: ARG001 (every kernel takes the same four arguments)
+"""A slack strap: the first torque only takes up the slack, and is read late or hardly at all."""
+
+from __future__ import annotations
+
+from numpy.random import Generator
+
+from hardware_sim.patients.hidden.base import Base
+from hardware_sim.patients.hidden.kernels import LARGEST_NM, Formulation, Stage, kernel
+
+
+@kernel
+def _dead(x, p, s, c):
+    """p: slack as a share of the largest torque."""
+    slack = p[0] * c[LARGEST_NM]
+    return max(x - slack, 0.0) if x > 0.0 else x
+
+
+@kernel
+def _toe(x, p, s, c):
+    """p: toe as a share of the largest torque: quadratic below, straight above."""
+    toe = p[0] * c[LARGEST_NM]
+    if x <= 0.0 or toe <= 0.0:
+        return x
+    return x * x / (2.0 * toe) if x < toe else x - 0.5 * toe
+
+
+def dead(_rng: Generator, _base: Base) -> Formulation:
+    return Formulation("slack", "dead zone", lambda m: [Stage("structure", _dead, (m,))], 0.6, "slack_share")
+
+
+def toe(_rng: Generator, _base: Base) -> Formulation:
+    return Formulation("toe", "toe region of webbing", lambda m: [Stage("structure", _toe, (m,))], 1.5, "toe_share")
+
+
+FORMULATIONS = (dead, toe)

@@ -1,0 +1,124 @@
+"""The same record as another recorder gives it: what changes nothing about the muscle.
+
+Each kind alone, several with `+`, or `real`, all that a clinic's recorder does at once.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.random import Generator
+
+from hardware_sim.patients.hidden.draw import rng_of
+from hardware_sim.patients.hidden.kernels import Floats
+
+KINDS = ("plain", "real", "offset", "start", "counts", "negative", "scaled", "shifted", "gap")
+COUNT_NM = 0.005
+SHIFT_S = 12345.678
+LARGEST_OFFSET_NM = {"offset": 50.0, "real": 12.0}
+CUT_S = (0.5, 3.0)
+IN_CONTRACTION_S = 0.1
+GAP_S = (0.3, 1.5)
+APART_S = 1.0
+"""Between gaps, and between a gap and the record's ends."""
+
+
+def _start(record: dict[str, Any], rng: Generator) -> int:
+    """A row 0.5 to 3 s past the beginning of the PRBS, the muscle stimulated there and 0.1 s before."""
+    in_prbs = np.flatnonzero(record["segment"] == "prbs")
+    if not in_prbs.size:
+        raise ValueError("the record has no prbs segment to begin in")
+    time_s, width_us = record["time_s"], record["pulse_width_us"]
+    since_s = time_s[in_prbs] - time_s[in_prbs[0]]
+    rows = in_prbs[(since_s >= CUT_S[0]) & (since_s <= CUT_S[1])]
+    before = np.searchsorted(time_s, time_s[rows] - IN_CONTRACTION_S)
+    return int(rng.choice(rows[(width_us[rows] > 0.0) & (width_us[before] > 0.0)]))
+
+
+def _gaps(record: dict[str, Any], rng: Generator) -> tuple[list[list[float]], np.ndarray]:
+    """Two gaps outside `validate`, as begin and length in s, and the rows that remain."""
+    time_s = record["time_s"]
+    kept = np.ones(time_s.size, bool)
+    held_out = record["segment"] == "validate"
+    found: list[list[float]] = []
+    for _ in range(1000):
+        length_s = float(rng.uniform(*GAP_S))
+        begin_s = float(rng.uniform(time_s[0] + APART_S, time_s[-1] - APART_S - length_s))
+        missing = (time_s >= begin_s) & (time_s < begin_s + length_s)
+        alone = all(abs(begin_s - other) > GAP_S[1] + APART_S for other, _ in found)
+        if alone and not held_out[missing].any():
+            kept &= ~missing
+            found.append([begin_s, length_s])
+        if len(found) == 2:
+            return sorted(found), kept
+    raise ValueError("the record has no room for two gaps outside validate")
+
+
+def _taken(record: dict[str, Any], rows: Any) -> dict[str, Any]:
+    """Some rows of every column."""
+    return {name: column[rows] for name, column in record.items()}
+
+
+def recorded(made: dict[str, Any], kind: str, seed: int) -> dict[str, Any]:
+    """The record `made` as another recorder gives it.
+
+    Joint angle and velocity lose the rows that torque loses, and keep their values: only the load cell is turned
+    round, shifted or scaled.
+
+    Parameters
+    ----------
+    made
+        From `hardware_sim.hidden_records.generate`; it is not changed.
+    kind
+        `plain`: as it is. `offset`: a zero within ±50 N·m. `start`: it begins 0.5 to 3 s into the PRBS, within a
+        contraction, its time there 0. `counts`: torque in steps of 5 mN·m. `negative`: torque with the other sign.
+        `scaled`: torque × 0.1 for even seeds, × 10 for odd. `shifted`: time + 12345.678 s. `gap`: 0.3 to 1.5 s
+        missing twice, outside `validate`. `real`: start, counts, an offset within ±12 N·m, and negative for odd
+        seeds. Several with `+`.
+    seed
+        Settles, with what is hidden, all that is drawn.
+
+    Returns
+    -------
+    dict
+        The columns, the same `truth`, and `recorder`: `kind`, `scale` (of torque, with its sign), `offset_nm`,
+        `cut_s`, `gaps_s`.
+
+    Raises
+    ------
+    ValueError
+        No such kind; a record in which there is no room for it.
+    """
+    kinds = kind.split("+")
+    for name in kinds:
+        if name not in KINDS:
+            raise ValueError(f"recorder {name!r}: one of {', '.join(KINDS)}")
+    truth = made["truth"]
+    rng = {name: rng_of(seed, "recorder", name, *truth["effects"], truth["strength"]) for name in KINDS}
+    all_of = {"start", "counts", "offset", *(["negative"] if seed % 2 else [])} if "real" in kinds else set()
+    asked = {*kinds} | all_of
+
+    record = {name: column.copy() for name, column in made.items() if isinstance(column, np.ndarray)}
+    told: dict[str, Any] = {"kind": kind, "scale": 1.0, "offset_nm": 0.0, "cut_s": 0.0, "gaps_s": []}
+    if "start" in asked:
+        first = _start(record, rng["start"])
+        told["cut_s"] = float(record["time_s"][first] - record["time_s"][0])
+        record = _taken(record, slice(first, None))
+        record["time_s"] = record["time_s"] - record["time_s"][0]
+    if "gap" in asked:
+        told["gaps_s"], kept = _gaps(record, rng["gap"])
+        record = _taken(record, kept)
+    if "shifted" in asked:
+        record["time_s"] = record["time_s"] + SHIFT_S
+    if "scaled" in asked:
+        told["scale"] = 10.0 if seed % 2 else 0.1
+    if "negative" in asked:
+        told["scale"] = -told["scale"]
+    if "offset" in asked:
+        largest = LARGEST_OFFSET_NM["offset" if "offset" in kinds else "real"]
+        told["offset_nm"] = float(rng["offset"].uniform(-largest, largest))
+    torque: Floats = record["torque_nm"] * told["scale"] + told["offset_nm"]
+    if "counts" in asked:
+        torque = np.round(torque / COUNT_NM) * COUNT_NM
+    return {**record, "torque_nm": torque, "truth": truth, "recorder": told}
