@@ -235,7 +235,7 @@ def setup_of(solution: Solution) -> Setup:
     sign = 1.0 if curve[np.argmax(np.abs(curve))] >= 0 else -1.0
     zero = float(solution.coefficients[size])
     target = sign * (grid.torque_nm - zero)
-    smooth = np.convolve(np.where(np.isfinite(target), target, 0.0), np.ones(3) / 3, "same")
+    smooth = np.convolve(np.where(problem.rows, target, 0.0), np.ones(3) / 3, "same")
     scale = float(np.percentile(np.abs(smooth[problem.rows]), 99.5))
     return Setup(
         grid=grid,

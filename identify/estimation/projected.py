@@ -35,8 +35,8 @@ ROUNDING = 2e-5
 """Share of the torque's range below which a residual is not noise."""
 EXTRAS = 3
 """Linear columns that aren't recruitment: baseline, initial torque, its rate."""
-INITIAL_RIDGE = 1e-5
-"""Of the initial torque: a state as large as the record's torque costs what noise of 0.3 % of it does."""
+INITIAL_RIDGE = 1e-8
+"""Of the initial torque: enough for a state that no row sees to stay at rest, too little to be felt by any other."""
 RATE_S = 0.1
 """Initial rate times this counts as a torque."""
 CURVE_POINTS = 201

@@ -79,7 +79,7 @@ class Problem:
         self.baselines = range(3, 3 + parts)
         self.initials = range(3 + parts, 3 + 3 * parts)
         self.coefficients = slice(len(table), len(table) + setup.basis.size)
-        table += [Parameter(f"recruitment_{i}_nm", "N·m", -span, span) for i in range(setup.basis.size)]
+        table += [Parameter(f"recruitment_{i}_nm", "N·m", -np.inf, np.inf) for i in range(setup.basis.size)]
         self.chosen: list[Chosen] = []
         for effect, form in effects:
             own = tuple(p.on(setup.scene) for p in form.parameters)
@@ -113,15 +113,17 @@ class Problem:
     @cached_property
     def prior(self) -> tuple[np.ndarray, np.ndarray]:
         """Mean of the parameters' prior and its precision matrix."""
-        mean = 0.5 * (self.lower + self.upper)
-        sd = np.maximum((self.upper - self.lower) / 3.0, 1e-9)
+        inside = np.isfinite(self.lower) & np.isfinite(self.upper)
+        mean = np.zeros(self.size)
+        mean[inside] = 0.5 * (self.lower[inside] + self.upper[inside])
+        sd = np.ones(self.size)
+        sd[inside] = np.maximum((self.upper[inside] - self.lower[inside]) / 3.0, 1e-9)
         mean[:2], sd[:2] = [np.log(0.2), 0.0], [1.2, 0.8]
         sd[2] = max((self.upper[2] - self.lower[2]) / 2.0, 1e-5)
         scale = self.setup.scale_nm
         sd[list(self.baselines)] = 0.5 * scale
         sd[list(self.initials)] = np.tile([scale, 5.0 * scale], len(self.baselines))
         precision = np.diag(1.0 / sd**2)
-        mean[self.coefficients] = 0.0
         precision[self.coefficients, self.coefficients] = self.setup.penalty
         return mean, precision
 
@@ -211,9 +213,11 @@ class _Walk:
         ends = setup.scene_at_ends
         for chosen in self.forms("filter"):
             rows, values = self.join(chosen.places)
+            delay = delay[rows]
             torque, rate = chosen.form.call((torque[rows], rate[rows]), self.named(chosen, values), ends)
         for chosen in self.forms("output"):
             rows, values = self.join(chosen.places)
+            delay = delay[rows]
             torque, rate = self.bend(chosen, torque[rows], rate[rows], values)
         return torque, rate, delay
 
