@@ -352,13 +352,13 @@ class _Walk:
         return value
 
     def sense(self, value: np.ndarray, scene=None) -> np.ndarray:
-        acting, setup = self.forms("sensor"), self.setup
-        if not acting:
-            return value
-        value = setup.unframed(value)  # the sensor knows nothing of the muscle's direction
-        for chosen in acting:
+        """What the sensor makes of the torque; it knows nothing of the muscle's zero and direction."""
+        for chosen in self.forms("sensor"):
             rows, values = self.join(chosen.places)
             value = value[rows]
-            if scene is not None or not chosen.form.settled:  # the target no longer holds what is settled
-                value = np.asarray(chosen.form.call(value, self.named(chosen, values), scene or setup.scene))
-        return setup.framed(value)
+            if scene is None and chosen.form.settled:  # the target no longer holds it
+                continue
+            seen = self.setup.unframed(value)
+            shown = np.asarray(chosen.form.call(seen, self.named(chosen, values), scene or self.setup.scene))
+            value = np.where(shown == seen, value, self.setup.framed(shown))
+        return value

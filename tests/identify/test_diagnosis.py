@@ -68,7 +68,7 @@ def test_held_out_rows_are_only_reported():
 
 def test_without_validate_the_held_out_error_is_cross_validated():
     result = diagnose(hidden_muscles.record("fatigue", seed=51, rate_hz=100, validate=False))
-    assert result["base"]["held_out"] == "blocked cross-validation"
+    assert result["base"]["held_out_by"] == "cross-validation"
     first = result["missing"][0]
     assert first["effect"] == "fatigue" and first["held_out_rms_after_nm"] < first["held_out_rms_before_nm"]
 

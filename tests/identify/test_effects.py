@@ -7,11 +7,11 @@ import json
 import numpy as np
 import pytest
 
+from identify import fit
 from identify.effects import get, library, registry
 from identify.effects.base import STAGES
 from identify.errors import BadRequest, NotIdentifiable
-from identify.estimation.prepare import first_setup, inspect
-from identify.estimation.with_effects import fit_candidate, fit_with_effects, to_model
+from identify.estimation.prepare import plain, prepare
 from identify.model import Model
 from identify.records.record import Record
 from identify.simulation.problem import Problem
@@ -57,11 +57,12 @@ def moving() -> Record:
 
 @pytest.fixture(scope="module")
 def setup(moving):
-    return first_setup(moving, inspect(moving))
+    grid = prepare(moving)
+    return plain(grid, grid.fitted).problem.setup
 
 
 def _theta(problem: Problem) -> np.ndarray:
-    values = [0.2, 0.9, 0.001, 0.05, *np.linspace(0.0, 6.0, problem.setup.basis.size)]
+    values = [0.2, 0.9, 0.001, 0.05, 0.0, 0.0, *np.linspace(0.0, 6.0, problem.setup.basis.size)]
     return problem.from_physical(np.array(values + [p.neutral for c in problem.chosen for p in c.parameters]))
 
 
@@ -107,8 +108,7 @@ def test_a_form_changes_something_and_stays_finite_at_its_starts(setup, effect, 
 
 
 def test_effects_compose_fit_predict_and_serialise(moving):
-    fitted = fit_candidate(moving, ["fatigue", "torque_angle:parabola", "baseline_drift:linear"])
-    model = to_model(fitted, moving)
+    model = fit(moving, effects=["fatigue", "torque_angle:parabola", "baseline_drift:linear"])
     again = Model.from_json(model.to_json())
     assert [e["id"] for e in again.effects] == ["fatigue", "torque_angle", "baseline_drift"]
     np.testing.assert_allclose(again.predict(moving), model.predict(moving), atol=1e-9)
@@ -119,16 +119,16 @@ def test_effects_compose_fit_predict_and_serialise(moving):
 def test_parameters_are_found_within_their_uncertainty():
     """Drift of 0.9 µs/s and of 0.03 N·m/s, put in by hand: found within three standard deviations."""
     for hidden, name, truth in (("threshold_drift", "slope_us_per_s", 0.9), ("baseline_drift", "slope_nm_per_s", 0.03)):
-        fit = fit_with_effects(hidden_muscles.record(hidden, seed=5), [f"{hidden}:linear"])
-        found = fit.effects[0]["parameters"][name]
+        model = fit(hidden_muscles.record(hidden, seed=5), effects=[f"{hidden}:linear"])
+        found = model.effects[0]["parameters"][name]
         assert abs(found["value"] - truth) < 3.5 * found["sd"] + 0.02 * truth
         assert found["sd"] < 0.2 * truth
 
 
 def test_what_cannot_be_had_is_said(moving):
     with pytest.raises(BadRequest, match="Known"):
-        fit_with_effects(moving, ["witchcraft"])
+        fit(moving, effects=["witchcraft"])
     with pytest.raises(BadRequest, match="no form"):
-        fit_with_effects(moving, ["fatigue:nonsense"])
+        fit(moving, effects=["fatigue:nonsense"])
     with pytest.raises(NotIdentifiable, match="angle_rad"):
-        fit_with_effects(hidden_muscles.record(rate_hz=100), ["torque_angle"])
+        fit(hidden_muscles.record(rate_hz=100), effects=["torque_angle"])

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+import identify
 from identify.effects import get
-from identify.estimation.prepare import first_setup, inspect
-from identify.estimation.to_model import predict_fitted
-from identify.estimation.with_effects import fit_candidate, fit_with_effects
+from identify.estimation.adding import with_effects
+from identify.estimation.prepare import plain, prepare
+from identify.estimation.tremor import predict_fitted
 from identify.noise.level import NoiseLevel, band_part, profile, whitened
 from identify.noise.slow_and_white import whiten_rows
 from identify.records.record import Record
@@ -64,15 +65,16 @@ def test_noise_is_found_again():
 )
 def test_derivatives_are_those_of_central_differences(names):
     record = hidden_muscles.record(seed=2, rate_hz=100)
-    setup = first_setup(record, inspect(record))
+    grid = prepare(record)
+    setup = plain(grid, grid.fitted).problem.setup
     problem = Problem(setup, [(n.split(":")[0], get(n.split(":")[0]).form(n.split(":")[1])) for n in names])
-    values = np.r_[[0.2, 0.8, 0.001, 0.1], np.linspace(0, 6, setup.basis.size)]
+    values = np.r_[[0.2, 0.8, 0.001, 0.1, 0.5, 0.2], np.linspace(0, 6, setup.basis.size)]
     starts = [p.start[0] for c in problem.chosen for p in c.parameters]
     theta = problem.from_physical(np.r_[values, starts])
     _, slopes = problem.run(theta, derivatives=True)
     assert slopes is not None
-    for place in [0, 1, 2, 3, 12, *range(problem.coefficients.stop, problem.size)]:
-        step = 2e-5 * (1.0 if problem.log[place] else max(problem.upper[place] - problem.lower[place], 1e-3))
+    for place in [0, 1, 2, 3, 4, 5, 12, *range(problem.coefficients.stop, problem.size)]:
+        step = 2e-5 * (1.0 if problem.log[place] else min(max(problem.upper[place] - problem.lower[place], 1e-3), 100.0))
         ahead, back = theta.copy(), theta.copy()
         ahead[place] += step
         back[place] -= step
@@ -84,19 +86,19 @@ def test_derivatives_are_those_of_central_differences(names):
 def test_a_model_meets_a_muscle_integrated_apart():
     """Without noise the base meets a Runge-Kutta muscle of two lags to a few thousandths of its range."""
     record = hidden_muscles.record(seed=4, noise_nm=1e-4)
-    error = predict_fitted(fit_candidate(record, []), record) - record.torque_nm
+    error = predict_fitted(with_effects(record, [])) - record.torque_nm
     assert np.sqrt(np.mean(error[record.held_out] ** 2)) < 0.012
 
 
 def test_held_out_rows_change_nothing_of_a_fit():
     record = hidden_muscles.record("fatigue", seed=6, rate_hz=100)
     spoilt = record.with_torque(np.where(record.held_out, 50.0 * np.sin(record.time_s * 9.0), record.torque_nm))
-    one, two = fit_candidate(record, ["fatigue", "mains_hum"]), fit_candidate(spoilt, ["fatigue", "mains_hum"])
+    one, two = with_effects(record, ["fatigue", "mains_hum"]), with_effects(spoilt, ["fatigue", "mains_hum"])
     np.testing.assert_array_equal(one.theta, two.theta)
 
 
 def test_warming_up_touches_every_compiled_part():
-    from identify.estimation.with_effects import warm
+    from identify.diagnosis.warm_up import warm
 
     warm()
 
@@ -108,6 +110,6 @@ def test_an_effect_asked_for_gets_the_form_that_the_diagnosis_would_give():
     made = generate(("series_compliance",), "strong", 81)
     assert made["truth"]["formulation"] == ["mass on a spring that stiffens"]
     record = Record.from_arrays(made["time_s"], made["pulse_width_us"], made["torque_nm"], made["segment"])
-    model = fit_with_effects(record, ["series_compliance"])
+    model = identify.fit(record, effects=["series_compliance"])
     assert model.effects[0]["form"] == "toe"
     assert model.fit["held_out_rms_nm"] < 1.3 * made["truth"]["noise"]["sd_nm"]
