@@ -97,7 +97,7 @@ def one(job: tuple[str, str, int, dict[str, Any]]) -> dict[str, Any] | None:
         "after": after,
         "noise": noise,
         "noise made": made["truth"]["noise"]["sd_nm"] * abs(made["recorder"]["scale"]),
-        "error over noise after": after / noise if result["base"]["held_out"] and noise > 0.0 else None,
+        "error over noise after": after / noise if noise > 0.0 else None,
         "explained": result["explained"],
         "structure": result["structure_left"],
         "structure said": _structure_said(result),
