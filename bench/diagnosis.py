@@ -63,8 +63,8 @@ def one(job: tuple[str, str, int, dict[str, Any]]) -> dict[str, Any] | None:
         return None
     began, cpu = time.perf_counter(), time.process_time()
     result = diagnose(as_record(made))
-    first = result["missing"][0] if result["missing"] else None
-    noise = result["noise_sd_nm"]
+    first = result.missing[0] if result.missing else None
+    noise = result.noise_sd_nm
     return {
         "effect": effect,
         "strength": strength,
@@ -72,16 +72,16 @@ def one(job: tuple[str, str, int, dict[str, Any]]) -> dict[str, Any] | None:
         "options": options,
         "truth": made["truth"]["effects"],
         "formulation": made["truth"]["formulation"],
-        "verdict": result["verdict"],
-        "named": [entry["effect"] for entry in result["missing"]],
-        "probability": first["probability"] if first else result["probability"],
+        "verdict": result.verdict,
+        "named": [entry["effect"] for entry in result.missing],
+        "probability": first["probability"] if first else result.probability,
         "group": [first["effect"], *first["confused_with"]] if first else [],
-        "before": result["base"]["held_out_rms_nm"],
-        "after": result["with_all"]["held_out_rms_nm"],
+        "before": result.base["held_out_rms_nm"],
+        "after": result.with_all["held_out_rms_nm"],
         "noise": noise,
-        "explained": result["explained"],
-        "structure": result["structure_left"],
-        "gains": [(c["effect"], c["form"], c["log_evidence_gain"]) for c in result["candidates"][0][:4]],
+        "explained": result.explained,
+        "structure": result.structure_left,
+        "gains": [(c["effect"], c["form"], c["log_evidence_gain"]) for c in result.candidates[0][:4]],
         "seconds": time.perf_counter() - began,
         "cpu_seconds": time.process_time() - cpu,
     }

@@ -104,7 +104,7 @@ class Comparison(_Result):
             "excess_rms_nm": self.excess_rms_nm,
             "samples": self.samples,
         }
-        alarms = [GOES_WITH.get(test["with"], test["with"]) for test in self.tests["tests"] if not test["passed"]]
+        alarms = [GOES_WITH.get(test["with"], str(test["with"])) for test in self.tests["tests"] if not test["passed"]]
         rows = [
             ("all rows", _figures(whole)),
             ("fitted rows", _figures(self.fitted)),
