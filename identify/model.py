@@ -296,7 +296,7 @@ def _words(model: Model) -> Sheet:
         ("dynamics", _dynamics(model.linear)),
         ("recruitment", f"{quantity(float(torque_nm[top]), 'N·m')} at most, at {quantity(float(width_us[top]), 'µs')}"),
         ("baseline", quantity(model.baseline_nm, "N·m")),
-        *[(str(effect["id"]), _parameters(effect["parameters"])) for effect in model.effects],
+        *[(str(effect["id"]), _parameters(effect.get("parameters", {}))) for effect in model.effects],
     ]
     if "pulse_width_us" in known and "pulse_rate_hz" in known:
         widths, rates = _span(known["pulse_width_us"], "µs"), _span(known["pulse_rate_hz"], "pulses/s")
