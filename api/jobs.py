@@ -56,7 +56,7 @@ def comparison(data: str, progress: Progress, model_json: str) -> dict[str, Any]
     record = identify.read(Path(data))
     model = identify.Model.from_json(model_json)
     progress(0.4, "comparing")
-    return thinned(clean(dict(identify.compare(model, record))))
+    return thinned(identify.compare(model, record).to_dict())
 
 
 def thinned(found: dict[str, Any]) -> dict[str, Any]:

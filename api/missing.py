@@ -5,7 +5,6 @@ Imported by the worker and the command line only.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -25,7 +24,7 @@ def diagnosis(data: str, progress: Progress) -> dict[str, Any]:
     import identify
 
     record = identify.read(Path(data))
-    found = dict(identify.diagnose(record, progress=lambda share, text="": progress(0.8 * share, text)))
+    found = identify.diagnose(record, progress=lambda share, text="": progress(0.8 * share, text)).to_dict()
     found["library"] = {entry["id"]: entry for entry in library() if entry["id"] in mentioned(found)}
     progress(0.82, "what each effect would explain")
     found["signatures"] = signatures(record, [entry["effect"] for entry in found["missing"]])
@@ -96,9 +95,7 @@ def improve(data: str, progress: Progress, force: Sequence[str] = ()) -> dict[st
     import identify
 
     record = identify.read(Path(data))
-    found = dict(identify.improve(record, progress=progress, force=tuple(force)))
-    models = [json.loads(model.to_json()) if hasattr(model, "to_json") else model for model in found["models"]]
-    return clean({**found, "models": models})
+    return identify.improve(record, progress=progress, force=tuple(force)).to_dict()
 
 
 def joined(parts: Sequence[str], out: str, progress: Progress) -> dict[str, Any]:

@@ -5,13 +5,13 @@ from api.notebook import compare, diagnose, fit, improve, plot, read
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from identify import compare, diagnose, fit, improve, predict, read
+from identify import Improvement, Model, compare, diagnose, fit, improve, predict, read
 
 if TYPE_CHECKING:
     from api.local_figure import LocalFigure
-    from identify import Model, Record
+    from identify import Record
 
 __all__ = ["compare", "diagnose", "fit", "improve", "plot", "predict", "read"]
 
@@ -19,12 +19,12 @@ MEASURED, MODEL, STIMULUS = "#a9b4be", "#0b6b75", "#b4690e"
 POINTS = 4000
 
 
-def plot(what: Model | dict[str, Any], record: Record | None = None) -> LocalFigure:
+def plot(what: Model | Improvement, record: Record | None = None) -> LocalFigure:
     """Draw a model beside its measurement, or how the error fell.
 
     Parameters
     ----------
-    what : Model or dict
+    what : Model or Improvement
         A model; or what `improve` found.
     record : Record, optional
         The measurement; needed with a model.
@@ -39,14 +39,14 @@ def plot(what: Model | dict[str, Any], record: Record | None = None) -> LocalFig
     TypeError
         Neither a model with a record, nor what `improve` found.
     """
-    if isinstance(what, dict) and "steps" in what:
+    if isinstance(what, Improvement):
         return _errors(what)
-    if record is None or not hasattr(what, "to_dict"):
+    if record is None or not isinstance(what, Model):
         raise TypeError("plot(model, record), or plot(improve(record))")
     return _comparison(what, record)
 
 
-def _comparison(model: Any, record: Record) -> LocalFigure:
+def _comparison(model: Model, record: Record) -> LocalFigure:
     import numpy as np
     from plotly.subplots import make_subplots
 
@@ -54,7 +54,7 @@ def _comparison(model: Any, record: Record) -> LocalFigure:
 
     pick = slice(None, None, max(1, -(-record.time_s.size // POINTS)))
     predicted, time_s = np.asarray(predict(model, record))[pick], record.time_s[pick]
-    torque, curve = record.torque_nm[pick], model.to_dict()["recruitment"]
+    torque, (width_us, torque_nm) = record.torque_nm[pick], model.recruitment.table()
     grid = [[{}, {"rowspan": 3}], [{}, None], [{}, None]]
     figure = make_subplots(
         3, 2, specs=grid, shared_xaxes=True, column_widths=[0.68, 0.32], row_heights=[0.5, 0.25, 0.25]
@@ -66,7 +66,7 @@ def _comparison(model: Any, record: Record) -> LocalFigure:
     ]  # fmt: skip
     for row, values, name, colour in rows:
         figure.add_scatter(x=time_s, y=values, name=name, line_color=colour, row=row, col=1)
-    figure.add_scatter(x=curve["pulse_width_us"], y=curve["torque_nm"], name="f", line_color=MODEL, row=1, col=2)
+    figure.add_scatter(x=width_us, y=torque_nm, name="f", line_color=MODEL, row=1, col=2)
     for row, title in enumerate(("Torque (N·m)", "Residual (N·m)", "Pulse width (µs)"), start=1):
         figure.update_yaxes(title_text=title, row=row, col=1)
     figure.update_xaxes(title_text="Time (s)", row=3, col=1)
@@ -75,15 +75,15 @@ def _comparison(model: Any, record: Record) -> LocalFigure:
     return LocalFigure(figure.update_layout(template="plotly_white", height=600, showlegend=False))
 
 
-def _errors(found: dict[str, Any]) -> LocalFigure:
+def _errors(found: Improvement) -> LocalFigure:
     from api.local_figure import LocalFigure
 
-    names = [step["added"] or "base model" for step in found["steps"]]
+    names = [step["added"] or "base model" for step in found.steps]
     figure = LocalFigure()
     for key, name, colour in (("rms_nm", "fitted rows", MEASURED), ("held_out_rms_nm", "held out", MODEL)):
-        values = [step[key] for step in found["steps"]]
+        values = [step[key] for step in found.steps]
         figure.add_scatter(x=names, y=values, name=name, mode="lines+markers", line_color=colour)
-    figure.add_hline(found["noise_sd_nm"], line_dash="dash", line_color=STIMULUS, annotation_text="noise")
+    figure.add_hline(found.noise_sd_nm, line_dash="dash", line_color=STIMULUS, annotation_text="noise")
     figure.update_xaxes(title_text="Effect added", type="category")
     figure.update_yaxes(title_text="RMS error (N·m)", rangemode="tozero")
     figure.update_layout(template="plotly_white", height=420)

@@ -78,8 +78,8 @@ def one(job: tuple[str, str, int, dict[str, Any]]) -> dict[str, Any] | None:
         return None
     began, cpu = time.perf_counter(), time.process_time()
     result = diagnose(as_record(made))
-    first = result["missing"][0] if result["missing"] else None
-    noise, after = result["noise_sd_nm"], result["with_all"]["held_out_rms_nm"]
+    first = result.missing[0] if result.missing else None
+    noise, after = result.noise_sd_nm, result.with_all["held_out_rms_nm"]
     return {
         "effect": effect,
         "strength": strength,
@@ -88,20 +88,20 @@ def one(job: tuple[str, str, int, dict[str, Any]]) -> dict[str, Any] | None:
         "recorder": made["recorder"] | {"kind": recorder},
         "truth": made["truth"]["effects"],
         "formulation": made["truth"]["formulation"],
-        "verdict": result["verdict"],
-        "named": [entry["effect"] for entry in result["missing"]],
-        "probability": first["probability"] if first else result["probability"],
-        "probabilities": [entry["probability"] for entry in result["missing"]],
+        "verdict": result.verdict,
+        "named": [entry["effect"] for entry in result.missing],
+        "probability": first["probability"] if first else result.probability,
+        "probabilities": [entry["probability"] for entry in result.missing],
         "group": [first["effect"], *first["confused_with"]] if first else [],
-        "before": result["base"]["held_out_rms_nm"],
+        "before": result.base["held_out_rms_nm"],
         "after": after,
         "noise": noise,
         "noise made": made["truth"]["noise"]["sd_nm"] * abs(made["recorder"]["scale"]),
         "error over noise after": after / noise if noise > 0.0 else None,
-        "explained": result["explained"],
-        "structure": result["structure_left"],
-        "structure said": _structure_said(result),
-        "gains": [(c["effect"], c["form"], c["log_evidence_gain"]) for c in result["candidates"][0][:4]],
+        "explained": result.explained,
+        "structure": result.structure_left,
+        "structure said": _structure_said(result.to_dict()),
+        "gains": [(c["effect"], c["form"], c["log_evidence_gain"]) for c in result.candidates[0][:4]],
         "seconds": time.perf_counter() - began,
         "cpu_seconds": time.process_time() - cpu,
     }

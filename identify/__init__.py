@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from identify.model import Model
     from identify.records.read import read
     from identify.records.record import Record
+    from identify.results import Comparison, Diagnosis, Improvement
     from identify.simulation.predict import predict
 
 _PLACES = {
@@ -32,6 +33,9 @@ _PLACES = {
     "fit": "identify.fitting",
     "predict": "identify.simulation.predict",
     "Model": "identify.model",
+    "Comparison": "identify.results",
+    "Diagnosis": "identify.results",
+    "Improvement": "identify.results",
     "compare": "identify.criticism",
     "diagnose": "identify.diagnosis",
     "improve": "identify.diagnosis.improvement",
@@ -49,7 +53,10 @@ __all__ = [
     "BadRecord",
     "BadRequest",
     "Cancelled",
+    "Comparison",
+    "Diagnosis",
     "IdentifyError",
+    "Improvement",
     "Model",
     "NotIdentifiable",
     "Record",

@@ -11,7 +11,9 @@ import numpy as np
 from identify import model_shape
 from identify.dynamics.linear import Discrete, Linear, SecondOrder, linear_from_dict
 from identify.errors import BadModel
+from identify.plain_json import plain
 from identify.recruitment.curve import Curve, basis_from_dict
+from identify.shown import Sheet, Shown, fit_words, quantity
 from identify.strict_json import BadJson, parse
 
 if TYPE_CHECKING:
@@ -69,8 +71,8 @@ class Covariance:
         return float(np.sqrt(max(self.matrix[place, place], 0.0)))
 
 
-@dataclass(frozen=True)
-class Model:
+@dataclass(frozen=True, repr=False)
+class Model(Shown):
     """A Hammerstein model, with effects around it or without.
 
     Parameters
@@ -128,6 +130,9 @@ class Model:
 
         return predict(self, record)
 
+    def _sheet(self) -> Sheet:
+        return _words(self)
+
     def to_dict(self) -> dict[str, Any]:
         """MODEL.json as a dict of plain lists and numbers."""
         width, torque = self.recruitment.table()
@@ -135,7 +140,7 @@ class Model:
         rate = self.sample_rate_hz if isinstance(self.linear, SecondOrder) else 1.0 / self.linear.step_s
         b, a, delay = self.linear.discrete(rate)
         covariance = self.covariance
-        return _plain(
+        return plain(
             {
                 "schema_version": SCHEMA_VERSION,
                 "model_id": self.model_id,
@@ -279,21 +284,55 @@ def _line(error: Exception) -> str:
     return " ".join(f"{type(error).__name__} {error}".split())[:100]
 
 
-def _plain(value: Any) -> Any:
-    """Arrays and numpy numbers as lists and numbers; what is not finite as null, which JSON can hold."""
-    if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    if isinstance(value, (bool, np.bool_)):
-        return bool(value)
-    if isinstance(value, (int, np.integer)):
-        return int(value)
-    if isinstance(value, (float, np.floating)):
-        return float(value) if np.isfinite(value) else None
-    return value
+def _words(model: Model) -> Sheet:
+    fit, known = model.fit, model.valid_for
+    named = ", ".join(str(effect["id"]) for effect in model.effects) or "no effects"
+    width_us, torque_nm = model.recruitment.table()
+    top = int(np.argmax(np.abs(torque_nm)))
+    rows = [
+        ("fit", fit_words(fit)),
+        ("held out", fit_words(fit, "held_out_")),
+        ("noise", f"{quantity(model.noise.white_sd_nm, 'N·m')} white, sd of a sample"),
+        ("dynamics", _dynamics(model.linear)),
+        ("recruitment", f"{quantity(float(torque_nm[top]), 'N·m')} at most, at {quantity(float(width_us[top]), 'µs')}"),
+        ("baseline", quantity(model.baseline_nm, "N·m")),
+        *[(str(effect["id"]), _parameters(effect.get("parameters", {}))) for effect in model.effects],
+    ]
+    if "pulse_width_us" in known and "pulse_rate_hz" in known:
+        widths, rates = _span(known["pulse_width_us"], "µs"), _span(known["pulse_rate_hz"], "pulses/s")
+        rows.append(("valid for", f"{widths}, {rates}"))
+    if model.quality:
+        first = model.quality.get("reasons", [])[:1]
+        rows.append(("quality", ": ".join([str(model.quality.get("verdict", "")), *first])))
+    rows.append(("made", f"{model.created} from {model.data.get('name') or 'a record without a name'}"))
+    figures = f"fit {quantity(fit.get('fit_percent'), '%')}, held out {quantity(fit.get('held_out_fit_percent'), '%')}"
+    return Sheet(f"Model {model.model_id[:8]}, {model.method}, {named}: {figures}", tuple(rows))
+
+
+def _dynamics(linear: Linear) -> str:
+    if isinstance(linear, SecondOrder):
+        return (
+            f"time constant {quantity(linear.time_constant_s, 's')}, damping {quantity(linear.damping, '1')}, "
+            f"delay {quantity(1e3 * linear.delay_s, 'ms')}"
+        )
+    step = quantity(1e3 * linear.step_s, "ms")
+    return f"order {len(linear.a) - 1} in steps of {step}, delay {quantity(linear.delay_samples, 'steps')}"
+
+
+def _parameters(values: dict[str, Any], most: int = 4) -> str:
+    parts = []
+    for name, entry in list(values.items())[:most]:
+        entry = entry if isinstance(entry, dict) else {"value": entry}
+        spread = "" if entry.get("sd") is None else f" ± {quantity(entry['sd'], '')}"
+        unit = str(entry.get("unit") or "1")
+        parts.append(f"{name} {quantity(entry.get('value'), '')}{spread}" + ("" if unit == "1" else f" {unit}"))
+    more = len(values) - most
+    return ", ".join([*parts, *([f"{more} parameters more"] if more > 0 else [])])
+
+
+def _span(value: Any, unit: str) -> str:
+    low, high = value if isinstance(value, list | tuple) else (value, value)
+    return f"{quantity(low, '')} to {quantity(high, unit)}"
 
 
 __all__ = ["SCHEMA_VERSION", "Covariance", "Discrete", "Model", "Noise", "SecondOrder"]

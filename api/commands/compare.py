@@ -28,7 +28,7 @@ def compare(
 
     model = load_model(model_json)
     record = identify.read(data)
-    found = clean(dict(identify.compare(model, record)))
+    found = identify.compare(model, record).to_dict()
     if html is not None:
         drawn = clean(curves(model, record))
         write(html, comparison_html(model.to_dict(), drawn, data.name, comparison=thinned(found)))

@@ -25,7 +25,7 @@ def diagnose(data: Data, as_json: Json = False) -> None:
     import identify
 
     record = identify.read(data)
-    found = identify.diagnose(record, progress=progress_line())
+    found = identify.diagnose(record, progress=progress_line()).to_dict()
     if as_json:
         say_json(found)
         return

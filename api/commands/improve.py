@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -24,15 +25,15 @@ def improve(
 ) -> None:
     """Add effects one by one while the held-out error falls; each step is a model."""
     import identify
-    from api.jobs import clean
 
     record = identify.read(data)
-    found = dict(identify.improve(record, progress=progress_line()))
-    models = found.pop("models")
+    improved = identify.improve(record, progress=progress_line())
+    found, models = improved.to_dict(), improved.models
+    del found["models"]
     if output is not None:
-        write(output, json.dumps(clean(models[-1]), indent=1))
+        write(output, json.dumps(models[-1].to_dict(), indent=1))
     if html is not None:
-        write(html, report(record, clean(found), models, data))
+        write(html, report(record, found, models, data))
     if as_json:
         say_json(found)
         return
@@ -40,17 +41,16 @@ def improve(
     say(*[f"written to {path}" for path in (output, html) if path is not None])
 
 
-def report(record: Any, found: dict[str, Any], models: list[Any], data: Path) -> str:
+def report(record: Any, found: dict[str, Any], models: Sequence[Any], data: Path) -> str:
     """The report: what was found, what each effect is, what is left before and after."""
     import numpy as np
 
     import identify
-    from api.jobs import clean, runs, thinned
+    from api.jobs import runs, thinned
     from api.missing import diagnosis
     from api.report import improvement_html
 
-    ends = [identify.Model.from_json(json.dumps(clean(model))) for model in (models[0], models[-1])]
-    before, after = (thinned(clean(dict(identify.compare(model, record)))) for model in ends)
+    before, after = (thinned(identify.compare(model, record).to_dict()) for model in (models[0], models[-1]))
     labels = [str(record.segment_names[index]) for index in record.segment]
     segments = runs(labels, np.asarray(record.time_s))
     return improvement_html(found, data.name, diagnosis(str(data), progress_line()), before, after, segments)

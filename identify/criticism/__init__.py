@@ -14,13 +14,14 @@ from identify.estimation.figures import best_fit_percent, ceiling_percent, rms
 from identify.estimation.prepare import inspect
 from identify.model import Model
 from identify.records.record import Record
+from identify.results import Comparison, Figures
 
 POINTS = 4000
 """Points of a plotted series at most."""
 BAND = 1.959964
 
 
-def compare(model: Model, record: Record) -> dict[str, Any]:
+def compare(model: Model, record: Record) -> Comparison:
     """A model against a measurement.
 
     Parameters
@@ -32,10 +33,8 @@ def compare(model: Model, record: Record) -> dict[str, Any]:
 
     Returns
     -------
-    dict
-        `fit_percent`, `ceiling_percent` (what the true system would reach on this noise), `rms_nm`, `noise_sd_nm`;
-        `fitted` and `held_out` the same for those rows; `by` segment, level, direction, time and frequency;
-        `tests` (correlations with bands); `where` (worst places in words); `series` for plots; `plain`.
+    Comparison
+        Figures of all rows, of the fitted and the held-out ones; the error split up, tested, placed and in words.
     """
     predicted = np.asarray(model.predict(record))
     raw = inspect(record)
@@ -45,26 +44,28 @@ def compare(model: Model, record: Record) -> dict[str, Any]:
     tests = correlation_tests(grid, residual)
     everything = np.ones(record.time_s.size, bool)
     places = worst_places(record, residual, noise)
-    result: dict[str, Any] = _figures(record, predicted, noise, everything) | {
-        "noise_sd_nm": noise,
-        "fitted": _figures(record, predicted, noise, ~record.held_out),
-        "held_out": _figures(record, predicted, noise, record.held_out) if record.has_held_out else None,
-        "by": {
+    whole = _figures(record, predicted, noise, everything)
+    held_out = _figures(record, predicted, noise, record.held_out) if record.has_held_out else None
+    return Comparison(
+        **whole,
+        noise_sd_nm=noise,
+        fitted=_figures(record, predicted, noise, ~record.held_out),
+        held_out=held_out,
+        by={
             "segment": by_segment(record, residual, noise),
             "level": by_level(record, residual, noise),
             "direction": by_direction(record, residual, noise),
             "time": by_time(record, residual, noise),
             "frequency": by_frequency(record, residual, noise),
         },
-        "tests": tests,
-        "where": places,
-        "series": _series(model, record, predicted, noise),
-    }
-    result["plain"] = _plain(result, tests, places)
-    return result
+        tests=tests,
+        where=tuple(places),
+        series=_series(model, record, predicted, noise),
+        plain=tuple(_plain(whole, held_out, noise, tests, places)),
+    )
 
 
-def _figures(record: Record, predicted: np.ndarray, noise: float, rows: np.ndarray) -> dict[str, float | None]:
+def _figures(record: Record, predicted: np.ndarray, noise: float, rows: np.ndarray) -> Figures:
     measured, guess = record.torque_nm[rows], predicted[rows]
     return {
         "fit_percent": best_fit_percent(measured, guess),
@@ -103,16 +104,17 @@ def _band(model: Model, record: Record, predicted: np.ndarray, noise: float) -> 
     return predicted - half, predicted + half
 
 
-def _plain(result: dict[str, Any], tests: dict[str, Any], places: list[dict[str, Any]]) -> list[str]:
+def _plain(
+    whole: Figures, held_out: Figures | None, noise: float, tests: dict[str, Any], places: list[dict[str, Any]]
+) -> list[str]:
     lines = [
-        f"The model fits {result['fit_percent']:.1f} %; noise of {result['noise_sd_nm']:.3g} N·m allows "
-        f"{result['ceiling_percent']:.1f} %."
+        f"The model fits {whole['fit_percent']:.1f} %; noise of {noise:.3g} N·m allows "
+        f"{whole['ceiling_percent']:.1f} %."
     ]
-    if result["held_out"] is not None:
-        held = result["held_out"]
+    if held_out is not None:
         lines.append(
-            f"On rows it was not fitted on it errs by {held['rms_nm']:.3g} N·m ({held['fit_percent']:.1f} %, at most "
-            f"{held['ceiling_percent']:.1f} %)."
+            f"On rows it was not fitted on it errs by {held_out['rms_nm']:.3g} N·m ({held_out['fit_percent']:.1f} %, "
+            f"at most {held_out['ceiling_percent']:.1f} %)."
         )
     alarms = [test["words"] for test in tests["tests"] if not test["passed"]]
     lines.append(" ".join(alarms) if alarms else "What is left looks like noise: none of the correlations stands out.")

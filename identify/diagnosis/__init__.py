@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from identify.diagnosis.analysis import Analysis, analyse
 from identify.diagnosis.candidates import Progress
 from identify.diagnosis.report import report
 from identify.diagnosis.verdict import Verdict, judge
 from identify.records.record import Record
+from identify.results import Diagnosis
 
 
-def diagnose(record: Record, progress: Progress | None = None) -> dict[str, Any]:
+def diagnose(record: Record, progress: Progress | None = None) -> Diagnosis:
     """What is missing from a Hammerstein model of this record.
 
     Parameters
@@ -23,9 +22,8 @@ def diagnose(record: Record, progress: Progress | None = None) -> dict[str, Any]
 
     Returns
     -------
-    dict
-        As `diagnose --json` in the contract, and more: `candidates` (log evidence of each), `explained`, `plain`
-        (paragraphs), `figures` (series for plots).
+    Diagnosis
+        The verdict, what is missing (most probable first), and the evidence for it.
 
     Raises
     ------

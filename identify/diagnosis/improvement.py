@@ -13,7 +13,9 @@ from identify.effects import get
 from identify.estimation.adding import names, try_effect
 from identify.estimation.finish import finish
 from identify.estimation.statistics import statistics
+from identify.model import Model
 from identify.records.record import Record
+from identify.results import Improvement
 
 COLUMNS = ("fit_percent", "rms_nm", "held_out_rms_nm", "held_out_fit_percent")
 
@@ -23,7 +25,7 @@ def improve(
     progress: Progress | None = None,
     max_effects: int | None = None,
     force: Sequence[str] = (),
-) -> dict[str, Any]:
+) -> Improvement:
     """Models of a record, each with one effect more, up to as many as are there.
 
     Parameters
@@ -39,9 +41,8 @@ def improve(
 
     Returns
     -------
-    dict
-        As `improve --json` in the contract, with `models` (MODEL.json of each step, `extra.parent` its forebear's id),
-        `refused` (effects not added, with the reason) and each step's `reason`.
+    Improvement
+        The steps, each with its model (`extra["parent"]` is its forebear's id) and its reason, and what was refused.
 
     Raises
     ------
@@ -62,18 +63,18 @@ def improve(
             row.append(step)
             reasons.append("Added because a person asked for it; the record doesn't.")
     models = _models(row)
-    return {
-        "noise_sd_nm": work.raw.noise_sd_nm,
-        "verdict": verdict.kind,
-        "steps": [
+    return Improvement(
+        noise_sd_nm=work.raw.noise_sd_nm,
+        verdict=verdict.kind,
+        steps=tuple(
             {"added": step.added}
             | {key: step.figures[key] for key in COLUMNS}
-            | {"model_id": model["model_id"], "reason": reason, "ceiling_percent": step.figures["ceiling_percent"]}
+            | {"model_id": model.model_id, "reason": reason, "ceiling_percent": step.figures["ceiling_percent"]}
             for step, model, reason in zip(row, models, reasons, strict=True)
-        ],
-        "models": models,
-        "refused": refused(work),
-    }
+        ),
+        models=tuple(models),
+        refused=tuple(refused(work)),
+    )
 
 
 def _reason(work: Analysis, step: Step) -> str:
@@ -118,10 +119,10 @@ def _forced(last: Step, effect: str) -> Step | None:
     return Step(effect, candidate.fitted, statistics(candidate.fitted))
 
 
-def _models(row: list[Step]) -> list[dict[str, Any]]:
-    models: list[dict[str, Any]] = []
+def _models(row: list[Step]) -> list[Model]:
+    models: list[Model] = []
     for number, step in enumerate(row):
-        parent = models[-1]["model_id"] if models else None
+        parent = models[-1].model_id if models else None
         model = finish("maximum-likelihood", step.fitted, figures=step.figures)
-        models.append(model.with_(extra={"parent": parent, "added": step.added, "step": number}).to_dict())
+        models.append(model.with_(extra={"parent": parent, "added": step.added, "step": number}))
     return models

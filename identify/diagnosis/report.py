@@ -14,6 +14,7 @@ from identify.effects import get
 from identify.estimation.finish import describe_parameters
 from identify.estimation.tremor import predict_fitted, with_band
 from identify.experiments import plan
+from identify.results import Diagnosis
 
 CLOSE = 0.8
 """Share of the best one's gain from which an effect that resembles it is named beside it."""
@@ -21,8 +22,8 @@ RIVAL = 0.04
 """Probability from which an effect is named as one that the record can't tell from the best."""
 
 
-def report(work: Analysis, verdict: Verdict) -> dict[str, Any]:
-    """The contract's JSON."""
+def report(work: Analysis, verdict: Verdict) -> Diagnosis:
+    """The contract's keys, and more."""
     record, raw = work.record, work.raw
     base_prediction = predict_fitted(work.base)
     row = steps(work)
@@ -33,13 +34,13 @@ def report(work: Analysis, verdict: Verdict) -> dict[str, Any]:
         predict_fitted(work.last) if verdict.kind == "unexplained_structure" else base_prediction
     )
     where = worst_places(record, residual, raw.noise_sd_nm, rows=~record.held_out)
-    return {
-        "noise_sd_nm": raw.noise_sd_nm,
-        "slow_noise": {
+    return Diagnosis(
+        noise_sd_nm=raw.noise_sd_nm,
+        slow_noise={
             "sd_nm": work.last.noise.sd_nm * float(np.sqrt(min(work.last.noise.share, 1.0))),
             "ar1": work.last.noise.ar1,
         },
-        "base": {
+        base={
             key: base[key]
             for key in (
                 "fit_percent",
@@ -51,17 +52,17 @@ def report(work: Analysis, verdict: Verdict) -> dict[str, Any]:
                 "held_out_by",
             )
         },
-        "verdict": verdict.kind,
-        "probability": verdict.probability,
-        "missing": missing,
-        "where": where,
-        "with_all": final,
-        "explained": verdict.explained,
-        "structure_left": verdict.structure,
-        "candidates": _candidates(work),
-        "notes": verdict.notes,
-        "plain": _plain(work, verdict, base, final, missing, where),
-    }
+        verdict=verdict.kind,
+        probability=verdict.probability,
+        missing=tuple(missing),
+        where=tuple(where),
+        with_all=final,
+        explained=verdict.explained,
+        structure_left=verdict.structure,
+        candidates=tuple(_candidates(work)),
+        notes=tuple(verdict.notes),
+        plain=tuple(_plain(work, verdict, base, final, missing, where)),
+    )
 
 
 def _ranked(work: Analysis, verdict: Verdict) -> list[str]:

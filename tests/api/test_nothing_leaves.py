@@ -12,7 +12,6 @@ import pytest
 
 import identify
 from api import notebook
-from api.cleaning import clean
 from api.jobs import curves, thinned
 from api.pages.chart_config import CHART_CONFIG
 from api.report import comparison_html, improvement_html
@@ -126,7 +125,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     record.write_text(record.read_text().replace(",prbs", ',"' + LINK.replace('"', '""') + '"'))
     read = identify.read(record)
     model = identify.fit(read)
-    drawn, against = curves(model, read), thinned(clean(dict(identify.compare(model, read))))
+    drawn, against = curves(model, read), thinned(identify.compare(model, read).to_dict())
     (folder / "compare.html").write_text(comparison_html(model.to_dict(), drawn, LINK, None, against))
     found = {"verdict": "effect_missing", "noise_sd_nm": 0.04, "refused": [], "steps": [
         {"added": added, "fit_percent": 97.0, "rms_nm": rms, "held_out_rms_nm": rms, "held_out_fit_percent": 97.0}
@@ -164,7 +163,8 @@ def test_a_report_lets_nothing_out_by_itself(tab: Any, files: Path) -> None:
 def test_each_way_of_showing_a_notebooks_figure_is_without_the_upload() -> None:
     import plotly.io as pio
 
-    figure = notebook.plot({"steps": [{"added": None, "rms_nm": 1.0, "held_out_rms_nm": 2.0}], "noise_sd_nm": 0.1})
+    step = {"added": None, "rms_nm": 1.0, "held_out_rms_nm": 2.0}
+    figure = notebook.plot(identify.Improvement(0.1, "nothing_missing", steps=(step,), models=(), refused=()))
     html = figure.to_html(include_plotlyjs=False, config={"showSendToCloud": True})
     assert '"showSendToCloud": false' in html and '"modeBarButtons": [["toImage"]' in html
     for renderer in ("colab", "plotly_mimetype"):

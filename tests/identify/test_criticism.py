@@ -23,26 +23,26 @@ def compared():
 def test_the_tables_add_up(compared):
     record, result = compared
     for kind in ("segment", "level", "direction", "time"):
-        rows = result["by"][kind]
+        rows = result.by[kind]
         assert sum(row["samples"] for row in rows) == record.time_s.size
         assert abs(sum(row["share_of_excess"] for row in rows) - 1.0) < 1e-9
-    power = sum(row["rms_nm"] ** 2 for row in result["by"]["frequency"])
-    assert abs(np.sqrt(power) - result["rms_nm"]) < 0.02 * result["rms_nm"] + 1e-3
+    power = sum(row["rms_nm"] ** 2 for row in result.by["frequency"])
+    assert abs(np.sqrt(power) - result.rms_nm) < 0.02 * result.rms_nm + 1e-3
 
 
 def test_series_fit_a_screen_and_words_name_a_place(compared):
     _, result = compared
-    assert len(result["series"]["time_s"]) <= 4000
-    assert result["fit_percent"] < result["ceiling_percent"]
-    assert any("N·m" in place["text"] and "%" in place["text"] for place in result["where"])
-    json.dumps(result, default=lambda value: value.tolist() if hasattr(value, "tolist") else str(value))
+    assert len(result.series["time_s"]) <= 4000
+    assert result.fit_percent < result.ceiling_percent
+    assert any("N·m" in place["text"] and "%" in place["text"] for place in result.where)
+    json.dumps(result.to_dict(), allow_nan=False)
 
 
 def test_a_wrong_model_alarms_and_a_right_one_does_not(compared):
     _, result = compared
-    assert not all(test["passed"] for test in result["tests"]["tests"])
+    assert not all(test["passed"] for test in result.tests["tests"])
     record = hidden_muscles.record(seed=13)
-    alarms = [test["with"] for test in compare(identify.fit(record), record)["tests"]["tests"] if not test["passed"]]
+    alarms = [test["with"] for test in compare(identify.fit(record), record).tests["tests"] if not test["passed"]]
     assert len(alarms) <= 1
 
 

@@ -30,9 +30,9 @@ HIDDEN = (
 @pytest.mark.parametrize("hidden", HIDDEN)
 def test_what_is_hidden_is_named_first_and_removed(hidden):
     result = diagnose(hidden_muscles.record(hidden, seed=11))
-    json.dumps(result, default=float)
-    assert result["verdict"] == "effect_missing"
-    first = result["missing"][0]
+    json.dumps(result.to_dict(), allow_nan=False)
+    assert result.verdict == "effect_missing"
+    first = result.missing[0]
     assert first["effect"] == hidden or hidden in first["confused_with"], (first["effect"], first["confused_with"])
     assert set(first) >= KEYS and 0.0 < first["probability"] <= 1.0
     noise = 0.04
@@ -44,38 +44,38 @@ def test_what_is_hidden_is_named_first_and_removed(hidden):
 @pytest.mark.parametrize(("seed", "ar1"), [(21, 0.0), (22, 0.9), (23, 0.99)])
 def test_where_nothing_is_hidden_nothing_is_named(seed, ar1):
     result = diagnose(hidden_muscles.record(seed=seed, ar1=ar1))
-    assert result["verdict"] == "nothing_missing" and result["missing"] == []
-    assert result["probability"] > 0.5
+    assert result.verdict == "nothing_missing" and result.missing == ()
+    assert result.probability > 0.5
 
 
 def test_noise_is_estimated_and_places_are_worded():
     result = diagnose(hidden_muscles.record("fatigue", seed=31))
-    assert abs(result["noise_sd_nm"] - 0.04) < 0.004
-    place = result["where"][0]
+    assert abs(result.noise_sd_nm - 0.04) < 0.004
+    place = result.where[0]
     assert {"segment", "start_s", "end_s", "pulse_width_us", "direction", "share_of_excess"} <= set(place)
     assert place["segment"] in place["text"] and "N·m" in place["text"]
-    assert all(p["segment"] != "validate" for p in result["where"])
+    assert all(p["segment"] != "validate" for p in result.where)
 
 
 def test_held_out_rows_are_only_reported():
     record = hidden_muscles.record("asymmetric_relaxation", seed=41, rate_hz=100)
     spoilt = record.with_torque(np.where(record.held_out, 0.0, record.torque_nm))
     one, two = diagnose(record), diagnose(spoilt)
-    assert one["candidates"] == two["candidates"]
-    assert one["missing"][0]["parameters"] == two["missing"][0]["parameters"]
-    assert one["base"]["held_out_rms_nm"] != two["base"]["held_out_rms_nm"]
+    assert one.candidates == two.candidates
+    assert one.missing[0]["parameters"] == two.missing[0]["parameters"]
+    assert one.base["held_out_rms_nm"] != two.base["held_out_rms_nm"]
 
 
 def test_without_validate_the_held_out_error_is_cross_validated():
     result = diagnose(hidden_muscles.record("fatigue", seed=51, rate_hz=100, validate=False))
-    assert result["base"]["held_out_by"] == "cross-validation"
-    first = result["missing"][0]
+    assert result.base["held_out_by"] == "cross-validation"
+    first = result.missing[0]
     assert first["effect"] == "fatigue" and first["held_out_rms_after_nm"] < first["held_out_rms_before_nm"]
 
 
 def test_effects_of_movement_are_no_candidates_without_its_columns():
     result = diagnose(hidden_muscles.record(seed=61, rate_hz=100))
-    tried = {c["effect"] for row in result["candidates"] for c in row}
+    tried = {c["effect"] for row in result.candidates for c in row}
     assert tried and not tried & {"torque_angle", "torque_velocity", "passive_torque"}
 
 
@@ -95,7 +95,7 @@ def test_progress_is_told_and_can_stop_it():
 def test_a_converter_that_holds_its_readings_is_structure_not_physics():
     record = hidden_muscles.record(seed=81)
     held = record.with_torque(record.torque_nm[(np.arange(record.time_s.size) // 12) * 12])
-    assert diagnose(held)["verdict"] == "unexplained_structure"
+    assert diagnose(held).verdict == "unexplained_structure"
 
 
 def test_a_gain_that_swings_is_no_effect_of_the_library():
@@ -103,5 +103,5 @@ def test_a_gain_that_swings_is_no_effect_of_the_library():
     clean = hidden_muscles.muscle(hidden_muscles.protocol(np.random.default_rng(91))[0])[::5]
     swing = 0.12 * np.sin(2.1 * record.time_s) * clean
     result = diagnose(record.with_torque(record.torque_nm + swing))
-    assert result["verdict"] == "unexplained_structure"
-    assert all(entry["probability"] < 0.5 for entry in result["missing"])
+    assert result.verdict == "unexplained_structure"
+    assert all(entry["probability"] < 0.5 for entry in result.missing)

@@ -74,7 +74,9 @@ def test_derivatives_are_those_of_central_differences(names):
     _, slopes = problem.run(theta, derivatives=True)
     assert slopes is not None
     for place in [0, 1, 2, 3, 4, 5, 12, *range(problem.coefficients.stop, problem.size)]:
-        step = 2e-5 * (1.0 if problem.log[place] else min(max(problem.upper[place] - problem.lower[place], 1e-3), 100.0))
+        step = 2e-5 * (
+            1.0 if problem.log[place] else min(max(problem.upper[place] - problem.lower[place], 1e-3), 100.0)
+        )
         ahead, back = theta.copy(), theta.copy()
         ahead[place] += step
         back[place] -= step

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
 
@@ -22,28 +20,28 @@ def improved():
 
 def test_the_error_falls_towards_the_noise(improved):
     _, result = improved
-    assert result["steps"][0]["added"] is None and result["steps"][1]["added"] == "fatigue"
-    before, after = result["steps"][0], result["steps"][1]
+    assert result.steps[0]["added"] is None and result.steps[1]["added"] == "fatigue"
+    before, after = result.steps[0], result.steps[1]
     assert after["held_out_rms_nm"] < 0.6 * before["held_out_rms_nm"]
-    assert after["rms_nm"] < 1.1 * result["noise_sd_nm"]
+    assert after["rms_nm"] < 1.1 * result.noise_sd_nm
 
 
 def test_each_step_is_a_model_that_predicts_what_the_step_says(improved):
     record, result = improved
-    for step, data in zip(result["steps"], result["models"], strict=True):
-        model = Model.from_dict(json.loads(json.dumps(data)))
+    for step, made in zip(result.steps, result.models, strict=True):
+        model = Model.from_json(made.to_json())
         error = (record.torque_nm - model.predict(record))[record.held_out]
         assert abs(np.sqrt(np.mean(error**2)) - step["held_out_rms_nm"]) < 1e-6
         assert model.model_id == step["model_id"]
-    parents = [data["extra"]["parent"] for data in result["models"]]
-    assert parents == [None, *[data["model_id"] for data in result["models"][:-1]]]
+    parents = [model.extra["parent"] for model in result.models]
+    assert parents == [None, *[model.model_id for model in result.models[:-1]]]
 
 
 def test_what_is_not_there_is_refused_with_a_reason_and_can_be_forced(improved):
     _, result = improved
-    assert result["steps"][-1]["added"] == "electromechanical_delay"
-    assert "person" in result["steps"][-1]["reason"]
-    refusals = {row["effect"]: row["reason"] for row in result["refused"]}
+    assert result.steps[-1]["added"] == "electromechanical_delay"
+    assert "person" in result.steps[-1]["reason"]
+    refusals = {row["effect"]: row["reason"] for row in result.refused}
     assert "log evidence" in refusals["electromechanical_delay"]
 
 
@@ -57,7 +55,7 @@ def test_a_model_with_effects_carries_bands_and_a_verdict():
     widths = []
     for noise_nm in (0.03, 0.06):
         record = hidden_muscles.record("fatigue", seed=5, noise_nm=noise_nm)
-        model = Model.from_json(json.dumps(identify.improve(record)["models"][-1]))
+        model = Model.from_json(identify.improve(record).models[-1].to_json())
         assert [effect["id"] for effect in model.effects] == ["fatigue"]
         assert model.quality["verdict"] in ("usable", "usable with care")
         assert model.valid_for["pulse_rate_hz"] == [38.0, 42.0]

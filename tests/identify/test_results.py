@@ -1,0 +1,236 @@
+"""Results show themselves in a few lines with units, and hold exactly the keys that docs/schema describes."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+from collections.abc import Iterator
+from html.parser import HTMLParser
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import jsonschema_rs
+import pytest
+
+import identify
+from identify.methods import methods
+from identify.shown import Sheet, fit_words, one_line, probability, quantity
+from tests.identify import hidden_muscles
+
+FOLDER = Path(__file__).parents[2] / "docs" / "schema"
+SCHEMAS = {path.stem: json.loads(path.read_text("utf-8")) for path in sorted(FOLDER.iterdir())}
+UNITS = {
+    "nm": "N·m", "us": "µs", "s": "s", "hz": "Hz", "percent": "%", "nm_s": "N·m·s", "per_us": "1/µs",
+}  # fmt: skip
+DIAGNOSE = {"noise_sd_nm", "base", "verdict", "missing", "where"}
+MISSING = {
+    "effect", "probability", "rms_before_nm", "rms_after_nm", "held_out_rms_before_nm", "held_out_rms_after_nm",
+    "confused_with", "next_experiment", "parameters",
+}  # fmt: skip
+STEP = {"added", "fit_percent", "rms_nm", "held_out_rms_nm", "held_out_fit_percent"}
+WORDS = "<img src=x onerror=alert(1)> & \"'\n\x1b[31m"
+
+
+@pytest.fixture(scope="module")
+def record():
+    return hidden_muscles.record("fatigue", seed=15, rate_hz=100)
+
+
+@pytest.fixture(scope="module")
+def results(record) -> dict[str, Any]:
+    model = identify.fit(record)
+    return {
+        "model": model,
+        "comparison": identify.compare(model, record),
+        "diagnosis": identify.diagnose(record),
+        "improvement": identify.improve(record, force=["electromechanical_delay"]),
+    }
+
+
+# ---- docs/schema --------------------------------------------------------------------------------------------
+
+
+def strict(schema: Any) -> Any:
+    """The schema, by which a key that it doesn't describe is an error."""
+    if isinstance(schema, list):
+        return [strict(part) for part in schema]
+    if not isinstance(schema, dict):
+        return schema
+    closed = {key: strict(part) for key, part in schema.items()}
+    named = isinstance(schema.get("properties"), dict) and "type" in schema
+    return {"additionalProperties": False} | closed if named else closed
+
+
+def errors(name: str, document: dict[str, Any]) -> list[str]:
+    """What a document lacks, and what it has beyond its schema."""
+    check = jsonschema_rs.Draft202012Validator(strict(SCHEMAS[name]))
+    found = json.loads(json.dumps(document, allow_nan=False))
+    return [f"{list(error.instance_path)}: {error.message[:200]}" for error in check.iter_errors(found)]
+
+
+def described(schema: dict[str, Any], place: str = "") -> Iterator[tuple[str, str, str]]:
+    """Place, name and description of every key of a schema."""
+    for name, part in schema.get("properties", {}).items():
+        yield f"{place}.{name}", name, part.get("description", "")
+        yield from described(part, f"{place}.{name}")
+    for key in ("items", "additionalProperties"):
+        if isinstance(schema.get(key), dict):
+            yield from described(schema[key], f"{place}[]")
+    for name, part in schema.get("$defs", {}).items():
+        yield from described(part, name)
+
+
+@pytest.mark.parametrize("name", SCHEMAS)
+def test_every_key_of_a_real_result_is_described_and_none_is_missing(results, name):
+    assert errors(name, results[name].to_dict()) == []
+
+
+def test_models_with_effects_and_of_each_method_keep_to_the_schema(results, record):
+    models = [*results["improvement"].models, *[identify.fit(record, method=name) for name in methods()]]
+    assert [found for model in models if (found := errors("model", model.to_dict()))] == []
+
+
+def test_nothing_missing_and_nothing_held_out_keep_to_the_schema():
+    bare = hidden_muscles.record(seed=13, rate_hz=100, validate=False)
+    model = identify.fit(bare)
+    assert errors("model", model.to_dict()) == [] == errors("comparison", identify.compare(model, bare).to_dict())
+    found = identify.diagnose(bare)
+    assert found.verdict == "nothing_missing" and errors("diagnosis", found.to_dict()) == []
+
+
+def test_rivals_and_the_test_between_them_keep_to_the_schema(record, monkeypatch):
+    """Every effect that was tried is made a rival, so that there is a test to plan."""
+    monkeypatch.setattr(import_module("identify.diagnosis.report"), "RIVAL", 0.0)
+    found = identify.diagnose(record)
+    assert found.missing[0]["next_experiment_plan"]["segments"] and errors("diagnosis", found.to_dict()) == []
+    assert "can't tell it from" in str(found) and "next test" in str(found)
+
+
+def test_the_check_sees_a_key_too_many_and_one_too_few(results):
+    found = results["diagnosis"].to_dict()
+    found["missing"][0]["colour"] = "red"
+    del found["base"]["rms_nm"]
+    assert len(errors("diagnosis", found)) == 2
+
+
+@pytest.mark.parametrize("name", SCHEMAS)
+def test_every_key_has_a_description_with_its_unit(name):
+    jsonschema_rs.meta.validate(SCHEMAS[name])
+    keys = list(described(SCHEMAS[name]))
+    assert len(keys) > 10
+    for place, key, words in keys:
+        assert words, place
+        suffix = re.search(r"_(nm_s|per_us|nm|us|s|hz|percent)$", key)
+        if suffix and not words.startswith("band of"):
+            assert re.search(rf"(?<![\w·]){re.escape(UNITS[suffix[1]])}(?![\w·])", words), (place, words)
+
+
+def test_the_contracts_keys_are_there(results):
+    diagnosis, improvement = results["diagnosis"].to_dict(), results["improvement"].to_dict()
+    assert set(diagnosis) >= DIAGNOSE and set(diagnosis["missing"][0]) >= MISSING
+    assert set(improvement) >= {"noise_sd_nm", "verdict", "steps"}
+    assert all(set(step) >= STEP for step in improvement["steps"])
+
+
+def test_a_dict_holds_the_fields_in_order(results):
+    for name in ("comparison", "diagnosis", "improvement"):
+        assert list(results[name].to_dict()) == [item.name for item in dataclasses.fields(results[name])]
+
+
+# ---- for people ---------------------------------------------------------------------------------------------
+
+
+class Tags(HTMLParser):
+    """Tags and text of a piece of HTML."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.words: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        assert {name for name, _ in attrs} <= {"style", "scope"}
+
+    def handle_data(self, data: str) -> None:
+        self.words.append(data)
+
+
+@pytest.mark.parametrize("name", SCHEMAS)
+def test_a_summary_is_about_ten_lines_and_prints_itself(results, name):
+    found = results[name]
+    lines = found.summary().splitlines()
+    assert 5 <= len(lines) <= 14 and max(map(len, lines)) < 340
+    assert str(found) == found.summary() and "N·m" in found.summary() and "nan" not in found.summary()
+    assert "\n" not in repr(found) and len(repr(found)) < 160
+    assert lines[0].startswith(name.capitalize()) and repr(found) == f"<{lines[0]}>"
+
+
+def test_summaries_say_what_was_found(results):
+    assert "fatigue" in repr(results["diagnosis"]) and "probability" in repr(results["diagnosis"])
+    assert "fatigue, electromechanical_delay added" in repr(results["improvement"])
+    assert re.search(
+        r"held out +fit [\d.]+ % \(the noise allows [\d.]+ %\), rms [\d.]+ N·m", str(results["comparison"])
+    )
+    last = str(results["improvement"].models[-1])
+    assert re.search(r"depth [\d.e-]+ ± [\d.e-]+", last) and re.search(r"onset_s [\d.e-]+ ± [\d.e-]+ s", last)
+    assert "order 2 in steps of 25 ms" in str(results["model"].with_(linear=_discrete()))
+
+
+def _discrete():
+    from identify.dynamics.linear import Discrete
+
+    return Discrete((0.1, 0.1), (1.0, -1.2, 0.4), 1, 0.025)
+
+
+@pytest.mark.parametrize("name", SCHEMAS)
+def test_the_notebooks_view_is_the_summary_as_a_table(results, name):
+    found = results[name]
+    parsed = Tags(found._repr_html_())
+    assert set(parsed.tags) == {"table", "caption", "tbody", "tr", "th", "td"}
+    assert parsed.tags.count("tr") == len(found.summary().splitlines()) - 1
+    assert parsed.words[0] == found.summary().splitlines()[0]
+
+
+def test_words_of_a_file_stay_words(results):
+    """Whatever stands in a MODEL.json or in a recording's names: no tag, no line of its own, no escape sequence."""
+    model = results["model"].with_(method=WORDS, model_id=WORDS, quality={"verdict": WORDS}, data={"name": WORDS})
+    where = ({**results["comparison"].where[0], "text": WORDS},)
+    for found in (
+        model.with_(effects=({"id": WORDS, "parameters": {WORDS: {"value": 1.0, "sd": None, "unit": WORDS}}},)),
+        dataclasses.replace(results["comparison"], where=where),
+        dataclasses.replace(results["diagnosis"], notes=(WORDS,), verdict=WORDS),
+        dataclasses.replace(results["improvement"], verdict=WORDS),
+    ):
+        assert "img" not in Tags(found._repr_html_()).tags
+        assert "\x1b" not in str(found) + repr(found) and "\n" not in repr(found)
+        assert len(str(found).splitlines()) <= 15
+
+
+def test_a_model_of_another_version_with_little_in_it_still_shows_itself(results):
+    bare = results["model"].to_dict()
+    for key in ("fit", "quality", "valid_for", "data", "created", "model_id", "noise", "effects"):
+        del bare[key]
+    model = identify.Model.from_dict(bare)
+    assert "fit –, held out –" in repr(model) and "N·m at most" in str(model)
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "said"),
+    [
+        (0.04123, "N·m", "0.0412 N·m"), (98.765, "%", "98.8 %"), (12345.6, "µs", "12346 µs"), (0.5, "1", "0.5"),
+        (None, "N·m", "–"), (float("nan"), "%", "–"), (float("inf"), "s", "–"), (True, "s", "–"), ("3", "s", "–"),
+    ],
+)  # fmt: skip
+def test_a_number_has_three_digits_and_its_unit(value, unit, said):
+    assert quantity(value, unit) == said
+
+
+def test_small_words():
+    assert [probability(p) for p in (0.0, 0.964, 0.9999, 1.0)] == ["0 %", "96 %", "99 %", "100 %"]
+    assert fit_words({}) == "fit –, rms –" and one_line("a\tb\u202e c\n") == "a b c"
+    assert len(one_line("x" * 1000)) == 300
+    assert Sheet("T", ()).text() == "T" and Sheet("T", (("", ""),)).text() == "T\n"
