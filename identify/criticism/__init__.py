@@ -10,7 +10,7 @@ from identify.criticism.correlation import correlation_tests
 from identify.criticism.shares import by_direction, by_frequency, by_level, by_segment, by_time
 from identify.criticism.where import worst_places
 from identify.dynamics.pulse_grid import make_grid
-from identify.estimation.figures import best_fit_percent, ceiling_percent, rms
+from identify.estimation.figures import UNDEFINED, best_fit_percent, ceiling_percent, rms
 from identify.estimation.prepare import inspect
 from identify.model import Model
 from identify.records.record import Record
@@ -67,7 +67,7 @@ def compare(model: Model, record: Record) -> dict[str, Any]:
 def _figures(record: Record, predicted: np.ndarray, noise: float, rows: np.ndarray) -> dict[str, float | None]:
     measured, guess = record.torque_nm[rows], predicted[rows]
     return {
-        "fit_percent": best_fit_percent(measured, guess),
+        "fit_percent": best_fit_percent(measured, guess, noise),
         "ceiling_percent": ceiling_percent(measured, noise),
         "rms_nm": rms(measured - guess),
         "excess_rms_nm": float(np.sqrt(max(rms(measured - guess) ** 2 - noise**2, 0.0))),
@@ -104,16 +104,17 @@ def _band(model: Model, record: Record, predicted: np.ndarray, noise: float) -> 
 
 
 def _plain(result: dict[str, Any], tests: dict[str, Any], places: list[dict[str, Any]]) -> list[str]:
-    lines = [
-        f"The model fits {result['fit_percent']:.1f} %; noise of {result['noise_sd_nm']:.3g} N·m allows "
-        f"{result['ceiling_percent']:.1f} %."
-    ]
+    noise = f"noise of {result['noise_sd_nm']:.3g} N·m"
+    if np.isfinite(result["fit_percent"]):
+        lines = [f"The model fits {result['fit_percent']:.1f} %; {noise} allows {result['ceiling_percent']:.1f} %."]
+    else:
+        lines = [f"The model errs by {result['rms_nm']:.3g} N·m beside {noise}; its fit is {UNDEFINED}."]
     if result["held_out"] is not None:
         held = result["held_out"]
-        lines.append(
-            f"On rows it was not fitted on it errs by {held['rms_nm']:.3g} N·m ({held['fit_percent']:.1f} %, at most "
-            f"{held['ceiling_percent']:.1f} %)."
-        )
+        share = f"its fit is {UNDEFINED}"
+        if np.isfinite(held["fit_percent"]):
+            share = f"{held['fit_percent']:.1f} %, at most {held['ceiling_percent']:.1f} %"
+        lines.append(f"On rows it was not fitted on it errs by {held['rms_nm']:.3g} N·m ({share}).")
     alarms = [test["words"] for test in tests["tests"] if not test["passed"]]
     lines.append(" ".join(alarms) if alarms else "What is left looks like noise: none of the correlations stands out.")
     if alarms:

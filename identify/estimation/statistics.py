@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from identify.estimation.figures import best_fit_percent, ceiling_percent, rms
 from identify.estimation.joint import Fitted, solve
 from identify.estimation.to_model import predict_fitted
 from identify.records.record import Record
@@ -12,14 +13,8 @@ from identify.simulation.problem import Problem
 FOLDS = 4
 
 
-def fit_percent(torque_nm: np.ndarray, predicted_nm: np.ndarray) -> float:
-    """100 (1 - ||y - ŷ|| / ||y - mean y||), as in the paper."""
-    spread = float(np.linalg.norm(torque_nm - torque_nm.mean()))
-    return float(100.0 * (1.0 - np.linalg.norm(torque_nm - predicted_nm) / max(spread, 1e-12)))
-
-
 def figures(fitted: Fitted, record: Record, predicted_nm: np.ndarray | None = None) -> dict[str, float | str | None]:
-    """Fit and error on fitted and on held-out rows, and the ceiling that noise sets."""
+    """Fit and error on fitted and on held-out rows, and the ceiling that noise sets; NaN where the torque is level."""
     predicted = predict_fitted(fitted, record) if predicted_nm is None else predicted_nm
     used = fitted.problem.setup.fitted[fitted.problem.setup.grid.interval] & ~record.held_out
     torque, noise = record.torque_nm, fitted.problem.setup.noise_sd_nm
@@ -28,14 +23,13 @@ def figures(fitted: Fitted, record: Record, predicted_nm: np.ndarray | None = No
     if not held.any():
         guess, held = cross_validated(fitted, record), used
         source = "blocked cross-validation"
-    spread = float(np.std(torque[used]))
     return {
-        "fit_percent": fit_percent(torque[used], predicted[used]),
-        "held_out_fit_percent": fit_percent(torque[held], guess[held]),
+        "fit_percent": best_fit_percent(torque[used], predicted[used], noise),
+        "held_out_fit_percent": best_fit_percent(torque[held], guess[held], noise),
         "rms_nm": rms(torque[used] - predicted[used]),
         "held_out_rms_nm": rms(torque[held] - guess[held]),
-        "ceiling_percent": 100.0 * (1.0 - noise / max(spread, 1e-12)),
-        "held_out_ceiling_percent": 100.0 * (1.0 - noise / max(float(np.std(torque[held])), 1e-12)),
+        "ceiling_percent": ceiling_percent(torque[used], noise),
+        "held_out_ceiling_percent": ceiling_percent(torque[held], noise),
         "noise_sd_nm": noise,
         "held_out": source,
     }
@@ -60,8 +54,3 @@ def _folds(fitted: np.ndarray) -> np.ndarray:
     piece = max(int(fitted.sum() / (FOLDS * 6)), 40)
     count = np.cumsum(fitted) - 1
     return (count // piece) % FOLDS
-
-
-def rms(values: np.ndarray) -> float:
-    """Root mean square."""
-    return float(np.sqrt(np.mean(values**2))) if values.size else 0.0
