@@ -20,6 +20,7 @@ GOOD_GAP, LARGEST_GAP = 2.0, 8.0
 """Points of fit below the ceiling on rows not seen: up to the first little is missing, above the second too much."""
 WITHIN_NOISE = 1.3
 """Error over the noise up to which what is left passes for noise, however little the torque moves beside it."""
+OWN = "its own rows"
 NEGLIGIBLE = 5e-4
 """Share of the torque's range below which it doesn't matter what an error looks like."""
 
@@ -194,25 +195,29 @@ def _held_out(model: Model) -> dict[str, Any]:
 
 
 def _gap(model: Model) -> dict[str, Any]:
-    """How far the fit on rows not seen stays below what the noise allows there."""
+    """How far the fit on rows not seen stays below what the noise allows there.
+
+    Where their torque is level, their error above the noise counts as a share of the fitted torque's spread.
+    """
     reached, ceiling, where, error = _reach(model)
-    gap = ceiling - reached
+    gap, noise = ceiling - reached, model.noise.white_sd_nm
+    says = f"on {where} it reaches {reached:.1f} % where the noise allows {ceiling:.1f} %"
+    unseen = _figure(model, "held_out_rms_nm")
+    if where == OWN and np.isfinite(unseen):
+        gap, error = 100.0 * (unseen - noise) * (1.0 - reached / 100.0) / max(error, 1e-300), unseen
+        says = f"on rows it has not seen, whose torque is level, it errs by {unseen:.3g} N·m (noise {noise:.3g})"
     if not np.isfinite(gap):
         return _gate(True, "care", "")
-    far = gap > LARGEST_GAP and not error <= WITHIN_NOISE * model.noise.white_sd_nm
-    return _gate(
-        gap <= GOOD_GAP,
-        "refuse" if far else "care",
-        f"on {where} it reaches {reached:.1f} % where the noise allows {ceiling:.1f} %: "
-        f"{'too much' if far else 'something'} is missing in it; run diagnose",
-    )
+    far = gap > LARGEST_GAP and not error <= WITHIN_NOISE * noise
+    much = "too much" if far else "something"
+    return _gate(gap <= GOOD_GAP, "refuse" if far else "care", f"{says}: {much} is missing in it; run diagnose")
 
 
 def _reach(model: Model) -> tuple[float, float, str, float]:
     """Fit, ceiling, the rows they hold for and the error there: rows not seen, where their torque isn't level."""
     prefix, where = "held_out_", "rows it has not seen"
     if not np.isfinite(_figure(model, "held_out_fit_percent")):
-        prefix, where = "", "its own rows"
+        prefix, where = "", OWN
     names = ("fit_percent", "ceiling_percent", "rms_nm")
     reached, ceiling, error = (_figure(model, prefix + name) for name in names)
     return reached, ceiling, where, error

@@ -45,10 +45,18 @@ def test_a_model_of_level_held_out_rows(record: identify.Record, effects: tuple[
     found = identify.fit(level, effects=effects)
     again = identify.Model.from_json(found.to_json())
     assert again.fit["held_out_fit_percent"] is None and again.fit["held_out_ceiling_percent"] is None
-    assert found.quality["verdict"] == "usable with care" and not found.quality["gates"]["held_out"]["passed"]
+    assert found.quality["verdict"] == "not usable" and "whose torque is level" in found.quality["words"]
     grid = make_grid(level)
     assert quality(again, grid, grid.fitted)["words"] == found.quality["words"]
     assert any(UNDEFINED in line for line in compare(again, level)["plain"])
+
+
+@pytest.mark.parametrize(("error", "verdict"), [(0.055, "usable"), (0.15, "usable with care"), (0.5, "not usable")])
+def test_an_error_on_level_rows_not_seen_counts(
+    record: identify.Record, model: identify.Model, error: float, verdict: str
+) -> None:
+    level = {"held_out_fit_percent": None, "held_out_ceiling_percent": None, "held_out_rms_nm": error}
+    assert judged(model, record, **level)["verdict"] == verdict
 
 
 def judged(model: identify.Model, record: identify.Record, **fit: Any) -> dict[str, Any]:

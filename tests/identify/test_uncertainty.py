@@ -74,8 +74,8 @@ def test_what_is_missing_is_not_silent(tired: float, verdict: str):
     record, clean = make_record(Patient(), np.random.default_rng(5), rate_hz=100, noise_nm=0.05)
     model = identify.fit(record.with_torque(record.torque_nm - clean * tired * np.linspace(0, 1, clean.size)))
     assert model.quality["verdict"] == verdict
-    for gate in ("ceiling", "residual"):
-        assert not model.quality["gates"][gate]["passed"]
+    gates = model.quality["gates"]
+    assert not gates["residual"]["passed"] and not gates["gap"]["passed"]
     assert any("diagnose" in reason for reason in model.quality["reasons"])
     assert model.quality["reasons"][0] in model.quality["words"]
 
