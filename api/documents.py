@@ -25,12 +25,13 @@ class VersionOut(Document):
     effects: list[str]
     fit_percent: float | None
     ceiling_percent: float | None = Field(description="what the noise allows, %")
-    held_out_fit_percent: float | None
+    held_out_fit_percent: float | None = Field(description="null: nothing is held out, or the torque is level there")
     rms_nm: float | None
     held_out_rms_nm: float | None
     noise_sd_nm: float | None
-    verdict: str
-    words: str
+    verdict: Literal["usable", "usable with care", "not usable", "unknown"]
+    words: str = Field(description="the verdict in one sentence")
+    reasons: list[str] = Field(description="what speaks against the model, worst first")
     decision: Literal["approved", "rejected"] | None
     served: bool = Field(description="the controller gets this one")
     created_utc: str

@@ -1,4 +1,4 @@
-"""What a person reads off a MODEL.json: threshold and plateau, natural period and damping, or the poles."""
+"""What a person reads off a MODEL.json: figures and verdict, threshold and plateau, natural period and damping."""
 
 from __future__ import annotations
 
@@ -8,6 +8,66 @@ from typing import Any
 
 THRESHOLD_SHARE = 0.05
 """The threshold is where the recruitment curve has risen by this share of its range."""
+
+
+UNDEFINED = "not defined: the torque is level there"
+"""What stands where a model has an error but no best-fit %."""
+VERDICTS = ("usable", "usable with care", "not usable")
+"""Best first."""
+FORMER = {"good": "usable", "poor": "not usable"}
+"""What older versions called them; their "usable" stood between the two."""
+
+
+def figures(document: dict[str, Any]) -> dict[str, Any]:
+    """The few numbers of a MODEL.json a person looks at first."""
+    fit = document.get("fit") or {}
+    names = (
+        "fit_percent", "ceiling_percent", "held_out_fit_percent", "held_out_ceiling_percent",
+        "rms_nm", "held_out_rms_nm", "noise_sd_nm",
+    )  # fmt: skip
+    return {name: fit.get(name) for name in names}
+
+
+def quality(document: dict[str, Any]) -> dict[str, Any]:
+    """identify's verdict on a model, as its MODEL.json stores it: nothing is judged here.
+
+    Older models are read so: a verdict of a former vocabulary by its place in today's; without words, the first reason;
+    whatever is stored, no better than its gates; "unknown" where there is no verdict.
+
+    Returns
+    -------
+    dict
+        ``verdict`` (usable, usable with care, not usable, unknown), ``words`` (a sentence), ``reasons`` (a list).
+    """
+    stored = document.get("quality") or {}
+    gates = stored.get("gates") or {}
+    verdict = stored.get("verdict")
+    if verdict == "usable" and not gates:  # only identify writes gates
+        verdict = "usable with care"
+    verdict = FORMER.get(str(verdict), verdict)
+    if verdict not in VERDICTS:
+        return {"verdict": "unknown", "words": "No verdict was stored with this model: fit it again.", "reasons": []}
+    refused = [gate.get("severity") == "refuse" for gate in gates.values() if not gate.get("passed", True)]
+    allowed = "not usable" if any(refused) else "usable with care" if refused else "usable"
+    worse = max(verdict, allowed, key=VERDICTS.index)
+    reasons = list(stored.get("reasons") or [])
+    words = stored.get("words") if worse == verdict else None
+    return {
+        "verdict": worse,
+        "words": words or (_sentence(reasons[0]) if reasons else DEFAULTS[worse]),
+        "reasons": reasons,
+    }
+
+
+DEFAULTS = {
+    "usable": "Nothing speaks against it.",
+    "usable with care": "Look at where it fails before relying on it.",
+    "not usable": "Do not rely on it.",
+}
+
+
+def _sentence(clause: str) -> str:
+    return clause[:1].upper() + clause[1:].rstrip(".") + "."
 
 
 def recruitment(document: dict[str, Any]) -> dict[str, float | None]:

@@ -12,7 +12,6 @@ from api import reading
 from api.pages import charts, why, why_charts
 from api.pages.environment import HERE, environment
 from api.pages.static import plotly_path
-from api.verdict import figures, quality
 
 
 def comparison_html(
@@ -37,11 +36,11 @@ def comparison_html(
     comparison : dict or None
         As `identify.compare` gives it, cleaned and thinned.
     """
-    fit = figures(document)
+    judged = reading.quality(document)
     return _page(
         "report.html",
         title=f"{name}: measurement against model",
-        model={**fit, **quality(fit), "id": document["model_id"], "method": document["method"]},
+        model={**reading.figures(document), **judged, "id": document["model_id"], "method": document["method"]},
         effects=[effect["id"] for effect in document.get("effects") or []],
         recruitment=reading.recruitment(document),
         dynamics=reading.dynamics(document),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -76,8 +77,15 @@ def say(*lines: str) -> None:
 
 def number(value: float | None, digits: int = 2, unit: str = "") -> str:
     """A number for people; a dash where there is none."""
-    text = "–" if value is None else f"{value:.{digits}f}"
+    text = "–" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
     return f"{text} {unit}".rstrip()
+
+
+def percent(value: float | None, digits: int = 2) -> str:
+    """A best-fit % for people; why there is none."""
+    from api.reading import UNDEFINED
+
+    return UNDEFINED if value is None or not math.isfinite(value) else f"{value:.{digits}f} %"
 
 
 def table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
@@ -103,16 +111,17 @@ def progress_line() -> Callable[[float, str], None]:
 def model_report(document: dict[str, Any]) -> list[str]:
     """What a person reads off a model."""
     from api import reading
-    from api.verdict import figures, quality
 
-    fit = figures(document)
+    fit, judged = reading.figures(document), reading.quality(document)
     dynamics, curve = reading.dynamics(document), reading.recruitment(document)
     effects = ", ".join(effect["id"] for effect in document.get("effects") or []) or "none"
     lines = [
         f"model          {document['model_id']}  ({document['method']}, effects: {effects})",
-        f"fit            {number(fit['fit_percent'])} %  (ceiling {number(fit['ceiling_percent'])} %), "
+        f"fit            {percent(fit['fit_percent'])}  (ceiling {number(fit['ceiling_percent'])} %), "
         f"rms {number(fit['rms_nm'], 4)} N·m, noise {number(fit['noise_sd_nm'], 4)} N·m",
-        f"held out       {number(fit['held_out_fit_percent'])} %, rms {number(fit['held_out_rms_nm'], 4)} N·m",
+        "held out       nothing"
+        if fit["held_out_rms_nm"] is None
+        else f"held out       {percent(fit['held_out_fit_percent'])}, rms {number(fit['held_out_rms_nm'], 4)} N·m",
     ]
     if dynamics["time_constant_s"] is not None:
         lines.append(
@@ -127,5 +136,5 @@ def model_report(document: dict[str, Any]) -> list[str]:
         f"recruitment    threshold {number(curve['threshold_us'], 0)} µs (5 % of the rise), "
         f"plateau {number(curve['plateau_nm'])} N·m (95 % at {number(curve['saturation_us'], 0)} µs)"
     )
-    lines.append(f"quality        {quality(fit)['verdict']}: {quality(fit)['words']}")
-    return lines
+    lines.append(f"quality        {judged['verdict']}: {judged['words']}")
+    return [*lines, *(f"               also: {reason}" for reason in judged["reasons"][1:])]

@@ -9,12 +9,11 @@ from typing import Any
 
 from sqlalchemy import select
 
-from api import audit
+from api import audit, reading
 from api.clock import Clock
 from api.errors import ApiError, NotFoundError
 from api.store import Store
 from api.store.tables import Approval, Model
-from api.verdict import figures, quality
 
 LATEST = "9999"
 """Sorts after every label of time: an approval from before approvals expired."""
@@ -38,6 +37,7 @@ class Versions:
     def __init__(self, store: Store, clock: Clock) -> None:
         self.store, self.clock = store, clock
         self._served: dict[str, Served] = {}
+        self._read: dict[str, dict[str, Any]] = {}
 
     def add(
         self,
@@ -60,7 +60,7 @@ class Versions:
             added_effect=added_effect,
             method=str(document.get("method", "")),
             effects=[str(effect["id"]) for effect in document.get("effects") or []],
-            fit=figures(document),
+            fit={**reading.figures(document), **reading.quality(document)},
             document=body,
             etag=hashlib.sha256(body).hexdigest(),
             created_utc=now,
@@ -171,6 +171,14 @@ class Versions:
                 )
         return found
 
+    def quality(self, row: Model) -> dict[str, Any]:
+        """The verdict stored in the model; kept beside its figures, but for those stored before it was."""
+        if "verdict" in row.fit:
+            return {key: row.fit[key] for key in ("verdict", "words", "reasons")}
+        if row.etag not in self._read:
+            self._read[row.etag] = reading.quality(json.loads(row.document))
+        return self._read[row.etag]
+
     def public(self, row: Model) -> dict[str, Any]:
         """A version as clients see it, without the model itself."""
         decision = self.decision(row.id)
@@ -185,7 +193,7 @@ class Versions:
             "method": row.method,
             "effects": row.effects,
             **row.fit,
-            **quality(row.fit),
+            **self.quality(row),
             "decision": None if decision is None else ("approved" if decision.approved else "rejected"),
             "decided_by": decision.by if decision else None,
             "decided_utc": decision.at_utc if decision else None,

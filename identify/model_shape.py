@@ -212,7 +212,13 @@ MODEL = fields(
         "residual_tests": each(each(anything)),
         "valid_for": each(PAIR),
         "quality": fields(
-            {}, {"verdict": text, "reasons": several(text), "gates": each(fields({"passed": anything, "says": text}))}
+            {},
+            {
+                "verdict": text,
+                "words": text,
+                "reasons": several(text),
+                "gates": each(fields({"passed": anything, "says": text})),
+            },
         ),
         "reasons": several(text),
         "data": each(anything),

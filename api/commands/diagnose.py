@@ -6,7 +6,7 @@ from typing import Any
 
 import typer
 
-from api.terminal import Data, Json, number, progress_line, say, say_json
+from api.terminal import Data, Json, number, percent, progress_line, say, say_json
 
 VERDICTS = {
     "effect_missing": "An effect is missing in the model.",
@@ -39,8 +39,8 @@ def diagnosis_lines(found: dict[str, Any]) -> list[str]:
         VERDICTS.get(found["verdict"], found["verdict"]),
         "",
         f"noise          {number(found['noise_sd_nm'], 4)} N·m",
-        f"base model     fit {number(base.get('fit_percent'))} %, rms {number(base.get('rms_nm'), 4)} N·m; "
-        f"held out {number(base.get('held_out_fit_percent'))} %, {number(base.get('held_out_rms_nm'), 4)} N·m",
+        f"base model     fit {percent(base.get('fit_percent'))}, rms {number(base.get('rms_nm'), 4)} N·m; "
+        f"held out {percent(base.get('held_out_fit_percent'))}, rms {number(base.get('held_out_rms_nm'), 4)} N·m",
     ]
     for effect in found.get("missing") or []:
         lines += ["", *effect_lines(effect)]

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from api.terminal import Data, InputError, Json, ModelFile, load_model, number, say, say_json
+from api.terminal import Data, InputError, Json, ModelFile, load_model, number, percent, say, say_json
 
 
 def register(app: typer.Typer) -> None:
@@ -25,6 +25,7 @@ def predict(
     import numpy as np
 
     import identify
+    from identify.estimation.figures import best_fit_percent
 
     model = load_model(model_json)
     record = identify.read(data)
@@ -35,10 +36,9 @@ def predict(
     except OSError as error:
         raise InputError(f"{output}: {error.strerror}. Give a file in a folder that can be written.") from error
     residual = record.torque_nm - predicted
-    spread = np.linalg.norm(record.torque_nm - record.torque_nm.mean())
-    percent = float(100 * (1 - np.linalg.norm(residual) / spread)) if spread > 0 else None
+    reached = best_fit_percent(record.torque_nm, predicted)
     rms_nm = float(np.sqrt(np.mean(residual**2)))
     if as_json:
-        say_json({"output": str(output), "rows": len(predicted), "fit_percent": percent, "rms_nm": rms_nm})
+        say_json({"output": str(output), "rows": len(predicted), "fit_percent": reached, "rms_nm": rms_nm})
         return
-    say(f"{output}: {len(predicted)} rows, fit {number(percent)} % over the whole record, rms {number(rms_nm, 4)} N·m")
+    say(f"{output}: {len(predicted)} rows, fit {percent(reached)} over the whole record, rms {number(rms_nm, 4)} N·m")

@@ -33,16 +33,17 @@ async def model(request: Request, context: Ctx, who: ModelReader, model_id: str,
     measured = await measurement(context, row)
     diagnosis = await looked_at(context, row, who.name, diagnose)
     shown = await asyncio.to_thread(gather, context, row, measured, diagnosis)
+    version = await asyncio.to_thread(context.versions.public, row)
     return page(
         request,
         "model.html",
-        model=await asyncio.to_thread(context.versions.public, row),
+        model=version,
         document=document,
         recruitment=reading.recruitment(document),
         dynamics=reading.dynamics(document),
         validity=reading.validity(document),
         problem=measured["problem"],
-        reasons=[*doubts(document), *await asyncio.to_thread(context.trials.outcomes.warnings, row.recording_id)],
+        reasons=[*version["reasons"][1:], *await asyncio.to_thread(context.trials.outcomes.warnings, row.recording_id)],
         hdf5=not (await asyncio.to_thread(context.analyses.path, row.recording_id)).endswith(".csv"),
         now_utc=context.clock.utc(),
         may_test=who.may(Scope.RUN_TEST),
@@ -50,14 +51,6 @@ async def model(request: Request, context: Ctx, who: ModelReader, model_id: str,
         **{key: value for key, value in shown.items() if key != "figures"},
         figures={**charts.of_model(document, measured["curves"], measured["comparison"]), **shown["figures"]},
     )
-
-
-def doubts(document: dict[str, Any]) -> list[str]:
-    """What else speaks against the model; that its fit stays below the ceiling is said in the verdict already."""
-    gates = ((document.get("quality") or {}).get("gates") or {}).items()
-    return [
-        gate["says"] for name, gate in gates if not gate.get("passed", True) and name not in ("ceiling", "residual")
-    ]
 
 
 async def measurement(context: Context, row: Model) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from identify.criticism.correlation import correlation_tests
 from identify.criticism.shares import by_direction, by_frequency, by_level, by_segment, by_time
 from identify.criticism.where import worst_places
 from identify.dynamics.pulse_grid import make_grid
-from identify.estimation.figures import best_fit_percent, ceiling_percent, rms
+from identify.estimation.figures import UNDEFINED, best_fit_percent, ceiling_percent, rms
 from identify.estimation.prepare import inspect
 from identify.model import Model
 from identify.records.record import Record
@@ -68,7 +68,7 @@ def compare(model: Model, record: Record) -> Comparison:
 def _figures(record: Record, predicted: np.ndarray, noise: float, rows: np.ndarray) -> Figures:
     measured, guess = record.torque_nm[rows], predicted[rows]
     return {
-        "fit_percent": best_fit_percent(measured, guess),
+        "fit_percent": best_fit_percent(measured, guess, noise),
         "ceiling_percent": ceiling_percent(measured, noise),
         "rms_nm": rms(measured - guess),
         "excess_rms_nm": float(np.sqrt(max(rms(measured - guess) ** 2 - noise**2, 0.0))),
@@ -105,17 +105,18 @@ def _band(model: Model, record: Record, predicted: np.ndarray, noise: float) -> 
 
 
 def _plain(
-    whole: Figures, held_out: Figures | None, noise: float, tests: dict[str, Any], places: list[dict[str, Any]]
+    whole: Figures, held_out: Figures | None, noise_sd_nm: float, tests: dict[str, Any], places: list[dict[str, Any]]
 ) -> list[str]:
-    lines = [
-        f"The model fits {whole['fit_percent']:.1f} %; noise of {noise:.3g} N·m allows "
-        f"{whole['ceiling_percent']:.1f} %."
-    ]
+    noise = f"noise of {noise_sd_nm:.3g} N·m"
+    if np.isfinite(whole["fit_percent"]):
+        lines = [f"The model fits {whole['fit_percent']:.1f} %; {noise} allows {whole['ceiling_percent']:.1f} %."]
+    else:
+        lines = [f"The model errs by {whole['rms_nm']:.3g} N·m beside {noise}; its fit is {UNDEFINED}."]
     if held_out is not None:
-        lines.append(
-            f"On rows it was not fitted on it errs by {held_out['rms_nm']:.3g} N·m ({held_out['fit_percent']:.1f} %, "
-            f"at most {held_out['ceiling_percent']:.1f} %)."
-        )
+        share = f"its fit is {UNDEFINED}"
+        if np.isfinite(held_out["fit_percent"]):
+            share = f"{held_out['fit_percent']:.1f} %, at most {held_out['ceiling_percent']:.1f} %"
+        lines.append(f"On rows it was not fitted on it errs by {held_out['rms_nm']:.3g} N·m ({share}).")
     alarms = [test["words"] for test in tests["tests"] if not test["passed"]]
     lines.append(" ".join(alarms) if alarms else "What is left looks like noise: none of the correlations stands out.")
     if alarms:

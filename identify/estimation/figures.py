@@ -8,13 +8,28 @@ import numpy as np
 
 from identify.dynamics.pulse_grid import Grid
 
+LEVEL = 1e-9
+"""Torque that spreads by less than this (N·m, or share of its size) is level: what is left is rounding."""
+NOISE_SHARE = 0.5
+"""Torque that spreads by less than this share of the noise's standard deviation is level, too."""
+UNDEFINED = "not defined: the torque is level there"
 
-def best_fit_percent(measured_nm: np.ndarray, predicted_nm: np.ndarray) -> float:
-    """100 (1 - ||y - ŷ|| / ||y - mean y||), as in the paper; NaN where y is constant."""
-    spread = float(np.linalg.norm(measured_nm - np.mean(measured_nm))) if measured_nm.size else 0.0
-    if not spread > 0:
+
+def best_fit_percent(measured_nm: np.ndarray, predicted_nm: np.ndarray, noise_sd_nm: float = 0.0) -> float:
+    """100 (1 - ||y - ŷ|| / ||y - mean y||), as in the paper; NaN (null in JSON) where the torque is level."""
+    if is_level(measured_nm, noise_sd_nm):
         return float("nan")
+    spread = float(np.linalg.norm(measured_nm - np.mean(measured_nm)))
     return 100.0 * (1.0 - float(np.linalg.norm(measured_nm - predicted_nm)) / spread)
+
+
+def is_level(measured_nm: np.ndarray, noise_sd_nm: float = 0.0) -> bool:
+    """Whether the torque does not spread: then no share of its spread can be told."""
+    if not measured_nm.size:
+        return True
+    largest = float(np.max(np.abs(measured_nm)))
+    spread = float(np.std(measured_nm))
+    return not spread > max(LEVEL * max(largest, 1.0), NOISE_SHARE * noise_sd_nm)
 
 
 def rms(residual_nm: np.ndarray) -> float:
@@ -54,16 +69,15 @@ def white_sd(grid: Grid, predicted_nm: np.ndarray, block_sd_nm: float, freedom: 
 
 def ceiling_percent(measured_nm: np.ndarray, sd_nm: float) -> float:
     """Best-fit % that the true system would reach on this noisy record: 100 (1 - ||noise|| / ||y - mean y||)."""
-    spread = float(np.linalg.norm(measured_nm - np.mean(measured_nm))) if measured_nm.size else 0.0
-    if not spread > 0:
+    if is_level(measured_nm, sd_nm):
         return float("nan")
-    return 100.0 * (1.0 - sd_nm * float(np.sqrt(measured_nm.size)) / spread)
+    return 100.0 * (1.0 - sd_nm / float(np.std(measured_nm)))
 
 
 def figures(
     grid: Grid, rows: np.ndarray, predicted_nm: np.ndarray, sd_nm: float, held_out_change: np.ndarray | None = None
 ) -> dict[str, Any]:
-    """What MODEL.json tells under `fit`, at the record's own rate.
+    """What MODEL.json tells under `fit`, at the record's own rate; percentages are NaN where the torque is level.
 
     Without `validate`, `held_out_change` (N·m, shape (K,)) turns the fit into that of blocked cross-validation.
     """
@@ -72,7 +86,7 @@ def figures(
     used = rows[grid.interval] & ~record.held_out
     held = record.held_out
     result: dict[str, Any] = {
-        "fit_percent": best_fit_percent(measured[used], predicted_nm[used]),
+        "fit_percent": best_fit_percent(measured[used], predicted_nm[used], sd_nm),
         "ceiling_percent": ceiling_percent(measured[used], sd_nm),
         "rms_nm": rms((measured - predicted_nm)[used]),
         "noise_sd_nm": sd_nm,
@@ -86,7 +100,7 @@ def figures(
     }
     if held.any():
         result |= {
-            "held_out_fit_percent": best_fit_percent(measured[held], predicted_nm[held]),
+            "held_out_fit_percent": best_fit_percent(measured[held], predicted_nm[held], sd_nm),
             "held_out_ceiling_percent": ceiling_percent(measured[held], sd_nm),
             "held_out_rms_nm": rms((measured - predicted_nm)[held]),
             "held_out_by": "validate",
@@ -94,7 +108,7 @@ def figures(
     elif held_out_change is not None:
         left_out = predicted_nm[used] + held_out_change[grid.interval[used]]
         result |= {
-            "held_out_fit_percent": best_fit_percent(measured[used], left_out),
+            "held_out_fit_percent": best_fit_percent(measured[used], left_out, sd_nm),
             "held_out_ceiling_percent": result["ceiling_percent"],
             "held_out_rms_nm": rms(measured[used] - left_out),
             "held_out_by": "cross-validation",
@@ -115,7 +129,7 @@ def segment_figures(grid: Grid, predicted_nm: np.ndarray, sd_nm: float) -> list[
                 "start_s": float(record.time_s[start]),
                 "end_s": float(record.time_s[end - 1]),
                 "rms_nm": rms(measured - predicted),
-                "fit_percent": best_fit_percent(measured, predicted),
+                "fit_percent": best_fit_percent(measured, predicted, sd_nm),
                 "ceiling_percent": ceiling_percent(measured, sd_nm),
             }
         )

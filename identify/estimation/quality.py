@@ -1,4 +1,4 @@
-"""For what a model holds, and whether it may be used: gates with a plain verdict."""
+"""For what a model holds, and whether it may be used: gates, and the one verdict on a model."""
 
 from __future__ import annotations
 
@@ -15,6 +15,11 @@ from identify.simulation.predict import refuse_rate
 UNDER_CEILING_POINTS = 1.0
 LARGEST_DIP = 0.05
 LEAST_FIT_PERCENT = 30.0
+GOOD_GAP, LARGEST_GAP = 2.0, 8.0
+"""Points of fit below the ceiling on rows not seen: up to the first little is missing, above the second too much."""
+WITHIN_NOISE = 1.3
+"""Error over the noise up to which what is left passes for noise, however little the torque moves beside it."""
+OWN = "its own rows"
 NEGLIGIBLE = 5e-4
 """Share of the torque's range below which it doesn't matter what an error looks like."""
 
@@ -61,12 +66,15 @@ def check(model: Model, record: Record) -> list[str]:
 
 
 def quality(model: Model, grid: Grid, rows: np.ndarray, converged: bool = True) -> dict[str, Any]:
-    """Gates and verdict.
+    """The one verdict on a model: everything that shows one shows this, from MODEL.json.
+
+    A gate that refuses makes a model not usable; one that asks for care makes it usable with care, however many fail.
 
     Returns
     -------
     dict
-        `gates`: name -> {"passed", "severity", "says"}; `verdict`: usable, usable with care, not usable; `reasons`.
+        `verdict`: usable, usable with care, not usable; `words`: it in one sentence; `reasons`: what the failed gates
+        say, those that refuse first; `gates`: name -> {"passed", "severity", "says"}.
     """
     gates = {
         "stable": _stable(model),
@@ -76,13 +84,23 @@ def quality(model: Model, grid: Grid, rows: np.ndarray, converged: bool = True) 
         "range": _range(grid, rows),
         "ceiling": _ceiling(model),
         "held_out": _held_out(model),
+        "gap": _gap(model),
         "residual": _residual(model, float(np.ptp(grid.torque_nm[rows]))),
         "sensor": _sensor(grid, model.baseline_nm),
     }
     failed = [gate for gate in gates.values() if not gate["passed"]]
+    failed.sort(key=lambda gate: gate["severity"] != "refuse")
     bad = any(gate["severity"] == "refuse" for gate in failed)
     verdict = "not usable" if bad else "usable with care" if failed else "usable"
-    return {"verdict": verdict, "reasons": [gate["says"] for gate in failed], "gates": gates}
+    reasons = [gate["says"] for gate in failed]
+    return {"verdict": verdict, "words": _words(model, bad, reasons), "reasons": reasons, "gates": gates}
+
+
+def _words(model: Model, bad: bool, reasons: list[str]) -> str:
+    if reasons:
+        return f"{'Do not rely on it' if bad else 'Use it with care'}, since {reasons[0]}."
+    reached, ceiling, where = _reach(model)[:3]
+    return f"It fits {reached:.1f} % on {where}, where the noise allows {ceiling:.1f} %: little is left to explain."
 
 
 def _gate(passed: bool, severity: str, says: str) -> dict[str, Any]:
@@ -129,13 +147,13 @@ def _range(grid: Grid, rows: np.ndarray) -> dict[str, Any]:
     return _gate(
         widths.size >= 8,
         "care",
-        f"only {widths.size} pulse widths were fitted: the recruitment curve between them is a guess. Record a ramp",
+        f"only {widths.size} pulse widths were fitted: the recruitment curve between them is a guess; record a ramp",
     )
 
 
 def _ceiling(model: Model) -> dict[str, Any]:
-    fit, ceiling = model.fit.get("fit_percent"), model.fit.get("ceiling_percent")
-    if fit is None or ceiling is None or not np.isfinite(fit) or not np.isfinite(ceiling):
+    fit, ceiling = _figure(model, "fit_percent"), _figure(model, "ceiling_percent")
+    if not np.isfinite(fit) or not np.isfinite(ceiling):
         return _gate(False, "care", "the fit can't be compared with its ceiling")
     if fit < LEAST_FIT_PERCENT or (fit < 50.0 and ceiling > 60.0):
         return _gate(False, "refuse", f"the fit, {fit:.1f} %, is too poor: torque hardly follows the pulses")
@@ -143,21 +161,56 @@ def _ceiling(model: Model) -> dict[str, Any]:
         fit >= ceiling - UNDER_CEILING_POINTS,
         "care",
         f"the fit, {fit:.1f} %, is {ceiling - fit:.1f} points below what the noise allows ({ceiling:.1f} %): "
-        "an effect is missing, or the noise is slow. Run diagnose",
+        "an effect is missing, or the noise is slow; run diagnose",
     )
 
 
 def _held_out(model: Model) -> dict[str, Any]:
-    error, ceiling_error = model.fit.get("held_out_rms_nm"), model.fit.get("rms_nm")
-    if error is None or ceiling_error is None or not np.isfinite(error):
+    error, fitted_error = _figure(model, "held_out_rms_nm"), _figure(model, "rms_nm")
+    if not np.isfinite(error) or not np.isfinite(fitted_error):
         return _gate(True, "care", "")
     return _gate(
         error
-        <= max(1.5 * ceiling_error, 1.5 * model.noise.white_sd_nm, NEGLIGIBLE * np.ptp(model.valid_for["torque_nm"])),
+        <= max(1.5 * fitted_error, 1.5 * model.noise.white_sd_nm, NEGLIGIBLE * np.ptp(model.valid_for["torque_nm"])),
         "care",
-        f"the error on rows not fitted, {error:.3g} N·m, is {error / max(ceiling_error, 1e-12):.1f} times "
+        f"the error on rows not fitted, {error:.3g} N·m, is {error / max(fitted_error, 1e-12):.1f} times "
         "that on fitted ones",
     )
+
+
+def _gap(model: Model) -> dict[str, Any]:
+    """How far the fit on rows not seen stays below what the noise allows there.
+
+    Where their torque is level, their error above the noise counts as a share of the fitted torque's spread.
+    """
+    reached, ceiling, where, error = _reach(model)
+    gap, noise = ceiling - reached, model.noise.white_sd_nm
+    says = f"on {where} it reaches {reached:.1f} % where the noise allows {ceiling:.1f} %"
+    unseen = _figure(model, "held_out_rms_nm")
+    if where == OWN and np.isfinite(unseen):
+        gap, error = 100.0 * (unseen - noise) * (1.0 - reached / 100.0) / max(error, 1e-300), unseen
+        says = f"on rows it has not seen, whose torque is level, it errs by {unseen:.3g} N·m (noise {noise:.3g})"
+    if not np.isfinite(gap):
+        return _gate(True, "care", "")
+    far = gap > LARGEST_GAP and not error <= WITHIN_NOISE * noise
+    much = "too much" if far else "something"
+    return _gate(gap <= GOOD_GAP, "refuse" if far else "care", f"{says}: {much} is missing in it; run diagnose")
+
+
+def _reach(model: Model) -> tuple[float, float, str, float]:
+    """Fit, ceiling, the rows they hold for and the error there: rows not seen, where their torque isn't level."""
+    prefix, where = "held_out_", "rows it has not seen"
+    if not np.isfinite(_figure(model, "held_out_fit_percent")):
+        prefix, where = "", OWN
+    names = ("fit_percent", "ceiling_percent", "rms_nm")
+    reached, ceiling, error = (_figure(model, prefix + name) for name in names)
+    return reached, ceiling, where, error
+
+
+def _figure(model: Model, name: str) -> float:
+    """A figure of the fit; NaN where there is none."""
+    value = model.fit.get(name)
+    return float("nan") if value is None else float(value)
 
 
 def _residual(model: Model, span_nm: float) -> dict[str, Any]:

@@ -22,6 +22,8 @@ def model(effects: list[str]) -> dict[str, Any]:
         "recruitment": {"pulse_width_us": widths, "torque_nm": torque},
         "fit": {"fit_percent": 98.5, "held_out_fit_percent": 97.9, "rms_nm": 0.04, "held_out_rms_nm": 0.042,
                 "ceiling_percent": 98.6, "noise_sd_nm": 0.04},
+        "quality": {"verdict": "usable", "words": "Little is left to explain.", "reasons": [],
+                    "gates": {"stable": {"passed": True, "severity": "refuse", "says": ""}}},
         "effects": [{"id": effect} for effect in effects], "uncertainty": {}, "data": {}, "software": {},
     }  # fmt: skip
 
