@@ -44,6 +44,8 @@ class Grid:
         Index into the record's `segment_names`.
     angle_rad, velocity_rad_s : ndarray or None, shape (K,)
         Means over each interval.
+    part : ndarray of int, shape (K,)
+        Index into the record's `parts`; the pause between two belongs to the part before it.
     """
 
     record: Record
@@ -58,6 +60,7 @@ class Grid:
     segment: np.ndarray
     angle_rad: np.ndarray | None
     velocity_rad_s: np.ndarray | None
+    part: np.ndarray
 
     @property
     def size(self) -> int:
@@ -80,8 +83,8 @@ class Grid:
 
     @cached_property
     def stretches(self) -> list[slice]:
-        """Contiguous runs of fitted intervals: noise is correlated inside one, not across."""
-        return runs(self.fitted)
+        """Contiguous runs of fitted intervals of one part: noise is correlated inside one, not across."""
+        return [run for index in range(len(self.record.parts)) for run in runs(self.fitted & (self.part == index))]
 
     def mean_weights(self, delay_s: float = 0.0) -> tuple[int, np.ndarray]:
         """How an interval's mean is read off the boundary states, for a model that lags by `delay_s`.
@@ -260,11 +263,14 @@ def make_grid(record: Record) -> Grid:
     middle = np.minimum(first_of + count // 2, record.time_s.size - 1)
     # Where samples are missing the last width seen is taken to be in force still.
     middle = np.where(count > 0, middle, np.maximum(first_of - 1, 0))
+    # Between two parts nothing is stimulated, whatever the first one ended with.
+    following = record.part[np.minimum(first_of, record.time_s.size - 1)]
+    pause = (count == 0) & (following != record.part[middle])
     return Grid(
         record=record,
         start_s=start_s,
         step_s=step_s,
-        pulse_width_us=record.pulse_width_us[middle],
+        pulse_width_us=np.where(pause, 0.0, record.pulse_width_us[middle]),
         torque_nm=mean(record.torque_nm),
         count=count,
         interval=interval,
@@ -273,6 +279,7 @@ def make_grid(record: Record) -> Grid:
         segment=record.segment[middle],
         angle_rad=None if record.angle_rad is None else mean(record.angle_rad),
         velocity_rad_s=None if record.velocity_rad_s is None else mean(record.velocity_rad_s),
+        part=record.part[middle],
     )
 
 

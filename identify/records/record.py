@@ -12,15 +12,52 @@ from identify.errors import BadRecord
 
 HELD_OUT = "validate"
 """Rows of this segment are never used to fit or to choose."""
+OPTIONAL_COLUMNS = ("angle_rad", "velocity_rad_s")
+"""Fields of a record with one value a sample, or None."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """Where a record came from, so that a model can say what it was fitted on."""
+    """Where a record came from, so that a model can say what it was fitted on; `parts` of a joined one, in order."""
 
     name: str = ""
     recording_id: str = ""
     sha256: str = ""
+    parts: tuple[Source, ...] = ()
+
+
+def joined_source(parts: Sequence[Source], name: str = "joined", sha256: str = "") -> Source:
+    """Where a joined record comes from: the ids of its parts' recordings, or their names where they have none.
+
+    `sha256` is that of the file it is read from; without one, those of the parts stand for it.
+    """
+    identity = " + ".join(part.recording_id or part.name for part in parts)
+    return Source(name, identity, sha256 or " + ".join(part.sha256 for part in parts), tuple(parts))
+
+
+@dataclass(frozen=True)
+class Part:
+    """One of the recordings that a record is made of.
+
+    Parameters
+    ----------
+    first : int
+        Index of its first sample in the record.
+    own_s : float
+        Time of that sample on the part's own clock, s.
+    begun_s : float or None
+        When that clock was 0, as Unix time, where it is known.
+    pause_s : float
+        The true pause before it, s, in whole pulse intervals; at most a day; 0 before the first, and where not known.
+    folded_s : float
+        What of that pause there is in `time_s`, s, in whole pulse intervals; at most `pause_s`.
+    """
+
+    first: int = 0
+    own_s: float = 0.0
+    begun_s: float | None = None
+    pause_s: float = 0.0
+    folded_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -45,6 +82,8 @@ class Record:
         Pulses a second.
     source : Source
         Origin.
+    parts : tuple of Part
+        The recordings it is made of, in order; one, except for a joined record.
     """
 
     time_s: np.ndarray
@@ -56,6 +95,7 @@ class Record:
     velocity_rad_s: np.ndarray | None = None
     pulse_rate_hz: float = 40.0
     source: Source = field(default_factory=Source)
+    parts: tuple[Part, ...] = (Part(),)
 
     @classmethod
     def from_arrays(
@@ -70,6 +110,7 @@ class Record:
         velocity_rad_s: np.ndarray | None = None,
         pulse_rate_hz: float = 40.0,
         source: Source | None = None,
+        parts: Sequence[Part] = (Part(),),
     ) -> Record:
         """Build a record from arrays; `segment` gives a name for each row (default: all `prbs`).
 
@@ -90,7 +131,9 @@ class Record:
                 raise BadRecord(f"{label} has shape {np.shape(column)}, time_s has ({size},)", place=label)
         if size == 0:
             raise BadRecord("the record holds no sample", mend="Give at least a few seconds of data.")
-        starts = np.flatnonzero(np.r_[True, code[1:] != code[:-1]])
+        changed = np.r_[True, code[1:] != code[:-1]]
+        changed[[part.first for part in parts]] = True
+        starts = np.flatnonzero(changed)
         begins = np.zeros(size, np.int64)
         begins[starts[1:]] = 1
         return cls(
@@ -103,6 +146,7 @@ class Record:
             velocity_rad_s=None if velocity_rad_s is None else np.ascontiguousarray(velocity_rad_s, float),
             pulse_rate_hz=pulse_rate_hz,
             source=source or Source(),
+            parts=tuple(parts),
         )
 
     @cached_property
@@ -119,6 +163,12 @@ class Record:
         """bool, shape (N,): rows that are never used to fit or to choose."""
         flags = np.array([name == HELD_OUT for name in self.segment_names])
         return flags[self.segment]
+
+    @cached_property
+    def part(self) -> np.ndarray:
+        """int, shape (N,): index into `parts` for each sample."""
+        first = [part.first for part in self.parts]
+        return np.searchsorted(first, np.arange(self.time_s.size), side="right") - 1
 
     @property
     def has_held_out(self) -> bool:
