@@ -10,7 +10,7 @@ from typing import Any
 import httpx
 import pytest
 
-from api import evidence, joining
+from api import evidence
 from api.pages import why
 from tests.api.conftest import Service, run_test, wait_done
 from tests.api.test_access import HTML, csrf, signed_in
@@ -182,64 +182,6 @@ def test_experiment_joins_only_the_participants_own_model(client: httpx.Client, 
     assert refused.status_code == 422 and "P017" in refused.json()["detail"]
     assert client.post("/v1/tests", json={"participant": "P017", "joins": "nothing"}).status_code == 404
     assert service.rig.starts == 1 and client.get("/v1/rig").json()["holder"] is None
-
-
-def record(rate_hz: float, lag_s: float, seconds: float = 6.0) -> Any:
-    """Rest, steps, rest; pulses due `lag_s` after the first sample and every 25 ms from then on."""
-    import numpy as np
-
-    import identify
-
-    time_s = np.arange(round(seconds * rate_hz)) / rate_hz
-    slot = np.floor((time_s - lag_s) * 40 + 1e-9)
-    width = np.where((slot >= 40) & (slot < 200) & (slot // 20 % 2 == 0), 200.0, 0.0)
-    names = np.where(slot < 40, "rest", "steps")
-    return identify.Record.from_arrays(time_s, width, width / 40 + 0.01 * np.sin(7 * time_s), names)
-
-
-def test_joined_recordings_are_one_even_record_on_one_grid_of_pulses(tmp_path: Path) -> None:
-    import numpy as np
-
-    import identify
-
-    path = tmp_path / "joined.csv"
-    path.write_text(joining.table([record(400, 0.01), record(1600, 0.004)]))
-    joined = identify.read(path)
-    assert joined.sample_rate_hz == pytest.approx(400, abs=0.01)
-    assert list(joined.segment_names) == ["rest", "steps", "rest", "steps"]
-    changes = np.flatnonzero(np.diff(joined.pulse_width_us)) + 1
-    assert set(changes % 10) == {0}  # every change of width falls on the same grid of 25 ms
-    assert len(changes) == 16
-    followed = joined.torque_nm - joined.pulse_width_us / 40
-    assert np.abs(np.delete(followed, np.r_[changes - 1, changes, changes + 1])).max() < 0.05
-
-
-def test_the_pause_between_joined_recordings_is_kept(tmp_path: Path) -> None:
-    import identify
-
-    parts = [record(400, 0.01), record(400, 0.01)]
-    pause_s = joining.pauses([1000.0, 1000.0 + float(parts[0].time_s[-1]) + 61.0], parts)
-    assert pause_s == pytest.approx([61.0])
-    assert joining.pauses([1000.0, 9000.0], parts) == [joining.LONGEST_PAUSE_S]
-    assert joining.pauses([None, 9000.0], parts) == [0.0]
-    path = tmp_path / "joined.csv"
-    path.write_text(joining.table(parts, pause_s))
-    joined = identify.read(path)
-    assert joined.sample_rate_hz == pytest.approx(400, abs=0.01)
-    jumps = [step for step in joined.time_s[1:] - joined.time_s[:-1] if step > 0.1]
-    assert jumps == pytest.approx([61.0], abs=0.05)
-    assert identify.fit(joined).baseline_nm == pytest.approx(0.0, abs=0.05)
-
-
-def test_recordings_that_cannot_be_joined_are_refused() -> None:
-    import numpy as np
-
-    import identify
-
-    working = record(400, 0.0)
-    late = identify.Record.from_arrays(working.time_s, np.full(working.time_s.size, 100.0), working.torque_nm)
-    with pytest.raises(identify.BadRecord, match="begin at rest"):
-        joining.table([working, late])
 
 
 # ---- what the page says -------------------------------------------------------------------------------------
