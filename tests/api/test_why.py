@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import h5py
 import httpx
 import pytest
 
@@ -182,6 +185,36 @@ def test_experiment_joins_only_the_participants_own_model(client: httpx.Client, 
     assert refused.status_code == 422 and "P017" in refused.json()["detail"]
     assert client.post("/v1/tests", json={"participant": "P017", "joins": "nothing"}).status_code == 404
     assert service.rig.starts == 1 and client.get("/v1/rig").json()["holder"] is None
+
+
+def test_worker_joins_by_begin_and_leaves_a_file_with_the_parts(tmp_path: Path) -> None:
+    import identify
+    from api import jobs, missing
+    from tests.api.fake_rig import write_recording
+
+    widths = [200.0 if index >= 40 and index // 20 % 2 else 0.0 for index in range(240)]
+    segments = [{"name": "rest", "start_s": 0.0, "end_s": 1.0}, {"name": "steps", "start_s": 1.0, "end_s": 6.0}]
+    paths = []
+    for name, rate_hz, minute in (("late", 400, 10), ("early", 1600, 0)):
+        torque = [widths[int(index * 40 / rate_hz)] / 40 for index in range(6 * rate_hz)]
+        plan = SimpleNamespace(test_id=name, participant="P017", kind="default")
+        path, _ = write_recording(tmp_path, plan, widths, torque, segments, rate_hz, "completed")  # pyright: ignore[reportArgumentType]
+        with h5py.File(path, "r+") as file:
+            file.attrs["created_utc"] = f"2026-01-01T00:{minute:02d}:00.250Z"
+        paths.append(str(path))
+    out, exported = tmp_path / "joined.csv", tmp_path / "exported.csv"
+    found = missing.joined(paths, str(out), lambda *_: None)
+    assert found["file_sha256"] == hashlib.sha256(out.read_bytes()).hexdigest()
+    joined = identify.read(out)
+    assert [source.recording_id for source in joined.source.parts] == ["R-early", "R-late"]
+    assert joined.sample_rate_hz == pytest.approx(400, abs=0.01)
+    assert joined.parts[1].pause_s == pytest.approx(594.0, abs=0.03) and joined.parts[1].folded_s == 30.0
+    assert joined.parts[0].begun_s == pytest.approx(1767225600.25)
+    assert identify.fit(joined).baseline_nm == pytest.approx(0.0, abs=0.05)
+    missing.joined(paths[::-1], str(exported), lambda *_: None)
+    assert exported.read_bytes() == out.read_bytes()
+    jobs.export_csv(str(out), lambda *_: None, str(exported))
+    assert identify.read(exported).parts == joined.parts
 
 
 # ---- what the page says -------------------------------------------------------------------------------------
