@@ -101,15 +101,15 @@ def _sent(file: StrictFile, name: str, interval_s: float) -> _Sent:
 
 
 def _felt(sent: _Sent, time_s: np.ndarray, sync: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """By how much each pulse was felt later than the promptest, s; whether that is unsure; times of pulses unasked for."""
+    """Lateness of each pulse behind the promptest, s; whether it is unsure; times of pulses that nobody asked for."""
     late, unsure = _by_host(sent)
     seen = _edges(time_s, sync)
-    found = _matched(sent, *seen) if seen is not None else None
-    if found is None:
+    found = None if seen is None else _matched(sent, *seen)
+    if seen is None or found is None:
         return late, unsure, np.zeros(0)
     edge, extra_s = found
     shown = edge >= 0
-    earliest, newest = (side[np.maximum(edge, 0)] for side in seen)  # type: ignore[union-attr]
+    earliest, newest = (side[np.maximum(edge, 0)] for side in seen)
     # The line tells the sample, the host's clock where in it.
     shift = float(np.median((0.5 * (earliest + newest) - sent.written)[shown]))
     felt = np.clip(sent.written + shift, earliest, newest)

@@ -9,8 +9,8 @@ import numpy as np
 
 from identify.errors import BadRecord
 from identify.records import bounds
-from identify.records.hdf5 import MEND, StrictFile
 from identify.records.felt import read_pulses
+from identify.records.hdf5 import MEND, StrictFile
 from identify.records.record import Pulses, Record, Source
 
 FORMAT = "stimrig-recording"
