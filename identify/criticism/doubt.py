@@ -20,16 +20,10 @@ def left_out(grid: Grid) -> str:
     seconds = float(np.sum(grid.doubted[grid.count > 0])) * grid.step_s
     if not pulses and not seconds:
         return ""
-    told = (
-        ""
-        if not pulses
-        else "1 pulse came late or was lost"
-        if pulses == 1
-        else f"{pulses} pulses came late or were lost"
-    )
+    told = "1 pulse came late or was lost" if pulses == 1 else f"{pulses} pulses came late or were lost"
     if not seconds:
         return f"{told}; when each was felt is known, and nothing is left out."
-    if not told:
+    if not pulses:
         return f"{seconds:.1f} s are left out: what was applied is not known there."
     return f"{told}; {seconds:.1f} s are left out, where it is not known what was felt."
 

@@ -74,6 +74,7 @@ def read_csv(content: bytes, path: Path, pulse_rate_hz: float = 40.0) -> Record:
         columns["torque_nm"],
         np.array(table.segment),
         segment_names=list(table.names),
+        pulses=None,
         pulse_rate_hz=pulse_rate_hz,
         source=Source(name=path.name, sha256=hashlib.sha256(content).hexdigest()),
         **{column: columns[column] for column in OPTIONAL if column in columns},
