@@ -166,8 +166,8 @@ def export_csv(data: str, progress: Progress, out: str) -> dict[str, Any]:
         message = f"{record.pulse_rate_hz:g} pulses/s; a CSV file would be read as 40"
         raise identify.BadRecord(message, mend="Take the HDF5 file.")
     names = ["time_s", "pulse_width_us", "torque_nm"]
-    also = [name for name in ("angle_rad", "velocity_rad_s") if getattr(record, name) is not None]
-    columns = [getattr(record, name).tolist() for name in (*names, *also)]
+    also = record.columns()
+    columns = [column.tolist() for column in (*(getattr(record, name) for name in names), *also.values())]
     segments = [record.segment_names[index] for index in record.segment.tolist()]
     progress(0.7, "writing")
     with Path(out).open("w", encoding="utf-8", newline="") as file:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from identify.criticism.correlation import correlation_tests
+from identify.criticism.doubt import left_out, refuse_doubted
 from identify.criticism.shares import by_direction, by_frequency, by_level, by_segment, by_time
 from identify.criticism.where import worst_places
 from identify.dynamics.pulse_grid import make_grid
@@ -35,29 +36,38 @@ def compare(model: Model, record: Record) -> dict[str, Any]:
     dict
         `fit_percent`, `ceiling_percent` (what the true system would reach on this noise), `rms_nm`, `noise_sd_nm`;
         `fitted` and `held_out` the same for those rows; `by` segment, level, direction, time and frequency;
-        `tests` (correlations with bands); `where` (worst places in words); `series` for plots; `plain`.
+        `tests` (correlations with bands); `where` (worst places in words); `series` for plots; `plain`; `left_out`:
+        how much was not counted, and why, in a sentence ("" where all is known). What is doubted counts in no figure.
+
+    Raises
+    ------
+    BadRecord
+        It is nowhere known what was felt.
     """
+    grid = make_grid(record)
+    refuse_doubted(grid)
     predicted = np.asarray(model.predict(record))
     raw = inspect(record)
     residual = record.torque_nm - predicted
     noise = raw.noise_sd_nm
-    grid = make_grid(record)
     tests = correlation_tests(grid, residual)
-    everything = np.ones(record.time_s.size, bool)
-    places = worst_places(record, residual, noise)
-    result: dict[str, Any] = _figures(record, predicted, noise, everything) | {
+    counted = grid.counted
+    places = worst_places(record, residual, noise, rows=counted)
+    held = record.held_out & counted
+    result: dict[str, Any] = _figures(record, predicted, noise, counted) | {
         "noise_sd_nm": noise,
-        "fitted": _figures(record, predicted, noise, ~record.held_out),
-        "held_out": _figures(record, predicted, noise, record.held_out) if record.has_held_out else None,
+        "fitted": _figures(record, predicted, noise, ~record.held_out & counted),
+        "held_out": _figures(record, predicted, noise, held) if held.any() else None,
         "by": {
-            "segment": by_segment(record, residual, noise),
-            "level": by_level(record, residual, noise),
-            "direction": by_direction(record, residual, noise),
-            "time": by_time(record, residual, noise),
-            "frequency": by_frequency(record, residual, noise),
+            "segment": by_segment(record, residual, noise, counted),
+            "level": by_level(record, residual, noise, counted),
+            "direction": by_direction(record, residual, noise, counted),
+            "time": by_time(record, residual, noise, counted),
+            "frequency": by_frequency(record, residual, noise, counted),
         },
         "tests": tests,
         "where": places,
+        "left_out": left_out(grid),
         "series": _series(model, record, predicted, noise),
     }
     result["plain"] = _plain(result, tests, places)
@@ -114,6 +124,7 @@ def _plain(result: dict[str, Any], tests: dict[str, Any], places: list[dict[str,
             f"On rows it was not fitted on it errs by {held['rms_nm']:.3g} N·m ({held['fit_percent']:.1f} %, at most "
             f"{held['ceiling_percent']:.1f} %)."
         )
+    lines += [result["left_out"]] if result["left_out"] else []
     alarms = [test["words"] for test in tests["tests"] if not test["passed"]]
     lines.append(" ".join(alarms) if alarms else "What is left looks like noise: none of the correlations stands out.")
     if alarms:

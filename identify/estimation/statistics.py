@@ -21,9 +21,10 @@ def fit_percent(torque_nm: np.ndarray, predicted_nm: np.ndarray) -> float:
 def figures(fitted: Fitted, record: Record, predicted_nm: np.ndarray | None = None) -> dict[str, float | str | None]:
     """Fit and error on fitted and on held-out rows, and the ceiling that noise sets."""
     predicted = predict_fitted(fitted, record) if predicted_nm is None else predicted_nm
-    used = fitted.problem.setup.fitted[fitted.problem.setup.grid.interval] & ~record.held_out
+    grid = fitted.problem.setup.grid
+    used = fitted.problem.setup.fitted[grid.interval] & ~record.held_out
     torque, noise = record.torque_nm, fitted.problem.setup.noise_sd_nm
-    held, guess = record.held_out, predicted
+    held, guess = record.held_out & grid.counted, predicted
     source = "validate"
     if not held.any():
         guess, held = cross_validated(fitted, record), used

@@ -18,10 +18,9 @@ import numpy as np
 from identify.errors import BadRecord
 from identify.records import bounds, parts_csv
 from identify.records.bounds import LARGEST
-from identify.records.record import Record, Source, joined_source
+from identify.records.record import OPTIONAL, Part, Record, Source, joined_source
 
 REQUIRED = ("time_s", "pulse_width_us", "torque_nm", "segment")
-OPTIONAL = ("angle_rad", "velocity_rad_s")
 PAUSE_S = 1.0
 """A jump of the clock as long as this, at zero pulse width, is a pause between two tests."""
 MOST_PAUSES = 1000
@@ -67,17 +66,24 @@ def read_csv(content: bytes, path: Path, pulse_rate_hz: float | None = None) -> 
             place=f"{name}, line {lines[negative[0]]}, column pulse_width_us",
             mend="A pulse width is 0 (no pulse) or positive.",
         )
+    doubted = columns.get("doubted", np.zeros(0))
+    if (bad := np.flatnonzero((doubted != 0) & (doubted != 1))).size:
+        raise BadRecord(
+            f"{doubted[bad[0]]:g} is neither 0 nor 1",
+            place=f"{name}, line {lines[bad[0]]}, column doubted",
+            mend="1 is a row in which it is not known what was felt, 0 any other.",
+        )
     return Record.from_arrays(
         time_s,
         columns["pulse_width_us"],
         columns["torque_nm"],
         np.array(table.segment),
         segment_names=list(table.names),
-        angle_rad=columns.get("angle_rad"),
-        velocity_rad_s=columns.get("velocity_rad_s"),
+        pulses=None,
         pulse_rate_hz=pulse_rate_hz or (joined.pulse_rate_hz if joined else None) or 40.0,
         source=source,
-        **({"parts": joined.parts} if joined else {}),
+        parts=joined.parts if joined else (Part(),),
+        **{column: columns[column] for column in OPTIONAL if column in columns},
     )
 
 

@@ -8,20 +8,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
 from identify.dynamics.pulse_grid import pulse_phase_s
 from identify.errors import BadRecord
 from identify.records import bounds
-from identify.records.record import OPTIONAL_COLUMNS, Part, Record, Source, joined_source
+from identify.records.record import OPTIONAL, Part, Pulses, Record, Source, joined_source
 
 PAUSE_S = 30.0
 """What of a pause is kept in the time at most: every pulse interval of it is a row of the grid."""
 SAME_RATE = 0.01
 """Sampling rates that differ by less, as a share, are one nominal rate and two clocks."""
 LEAST_SAMPLES = 8
+TOLD_WHERE_SO = ("late_s", "doubted")
+"""Columns that a record lacks where there is nothing to tell."""
 RESAMPLED = ("time_s", "torque_nm", "angle_rad", "velocity_rad_s")
 """Columns of which a sample at a lower rate is a mean; a flag is set if one was, and else a value is taken that was."""
 
@@ -61,7 +63,8 @@ def join(records: Sequence[Record], begun_s: Sequence[float | None]) -> Record:
     Parts sampled faster than the slowest are brought down by block means, whole blocks to a pulse interval. Those
     that differ by less than 1 % stay as they are. The slots of the pulses fall on one grid. A pause is kept in whole
     pulse intervals, up to 30 s of it in `time_s`; it is 0 where a begin is not known, or where by their clocks two
-    parts overlap. An optional column is dropped unless all parts have it.
+    parts overlap. An angle or velocity is dropped unless all parts have it; so are the pulses in the gaps, which are
+    doubted then. A part that has no lateness or doubt has none to tell.
 
     Parameters
     ----------
@@ -112,8 +115,10 @@ def _pieces(record: Record, begun_s: float | None) -> list[_Piece]:
         shift_s = 0.0 if alone and part.begun_s is None else part.own_s - float(record.time_s[part.first])
         names = record.segment[rows]
         changes: dict[str, object] = {
-            name: column[rows] for name in OPTIONAL_COLUMNS if (column := getattr(record, name)) is not None
+            name: column[rows] for name in OPTIONAL if (column := getattr(record, name)) is not None
         }
+        if record.pulses is not None:
+            changes["pulses"] = _pulses(record.pulses, shift_s, -np.inf, np.inf)
         changes |= {
             "time_s": record.time_s[rows] + shift_s,
             "pulse_width_us": record.pulse_width_us[rows],
@@ -171,7 +176,7 @@ def _block_means(piece: _Piece, each: int, rate_hz: float) -> Record:
         pick[index] = starts[index] + int(np.argmax(record.held_out[starts[index] : starts[index] + count[index]]))
     pick = pick[whole]
     changes: dict[str, object] = {}
-    for name in ("time_s", "pulse_width_us", "torque_nm", *OPTIONAL_COLUMNS):
+    for name in ("time_s", "pulse_width_us", "torque_nm", *OPTIONAL):
         column = getattr(record, name)
         if column is not None:
             if name in RESAMPLED:
@@ -192,6 +197,7 @@ def _joined(pieces: list[_Piece], rate_hz: float) -> Record:
     if total > bounds.LARGEST_ROWS:
         raise BadRecord(f"{total} samples together", mend=f"At most {bounds.LARGEST_ROWS} in one record.")
     times, parts, codes, names, sources = [], [], [], [], []
+    pulses: list[Pulses] = []
     first, ended, slot_s = 0, 0, pieces[0].slot_s
     for index, piece in enumerate(pieces):
         time_s = piece.record.time_s
@@ -207,6 +213,8 @@ def _joined(pieces: list[_Piece], rate_hz: float) -> Record:
         else:
             ended = piece.interval(-1, rate_hz)
         times.append(time_s + shift_s)
+        if piece.record.pulses is not None:
+            pulses.append(_pulses(piece.record.pulses, shift_s, float(time_s[0]), float(time_s[-1])))
         codes.append(piece.record.segment + len(names))
         names += piece.record.segment_names
         sources.append(piece.source)
@@ -215,20 +223,40 @@ def _joined(pieces: list[_Piece], rate_hz: float) -> Record:
     time_s = np.concatenate(times)
     bounds.check_span(time_s, "the joined record")
     columns: dict[str, np.ndarray | None] = {}
-    for name in OPTIONAL_COLUMNS:
-        each = [getattr(piece.record, name) for piece in pieces]
-        columns[name] = None if any(column is None for column in each) else np.concatenate(each)
+    for name in OPTIONAL:
+        each = [column for piece in pieces if (column := _column(piece.record, name)) is not None]
+        whole = np.concatenate(each) if len(each) == len(pieces) else None
+        columns[name] = None if name in TOLD_WHERE_SO and whole is not None and not whole.any() else whole
     return Record(
         time_s=time_s,
         pulse_width_us=np.concatenate([piece.record.pulse_width_us for piece in pieces]),
         torque_nm=np.concatenate([piece.record.torque_nm for piece in pieces]),
         segment=np.concatenate(codes),
         segment_names=tuple(names),
+        pulses=_all_pulses(pulses) if len(pulses) == len(pieces) else None,
         pulse_rate_hz=rate_hz,
         source=sources[0] if len(sources) == 1 else joined_source(sources),
         parts=tuple(parts),
         **columns,  # pyright: ignore[reportArgumentType]
     )
+
+
+def _column(record: Record, name: str) -> np.ndarray | None:
+    column = getattr(record, name)
+    if column is None and name in TOLD_WHERE_SO:
+        return np.zeros(record.time_s.size, bool if name == "doubted" else float)
+    return column
+
+
+def _pulses(known: Pulses, shift_s: float, first_s: float, last_s: float) -> Pulses:
+    """Those from the first to the last of a part's samples, on another clock."""
+    rows = (known.time_s >= first_s) & (known.time_s <= last_s)
+    return Pulses(known.time_s[rows] + shift_s, known.width_us[rows], known.late_s[rows], known.lost[rows])
+
+
+def _all_pulses(parts: list[Pulses]) -> Pulses:
+    columns = (np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(Pulses))
+    return Pulses(*columns)
 
 
 def _pause(before: _Piece, after: _Piece, rate_hz: float) -> int:

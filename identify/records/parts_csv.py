@@ -16,7 +16,7 @@ import numpy as np
 
 from identify.errors import BadRecord
 from identify.records import bounds
-from identify.records.record import OPTIONAL_COLUMNS, Part, Record, Source
+from identify.records.record import OPTIONAL, Part, Record, Source
 
 CELLS = ("pause_s", "folded_s", "own_s", "begun_s", "pulse_rate_hz", "name", "recording_id", "sha256")
 """Columns of which only a part's first row is filled; all but `pause_s` may be missing or empty."""
@@ -33,7 +33,7 @@ def write(record: Record, path: Path) -> None:
     BadRecord
         The file would be larger than what can be read.
     """
-    optional = [name for name in OPTIONAL_COLUMNS if getattr(record, name) is not None]
+    optional = [name for name in OPTIONAL if getattr(record, name) is not None]
     names = [_cell(name) for name in record.segment_names]
     header = ("time_s", "pulse_width_us", "torque_nm", "segment", *optional, "part", *CELLS)
     columns: list[Iterator[str]] = [

@@ -16,8 +16,8 @@ def read(path: str | Path, pulse_rate_hz: float | None = None) -> Record:
     Parameters
     ----------
     path : str or Path
-        CSV with the header `time_s,pulse_width_us,torque_nm,segment` (and optionally `angle_rad,velocity_rad_s`, and
-        the columns of a joined record), or a sealed recording.
+        CSV with the header `time_s,pulse_width_us,torque_nm,segment` (and optionally `angle_rad`, `velocity_rad_s`,
+        `late_s`, `doubted`, and the columns of a joined record), or a sealed recording.
     pulse_rate_hz : float, optional
         Pulses a second; by default what the recording says, else 40.
 

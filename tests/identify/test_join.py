@@ -13,7 +13,7 @@ from identify import Record
 from identify.dynamics.pulse_grid import make_grid
 from identify.records import parts_csv
 from identify.records.join import PAUSE_S, join
-from identify.records.record import Part, Source
+from identify.records.record import Part, Pulses, Source
 
 
 def record(
@@ -169,6 +169,46 @@ def test_optional_columns_are_kept_where_all_parts_have_them():
     assert joined.velocity_rad_s == pytest.approx(0.1)
     dropped = join([a, replace(b, angle_rad=None)], [0.0, 50.0])
     assert dropped.angle_rad is None and dropped.velocity_rad_s is not None
+
+
+def test_lateness_and_doubt_of_one_part_stay_its_own(tmp_path):
+    a, b = record(400, name="a"), record(1600, name="b", seed=2)
+    late = np.where((b.time_s >= 2) & (b.time_s < 2.025), 0.004, 0.0)
+    joined = join([a, replace(b, late_s=late, doubted=b.time_s >= 5)], [0.0, 50.0])
+    for each in (joined, through_file(joined, tmp_path)):
+        assert each.late_s is not None and each.doubted is not None and each.doubted.dtype == bool
+        assert not each.late_s[each.part == 0].any() and not each.doubted[each.part == 0].any()
+        assert (each.late_s == 0.004).sum() == 10 and each.doubted.sum() == 400
+    assert join([a, b], [0.0, 50.0]).late_s is None
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_gap_is_told_by_the_pulses_or_doubted_to_the_end_of_its_part(known):
+    def with_gap(name: str) -> Record:
+        whole = record(400, name=name)
+        slots = slice(None, None, 10)
+        pulses = Pulses(whole.time_s[slots], whole.pulse_width_us[slots], np.zeros(240), np.zeros(240, bool))
+        return replace(whole, pulses=pulses if known else None).take((whole.time_s < 4.9) | (whole.time_s >= 5.3))
+
+    a, b = with_gap("a"), with_gap("b")
+    joined = join([a, b], [0.0, 9.0])
+    grid = make_grid(joined)
+    own = make_grid(a)
+    for part in (0, 1):
+        rows = np.flatnonzero(grid.part == part)[: own.size]
+        assert np.array_equal(grid.pulse_width_us[rows], own.pulse_width_us)
+        assert np.array_equal(grid.doubted[rows], own.doubted)
+    assert grid.doubted.any() == (not known)
+
+
+def test_parts_of_some_rows():
+    a, b, c = (record(400, name=name, seed=seed) for seed, name in enumerate("abc"))
+    joined = join([a, b, c], [0.0, 16.0, 116.0])
+    some = joined.take((joined.part != 1) & (np.arange(joined.time_s.size) > 9))
+    assert [part.first for part in some.parts] == [0, a.time_s.size - 10]
+    assert some.parts[0].own_s == pytest.approx(a.time_s[10])
+    assert some.parts[1].pause_s == pytest.approx(104.0, abs=0.06)
+    assert some.parts[1].folded_s == pytest.approx(40.0, abs=0.06)
 
 
 @pytest.mark.parametrize("begun_s", [(1000.25, 8200.5), (None, None)])
