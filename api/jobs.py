@@ -156,12 +156,18 @@ def export_csv(data: str, progress: Progress, out: str) -> dict[str, Any]:
 
     progress(0.1, "reading the recording")
     record = identify.read(Path(data))
+    if len(record.parts) > 1:
+        from identify.records import parts_csv
+
+        progress(0.7, "writing")
+        parts_csv.write(record, Path(out))
+        return {"rows": int(record.time_s.size)}
     if abs(record.pulse_rate_hz - 40.0) > 1e-6:
         message = f"{record.pulse_rate_hz:g} pulses/s; a CSV file would be read as 40"
         raise identify.BadRecord(message, mend="Take the HDF5 file.")
     names = ["time_s", "pulse_width_us", "torque_nm"]
-    also = [name for name in ("angle_rad", "velocity_rad_s") if getattr(record, name) is not None]
-    columns = [getattr(record, name).tolist() for name in (*names, *also)]
+    also = record.columns()
+    columns = [column.tolist() for column in (*(getattr(record, name) for name in names), *also.values())]
     segments = [record.segment_names[index] for index in record.segment.tolist()]
     progress(0.7, "writing")
     with Path(out).open("w", encoding="utf-8", newline="") as file:

@@ -99,21 +99,22 @@ def improve(data: str, progress: Progress, force: Sequence[str] = ()) -> dict[st
 
 
 def joined(parts: Sequence[str], out: str, progress: Progress) -> dict[str, Any]:
-    """Recordings one after the other as one (see `api.joining`), written as CSV to `out`; its SHA-256."""
+    """Recordings as the parts of one, written to `out` as CSV that `identify.read` reads; its SHA-256."""
     import hashlib
 
     import identify
-    from api.joining import pauses, table
+    from identify.records import parts_csv
+    from identify.records.join import join
 
     progress(0.1, "joining the recordings")
     records = [identify.read(Path(part)) for part in parts]
-    content = table(records, pauses([begun(Path(part)) for part in parts], records)).encode()
-    Path(out).write_bytes(content)
-    return {"file_sha256": hashlib.sha256(content).hexdigest()}
+    parts_csv.write(join(records, [begun(Path(part)) for part in parts]), Path(out))
+    with Path(out).open("rb") as file:
+        return {"file_sha256": hashlib.file_digest(file, "sha256").hexdigest()}
 
 
 def begun(path: Path) -> float | None:
-    """When a sealed recording's clock was 0, as Unix time; None for a file that doesn't say."""
+    """When a sealed recording's clock was 0, as Unix time; None for CSV: a joined one says it of its parts."""
     from datetime import datetime
 
     import identify

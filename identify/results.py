@@ -78,6 +78,8 @@ class Comparison(_Result):
     series : dict
         What a plot needs, thinned: `time_s`, `torque_nm`, `predicted_torque_nm`, `lower_nm`, `upper_nm`, `residual_nm`,
         `pulse_width_us`, `segment`, `noise_band_nm`.
+    left_out : str
+        How much was not counted, and why; empty where all is known.
     plain : tuple of str
         Sentences for people.
     """
@@ -94,6 +96,7 @@ class Comparison(_Result):
     tests: Row
     where: tuple[Row, ...]
     series: Row
+    left_out: str
     plain: tuple[str, ...]
 
     def _sheet(self) -> Sheet:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from identify.criticism.correlation import correlation_tests
+from identify.criticism.doubt import left_out, refuse_doubted
 from identify.criticism.shares import by_direction, by_frequency, by_level, by_segment, by_time
 from identify.criticism.where import worst_places
 from identify.dynamics.pulse_grid import make_grid
@@ -35,33 +36,43 @@ def compare(model: Model, record: Record) -> Comparison:
     -------
     Comparison
         Figures of all rows, of the fitted and the held-out ones; the error split up, tested, placed and in words.
+        What is doubted counts in no figure.
+
+    Raises
+    ------
+    BadRecord
+        It is nowhere known what was felt.
     """
+    grid = make_grid(record)
+    refuse_doubted(grid)
     predicted = np.asarray(model.predict(record))
     raw = inspect(record)
     residual = record.torque_nm - predicted
     noise = raw.noise_sd_nm
-    grid = make_grid(record)
     tests = correlation_tests(grid, residual)
-    everything = np.ones(record.time_s.size, bool)
-    places = worst_places(record, residual, noise)
-    whole = _figures(record, predicted, noise, everything)
-    held_out = _figures(record, predicted, noise, record.held_out) if record.has_held_out else None
+    counted = grid.counted
+    places = worst_places(record, residual, noise, rows=counted)
+    held = record.held_out & counted
+    whole = _figures(record, predicted, noise, counted)
+    held_out = _figures(record, predicted, noise, held) if held.any() else None
+    said = left_out(grid)
     return Comparison(
         **whole,
         noise_sd_nm=noise,
-        fitted=_figures(record, predicted, noise, ~record.held_out),
+        fitted=_figures(record, predicted, noise, ~record.held_out & counted),
         held_out=held_out,
         by={
-            "segment": by_segment(record, residual, noise),
-            "level": by_level(record, residual, noise),
-            "direction": by_direction(record, residual, noise),
-            "time": by_time(record, residual, noise),
-            "frequency": by_frequency(record, residual, noise),
+            "segment": by_segment(record, residual, noise, counted),
+            "level": by_level(record, residual, noise, counted),
+            "direction": by_direction(record, residual, noise, counted),
+            "time": by_time(record, residual, noise, counted),
+            "frequency": by_frequency(record, residual, noise, counted),
         },
         tests=tests,
         where=tuple(places),
+        left_out=said,
         series=_series(model, record, predicted, noise),
-        plain=tuple(_plain(whole, held_out, noise, tests, places)),
+        plain=(*_plain(whole, held_out, noise, tests, places), *([said] if said else [])),
     )
 
 

@@ -42,7 +42,7 @@ def correlation_tests(grid: Grid, residual_nm: np.ndarray) -> dict[str, Any]:
         `false_alarm_rate`: what the bands are made for; `innovations`: whether the cross-correlations were taken on
         the residual freed of its slow noise.
     """
-    known = grid.count > 0
+    known = (grid.count > 0) & ~grid.doubted
     residual = np.where(known, block_means(grid, residual_nm), 0.0)
     residual = residual - residual[known].mean()
     torque = np.where(known, grid.torque_nm, 0.0)

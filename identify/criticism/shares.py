@@ -1,4 +1,4 @@
-"""The error split up: by segment, level of pulse width, direction, time and frequency."""
+"""The error split up: by segment, level of pulse width, direction, time and frequency; of samples that count."""
 
 from __future__ import annotations
 
@@ -33,20 +33,27 @@ def _total(groups: list[np.ndarray], residual_nm: np.ndarray, noise_sd_nm: float
     return sum(max(float(np.sum(residual_nm[g] ** 2) - g.sum() * noise_sd_nm**2), 0.0) for g in groups)
 
 
-def _table(labels: list[str], groups: list[np.ndarray], residual: np.ndarray, noise: float) -> list[dict[str, Any]]:
+def _table(
+    labels: list[str], groups: list[np.ndarray], residual: np.ndarray, noise: float, counted: np.ndarray | None
+) -> list[dict[str, Any]]:
+    groups = groups if counted is None else [group & counted for group in groups]
     total = _total(groups, residual, noise)
     return [
         part(label, group, residual, noise, total) for label, group in zip(labels, groups, strict=True) if group.any()
     ]
 
 
-def by_segment(record: Record, residual_nm: np.ndarray, noise_sd_nm: float) -> list[dict[str, Any]]:
+def by_segment(
+    record: Record, residual_nm: np.ndarray, noise_sd_nm: float, counted: np.ndarray | None = None
+) -> list[dict[str, Any]]:
     """Each segment in order."""
     groups = [record.segment == i for i in range(len(record.segment_names))]
-    return _table(list(record.segment_names), groups, residual_nm, noise_sd_nm)
+    return _table(list(record.segment_names), groups, residual_nm, noise_sd_nm, counted)
 
 
-def by_level(record: Record, residual_nm: np.ndarray, noise_sd_nm: float) -> list[dict[str, Any]]:
+def by_level(
+    record: Record, residual_nm: np.ndarray, noise_sd_nm: float, counted: np.ndarray | None = None
+) -> list[dict[str, Any]]:
     """Pulse width zero, then equal spans up to the largest."""
     u, top = record.pulse_width_us, float(record.pulse_width_us.max())
     labels, groups = ["0 µs"], [u <= 0]
@@ -54,28 +61,35 @@ def by_level(record: Record, residual_nm: np.ndarray, noise_sd_nm: float) -> lis
     for low, high in itertools.pairwise(edges):
         labels.append(f"{low:.0f}-{high:.0f} µs")
         groups.append((u > max(low, 0.0)) & (u <= high) if high > 0 else np.zeros(u.size, bool))
-    return _table(labels, groups, residual_nm, noise_sd_nm)
+    return _table(labels, groups, residual_nm, noise_sd_nm, counted)
 
 
-def by_direction(record: Record, residual_nm: np.ndarray, noise_sd_nm: float) -> list[dict[str, Any]]:
+def by_direction(
+    record: Record, residual_nm: np.ndarray, noise_sd_nm: float, counted: np.ndarray | None = None
+) -> list[dict[str, Any]]:
     """Pulse width rising, falling or held over the last third of a second."""
     sign = direction_of(record)
-    return _table(["rising", "falling", "held"], [sign > 0, sign < 0, sign == 0], residual_nm, noise_sd_nm)
+    return _table(["rising", "falling", "held"], [sign > 0, sign < 0, sign == 0], residual_nm, noise_sd_nm, counted)
 
 
-def by_time(record: Record, residual_nm: np.ndarray, noise_sd_nm: float) -> list[dict[str, Any]]:
+def by_time(
+    record: Record, residual_nm: np.ndarray, noise_sd_nm: float, counted: np.ndarray | None = None
+) -> list[dict[str, Any]]:
     """Equal spans since the start."""
     t = record.time_s - record.time_s[0]
     edges = np.linspace(0.0, t[-1] + 1e-9, SPANS + 1)
     labels = [f"{a:.1f}-{b:.1f} s" for a, b in itertools.pairwise(edges)]
     groups = [(t >= a) & (t < b) for a, b in itertools.pairwise(edges)]
-    return _table(labels, groups, residual_nm, noise_sd_nm)
+    return _table(labels, groups, residual_nm, noise_sd_nm, counted)
 
 
-def by_frequency(record: Record, residual_nm: np.ndarray, noise_sd_nm: float) -> list[dict[str, Any]]:
+def by_frequency(
+    record: Record, residual_nm: np.ndarray, noise_sd_nm: float, counted: np.ndarray | None = None
+) -> list[dict[str, Any]]:
     """Octaves: root mean square of the residual in each, and of white noise there."""
     rate = record.sample_rate_hz
-    longest = max(runs(np.ones(residual_nm.size, bool)), key=lambda r: r.stop - r.start)
+    known = np.ones(residual_nm.size, bool) if counted is None else counted
+    longest = max(runs(known), key=lambda r: r.stop - r.start)
     values = residual_nm[longest]
     power = np.abs(np.fft.rfft(values)) ** 2 / values.size**2
     power[1:] *= 2.0

@@ -43,13 +43,15 @@ class SecondOrder:
         return self.delay_s + 7.0 * self.time_constant_s / max(slowest, 1e-3)
 
     def on_grid(self, grid: Grid, drive_nm: np.ndarray) -> np.ndarray:
-        """Block means of the response to a held drive, (K,) or (K, M) N·m, from rest."""
-        torque, rate = boundary_states(self.time_constant_s, self.damping, grid.step_s, drive_nm)
+        """Block means of the response to a drive by even slots, (K,) or (K, M) N·m, as it was felt, from rest."""
+        felt = grid.held(drive_nm)
+        torque, rate = boundary_states(self.time_constant_s, self.damping, grid.step_s, felt)
         return grid.block_mean(torque, rate, self.delay_s)
 
     def at_samples(self, grid: Grid, drive_nm: np.ndarray) -> np.ndarray:
         """The response at the record's samples, shape (N,)."""
-        torque, rate = boundary_states(self.time_constant_s, self.damping, grid.step_s, drive_nm)
+        felt = grid.held(drive_nm)
+        torque, rate = boundary_states(self.time_constant_s, self.damping, grid.step_s, felt)
         position = grid.interval + grid.fraction - self.delay_s / grid.step_s
         return read_at(torque, rate, position, grid.step_s)
 
@@ -131,10 +133,11 @@ class Discrete:
         return self.step_s * (self.delay_samples + len(self.b) + decay)
 
     def on_grid(self, grid: Grid, drive_nm: np.ndarray) -> np.ndarray:
-        """Block means of the response to a held drive, (K,) or (K, M) N·m, from rest."""
+        """Block means of the response to a drive by even slots, (K,) or (K, M) N·m, as it was felt, from rest."""
+        felt = grid.held(drive_nm)
         if abs(grid.step_s - self.step_s) > 1e-9:
-            return _resampled(self, grid, drive_nm)
-        return self.filter(drive_nm)
+            return _resampled(self, grid, felt)
+        return self.filter(felt)
 
     def filter(self, drive_nm: np.ndarray) -> np.ndarray:
         """B(q)/A(q) applied along the first axis, from rest."""
@@ -143,8 +146,11 @@ class Discrete:
         return np.asarray(lfilter(np.r_[np.zeros(self.delay_samples), self.b], self.a, drive_nm, axis=0))
 
     def at_samples(self, grid: Grid, drive_nm: np.ndarray) -> np.ndarray:
-        """The response at the record's samples: a cubic through the block means at their centres, shape (N,)."""
-        mean = self.on_grid(grid, drive_nm)
+        """The response at the record's samples, shape (N,)."""
+        return self.between(grid, self.on_grid(grid, drive_nm))
+
+    def between(self, grid: Grid, mean: np.ndarray) -> np.ndarray:
+        """Block means read at the record's samples: a cubic through them at their centres, shape (N,)."""
         position = grid.interval + grid.fraction - self.centre
         if np.allclose(position, np.round(position), atol=1e-6):
             return mean[np.clip(np.round(position).astype(np.int64), 0, mean.size - 1)]

@@ -33,5 +33,5 @@ def run(recipe: dict[str, Any], width_us: np.ndarray) -> np.ndarray:
 
 def at_samples(recipe: dict[str, Any], grid: Grid, centre: float) -> np.ndarray:
     """Free run at the record's samples, its own baseline included, N·m, shape (N,)."""
-    means = run(recipe, grid.pulse_width_us) + recipe["baseline_nm"]
-    return Discrete((1.0,), (1.0,), 0, grid.step_s, centre).at_samples(grid, means)
+    means = run(recipe, grid.held(grid.pulse_width_us)) + recipe["baseline_nm"]
+    return Discrete((1.0,), (1.0,), 0, grid.step_s, centre).between(grid, means)

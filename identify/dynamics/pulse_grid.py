@@ -15,7 +15,7 @@ import numpy as np
 
 from identify.dynamics.second_order import hermite
 from identify.errors import BadRecord
-from identify.records.record import Record
+from identify.records.record import FORGOTTEN_S, Record
 
 
 @dataclass(frozen=True)
@@ -44,6 +44,12 @@ class Grid:
         Index into the record's `segment_names`.
     angle_rad, velocity_rad_s : ndarray or None, shape (K,)
         Means over each interval.
+    late_s : ndarray or None, shape (K,)
+        By how much later than its slot each interval's pulse was felt, s; None where none was late.
+    doubted : ndarray of bool, shape (K,)
+        Intervals in which it is not known what was felt.
+    part : ndarray of int, shape (K,)
+        Index into the record's `parts`; the pause between two belongs to the part before it.
     noise_sd_nm : float
         White noise of a sample, as the raw samples show it, N·m; 0 where nobody has looked.
     """
@@ -60,6 +66,9 @@ class Grid:
     segment: np.ndarray
     angle_rad: np.ndarray | None
     velocity_rad_s: np.ndarray | None
+    late_s: np.ndarray | None
+    doubted: np.ndarray
+    part: np.ndarray
     noise_sd_nm: float = 0.0
 
     @property
@@ -77,9 +86,15 @@ class Grid:
         """bool, shape (K,): intervals that may be used to fit and to choose.
 
         An interval with fewer than half of its samples (an edge, a gap) is left out: its mean is noisier than the rest.
+        One in which it is not known what was felt is left out, too.
         """
         usual = float(np.median(self.count[self.count > 0])) if np.any(self.count) else 1.0
-        return ~self.held_out & (self.count > 0) & (2 * self.count >= usual)
+        return ~self.held_out & ~self.doubted & (self.count > 0) & (2 * self.count >= usual)
+
+    @cached_property
+    def counted(self) -> np.ndarray:
+        """bool, shape (N,): samples whose error counts, those of `validate` among them."""
+        return ~self.doubted[self.interval]
 
     @property
     def delay_bounds_s(self) -> tuple[float, float]:
@@ -89,8 +104,61 @@ class Grid:
 
     @cached_property
     def stretches(self) -> list[slice]:
-        """Contiguous runs of fitted intervals: noise is correlated inside one, not across."""
-        return runs(self.fitted)
+        """Contiguous runs of fitted intervals of one part: noise is correlated inside one, not across."""
+        return [run for index in range(len(self.record.parts)) for run in runs(self.fitted & (self.part == index))]
+
+    def held(self, drive_nm: np.ndarray, axis: int = 0) -> np.ndarray:
+        """The drive of each interval as it was felt: the input itself where nothing was late.
+
+        A pulse felt late by a part of an interval leaves the drive before it standing for that part; an early one takes
+        the part from the drive before it. What follows the last pulse of a train begins as late as that pulse was. One
+        that was late by whole intervals falls into those in which it was felt, beside what is felt there: its own are
+        empty, and the drive's sum stays.
+
+        Parameters
+        ----------
+        drive_nm : ndarray, shape (K,), (K, M) or (M, K)
+            Drive by even slots.
+        axis : int
+            That of the intervals.
+        """
+        if self._felt is None:
+            return drive_nm
+        rows, late, early, moved, at, share = self._felt
+        drive = np.moveaxis(drive_nm, axis, 0)
+        lift = (slice(None),) + (None,) * (drive.ndim - 1)
+        result = np.copy(drive, order="K")
+        if moved.size:
+            result[moved] = 0.0
+        base = result[np.r_[rows, np.maximum(rows - 1, 0), np.minimum(rows + 1, self.size - 1)]]
+        own, before, after = np.split(base, 3)
+        result[rows] = (1.0 - late - early)[lift] * own + late[lift] * before + early[lift] * after
+        for target, part in zip(at, share, strict=True):
+            inside = target < self.size
+            np.add.at(result, target[inside], part[inside][lift] * drive[moved[inside]])
+        return np.moveaxis(result, 0, axis)
+
+    @cached_property
+    def _felt(self) -> tuple[np.ndarray, ...] | None:
+        """Which intervals late pulses change, and how: rows with their parts of before and after, and pulses moved."""
+        if self.late_s is None or not np.any(self.late_s):
+            return None
+        part = self.late_s / self.step_s
+        moved = np.flatnonzero(part >= 1.0)
+        whole = np.floor(part[moved]).astype(np.int64)
+        rest = part[moved] - whole
+        part = np.where(part >= 1.0, 0.0, part)
+        empty = self.pulse_width_us == 0
+        empty[moved] = True
+        ends = np.flatnonzero(empty[1:] & ~empty[:-1]) + 1
+        part[ends] = part[ends - 1]
+        late = np.clip(part, 0.0, 1.0)
+        late[0] = 0.0
+        early = np.r_[np.clip(-part[1:], 0.0, 1.0), 0.0]
+        early = np.minimum(early, 1.0 - late)
+        rows = np.flatnonzero(late + early)
+        at = np.stack([moved + whole, moved + whole + 1])
+        return rows, late[rows], early[rows], moved, at, np.stack([1.0 - rest, rest])
 
     def mean_weights(self, delay_s: float = 0.0) -> tuple[int, np.ndarray]:
         """How an interval's mean is read off the boundary states, for a model that lags by `delay_s`.
@@ -269,11 +337,21 @@ def make_grid(record: Record) -> Grid:
     middle = np.minimum(first_of + count // 2, record.time_s.size - 1)
     # Where samples are missing the last width seen is taken to be in force still.
     middle = np.where(count > 0, middle, np.maximum(first_of - 1, 0))
+    following = record.part[np.minimum(first_of, record.time_s.size - 1)]
+    part = record.part[middle]
+    pause = (count == 0) & (following != part)
+    width, late_s, doubted = _applied(record, middle, start_s, step_s, (count == 0) & ~pause, part)
+    # Between two parts nothing is stimulated, whatever the first one ended with.
+    width[pause] = 0.0
+    if late_s is not None:
+        late_s[pause] = 0.0
+    if record.doubted is not None:
+        doubted |= np.bincount(interval, record.doubted, minlength=size) > 0
     return Grid(
         record=record,
         start_s=start_s,
         step_s=step_s,
-        pulse_width_us=record.pulse_width_us[middle],
+        pulse_width_us=width,
         torque_nm=mean(record.torque_nm),
         count=count,
         interval=interval,
@@ -282,10 +360,41 @@ def make_grid(record: Record) -> Grid:
         segment=record.segment[middle],
         angle_rad=None if record.angle_rad is None else mean(record.angle_rad),
         velocity_rad_s=None if record.velocity_rad_s is None else mean(record.velocity_rad_s),
+        late_s=late_s,
+        doubted=doubted,
+        part=part,
     )
 
 
+def _applied(
+    record: Record, middle: np.ndarray, start_s: float, step_s: float, gaps: np.ndarray, part: np.ndarray
+) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
+    """Width of each interval, its lateness, and where it is not known what was applied.
+
+    Where samples are missing the pulses tell, if the record has them. Else the last width seen is taken to be in force
+    still, and what comes after is doubted until a muscle has forgotten it, unless nothing was applied before and after.
+    """
+    width = record.pulse_width_us[middle]
+    late = np.zeros(width.size) if record.late_s is None else record.late_s[middle]
+    doubted = np.zeros(width.size, bool)
+    if gaps.any() and record.pulses is not None:
+        known = record.pulses
+        place = np.round((known.time_s - start_s) / step_s).astype(np.int64)
+        inside = (place >= 0) & (place < width.size)
+        for target, values in ((width, known.width_us), (late, known.late_s)):
+            told = np.zeros(width.size)
+            told[place[inside]] = values[inside]
+            target[gaps] = told[gaps]
+    elif gaps.any():
+        for gap in runs(gaps):
+            if width[gap.start - 1] or width[min(gap.stop, width.size - 1)]:
+                after = slice(gap.start, gap.stop + round(FORGOTTEN_S / step_s))
+                doubted[after] |= part[after] == part[gap.start]
+    return width, late if late.any() else None, doubted
+
+
 LONGEST_S = 24 * 3600.0
+LONGEST_LATE_S = 1.0
 
 
 def refuse_nonsense(record: Record) -> None:
@@ -305,6 +414,12 @@ def refuse_nonsense(record: Record) -> None:
             raise BadRecord(
                 "not finite", place=f"{name}, sample {int(np.argmin(finite))}", mend="Cut the record there."
             )
+    if record.late_s is not None and (wild := np.flatnonzero(~(np.abs(record.late_s) <= LONGEST_LATE_S))).size:
+        raise BadRecord(
+            f"{record.late_s[wild[0]]:g} s late",
+            place=f"late_s, sample {int(wild[0])}",
+            mend="Give lateness in seconds.",
+        )
     if np.any(record.pulse_width_us < 0):
         place = f"pulse_width_us, sample {int(np.argmax(record.pulse_width_us < 0))}"
         raise BadRecord("negative", place=place, mend="A pulse width is 0 (no pulse) or positive.")

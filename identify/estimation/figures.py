@@ -77,14 +77,16 @@ def ceiling_percent(measured_nm: np.ndarray, sd_nm: float) -> float:
 def figures(
     grid: Grid, rows: np.ndarray, predicted_nm: np.ndarray, sd_nm: float, held_out_change: np.ndarray | None = None
 ) -> dict[str, Any]:
-    """What MODEL.json tells under `fit`, at the record's own rate; percentages are NaN where the torque is level.
+    """What MODEL.json tells under `fit`, at the record's own rate.
+
+    Percentages are NaN where the torque is level; samples that are doubted are not counted.
 
     Without `validate`, `held_out_change` (N·m, shape (K,)) turns the fit into that of blocked cross-validation.
     """
     record = grid.record
     measured = record.torque_nm
-    used = rows[grid.interval] & ~record.held_out
-    held = record.held_out
+    used = rows[grid.interval] & ~record.held_out & grid.counted
+    held = record.held_out & grid.counted
     result: dict[str, Any] = {
         "fit_percent": best_fit_percent(measured[used], predicted_nm[used], sd_nm),
         "ceiling_percent": ceiling_percent(measured[used], sd_nm),
@@ -118,11 +120,12 @@ def figures(
 
 
 def segment_figures(grid: Grid, predicted_nm: np.ndarray, sd_nm: float) -> list[dict[str, Any]]:
-    """Fit and ceiling of each segment, in order."""
+    """Fit and ceiling of each segment, in order, without samples that are doubted."""
     record, rows = grid.record, []
     edges = np.searchsorted(record.segment, np.arange(len(record.segment_names) + 1))
     for name, start, end in zip(record.segment_names, edges[:-1], edges[1:], strict=True):
-        measured, predicted = record.torque_nm[start:end], predicted_nm[start:end]
+        counted = grid.counted[start:end]
+        measured, predicted = record.torque_nm[start:end][counted], predicted_nm[start:end][counted]
         rows.append(
             {
                 "segment": name,

@@ -144,9 +144,9 @@ def finish_discrete(
 ) -> Model:
     """The model of a method that gives a discrete block and a curve, without covariance."""
     if extra and "narx" in extra:
-        response = run(extra["narx"], grid.pulse_width_us)
+        response = run(extra["narx"], grid.held(grid.pulse_width_us))
     else:
-        response = block.filter(curve(grid.pulse_width_us))
+        response = block.filter(grid.held(curve(grid.pulse_width_us)))
     residual = np.nan_to_num(grid.torque_nm) - np.nan_to_num(response, nan=1e6, posinf=1e6, neginf=-1e6)
     baseline = float(np.mean(residual[rows]))
     free = curve.basis.size + len(block.a) + len(block.b)

@@ -115,7 +115,7 @@ class Projection:
         t, z, d = linear.time_constant_s, linear.damping, linear.delay_s
         held, grid = self.drive @ coefficients[:size], self.grid
         # The delay shifts only where the curve is read: the states are those of the other two's base.
-        torque, rate = boundary_states(t, z, grid.step_s, held)
+        torque, rate = boundary_states(t, z, grid.step_s, grid.held(held))
         near = [SecondOrder(t * np.exp(step), z, d), SecondOrder(t, z * np.exp(step), d)]
         values = [at.on_grid(grid, held) for at in near]
         if self.delay_s is None:

@@ -49,7 +49,7 @@ class Narx:
         torque_scale = float(np.std(grid.torque_nm[rows])) or 1.0
         width_scale = float(np.max(grid.pulse_width_us)) or 1.0
         torque = (np.nan_to_num(grid.torque_nm) - baseline) / torque_scale
-        width = grid.pulse_width_us / width_scale
+        width = grid.held(grid.pulse_width_us) / width_scale
         variables = [(0, lag) for lag in range(1, torque_lags + 1)] + [(1, lag) for lag in range(1, width_lags + 1)]
         degree = int(options.get("degree", 3))
         terms = [c for d in range(1, degree + 1) for c in combinations_with_replacement(range(len(variables)), d)]

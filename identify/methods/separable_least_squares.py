@@ -67,7 +67,7 @@ def separate(grid: Grid, rows: np.ndarray, taps: int) -> tuple[SigmoidBasis, np.
     levels, place = np.unique(width, return_inverse=True)
 
     def design(basis: SigmoidBasis) -> np.ndarray:
-        drive = basis.design(levels)[:, 0][place]
+        drive = grid.held(basis.design(levels)[:, 0][place])
         return np.stack([*(shifted(drive, lag)[rows] for lag in range(taps)), np.ones(int(rows.sum()))], axis=1)
 
     def solve(basis: SigmoidBasis) -> tuple[np.ndarray, np.ndarray]:

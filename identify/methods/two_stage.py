@@ -148,6 +148,7 @@ def general(
     fitted = near_rest(grid, prbs)
 
     def linear_part(drive: np.ndarray, rows: np.ndarray, asked: str | tuple[int, int, int]) -> OutputError:
+        drive = grid.held(drive)
         if literal:
             chosen = asked if isinstance(asked, tuple) else (2, 1, 1)
             b, a = equation_error(torque - baseline, drive, rows, chosen)

@@ -15,9 +15,19 @@ LARGEST_ROWS = 5_000_000
 LONGEST_S = 24 * 3600.0
 """From the first sample to the last, pauses included."""
 LOWEST_HZ, HIGHEST_HZ = 39.0, 2100.0
-LARGEST = {"time_s": 1e7, "pulse_width_us": 1e4, "torque_nm": 1e6, "angle_rad": 1e3, "velocity_rad_s": 1e5}
+LARGEST = {
+    "time_s": 1e7,
+    "pulse_width_us": 1e4,
+    "torque_nm": 1e6,
+    "angle_rad": 1e3,
+    "velocity_rad_s": 1e5,
+    "late_s": 1.0,
+    "doubted": 1.0,
+    "part": 1e3,
+}
 LONGEST_NAME = 100
 MOST_SEGMENTS = 1000
+MOST_PARTS = 1000
 PULSE_RATES_HZ = (1.0, 200.0)
 
 

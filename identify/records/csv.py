@@ -16,12 +16,11 @@ from pathlib import Path
 import numpy as np
 
 from identify.errors import BadRecord
-from identify.records import bounds
+from identify.records import bounds, parts_csv
 from identify.records.bounds import LARGEST
-from identify.records.record import Record, Source
+from identify.records.record import OPTIONAL, Part, Record, Source, joined_source
 
 REQUIRED = ("time_s", "pulse_width_us", "torque_nm", "segment")
-OPTIONAL = ("angle_rad", "velocity_rad_s")
 PAUSE_S = 1.0
 """A jump of the clock as long as this, at zero pulse width, is a pause between two tests."""
 MOST_PAUSES = 1000
@@ -32,8 +31,8 @@ LONGEST_LINE = 10_000
 CUT = "Every row needs every column; was the file cut off?"
 
 
-def read_csv(content: bytes, path: Path, pulse_rate_hz: float = 40.0) -> Record:
-    """A CSV record from its bytes; `path` is how it is called.
+def read_csv(content: bytes, path: Path, pulse_rate_hz: float | None = None) -> Record:
+    """A CSV record from its bytes; `path` is how it is called. Pulses come at 40 Hz, unless it or the caller says else.
 
     Raises
     ------
@@ -54,7 +53,12 @@ def read_csv(content: bytes, path: Path, pulse_rate_hz: float = 40.0) -> Record:
     columns, lines = {column: np.array(values) for column, values in table.numbers.items()}, table.lines
     if not lines:
         raise BadRecord("no row under the header", place=f"{name}, line 2", mend="Give a few seconds of data.")
-    time_s = _even_parts(columns["time_s"], columns["pulse_width_us"], lines, name)
+    source = Source(name=path.name, sha256=hashlib.sha256(content).hexdigest())
+    joined = parts_csv.parsed(columns, table.parts, lines, name) if "part" in columns else None
+    if joined is None:
+        time_s = _even_parts(columns["time_s"], columns["pulse_width_us"], lines, name)
+    else:
+        time_s, source = columns["time_s"], joined_source(joined.sources, source.name, source.sha256)
     bounds.check_span(time_s, f"{name}, line {lines[-1]}, column time_s")
     if (negative := np.flatnonzero(columns["pulse_width_us"] < 0)).size:
         raise BadRecord(
@@ -62,16 +66,24 @@ def read_csv(content: bytes, path: Path, pulse_rate_hz: float = 40.0) -> Record:
             place=f"{name}, line {lines[negative[0]]}, column pulse_width_us",
             mend="A pulse width is 0 (no pulse) or positive.",
         )
+    doubted = columns.get("doubted", np.zeros(0))
+    if (bad := np.flatnonzero((doubted != 0) & (doubted != 1))).size:
+        raise BadRecord(
+            f"{doubted[bad[0]]:g} is neither 0 nor 1",
+            place=f"{name}, line {lines[bad[0]]}, column doubted",
+            mend="1 is a row in which it is not known what was felt, 0 any other.",
+        )
     return Record.from_arrays(
         time_s,
         columns["pulse_width_us"],
         columns["torque_nm"],
         np.array(table.segment),
         segment_names=list(table.names),
-        angle_rad=columns.get("angle_rad"),
-        velocity_rad_s=columns.get("velocity_rad_s"),
-        pulse_rate_hz=pulse_rate_hz,
-        source=Source(name=path.name, sha256=hashlib.sha256(content).hexdigest()),
+        pulses=None,
+        pulse_rate_hz=pulse_rate_hz or (joined.pulse_rate_hz if joined else None) or 40.0,
+        source=source,
+        parts=joined.parts if joined else (Part(),),
+        **{column: columns[column] for column in OPTIONAL if column in columns},
     )
 
 
@@ -108,11 +120,13 @@ class _Table:
         self.names: dict[str, int] = {}
         self.numbers: dict[str, array[float]] = {}
         self.place: dict[str, int] = {}
+        self.parts: dict[int, dict[str, str]] = {}
+        """Cells that describe a part, by the row that it begins with."""
 
     def fill(self, reader: Iterator[list[str]]) -> None:
         """Take all rows in; blank lines are passed over."""
         self.place = _header(next(reader, []), self.name)
-        self.numbers = {column: array("d") for column in self.place if column != "segment"}
+        self.numbers = {column: array("d") for column in self.place if column not in ("segment", *parts_csv.CELLS)}
         rows = ((reader.line_num, row) for row in reader if row)  # pyright: ignore[reportAttributeAccessIssue]
         while block := list(islice(rows, BLOCK)):
             self._take([row for _, row in block], [line for line, _ in block])
@@ -120,6 +134,8 @@ class _Table:
     def _take(self, rows: list[list[str]], lines: list[int]) -> None:
         for column, values in self.numbers.items():
             values.extend(self._column(rows, column, lines))
+        if "part" in self.place:
+            self._take_parts(rows, lines)
         at = self.place["segment"]
         for row, line in zip(rows, lines, strict=True):
             if len(row) <= at:
@@ -128,6 +144,21 @@ class _Table:
             code = self.names.get(text)
             self.segment.append(self._new_name(text, line) if code is None else code)
         self.lines.extend(lines)
+
+    def _take_parts(self, rows: list[list[str]], lines: list[int]) -> None:
+        """Keep the cells of each row with which a part begins."""
+        before = len(self.lines)
+        number = np.array(self.numbers["part"][max(before - 1, 0) :])
+        firsts = np.flatnonzero(np.diff(number)) + (0 if before else 1)
+        cells = {column: self.place[column] for column in parts_csv.CELLS if column in self.place}
+        for index in firsts.tolist() if before else [0, *firsts.tolist()]:
+            row = rows[index]
+            if len(row) <= max(cells.values()):
+                raise self._short(row, lines[index], "pause_s")
+            self.parts[before + index] = {column: row[at].strip() for column, at in cells.items()}
+            if len(self.parts) > bounds.MOST_PARTS:
+                mend = f"At most {bounds.MOST_PARTS} in one record."
+                raise BadRecord("too many parts", place=self._at(lines[index], "part"), mend=mend)
 
     def _column(self, rows: list[list[str]], column: str, lines: list[int]) -> np.ndarray:
         at = self.place[column]
@@ -183,10 +214,13 @@ def _header(first: list[str], name: str) -> dict[str, int]:
         separator = next((mark for mark in ";\t" if len(header) == 1 and mark in header[0]), None)
         mend = f"Separate with commas, not {separator!r}." if separator else f"The first line must be {HEADER}."
         raise BadRecord(f"no column {', '.join(missing)}", place=f"{name}, line 1", mend=mend)
-    twice = [column for column in REQUIRED + OPTIONAL if header.count(column) > 1]
+    # One of them alone is a column of somebody else's.
+    of_parts = ("part", *parts_csv.CELLS) if {"part", "pause_s"} <= set(header) else ()
+    known = (*REQUIRED, *OPTIONAL, *of_parts)
+    twice = [column for column in known if header.count(column) > 1]
     if twice:
         raise BadRecord(f"column {twice[0]} is there twice", place=f"{name}, line 1", mend="Keep one of them.")
-    return {column: header.index(column) for column in REQUIRED + OPTIONAL if column in header}
+    return {column: header.index(column) for column in known if column in header}
 
 
 def _is_number(cell: str) -> bool:

@@ -59,6 +59,18 @@ class StrictFile:
         value = self._attribute(name, default)
         return float(value) if isinstance(value, int | float | np.number) else float("nan")
 
+    def has(self, path: str) -> bool:
+        """Whether something is called so; what it is, `numbers` says."""
+        here: Any = self._root
+        for part in path.strip("/").encode().split(b"/"):
+            with self._asking(path):
+                if not isinstance(here, h5g.GroupID) or not here.links.exists(part):
+                    return False
+                if here.links.get_info(part).type != h5l.TYPE_HARD:
+                    return True
+                here = h5o.open(here, part)
+        return True
+
     def numbers(self, path: str) -> np.ndarray:
         """A dataset of one dimension as float64.
 

@@ -16,8 +16,8 @@ def read(path: str | Path, pulse_rate_hz: float | None = None) -> Record:
     Parameters
     ----------
     path : str or Path
-        CSV with the header `time_s,pulse_width_us,torque_nm,segment` (and optionally `angle_rad,velocity_rad_s`), or
-        a sealed recording.
+        CSV with the header `time_s,pulse_width_us,torque_nm,segment` (and optionally `angle_rad`, `velocity_rad_s`,
+        `late_s`, `doubted`, and the columns of a joined record), or a sealed recording.
     pulse_rate_hz : float, optional
         Pulses a second; by default what the recording says, else 40.
 
@@ -36,4 +36,4 @@ def read(path: str | Path, pulse_rate_hz: float | None = None) -> Record:
         return read_recording(content, path, pulse_rate_hz)
     from identify.records.csv import read_csv
 
-    return read_csv(content, path, 40.0 if pulse_rate_hz is None else pulse_rate_hz)
+    return read_csv(content, path, pulse_rate_hz)

@@ -12,15 +12,76 @@ from identify.errors import BadRecord
 
 HELD_OUT = "validate"
 """Rows of this segment are never used to fit or to choose."""
+OPTIONAL = ("angle_rad", "velocity_rad_s", "late_s", "doubted")
+"""Every column that a record may have or not: what cuts, joins or copies records goes by this list and loses none."""
+FORGOTTEN_S = 1.5
+"""So long after something unknown was applied a muscle still shows it: 7 time constants of 0.2 s, a slow muscle's."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """Where a record came from, so that a model can say what it was fitted on."""
+    """Where a record came from, so that a model can say what it was fitted on; `parts` of a joined one, in order."""
 
     name: str = ""
     recording_id: str = ""
     sha256: str = ""
+    parts: tuple[Source, ...] = ()
+
+
+def joined_source(parts: Sequence[Source], name: str = "joined", sha256: str = "") -> Source:
+    """Where a joined record comes from: the ids of its parts' recordings, or their names where they have none.
+
+    `sha256` is that of the file it is read from; without one, those of the parts stand for it.
+    """
+    identity = " + ".join(part.recording_id or part.name for part in parts)
+    return Source(name, identity, sha256 or " + ".join(part.sha256 for part in parts), tuple(parts))
+
+
+@dataclass(frozen=True)
+class Part:
+    """One of the recordings that a record is made of.
+
+    Parameters
+    ----------
+    first : int
+        Index of its first sample in the record.
+    own_s : float
+        Time of that sample on the part's own clock, s.
+    begun_s : float or None
+        When that clock was 0, as Unix time, where it is known.
+    pause_s : float
+        The true pause before it, s, in whole pulse intervals; at most a day; 0 before the first, and where not known.
+    folded_s : float
+        What of that pause there is in `time_s`, s, in whole pulse intervals; at most `pause_s`.
+    """
+
+    first: int = 0
+    own_s: float = 0.0
+    begun_s: float | None = None
+    pause_s: float = 0.0
+    folded_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class Pulses:
+    """The pulses themselves, for the times at which a record has no samples.
+
+    Parameters
+    ----------
+    time_s : ndarray, shape (P,)
+        Even slot of each, s, rising.
+    width_us : ndarray, shape (P,)
+        Width felt, µs; 0 where there was none.
+    late_s : ndarray, shape (P,)
+        By how much later than its slot it was felt, s.
+    lost : ndarray of bool, shape (P,)
+        Planned, and not sent.
+    """
+
+    time_s: np.ndarray
+    width_us: np.ndarray
+    late_s: np.ndarray
+    lost: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -41,10 +102,18 @@ class Record:
         One name for each contiguous run of rows; a name may occur several times.
     angle_rad, velocity_rad_s : ndarray or None, shape (N,)
         Joint angle, rad, and angular velocity, rad/s, where the record has them.
+    late_s : ndarray or None, shape (N,)
+        By how much later than its even slot the pulse in force was felt, s; may be slightly negative.
+    doubted : ndarray of bool or None, shape (N,)
+        Samples in which it is not known what was felt: never used to fit or to choose, and the error there not counted.
+    pulses : Pulses or None
+        What was applied while there were no samples, where it is known.
     pulse_rate_hz : float
         Pulses a second.
     source : Source
         Origin.
+    parts : tuple of Part
+        The recordings it is made of, in order; one, except for a joined record.
     """
 
     time_s: np.ndarray
@@ -54,8 +123,12 @@ class Record:
     segment_names: tuple[str, ...]
     angle_rad: np.ndarray | None = None
     velocity_rad_s: np.ndarray | None = None
+    late_s: np.ndarray | None = None
+    doubted: np.ndarray | None = None
+    pulses: Pulses | None = None
     pulse_rate_hz: float = 40.0
     source: Source = field(default_factory=Source)
+    parts: tuple[Part, ...] = (Part(),)
 
     @classmethod
     def from_arrays(
@@ -68,8 +141,12 @@ class Record:
         segment_names: Sequence[str] | None = None,
         angle_rad: np.ndarray | None = None,
         velocity_rad_s: np.ndarray | None = None,
+        late_s: np.ndarray | None = None,
+        doubted: np.ndarray | None = None,
+        pulses: Pulses | None = None,
         pulse_rate_hz: float = 40.0,
         source: Source | None = None,
+        parts: Sequence[Part] = (Part(),),
     ) -> Record:
         """Build a record from arrays; `segment` gives a name for each row (default: all `prbs`).
 
@@ -79,7 +156,7 @@ class Record:
         Raises
         ------
         BadRecord
-            Lengths differ, or there is nothing.
+            Lengths differ, there is nothing, or an optional column is not finite.
         """
         time_s = np.ascontiguousarray(time_s, float)
         size = time_s.size
@@ -88,9 +165,13 @@ class Record:
         for label, column in columns.items():
             if np.shape(column) != (size,):
                 raise BadRecord(f"{label} has shape {np.shape(column)}, time_s has ({size},)", place=label)
+        given = {"angle_rad": angle_rad, "velocity_rad_s": velocity_rad_s, "late_s": late_s, "doubted": doubted}
+        optional = {label: _checked(label, column, size) for label, column in given.items() if column is not None}
         if size == 0:
             raise BadRecord("the record holds no sample", mend="Give at least a few seconds of data.")
-        starts = np.flatnonzero(np.r_[True, code[1:] != code[:-1]])
+        changed = np.r_[True, code[1:] != code[:-1]]
+        changed[[part.first for part in parts]] = True
+        starts = np.flatnonzero(changed)
         begins = np.zeros(size, np.int64)
         begins[starts[1:]] = 1
         return cls(
@@ -99,11 +180,46 @@ class Record:
             torque_nm=np.ascontiguousarray(torque_nm, float),
             segment=np.cumsum(begins),
             segment_names=tuple(known[index] for index in code[starts]),
-            angle_rad=None if angle_rad is None else np.ascontiguousarray(angle_rad, float),
-            velocity_rad_s=None if velocity_rad_s is None else np.ascontiguousarray(velocity_rad_s, float),
+            pulses=pulses,
             pulse_rate_hz=pulse_rate_hz,
             source=source or Source(),
+            parts=tuple(parts),
+            **optional,
         )
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """The optional columns that this record has, by name."""
+        found = {name: getattr(self, name) for name in OPTIONAL}
+        return {name: column for name, column in found.items() if column is not None}
+
+    def take(self, rows: np.ndarray) -> Record:
+        """The record of some of its rows (bool or indices, rising), with every column it has, and its pulses."""
+        return Record.from_arrays(
+            self.time_s[rows],
+            self.pulse_width_us[rows],
+            self.torque_nm[rows],
+            self.segment[rows],
+            segment_names=self.segment_names,
+            pulses=self.pulses,
+            pulse_rate_hz=self.pulse_rate_hz,
+            source=self.source,
+            parts=self._parts_of(np.arange(self.time_s.size)[rows]),
+            **{name: column[rows] for name, column in self.columns().items()},
+        )
+
+    def _parts_of(self, kept: np.ndarray) -> list[Part]:
+        """The parts of some of its rows; one that goes as a whole is a pause."""
+        first = np.searchsorted(kept, [part.first for part in self.parts])
+        found: list[Part] = []
+        pause_s = folded_s = 0.0
+        for part, start, end in zip(self.parts, first, [*first[1:], kept.size], strict=True):
+            pause_s, folded_s = pause_s + part.pause_s, folded_s + part.folded_s
+            if start < end:
+                moved_s = float(self.time_s[kept[start]] - self.time_s[part.first])
+                before = (pause_s, folded_s) if found else (0.0, 0.0)
+                found.append(Part(int(start), part.own_s + moved_s, part.begun_s, *before))
+                pause_s = folded_s = 0.0
+        return found or [Part()]
 
     @cached_property
     def sample_rate_hz(self) -> float:
@@ -120,6 +236,12 @@ class Record:
         flags = np.array([name == HELD_OUT for name in self.segment_names])
         return flags[self.segment]
 
+    @cached_property
+    def part(self) -> np.ndarray:
+        """int, shape (N,): index into `parts` for each sample."""
+        first = [part.first for part in self.parts]
+        return np.searchsorted(first, np.arange(self.time_s.size), side="right") - 1
+
     @property
     def has_held_out(self) -> bool:
         """Whether the record has rows of `validate`."""
@@ -128,6 +250,22 @@ class Record:
     def with_torque(self, torque_nm: np.ndarray) -> Record:
         """The same record with another torque, N·m, shape (N,)."""
         return replace(self, torque_nm=np.ascontiguousarray(torque_nm, float))
+
+
+def _checked(label: str, column: np.ndarray, size: int) -> np.ndarray:
+    """An optional column, of the right shape and finite; `doubted` as bool."""
+    if np.shape(column) != (size,):
+        raise BadRecord(f"{label} has shape {np.shape(column)}, time_s has ({size},)", place=label)
+    values = np.ascontiguousarray(column, float)
+    finite = np.isfinite(values)
+    if not finite.all():
+        raise BadRecord("not finite", place=f"{label}, sample {int(np.argmin(finite))}", mend="Leave the column out.")
+    if label != "doubted":
+        return values
+    if (bad := np.flatnonzero((values != 0) & (values != 1))).size:
+        place = f"{label}, sample {int(bad[0])}"
+        raise BadRecord(f"{values[bad[0]]:g} is neither 0 nor 1", place=place, mend="1 is doubted, 0 is not.")
+    return values > 0
 
 
 def _coded(

@@ -9,11 +9,11 @@ import numpy as np
 
 from identify.errors import BadRecord
 from identify.records import bounds
+from identify.records.felt import read_pulses
 from identify.records.hdf5 import MEND, StrictFile
-from identify.records.record import Record, Source
+from identify.records.record import Pulses, Record, Source
 
 FORMAT = "stimrig-recording"
-SENT_AND_ACKNOWLEDGED = 0
 
 
 def attributes(path: Path, names: Sequence[str]) -> dict[str, str]:
@@ -32,8 +32,8 @@ def attributes(path: Path, names: Sequence[str]) -> dict[str, str]:
 def read_recording(content: bytes, path: Path, pulse_rate_hz: float | None = None) -> Record:
     """A sealed recording from its bytes; `path` is how it is called.
 
-    The width in force at a sample is that of the last pulse due before it; a pulse that was dropped or refused counts
-    as none. Samples outside every segment are left out.
+    The width in force at a sample is that of the last pulse due before it, and how late that was felt stands beside
+    it; a pulse that was dropped or refused counts as none. Samples outside every segment are left out.
 
     Raises
     ------
@@ -54,12 +54,15 @@ def read_recording(content: bytes, path: Path, pulse_rate_hz: float | None = Non
     if (bad := np.flatnonzero(inside & ~(np.abs(torque) <= largest))).size:
         what = "is not finite" if not np.isfinite(torque[bad[0]]) else f"{torque[bad[0]]:g} N·m is no measurement"
         raise BadRecord(f"torque {what}", place=f"{name}, /torque/torque_nm, sample {bad[0]}", mend=MEND)
-    width = _held_width(file, name, time_s, rate)
+    pulses, doubts = read_pulses(file, name, time_s, rate)
+    width, late = _in_force(pulses, time_s, rate)
     bounds.check_span(time_s[inside], f"{name}, /torque/time_s")
     source = Source(path.name, file.text("recording_id", ""), file.text("content_sha256", ""))
     return Record.from_arrays(
         time_s[inside], width[inside], torque[inside], code[inside], segment_names=names, pulse_rate_hz=rate,
-        source=source,
+        source=source, pulses=pulses,
+        late_s=late[inside] if pulses.late_s.any() else None,
+        doubted=doubts[inside] if doubts.any() else None,
     )  # fmt: skip
 
 
@@ -105,24 +108,12 @@ def _segments(file: StrictFile, name: str, time_s: np.ndarray) -> tuple[np.ndarr
     return np.where(inside, order, -1), names
 
 
-def _held_width(file: StrictFile, name: str, time_s: np.ndarray, pulse_rate_hz: float) -> np.ndarray:
-    """Width in force at each sample: pulses are put back on their even slots, late by what they were late together."""
-    columns = ("planned_time_s", "sent_pulse_width_us", "written_time_s", "status")
-    planned, sent, written, status = (file.numbers(f"/pulses/{column}") for column in columns)
-    if not (planned.size == sent.size == written.size == status.size):
-        raise BadRecord("columns of different lengths", place=f"{name}, /pulses", mend=MEND)
-    sent = np.where(np.isnan(sent), 0.0, sent)
-    if (bad := np.flatnonzero(~((sent >= 0) & (sent <= bounds.LARGEST["pulse_width_us"])))).size:
-        place = f"{name}, /pulses/sent_pulse_width_us, pulse {bad[0]}"
-        raise BadRecord(f"{sent[bad[0]]:g} µs is no pulse width", place=place, mend=MEND)
-    if not (np.diff(planned) > 0).all() or not np.isfinite(planned).all():
-        raise BadRecord("pulses do not follow one another", place=f"{name}, /pulses/planned_time_s", mend=MEND)
-    if not planned.size:
-        return np.zeros(time_s.size)
-    sound = (status == SENT_AND_ACKNOWLEDGED) & np.isfinite(written)
-    lag = float(np.median(written[sound] - planned[sound])) if sound.any() else 0.0
-    slot = planned + lag
-    last = np.searchsorted(slot, time_s + 1e-9, side="right") - 1
-    width = np.where(last >= 0, sent[np.maximum(last, 0)], 0.0)
+def _in_force(pulses: Pulses, time_s: np.ndarray, pulse_rate_hz: float) -> tuple[np.ndarray, np.ndarray]:
+    """Width and lateness of the pulse in force at each sample, by the even slots."""
+    if not pulses.time_s.size:
+        return np.zeros(time_s.size), np.zeros(time_s.size)
+    last = np.searchsorted(pulses.time_s, time_s + 1e-9, side="right") - 1
     # A slot without a pulse, at a gap or after the end, is no stimulation.
-    return np.where(time_s - slot[np.maximum(last, 0)] < 1.5 / pulse_rate_hz, width, 0.0)
+    inside = (last >= 0) & (time_s - pulses.time_s[np.maximum(last, 0)] < 1.5 / pulse_rate_hz)
+    last = np.maximum(last, 0)
+    return np.where(inside, pulses.width_us[last], 0.0), np.where(inside, pulses.late_s[last], 0.0)

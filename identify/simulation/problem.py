@@ -241,7 +241,7 @@ class _Walk:
             places = range(problem.coefficients.start, problem.coefficients.stop)
             self.owners += [(place, float(s)) for place, s in zip(places, step, strict=True)]
             drive = np.concatenate([drive, drive[:1] + step[:, None] * design])
-        return drive
+        return setup.grid.held(drive, axis=1)
 
     def dynamics(self, drive: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         setup = self.setup

@@ -64,7 +64,7 @@ class Setup:
     @cached_property
     def begins(self) -> np.ndarray:
         """Intervals at which the parts of the record begin, shape (B,), the first 0."""
-        return np.zeros(1, np.int64)
+        return np.searchsorted(self.grid.part, np.arange(len(self.grid.record.parts))).astype(np.int64)
 
     def part_of(self, at_samples: bool) -> np.ndarray | None:
         """Part of each sample or of each interval; None where there is one part."""

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import h5py
 import httpx
 import pytest
 
-from api import evidence, joining
+from api import evidence
 from api.pages import why
 from tests.api.conftest import Service, run_test, wait_done
 from tests.api.test_access import HTML, csrf, signed_in
@@ -184,62 +187,34 @@ def test_experiment_joins_only_the_participants_own_model(client: httpx.Client, 
     assert service.rig.starts == 1 and client.get("/v1/rig").json()["holder"] is None
 
 
-def record(rate_hz: float, lag_s: float, seconds: float = 6.0) -> Any:
-    """Rest, steps, rest; pulses due `lag_s` after the first sample and every 25 ms from then on."""
-    import numpy as np
-
+def test_worker_joins_by_begin_and_leaves_a_file_with_the_parts(tmp_path: Path) -> None:
     import identify
+    from api import jobs, missing
+    from tests.api.fake_rig import write_recording
 
-    time_s = np.arange(round(seconds * rate_hz)) / rate_hz
-    slot = np.floor((time_s - lag_s) * 40 + 1e-9)
-    width = np.where((slot >= 40) & (slot < 200) & (slot // 20 % 2 == 0), 200.0, 0.0)
-    names = np.where(slot < 40, "rest", "steps")
-    return identify.Record.from_arrays(time_s, width, width / 40 + 0.01 * np.sin(7 * time_s), names)
-
-
-def test_joined_recordings_are_one_even_record_on_one_grid_of_pulses(tmp_path: Path) -> None:
-    import numpy as np
-
-    import identify
-
-    path = tmp_path / "joined.csv"
-    path.write_text(joining.table([record(400, 0.01), record(1600, 0.004)]))
-    joined = identify.read(path)
+    widths = [200.0 if index >= 40 and index // 20 % 2 else 0.0 for index in range(240)]
+    segments = [{"name": "rest", "start_s": 0.0, "end_s": 1.0}, {"name": "steps", "start_s": 1.0, "end_s": 6.0}]
+    paths = []
+    for name, rate_hz, minute in (("late", 400, 10), ("early", 1600, 0)):
+        torque = [widths[int(index * 40 / rate_hz)] / 40 for index in range(6 * rate_hz)]
+        plan = SimpleNamespace(test_id=name, participant="P017", kind="default")
+        path, _ = write_recording(tmp_path, plan, widths, torque, segments, rate_hz, "completed")  # pyright: ignore[reportArgumentType]
+        with h5py.File(path, "r+") as file:
+            file.attrs["created_utc"] = f"2026-01-01T00:{minute:02d}:00.250Z"
+        paths.append(str(path))
+    out, exported = tmp_path / "joined.csv", tmp_path / "exported.csv"
+    found = missing.joined(paths, str(out), lambda *_: None)
+    assert found["file_sha256"] == hashlib.sha256(out.read_bytes()).hexdigest()
+    joined = identify.read(out)
+    assert [source.recording_id for source in joined.source.parts] == ["R-early", "R-late"]
     assert joined.sample_rate_hz == pytest.approx(400, abs=0.01)
-    assert list(joined.segment_names) == ["rest", "steps", "rest", "steps"]
-    changes = np.flatnonzero(np.diff(joined.pulse_width_us)) + 1
-    assert set(changes % 10) == {0}  # every change of width falls on the same grid of 25 ms
-    assert len(changes) == 16
-    followed = joined.torque_nm - joined.pulse_width_us / 40
-    assert np.abs(np.delete(followed, np.r_[changes - 1, changes, changes + 1])).max() < 0.05
-
-
-def test_the_pause_between_joined_recordings_is_kept(tmp_path: Path) -> None:
-    import identify
-
-    parts = [record(400, 0.01), record(400, 0.01)]
-    pause_s = joining.pauses([1000.0, 1000.0 + float(parts[0].time_s[-1]) + 61.0], parts)
-    assert pause_s == pytest.approx([61.0])
-    assert joining.pauses([1000.0, 9000.0], parts) == [joining.LONGEST_PAUSE_S]
-    assert joining.pauses([None, 9000.0], parts) == [0.0]
-    path = tmp_path / "joined.csv"
-    path.write_text(joining.table(parts, pause_s))
-    joined = identify.read(path)
-    assert joined.sample_rate_hz == pytest.approx(400, abs=0.01)
-    jumps = [step for step in joined.time_s[1:] - joined.time_s[:-1] if step > 0.1]
-    assert jumps == pytest.approx([61.0], abs=0.05)
+    assert joined.parts[1].pause_s == pytest.approx(594.0, abs=0.03) and joined.parts[1].folded_s == 30.0
+    assert joined.parts[0].begun_s == pytest.approx(1767225600.25)
     assert identify.fit(joined).baseline_nm == pytest.approx(0.0, abs=0.05)
-
-
-def test_recordings_that_cannot_be_joined_are_refused() -> None:
-    import numpy as np
-
-    import identify
-
-    working = record(400, 0.0)
-    late = identify.Record.from_arrays(working.time_s, np.full(working.time_s.size, 100.0), working.torque_nm)
-    with pytest.raises(identify.BadRecord, match="begin at rest"):
-        joining.table([working, late])
+    missing.joined(paths[::-1], str(exported), lambda *_: None)
+    assert exported.read_bytes() == out.read_bytes()
+    jobs.export_csv(str(out), lambda *_: None, str(exported))
+    assert identify.read(exported).parts == joined.parts
 
 
 # ---- what the page says -------------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ from identify.recruitment.spline import SplineBasis
 def through(grid: Grid, block: Discrete, rows: np.ndarray, knots: int, baseline_nm: float) -> Curve:
     """Least squares of the output: the spline's columns are filtered, the torque is left as it was measured."""
     target = grid.torque_nm[rows] - baseline_nm
-    return _penalised(grid, lambda columns: block.filter(columns)[rows], target, knots)
+    return _penalised(grid, lambda columns: block.filter(grid.held(columns))[rows], target, knots)
 
 
 def invert(grid: Grid, block: Discrete, rows: np.ndarray, knots: int, baseline_nm: float) -> Curve:
@@ -32,7 +32,7 @@ def invert(grid: Grid, block: Discrete, rows: np.ndarray, knots: int, baseline_n
     driven[:start] = 0.0
     with np.errstate(over="ignore", invalid="ignore"):
         w = np.clip(np.nan_to_num(recursion(b, driven)), -1e6, 1e6)
-    return _penalised(grid, lambda columns: columns[rows], w[rows], knots)
+    return _penalised(grid, lambda columns: grid.held(columns)[rows], w[rows], knots)
 
 
 def _penalised(grid: Grid, respond, target: np.ndarray, knots: int) -> Curve:

@@ -1,0 +1,269 @@
+"""Several recordings of one muscle as one record, made of parts.
+
+Each part keeps its own samples, offset and noise; what they share is the grid of pulses. Nothing is made up to fill
+the pause between two parts: it has no rows, and `Part` says how long it truly was.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from identify.dynamics.pulse_grid import pulse_phase_s
+from identify.errors import BadRecord
+from identify.records import bounds
+from identify.records.record import OPTIONAL, Part, Pulses, Record, Source, joined_source
+
+PAUSE_S = 30.0
+"""What of a pause is kept in the time at most: every pulse interval of it is a row of the grid."""
+SAME_RATE = 0.01
+"""Sampling rates that differ by less, as a share, are one nominal rate and two clocks."""
+LEAST_SAMPLES = 8
+TOLD_WHERE_SO = ("late_s", "doubted")
+"""Columns that a record lacks where there is nothing to tell."""
+RESAMPLED = ("time_s", "torque_nm", "angle_rad", "velocity_rad_s")
+"""Columns of which a sample at a lower rate is a mean; a flag is set if one was, and else a value is taken that was."""
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """One part, cut out: a record on its own clock."""
+
+    record: Record
+    begun_s: float | None
+    slot_s: float
+    """A time at which a pulse is due."""
+    source: Source
+    known_pause_s: float
+    """The pause before it, as the record that it was cut from has it."""
+    follows: bool
+    """Whether the piece before it in the list was before it in that record too."""
+
+    @property
+    def begin_s(self) -> float:
+        """Its first sample as Unix time."""
+        assert self.begun_s is not None
+        return self.begun_s + float(self.record.time_s[0])
+
+    def interval(self, index: int, rate_hz: float) -> int:
+        """The pulse interval of a sample, counted from the slot; a hair early, as on the grid."""
+        intervals = (float(self.record.time_s[index]) - self.slot_s) * rate_hz
+        return math.floor(intervals + 1e-6 + 1e-3 * min(1.0, rate_hz / self.record.sample_rate_hz))
+
+
+def join(records: Sequence[Record], begun_s: Sequence[float | None]) -> Record:
+    """Put records one behind the other as the parts of one.
+
+    Where all begins are known the parts are in their order, else as given; either order of the arguments then gives
+    the same record. A record that was joined before is taken apart: its parts stand beside the others'.
+
+    Parts sampled faster than the slowest are brought down by block means, whole blocks to a pulse interval. Those
+    that differ by less than 1 % stay as they are. The slots of the pulses fall on one grid. A pause is kept in whole
+    pulse intervals, up to 30 s of it in `time_s`; it is 0 where a begin is not known, or where by their clocks two
+    parts overlap. An angle or velocity is dropped unless all parts have it; so are the pulses in the gaps, which are
+    doubted then. A part that has no lateness or doubt has none to tell.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        At least one.
+    begun_s : sequence of float or None
+        Unix time at which each record's clock was 0; None where it is not known, and for a joined record, which knows
+        it of its parts.
+
+    Raises
+    ------
+    BadRecord
+        Pulse rates differ, too little in one or too much together, or fewer than two samples a pulse in a slow part.
+    """
+    if len(records) != len(begun_s) or not records:
+        raise BadRecord(f"{len(records)} records with {len(begun_s)} begins", mend="Give one for each.")
+    rate_hz = records[0].pulse_rate_hz
+    pieces: list[_Piece] = []
+    for number, (record, begun) in enumerate(zip(records, begun_s, strict=True), start=1):
+        if abs(record.pulse_rate_hz - rate_hz) > 1e-6:
+            message = f"{record.pulse_rate_hz:g} pulses/s, the first has {rate_hz:g}"
+            raise BadRecord(message, place=f"recording {number}", mend="Join recordings of one pulse rate.")
+        if record.time_s.size < LEAST_SAMPLES:
+            message = f"only {record.time_s.size} samples"
+            raise BadRecord(message, place=f"recording {number}", mend="Give a few seconds of data.")
+        pieces += _pieces(record, begun)
+    if len(pieces) > bounds.MOST_PARTS:
+        raise BadRecord(f"{len(pieces)} parts", mend=f"Join at most {bounds.MOST_PARTS}.")
+    if all(piece.begun_s is not None for piece in pieces):
+        pieces = [replace(piece, follows=False) for piece in sorted(pieces, key=_order)]
+    return _joined(_at_one_rate(pieces, rate_hz), rate_hz)
+
+
+def _order(piece: _Piece) -> tuple[float, str, str, bytes]:
+    return piece.begin_s, piece.source.sha256, piece.source.recording_id, piece.record.torque_nm.tobytes()
+
+
+def _pieces(record: Record, begun_s: float | None) -> list[_Piece]:
+    """The parts of a record, each on its own clock."""
+    slot_s = float(record.time_s[0]) + pulse_phase_s(record)
+    alone = len(record.parts) == 1
+    sources = record.source.parts if len(record.source.parts) == len(record.parts) else ()
+    edges = [*(part.first for part in record.parts), record.time_s.size]
+    found = []
+    for index, part in enumerate(record.parts):
+        rows = slice(part.first, edges[index + 1])
+        # A plain record's clock is its own.
+        shift_s = 0.0 if alone and part.begun_s is None else part.own_s - float(record.time_s[part.first])
+        names = record.segment[rows]
+        changes: dict[str, object] = {
+            name: column[rows] for name in OPTIONAL if (column := getattr(record, name)) is not None
+        }
+        if record.pulses is not None:
+            changes["pulses"] = _pulses(record.pulses, shift_s, -np.inf, np.inf)
+        changes |= {
+            "time_s": record.time_s[rows] + shift_s,
+            "pulse_width_us": record.pulse_width_us[rows],
+            "torque_nm": record.torque_nm[rows],
+            "segment": names - names[0],
+            "segment_names": record.segment_names[names[0] : names[-1] + 1],
+            "parts": (Part(),),
+        }
+        found.append(
+            _Piece(
+                record=replace(record, **changes),  # pyright: ignore[reportArgumentType]
+                begun_s=begun_s if alone and part.begun_s is None else part.begun_s,
+                slot_s=slot_s + shift_s,
+                source=sources[index] if sources else replace(record.source, parts=()),
+                known_pause_s=part.pause_s,
+                follows=index > 0,
+            )
+        )
+    return found
+
+
+def _at_one_rate(pieces: list[_Piece], rate_hz: float) -> list[_Piece]:
+    """All pieces at the lowest of their rates, or just below it, where a whole number of samples is to make a pulse."""
+    own = [piece.record.sample_rate_hz for piece in pieces]
+    lowest = min(own)
+    if max(own) <= (1 + SAME_RATE) * lowest:
+        return pieces
+    each = math.floor((1 + SAME_RATE) * lowest / rate_hz)
+    if each < 2:
+        raise BadRecord(
+            f"sampled at {lowest:.4g} and {max(own):.4g} Hz",
+            mend=f"Recordings of different rates are joined from {2 * rate_hz:g} Hz on.",
+        )
+    return [
+        replace(piece, record=_block_means(piece, each, rate_hz)) if own_hz > (1 + SAME_RATE) * lowest else piece
+        for piece, own_hz in zip(pieces, own, strict=True)
+    ]
+
+
+def _block_means(piece: _Piece, each: int, rate_hz: float) -> Record:
+    """A piece with `each` samples a pulse interval, at the mean time of what each one is the mean of.
+
+    A block at an edge or a gap, with less than half of its samples, is left out: it would be noisier than the rest.
+    A block with any held-out sample is held out.
+    """
+    record = piece.record
+    hair = 1e-6 + 1e-3 * min(1.0, rate_hz / record.sample_rate_hz)
+    block = np.floor(((record.time_s - piece.slot_s) * rate_hz + hair) * each).astype(np.int64)
+    starts = np.flatnonzero(np.r_[True, np.diff(block) > 0])
+    count = np.diff(np.r_[starts, block.size])
+    whole = 2 * count >= np.median(count)
+    pick = starts + count // 2
+    held = np.add.reduceat(record.held_out.astype(np.int64), starts) > 0
+    for index in np.flatnonzero(held & ~record.held_out[pick]):
+        pick[index] = starts[index] + int(np.argmax(record.held_out[starts[index] : starts[index] + count[index]]))
+    pick = pick[whole]
+    changes: dict[str, object] = {}
+    for name in ("time_s", "pulse_width_us", "torque_nm", *OPTIONAL):
+        column = getattr(record, name)
+        if column is not None:
+            if name in RESAMPLED:
+                changes[name] = (np.add.reduceat(column, starts) / count)[whole]
+            elif column.dtype == bool:
+                changes[name] = np.logical_or.reduceat(column, starts)[whole]
+            else:
+                changes[name] = column[pick]
+    kept = record.segment[pick]
+    used, segment = np.unique(kept, return_inverse=True)
+    names = tuple(record.segment_names[index] for index in used)
+    return replace(record, segment=segment, segment_names=names, **changes)  # pyright: ignore[reportArgumentType]
+
+
+def _joined(pieces: list[_Piece], rate_hz: float) -> Record:
+    """One record of pieces at one rate."""
+    total = sum(piece.record.time_s.size for piece in pieces)
+    if total > bounds.LARGEST_ROWS:
+        raise BadRecord(f"{total} samples together", mend=f"At most {bounds.LARGEST_ROWS} in one record.")
+    times, parts, codes, names, sources = [], [], [], [], []
+    pulses: list[Pulses] = []
+    first, ended, slot_s = 0, 0, pieces[0].slot_s
+    for index, piece in enumerate(pieces):
+        time_s = piece.record.time_s
+        pause = folded = 0
+        shift_s = 0.0
+        if index:
+            pause = _pause(pieces[index - 1], piece, rate_hz)
+            folded = min(pause, round(PAUSE_S * rate_hz))
+            start = ended + 1 + folded
+            own = piece.interval(0, rate_hz)
+            shift_s = slot_s + (start - own) / rate_hz - piece.slot_s
+            ended = start + piece.interval(-1, rate_hz) - own
+        else:
+            ended = piece.interval(-1, rate_hz)
+        times.append(time_s + shift_s)
+        if piece.record.pulses is not None:
+            pulses.append(_pulses(piece.record.pulses, shift_s, float(time_s[0]), float(time_s[-1])))
+        codes.append(piece.record.segment + len(names))
+        names += piece.record.segment_names
+        sources.append(piece.source)
+        parts.append(Part(first, float(time_s[0]), piece.begun_s, pause / rate_hz, folded / rate_hz))
+        first += time_s.size
+    time_s = np.concatenate(times)
+    bounds.check_span(time_s, "the joined record")
+    columns: dict[str, np.ndarray | None] = {}
+    for name in OPTIONAL:
+        each = [column for piece in pieces if (column := _column(piece.record, name)) is not None]
+        whole = np.concatenate(each) if len(each) == len(pieces) else None
+        columns[name] = None if name in TOLD_WHERE_SO and whole is not None and not whole.any() else whole
+    return Record(
+        time_s=time_s,
+        pulse_width_us=np.concatenate([piece.record.pulse_width_us for piece in pieces]),
+        torque_nm=np.concatenate([piece.record.torque_nm for piece in pieces]),
+        segment=np.concatenate(codes),
+        segment_names=tuple(names),
+        pulses=_all_pulses(pulses) if len(pulses) == len(pieces) else None,
+        pulse_rate_hz=rate_hz,
+        source=sources[0] if len(sources) == 1 else joined_source(sources),
+        parts=tuple(parts),
+        **columns,  # pyright: ignore[reportArgumentType]
+    )
+
+
+def _column(record: Record, name: str) -> np.ndarray | None:
+    column = getattr(record, name)
+    if column is None and name in TOLD_WHERE_SO:
+        return np.zeros(record.time_s.size, bool if name == "doubted" else float)
+    return column
+
+
+def _pulses(known: Pulses, shift_s: float, first_s: float, last_s: float) -> Pulses:
+    """Those from the first to the last of a part's samples, on another clock."""
+    rows = (known.time_s >= first_s) & (known.time_s <= last_s)
+    return Pulses(known.time_s[rows] + shift_s, known.width_us[rows], known.late_s[rows], known.lost[rows])
+
+
+def _all_pulses(parts: list[Pulses]) -> Pulses:
+    columns = (np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(Pulses))
+    return Pulses(*columns)
+
+
+def _pause(before: _Piece, after: _Piece, rate_hz: float) -> int:
+    """Whole pulse intervals without a sample between two pieces."""
+    if before.begun_s is not None and after.begun_s is not None:
+        last_s = before.begun_s + float(before.record.time_s[-1])
+        pause_s = after.begin_s - last_s - 1 / before.record.sample_rate_hz
+    else:
+        pause_s = after.known_pause_s if after.follows else 0.0
+    return round(min(max(pause_s, 0.0), bounds.LONGEST_S) * rate_hz)
