@@ -17,6 +17,15 @@ from identify.dynamics.second_order import hermite
 from identify.errors import BadRecord
 from identify.records.record import FORGOTTEN_S, Record
 
+STANDS = 0.2
+"""In intervals: a pulse less late (early) prolongs (cuts) the drive before it; one later is moved, its effect whole.
+
+Twitches fuse over a short pause and not over a long one. 0 would be twitches that add up, 1 a drive that stands until
+it changes. 1 errs more than taking all pulses as on time, wherever those due after a late one are dropped, as the rig
+does: for a fast muscle whose pulses add up, 5 % of them up to 60 ms late, by 2.7 times the noise, against 1.8 on time
+and 1.0 with this.
+"""
+
 
 @dataclass(frozen=True)
 class Grid:
@@ -110,10 +119,9 @@ class Grid:
     def held(self, drive_nm: np.ndarray, axis: int = 0) -> np.ndarray:
         """The drive of each interval as it was felt: the input itself where nothing was late.
 
-        A pulse felt late by a part of an interval leaves the drive before it standing for that part; an early one takes
-        the part from the drive before it. What follows the last pulse of a train begins as late as that pulse was. One
-        that was late by whole intervals falls into those in which it was felt, beside what is felt there: its own are
-        empty, and the drive's sum stays.
+        A pulse felt late by a small part of an interval (`STANDS`) leaves the drive before it standing for that part;
+        an early one takes the part from it; what follows the last pulse of a train begins as late as that pulse was.
+        A pulse that was later falls into the intervals in which it was felt, beside what is felt there.
 
         Parameters
         ----------
@@ -134,7 +142,7 @@ class Grid:
         own, before, after = np.split(base, 3)
         result[rows] = (1.0 - late - early)[lift] * own + late[lift] * before + early[lift] * after
         for target, part in zip(at, share, strict=True):
-            inside = target < self.size
+            inside = (target >= 0) & (target < self.size)
             np.add.at(result, target[inside], part[inside][lift] * drive[moved[inside]])
         return np.moveaxis(result, 0, axis)
 
@@ -144,10 +152,10 @@ class Grid:
         if self.late_s is None or not np.any(self.late_s):
             return None
         part = self.late_s / self.step_s
-        moved = np.flatnonzero(part >= 1.0)
+        moved = np.flatnonzero((np.abs(part) >= STANDS) & (part != 0) & (self.pulse_width_us > 0))
         whole = np.floor(part[moved]).astype(np.int64)
         rest = part[moved] - whole
-        part = np.where(part >= 1.0, 0.0, part)
+        part[moved] = 0.0
         empty = self.pulse_width_us == 0
         empty[moved] = True
         ends = np.flatnonzero(empty[1:] & ~empty[:-1]) + 1

@@ -75,7 +75,7 @@ def read_pulses(file: StrictFile, name: str, time_s: np.ndarray, pulse_rate_hz: 
     late = np.where(may & ~wild & (np.abs(late) >= LEAST_LATE_S), late, 0.0)
     slot = sent.planned + lag
     # An acknowledgement that came late tells by when the pulse was felt at the latest.
-    latest = np.fmax(slot, np.fmin(sent.acknowledged, slot + LONGEST_LATE_S))[unsure]
+    latest = _by(sent.acknowledged, slot)[unsure]
     lost = np.isin(sent.status, (DROPPED, REFUSED))
     spans = np.r_[slot[unsure], extra_s], np.r_[latest, extra_s] + FORGOTTEN_S
     return Pulses(slot, sent.width, late, lost), _inside(time_s, *spans)
@@ -167,12 +167,18 @@ def _matched(sent: _Sent, earliest: np.ndarray, newest: np.ndarray) -> tuple[np.
     return edge, newest[left]
 
 
+def _by(acknowledged_s: np.ndarray, begin_s: np.ndarray) -> np.ndarray:
+    """When a pulse was felt at the latest, s; its begin where it was not acknowledged."""
+    known = np.isfinite(acknowledged_s)
+    return np.where(known, np.clip(acknowledged_s, begin_s, begin_s + LONGEST_LATE_S), begin_s)
+
+
 def _watched(sent: _Sent, time_s: np.ndarray) -> np.ndarray:
     """Whether the cell sampled all the while in which a pulse can have been felt."""
     period_s = float(np.median(np.diff(time_s)))
     holes = np.flatnonzero(np.diff(time_s) >= 1.5 * period_s)
     start = np.where(np.isfinite(sent.written), sent.written, sent.planned)
-    stop = np.fmax(start, np.fmin(sent.acknowledged, start + LONGEST_LATE_S)) + REACH * sent.interval_s
+    stop = _by(sent.acknowledged, start) + REACH * sent.interval_s
     start = start - REACH * sent.interval_s
     # The first hole that ends after the start must begin after the stop.
     after = np.searchsorted(time_s[holes + 1], start, side="right")
