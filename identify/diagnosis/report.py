@@ -16,6 +16,10 @@ from identify.estimation.tremor import predict_fitted, with_band
 from identify.experiments import plan
 from identify.results import Diagnosis
 
+FIGURES = (
+    "fit_percent", "held_out_fit_percent", "rms_nm", "held_out_rms_nm", "ceiling_percent", "held_out_ceiling_percent",
+    "held_out_by",
+)  # fmt: skip
 CLOSE = 0.8
 """Share of the best one's gain from which an effect that resembles it is named beside it."""
 RIVAL = 0.04
@@ -33,30 +37,19 @@ def report(work: Analysis, verdict: Verdict) -> Diagnosis:
     residual = record.torque_nm - (
         predict_fitted(work.last) if verdict.kind == "unexplained_structure" else base_prediction
     )
-    where = worst_places(record, residual, raw.noise_sd_nm, rows=~record.held_out)
+    where = worst_places(record, residual, raw.noise_sd_nm, rows=~record.held_out & work.base.problem.setup.grid.counted)
     return Diagnosis(
         noise_sd_nm=raw.noise_sd_nm,
         slow_noise={
             "sd_nm": work.last.noise.sd_nm * float(np.sqrt(min(work.last.noise.share, 1.0))),
             "ar1": work.last.noise.ar1,
         },
-        base={
-            key: base[key]
-            for key in (
-                "fit_percent",
-                "held_out_fit_percent",
-                "rms_nm",
-                "held_out_rms_nm",
-                "ceiling_percent",
-                "held_out_ceiling_percent",
-                "held_out_by",
-            )
-        },
+        base={key: base[key] for key in FIGURES},
         verdict=verdict.kind,
         probability=verdict.probability,
         missing=tuple(missing),
         where=tuple(where),
-        with_all=final,
+        with_all={key: final[key] for key in FIGURES} | {"noise_sd_nm": final["noise_sd_nm"]},
         explained=verdict.explained,
         structure_left=verdict.structure,
         candidates=tuple(_candidates(work)),

@@ -52,7 +52,7 @@ class Raw:
 
 def inspect(record: Record) -> Raw:
     """Hum, clipping and white noise of a record; held-out rows are left out, as everywhere."""
-    kept = ~record.held_out
+    kept = ~record.held_out if record.doubted is None else ~record.held_out & ~record.doubted
     torque = record.torque_nm
     ceiling, floor = _flat(torque[kept]), _flat(-torque[kept])
     hum, ratio = _find_hum(record, kept)
