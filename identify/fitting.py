@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from identify.diagnosis.analysis import analyse
-from identify.dynamics.pulse_grid import Grid
 from identify.errors import BadRequest, NotIdentifiable
 from identify.estimation.adding import names, with_effects
 from identify.estimation.finish import finish
@@ -19,7 +18,6 @@ from identify.methods.maximum_likelihood import METHOD as MAXIMUM_LIKELIHOOD
 from identify.model import Model
 from identify.records.record import Record
 
-LEAST_ROWS = 8
 AUTO = "auto"
 NO_EFFECTS_WITH = {"monotone", "order"}
 """Options that shape the plain structure alone."""
@@ -59,16 +57,11 @@ def fit(
     try:
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             if not wanted:
-                grid = prepare(record)
-                refuse_stillness(grid)
-                return chosen.fit(grid, names, **options)
-            if chosen is not MAXIMUM_LIKELIHOOD or set(options) & NO_EFFECTS_WITH:
-                given = (
-                    method if chosen is not MAXIMUM_LIKELIHOOD else " and ".join(sorted(set(options) & NO_EFFECTS_WITH))
-                )
-                raise BadRequest(
-                    f"effects are not fitted with {given}", place="effects", mend="Use maximum-likelihood without it."
-                )
+                return chosen.fit(prepare(record), names, **options)
+            against = [method] if chosen is not MAXIMUM_LIKELIHOOD else sorted(set(options) & NO_EFFECTS_WITH)
+            if against:
+                message = f"effects are not fitted with {' and '.join(against)}"
+                raise BadRequest(message, place="effects", mend="Use maximum-likelihood without it.")
             return _with_effects(record, wanted, names, options)
     except np.linalg.LinAlgError as error:
         raise NotIdentifiable(
@@ -86,29 +79,9 @@ def _with_effects(
 ) -> Model:
     """Maximum likelihood with the effects named, each in its likeliest form, or in the one named after a colon."""
     grid = prepare(record)
-    refuse_stillness(grid)
     rows = fitted_rows(grid, fit_on)
     if list(wanted) == [AUTO]:
         last = analyse(record, fitted=rows).last
         return finish(MAXIMUM_LIKELIHOOD.id, last, [f"effects added: {', '.join(names(last)) or 'none'}"])
     base, reasons = MAXIMUM_LIKELIHOOD.start(grid, rows, options)
     return finish(MAXIMUM_LIKELIHOOD.id, with_effects(record, wanted, base), reasons)
-
-
-def refuse_stillness(grid: Grid) -> None:
-    """Refuse a record in which nothing happens.
-
-    Raises
-    ------
-    NotIdentifiable
-        Nothing may be fitted, there is no pulse, or the torque never changes.
-    """
-    if grid.fitted.sum() < LEAST_ROWS:
-        raise NotIdentifiable(
-            f"only {int(grid.fitted.sum())} pulse intervals may be fitted",
-            mend="Give rows of segments other than `validate`.",
-        )
-    if not np.max(grid.pulse_width_us[grid.fitted]) > 0:
-        raise NotIdentifiable("no pulse is in the record", mend="Record a PRBS and a ramp.")
-    if not np.ptp(grid.torque_nm[grid.fitted]) > 0:
-        raise NotIdentifiable("the torque never changes", mend="Check the load cell and the electrodes.")

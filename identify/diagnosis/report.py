@@ -37,7 +37,9 @@ def report(work: Analysis, verdict: Verdict) -> Diagnosis:
     residual = record.torque_nm - (
         predict_fitted(work.last) if verdict.kind == "unexplained_structure" else base_prediction
     )
-    where = worst_places(record, residual, raw.noise_sd_nm, rows=~record.held_out & work.base.problem.setup.grid.counted)
+    where = worst_places(
+        record, residual, raw.noise_sd_nm, rows=~record.held_out & work.base.problem.setup.grid.counted
+    )
     return Diagnosis(
         noise_sd_nm=raw.noise_sd_nm,
         slow_noise={

@@ -8,6 +8,7 @@ import numpy as np
 
 from identify.dynamics.pulse_grid import Grid, make_grid, runs
 from identify.effects.mains_hum import HARMONICS
+from identify.errors import NotIdentifiable
 from identify.estimation.joint import Fitted, solve
 from identify.estimation.projected import Solution, estimate
 from identify.noise.level import NoiseLevel
@@ -20,6 +21,7 @@ LEAST_LINE = 30.0
 FOLLOWED_S = 1.0
 """Window over which hum's amplitude and phase are taken as even: the grid's frequency wanders more slowly."""
 MOST_HARMONICS = 8
+LEAST_ROWS = 8
 LEAST_EQUAL = 20
 """Samples at exactly the greatest (or smallest) value that count as clipping."""
 
@@ -200,10 +202,36 @@ def block_means(grid: Grid, torque_nm: np.ndarray) -> np.ndarray:
 
 
 def prepare(record: Record, raw: Raw | None = None) -> Grid:
-    """The record on its grid, hum removed, with its white noise."""
-    raw = raw or inspect(record)
+    """The record on its grid, hum removed, with its white noise.
+
+    Raises
+    ------
+    BadRecord, NotIdentifiable
+        No grid can be made, or nothing happens in the record.
+    """
     grid = make_grid(record)
+    refuse_stillness(grid)
+    raw = raw or inspect(record)
     return replace(grid, torque_nm=block_means(grid, raw.torque_nm), noise_sd_nm=raw.noise_sd_nm)
+
+
+def refuse_stillness(grid: Grid) -> None:
+    """Refuse a record in which nothing happens.
+
+    Raises
+    ------
+    NotIdentifiable
+        Nothing may be fitted, there is no pulse, or the torque never changes.
+    """
+    if grid.fitted.sum() < LEAST_ROWS:
+        raise NotIdentifiable(
+            f"only {int(grid.fitted.sum())} pulse intervals may be fitted",
+            mend="Give rows of segments other than `validate`.",
+        )
+    if not np.max(grid.pulse_width_us[grid.fitted]) > 0:
+        raise NotIdentifiable("no pulse is in the record", mend="Record a PRBS and a ramp.")
+    if not np.ptp(grid.torque_nm[grid.fitted]) > 0:
+        raise NotIdentifiable("the torque never changes", mend="Check the load cell and the electrodes.")
 
 
 def plain(grid: Grid, rows: np.ndarray) -> Fitted:

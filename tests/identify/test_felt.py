@@ -294,8 +294,7 @@ def test_bad_csv_columns_are_one_line(tmp_path, cells, says):
     assert "a.csv" in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_joined_and_exported_records_keep_both(tmp_path):
-    from api import joining
+def test_exported_records_keep_both(tmp_path):
     from api.jobs import export_csv
 
     seal(tmp_path / "r.h5", sync=True)
@@ -304,31 +303,6 @@ def test_joined_and_exported_records_keep_both(tmp_path):
     back = read(tmp_path / "out.csv")
     assert back.late_s is not None and sealed.late_s is not None
     assert np.abs(back.late_s - sealed.late_s).max() < 1e-6
-    doubts = np.arange(sealed.time_s.size) // 400 == 3
-    parts = [sealed, Record.from_arrays(back.time_s, back.pulse_width_us, back.torque_nm, doubted=doubts)]
-    (tmp_path / "joined.csv").write_text(joining.table(parts))
-    joined = read(tmp_path / "joined.csv")
-    assert joined.late_s is not None and joined.doubted is not None
-    assert np.count_nonzero(joined.late_s) == pytest.approx(np.count_nonzero(sealed.late_s), abs=20)
-    assert np.sum(joined.doubted) == 400
-    assert "late_s" not in joining.table([parts[1], parts[1]]).partition("\n")[0]
-
-
-def test_a_gap_in_a_joined_recording_is_doubted_and_invents_no_pulse(tmp_path):
-    from api import joining
-
-    true = seal(tmp_path / "r.h5", late=False)
-    k = int(np.flatnonzero(np.diff(true["widths"]) < -200)[2])
-    rows = np.ones(true["clean"].size, bool)
-    rows[10 * k - 40 : 10 * k + 120] = False
-    cut(tmp_path / "r.h5", rows)
-    (tmp_path / "joined.csv").write_text(joining.table([read(tmp_path / "r.h5")]))
-    joined = read(tmp_path / "joined.csv")
-    grid = make_grid(joined)
-    first = int(np.flatnonzero(true["widths"])[0]) - int(np.flatnonzero(grid.pulse_width_us)[0])
-    there = true["widths"][first : first + grid.size]
-    assert np.abs(grid.pulse_width_us[:-1] - there[: grid.size - 1]).max() < 1e-3
-    assert np.sum(grid.doubted) == pytest.approx(15, abs=2)
 
 
 # ---- held ---------------------------------------------------------------------------------------------------
@@ -447,25 +421,25 @@ def test_what_is_doubted_is_not_counted():
     assert model.fit["held_out_rms_nm"] == pytest.approx(clean.fit["held_out_rms_nm"], rel=0.1)
     assert max(part["rms_nm"] for part in model.fit["segments"]) < 0.03
     against = compare(model, wrong)
-    assert against["rms_nm"] < 0.025
-    assert against["held_out"]["rms_nm"] < 0.025
-    assert all(row["rms_nm"] is None or row["rms_nm"] < 0.05 for rows in against["by"].values() for row in rows)
-    assert against["left_out"] == "3.0 s are left out: what was applied is not known there."
-    assert against["left_out"] in against["plain"]
-    assert compare(clean, record)["left_out"] == ""
+    assert against.rms_nm < 0.025
+    assert against.held_out["rms_nm"] < 0.025
+    assert all(row["rms_nm"] is None or row["rms_nm"] < 0.05 for rows in against.by.values() for row in rows)
+    assert against.left_out == "3.0 s are left out: what was applied is not known there."
+    assert against.left_out in against.plain
+    assert compare(clean, record).left_out == ""
 
 
 def test_it_is_said_how_much_was_left_out(tmp_path):
     true = seal(tmp_path / "r.h5", seed=1)
     record = read(tmp_path / "r.h5")
-    words = compare(identify.fit(record), record)["left_out"]
+    words = compare(identify.fit(record), record).left_out
     late = int(np.sum(true["late_s"] > 0.005)) + int(np.sum(true["dropped"]))
     said = int(words.split()[0])
     assert abs(said - late) <= 3
     assert words.endswith("pulses came late or were lost; when each was felt is known, and nothing is left out.")
     seal(tmp_path / "r.h5", seed=1, sync=False)
     record = read(tmp_path / "r.h5")
-    words = compare(identify.fit(record), record)["left_out"]
+    words = compare(identify.fit(record), record).left_out
     assert "s are left out, where it is not known what was felt." in words
 
 
