@@ -99,6 +99,7 @@ def one(job: tuple[str, str, int, dict[str, Any]]) -> dict[str, Any] | None:
         "noise made": made["truth"]["noise"]["sd_nm"] * abs(made["recorder"]["scale"]),
         "error over noise after": after / noise if noise > 0.0 else None,
         "explained": result.explained,
+        "unseen": result.unseen,
         "structure": result.structure_left,
         "structure said": _structure_said(result.to_dict()),
         "gains": [(c["effect"], c["form"], c["log_evidence_gain"]) for c in result.candidates[0][:4]],

@@ -57,7 +57,7 @@ def fit(
     try:
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             if not wanted:
-                return chosen.fit(prepare(record), names, **options)
+                return chosen.fit(prepare(record)[0], names, **options)
             against = [method] if chosen is not MAXIMUM_LIKELIHOOD else sorted(set(options) & NO_EFFECTS_WITH)
             if against:
                 message = f"effects are not fitted with {' and '.join(against)}"
@@ -78,10 +78,10 @@ def _with_effects(
     record: Record, wanted: Sequence[str], fit_on: tuple[str, ...] | None, options: dict[str, Any]
 ) -> Model:
     """Maximum likelihood with the effects named, each in its likeliest form, or in the one named after a colon."""
-    grid = prepare(record)
+    grid, raw = prepare(record)
     rows = fitted_rows(grid, fit_on)
     if list(wanted) == [AUTO]:
         last = analyse(record, fitted=rows).last
         return finish(MAXIMUM_LIKELIHOOD.id, last, [f"effects added: {', '.join(names(last)) or 'none'}"])
     base, reasons = MAXIMUM_LIKELIHOOD.start(grid, rows, options)
-    return finish(MAXIMUM_LIKELIHOOD.id, with_effects(record, wanted, base), reasons)
+    return finish(MAXIMUM_LIKELIHOOD.id, with_effects(base, wanted, raw), reasons)

@@ -150,6 +150,9 @@ class Diagnosis(_Result):
         Share, 0 to 1, of the explicable log-likelihood that the effects took.
     structure_left : float
         Log-likelihood by which work and rest still differ.
+    unseen : dict or None
+        Error of the last model on rows not seen, `rms_nm`, and what noise and its own uncertainty allow, `allowed_nm`,
+        both of means over a pulse interval; None where those rows can say nothing.
     candidates : tuple of list of dict
         What was tried in each round, best first: `effect`, `form`, `log_evidence_gain`, `rms_nm`, `forms`.
     notes : tuple of str
@@ -168,6 +171,7 @@ class Diagnosis(_Result):
     with_all: Row
     explained: float
     structure_left: float
+    unseen: Row | None
     candidates: tuple[Sequence[Row], ...]
     notes: tuple[str, ...]
     plain: tuple[str, ...]

@@ -79,7 +79,7 @@ def _innovations(residual: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, f
     parts = runs(known)
     start = np.array([p.start for p in parts], np.int64)
     stop = np.array([p.stop for p in parts], np.int64)
-    ar1, share, _, _ = profile_noise(residual, start, stop, 0.5, 0.5)
+    ar1, share, _, _ = profile_noise(residual, start, stop, 0.5, 0.5, True)
     lag_one = ar1 * share
     if abs(lag_one) < 0.08:
         return residual, 0.0

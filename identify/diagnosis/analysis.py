@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -12,9 +12,9 @@ from identify.diagnosis.structure import Left, left_over, quiet_rows
 from identify.diagnosis.unknown import WANDER
 from identify.effects import get, registry
 from identify.effects.base import Effect
-from identify.estimation.adding import Candidate, fit_form, given_by_samples, try_effect
+from identify.estimation.adding import Candidate, fit_form, given_by_samples, names, try_effect, with_effects
 from identify.estimation.joint import Fitted, solve, start_from
-from identify.estimation.prepare import Raw, inspect, plain, prepare
+from identify.estimation.prepare import Raw, plain, prepare
 from identify.estimation.rows import fitted_rows
 from identify.noise.level import NoiseLevel
 from identify.records.record import Record
@@ -104,12 +104,16 @@ def analyse(
     most: int = MOST,
     effects: Iterable[Effect] | None = None,
     fitted: np.ndarray | None = None,
+    structure: Sequence[str] = (),
 ) -> Analysis:
-    """Try all effects on a record, add the best, and go on while the evidence lasts."""
+    """Try all effects on a record, add the best, and go on while the evidence lasts.
+
+    `structure` names effects, "id" or "id:form", that the model criticised holds already.
+    """
     listed = list(registry().values() if effects is None else effects)
-    raw = inspect(record)
-    grid = prepare(record, raw)
+    grid, raw = prepare(record)
     base = plain(grid, fitted_rows(grid, None) if fitted is None else fitted)
+    base = with_effects(base, structure, raw)
     work = Analysis(record, raw, base)
     start = _with_given(work, base)
     work.chain, work.quiet = [start], quiet_rows(start)
@@ -204,6 +208,8 @@ def _exhausted(work: Analysis) -> bool:
 def _with_given(work: Analysis, base: Fitted) -> Fitted:
     """The base model with what the raw samples show beyond doubt."""
     for effect, form, values in given_by_samples(work.raw):
+        if effect in names(base):
+            continue
         effects = [*base.effects, (effect, form)]
         problem = Problem(base.problem.setup, effects)
         base = solve(problem, start_from(problem, base, {len(effects) - 1: values}), base.noise)

@@ -54,6 +54,9 @@ def report(work: Analysis, verdict: Verdict) -> Diagnosis:
         with_all={key: final[key] for key in FIGURES} | {"noise_sd_nm": final["noise_sd_nm"]},
         explained=verdict.explained,
         structure_left=verdict.structure,
+        unseen=None
+        if verdict.unseen is None
+        else {"rms_nm": verdict.unseen.rms_nm, "allowed_nm": verdict.unseen.allowed_nm},
         candidates=tuple(_candidates(work)),
         notes=tuple(verdict.notes),
         plain=tuple(_plain(work, verdict, base, final, missing, where)),

@@ -12,6 +12,8 @@ from identify.noise.level import band_part
 from identify.noise.slow_and_white import profile_noise
 from identify.records.record import Record
 
+COUNTS = 2.5
+"""Counts by which readings change from one to the next, at the median, from which a repeat is none of the counting."""
 QUIET = 0.025
 """Share of the largest torque below which the muscle counts as resting."""
 
@@ -99,7 +101,7 @@ def _profile(residual: np.ndarray, parts: list[slice]) -> tuple[float, float, fl
         return (0.0, 0.0, 0.0, 0.0)
     start = np.array([p.start for p in parts], np.int64)
     stop = np.array([p.stop for p in parts], np.int64)
-    return profile_noise(residual, start, stop, 0.5, 0.5)
+    return profile_noise(residual, start, stop, 0.5, 0.5, True)
 
 
 def _rms(residual: np.ndarray, parts: list[slice]) -> float:
@@ -131,9 +133,10 @@ def quiet_rows(fitted: Fitted) -> np.ndarray:
 
 
 def held_readings(record: Record) -> float:
-    """Share of samples that repeat the one before exactly, above what its number of distinct values explains."""
+    """Share of samples that repeat the one before exactly, where that is not the coarse count of a quiet signal."""
     torque = record.torque_nm
-    inside = torque[(torque > torque.min()) & (torque < torque.max())]
-    if inside.size < 100:
-        return 0.0
-    return float(np.mean(np.diff(inside) == 0.0))
+    change = np.abs(np.diff(torque[(torque > torque.min()) & (torque < torque.max())]))
+    moved = change[change > 1e-9 * max(float(np.ptp(torque)), 1e-300)]
+    if change.size < 100 or not moved.size or np.median(moved) < COUNTS * np.min(moved):
+        return 0.0  # it moves by single counts: between two of them it stands
+    return float(np.mean(change == 0.0))

@@ -8,6 +8,7 @@ import numpy as np
 
 from identify.diagnosis.analysis import FIRST_MARGIN, SEEN_AT_REST, Analysis, seen_at_rest
 from identify.diagnosis.structure import held_readings
+from identify.diagnosis.unseen import Unseen, unseen
 from identify.effects import get
 from identify.estimation.adding import Candidate
 
@@ -35,6 +36,10 @@ NAMELESS = 8.0
 """Log evidence by which a gain without a law must beat the best effect."""
 EXPLAINED_BY_LAWS = 0.9
 """Share that effects together must explain for a gain without a law not to count."""
+UNSEEN_RATIO = 2.5
+"""Error on rows not seen over what is allowed there, above which structure may be left."""
+UNSEEN_SHARE = 0.5
+"""And in proportion to what the plain structure leaves there: a law close to the truth takes most, not all."""
 HELD = 0.3
 """Share of repeated samples that no noisy converter gives."""
 
@@ -57,6 +62,10 @@ class Verdict:
         Log-likelihood by which work and rest still differ.
     probability : float
         Of the verdict as a whole.
+    unseen : Unseen or None
+        What the rows not seen say of the last model; None where they can say nothing.
+    contradicted : bool
+        Whether they say that structure is left.
     notes : list of str
         Reasons, for people.
     """
@@ -67,6 +76,8 @@ class Verdict:
     explained: float
     structure: float
     probability: float
+    unseen: Unseen | None = None
+    contradicted: bool = False
     notes: list[str] = field(default_factory=list)
 
 
@@ -105,6 +116,13 @@ def _efforts(work: Analysis) -> int:
     return int(np.sum(np.diff(centres) > APART_S)) + 1 if centres.size else 0
 
 
+def _contradicted(before: Unseen | None, after: Unseen) -> bool:
+    """Whether the rows not seen say that something is left, whatever the fitted rows say."""
+    if after.ratio < UNSEEN_RATIO:
+        return False
+    return before is None or after.excess_nm > UNSEEN_SHARE * before.excess_nm
+
+
 def judge(work: Analysis) -> Verdict:
     """The verdict on an analysis."""
     first, last = work.chain[0], work.last
@@ -140,6 +158,14 @@ def judge(work: Analysis) -> Verdict:
             strange = strange or _no_effort(work, explained, structure)
     else:
         strange = strange or structure > STRUCTURE
+    before, after = unseen(first), unseen(last)
+    contradicted = after is not None and _contradicted(before, after)
+    if after is not None and contradicted:
+        strange = True
+        notes.append(
+            f"On rows not seen the last model errs by {after.ratio:.1f} times what noise and its own uncertainty "
+            "allow: structure is left."
+        )
     if strange:
         found = {effect: min(p, 0.45) for effect, p in found.items()}
         kind = "unexplained_structure"
@@ -148,4 +174,6 @@ def judge(work: Analysis) -> Verdict:
         kind, probability = "effect_missing", max(found.values())
     else:
         kind, probability = "nothing_missing", _nothing(work.rounds[0] if work.rounds else [])
-    return Verdict(kind, found, rivals, float(explained), float(structure), float(probability), notes)
+    return Verdict(
+        kind, found, rivals, float(explained), float(structure), float(probability), after, contradicted, notes
+    )

@@ -19,7 +19,7 @@ def warm() -> None:
     width = np.where((np.floor(time_s * 4) % 2) == 1, 200.0, 0.0)
     torque = np.convolve(width / 100.0, np.exp(-np.arange(40) / 10.0) / 10.0)[:400]
     record = Record.from_arrays(time_s, width, torque + 0.01 * np.sin(37.0 * np.arange(400) ** 1.3))
-    grid = prepare(record)
+    grid, _ = prepare(record)
     base = plain(grid, fitted_rows(grid, None))
     setup = base.problem.setup
     find_band(base.residual_nm, setup.stretches, setup.grid.step_s)

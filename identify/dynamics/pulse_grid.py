@@ -13,6 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
+from identify.dynamics.mean_weights import mean_weights
 from identify.dynamics.second_order import hermite
 from identify.errors import BadRecord
 from identify.records.record import FORGOTTEN_S, Record
@@ -206,50 +207,12 @@ class Grid:
         return first, np.broadcast_to(row / self._pattern.size, (self.size, *row.shape))
 
     def _any_weights(self, delay_s: float) -> tuple[int, np.ndarray]:
-        """Weights from running sums, whatever the samples' places."""
-        shift = delay_s / self.step_s
-        whole = int(np.floor(shift))
-        part = shift - whole
-        # Samples past `part` of their interval are read in the interval `whole` before, the others one earlier still.
-        split = np.searchsorted(self._position, np.arange(self.size) + part, side="left")
-        split = np.clip(split, self._edges[:-1], self._edges[1:])
-        groups = []
-        for offset, start, stop, lag in (
-            (-whole - 1, self._edges[:-1], split, part - 1.0),
-            (-whole, split, self._edges[1:], part),
-        ):
-            if np.any(stop > start):
-                groups.append((offset, _mean_hermite(self._powers[:, stop] - self._powers[:, start], lag, self.step_s)))
-        first = groups[0][0]
-        weights = np.zeros((self.size, groups[-1][0] - first + 2, 2))
-        for offset, cubic in groups:
-            weights[:, offset - first] += cubic[:, :2]
-            weights[:, offset - first + 1] += cubic[:, 2:]
-        return first, weights / np.maximum(self.count, 1)[:, None, None]
+        """Weights sample by sample, whatever their places."""
+        return mean_weights(self.fraction, self.interval, self.count, delay_s / self.step_s, self.step_s)
 
     @cached_property
     def _weights(self) -> dict[float, tuple[int, np.ndarray]]:
         return {}
-
-    @cached_property
-    def _position(self) -> np.ndarray:
-        """Each sample's place in steps since the first pulse slot, rising."""
-        return self.interval + self.fraction
-
-    @cached_property
-    def _edges(self) -> np.ndarray:
-        """First sample of each interval, and the number of samples; shape (K + 1,)."""
-        return np.searchsorted(self.interval, np.arange(self.size + 1))
-
-    @cached_property
-    def _powers(self) -> np.ndarray:
-        """Running sums of 1, f, f², f³ over the samples, f their place in the interval; shape (4, N + 1)."""
-        sums = np.zeros((4, self.fraction.size + 1))
-        term = np.ones(self.fraction.size)
-        for power in range(4):
-            np.cumsum(term, out=sums[power, 1:])
-            term = term * self.fraction
-        return sums
 
     def block_mean(self, torque_nm: np.ndarray, rate_nm_s: np.ndarray, delay_s: float = 0.0) -> np.ndarray:
         """Mean over each interval's samples of the curve through boundary states.
@@ -282,16 +245,6 @@ class Grid:
                     np.multiply(state[rows], factor, out=term)
                     result += term
         return result
-
-
-def _mean_hermite(sums: np.ndarray, lag: float, step_s: float) -> np.ndarray:
-    """Sums of the cubic's four weights over samples at f - lag, from their sums of powers of f; shape (K, 4)."""
-    s0, s1, s2, s3 = sums
-    x1 = s1 - lag * s0
-    x2 = s2 - 2 * lag * s1 + lag * lag * s0
-    x3 = s3 - 3 * lag * s2 + 3 * lag * lag * s1 - lag**3 * s0
-    rise = 3 * x2 - 2 * x3
-    return np.stack([s0 - rise, step_s * (x1 - 2 * x2 + x3), rise, step_s * (x3 - x2)], axis=1)
 
 
 def _padded(values: np.ndarray, before: int, after: int, *, hold: bool) -> np.ndarray:

@@ -134,6 +134,52 @@ def _second(law, linear, inverse, y, v, lag_s, scale_nm):  # pragma: no cover
 
 
 @njit(cache=True, nogil=True)
+def _through(drive, torque, rate, rows, even, varied, begins, initial):  # pragma: no cover
+    """Four rows at a time through given transitions: each waits for itself alone, so four take hardly longer than one.
+
+    Parameters
+    ----------
+    rows : ndarray of int, shape (4,)
+        Which; a row may stand there several times.
+    even : ndarray, shape (4, 4)
+        Transition of each row, column by column, where it is the same in all intervals.
+    varied : ndarray, shape (4, K) or (4, 0)
+        Transition of each interval, the same for all rows, where it is not.
+    """
+    size = drive.shape[1]
+    a, b, c, d = rows
+    for part in range(begins.size):
+        start, stop = begins[part], begins[part + 1] if part + 1 < begins.size else size
+        ya, va, yb, vb = initial[a, part, 0], initial[a, part, 1], initial[b, part, 0], initial[b, part, 1]
+        yc, vc, yd, vd = initial[c, part, 0], initial[c, part, 1], initial[d, part, 0], initial[d, part, 1]
+        for r in range(4):
+            torque[rows[r], start], rate[rows[r], start] = initial[rows[r], part, 0], initial[rows[r], part, 1]
+        if varied.shape[1] == 0:
+            a1, a2, a3, a4 = even[0]
+            b1, b2, b3, b4 = even[1]
+            c1, c2, c3, c4 = even[2]
+            d1, d2, d3, d4 = even[3]
+            for k in range(start, stop):
+                wa, wb, wc, wd = drive[a, k], drive[b, k], drive[c, k], drive[d, k]
+                ya, va = wa + a1 * (ya - wa) + a2 * va, a3 * (ya - wa) + a4 * va
+                yb, vb = wb + b1 * (yb - wb) + b2 * vb, b3 * (yb - wb) + b4 * vb
+                yc, vc = wc + c1 * (yc - wc) + c2 * vc, c3 * (yc - wc) + c4 * vc
+                yd, vd = wd + d1 * (yd - wd) + d2 * vd, d3 * (yd - wd) + d4 * vd
+                torque[a, k + 1], torque[b, k + 1], torque[c, k + 1], torque[d, k + 1] = ya, yb, yc, yd
+                rate[a, k + 1], rate[b, k + 1], rate[c, k + 1], rate[d, k + 1] = va, vb, vc, vd
+        else:
+            for k in range(start, stop):
+                s1, s2, s3, s4 = varied[0, k], varied[1, k], varied[2, k], varied[3, k]
+                wa, wb, wc, wd = drive[a, k], drive[b, k], drive[c, k], drive[d, k]
+                ya, va = wa + s1 * (ya - wa) + s2 * va, s3 * (ya - wa) + s4 * va
+                yb, vb = wb + s1 * (yb - wb) + s2 * vb, s3 * (yb - wb) + s4 * vb
+                yc, vc = wc + s1 * (yc - wc) + s2 * vc, s3 * (yc - wc) + s4 * vc
+                yd, vd = wd + s1 * (yd - wd) + s2 * vd, s3 * (yd - wd) + s4 * vd
+                torque[a, k + 1], torque[b, k + 1], torque[c, k + 1], torque[d, k + 1] = ya, yb, yc, yd
+                rate[a, k + 1], rate[b, k + 1], rate[c, k + 1], rate[d, k + 1] = va, vb, vc, vd
+
+
+@njit(cache=True, nogil=True)
 def run_core(
     drive, time_constant_s, damping, law, multiplier, begins, initial, scale_nm, step_s, shared
 ):  # pragma: no cover
@@ -169,7 +215,8 @@ def run_core(
     given = multiplier.shape[0]
     torque = np.zeros((rows, size + 1))
     rate = np.zeros((rows, size + 1))
-    first = np.empty((4, size))
+    first, none, even, step = np.empty((4, size)), np.empty((4, 0)), np.zeros((4, 4)), np.zeros((4, 4))
+    four, plain, many, few = np.zeros(4, np.int64), np.zeros(4, np.int64), 0, 0
     varied = False
     for m in range(rows):
         base = time_constant_s[m]
@@ -188,28 +235,17 @@ def run_core(
         last = 1.0
         forget = np.exp(-step_s / PARTS / max(quick_s if law[m, 18] != 0.0 else slow_s, 1e-4))
         if alike and varied:
-            for k in range(size):
-                if part < begins.size and k == begins[part]:
-                    y, v = initial[m, part, 0], initial[m, part, 1]
-                    torque[m, k], rate[m, k] = y, v
-                    part += 1
-                w = drive[m, k]
-                gap = y - w
-                y, v = w + first[0, k] * gap + first[1, k] * v, first[2, k] * gap + first[3, k] * v
-                torque[m, k + 1] = y
-                rate[m, k + 1] = v
+            four[many % 4] = m
+            many += 1
+            if many % 4 == 0:
+                _through(drive, torque, rate, four, even, first, begins, initial)
             continue
         if not lawful and given == 0:
-            for k in range(size):
-                if part < begins.size and k == begins[part]:
-                    y, v = initial[m, part, 0], initial[m, part, 1]
-                    torque[m, k], rate[m, k] = y, v
-                    part += 1
-                w = drive[m, k]
-                gap = y - w
-                y, v = w + b11 * gap + b12 * v, b21 * gap + b22 * v
-                torque[m, k + 1] = y
-                rate[m, k + 1] = v
+            plain[few % 4] = m
+            step[few % 4, 0], step[few % 4, 1], step[few % 4, 2], step[few % 4, 3] = b11, b12, b21, b22
+            few += 1
+            if few % 4 == 0:
+                _through(drive, torque, rate, plain, step, none, begins, initial)
             continue
         h = step_s / PARTS
         for k in range(size):
@@ -256,6 +292,12 @@ def run_core(
                 first[0, k], first[1, k], first[2, k], first[3, k] = p11, p12, p21, p22
             torque[m, k + 1] = y
             rate[m, k + 1] = v
+    if many % 4:
+        four[many % 4 :] = four[0]
+        _through(drive, torque, rate, four, even, first, begins, initial)
+    if few % 4:
+        plain[few % 4 :], step[few % 4 :] = plain[0], step[0]
+        _through(drive, torque, rate, plain, step, none, begins, initial)
     return torque, rate
 
 

@@ -237,85 +237,52 @@ def activate_by_level(
     return out
 
 
+SPRING_PARTS = 12
+"""Leapfrog steps in an interval: at 16 Hz and 40 pulses a second a fifth of a radian each."""
+
+
 @njit(cache=True, nogil=True)
-def follow_stiffening(
+def follow_curved(
     torque: np.ndarray,
     slope: np.ndarray,
     omega: np.ndarray,
     damping: np.ndarray,
-    stiffening: np.ndarray,
-    scale: float,
+    curved: np.ndarray,
+    toe: bool,
     step_s: float,
 ) -> tuple[np.ndarray, np.ndarray]:  # pragma: no cover
-    """z'' = ω² (1 + β |z|/scale)(x - z) - 2 ζ ω z', x the cubic through boundary states; twelve leapfrog steps each."""
-    rows, size = torque.shape
-    parts = 12
-    h = step_s / parts
-    out = np.zeros((rows, size))
-    rate = np.zeros((rows, size))
-    for m in range(rows):
-        z, v = torque[m, 0], 0.0
-        out[m, 0] = z
-        w2, c = omega[m] * omega[m], damping[m] * omega[m] * h
-        for k in range(size - 1):
-            a, b, d, e = torque[m, k], slope[m, k], torque[m, k + 1], slope[m, k + 1]
-            for i in range(parts):
-                z += 0.5 * h * v
-                s = (i + 0.5) / parts
-                x = (
-                    (1 + 2 * s) * (1 - s) * (1 - s) * a
-                    + s * (1 - s) * (1 - s) * b
-                    + s * s * (3 - 2 * s) * d
-                    + s * s * (s - 1) * e
-                )
-                force = w2 * (1.0 + stiffening[m] * abs(z) / scale) * (x - z)
-                v = (v * (1.0 - c) + h * force) / (1.0 + c)
-                z += 0.5 * h * v
-            if not abs(z) < 1e6:
-                z, v = 0.0, 0.0
-            out[m, k + 1] = z
-            rate[m, k + 1] = v
-    return out, rate
+    """A mass on a curved spring behind the torque x, the cubic through boundary states; all rows side by side.
 
-
-@njit(cache=True, nogil=True)
-def follow_toe(
-    torque: np.ndarray,
-    slope: np.ndarray,
-    omega: np.ndarray,
-    damping: np.ndarray,
-    toe: np.ndarray,
-    scale: float,
-    step_s: float,
-) -> tuple[np.ndarray, np.ndarray]:  # pragma: no cover
-    """q'' = ω² (x - z) - 2 ζ ω q', z = q (1 + β q²/scale²) the spring's torque; x the cubic through boundary states."""
+    With a toe q'' = ω² (x - z) - 2 ζ ω q', z = q (1 + β q²) the spring's torque; else z'' = ω² (1 + β |z|)(x - z) -
+    2 ζ ω z'. Shapes (M, K) and (M,); β in 1/(N·m)² or 1/(N·m).
+    """
     rows, size = torque.shape
-    parts = 12
-    h = step_s / parts
-    out = np.zeros((rows, size))
-    rate = np.zeros((rows, size))
-    for m in range(rows):
-        q, v = torque[m, 0], 0.0
-        out[m, 0] = q
-        w2, c, beta = omega[m] * omega[m], damping[m] * omega[m] * h, toe[m] / (scale * scale)
-        for k in range(size - 1):
-            a, b, d, e = torque[m, k], slope[m, k], torque[m, k + 1], slope[m, k + 1]
-            for i in range(parts):
-                q += 0.5 * h * v
-                s = (i + 0.5) / parts
-                x = (
-                    (1 + 2 * s) * (1 - s) * (1 - s) * a
-                    + s * (1 - s) * (1 - s) * b
-                    + s * s * (3 - 2 * s) * d
-                    + s * s * (s - 1) * e
-                )
-                v = (v * (1.0 - c) + h * w2 * (x - q * (1.0 + beta * q * q))) / (1.0 + c)
-                q += 0.5 * h * v
-            if not abs(q) < 1e6:
-                q, v = 0.0, 0.0
-            out[m, k + 1] = q * (1.0 + beta * q * q)
-            rate[m, k + 1] = v * (1.0 + 3.0 * beta * q * q)
-    return out, rate
+    h = step_s / SPRING_PARTS
+    out, rate = np.zeros((size, rows)), np.zeros((size, rows))
+    x0, v0 = np.ascontiguousarray(torque.T), np.ascontiguousarray(slope.T)
+    q, v = x0[0].copy(), np.zeros(rows)
+    out[0] = q
+    w2 = h * omega * omega
+    c = damping * omega * h
+    keep, give = (1.0 - c) / (1.0 + c), w2 / (1.0 + c)
+    for k in range(size - 1):
+        for i in range(SPRING_PARTS):
+            s = (i + 0.5) / SPRING_PARTS
+            a, b = (1 + 2 * s) * (1 - s) * (1 - s), s * (1 - s) * (1 - s)
+            d, e = s * s * (3 - 2 * s), s * s * (s - 1)
+            for m in range(rows):
+                x = a * x0[k, m] + b * v0[k, m] + d * x0[k + 1, m] + e * v0[k + 1, m]
+                z = q[m] + 0.5 * h * v[m]
+                force = x - z * (1.0 + curved[m] * z * z) if toe else (1.0 + curved[m] * abs(z)) * (x - z)
+                v[m] = keep[m] * v[m] + give[m] * force
+                q[m] = z + 0.5 * h * v[m]
+        for m in range(rows):
+            if not abs(q[m]) < 1e6:
+                q[m], v[m] = 0.0, 0.0
+            bent = curved[m] * q[m] * q[m] if toe else 0.0
+            out[k + 1, m] = q[m] * (1.0 + bent)
+            rate[k + 1, m] = v[m] * (1.0 + 3.0 * bent)
+    return np.ascontiguousarray(out.T), np.ascontiguousarray(rate.T)
 
 
 @njit(cache=True, nogil=True)

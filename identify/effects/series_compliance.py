@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from identify.effects.base import Effect, Form, Parameter, Scene
-from identify.effects.kernels import exponential, follow, follow_stiffening, follow_toe
+from identify.effects.kernels import exponential, follow, follow_curved
 
 _RESTARTS = tuple(
     {"resonance_hz": hz, "damping": 0.15, "share": 0.4, "base.time_constant_s": t, "base.damping": 1.0}
@@ -62,24 +63,16 @@ def _inertia(x: tuple[np.ndarray, np.ndarray], p: dict[str, Any], scene: Scene) 
     return y - share * taken, y_rate - share * (y_rate - z_rate - 2 * damping * speeding / omega)
 
 
-def _stiffening(x: tuple[np.ndarray, np.ndarray], p: dict[str, Any], scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    frequency = p["resonance_hz"][:, 0]
-    if np.all(np.isinf(frequency)):
-        return x
-    omega = 2 * np.pi * frequency
-    return follow_stiffening(
-        x[0], x[1] * scene.step_s, omega, p["damping"][:, 0], p["stiffening"][:, 0], scene.scale_nm, scene.step_s
-    )
+def _curved(toe: bool) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
+    def apply(x: tuple[np.ndarray, np.ndarray], p: dict[str, Any], scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+        frequency = p["resonance_hz"][:, 0]
+        if np.all(np.isinf(frequency)):
+            return x
+        beta = p["stiffening"][:, 0] / scene.scale_nm ** (2 if toe else 1)
+        damping = p["damping"][:, 0]
+        return follow_curved(x[0], x[1] * scene.step_s, 2 * np.pi * frequency, damping, beta, toe, scene.step_s)
 
-
-def _toe(x: tuple[np.ndarray, np.ndarray], p: dict[str, Any], scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    frequency = p["resonance_hz"][:, 0]
-    if np.all(np.isinf(frequency)):
-        return x
-    omega = 2 * np.pi * frequency
-    return follow_toe(
-        x[0], x[1] * scene.step_s, omega, p["damping"][:, 0], p["stiffening"][:, 0], scene.scale_nm, scene.step_s
-    )
+    return apply
 
 
 EFFECT = Effect(
@@ -117,7 +110,7 @@ EFFECT = Effect(
                 *_RESONANCE,
                 Parameter("stiffening", "1", 0.0, 12.0, 0.0, (1.0,), about="rise of stiffness to full torque"),
             ),
-            _toe,
+            _curved(toe=True),
             True,
             source="toe region of a tendon: Zajac 1989; Duffing's spring",
         ),
@@ -129,7 +122,7 @@ EFFECT = Effect(
                 *_RESONANCE,
                 Parameter("stiffening", "1", -0.6, 12.0, 0.0, (1.0,), about="rise of stiffness to full torque"),
             ),
-            _stiffening,
+            _curved(toe=False),
             True,
             grows=True,
         ),

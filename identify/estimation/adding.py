@@ -11,7 +11,7 @@ from identify.effects import get, registry
 from identify.effects.base import Effect, Form, Scene
 from identify.errors import BadRequest, NotIdentifiable
 from identify.estimation.joint import Fitted, solve, start_from
-from identify.estimation.prepare import Raw, inspect, plain, prepare
+from identify.estimation.prepare import Raw, plain, prepare
 from identify.estimation.rows import fitted_rows
 from identify.noise.level import find_band
 from identify.records.record import Record
@@ -140,7 +140,7 @@ def add(base: Fitted, effect: Effect, form: str, raw: Raw) -> Fitted:
     except KeyError as error:
         raise BadRequest(f"{effect.id} has no form {form!r}", place="effects") from error
     for identifier, seen, values in given_by_samples(raw):
-        if identifier == effect.id and form in ("", seen.name):
+        if identifier == effect.id:
             problem = Problem(base.problem.setup, [*base.effects, (identifier, seen)])
             return solve(problem, start_from(problem, base, {len(base.effects): values}), base.noise)
     found = try_effect(effect, base, forms)
@@ -163,19 +163,21 @@ def given_by_samples(raw: Raw) -> list[tuple[str, Form, dict[str, float]]]:
     return found
 
 
-def with_effects(record: Record, wanted: Sequence[str], base: Fitted | None = None) -> Fitted:
-    """The plain structure and the effects named, each in its likeliest form, or in the one named after a colon.
+def with_effects(base: Fitted, wanted: Sequence[str], raw: Raw) -> Fitted:
+    """The model and the effects named, each in its likeliest form, or in the one named after a colon.
 
     Raises
     ------
     BadRequest, NotIdentifiable
         As `add`; no effect of that name.
     """
-    raw = inspect(record)
-    if base is None:
-        grid = prepare(record, raw)
-        base = plain(grid, fitted_rows(grid, None))
     for name in wanted:
         identifier, _, form = name.partition(":")
         base = add(base, get(identifier), form, raw)
     return base
+
+
+def fitted_with(record: Record, wanted: Sequence[str]) -> Fitted:
+    """The plain structure of a record with the effects named."""
+    grid, raw = prepare(record)
+    return with_effects(plain(grid, fitted_rows(grid, None)), wanted, raw)

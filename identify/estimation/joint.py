@@ -96,10 +96,6 @@ class Fitted:
         return inverse * slope[:, None] * slope[None, :]
 
 
-def _noise(problem: Problem, residual: np.ndarray, near: NoiseLevel) -> tuple[NoiseLevel, float]:
-    return profile(residual, problem.setup.stretches, near)
-
-
 def _whiten(problem: Problem, rows: np.ndarray, noise: NoiseLevel) -> np.ndarray:
     return whitened(rows, problem.setup.stretches, noise)
 
@@ -140,7 +136,7 @@ def solve(
     floor : float or None
         Log evidence of a rival start: a run that stays far below it and hardly gains is given up.
     """
-    at = _at(problem, np.clip(theta, problem.lower, problem.upper), noise)
+    at = _at(problem, np.clip(theta, problem.lower, problem.upper), noise, wide=True)
     assert at is not None
     frozen = np.zeros(problem.size, bool)
     for chosen in problem.chosen:
@@ -148,21 +144,19 @@ def solve(
             frozen[chosen.places.start : chosen.places.stop] = True
     damping, iterations = 1e-3, 0
     prior_mean, precision = problem.prior
-    jacobian = _slopes(problem, at.theta)
     while iterations < most:
         iterations += 1
-        products = gram(_whiten(problem, np.vstack([at.residual, jacobian]), at.noise))
+        products = gram(_whiten(problem, np.vstack([at.residual, at.slopes]), at.noise))
         gradient = products[0, 1:] - precision @ (at.theta - prior_mean)
         found, damping = _advance(problem, at, products[1:, 1:] + precision, gradient, damping, frozen)
         if found is None:
             break
         gain, at = found.value - at.value, found
-        jacobian = _slopes(problem, at.theta)
         if gain < tolerance and iterations >= 2:
             break
         if floor is not None and iterations >= 3 and at.value - OCCAM + GIVE_UP * gain < floor - 12.0:
             break
-    hessian = gram(_whiten(problem, jacobian, at.noise)) + precision
+    hessian = gram(_whiten(problem, at.slopes, at.noise)) + precision
     return Fitted(
         problem=problem,
         theta=at.theta,
@@ -170,7 +164,7 @@ def solve(
         log_likelihood=at.log_likelihood,
         log_evidence=at.value - 0.5 * _log_det_ratio(hessian, precision),
         residual_nm=at.residual,
-        slopes=jacobian,
+        slopes=at.slopes,
         hessian=hessian,
         iterations=iterations,
         settled=most == 0 or iterations < most,
@@ -179,28 +173,23 @@ def solve(
 
 @dataclass(frozen=True)
 class _Point:
-    """Where a run stands: parameters, residual, noise, log-likelihood, and the log posterior."""
+    """Where a run stands: parameters, residual, slopes, noise, log-likelihood, and the log posterior."""
 
     theta: np.ndarray
     residual: np.ndarray
+    slopes: np.ndarray
     noise: NoiseLevel
     log_likelihood: float
     value: float
 
 
-def _at(problem: Problem, theta: np.ndarray, noise: NoiseLevel) -> _Point | None:
-    mean, _ = problem.run(theta)
-    if not np.all(np.isfinite(mean)):
+def _at(problem: Problem, theta: np.ndarray, noise: NoiseLevel, wide: bool = False) -> _Point | None:
+    mean, slopes = problem.run(theta, derivatives=True)
+    if slopes is None or not np.all(np.isfinite(mean)):
         return None
     residual = _residual(problem, mean)
-    level, log_likelihood = _noise(problem, residual, noise)
-    return _Point(theta, residual, level, log_likelihood, log_likelihood - _penalty(problem, theta))
-
-
-def _slopes(problem: Problem, theta: np.ndarray) -> np.ndarray:
-    _, jacobian = problem.run(theta, derivatives=True)
-    assert jacobian is not None
-    return jacobian
+    level, log_likelihood = profile(residual, problem.setup.stretches, noise, wide)
+    return _Point(theta, residual, slopes, level, log_likelihood, log_likelihood - _penalty(problem, theta))
 
 
 def _advance(

@@ -52,14 +52,18 @@ class Raw:
     floor_nm: float | None
 
 
-def inspect(record: Record) -> Raw:
-    """Hum, clipping and white noise of a record; held-out rows are left out, as everywhere."""
+def inspect(record: Record, start_s: float | None = None) -> Raw:
+    """Hum, clipping and white noise of a record; held-out rows are left out, as everywhere.
+
+    Hum is told by cosines and sines of the time since `start_s`, the record's first sample by default.
+    """
+    own_s = record.time_s - (record.time_s[0] if start_s is None else start_s)
     kept = ~record.held_out if record.doubted is None else ~record.held_out & ~record.doubted
     torque = record.torque_nm
     ceiling, floor = _flat(torque[kept]), _flat(-torque[kept])
-    hum, ratio = _find_hum(record, kept)
+    hum, ratio = _find_hum(record, own_s, kept)
     if hum is not None:
-        torque = torque - hum_at(hum, record.time_s - record.time_s[0])
+        torque = torque - hum_at(hum, own_s)
         torque = torque - _wander(record, torque, hum["frequency_hz"], kept)
     noise = white_noise(record, torque[kept])
     return Raw(torque, noise, hum, ratio, ceiling, None if floor is None else -floor)
@@ -102,7 +106,7 @@ def hum_at(hum: dict[str, float], time_s: np.ndarray) -> np.ndarray:
     return total
 
 
-def _find_hum(record: Record, kept: np.ndarray) -> tuple[dict[str, float] | None, float]:
+def _find_hum(record: Record, own_s: np.ndarray, kept: np.ndarray) -> tuple[dict[str, float] | None, float]:
     """A line at 50 or 60 Hz that stands out of its neighbours, with its harmonics."""
     rate_hz = record.sample_rate_hz
     if rate_hz < 99.0 or kept.sum() < 4 * rate_hz:
@@ -124,7 +128,7 @@ def _find_hum(record: Record, kept: np.ndarray) -> tuple[dict[str, float] | None
     ratio, mains = best
     if ratio < LEAST_LINE or mains > 0.5 * rate_hz + 1e-6:
         return None, ratio
-    return _fit_hum(record, mains, kept), ratio
+    return _fit_hum(record, own_s, mains, kept), ratio
 
 
 def _line(power: np.ndarray, frequency: np.ndarray, centre_hz: float, reach_hz: float) -> float:
@@ -161,9 +165,9 @@ def _wander(record: Record, torque: np.ndarray, mains_hz: float, kept: np.ndarra
     return found
 
 
-def _fit_hum(record: Record, mains_hz: float, kept: np.ndarray) -> dict[str, float]:
+def _fit_hum(record: Record, time_s: np.ndarray, mains_hz: float, kept: np.ndarray) -> dict[str, float]:
     """Frequency and amplitudes by least squares on the high-passed torque."""
-    rate_hz, time_s = record.sample_rate_hz, record.time_s - record.time_s[0]
+    rate_hz = record.sample_rate_hz
     width = max(round(rate_hz / record.pulse_rate_hz), 2)
     harmonics = [h for h in range(1, HARMONICS + 1) if h * mains_hz <= 0.5 * rate_hz + 1e-6]
 
@@ -201,8 +205,8 @@ def block_means(grid: Grid, torque_nm: np.ndarray) -> np.ndarray:
     return np.where(grid.count > 0, total, np.nan)
 
 
-def prepare(record: Record, raw: Raw | None = None) -> Grid:
-    """The record on its grid, hum removed, with its white noise.
+def prepare(record: Record) -> tuple[Grid, Raw]:
+    """The record on its grid, hum removed, with its white noise; and what its samples show before any fit.
 
     Raises
     ------
@@ -211,8 +215,8 @@ def prepare(record: Record, raw: Raw | None = None) -> Grid:
     """
     grid = make_grid(record)
     refuse_stillness(grid)
-    raw = raw or inspect(record)
-    return replace(grid, torque_nm=block_means(grid, raw.torque_nm), noise_sd_nm=raw.noise_sd_nm)
+    raw = inspect(record, grid.start_s)
+    return replace(grid, torque_nm=block_means(grid, raw.torque_nm), noise_sd_nm=raw.noise_sd_nm), raw
 
 
 def refuse_stillness(grid: Grid) -> None:

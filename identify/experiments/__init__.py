@@ -11,7 +11,7 @@ import numpy as np
 from identify.dynamics.pulse_grid import make_grid
 from identify.effects import get
 from identify.errors import BadRequest
-from identify.estimation.adding import with_effects
+from identify.estimation.adding import fitted_with
 from identify.estimation.joint import Fitted
 from identify.experiments.designs import Design, designs
 from identify.noise.level import whitened
@@ -50,9 +50,9 @@ def next_experiment(record: Record, rivals: Sequence[str]) -> dict[str, Any]:
         raise BadRequest("no rival was named", place="rivals", mend="Name two effects.")
     for name in names:
         get(name)
-    fits = {name: with_effects(record, [name]) for name in names}
+    fits = {name: fitted_with(record, [name]) for name in names}
     if len(names) == 1:
-        fits["nothing"] = with_effects(record, [])
+        fits["nothing"] = fitted_with(record, [])
     return plan(record, fits)
 
 

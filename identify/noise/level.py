@@ -47,11 +47,13 @@ class NoiseLevel:
         return self.band <= 0.0 and min(self.share, 1.0) * self.ar1 < 0.05
 
 
-def profile(residual: np.ndarray, stretches: Stretches, near: NoiseLevel) -> tuple[NoiseLevel, float]:
-    """The likeliest noise of a residual, of the kind of `near`, and its log-likelihood."""
+def profile(
+    residual: np.ndarray, stretches: Stretches, near: NoiseLevel, wide: bool = True
+) -> tuple[NoiseLevel, float]:
+    """The likeliest noise of a residual, of the kind of `near`, and its log-likelihood; sought far off if `wide`."""
     start, stop = stretches
     if near.band <= 0.0:
-        ar1, share, sd, log_likelihood = profile_noise(residual, start, stop, near.ar1, near.share)
+        ar1, share, sd, log_likelihood = profile_noise(residual, start, stop, near.ar1, near.share, wide)
         return NoiseLevel(ar1, share, max(sd, 1e-9)), log_likelihood
     x = np.array(
         [

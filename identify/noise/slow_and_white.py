@@ -152,7 +152,7 @@ def _minus_log_likelihood(row, start, stop, ar1, share):  # pragma: no cover
 
 
 @njit(cache=True, nogil=True)
-def profile_noise(row, start, stop, ar1, share):  # pragma: no cover
+def profile_noise(row, start, stop, ar1, share, wide):  # pragma: no cover
     """Correlation and slow share that make a residual most likely, by a pattern search from where it stands.
 
     Returns
@@ -175,10 +175,12 @@ def profile_noise(row, start, stop, ar1, share):  # pragma: no cover
         (np.log(0.5), 0.02),
         (np.log(0.3), 1.7),
     ):
+        if not wide:
+            break
         value = _minus_log_likelihood(row, start, stop, 1.0 - np.exp(guess_a), guess_b)
         if value < best:
             best, a, b = value, guess_a, guess_b
-    da, db = 0.6, 0.2
+    da, db = (0.6, 0.2) if wide else (0.15, 0.05)
     while da > 0.01:
         moved = False
         for i in range(8):

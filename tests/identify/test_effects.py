@@ -57,7 +57,7 @@ def moving() -> Record:
 
 @pytest.fixture(scope="module")
 def setup(moving):
-    grid = prepare(moving)
+    grid, _ = prepare(moving)
     return plain(grid, grid.fitted).problem.setup
 
 

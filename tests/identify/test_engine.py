@@ -7,7 +7,7 @@ import pytest
 
 import identify
 from identify.effects import get
-from identify.estimation.adding import with_effects
+from identify.estimation.adding import fitted_with
 from identify.estimation.prepare import plain, prepare
 from identify.estimation.tremor import predict_fitted
 from identify.noise.level import NoiseLevel, band_part, profile, whitened
@@ -65,7 +65,7 @@ def test_noise_is_found_again():
 )
 def test_derivatives_are_those_of_central_differences(names):
     record = hidden_muscles.record(seed=2, rate_hz=100)
-    grid = prepare(record)
+    grid, _ = prepare(record)
     setup = plain(grid, grid.fitted).problem.setup
     problem = Problem(setup, [(n.split(":")[0], get(n.split(":")[0]).form(n.split(":")[1])) for n in names])
     values = np.r_[[0.2, 0.8, 0.001, 0.1, 0.5, 0.2], np.linspace(0, 6, setup.basis.size)]
@@ -88,14 +88,14 @@ def test_derivatives_are_those_of_central_differences(names):
 def test_a_model_meets_a_muscle_integrated_apart():
     """Without noise the base meets a Runge-Kutta muscle of two lags to a few thousandths of its range."""
     record = hidden_muscles.record(seed=4, noise_nm=1e-4)
-    error = predict_fitted(with_effects(record, [])) - record.torque_nm
+    error = predict_fitted(fitted_with(record, [])) - record.torque_nm
     assert np.sqrt(np.mean(error[record.held_out] ** 2)) < 0.012
 
 
 def test_held_out_rows_change_nothing_of_a_fit():
     record = hidden_muscles.record("fatigue", seed=6, rate_hz=100)
     spoilt = record.with_torque(np.where(record.held_out, 50.0 * np.sin(record.time_s * 9.0), record.torque_nm))
-    one, two = with_effects(record, ["fatigue", "mains_hum"]), with_effects(spoilt, ["fatigue", "mains_hum"])
+    one, two = fitted_with(record, ["fatigue", "mains_hum"]), fitted_with(spoilt, ["fatigue", "mains_hum"])
     np.testing.assert_array_equal(one.theta, two.theta)
 
 

@@ -132,7 +132,7 @@ def test_without_validate_the_held_out_error_is_cross_validated():
 
 def test_cross_validation_agrees_with_refits_of_the_same_design():
     record, _ = make_record(Patient(), np.random.default_rng(9), rate_hz=40, noise_nm=0.2, validate=False)
-    grid = prepare(record)
+    grid, _ = prepare(record)
     fitted_all = plain(grid, grid.fitted)
     setup = fitted_all.problem.setup
     fold = (np.cumsum(grid.fitted) // round(BLOCK_S * 40)) % FOLDS

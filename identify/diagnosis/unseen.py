@@ -1,0 +1,60 @@
+"""What rows not seen say of a model: its error there beside what the noise and the model's own band allow."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from identify.effects import get
+from identify.estimation.joint import Fitted
+
+LEAST_ROWS = 40
+"""Intervals, a second at 40 pulses/s: of fewer nothing is said."""
+
+
+@dataclass(frozen=True)
+class Unseen:
+    """The error of one model on the intervals held out.
+
+    Parameters
+    ----------
+    rms_nm : float
+        Error of the intervals' means, N·m.
+    allowed_nm : float
+        What noise as in the fitted rows and the uncertainty of the model's parameters give there, N·m.
+    """
+
+    rms_nm: float
+    allowed_nm: float
+
+    @property
+    def excess_nm(self) -> float:
+        """Error beyond what is allowed, N·m."""
+        return float(np.sqrt(max(self.rms_nm**2 - self.allowed_nm**2, 0.0)))
+
+    @property
+    def ratio(self) -> float:
+        """Error over what is allowed."""
+        return self.rms_nm / self.allowed_nm
+
+
+def unseen(fitted: Fitted) -> Unseen | None:
+    """The model on the intervals held out; None where there are none, or where it holds what nobody can foresee."""
+    setup = fitted.problem.setup
+    grid = setup.grid
+    rows = grid.held_out & ~grid.doubted & (2 * grid.count >= np.median(grid.count[setup.fitted]))
+    if rows.sum() < LEAST_ROWS or not foreseeable(fitted):
+        return None
+    residual = fitted.residual_nm[rows]
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(fitted.hessian), 1e-300))
+    scaled = fitted.hessian * scale[:, None] * scale[None, :] + 1e-12 * np.eye(scale.size)
+    slopes = fitted.slopes[:, rows] * scale[:, None]
+    band = np.sum(slopes * np.linalg.solve(scaled, slopes), axis=0)
+    allowed = np.sqrt(fitted.noise.sd_nm**2 + float(np.mean(band)))
+    return Unseen(float(np.sqrt(np.mean(residual**2))), float(allowed))
+
+
+def foreseeable(fitted: Fitted) -> bool:
+    """Whether everything in the model can be foreseen on other rows: efforts and a tremor cannot."""
+    return fitted.noise.band <= 0.0 and all(get(effect).foreseeable for effect, _ in fitted.effects)
