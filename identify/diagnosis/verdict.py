@@ -103,15 +103,16 @@ def _no_effort(work: Analysis, explained: float, structure: float) -> bool:
     """Whether what looks like efforts is more likely something the stimulation does."""
     if explained < LEAST_BY_EFFORTS and structure > STRUCTURE:
         return True
-    if seen_at_rest(work.quiet, work.chain[1], work.added[0]) >= SEEN_AT_REST:
+    effort = work.added[0]
+    # Where a rival took its place since, it was still there in an earlier model, or in the last.
+    holder = next(fitted for fitted in work.chain[1:] if effort in dict(fitted.effects))
+    if seen_at_rest(work.quiet, holder, effort) >= SEEN_AT_REST:
         return False
-    form = next(form.name for name, form in work.chain[1].effects if name == work.added[0])
-    return "resisting" in form or _efforts(work) >= MANY
+    return "resisting" in dict(holder.effects)[effort].name or _efforts(holder.parameters_of(effort)) >= MANY
 
 
-def _efforts(work: Analysis) -> int:
+def _efforts(parameters: dict[str, float]) -> int:
     """How many efforts the bumps make: those close to one another are one."""
-    parameters = work.chain[1].parameters_of(work.added[0])
     centres = np.sort([value for name, value in parameters.items() if name.startswith("centre_")])
     return int(np.sum(np.diff(centres) > APART_S)) + 1 if centres.size else 0
 
