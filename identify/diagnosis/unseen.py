@@ -6,11 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from identify.diagnosis.thresholds import LEAST_ROWS
 from identify.effects import get
 from identify.estimation.joint import Fitted
-
-LEAST_ROWS = 40
-"""Intervals, a second at 40 pulses/s: of fewer nothing is said."""
 
 
 @dataclass(frozen=True)
