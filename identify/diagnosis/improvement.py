@@ -135,5 +135,5 @@ def _models(row: list[Step]) -> list[Model]:
     for number, step in enumerate(row):
         parent = models[-1].model_id if models else None
         model = finish("maximum-likelihood", step.fitted, figures=step.figures)
-        models.append(model.with_(extra={"parent": parent, "added": step.added, "step": number}))
+        models.append(model.with_(extra=model.extra | {"parent": parent, "added": step.added, "step": number}))
     return models

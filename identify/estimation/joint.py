@@ -97,7 +97,7 @@ class Fitted:
 
 
 def _whiten(problem: Problem, rows: np.ndarray, noise: NoiseLevel) -> np.ndarray:
-    return whitened(rows, problem.setup.stretches, noise)
+    return whitened(rows / problem.setup.spread, problem.setup.stretches, noise)
 
 
 def _residual(problem: Problem, mean: np.ndarray) -> np.ndarray:
@@ -188,7 +188,7 @@ def _at(problem: Problem, theta: np.ndarray, noise: NoiseLevel, wide: bool = Fal
     if slopes is None or not np.all(np.isfinite(mean)):
         return None
     residual = _residual(problem, mean)
-    level, log_likelihood = profile(residual, problem.setup.stretches, noise, wide)
+    level, log_likelihood = profile(residual / problem.setup.spread, problem.setup.stretches, noise, wide)
     return _Point(theta, residual, slopes, level, log_likelihood, log_likelihood - _penalty(problem, theta))
 
 
