@@ -148,7 +148,10 @@ def solve(
         iterations += 1
         products = gram(_whiten(problem, np.vstack([at.residual, at.slopes]), at.noise))
         gradient = products[0, 1:] - precision @ (at.theta - prior_mean)
-        found, damping = _advance(problem, at, products[1:, 1:] + precision, gradient, damping, frozen)
+        hessian = products[1:, 1:] + precision
+        if iterations > 1 and _expected(hessian, gradient, at.theta, problem, frozen) < 0.5 * tolerance:
+            break
+        found, damping = _advance(problem, at, hessian, gradient, damping, frozen)
         if found is None:
             break
         gain, at = found.value - at.value, found
@@ -203,6 +206,13 @@ def _advance(
             return trial, max(damping / 6.0, 1e-7)
         damping = max(damping * 8.0, 1e-3)
     return None, damping
+
+
+def _expected(
+    hessian: np.ndarray, gradient: np.ndarray, theta: np.ndarray, problem: Problem, frozen: np.ndarray
+) -> float:
+    """What a whole step would gain in log posterior, were it the parabola that it looks like."""
+    return 0.5 * float(gradient @ _step(hessian, gradient, 1e-7, theta, problem, frozen))
 
 
 def _step(
