@@ -241,6 +241,9 @@ class Effect:
         weighed.
     experiment : tuple of str
         Kinds of sequence that show it best.
+    seen : callable or None
+        `seen(raw)`: the form and its parameters where the raw samples show the effect beyond doubt, else None; `raw` is
+        what `identify.estimation.prepare.inspect` saw. It is then taken as there, before any fit.
     prior : float
         Odds against it beforehand, as a natural logarithm, on top of the common ones.
     """
@@ -258,6 +261,7 @@ class Effect:
     raw: bool = False
     band: bool = False
     experiment: Sequence[str] = ()
+    seen: Callable[[Any], tuple[str, dict[str, float]] | None] | None = None
     prior: float = 0.0
 
     @property

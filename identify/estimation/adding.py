@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from identify.effects import get, registry
-from identify.effects.base import Effect, Form, Scene
+from identify.effects.base import STAGES, Effect, Form, Scene
 from identify.errors import BadRequest, NotIdentifiable
 from identify.estimation.joint import Fitted, solve, start_from
 from identify.estimation.prepare import Raw, plain, prepare
@@ -161,15 +161,11 @@ def add(base: Fitted, effect: Effect, form: str, raw: Raw) -> Fitted:
 
 def given_by_samples(raw: Raw) -> list[tuple[str, Form, dict[str, float]]]:
     """Effects that the samples show before any fit: a line of the mains, a ceiling; with their parameters."""
-    effects, found = registry(), []
-    if raw.hum is not None and "mains_hum" in effects:
-        found.append(("mains_hum", effects["mains_hum"].forms[0], raw.hum))
-    if "sensor_clipping" in effects:
-        levels = {"ceiling": raw.ceiling_nm, "floor": raw.floor_nm}
-        seen = {name: value for name, value in levels.items() if value is not None}
-        if seen:
-            form = effects["sensor_clipping"].form("both" if len(seen) == 2 else next(iter(seen)))
-            found.append(("sensor_clipping", form, {f"{name}_nm": value for name, value in seen.items()}))
+    found = []
+    for effect in sorted(registry().values(), key=lambda effect: STAGES.index(effect.stage)):
+        seen = effect.seen(raw) if effect.seen is not None else None
+        if seen is not None:
+            found.append((effect.id, effect.form(seen[0]), seen[1]))
     return found
 
 
