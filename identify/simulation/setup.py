@@ -82,7 +82,9 @@ class Setup:
         mean = np.bincount(grid.interval, grid.fraction, minlength=grid.size) / np.maximum(grid.count, 1)
         mean = np.where(grid.count > 0, mean, 0.5)
         scene = self._scene((np.arange(grid.size) + mean) * grid.step_s, grid.pulse_width_us)
-        return replace(scene, fitted=self.fitted)
+        pauses = np.zeros(grid.size)
+        pauses[grid.begins] = [part.pause_s - part.folded_s for part in grid.record.parts]
+        return replace(scene, fitted=self.fitted, pauses_s=pauses)
 
     @cached_property
     def scene_at_ends(self) -> Scene:
