@@ -40,6 +40,8 @@ LEAST_BY_BAND = 0.94
 """Share of the power that a tremor must take, where work and rest differ beside it."""
 MANY = 4
 """Efforts, none of them at rest, that are more likely something the stimulation does."""
+EVERYWHERE = 0.33
+"""Share of the test that efforts last from which they are something that is always there."""
 APART_S = 1.2
 """Between the middles of two bumps that are two efforts."""
 UNSTEADY = 60.0

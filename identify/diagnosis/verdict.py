@@ -11,6 +11,7 @@ from identify.diagnosis.structure import held_readings
 from identify.diagnosis.thresholds import (
     APART_S,
     DOUBTED,
+    EVERYWHERE,
     EXPLAINED_BY_LAWS,
     FIRST_MARGIN,
     HELD,
@@ -101,6 +102,15 @@ def _no_effort(work: Analysis, explained: float, structure: float) -> bool:
     return "resisting" in dict(holder.effects)[effort].name or _efforts(holder.parameters_of(effort)) >= MANY
 
 
+def _everywhere(work: Analysis) -> bool:
+    """Whether what looks like efforts lasts for much of the test: efforts are seldom."""
+    effort = work.added[0]
+    holder = next(fitted for fitted in work.chain[1:] if effort in dict(fitted.effects))
+    widths = [value for name, value in holder.parameters_of(effort).items() if name.startswith(("width_", "decay_"))]
+    setup = holder.problem.setup
+    return 2.0 * sum(widths) > EVERYWHERE * float(setup.fitted.sum()) * setup.grid.step_s
+
+
 def _efforts(parameters: dict[str, float]) -> int:
     """How many efforts the bumps make: those close to one another are one."""
     centres = np.sort([value for name, value in parameters.items() if name.startswith("centre_")])
@@ -140,7 +150,8 @@ def judge(work: Analysis) -> Verdict:
         rivals[effect] = shares(
             [c for c in work.rounds[number] if c.effect.id == effect or c.effect.id not in work.added]
         )
-        found[effect] = rivals[effect].get(effect, 0.5)
+        # What was added later stands on what was added before.
+        found[effect] = min([rivals[effect].get(effect, 0.5), *(found[e] for e in work.added[:number] if e in found)])
         if _unhelpful(work, number):
             found[effect] = min(found[effect], DOUBTED)
             notes.append(f"{get(effect).name}: the error on rows not seen rises with it.")
@@ -159,7 +170,7 @@ def judge(work: Analysis) -> Verdict:
         if get(work.added[0]).band:
             strange = strange or (explained < LEAST_BY_BAND and structure > UNSTEADY)
         elif not get(work.added[0]).foreseeable:
-            strange = strange or _no_effort(work, explained, structure)
+            strange = strange or _everywhere(work) or _no_effort(work, explained, structure)
     else:
         strange = strange or structure > STRUCTURE
     before, after = unseen(first), unseen(last)
