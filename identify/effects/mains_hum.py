@@ -45,5 +45,4 @@ EFFECT = Effect(
     plain="The mains couples into the load cell. It isn't the muscle: check shielding and earth.",
     source="Interference",
     raw=True,
-    experiment=("rest",),
 )

@@ -45,5 +45,4 @@ EFFECT = Effect(
     plain="The measurement hits its ceiling: the muscle gives more than the cell shows. Lower the gain or the charge.",
     source="Range of the analogue-to-digital converter",
     raw=True,
-    experiment=("staircase",),
 )
