@@ -113,10 +113,9 @@ class Grid:
         sample_s = min(1.02 / self.record.sample_rate_hz, 1.02 * self.step_s)
         return -sample_s, sample_s
 
-    @cached_property
-    def stretches(self) -> list[slice]:
-        """Contiguous runs of fitted intervals of one part: noise is correlated inside one, not across."""
-        return [run for index in range(len(self.record.parts)) for run in runs(self.fitted & (self.part == index))]
+    def stretches(self, rows: np.ndarray) -> list[slice]:
+        """Contiguous runs of some of the intervals, of one part each: noise is correlated inside one, not across."""
+        return [run for index in range(len(self.record.parts)) for run in runs(rows & (self.part == index))]
 
     def held(self, drive_nm: np.ndarray, axis: int = 0) -> np.ndarray:
         """The drive of each interval as it was felt: the input itself where nothing was late.

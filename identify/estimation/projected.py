@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUNDS_S, SecondOrder
-from identify.dynamics.pulse_grid import Grid, runs
+from identify.dynamics.pulse_grid import Grid
 from identify.dynamics.second_order import boundary_states, free_states
 from identify.errors import NotIdentifiable
 from identify.noise.ar1 import noise_evidence, whiten
@@ -70,7 +70,7 @@ class Projection:
     stretches: list[slice] = field(init=False)
 
     def __post_init__(self) -> None:
-        self.stretches = runs(self.rows)
+        self.stretches = self.grid.stretches(self.rows)
         if not self.stretches:
             raise NotIdentifiable("no row may be fitted", mend="Give rows outside `validate`.")
 
