@@ -13,6 +13,7 @@ from identify.criticism.where import worst_places
 from identify.dynamics.pulse_grid import make_grid
 from identify.estimation.figures import UNDEFINED, best_fit_percent, ceiling_percent, rms
 from identify.estimation.prepare import inspect
+from identify.estimation.quality import check
 from identify.model import Model
 from identify.records.record import Record
 from identify.results import Comparison, Figures
@@ -56,6 +57,7 @@ def compare(model: Model, record: Record) -> Comparison:
     whole = _figures(record, predicted, noise, counted)
     held_out = _figures(record, predicted, noise, held) if held.any() else None
     said = left_out(grid)
+    outside = [f"{warning[0].upper()}{warning[1:]}." for warning in check(model, record)]
     return Comparison(
         **whole,
         noise_sd_nm=noise,
@@ -72,7 +74,7 @@ def compare(model: Model, record: Record) -> Comparison:
         where=tuple(places),
         left_out=said,
         series=_series(model, record, predicted, noise),
-        plain=(*_plain(whole, held_out, noise, tests, places), *([said] if said else [])),
+        plain=(*_plain(whole, held_out, noise, tests, places), *([said] if said else []), *outside),
     )
 
 

@@ -22,10 +22,8 @@ class Left:
     ----------
     white_nm : float
         Standard deviation of an interval's mean from the samples' white noise alone, N·m.
-    quiet_nm, busy_nm : float
-        Residual while the muscle rests and while it works, N·m.
-    quiet_seconds : float
-        Length of the rests, s.
+    busy_nm : float
+        Residual while the muscle works, N·m.
     ratio : float
         Log-likelihood gained by giving rests and work a noise of their own: large where structure goes with work.
     ideal : float
@@ -37,9 +35,7 @@ class Left:
     """
 
     white_nm: float
-    quiet_nm: float
     busy_nm: float
-    quiet_seconds: float
     ratio: float
     ideal: float
     slow_nm: float
@@ -69,9 +65,7 @@ def left_over(fitted: Fitted, quiet: np.ndarray, noise_sd_nm: float) -> Left:
     lag = _lag_one(residual, setup.fitted)
     return Left(
         white_nm=white,
-        quiet_nm=_rms(residual, rests),
         busy_nm=_rms(residual, works),
-        quiet_seconds=sum(r.stop - r.start for r in rests) * setup.grid.step_s,
         ratio=ratio,
         ideal=_ideal(setup.fitted, resting, white, sum(r.stop - r.start for r in rests)),
         slow_nm=fitted.noise.sd_nm * float(np.sqrt(min(fitted.noise.share, 1.0))),

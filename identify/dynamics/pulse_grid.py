@@ -16,6 +16,7 @@ import numpy as np
 from identify.dynamics.mean_weights import mean_weights
 from identify.dynamics.second_order import hermite
 from identify.errors import BadRecord
+from identify.records.pulse_phase import pulse_phase_s
 from identify.records.record import FORGOTTEN_S, Record
 
 STANDS = 0.2
@@ -117,10 +118,9 @@ class Grid:
         sample_s = min(1.02 / self.record.sample_rate_hz, 1.02 * self.step_s)
         return -sample_s, sample_s
 
-    @cached_property
-    def stretches(self) -> list[slice]:
-        """Contiguous runs of fitted intervals of one part: noise is correlated inside one, not across."""
-        return [run for index in range(len(self.record.parts)) for run in runs(self.fitted & (self.part == index))]
+    def stretches(self, rows: np.ndarray) -> list[slice]:
+        """Contiguous runs of some of the intervals, of one part each: noise is correlated inside one, not across."""
+        return [run for index in range(len(self.record.parts)) for run in runs(rows & (self.part == index))]
 
     def held(self, drive_nm: np.ndarray, axis: int = 0) -> np.ndarray:
         """The drive of each interval as it was felt: the input itself where nothing was late.
@@ -394,27 +394,3 @@ def refuse_nonsense(record: Record) -> None:
         raise BadRecord("time doesn't rise", place=place, mend="Sort the samples by time, once each.")
     if record.time_s[-1] - record.time_s[0] > LONGEST_S:
         raise BadRecord("longer than a day", place="time_s", mend="Give time in seconds.")
-
-
-def pulse_phase_s(record: Record) -> float:
-    """Time of the pulse slots after the first sample, modulo the pulse interval, s.
-
-    A change of width seen first in the sample at t puts a pulse into (t - 1/rate, t]. The phase that satisfies the
-    most changes is taken; of those, the latest (the pulse coincides with the sample that shows it).
-    """
-    changes = np.flatnonzero(np.diff(record.pulse_width_us)) + 1
-    step_s, sample_s = 1.0 / record.pulse_rate_hz, 1.0 / record.sample_rate_hz
-    if changes.size == 0 or sample_s > 0.999 * step_s:
-        return 0.0
-    latest = np.mod(record.time_s[changes] - record.time_s[0], step_s)
-    trial = np.linspace(0.0, step_s, 401)[:-1]
-    # How many changes each trial phase explains, with a tolerance of a hair for rounding.
-    lag = np.mod(latest[:, None] - trial[None, :] + 1e-3 * sample_s, step_s)
-    explained = (lag < sample_s * 1.002).sum(axis=0)
-    best = np.flatnonzero(explained == explained.max())
-    anchor = trial[best[best.size // 2]]
-    # From the anchor the earliest 'latest' time is the bound; take it exactly, free of the trial's spacing.
-    ahead = np.mod(latest - anchor + 1e-3 * sample_s, step_s)
-    inside = ahead[ahead < sample_s * 1.002]
-    phase = float(np.mod(anchor + np.min(inside) - 1e-3 * sample_s, step_s))
-    return 0.0 if step_s - phase < 1e-9 else phase

@@ -60,5 +60,4 @@ EFFECT = Effect(
     plain="The muscle is quicker, or slower, when it works hard. One linear model can be right at one level only; the "
     "controller should know the speed at each.",
     source="Hunt, Munih, Donaldson, Barr 1998: speed varied fivefold with level, small-signal gain up to threefold",
-    experiment=("multilevel", "staircase"),
 )

@@ -103,5 +103,4 @@ EFFECT = Effect(
     plain="The muscle relaxes at another speed than it contracts. After a stroke both are changed, each by itself. A "
     "controller with one speed reacts too late in one direction.",
     source="McCrea, Eng, Hodgson 2003 (development and decay impaired independently); Thelen 2003",
-    experiment=("steps", "prbs"),
 )

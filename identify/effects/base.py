@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -190,10 +190,6 @@ class Form:
     settled: bool = False
     source: str = ""
 
-    def neutral(self) -> dict[str, float]:
-        """Parameters at which nothing changes."""
-        return {p.name: p.neutral for p in self.parameters}
-
     def starts(self, scene: Scene) -> list[dict[str, float]]:
         """Starting values, one dict a run."""
         on = [p.on(scene) for p in self.parameters]
@@ -247,7 +243,6 @@ class Effect:
     band : bool
         Whether it is a narrow band of noise: sought in the residual's spectrum, and part of the noise while others are
         weighed.
-    experiment : tuple of str
         Kinds of sequence that show it best.
     seen : callable or None
         `seen(raw)`: the form and its parameters where the raw samples show the effect beyond doubt, else None; `raw` is
@@ -268,7 +263,6 @@ class Effect:
     foreseeable: bool = True
     raw: bool = False
     band: bool = False
-    experiment: Sequence[str] = ()
     seen: Callable[[Any], tuple[str, dict[str, float]] | None] | None = None
     prior: float = 0.0
 

@@ -107,5 +107,4 @@ EFFECT = Effect(
     separated_by="Rests at zero pulse width before and after each part.",
     plain="The zero of the measurement moves. It isn't the muscle: let the cell warm up, support the limb, zero again.",
     source="Load-cell warm-up and limb settling",
-    experiment=("rest",),
 )

@@ -176,5 +176,4 @@ EFFECT = Effect(
     plain="The first pulses after a silence pull harder than those that follow. Trains that begin with a close pair of "
     "pulses use this; a controller that doesn't know it overshoots at every start.",
     source="Bickel, Slade, Dudley 2004; Binder-Macleod, Kesar 2005",
-    experiment=("steps", "rest"),
 )

@@ -79,5 +79,4 @@ EFFECT = Effect(
     plain="Some hundredths of a second pass between the pulse and the first torque. Longer delays force a gentler "
     "controller.",
     source="Sinclair et al.: quadriceps onset 31 ± 3 ms at 90°, 67 ± 24 ms at 15°; offset 58 ± 5 ms",
-    experiment=("steps", "prbs"),
 )

@@ -71,5 +71,4 @@ EFFECT = Effect(
     plain="The muscle tires: the same pulse gives less torque the longer it has worked, and recovers when it rests. "
     "After a stroke muscles tire sooner. Late in a session it needs more charge, or longer rests.",
     source="Riener et al. 1996; Ding et al. 2003",
-    experiment=("ramp", "rest", "steps"),
 )

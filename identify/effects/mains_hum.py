@@ -46,5 +46,4 @@ EFFECT = Effect(
     source="Interference",
     raw=True,
     seen=lambda raw: None if raw.hum is None else ("line", raw.hum),
-    experiment=("rest",),
 )

@@ -43,5 +43,4 @@ EFFECT = Effect(
     plain="The muscle is a mixture of quick and slow fibres: a step comes fast at first, and creeps on for a while.",
     source="Parallel fast and slow branches; cf. Ding et al. 2003 for the two fibre types' time constants",
     prior=-1.5,
-    experiment=("steps",),
 )

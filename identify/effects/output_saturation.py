@@ -65,5 +65,4 @@ EFFECT = Effect(
     plain="Above some torque the limb or the fixture gives way, or the tendon takes no more: the muscle pulls harder, "
     "the cell doesn't see it.",
     source="Soft knee of tendon and compliance after the dynamics (Wiener structure)",
-    experiment=("staircase", "steps"),
 )

@@ -97,5 +97,4 @@ EFFECT = Effect(
     plain="The joint itself resists being moved, stimulation or not: stiffness and, after a stroke, spasticity.",
     source="De Groote et al. 2016; Riener et al. 1996",
     needs=("angle_rad",),
-    experiment=("rest",),
 )

@@ -41,5 +41,4 @@ EFFECT = Effect(
     plain="The muscle warms up: after some seconds of work the same pulse gives more torque, and over a minute of rest "
     "that gain fades. A short conditioning train before training makes the muscle repeatable.",
     source="O'Leary, Hope, Sale 1997: twitch +45 % at 5 s and +28 % at 1 min after 7 s at 100 Hz",
-    experiment=("steps", "ramp", "rest"),
 )

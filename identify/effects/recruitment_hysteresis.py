@@ -146,5 +146,4 @@ EFFECT = Effect(
     "know where it comes from, or it will be off by the distance of two curves.",
     source="Two curves, one a direction, come out of a ramp's deconvolution: Durfee, MacLean 1989",
     prior=-2.5,
-    experiment=("ramp",),
 )

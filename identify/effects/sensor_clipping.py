@@ -54,5 +54,4 @@ EFFECT = Effect(
     source="Range of the analogue-to-digital converter",
     raw=True,
     seen=_seen,
-    experiment=("staircase",),
 )

@@ -132,5 +132,4 @@ EFFECT = Effect(
     separated_by="Steps, sampled fast.",
     plain="Strap, tendon or fixture give like a spring: torque rings after every step. Fasten limb and cell.",
     source="An extra resonance in series with the muscle",
-    experiment=("steps",),
 )

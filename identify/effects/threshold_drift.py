@@ -94,5 +94,4 @@ EFFECT = Effect(
     "an electrode shifts. Strong pulses look unchanged, weak ones are lost. Check the electrodes.",
     source="Electrode and skin impedance; no single source, see docs/diagnosis.md",
     prior=-2.5,
-    experiment=("ramp", "rest"),
 )

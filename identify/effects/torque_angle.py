@@ -116,5 +116,4 @@ EFFECT = Effect(
     "for it; a test at one angle can't show it.",
     source="Marion et al. 2010; Thelen 2003",
     needs=("angle_rad",),
-    experiment=("ramp",),
 )

@@ -90,5 +90,4 @@ EFFECT = Effect(
     "difference.",
     source="Hill 1938; Marion et al. 2010; De Groote et al. 2016",
     needs=("velocity_rad_s",),
-    experiment=("ramp",),
 )

@@ -56,5 +56,4 @@ EFFECT = Effect(
     source="Narrow band near 5 Hz (pathological), 8 to 12 Hz (physiological)",
     foreseeable=False,
     band=True,
-    experiment=("rest",),
 )

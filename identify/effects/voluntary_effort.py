@@ -174,5 +174,4 @@ EFFECT = Effect(
     source="Additive torque unrelated to the stimulation",
     foreseeable=False,
     prior=-5.0,
-    experiment=("rest",),
 )

@@ -40,8 +40,6 @@ class Fitted:
         Derivatives of the interval means by the parameters.
     hessian : ndarray, shape (P, P)
         Of minus the log posterior.
-    iterations : int
-        Steps taken.
     settled : bool
         Whether the search ended because nothing more was to be gained.
     """
@@ -54,7 +52,6 @@ class Fitted:
     residual_nm: np.ndarray
     slopes: np.ndarray
     hessian: np.ndarray
-    iterations: int
     settled: bool = True
 
     @property
@@ -169,7 +166,6 @@ def solve(
         residual_nm=at.residual,
         slopes=at.slopes,
         hessian=hessian,
-        iterations=iterations,
         settled=most == 0 or iterations < most,
     )
 

@@ -38,8 +38,6 @@ class Raw:
         White noise of a sample, N·m.
     hum : dict or None
         Parameters of `mains_hum`; None where there is no line.
-    hum_ratio : float
-        Power of the line over its neighbours.
     ceiling_nm, floor_nm : float or None
         Clipping level, N·m.
     """
@@ -47,7 +45,6 @@ class Raw:
     torque_nm: np.ndarray
     noise_sd_nm: float
     hum: dict[str, float] | None
-    hum_ratio: float
     ceiling_nm: float | None
     floor_nm: float | None
 
@@ -61,12 +58,12 @@ def inspect(record: Record, start_s: float | None = None) -> Raw:
     kept = ~record.held_out if record.doubted is None else ~record.held_out & ~record.doubted
     torque = record.torque_nm
     ceiling, floor = _flat(torque[kept]), _flat(-torque[kept])
-    hum, ratio = _find_hum(record, own_s, kept)
+    hum = _find_hum(record, own_s, kept)
     if hum is not None:
         torque = torque - hum_at(hum, own_s)
         torque = torque - _wander(record, torque, hum["frequency_hz"], kept)
     noise = white_noise(record, torque[kept])
-    return Raw(torque, noise, hum, ratio, ceiling, None if floor is None else -floor)
+    return Raw(torque, noise, hum, ceiling, None if floor is None else -floor)
 
 
 def _flat(torque: np.ndarray) -> float | None:
@@ -106,11 +103,11 @@ def hum_at(hum: dict[str, float], time_s: np.ndarray) -> np.ndarray:
     return total
 
 
-def _find_hum(record: Record, own_s: np.ndarray, kept: np.ndarray) -> tuple[dict[str, float] | None, float]:
+def _find_hum(record: Record, own_s: np.ndarray, kept: np.ndarray) -> dict[str, float] | None:
     """A line at 50 or 60 Hz that stands out of its neighbours, with its harmonics."""
     rate_hz = record.sample_rate_hz
     if rate_hz < 99.0 or kept.sum() < 4 * rate_hz:
-        return None, 0.0
+        return None
     longest = max(runs(kept), key=lambda run: run.stop - run.start)
     # Differences whiten the muscle's own spectrum, so that neighbours are comparable.
     signal = np.diff(record.torque_nm[longest], 2)
@@ -127,8 +124,8 @@ def _find_hum(record: Record, own_s: np.ndarray, kept: np.ndarray) -> tuple[dict
         best = max(best, (ratio, mains))
     ratio, mains = best
     if ratio < LEAST_LINE or mains > 0.5 * rate_hz + 1e-6:
-        return None, ratio
-    return _fit_hum(record, own_s, mains, kept), ratio
+        return None
+    return _fit_hum(record, own_s, mains, kept)
 
 
 def _line(power: np.ndarray, frequency: np.ndarray, centre_hz: float, reach_hz: float) -> float:

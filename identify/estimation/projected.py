@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUNDS_S, SecondOrder
-from identify.dynamics.pulse_grid import Grid, runs
+from identify.dynamics.pulse_grid import Grid
 from identify.dynamics.second_order import boundary_states, free_states
 from identify.errors import NotIdentifiable
 from identify.noise.ar1 import noise_evidence, whiten
@@ -68,7 +68,7 @@ class Projection:
     stretches: list[slice] = field(init=False)
 
     def __post_init__(self) -> None:
-        self.stretches = runs(self.rows)
+        self.stretches = self.grid.stretches(self.rows)
         if not self.stretches:
             raise NotIdentifiable("no row may be fitted", mend="Give rows outside `validate`.")
 
@@ -158,16 +158,10 @@ class Solution:
         Correlation of the noise that rows were whitened with.
     columns, slopes : ndarray, shape (K, P + extras), (K, 2 or 3)
         The model's derivatives there.
-    gram : ndarray
-        A'A of the whitened [columns, slopes], penalty added: the information, times the noise variance.
     freedom : float
         Effective number of coefficients in all.
     variance : float
         Innovation variance on the grid, N²m².
-    iterations : int
-        Steps taken.
-    converged : bool
-        Whether the last step was far below its standard error.
     """
 
     problem: Projection
@@ -177,11 +171,8 @@ class Solution:
     ar1: float
     columns: np.ndarray
     slopes: np.ndarray
-    gram: np.ndarray
     freedom: float
     variance: float
-    iterations: int
-    converged: bool
 
     @cached_property
     def fitted_nm(self) -> np.ndarray:
@@ -227,7 +218,7 @@ def search(
 
 def _descend(state: _State, weight: float | None, most: int, tolerance: float) -> Solution:
     problem, linear, target, ar1 = state.problem, state.linear, state.target, state.ar1
-    damping, taken, converged = 0.0, 0, False
+    damping, taken = 0.0, 0
     while taken < most:
         taken += 1
         step = state.step(damping)
@@ -236,7 +227,6 @@ def _descend(state: _State, weight: float | None, most: int, tolerance: float) -
         # Steps in units of standard errors, from the information itself.
         size = float(np.sqrt(max(moved @ state.information @ moved, 0.0) * target.size / state.squares))
         if size < tolerance or np.max(np.abs(moved)) < 1e-9:
-            converged = True
             break
         keep = None if (weight is None and taken <= REWEIGHTED) else state.weight
         attempt = _assess(problem, trial, target, ar1, keep)
@@ -247,12 +237,12 @@ def _descend(state: _State, weight: float | None, most: int, tolerance: float) -
             damping = max(10 * damping, 1e-2)
             if damping > 1e8:
                 break
-    return state.solution(taken, converged)
+    return state.solution()
 
 
 def project(problem: Projection, linear: SecondOrder, *, ar1: float = 0.0, weight: float | None = None) -> Solution:
     """Coefficients for given dynamics: the linear half of the problem alone."""
-    return _assess(problem, linear, whiten(problem.target, problem.stretches, ar1), ar1, weight).solution(0, True)
+    return _assess(problem, linear, whiten(problem.target, problem.stretches, ar1), ar1, weight).solution()
 
 
 class _State:
@@ -290,12 +280,6 @@ class _State:
     @cached_property
     def _inner(self) -> np.ndarray:
         return _solve(self.zz + self.penalty, self._bent[0])
-
-    @cached_property
-    def full(self) -> np.ndarray:
-        """The joint information of coefficients and searched numbers, times the noise variance."""
-        cross, square, _ = self._bent
-        return np.block([[self.zz + self.penalty, cross], [cross.T, square]])
 
     @cached_property
     def information(self) -> np.ndarray:
@@ -351,7 +335,7 @@ class _State:
             step[free] = _solve(information + damping * np.diag(np.diag(information)), gradient[free])
         return step
 
-    def solution(self, taken: int, converged: bool) -> Solution:
+    def solution(self) -> Solution:
         return Solution(
             problem=self.problem,
             linear=self.linear,
@@ -360,11 +344,8 @@ class _State:
             ar1=self.ar1,
             columns=self.columns,
             slopes=self.slopes,
-            gram=self.full,
             freedom=self.freedom,
             variance=self.variance,
-            iterations=taken,
-            converged=converged,
         )
 
 

@@ -12,9 +12,9 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from identify.dynamics.pulse_grid import pulse_phase_s
 from identify.errors import BadRecord
 from identify.records import bounds
+from identify.records.pulse_phase import pulse_phase_s
 from identify.records.record import OPTIONAL, Part, Pulses, Record, Source, joined_source
 
 PAUSE_S = 30.0

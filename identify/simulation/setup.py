@@ -60,9 +60,9 @@ class Setup:
 
     @cached_property
     def stretches(self) -> tuple[np.ndarray, np.ndarray]:
-        """Starts and ends of the runs of fitted intervals."""
-        edges = np.flatnonzero(np.diff(np.r_[0, self.fitted.astype(np.int8), 0]))
-        return edges[::2].astype(np.int64), edges[1::2].astype(np.int64)
+        """Starts and ends of the runs of fitted intervals, of one part each."""
+        runs = self.grid.stretches(self.fitted)
+        return np.array([r.start for r in runs], np.int64), np.array([r.stop for r in runs], np.int64)
 
     @cached_property
     def begins(self) -> np.ndarray:

@@ -10,7 +10,8 @@ import pytest
 
 import identify
 from identify import Record
-from identify.dynamics.pulse_grid import make_grid
+from identify.dynamics.pulse_grid import Grid, make_grid, runs
+from identify.estimation.prepare import plain, prepare
 from identify.records import parts_csv
 from identify.records.join import PAUSE_S, join
 from identify.records.record import Part, Pulses, Source
@@ -133,14 +134,33 @@ def test_each_pause_is_kept_and_a_long_one_folded(pause_s, kept_s):
     assert (grid.count == 0).sum() == round(part.folded_s * 40)
     assert not grid.part[grid.count == 0].any()
     assert not grid.pulse_width_us[grid.count == 0].any()
-    assert not any(set(grid.part[run]) == {0, 1} for run in grid.stretches)
+    assert not any(set(grid.part[run]) == {0, 1} for run in grid.stretches(grid.fitted))
 
 
 def test_parts_whose_clocks_overlap_have_no_pause():
     joined = join([record(400), record(400, name="b", seed=2)], [0.0, 3.0])
     assert joined.parts[1].pause_s == joined.parts[1].folded_s == 0.0
     assert (np.diff(joined.time_s) > 0).all()
-    assert not any(set(make_grid(joined).part[run]) == {0, 1} for run in make_grid(joined).stretches)
+    assert not any(
+        set(make_grid(joined).part[run]) == {0, 1} for run in make_grid(joined).stretches(make_grid(joined).fitted)
+    )
+
+
+def test_noise_is_not_carried_from_one_part_into_the_next():
+    """Parts that lie back to back, with nothing held out between them, are still two stretches of noise."""
+    whole = record(400)
+    one = whole.take(~whole.held_out)
+    joined = join([one, replace(one, torque_nm=one.torque_nm[::-1] * 0.5)], [0.0, 3.0])
+    grid = make_grid(joined)
+    assert [set(grid.part[run]) for run in runs(grid.fitted)] == [{0, 1}]
+    setup = plain(*_rows(joined)).problem.setup
+    start, stop = setup.stretches
+    assert [set(grid.part[a:b]) for a, b in zip(start, stop, strict=True)] == [{0}, {1}]
+
+
+def _rows(joined: Record) -> tuple[Grid, np.ndarray]:
+    grid = prepare(joined)[0]
+    return grid, grid.fitted
 
 
 def test_part_may_begin_and_end_working():

@@ -139,6 +139,7 @@ def test_warns_and_refuses_outside_what_it_holds_for(case):
     assert check(model, record) == []
     wider = replace(record, pulse_width_us=record.pulse_width_us * 1.5)
     assert any("above the largest fitted" in warning for warning in check(model, wider))
+    assert "above the largest fitted" in identify.compare(model, wider).plain[-1]
     with pytest.raises(identify.BadModel, match="pulses a second"):
         identify.predict(model, replace(record, pulse_rate_hz=20.0))
     slightly = replace(record, pulse_rate_hz=44.0)

@@ -1,0 +1,256 @@
+"""What must not change the answer: the counting of torque, the clock, the sampling, and rows that were not needed.
+
+The fit is of the plain structure, so with something hidden its figures may move a little with the rows it sees: how
+much is stated for each relation. Relations that do not hold are here too, as strict failures with their figures.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from identify import Record, fit
+from identify.diagnosis import diagnose
+from identify.model import Model
+from identify.records.record import Pulses
+from tests.identify import hidden_muscles
+
+HIDDEN = (
+    "",
+    "fatigue",
+    "asymmetric_relaxation",
+    "electromechanical_delay",
+    "output_saturation",
+    "threshold_drift",
+)
+SEED, RATE_HZ = 11, 100
+WIDTHS_US = np.linspace(0.0, hidden_muscles.TOP_US, 31)
+
+
+def torque(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Record], Record]:
+    return lambda record: record.with_torque(change(record.torque_nm))
+
+
+def kept(choose: Callable[[Record], np.ndarray]) -> Callable[[Record], Record]:
+    return lambda record: record.take(choose(record))
+
+
+def later(record: Record) -> Record:
+    return replace(record, time_s=record.time_s + 1e4)
+
+
+def counted(record: Record) -> Record:
+    return record.with_torque(np.round(record.torque_nm / 0.005) * 0.005)
+
+
+def told(record: Record) -> Record:
+    """The same with its pulses known, as those of a sealed recording are: a gap then hides nothing that was applied."""
+    slot_s = np.arange(round((record.time_s[-1] - record.time_s[0]) * 40)) / 40 + record.time_s[0]
+    width = record.pulse_width_us[np.searchsorted(record.time_s, slot_s - 1e-9)]
+    return replace(record, pulses=Pulses(slot_s, width, np.zeros(slot_s.size), np.zeros(slot_s.size, bool)))
+
+
+def without(segment: int, *, pulses: bool) -> Callable[[Record], Record]:
+    return lambda record: (told(record) if pulses else record).take(record.segment != segment)
+
+
+FIRST_REST, PRBS, MIDDLE_REST, RAMP, LAST_REST, VALIDATE = range(6)
+
+COUNTING = {
+    "50 N·m above": (torque(lambda y: y + 50.0), 1.0),
+    "50 N·m below": (torque(lambda y: y - 50.0), 1.0),
+    "a tenth": (torque(lambda y: 0.1 * y), 0.1),
+    "ten times": (torque(lambda y: 10.0 * y), 10.0),
+    "the other way": (torque(lambda y: -y), -1.0),
+    "1e4 s later": (later, 1.0),
+}
+"""Changes of how torque and time are counted, with the factor that torque then has: nothing else moves."""
+
+SAMPLING = {
+    "in 5 mN·m": counted,
+    "begun in the PRBS": kept(lambda r: r.time_s >= 4.3),
+    "a gap of 0.5 s": kept(lambda r: ~((r.time_s > 8.0) & (r.time_s < 8.5))),
+    "every second sample": kept(lambda r: np.arange(r.time_s.size) % 2 == 0),
+    "without the first rest": without(FIRST_REST, pulses=False),
+    "without the middle rest": without(MIDDLE_REST, pulses=True),
+    "without the last rest": without(LAST_REST, pulses=True),
+    "without validate": without(VALIDATE, pulses=False),
+}
+"""Other samples of the same muscle: what is estimated moves within what the rows leave open."""
+
+
+@cache
+def record_of(hidden: str) -> Record:
+    return hidden_muscles.record(hidden, seed=SEED, rate_hz=RATE_HZ)
+
+
+@cache
+def plain_fit(hidden: str) -> Model:
+    return fit(record_of(hidden))
+
+
+@cache
+def answer(hidden: str) -> tuple[str, str, float]:
+    return said(record_of(hidden))
+
+
+def said(record: Record) -> tuple[str, str, float]:
+    """Verdict, what is named first, and its probability."""
+    result = diagnose(record)
+    first = result.missing[0] if result.missing else {"effect": "", "probability": 0.0}
+    return result.verdict, str(first["effect"]), float(first["probability"])
+
+
+def moved(model: Model, base: Model, factor: float = 1.0) -> dict[str, float]:
+    """By how much a fit moved: shares of time constant, damping and the curve's range, and the delay in s."""
+    curve = base.recruitment(WIDTHS_US)
+    return {
+        "time_constant": abs(model.linear.time_constant_s / base.linear.time_constant_s - 1.0),
+        "damping": abs(model.linear.damping / base.linear.damping - 1.0),
+        "delay_s": abs(model.linear.delay_s - base.linear.delay_s),
+        "curve": float(np.max(np.abs(model.recruitment(WIDTHS_US) / factor - curve)) / np.ptp(curve)),
+    }
+
+
+# ---- the fit ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("relation", COUNTING)
+@pytest.mark.parametrize("hidden", HIDDEN)
+def test_fit_does_not_depend_on_how_torque_and_time_are_counted(hidden, relation):
+    change, factor = COUNTING[relation]
+    found = moved(fit(change(record_of(hidden))), plain_fit(hidden), factor)
+    assert max(found.values()) < 1e-5, found
+
+
+DELAY_SHORT_OF_A_SAMPLE = pytest.mark.xfail(
+    strict=True,
+    reason="the plain structure's delay ends at a sample, so a hidden delay of 45 ms bends T by -7.7 %, ζ by +13 % "
+    "and the delay by 10 ms once a sample is 20 ms",
+)
+
+
+def _fits() -> list:
+    cases = []
+    for hidden in HIDDEN:
+        for relation in SAMPLING:
+            bent = (hidden, relation) == ("electromechanical_delay", "every second sample")
+            cases.append(pytest.param(hidden, relation, marks=[DELAY_SHORT_OF_A_SAMPLE] if bent else []))
+    return cases
+
+
+@pytest.mark.parametrize(("hidden", "relation"), _fits())
+def test_fit_hardly_depends_on_which_samples_show_the_muscle(hidden, relation):
+    found = moved(fit(SAMPLING[relation](record_of(hidden))), plain_fit(hidden))
+    allowed = {"time_constant": 0.005, "damping": 0.005, "delay_s": 5e-4, "curve": 0.003}
+    if hidden:  # the plain structure is wrong then, and which wrong one is best depends on the rows
+        allowed = {"time_constant": 0.015, "damping": 0.025, "delay_s": 1e-3, "curve": 0.03}
+    assert all(found[name] <= allowed[name] for name in found), found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("relation", ["begun in the PRBS", "a gap of 0.5 s", "every second sample"])
+@pytest.mark.parametrize("hidden", HIDDEN[1:])
+def test_fit_with_the_effect_hardly_depends_on_the_samples(hidden, relation):
+    """Its dynamics keep to 1 %; the form may be another of the same effect, and its curve then stands a little else."""
+    record = record_of(hidden)
+    base = fit(record, effects=[hidden])
+    found = moved(fit(SAMPLING[relation](record), effects=[hidden]), base)
+    assert found["time_constant"] < 0.01 and found["damping"] < 0.01 and found["curve"] < 0.03, found
+
+
+# ---- the diagnosis ------------------------------------------------------------------------------------------
+
+
+LONG = ("asymmetric_relaxation", "electromechanical_delay")
+"""Hidden effects whose diagnosis takes longest."""
+
+
+@pytest.mark.parametrize(
+    "hidden", [pytest.param(name, marks=[pytest.mark.slow] if name in LONG else []) for name in HIDDEN]
+)
+def test_diagnosis_does_not_depend_on_how_torque_and_time_are_counted(hidden):
+    """All at once: turned, ten times as large, 50 N·m lower, 1e4 s later."""
+    record = record_of(hidden)
+    other = said(later(record.with_torque(-10.0 * record.torque_nm - 50.0)))
+    assert other == (*answer(hidden)[:2], pytest.approx(answer(hidden)[2], abs=1e-3))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("hidden", HIDDEN)
+def test_diagnosis_does_not_depend_on_it_the_other_way_either(hidden):
+    """A tenth, 50 N·m higher; then counted in 5 mN·m."""
+    record = record_of(hidden)
+    small = said(record.with_torque(0.1 * record.torque_nm + 50.0))
+    assert small == (*answer(hidden)[:2], pytest.approx(answer(hidden)[2], abs=1e-3))
+    assert said(counted(record)) == (*answer(hidden)[:2], pytest.approx(answer(hidden)[2], abs=0.02))
+
+
+@pytest.mark.parametrize(
+    ("hidden", "relation"),
+    [
+        ("", "a gap of 0.5 s"),
+        ("fatigue", "every second sample"),
+        ("output_saturation", "begun in the PRBS"),
+    ],
+)
+def test_diagnosis_stays_whichever_samples_show_the_muscle(hidden, relation):
+    assert said(SAMPLING[relation](record_of(hidden)))[:2] == answer(hidden)[:2]
+
+
+FAR_ROWS = pytest.mark.xfail(
+    strict=True,
+    reason="validate, after 19 s of drift, speaks against threshold_drift: unexplained_structure at 0.45 with it, "
+    "effect_missing at 0.96 without",
+)
+
+
+def _diagnoses() -> list:
+    cases = []
+    for hidden in HIDDEN:
+        for relation in SAMPLING:
+            far = (hidden, relation) == ("threshold_drift", "without validate")
+            if relation != "in 5 mN·m":
+                cases.append(pytest.param(hidden, relation, marks=[FAR_ROWS] if far else []))
+    return cases
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("hidden", "relation"), _diagnoses())
+def test_diagnosis_stays_for_all_of_them(hidden, relation):
+    assert said(SAMPLING[relation](record_of(hidden)))[:2] == answer(hidden)[:2]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("hidden", ["", "fatigue", "threshold_drift"])
+def test_without_the_prbs_where_its_pulses_are_known(hidden):
+    assert said(without(PRBS, pulses=True)(record_of(hidden)))[:2] == answer(hidden)[:2]
+
+
+@pytest.mark.slow
+def test_without_the_ramp_where_its_pulses_are_known():
+    assert said(without(RAMP, pulses=True)(record_of("")))[:2] == answer("")[:2]
+
+
+@pytest.mark.slow
+@pytest.mark.xfail(
+    strict=True,
+    reason="between two rests a gap is taken for rest: the torque that the PRBS left is named voluntary_effort at "
+    "0.96, and the fit's T is twice as long",
+)
+def test_without_the_prbs_where_nobody_knows_its_pulses():
+    assert said(without(PRBS, pulses=False)(record_of("")))[:2] == answer("")[:2]
+
+
+@pytest.mark.slow
+@pytest.mark.xfail(
+    strict=True,
+    reason="two widths are fitted and validate has eighteen: the error there, 0.46 N·m, is 17 times what is allowed, "
+    "since what is allowed knows nothing of the curve between two widths; unexplained_structure",
+)
+def test_without_the_ramp_where_nobody_knows_its_pulses():
+    assert said(without(RAMP, pulses=False)(record_of("")))[:2] == answer("")[:2]
