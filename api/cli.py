@@ -17,7 +17,7 @@ import typer
 from typer.exceptions import TyperException
 
 from api import commands
-from api.terminal import InputError
+from api.terminal import InputError, clear_progress
 
 
 def build() -> typer.Typer:
@@ -51,6 +51,7 @@ def run(arguments: list[str] | None = None) -> int:
         sys.stdout.flush()
         return code if isinstance(code, int) else 0
     except (KeyboardInterrupt, typer.Abort):
+        clear_progress()
         print("stimrig: interrupted", file=sys.stderr)
         return 130
     except BrokenPipeError:
@@ -63,6 +64,7 @@ def run(arguments: list[str] | None = None) -> int:
 def _one_line(verb: str, error: Exception) -> int:
     """The error's line, and the exit code it stands for."""
     name = f"stimrig {verb}".strip()
+    clear_progress()
     expected = any(kind.__name__ in ("IdentifyError", "ApiError") for kind in type(error).__mro__)
     code = getattr(error, "code", 1)
     if isinstance(error, TyperException):
