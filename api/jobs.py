@@ -34,7 +34,11 @@ def fit(
     progress(0.05, "reading the recording")
     record = identify.read(Path(data))
     progress(0.2, "identifying")
-    model = identify.fit(record, method=method, effects=tuple(effects), fit_on=fit_on)
+
+    def further(share: float, text: str = "") -> None:
+        progress(0.2 + 0.8 * share, text)
+
+    model = identify.fit(record, method=method, effects=tuple(effects), fit_on=fit_on, progress=further)
     return {"json": model.to_json(), "model": model.to_dict()}
 
 
