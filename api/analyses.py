@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from api import audit, evidence, uploads
+from api.beginnings import Beginnings
 from api.clock import Clock
 from api.errors import ApiError, NotFoundError
 from api.fitting import Fitting, Job
@@ -45,6 +46,7 @@ class Analyses:
     def __init__(self, store: Store, clock: Clock, fitting: Fitting, versions: Versions, settings: Settings) -> None:
         self.store, self.clock, self.fitting, self.versions = store, clock, fitting, versions
         self.settings = settings
+        self.beginnings = Beginnings(store, fitting, settings)
         self.running: dict[tuple[str, str], Job] = {}
         self._ids: list[str] | None = None
 
@@ -218,7 +220,7 @@ class Analyses:
         """
         path = await asyncio.to_thread(self.path, model.recording_id)
         plain = await asyncio.to_thread(is_plain, model)
-        given = {} if plain else {"model_json": model.document.decode()}
+        given: dict[str, Any] = {} if plain else {"model_json": model.document.decode()}
         job = self.fitting.submit("improve", data=path, **given)
         if on_job is not None:
             on_job(job)

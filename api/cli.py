@@ -76,6 +76,11 @@ def _one_line(verb: str, error: Exception) -> int:
     if isinstance(error, InputError) or expected:
         print(f"{name}: {flat(str(error))}", file=sys.stderr)
         return 2
+    if type(error).__name__ == "ValidationError" and getattr(error, "title", "") == "Settings":
+        from api.settings import refusal  # here: most verbs need no settings of the service
+
+        print(f"{name}: {flat(refusal(error))}", file=sys.stderr)  # pyright: ignore[reportArgumentType]
+        return 2
     if type(error).__name__ in ("LaunchError", "ReportedError") and isinstance(code, int):
         print(f"{name}: {flat(str(error))}", file=sys.stderr)
         return code
