@@ -12,6 +12,7 @@ from identify.diagnosis.steps import Step, steps
 from identify.diagnosis.thresholds import CLOSE, RIVAL
 from identify.diagnosis.verdict import Verdict
 from identify.effects import get
+from identify.estimation.adding import names
 from identify.estimation.finish import describe_parameters
 from identify.estimation.tremor import predict_fitted, with_band
 from identify.experiments import plan
@@ -142,8 +143,9 @@ def _plain(
     work: Analysis, verdict: Verdict, base: dict[str, Any], final: dict[str, Any], missing: list, where: list
 ) -> list[str]:
     noise = work.raw.noise_sd_nm
+    held = " and ".join(get(name).name.lower() for name in names(work.base))
     lines = [
-        f"The model without effects fits {base['fit_percent']:.1f} % where noise of {noise:.3g} N·m allows "
+        f"The model {f'with {held}' if held else 'without effects'} fits {base['fit_percent']:.1f} % where noise of {noise:.3g} N·m allows "
         f"{base['ceiling_percent']:.1f} %; on rows not fitted it errs by {base['held_out_rms_nm']:.3g} N·m."
     ]
     if verdict.kind == "nothing_missing":

@@ -7,6 +7,7 @@ from typing import Any
 
 from identify.diagnosis.analysis import Analysis
 from identify.effects import get
+from identify.estimation.adding import names
 from identify.estimation.joint import Fitted, solve, start_from
 from identify.estimation.statistics import statistics
 from identify.simulation.problem import Problem
@@ -36,18 +37,19 @@ def steps(work: Analysis) -> list[Step]:
     last = work.last
     result = [Step(None, work.base, statistics(work.base))]
     previous = work.base
-    names = [*work.given, *work.added]
-    for number, name in enumerate(names):
-        fitted = last if number == len(names) - 1 else _part(last, previous, names[: number + 1])
+    held = names(work.base)
+    further = [*work.given, *work.added]
+    for number, name in enumerate(further):
+        fitted = last if number == len(further) - 1 else _part(last, previous, [*held, *further[: number + 1]])
         result.append(Step(name, fitted, statistics(fitted)))
         previous = fitted
     return result
 
 
-def _part(last: Fitted, previous: Fitted, names: list[str]) -> Fitted:
+def _part(last: Fitted, previous: Fitted, kept: list[str]) -> Fitted:
     """The last model with only some of its effects, from where they stand in it."""
-    effects = [(effect, form) for effect, form in last.effects if effect in names]
+    effects = [(effect, form) for effect, form in last.effects if effect in kept]
     problem = Problem(last.problem.setup, effects)
-    banded = any(get(name).band for name in names)
+    banded = any(get(name).band for name in kept)
     noise = last.noise if banded else previous.noise
     return solve(problem, start_from(problem, last, {}), noise)

@@ -61,7 +61,8 @@ class SecondOrder:
         A delay that is no whole number of samples goes into b, as a third coefficient.
         """
         step = 1.0 / sample_rate_hz
-        whole = int(np.floor(self.delay_s / step + 1e-9))
+        # A curve read up to a sample early is one that is not late: d is 0 at least.
+        whole = max(int(np.floor(self.delay_s / step + 1e-9)), -1)
         rest = max(self.delay_s - whole * step, 0.0)
         phi, gamma = transition(self.time_constant_s, self.damping, step)
         # The input changes `rest` after the sample: the older value acts first, then the newer for step - rest.

@@ -66,3 +66,13 @@ def test_a_model_with_effects_carries_bands_and_a_verdict():
         assert np.all(np.asarray(curve["lower"]) <= np.asarray(curve["upper"]))
         widths.append(float(np.mean((upper - lower)[~record.held_out])))
     assert 1.4 < widths[1] / widths[0] < 2.8
+
+
+def test_every_step_keeps_what_the_structure_held():
+    record = hidden_muscles.record("fatigue", seed=15)
+    record = record.with_torque(record.torque_nm + 0.3 * np.sin(2 * np.pi * 50.0 * record.time_s))
+    held = identify.fit(record, effects=["baseline_drift:linear"])
+    result = identify.improve(record, model=held)
+    assert [step["added"] for step in result.steps] == [None, "mains_hum", "fatigue"]
+    for model in result.models:
+        assert model.effects[0]["id"] == "baseline_drift"
