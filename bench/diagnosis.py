@@ -26,6 +26,7 @@ from identify.diagnosis import candidates as workers
 from identify.diagnosis import diagnose
 from identify.diagnosis.verdict import STRUCTURE
 from identify.effects import registry
+from identify.records.join import join
 from identify.records.record import Record
 
 SETS = ("single", "nothing", "outside", "two", "slow", "rates", "kept")
@@ -58,6 +59,25 @@ def as_record(made: dict[str, Any]) -> Record:
     )
 
 
+def as_joined(made: dict[str, Any], kind: str, seed: int) -> tuple[Record, dict[str, Any]]:
+    """Two tests of one patient, each as its own recorder gives it, as one record; and what the first recorder did."""
+    from hardware_sim.recorders import recorded
+
+    time_s = made["time_s"]
+    cut = int(np.argmax(np.diff(time_s))) + 1
+    records, begun_s, did = [], [], []
+    for number, rows in enumerate((slice(0, cut), slice(cut, None))):
+        part = {
+            key: value[rows] if isinstance(value, np.ndarray | list) and len(value) == time_s.size else value
+            for key, value in made.items()
+        }
+        part = recorded(part, kind, seed + 2 * number)
+        records.append(as_record(part))
+        begun_s.append(float(time_s[rows][-1] - part["time_s"][-1]))
+        did.append(part["recorder"])
+    return join(records, begun_s), did[0]
+
+
 def one(job: tuple[str, str, int, dict[str, Any]]) -> dict[str, Any] | None:
     """One record diagnosed; None where the generator can't make it."""
     from hardware_sim.hidden_records import generate
@@ -73,11 +93,16 @@ def one(job: tuple[str, str, int, dict[str, Any]]) -> dict[str, Any] | None:
         settings["again_after_s"] = JOINED_AFTER_S
         kinds.remove("joined")
     try:
-        made = recorded(generate(names, strength, seed, **settings), "+".join(kinds) or "plain", seed)
+        made, kind = generate(names, strength, seed, **settings), "+".join(kinds) or "plain"
     except ValueError:
         return None
+    if "again_after_s" in settings:
+        record, did = as_joined(made, kind, seed)
+    else:
+        made = recorded(made, kind, seed)
+        record, did = as_record(made), made["recorder"]
     began, cpu = time.perf_counter(), time.process_time()
-    result = diagnose(as_record(made))
+    result = diagnose(record)
     first = result.missing[0] if result.missing else None
     noise, after = result.noise_sd_nm, result.with_all["held_out_rms_nm"]
     return {
@@ -85,7 +110,7 @@ def one(job: tuple[str, str, int, dict[str, Any]]) -> dict[str, Any] | None:
         "strength": strength,
         "seed": seed,
         "options": {key: value for key, value in options.items() if key != "recorder"},
-        "recorder": made["recorder"] | {"kind": recorder},
+        "recorder": did | {"kind": recorder},
         "truth": made["truth"]["effects"],
         "formulation": made["truth"]["formulation"],
         "verdict": result.verdict,
@@ -96,7 +121,7 @@ def one(job: tuple[str, str, int, dict[str, Any]]) -> dict[str, Any] | None:
         "before": result.base["held_out_rms_nm"],
         "after": after,
         "noise": noise,
-        "noise made": made["truth"]["noise"]["sd_nm"] * abs(made["recorder"]["scale"]),
+        "noise made": made["truth"]["noise"]["sd_nm"] * abs(did["scale"]),
         "error over noise after": after / noise if noise > 0.0 else None,
         "explained": result.explained,
         "unseen": result.unseen,

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 
 from identify.diagnosis.analysis import analyse
+from identify.diagnosis.improvement import helpful
+from identify.diagnosis.steps import steps
 from identify.errors import BadRequest, NotIdentifiable
 from identify.estimation.adding import names, with_effects
 from identify.estimation.finish import finish
@@ -81,7 +83,7 @@ def _with_effects(
     grid, raw = prepare(record)
     rows = fitted_rows(grid, fit_on)
     if list(wanted) == [AUTO]:
-        last = analyse(record, fitted=rows).last
+        last = helpful(steps(analyse(record, fitted=rows)))[0][-1].fitted
         return finish(MAXIMUM_LIKELIHOOD.id, last, [f"effects added: {', '.join(names(last)) or 'none'}"])
     base, reasons = MAXIMUM_LIKELIHOOD.start(grid, rows, options)
     return finish(MAXIMUM_LIKELIHOOD.id, with_effects(base, wanted, raw), reasons)

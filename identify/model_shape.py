@@ -223,7 +223,7 @@ MODEL = fields(
         "reasons": several(text),
         "data": each(anything),
         "software": each(anything),
-        "extra": fields({}, {"narx": narx}),
+        "extra": fields({}, {"narx": narx, "parts": several(several(ANY, 3, 3), 1, 1000)}),
         "model_id": text,
         "created": text,
     },

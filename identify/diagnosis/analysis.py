@@ -9,6 +9,19 @@ import numpy as np
 
 from identify.diagnosis.candidates import Progress, scan
 from identify.diagnosis.structure import Left, left_over, quiet_rows
+from identify.diagnosis.thresholds import (
+    AT_WORK_ONLY,
+    BORNE_OUT,
+    DYNAMIC,
+    FIRST_MARGIN,
+    KINDRED,
+    NEXT_MARGIN,
+    PATCH,
+    PATCHER,
+    SEEN_APART,
+    SEEN_AT_REST,
+    SLOWEST,
+)
 from identify.diagnosis.unknown import WANDER
 from identify.effects import get, registry
 from identify.effects.base import Effect
@@ -20,28 +33,6 @@ from identify.noise.level import NoiseLevel
 from identify.records.record import Record
 from identify.simulation.problem import Problem
 
-FIRST_MARGIN = 4.5
-"""Log evidence that the first effect must gain."""
-NEXT_MARGIN = 10.0
-"""Log evidence that a further effect must gain."""
-PATCH = 0.12
-"""And in proportion to what the first gained."""
-KINDRED = 0.25
-"""In proportion, where it resembles the first or both change the dynamics: one in an imperfect form looks like both."""
-SEEN_APART = 0.03
-"""In proportion, where something else bears it out: rests for a drift of zero, a gain without a law for a slow gain."""
-BORNE_OUT = 0.4
-"""Share of a slow gain's evidence that a gain without a law must find, too."""
-PATCHERS = {"voluntary_effort": 0.4, "tremor": 0.4}
-"""Of those that mend anything, more is asked for."""
-AT_WORK_ONLY = 0.85
-"""What evidence counts for efforts of which the rests show nothing: they'd be the first to keep to the stimulation."""
-SEEN_AT_REST = 0.15
-"""Least share of an effort's torque, rests against work, that counts as seen at rest."""
-DYNAMIC = {"speed", "branch", "delay", "filter"}
-"""Stages that change how quickly torque follows."""
-SLOWEST = 0.97
-"""Correlation of neighbours above which slow noise may as well be a drift."""
 MOST = 3
 """Effects at most."""
 
@@ -176,8 +167,8 @@ def _margin(work: Analysis, candidate: Candidate | None) -> float:
 
 def _patch(work: Analysis, candidate: Candidate) -> float:
     effect, stage = candidate.effect, candidate.form.stage
-    if effect.id in PATCHERS:
-        return PATCHERS[effect.id]
+    if not effect.foreseeable:
+        return PATCHER
     if stage == "additive":
         return 0.5 * SEEN_APART
     if stage in ("gain", "pulse_width") and work.nameless[-1] > BORNE_OUT * candidate.gain:

@@ -8,6 +8,7 @@ from typing import Any
 from identify.diagnosis.analysis import MOST, Analysis, analyse
 from identify.diagnosis.candidates import Progress
 from identify.diagnosis.steps import Step, steps
+from identify.diagnosis.thresholds import RISE
 from identify.diagnosis.verdict import judge
 from identify.effects import get
 from identify.estimation.adding import names, try_effect
@@ -53,7 +54,7 @@ def improve(
         get(effect)
     work = analyse(record, progress, most=MOST if max_effects is None else min(max_effects, MOST))
     verdict = judge(work)
-    row = steps(work)
+    row, against = helpful(steps(work))
     if max_effects is not None:
         row = row[: max_effects + 1]
     reasons = [_reason(work, step) for step in row]
@@ -73,8 +74,18 @@ def improve(
             for step, model, reason in zip(row, models, reasons, strict=True)
         ),
         models=tuple(models),
-        refused=tuple(refused(work)),
+        refused=(*against, *refused(work)),
     )
+
+
+def helpful(row: list[Step]) -> tuple[list[Step], list[dict[str, Any]]]:
+    """The steps up to the first after which the error on rows not seen rises; and what is refused for that."""
+    for number in range(1, len(row)):
+        before, after = (row[i].figures["held_out_rms_nm"] for i in (number - 1, number))
+        if after is not None and before is not None and after > RISE * before:
+            reason = f"The error on rows not seen would rise from {before:.3g} to {after:.3g} N·m."
+            return row[:number], [{"effect": row[number].added, "log_evidence_gain": None, "reason": reason}]
+    return row, []
 
 
 def _reason(work: Analysis, step: Step) -> str:
@@ -124,5 +135,5 @@ def _models(row: list[Step]) -> list[Model]:
     for number, step in enumerate(row):
         parent = models[-1].model_id if models else None
         model = finish("maximum-likelihood", step.fitted, figures=step.figures)
-        models.append(model.with_(extra={"parent": parent, "added": step.added, "step": number}))
+        models.append(model.with_(extra=model.extra | {"parent": parent, "added": step.added, "step": number}))
     return models

@@ -9,6 +9,7 @@ import numpy as np
 from identify.criticism.where import worst_places
 from identify.diagnosis.analysis import Analysis
 from identify.diagnosis.steps import Step, steps
+from identify.diagnosis.thresholds import CLOSE, RIVAL
 from identify.diagnosis.verdict import Verdict
 from identify.effects import get
 from identify.estimation.finish import describe_parameters
@@ -20,10 +21,6 @@ FIGURES = (
     "fit_percent", "held_out_fit_percent", "rms_nm", "held_out_rms_nm", "ceiling_percent", "held_out_ceiling_percent",
     "held_out_by",
 )  # fmt: skip
-CLOSE = 0.8
-"""Share of the best one's gain from which an effect that resembles it is named beside it."""
-RIVAL = 0.04
-"""Probability from which an effect is named as one that the record can't tell from the best."""
 
 
 def report(work: Analysis, verdict: Verdict) -> Diagnosis:

@@ -6,16 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from identify.diagnosis.thresholds import COUNTS, QUIET
 from identify.dynamics.pulse_grid import runs
 from identify.estimation.joint import Fitted
 from identify.noise.level import band_part
 from identify.noise.slow_and_white import profile_noise
 from identify.records.record import Record
-
-COUNTS = 2.5
-"""Counts by which readings change from one to the next, at the median, from which a repeat is none of the counting."""
-QUIET = 0.025
-"""Share of the largest torque below which the muscle counts as resting."""
 
 
 @dataclass(frozen=True)

@@ -6,42 +6,33 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from identify.diagnosis.analysis import FIRST_MARGIN, SEEN_AT_REST, Analysis, seen_at_rest
+from identify.diagnosis.analysis import Analysis, seen_at_rest
 from identify.diagnosis.structure import held_readings
+from identify.diagnosis.thresholds import (
+    APART_S,
+    DOUBTED,
+    EVERYWHERE,
+    EXPLAINED_BY_LAWS,
+    FIRST_MARGIN,
+    HELD,
+    LAPSE,
+    LEAST_BY_BAND,
+    LEAST_BY_EFFORTS,
+    LEAST_EXPLAINED,
+    MANY,
+    NAMELESS,
+    RELATIVE,
+    SEEN_AT_REST,
+    STRUCTURE,
+    TEMPERATURE,
+    UNSEEN_RATIO,
+    UNSEEN_RISE,
+    UNSEEN_SHARE,
+    UNSTEADY,
+)
 from identify.diagnosis.unseen import Unseen, unseen
 from identify.effects import get
 from identify.estimation.adding import Candidate
-
-TEMPERATURE = 2.0
-"""Spread, in log evidence, that the best form of a rival may lose by chance."""
-RELATIVE = 0.03
-"""And in proportion to the gain: a form close to the truth explains most, not all."""
-LEAST_EXPLAINED = 0.68
-"""Share of the explicable log-likelihood below which the rest counts as structure of another kind."""
-LEAST_BY_EFFORTS = 0.8
-"""The same where efforts are named first: they mend anything a little."""
-LEAST_BY_BAND = 0.94
-"""Share of the power that a tremor must take, where work and rest differ beside it."""
-MANY = 4
-"""Efforts, none of them at rest, that are more likely something the stimulation does."""
-APART_S = 1.2
-"""Between the middles of two bumps that are two efforts."""
-UNSTEADY = 60.0
-"""Log-likelihood by which work and rest must differ beside a tremor for it to be something else."""
-STRUCTURE = 12.0
-"""Log-likelihood by which work and rest must differ for structure to be left."""
-LAPSE = 0.04
-"""Probability kept for what no form of the library foresees."""
-NAMELESS = 8.0
-"""Log evidence by which a gain without a law must beat the best effect."""
-EXPLAINED_BY_LAWS = 0.9
-"""Share that effects together must explain for a gain without a law not to count."""
-UNSEEN_RATIO = 2.5
-"""Error on rows not seen over what is allowed there, above which structure may be left."""
-UNSEEN_SHARE = 0.5
-"""And in proportion to what the plain structure leaves there: a law close to the truth takes most, not all."""
-HELD = 0.3
-"""Share of repeated samples that no noisy converter gives."""
 
 
 @dataclass(frozen=True)
@@ -103,17 +94,37 @@ def _no_effort(work: Analysis, explained: float, structure: float) -> bool:
     """Whether what looks like efforts is more likely something the stimulation does."""
     if explained < LEAST_BY_EFFORTS and structure > STRUCTURE:
         return True
-    if seen_at_rest(work.quiet, work.chain[1], work.added[0]) >= SEEN_AT_REST:
+    effort = work.added[0]
+    # Where a rival took its place since, it was still there in an earlier model, or in the last.
+    holder = next(fitted for fitted in work.chain[1:] if effort in dict(fitted.effects))
+    if seen_at_rest(work.quiet, holder, effort) >= SEEN_AT_REST:
         return False
-    form = next(form.name for name, form in work.chain[1].effects if name == work.added[0])
-    return "resisting" in form or _efforts(work) >= MANY
+    return "resisting" in dict(holder.effects)[effort].name or _efforts(holder.parameters_of(effort)) >= MANY
 
 
-def _efforts(work: Analysis) -> int:
+def _everywhere(work: Analysis) -> bool:
+    """Whether what looks like efforts lasts for much of the test: efforts are seldom."""
+    effort = work.added[0]
+    holder = next(fitted for fitted in work.chain[1:] if effort in dict(fitted.effects))
+    widths = [value for name, value in holder.parameters_of(effort).items() if name.startswith(("width_", "decay_"))]
+    setup = holder.problem.setup
+    return 2.0 * sum(widths) > EVERYWHERE * float(setup.fitted.sum()) * setup.grid.step_s
+
+
+def _efforts(parameters: dict[str, float]) -> int:
     """How many efforts the bumps make: those close to one another are one."""
-    parameters = work.chain[1].parameters_of(work.added[0])
     centres = np.sort([value for name, value in parameters.items() if name.startswith("centre_")])
     return int(np.sum(np.diff(centres) > APART_S)) + 1 if centres.size else 0
+
+
+def _unhelpful(work: Analysis, number: int) -> bool:
+    """Whether the error on rows not seen rises with the effect added in this round."""
+    if number + 1 >= len(work.chain):
+        return False
+    before, after = unseen(work.chain[number]), unseen(work.chain[number + 1])
+    return (
+        before is not None and after is not None and after.rms_nm > UNSEEN_RISE * max(before.rms_nm, after.allowed_nm)
+    )
 
 
 def _contradicted(before: Unseen | None, after: Unseen) -> bool:
@@ -139,7 +150,11 @@ def judge(work: Analysis) -> Verdict:
         rivals[effect] = shares(
             [c for c in work.rounds[number] if c.effect.id == effect or c.effect.id not in work.added]
         )
-        found[effect] = rivals[effect].get(effect, 0.5)
+        # What was added later stands on what was added before.
+        found[effect] = min([rivals[effect].get(effect, 0.5), *(found[e] for e in work.added[:number] if e in found)])
+        if _unhelpful(work, number):
+            found[effect] = min(found[effect], DOUBTED)
+            notes.append(f"{get(effect).name}: the error on rows not seen rises with it.")
     structure = left.ratio
     if last.noise.band > 0.0:
         # The band's own surprise isn't structure: what counts is what remains beside it.
@@ -155,7 +170,7 @@ def judge(work: Analysis) -> Verdict:
         if get(work.added[0]).band:
             strange = strange or (explained < LEAST_BY_BAND and structure > UNSTEADY)
         elif not get(work.added[0]).foreseeable:
-            strange = strange or _no_effort(work, explained, structure)
+            strange = strange or _everywhere(work) or _no_effort(work, explained, structure)
     else:
         strange = strange or structure > STRUCTURE
     before, after = unseen(first), unseen(last)
@@ -167,7 +182,7 @@ def judge(work: Analysis) -> Verdict:
             "allow: structure is left."
         )
     if strange:
-        found = {effect: min(p, 0.45) for effect, p in found.items()}
+        found = {effect: min(p, DOUBTED) for effect, p in found.items()}
         kind = "unexplained_structure"
         probability = 0.9
     elif found:

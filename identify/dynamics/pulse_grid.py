@@ -107,6 +107,11 @@ class Grid:
         """bool, shape (N,): samples whose error counts, those of `validate` among them."""
         return ~self.doubted[self.interval]
 
+    @cached_property
+    def begins(self) -> np.ndarray:
+        """Intervals at which the parts of the record begin, shape (B,), the first 0."""
+        return np.searchsorted(self.part, np.arange(len(self.record.parts))).astype(np.int64)
+
     @property
     def delay_bounds_s(self) -> tuple[float, float]:
         """Timing that every model leaves open: a sample either way; a longer delay is an effect."""

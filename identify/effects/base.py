@@ -89,6 +89,8 @@ class Scene:
         Time to which the recruitment curve belongs where it drifts: the middle of the partly recruited pulses.
     fitted : ndarray of bool or None, shape (K,)
         Where the torque is used for fitting.
+    pauses_s : ndarray or None, shape (K,)
+        What of a pause between two parts of a record is not in `time_s`, s, at the part's first interval.
     """
 
     time_s: np.ndarray
@@ -102,6 +104,12 @@ class Scene:
     zero_nm: float = 0.0
     reference_s: float = 0.0
     fitted: np.ndarray | None = None
+    pauses_s: np.ndarray | None = None
+
+    @property
+    def rest_s(self) -> np.ndarray:
+        """Rest before each interval that the intervals do not show, s, shape (K,)."""
+        return np.zeros(self.time_s.size) if self.pauses_s is None else self.pauses_s
 
     @property
     def on(self) -> np.ndarray:
@@ -235,6 +243,9 @@ class Effect:
     band : bool
         Whether it is a narrow band of noise: sought in the residual's spectrum, and part of the noise while others are
         weighed.
+    seen : callable or None
+        `seen(raw)`: the form and its parameters where the raw samples show the effect beyond doubt, else None; `raw` is
+        what `identify.estimation.prepare.inspect` saw. It is then taken as there, before any fit.
     prior : float
         Odds against it beforehand, as a natural logarithm, on top of the common ones.
     """
@@ -251,6 +262,7 @@ class Effect:
     foreseeable: bool = True
     raw: bool = False
     band: bool = False
+    seen: Callable[[Any], tuple[str, dict[str, float]] | None] | None = None
     prior: float = 0.0
 
     @property

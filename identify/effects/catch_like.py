@@ -18,13 +18,13 @@ _RECOVERY = Parameter("recovery_s", "s", 0.02, 4.0, 0.3, (0.1, 1.0), "log", abou
 
 def _depletes(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
     on = np.broadcast_to(scene.on, drive.shape)
-    x = adapt(on, p["decay_s"][:, 0], p["recovery_s"][:, 0], False, scene.step_s)
+    x = adapt(on, p["decay_s"][:, 0], p["recovery_s"][:, 0], False, scene.step_s, scene.rest_s)
     return drive * (1.0 + p["gain"] * (1.0 - x))
 
 
 def _by_level(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
     level = np.minimum(np.abs(drive) / scene.scale_nm, 1.0)
-    x = adapt(level, p["decay_s"][:, 0], p["recovery_s"][:, 0], True, scene.step_s)
+    x = adapt(level, p["decay_s"][:, 0], p["recovery_s"][:, 0], True, scene.step_s, scene.rest_s)
     return drive * (1.0 + p["gain"] * (1.0 - x))
 
 

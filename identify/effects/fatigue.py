@@ -19,18 +19,18 @@ def _level(drive: np.ndarray, scene: Scene) -> np.ndarray:
 
 
 def _fitness(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
-    x = adapt(_level(drive, scene), p["onset_s"][:, 0], p["recovery_s"][:, 0], False, scene.step_s)
+    x = adapt(_level(drive, scene), p["onset_s"][:, 0], p["recovery_s"][:, 0], False, scene.step_s, scene.rest_s)
     return drive * (1.0 - p["depth"] * x)
 
 
 def _compartments(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
-    x = adapt(_level(drive, scene), p["onset_s"][:, 0], p["recovery_s"][:, 0], True, scene.step_s)
+    x = adapt(_level(drive, scene), p["onset_s"][:, 0], p["recovery_s"][:, 0], True, scene.step_s, scene.rest_s)
     return drive * (1.0 - p["depth"] * x)
 
 
 def _by_pulses(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
     on = np.broadcast_to(scene.on, drive.shape)
-    x = adapt(on, p["onset_s"][:, 0], p["recovery_s"][:, 0], False, scene.step_s)
+    x = adapt(on, p["onset_s"][:, 0], p["recovery_s"][:, 0], False, scene.step_s, scene.rest_s)
     return drive * (1.0 - p["depth"] * x)
 
 

@@ -8,7 +8,7 @@ from numba import njit
 
 @njit(cache=True, nogil=True)
 def adapt(
-    drive: np.ndarray, onset_s: np.ndarray, recovery_s: np.ndarray, constant: bool, step_s: float
+    drive: np.ndarray, onset_s: np.ndarray, recovery_s: np.ndarray, constant: bool, step_s: float, rest_s: np.ndarray
 ) -> np.ndarray:  # pragma: no cover
     """State x in [0, 1] with x' = a (1 - x)/onset - (1 - a) x/recovery, exact for a held drive a; from x = 0.
 
@@ -24,6 +24,8 @@ def adapt(
         Whether recovery is independent of the drive.
     step_s : float
         Length of an interval, s.
+    rest_s : ndarray, shape (K,)
+        Rest before each interval that the intervals do not show, s.
 
     Returns
     -------
@@ -35,6 +37,8 @@ def adapt(
     for m in range(rows):
         x = 0.0
         for k in range(size):
+            if rest_s[k] > 0.0:
+                x *= np.exp(-rest_s[k] / recovery_s[m])
             a = min(max(drive[m, k], 0.0), 1.0)
             up = a / onset_s[m]
             down = 1.0 / recovery_s[m] if constant else (1.0 - a) / recovery_s[m]

@@ -45,4 +45,5 @@ EFFECT = Effect(
     plain="The mains couples into the load cell. It isn't the muscle: check shielding and earth.",
     source="Interference",
     raw=True,
+    seen=lambda raw: None if raw.hum is None else ("line", raw.hum),
 )

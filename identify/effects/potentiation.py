@@ -18,7 +18,7 @@ def _make(kind: str) -> Any:
     def apply(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
         level = np.minimum(np.abs(drive) / scene.scale_nm, 1.0)
         a = np.broadcast_to(scene.on, drive.shape) if kind == "by_pulses" else level
-        x = adapt(a, p["onset_s"][:, 0], p["recovery_s"][:, 0], kind == "steady_decay", scene.step_s)
+        x = adapt(a, p["onset_s"][:, 0], p["recovery_s"][:, 0], kind == "steady_decay", scene.step_s, scene.rest_s)
         return drive * (1.0 + p["gain"] * x)
 
     return apply

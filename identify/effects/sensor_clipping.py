@@ -28,6 +28,14 @@ def _both(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
     return _floored(_clipped(y, p, scene), p, scene)
 
 
+def _seen(raw: Any) -> tuple[str, dict[str, float]] | None:
+    levels = {"ceiling": raw.ceiling_nm, "floor": raw.floor_nm}
+    found = {name: value for name, value in levels.items() if value is not None}
+    if not found:
+        return None
+    return "both" if len(found) == 2 else next(iter(found)), {f"{name}_nm": value for name, value in found.items()}
+
+
 _CEILING = Parameter("ceiling_nm", "N·m", -1.5, 1.5, np.inf, (0.9,), "linear", "level", "largest torque shown")
 _FLOOR = Parameter("floor_nm", "N·m", -1.5, 1.5, -np.inf, (-0.5,), "linear", "level", "smallest torque shown")
 
@@ -45,4 +53,5 @@ EFFECT = Effect(
     plain="The measurement hits its ceiling: the muscle gives more than the cell shows. Lower the gain or the charge.",
     source="Range of the analogue-to-digital converter",
     raw=True,
+    seen=_seen,
 )

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from identify.effects import get, registry
-from identify.effects.base import Effect, Form, Scene
+from identify.effects.base import STAGES, Effect, Form, Scene
 from identify.errors import BadRequest, NotIdentifiable
 from identify.estimation.joint import Fitted, solve, start_from
 from identify.estimation.prepare import Raw, plain, prepare
@@ -19,6 +19,8 @@ from identify.simulation.problem import Problem
 
 PATIENCE = 2
 """Steps of a chain (one bump, two bumps, …) without a gain after which it ends: one of four bumps hardly helps."""
+TOLERANCE = 0.1
+"""Gain in log posterior below which a candidate's search ends: a fortieth of the least margin."""
 BAND_COST = 16.0
 """Log evidence that a narrow band's three numbers cost."""
 
@@ -63,7 +65,9 @@ def try_effect(effect: Effect, base: Fitted, forms: Iterable[Form] | None = None
             previous, residual, idle, top = {}, base.residual_nm, 0, -np.inf
         elif idle >= PATIENCE:
             continue
-        found = fit_form(effect, form, base, residual, previous)
+        # A chain needs each of its steps at its best: the next begins there.
+        rival = best if form.propose is None else None
+        found = fit_form(effect, form, base, residual, previous, rival)
         if found is None:
             idle = PATIENCE
             continue
@@ -91,9 +95,14 @@ def try_band(effect: Effect, base: Fitted) -> Candidate | None:
 
 
 def fit_form(
-    effect: Effect, form: Form, base: Fitted, residual: np.ndarray, previous: dict[str, float]
+    effect: Effect,
+    form: Form,
+    base: Fitted,
+    residual: np.ndarray,
+    previous: dict[str, float],
+    rival: Fitted | None = None,
 ) -> Fitted | None:
-    """One form added to a model, from each of its starting values; the best."""
+    """One form added to a model, from each of its starting values; the best. Far behind the rival it is given up."""
     setup = base.problem.setup
     scene: Scene = setup.scene
     problem = Problem(setup, [*base.effects, (effect.id, form)])
@@ -106,7 +115,8 @@ def fit_form(
         if apart is not None and "base.time_constant_s" not in start and base.physical[1] >= apart:
             continue  # the base has its lags apart already
         theta = start_from(problem, base, {len(base.effects): start})
-        found = solve(problem, theta, base.noise, floor=None if best is None else best.log_evidence)
+        ahead = max((f.log_evidence for f in (best, rival) if f is not None), default=None)
+        found = solve(problem, theta, base.noise, tolerance=TOLERANCE, floor=ahead)
         if form.accept is not None and not form.accept(found.parameters_of(effect.id), scene):
             continue
         if best is None or found.log_evidence > best.log_evidence:
@@ -151,15 +161,11 @@ def add(base: Fitted, effect: Effect, form: str, raw: Raw) -> Fitted:
 
 def given_by_samples(raw: Raw) -> list[tuple[str, Form, dict[str, float]]]:
     """Effects that the samples show before any fit: a line of the mains, a ceiling; with their parameters."""
-    effects, found = registry(), []
-    if raw.hum is not None and "mains_hum" in effects:
-        found.append(("mains_hum", effects["mains_hum"].forms[0], raw.hum))
-    if "sensor_clipping" in effects:
-        levels = {"ceiling": raw.ceiling_nm, "floor": raw.floor_nm}
-        seen = {name: value for name, value in levels.items() if value is not None}
-        if seen:
-            form = effects["sensor_clipping"].form("both" if len(seen) == 2 else next(iter(seen)))
-            found.append(("sensor_clipping", form, {f"{name}_nm": value for name, value in seen.items()}))
+    found = []
+    for effect in sorted(registry().values(), key=lambda effect: STAGES.index(effect.stage)):
+        seen = effect.seen(raw) if effect.seen is not None else None
+        if seen is not None:
+            found.append((effect.id, effect.form(seen[0]), seen[1]))
     return found
 
 

@@ -65,10 +65,20 @@ def finish(method_id: str, fitted: Fitted, reasons: Sequence[str] = (), figures:
         fit=figures,
         residual_tests=tests,
         reasons=tuple(reasons),
+        extra=_parts(written),
     )
     model = _named(model, setup.grid)
     model = model.with_(bands=bands(model), valid_for=valid_for(model, setup.grid, setup.fitted))
     return model.with_(quality=quality(model, setup.grid, setup.fitted, fitted.settled))
+
+
+def _parts(fitted: Fitted) -> dict[str, Any]:
+    """Baseline, N·m, initial torque, N·m, and its rate, N·m/s, of each part of a record that has several."""
+    problem, setup, values = fitted.problem, fitted.problem.setup, fitted.physical
+    if setup.begins.size == 1:
+        return {}
+    states = setup.sign * values[list(problem.initials)].reshape(-1, 2)
+    return {"parts": np.c_[setup.unframed(values[list(problem.baselines)]), states].tolist()}
 
 
 def _named(model: Model, grid: Grid) -> Model:

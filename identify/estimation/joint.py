@@ -94,7 +94,7 @@ class Fitted:
 
 
 def _whiten(problem: Problem, rows: np.ndarray, noise: NoiseLevel) -> np.ndarray:
-    return whitened(rows, problem.setup.stretches, noise)
+    return whitened(rows / problem.setup.spread, problem.setup.stretches, noise)
 
 
 def _residual(problem: Problem, mean: np.ndarray) -> np.ndarray:
@@ -145,7 +145,10 @@ def solve(
         iterations += 1
         products = gram(_whiten(problem, np.vstack([at.residual, at.slopes]), at.noise))
         gradient = products[0, 1:] - precision @ (at.theta - prior_mean)
-        found, damping = _advance(problem, at, products[1:, 1:] + precision, gradient, damping, frozen)
+        hessian = products[1:, 1:] + precision
+        if iterations > 1 and _expected(hessian, gradient, at.theta, problem, frozen) < 0.5 * tolerance:
+            break
+        found, damping = _advance(problem, at, hessian, gradient, damping, frozen)
         if found is None:
             break
         gain, at = found.value - at.value, found
@@ -184,7 +187,7 @@ def _at(problem: Problem, theta: np.ndarray, noise: NoiseLevel, wide: bool = Fal
     if slopes is None or not np.all(np.isfinite(mean)):
         return None
     residual = _residual(problem, mean)
-    level, log_likelihood = profile(residual, problem.setup.stretches, noise, wide)
+    level, log_likelihood = profile(residual / problem.setup.spread, problem.setup.stretches, noise, wide)
     return _Point(theta, residual, slopes, level, log_likelihood, log_likelihood - _penalty(problem, theta))
 
 
@@ -199,6 +202,13 @@ def _advance(
             return trial, max(damping / 6.0, 1e-7)
         damping = max(damping * 8.0, 1e-3)
     return None, damping
+
+
+def _expected(
+    hessian: np.ndarray, gradient: np.ndarray, theta: np.ndarray, problem: Problem, frozen: np.ndarray
+) -> float:
+    """What a whole step would gain in log posterior, were it the parabola that it looks like."""
+    return 0.5 * float(gradient @ _step(hessian, gradient, 1e-7, theta, problem, frozen))
 
 
 def _step(

@@ -250,7 +250,10 @@ def to_fitted(solution: Solution, most: int = 20) -> Fitted:
     size, linear = solution.problem.basis.size, solution.linear
     values = np.zeros(problem.size)
     values[:3] = linear.time_constant_s, linear.damping, linear.delay_s
-    values[list(problem.initials)[:2]] = setup.sign * solution.coefficients[size + 1 :]
+    # Of the first part alone: how far the parts before run into a later one is not known here, and soon found.
+    parts = setup.begins.size
+    values[list(problem.baselines)] = setup.framed(solution.coefficients[size : size + parts])
+    values[list(problem.initials)[:2]] = setup.sign * solution.coefficients[size + parts : size + parts + 2]
     values[problem.coefficients] = setup.sign * solution.coefficients[:size]
     noise = NoiseLevel(max(solution.ar1, 0.0), 0.5, float(np.sqrt(solution.variance)))
     return solve(problem, problem.from_physical(values), noise, most=most)
@@ -264,7 +267,9 @@ def setup_of(solution: Solution) -> Setup:
     sign = 1.0 if curve[np.argmax(np.abs(curve))] >= 0 else -1.0
     zero = float(solution.coefficients[size])
     target = sign * (grid.torque_nm - zero)
-    smooth = np.convolve(np.where(problem.rows, target, 0.0), np.ones(3) / 3, "same")
+    parts = grid.begins.size
+    own_zero = sign * (solution.coefficients[size : size + parts][grid.part] - zero)
+    smooth = np.convolve(np.where(problem.rows, target - own_zero, 0.0), np.ones(3) / 3, "same")
     scale = float(np.percentile(np.abs(smooth[problem.rows]), 99.5))
     return Setup(
         grid=grid,
@@ -277,8 +282,20 @@ def setup_of(solution: Solution) -> Setup:
         delay_bounds_s=grid.delay_bounds_s if problem.delay_s is None else (problem.delay_s, problem.delay_s),
         zero_nm=zero,
         sign=sign,
+        spread=_spread(grid),
         reference_s=_reference(grid, problem.rows),
     )
+
+
+def _spread(grid: Grid) -> np.ndarray | float:
+    """Noise of each interval over the mean noise: each part of a record has its own."""
+    parts = grid.begins.size
+    if parts == 1:
+        return 1.0
+    record = grid.record
+    kept = grid.counted & ~record.held_out
+    own = [white_noise(record, record.torque_nm[kept & (record.part == part)]) for part in range(parts)]
+    return (np.maximum(own, 1e-12) / max(float(np.mean(own)), 1e-12))[grid.part]
 
 
 def _reference(grid: Grid, rows: np.ndarray) -> float:

@@ -33,8 +33,6 @@ from identify.recruitment.spline import SplineBasis
 STARTS_S = (0.12, 0.4)
 ROUNDING = 2e-5
 """Share of the torque's range below which a residual is not noise."""
-EXTRAS = 3
-"""Linear columns that aren't recruitment: baseline, initial torque, its rate."""
 INITIAL_RIDGE = 1e-8
 """Of the initial torque: enough for a state that no row sees to stay at rest, too little to be felt by any other."""
 RATE_S = 0.1
@@ -90,19 +88,33 @@ class Projection:
         """Torque, with zeros where there is none (such rows are never fitted)."""
         return np.nan_to_num(self.grid.torque_nm)
 
+    @property
+    def extras(self) -> int:
+        """Linear columns that aren't recruitment: of each part baseline, initial torque and its rate."""
+        return 3 * self.grid.begins.size
+
     @cached_property
     def ridge(self) -> np.ndarray:
-        """Penalty on baseline and initial state: a state that no row sees stays at rest."""
-        return INITIAL_RIDGE * np.array([0.0, 1.0, RATE_S**2])
+        """Penalty on baselines and initial states: a state that no row sees stays at rest."""
+        parts = self.grid.begins.size
+        return INITIAL_RIDGE * np.r_[np.zeros(parts), np.tile([1.0, RATE_S**2], parts)]
 
     def columns(self, linear: SecondOrder) -> np.ndarray:
-        """Block means of the response to each linear coefficient, shape (K, P + 3)."""
+        """Block means of the response to each linear coefficient, shape (K, P + extras)."""
         response = linear.on_grid(self.grid, self.drive)
         return np.concatenate([response, *self._extra_columns(linear)], axis=1)
 
     def _extra_columns(self, linear: SecondOrder) -> list[np.ndarray]:
-        states = free_states(linear.time_constant_s, linear.damping, self.grid.step_s, self.grid.size)
-        return [np.ones((self.grid.size, 1)), self.grid.block_mean(*states, linear.delay_s)]
+        grid = self.grid
+        states = free_states(linear.time_constant_s, linear.damping, grid.step_s, grid.size)
+        if grid.begins.size == 1:
+            return [np.ones((grid.size, 1)), grid.block_mean(*states, linear.delay_s)]
+        own = (grid.part[:, None] == np.arange(grid.begins.size)).astype(float)
+        tails = []
+        for part, begin in enumerate(grid.begins):
+            torque, rate = (np.concatenate([np.zeros((begin, 2)), s[: grid.size + 1 - begin]]) for s in states)
+            tails.append(own[:, part : part + 1] * grid.block_mean(torque, rate, linear.delay_s))
+        return [own, *tails]
 
     @property
     def searched(self) -> int:
@@ -122,8 +134,9 @@ class Projection:
             near.append(SecondOrder(t, z, d + step))
             values.append(grid.block_mean(torque, rate, d + step))
         change = np.stack(values, axis=1) - grid.block_mean(torque, rate, d)[:, None]
-        here = self._extra_columns(linear)[1]
-        tails = [(self._extra_columns(at)[1] - here) @ coefficients[size + 1 :] for at in near]
+        first = size + self.grid.begins.size
+        here = np.hstack(self._extra_columns(linear)[1:])
+        tails = [(np.hstack(self._extra_columns(at)[1:]) - here) @ coefficients[first:] for at in near]
         return (change + np.stack(tails, axis=1)) / step
 
 
@@ -137,13 +150,13 @@ class Solution:
         What was solved.
     linear : SecondOrder
         Dynamics.
-    coefficients : ndarray, shape (P + 3,)
+    coefficients : ndarray, shape (P + extras,)
         Recruitment, baseline, initial state.
     weight : float
         Of the roughness.
     ar1 : float
         Correlation of the noise that rows were whitened with.
-    columns, slopes : ndarray, shape (K, P + 3), (K, 2 or 3)
+    columns, slopes : ndarray, shape (K, P + extras), (K, 2 or 3)
         The model's derivatives there.
     freedom : float
         Effective number of coefficients in all.
@@ -249,7 +262,7 @@ class _State:
         self.weight = weight
         self.penalty = np.zeros_like(self.zz)
         self.penalty[:size, :size] = weight * problem.roughness
-        self.penalty[np.arange(size, size + EXTRAS), np.arange(size, size + EXTRAS)] = problem.ridge
+        self.penalty[size:, size:] = np.diag(problem.ridge)
         self.coefficients = _solve(self.zz + self.penalty, self.zy)
         self.cost = self.energy - float(self.zy @ self.coefficients)
         self.white = white
@@ -300,7 +313,7 @@ class _State:
         energy = self.energy - float(self.zy[size:] @ inner[:, -1])
         if not np.any(self.problem.roughness):
             return 0.0
-        known = {"free": EXTRAS, "null": self.problem.null}
+        known = {"free": self.problem.extras, "null": self.problem.null}
         size_fitted = self.target.size
         return choose_weight((gram + gram.T) / 2, moment, energy, size_fitted, self.problem.roughness, **known).weight
 

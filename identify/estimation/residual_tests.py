@@ -39,7 +39,7 @@ def residual_tests(fitted: Fitted) -> dict[str, Any]:
     """
     setup = fitted.problem.setup
     start, stop = setup.stretches
-    white = whitened(fitted.residual_nm[None, :], setup.stretches, fitted.noise)[0]
+    white = whitened(fitted.residual_nm[None, :] / setup.spread, setup.stretches, fitted.noise)[0]
     if not fitted.rms_nm > 1e-12 * setup.scale_nm:
         return {}
     edges = np.r_[0, np.cumsum(stop - start)]
@@ -67,8 +67,8 @@ def _structure(fitted: Fitted, white: np.ndarray) -> dict[str, Any]:
     signals = np.stack([time, time * mean, mean**2, np.abs(rate), np.abs(drive - mean) * mean, time * drive])
     scale = np.linalg.norm(signals, axis=1)
     signals = signals[scale > 0] / scale[scale > 0][:, None]
-    extra = whitened(signals, setup.stretches, fitted.noise)
-    own = whitened(fitted.slopes, setup.stretches, fitted.noise)
+    extra = whitened(signals / setup.spread, setup.stretches, fitted.noise)
+    own = whitened(fitted.slopes / setup.spread, setup.stretches, fitted.noise)
     # The penalised fit takes out less than a projection: the same smoother is applied to the signals.
     size = np.sqrt(np.maximum(np.diag(fitted.hessian), 1e-300))
     scaled = fitted.hessian / size[:, None] / size[None, :] + 1e-10 * np.eye(size.size)

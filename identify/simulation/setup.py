@@ -39,6 +39,8 @@ class Setup:
         Zero of the record's torque, N·m.
     sign : float
         1 where stimulation raises the record's torque, -1 where it lowers it.
+    spread : ndarray, shape (K,), or float
+        Noise of each interval over the noise of all: parts of a record are recorded with noises of their own.
     reference_s : float
         Time to which the recruitment curve belongs where it drifts.
     """
@@ -53,6 +55,7 @@ class Setup:
     delay_bounds_s: tuple[float, float]
     zero_nm: float = 0.0
     sign: float = 1.0
+    spread: np.ndarray | float = 1.0
     reference_s: float = 0.0
 
     @cached_property
@@ -64,14 +67,13 @@ class Setup:
     @cached_property
     def begins(self) -> np.ndarray:
         """Intervals at which the parts of the record begin, shape (B,), the first 0."""
-        return np.searchsorted(self.grid.part, np.arange(len(self.grid.record.parts))).astype(np.int64)
+        return self.grid.begins
 
     def part_of(self, at_samples: bool) -> np.ndarray | None:
         """Part of each sample or of each interval; None where there is one part."""
         if self.begins.size == 1:
             return None
-        at = self.grid.interval if at_samples else np.arange(self.grid.size)
-        return np.searchsorted(self.begins, at, side="right") - 1
+        return self.grid.part[self.grid.interval] if at_samples else self.grid.part
 
     @cached_property
     def scene(self) -> Scene:
@@ -80,7 +82,9 @@ class Setup:
         mean = np.bincount(grid.interval, grid.fraction, minlength=grid.size) / np.maximum(grid.count, 1)
         mean = np.where(grid.count > 0, mean, 0.5)
         scene = self._scene((np.arange(grid.size) + mean) * grid.step_s, grid.pulse_width_us)
-        return replace(scene, fitted=self.fitted)
+        pauses = np.zeros(grid.size)
+        pauses[grid.begins] = [part.pause_s - part.folded_s for part in grid.record.parts]
+        return replace(scene, fitted=self.fitted, pauses_s=pauses)
 
     @cached_property
     def scene_at_ends(self) -> Scene:

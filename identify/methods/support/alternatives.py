@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUNDS_S, SecondOrder
-from identify.estimation.projected import EXTRAS, Projection, Solution, project, search
+from identify.estimation.projected import Projection, Solution, project, search
 from identify.noise.ar1 import log_likelihood, whiten
 from identify.recruitment.power import PowerBasis
 from identify.recruitment.sigmoid import SigmoidBasis
@@ -88,9 +88,9 @@ def monotone(solution: Solution) -> Solution:
     root = np.linalg.cholesky(hessian).T
     right = np.linalg.solve(root.T, white.T @ target)
     sign = 1.0 if np.sum(solution.coefficients[:size]) >= 0 else -1.0
-    steps = np.zeros((white.shape[1], size + 2 * EXTRAS))
+    steps = np.zeros((white.shape[1], size + 2 * problem.extras))
     steps[:size, :size] = sign * np.tril(np.ones((size, size)))
-    for extra in range(EXTRAS):  # these may have either sign
+    for extra in range(problem.extras):  # these may have either sign
         steps[size + extra, size + 2 * extra : size + 2 * extra + 2] = 1.0, -1.0
     coefficients = steps @ nnls(root @ steps, right, maxiter=50 * steps.shape[1])[0]
     return replace(solution, coefficients=coefficients)
