@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from api import audit, evidence, uploads
+from api.beginnings import Beginnings
 from api.clock import Clock
 from api.errors import ApiError, NotFoundError
 from api.fitting import Fitting, Job
@@ -22,8 +23,21 @@ from api.versions import Versions
 
 log = logging.getLogger("stimrig.analyses")
 OnJob = Callable[[Job], None]
+OWN_DIAGNOSIS = "diagnosis of its structure"
+"""The name under which that of a version is kept whose structure is not the plain one."""
 HALF_DONE = 0.5
 """From here on a diagnosis of low priority is left to finish when somebody begins to wait for it."""
+
+
+def is_plain(model: Model) -> bool:
+    """Whether a version's structure is the plain one: no effects around f(u) and a G of second order."""
+    return not model.effects and "time_constant_s" in json.loads(model.document)["linear"]
+
+
+def structure_of(model: Model) -> list[str]:
+    """The effects of a version, each `id:form` or, where no form is named, `id`."""
+    held = json.loads(model.document).get("effects") or []
+    return [f"{effect['id']}:{effect.get('form') or ''}".removesuffix(":") for effect in held]
 
 
 class Analyses:
@@ -32,6 +46,7 @@ class Analyses:
     def __init__(self, store: Store, clock: Clock, fitting: Fitting, versions: Versions, settings: Settings) -> None:
         self.store, self.clock, self.fitting, self.versions = store, clock, fitting, versions
         self.settings = settings
+        self.beginnings = Beginnings(store, fitting, settings)
         self.running: dict[tuple[str, str], Job] = {}
         self._ids: list[str] | None = None
 
@@ -55,28 +70,36 @@ class Analyses:
         return await self._kept(model, "curves", {"model_json": model.document.decode()})
 
     async def diagnosis(self, model: Model, on_job: OnJob | None = None) -> dict[str, Any]:
-        """What is missing in the base model of the recording: the same for all versions made from it."""
-        eldest = await asyncio.to_thread(self.eldest, model)
-        return await self._kept(eldest, "diagnosis", {}, on_job=on_job)
+        """What is missing in the model's own structure; that of the plain one is shared by all that have it."""
+        place, kind, given = await asyncio.to_thread(self._criticised, model)
+        return await self._kept(place, kind, given, verb="diagnosis", on_job=on_job)
+
+    def _criticised(self, model: Model) -> tuple[Model, str, dict[str, Any]]:
+        """With which version a diagnosis is kept, under which name, and what the worker is given for it."""
+        if is_plain(model):
+            return self.eldest(model), "diagnosis", {}
+        return model, OWN_DIAGNOSIS, {"model_json": model.document.decode()}
 
     def eldest(self, model: Model) -> Model:
-        """The first version made from the model's recording: what is found of the recording is kept with it."""
+        """The first version made from the model's recording: what is found of its plain structure is kept with it."""
         rows = self.store.all(Model, Model.recording_id == model.recording_id, order=Model.created_utc, limit=1)
         return rows[0]
 
+    def _plain_eldest(self, model: Model) -> Model:
+        """The recording's first version where that is plain like the model, else the model."""
+        eldest = self.eldest(model)
+        return eldest if is_plain(eldest) else model
+
     def known_diagnosis(self, model: Model) -> dict[str, Any] | None:
         """The diagnosis if it has been made."""
-        return self.known(self.eldest(model).id, "diagnosis")
-
-    def running_diagnosis(self, model: Model) -> Job | None:
-        """The job that makes the diagnosis, while it does."""
-        return self.running.get((self.eldest(model).id, "diagnosis"))
+        place, kind, _ = self._criticised(model)
+        return self.known(place.id, kind)
 
     async def foresee(self, model: Model) -> None:
         """Diagnose before anybody asks, with low priority; a new test ends it, and nobody is told."""
-        eldest = await asyncio.to_thread(self.eldest, model)
+        place, kind, given = await asyncio.to_thread(self._criticised, model)
         try:
-            await self._kept(eldest, "diagnosis", {}, background=True)
+            await self._kept(place, kind, given, verb="diagnosis", background=True)
         except ApiError as error:
             log.info("diagnosis of %s in the background: %s", model.id, error.title)
 
@@ -162,7 +185,9 @@ class Analyses:
         if not force:
             evidence.demand(await self.diagnosis(model, on_job), model.effects, added)
         path = await asyncio.to_thread(self.path, model.recording_id)
-        job = self.fitting.submit("fit", data=path, method=model.method, effects=effects)
+        held = {effect.partition(":")[0]: effect for effect in structure_of(model)}
+        asked = [held.get(effect, effect) for effect in effects]
+        job = self.fitting.submit("fit", data=path, method=model.method, effects=asked)
         if on_job is not None:
             on_job(job)
         found = await asyncio.shield(job.result)
@@ -189,18 +214,24 @@ class Analyses:
         return row
 
     async def improve(self, model: Model, by: str, on_job: OnJob | None = None) -> tuple[dict[str, Any], list[Model]]:
-        """Effects added one by one while the evidence lasts, each step a version that descends from the eldest."""
+        """Effects added to the model's structure one by one while the evidence lasts, each step a version.
+
+        They descend from the model; of the plain structure, from the recording's first version if that has it, too.
+        """
         path = await asyncio.to_thread(self.path, model.recording_id)
-        job = self.fitting.submit("improve", data=path)
+        plain = await asyncio.to_thread(is_plain, model)
+        given: dict[str, Any] = {} if plain else {"model_json": model.document.decode()}
+        job = self.fitting.submit("improve", data=path, **given)
         if on_job is not None:
             on_job(job)
         found = await asyncio.shield(job.result)
-        rows = await asyncio.to_thread(self._store_steps, found, await asyncio.to_thread(self.eldest, model), by)
+        first = await asyncio.to_thread(self._plain_eldest, model) if plain else model
+        rows = await asyncio.to_thread(self._store_steps, found, first, by)
         return {key: value for key, value in found.items() if key != "models"}, rows
 
-    def _store_steps(self, found: dict[str, Any], eldest: Model, by: str) -> list[Model]:
-        """Each step that adds something as a version; the base is the eldest version, which is there already."""
-        rows = [eldest]
+    def _store_steps(self, found: dict[str, Any], first: Model, by: str) -> list[Model]:
+        """Each step that adds something as a version; what they begin with is there already."""
+        rows = [first]
         for step, document in zip(found["steps"], found["models"], strict=True):
             if step["added"] is None:
                 continue

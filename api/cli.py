@@ -17,7 +17,7 @@ import typer
 from typer.exceptions import TyperException
 
 from api import commands
-from api.terminal import InputError
+from api.terminal import InputError, clear_progress
 
 
 def build() -> typer.Typer:
@@ -51,6 +51,7 @@ def run(arguments: list[str] | None = None) -> int:
         sys.stdout.flush()
         return code if isinstance(code, int) else 0
     except (KeyboardInterrupt, typer.Abort):
+        clear_progress()
         print("stimrig: interrupted", file=sys.stderr)
         return 130
     except BrokenPipeError:
@@ -63,6 +64,7 @@ def run(arguments: list[str] | None = None) -> int:
 def _one_line(verb: str, error: Exception) -> int:
     """The error's line, and the exit code it stands for."""
     name = f"stimrig {verb}".strip()
+    clear_progress()
     expected = any(kind.__name__ in ("IdentifyError", "ApiError") for kind in type(error).__mro__)
     code = getattr(error, "code", 1)
     if isinstance(error, TyperException):
@@ -73,6 +75,11 @@ def _one_line(verb: str, error: Exception) -> int:
         return 2
     if isinstance(error, InputError) or expected:
         print(f"{name}: {flat(str(error))}", file=sys.stderr)
+        return 2
+    if type(error).__name__ == "ValidationError" and getattr(error, "title", "") == "Settings":
+        from api.settings import refusal  # here: most verbs need no settings of the service
+
+        print(f"{name}: {flat(refusal(error))}", file=sys.stderr)  # pyright: ignore[reportArgumentType]
         return 2
     if type(error).__name__ in ("LaunchError", "ReportedError") and isinstance(code, int):
         print(f"{name}: {flat(str(error))}", file=sys.stderr)

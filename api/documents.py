@@ -112,8 +112,11 @@ class ExperimentOut(Document):
 
 
 class DiagnosisOut(Document):
-    """What is missing."""
+    """What is missing in a model's structure."""
 
+    structure: list[str] | None = Field(
+        None, description="effects of the structure criticised, `id` or `id:form`; null: made when it was always plain"
+    )
     verdict: Literal["effect_missing", "nothing_missing", "unexplained_structure"]
     noise_sd_nm: float | None = None
     base: dict[str, Any] = {}

@@ -34,7 +34,11 @@ def fit(
     progress(0.05, "reading the recording")
     record = identify.read(Path(data))
     progress(0.2, "identifying")
-    model = identify.fit(record, method=method, effects=tuple(effects), fit_on=fit_on)
+
+    def further(share: float, text: str = "") -> None:
+        progress(0.2 + 0.8 * share, text)
+
+    model = identify.fit(record, method=method, effects=tuple(effects), fit_on=fit_on, progress=further)
     return {"json": model.to_json(), "model": model.to_dict()}
 
 
@@ -112,9 +116,10 @@ def step_response(document: dict[str, Any], seconds: float = 4.0) -> dict[str, l
     count = max(2, round(seconds * rate_hz))
     response = np.asarray(lfilter(linear["b"], linear["a"], np.ones(count)))
     delay = int(linear.get("delay_samples", 0))
-    response = np.concatenate([np.zeros(delay), response])[:count]
+    # A pulse may act up to a sample before it is written down: then the response begins within itself.
+    response = np.concatenate([np.zeros(max(delay, 0)), response[max(-delay, 0) :]])[:count]
     pick = slice(None, None, max(1, count // 400))
-    return {"time_s": (np.arange(count) / rate_hz)[pick].tolist(), "response": response[pick].round(6).tolist()}
+    return {"time_s": (np.arange(response.size) / rate_hz)[pick].tolist(), "response": response[pick].round(6).tolist()}
 
 
 def effects(progress: Progress) -> dict[str, Any]:

@@ -10,24 +10,28 @@ from pathlib import Path
 from typing import Any
 
 from api.cleaning import clean
+from api.structure import held_by
 
 Progress = Callable[[float, str], None]
 POINTS = 900
 """Points of a signature's curve: it is drawn small."""
 
 
-def diagnosis(data: str, progress: Progress) -> dict[str, Any]:
-    """What is missing in the model of a recording, what each effect would explain, and the test that decides.
+def diagnosis(data: str, progress: Progress, model_json: str | None = None) -> dict[str, Any]:
+    """What is missing in a model's structure, what each effect would explain, and the test that decides.
 
-    The first four fifths of the progress are identify's diagnosis.
+    Without a model it is the plain structure. The first four fifths of the progress are identify's diagnosis.
     """
     import identify
 
     record = identify.read(Path(data))
-    found = identify.diagnose(record, progress=lambda share, text="": progress(0.8 * share, text)).to_dict()
+    model = None if model_json is None else identify.Model.from_json(model_json)
+    structure = held_by(model, record)
+    found = identify.diagnose(record, model, lambda share, text="": progress(0.8 * share, text)).to_dict()
+    found["structure"] = structure
     found["library"] = {entry["id"]: entry for entry in library() if entry["id"] in mentioned(found)}
     progress(0.82, "what each effect would explain")
-    found["signatures"] = signatures(record, [entry["effect"] for entry in found["missing"]])
+    found["signatures"] = signatures(record, [entry["effect"] for entry in found["missing"]], structure)
     found["experiment"] = experiment(found["missing"])
     return clean(found)
 
@@ -46,11 +50,11 @@ def mentioned(found: dict[str, Any]) -> set[str]:
     return named | {row["effect"] for rows in found.get("candidates") or [] for row in rows}
 
 
-def signatures(record: Any, effects: Sequence[str]) -> dict[str, Any]:
+def signatures(record: Any, effects: Sequence[str], structure: Sequence[str] = ()) -> dict[str, Any]:
     """What each effect explains of what the model before it leaves: seen beside expected.
 
     ``seen_nm`` is measurement minus the model before, ``expected_nm`` the model with the effect minus the model before.
-    An effect whose model cannot be fitted alone has none.
+    The first model is the structure criticised. An effect whose model cannot be fitted alone has none.
     """
     import numpy as np
 
@@ -58,7 +62,8 @@ def signatures(record: Any, effects: Sequence[str]) -> dict[str, Any]:
 
     pick = slice(None, None, max(1, -(-record.time_s.size // POINTS)))
     found: dict[str, Any] = {"time_s": record.time_s[pick].round(4)}
-    before, held = np.asarray(identify.predict(identify.fit(record), record)), []
+    held = list(structure)
+    before = np.asarray(identify.predict(identify.fit(record, effects=held), record))
     for effect in effects:
         held.append(effect)
         try:
@@ -90,12 +95,14 @@ def experiment(missing: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
     return None
 
 
-def improve(data: str, progress: Progress, force: Sequence[str] = ()) -> dict[str, Any]:
-    """Effects added one by one while the evidence lasts, each step with its model."""
+def improve(data: str, progress: Progress, force: Sequence[str] = (), model_json: str | None = None) -> dict[str, Any]:
+    """Effects added to a model's structure one by one while the evidence lasts, each step with its model."""
     import identify
 
     record = identify.read(Path(data))
-    return identify.improve(record, progress=progress, force=tuple(force)).to_dict()
+    model = None if model_json is None else identify.Model.from_json(model_json)
+    structure = held_by(model, record)
+    return {**identify.improve(record, progress, force=tuple(force), model=model).to_dict(), "structure": structure}
 
 
 def joined(parts: Sequence[str], out: str, progress: Progress) -> dict[str, Any]:

@@ -101,12 +101,14 @@ class Outcomes:
             reason = f"joining the recordings: {error.detail or error.title}"
             await asyncio.to_thread(self.update, test_id, state="failed", reason=reason)
             return
-        job = self.fitting.submit(
-            "fit", urgent=True, data=recording.path, on_progress=lambda _job: self.on_progress(test_id)
-        )
-        self.jobs[test_id] = job
+
+        def take(job: Job) -> None:
+            self.jobs[test_id] = job
+
         try:
-            found = await job.result
+            found, warning = await self.analyses.beginnings.fit(
+                row.participant, recording.path, take, urgent=True, on_progress=lambda _job: self.on_progress(test_id)
+            )
         except ApiError as error:
             reason = f"identification: {error.detail or error.title}"
             await asyncio.to_thread(self.update, test_id, state="failed", reason=reason)
@@ -117,6 +119,8 @@ class Outcomes:
             self.versions.add, found["json"], row.participant, recording.id, f"test {test_id}", parent
         )
         summary = dict(row.summary)
+        if warning:
+            summary["warnings"] = [*(summary.get("warnings") or []), warning]
         if last_sample_unix_s is not None:
             summary["last_sample_to_model_s"] = round(self.clock.unix_s() - last_sample_unix_s, 3)
         await asyncio.to_thread(self.update, test_id, state="completed", model_id=model.id, summary=summary)

@@ -17,11 +17,11 @@ import uvicorn
 from pydantic import ValidationError
 from starlette.types import ASGIApp
 
-from api import logs
+from api import beginnings, logs
 from api.app import create_app
 from api.errors import ApiError
 from api.lock import ServiceLock
-from api.settings import Settings
+from api.settings import Settings, refusal
 from api.visitors import protocol, raise_file_limit
 
 
@@ -37,11 +37,10 @@ def main() -> int:
         listener = bind(settings.host, settings.port)
         url = address_of(listener)
         lock.tell(url)
+        asyncio.run(beginnings.refuse_unknown(settings))  # before a first token is drawn: it is told only once
         app = create_app(settings, lock=lock)
     except ValidationError as error:
-        first = error.errors()[0]
-        name = "STIMRIG_" + "_".join(str(part) for part in first["loc"]).upper()
-        print(f"stimrig: {name}: {first['msg']}, not {first['input']!r}", file=sys.stderr)
+        print(f"stimrig: {refusal(error)}", file=sys.stderr)
         return 2
     except (ApiError, OSError) as error:
         print(f"stimrig: {error}", file=sys.stderr)

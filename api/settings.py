@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import Field, SecretStr
-from pydantic_settings import BaseSettings, SettingsConfigDict
+from pydantic import Field, SecretStr, ValidationError, field_validator
+from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 
 class Settings(BaseSettings):
@@ -31,6 +32,22 @@ class Settings(BaseSettings):
     tls_proxy: bool = Field(default=False, description="True: a TLS proxy stands in front; needed to leave loopback")
     max_upload_mb: Annotated[float, Field(gt=0)] = 64.0
     effects_dir: Path | None = Field(default=None, description="folder of the users' own effects")
+    structure: Annotated[tuple[str, ...], NoDecode] = Field(
+        default=(), description="effects, comma-separated, that a new participant's models begin with; default: none"
+    )
+
+    @field_validator("structure", mode="before")
+    @classmethod
+    def _separated(cls, given: object) -> object:
+        """A comma-separated text, as it stands in the environment; each effect once."""
+        named = [part.strip() for part in given.split(",")] if isinstance(given, str) else given
+        if not isinstance(named, list | tuple):
+            return named
+        named = [name for name in named if name]
+        odd = next((name for name in named if not re.fullmatch(r"[a-z0-9_]{1,64}", str(name))), None)
+        if odd is not None:
+            raise ValueError(f"{odd} is no effect's id (see `stimrig effects`); give ids, separated by commas")
+        return tuple(dict.fromkeys(named))
 
     @property
     def database(self) -> str:
@@ -51,3 +68,10 @@ class Settings(BaseSettings):
     def logs_dir(self) -> Path:
         """Where each process writes its log."""
         return self.data_dir / "logs"
+
+
+def refusal(error: ValidationError) -> str:
+    """Which setting does not hold, in one line, by the name of its environment variable."""
+    first = error.errors()[0]
+    name = "STIMRIG_" + "_".join(str(part) for part in first["loc"]).upper()
+    return f"{name}: {first['msg'].removeprefix('Value error, ')}, not {first['input']!r}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sys
+import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,6 +13,11 @@ from typing import Annotated, Any
 import typer
 
 LARGEST_MODEL_BYTES = 32 * 2**20
+PATIENCE_S = 1.0
+"""What takes no longer shows no progress."""
+LEAST_PACE = 0.05
+"""Share from which the time that passed says how long it takes."""
+CLEARED = "\r\x1b[K"
 
 
 class InputError(Exception):
@@ -97,15 +103,35 @@ def table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
 
 
 def progress_line() -> Callable[[float, str], None]:
-    """A progress line on standard error, where a person looks at it."""
-    shown = sys.stderr.isatty()
+    """A line on standard error where a person looks at it: how far, how long yet; gone once all is done.
+
+    What ends within a second shows none.
+    """
+    shown, begun_s = sys.stderr.isatty(), time.monotonic()
 
     def progress(fraction: float, text: str = "") -> None:
-        if shown:
-            end = "\n" if fraction >= 1 else ""
-            print(f"\r\x1b[K{100 * fraction:3.0f} %  {text[:90]}", end=end, file=sys.stderr, flush=True)
+        passed_s = time.monotonic() - begun_s
+        if not shown or passed_s < PATIENCE_S:
+            return
+        line = "" if fraction >= 1 else progress_words(fraction, passed_s, text)
+        print(f"{CLEARED}{line}", end="", file=sys.stderr, flush=True)
 
     return progress
+
+
+def progress_words(fraction: float, passed_s: float, text: str) -> str:
+    """The share that is done, the time that its pace leaves, and what is being done."""
+    left = ""
+    if fraction >= LEAST_PACE:
+        left_s = round(passed_s * (1.0 - fraction) / fraction)
+        left = f"about {left_s // 60} min {left_s % 60} s left" if left_s >= 60 else f"about {left_s} s left"
+    return f"{100 * fraction:3.0f} %  {left:22}  {text[:60]}".rstrip()
+
+
+def clear_progress() -> None:
+    """Take a progress line away before something else is said on standard error."""
+    if sys.stderr.isatty():
+        print(CLEARED, end="", file=sys.stderr, flush=True)
 
 
 def model_report(document: dict[str, Any]) -> list[str]:

@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 
 from identify.diagnosis.analysis import analyse
+from identify.diagnosis.candidates import Progress
 from identify.diagnosis.improvement import helpful
 from identify.diagnosis.steps import steps
+from identify.effects import get
 from identify.errors import BadRequest, NotIdentifiable
 from identify.estimation.adding import names, with_effects
 from identify.estimation.finish import finish
@@ -30,6 +32,7 @@ def fit(
     method: str = "maximum-likelihood",
     effects: Sequence[str] = (),
     fit_on: Sequence[str] | None = None,
+    progress: Progress | None = None,
     **options: Any,
 ) -> Model:
     """Fit a model to a record.
@@ -45,6 +48,8 @@ def fit(
         likelihood. "auto" adds those that the record asks for, as `improve` does.
     fit_on : sequence of str, optional
         Names of the segments to fit on; by default all but `validate`, or what the method needs.
+    progress : callable, optional
+        Called with a share of 0 to 1 and a line of text while effects are fitted; may raise `Cancelled`.
     **options
         Of the method; `identify.methods.methods()[id].options` tells.
 
@@ -64,7 +69,7 @@ def fit(
             if against:
                 message = f"effects are not fitted with {' and '.join(against)}"
                 raise BadRequest(message, place="effects", mend="Use maximum-likelihood without it.")
-            return _with_effects(record, wanted, names, options)
+            return _with_effects(record, wanted, names, options, progress or _quiet)
     except np.linalg.LinAlgError as error:
         raise NotIdentifiable(
             f"{method} finds no solution on this record ({error})", mend="Check that torque follows the pulses."
@@ -77,13 +82,33 @@ def fit(
 
 
 def _with_effects(
-    record: Record, wanted: Sequence[str], fit_on: tuple[str, ...] | None, options: dict[str, Any]
+    record: Record, wanted: Sequence[str], fit_on: tuple[str, ...] | None, options: dict[str, Any], progress: Progress
 ) -> Model:
     """Maximum likelihood with the effects named, each in its likeliest form, or in the one named after a colon."""
     grid, raw = prepare(record)
     rows = fitted_rows(grid, fit_on)
-    if list(wanted) == [AUTO]:
-        last = helpful(steps(analyse(record, fitted=rows)))[0][-1].fitted
+    if AUTO in wanted:
+        if len(wanted) > 1:
+            others = ", ".join(name for name in wanted if name != AUTO)
+            raise BadRequest(
+                f"{AUTO} chooses the effects itself, and {others} beside it",
+                place="effects",
+                mend="Give one or the other.",
+            )
+        last = helpful(steps(analyse(record, progress, fitted=rows)))[0][-1].fitted
+        progress(1.0, "done")
         return finish(MAXIMUM_LIKELIHOOD.id, last, [f"effects added: {', '.join(names(last)) or 'none'}"])
+    for name in wanted:
+        get(name.partition(":")[0])  # an unknown one is refused before anything is fitted
     base, reasons = MAXIMUM_LIKELIHOOD.start(grid, rows, options)
-    return finish(MAXIMUM_LIKELIHOOD.id, with_effects(base, wanted, raw), reasons)
+    for number, name in enumerate(wanted, start=1):
+        progress(number / (len(wanted) + 2), f"fitting {name.partition(':')[0].replace('_', ' ')}")
+        base = with_effects(base, [name], raw)
+    progress((len(wanted) + 1) / (len(wanted) + 2), "bands and tests of the residual")
+    model = finish(MAXIMUM_LIKELIHOOD.id, base, reasons)
+    progress(1.0, "done")
+    return model
+
+
+def _quiet(_share: float, _text: str) -> None:
+    pass

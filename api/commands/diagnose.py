@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any
 
 import typer
 
-from api.terminal import Data, Json, number, percent, progress_line, say, say_json
+from api.structure import in_words
+from api.terminal import Data, InputError, Json, load_model, number, percent, progress_line, say, say_json
 
 VERDICTS = {
     "effect_missing": "An effect is missing in the model.",
@@ -20,12 +22,33 @@ def register(app: typer.Typer) -> None:
     app.command("diagnose")(diagnose)
 
 
-def diagnose(data: Data, as_json: Json = False) -> None:
-    """What is missing in the model of this record, ranked; or that nothing is; or that it has no name here."""
+def diagnose(
+    data: Data,
+    model_json: Annotated[
+        Path | None,
+        typer.Option(
+            "--model",
+            help="MODEL.json whose structure is criticised: what it holds is fitted anew to the record; "
+            "default: the plain structure, f(u) and then G of second order",
+            metavar="MODEL.json",
+            show_default=False,
+        ),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """What is missing in a model's structure, ranked; or that nothing is; or that it has no name here."""
     import identify
+    from api.structure import held_by
 
+    model = None if model_json is None else load_model(model_json)
     record = identify.read(data)
-    found = identify.diagnose(record, progress=progress_line()).to_dict()
+    try:
+        structure = held_by(model, record)
+    except identify.IdentifyError as error:
+        raise InputError(f"{model_json}: {error}") from error
+    progress = progress_line()
+    found = {"structure": structure, **identify.diagnose(record, model, progress).to_dict()}
+    progress(1.0, "done")
     if as_json:
         say_json(found)
         return
@@ -38,8 +61,9 @@ def diagnosis_lines(found: dict[str, Any]) -> list[str]:
     lines = [
         VERDICTS.get(found["verdict"], found["verdict"]),
         "",
+        f"structure: {in_words(found['structure'])}",
         f"noise          {number(found['noise_sd_nm'], 4)} N·m",
-        f"base model     fit {percent(base.get('fit_percent'))}, rms {number(base.get('rms_nm'), 4)} N·m; "
+        f"as it is       fit {percent(base.get('fit_percent'))}, rms {number(base.get('rms_nm'), 4)} N·m; "
         f"held out {percent(base.get('held_out_fit_percent'))}, rms {number(base.get('held_out_rms_nm'), 4)} N·m",
     ]
     for effect in found.get("missing") or []:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from api.terminal import Data, Json, model_report, names, say, say_json, write
+from api.terminal import Data, Json, model_report, names, progress_line, say, say_json, write
 
 
 def register(app: typer.Typer) -> None:
@@ -21,7 +21,13 @@ def fit(
         str,
         typer.Option(help="maximum-likelihood, two-stage, ramp-deconvolution, separable-least-squares or narx"),
     ] = "maximum-likelihood",
-    effects: Annotated[str, typer.Option(help="effects around it, comma-separated (see `stimrig effects`)")] = "",
+    effects: Annotated[
+        str,
+        typer.Option(
+            help="effects around it, comma-separated (see `stimrig effects`), each `id` or `id:form`; or `auto`: those "
+            "that the record asks for, as `improve` adds them. With maximum-likelihood alone"
+        ),
+    ] = "",
     fit_on: Annotated[str, typer.Option(help="segments to fit on, comma-separated; never `validate`")] = "",
     output: Annotated[Path | None, typer.Option("-o", "--output", help="write MODEL.json here")] = None,
     as_json: Json = False,
@@ -30,7 +36,9 @@ def fit(
     import identify
 
     record = identify.read(data)
-    model = identify.fit(record, method=method, effects=names(effects), fit_on=names(fit_on) or None)
+    model = identify.fit(
+        record, method=method, effects=names(effects), fit_on=names(fit_on) or None, progress=progress_line()
+    )
     if output is not None:
         write(output, model.to_json())
     if as_json:

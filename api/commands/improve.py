@@ -23,11 +23,13 @@ def improve(
     output: Annotated[Path | None, typer.Option("-o", "--output", help="write the last MODEL.json here")] = None,
     as_json: Json = False,
 ) -> None:
-    """Add effects one by one while the held-out error falls; each step is a model."""
+    """Add effects one by one to the plain structure while the evidence lasts; each step is a model."""
     import identify
 
     record = identify.read(data)
-    improved = identify.improve(record, progress=progress_line())
+    progress = progress_line()
+    improved = identify.improve(record, progress=progress)
+    progress(1.0, "done")
     found, models = improved.to_dict(), improved.models
     del found["models"]
     if output is not None:

@@ -18,6 +18,7 @@ from api.pages.environment import environment
 from api.pages.render import page
 from api.routes import people, tokens
 from api.store.tables import AuditEntry
+from api.structure import in_words
 
 router = APIRouter(include_in_schema=False, prefix="/administration")
 NEWEST = 60
@@ -55,7 +56,10 @@ async def shown(request: Request, context: Context, key: dict[str, Any] | None =
         }
 
     found = await asyncio.to_thread(gather)
-    return page(request, "administration.html", **found, key=key, roles=MAY, now_utc=context.clock.utc())
+    structure = in_words(context.settings.structure)
+    return page(
+        request, "administration.html", **found, key=key, roles=MAY, now_utc=context.clock.utc(), structure=structure
+    )
 
 
 def role_of(scopes: list[str]) -> str:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from api.structure import in_words
+
 SPLITS = {
     "segment": "By segment",
     "level": "By level of pulse width",
@@ -40,6 +42,7 @@ def view(diagnosis: dict[str, Any], comparison: dict[str, Any] | None, effects: 
     return {
         **headline(diagnosis, missing, comparison, effects),
         "missing": [card(entry, library) for entry in missing],
+        "structure": in_words(diagnosis.get("structure") or []),
         "present": [{"id": effect, "name": name_of(effect, library)} for effect in effects],
         "places": [place(entry, number) for number, entry in enumerate(places, start=1)],
         "splits": splits(comparison),
@@ -196,13 +199,21 @@ def versions(rows: Sequence[dict[str, Any]], current: str) -> list[dict[str, Any
     return [
         {
             "id": row["id"],
-            "label": "base model" if not row["added_effect"] else f"+ {row['added_effect'].replace('_', ' ')}",
+            "label": label(row),
             "current": row["id"] == current,
             **{key: row.get(key) for key in ("rms_nm", "held_out_rms_nm", "noise_sd_nm", "fit_percent")},
             **{key: row.get(key) for key in ("held_out_fit_percent", "decision", "served", "created_utc")},
         }
         for row in rows
     ]
+
+
+def label(row: dict[str, Any]) -> str:
+    """What a version is, beside the one that it was made from."""
+    if row["added_effect"]:
+        return f"+ {row['added_effect'].replace('_', ' ')}"
+    begun_with = ", ".join(row.get("effects") or []).replace("_", " ")
+    return f"with {begun_with}" if begun_with else "base model"
 
 
 def of_steps(found: dict[str, Any]) -> list[dict[str, Any]]:

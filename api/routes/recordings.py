@@ -72,13 +72,13 @@ async def upload(context: Ctx, who: Tester, code: str, request: Request, respons
     """Take in a recording of another tool (CSV or HDF5 as the request's body) and identify a model from it."""
     await asyncio.to_thread(participants.find, context, code)
     data = await bounded_body(request, context.settings.max_upload_mb)
-    row, model = await take_in(context, code, data, who.name)
+    row, model, warning = await take_in(context, code, data, who.name)
     response.headers["Location"] = f"/v1/recordings/{row.id}"
-    return {"recording_id": row.id, "model": context.versions.public(model)}
+    return {"recording_id": row.id, "model": context.versions.public(model), "warnings": [warning] if warning else []}
 
 
-async def take_in(context: Context, code: str, data: bytes, by: str) -> tuple[Recording, Model]:
-    """Keep a recording of another tool and identify a model from it.
+async def take_in(context: Context, code: str, data: bytes, by: str) -> tuple[Recording, Model, str]:
+    """Keep a recording of another tool and identify a model from it; and what was left out of its structure.
 
     Raises
     ------
@@ -88,18 +88,18 @@ async def take_in(context: Context, code: str, data: bytes, by: str) -> tuple[Re
     whole = await asyncio.to_thread(_write, context, data)
     part = uploads.part_of(whole)
     try:
-        found = await _identified(context, part)
+        found, warning = await _identified(context, code, part)
     except BaseException:  # refused, or nobody waits for it any more
         part.unlink(missing_ok=True)
         raise
     row = await asyncio.shield(asyncio.to_thread(_store, context, code, whole, data, by))
-    return row, await asyncio.to_thread(context.versions.add, found["json"], code, row.id, by)
+    return row, await asyncio.to_thread(context.versions.add, found["json"], code, row.id, by), warning
 
 
-async def _identified(context: Context, path: Path) -> dict[str, Any]:
+async def _identified(context: Context, code: str, path: Path) -> tuple[dict[str, Any], str]:
     """The model of an upload; every reason why there is none is about the upload, and tells nothing of this machine."""
     try:
-        return await context.fitting.submit("fit", data=str(path)).result
+        return await context.analyses.beginnings.fit(code, str(path))
     except ApiError as error:
         if error.code == "worker-died":
             detail = f"{error.detail.partition('. ')[0]}. Is the file damaged? Nothing of it was kept."

@@ -10,6 +10,7 @@ import numpy as np
 from identify.diagnosis.candidates import Progress, scan
 from identify.diagnosis.structure import Left, left_over, quiet_rows
 from identify.diagnosis.thresholds import (
+    AFTER_LAWS,
     AT_WORK_ONLY,
     BORNE_OUT,
     DYNAMIC,
@@ -145,12 +146,11 @@ def seen_at_rest(quiet: np.ndarray, fitted: Fitted, effect: str) -> float:
 
 
 def _tempered(work: Analysis, candidate: Candidate) -> Candidate:
-    """An effort that only work shows counts for a little less than a law that explains as much."""
+    """An effort counts for a little less than a law that explains as much, and for less yet if only work shows it."""
     if candidate.effect.foreseeable or candidate.effect.band:
         return candidate
-    if candidate.form.stage != "additive" or _at_rest(work, candidate):
-        return candidate
-    return replace(candidate, gain=AT_WORK_ONLY * candidate.gain)
+    seen = candidate.form.stage != "additive" or _at_rest(work, candidate)
+    return replace(candidate, gain=(AFTER_LAWS if seen else AT_WORK_ONLY) * candidate.gain)
 
 
 def _at_rest(work: Analysis, candidate: Candidate) -> bool:

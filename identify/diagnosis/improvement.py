@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from identify.diagnosis import structure_of
 from identify.diagnosis.analysis import MOST, Analysis, analyse
 from identify.diagnosis.candidates import Progress
 from identify.diagnosis.steps import Step, steps
@@ -26,6 +27,7 @@ def improve(
     progress: Progress | None = None,
     max_effects: int | None = None,
     force: Sequence[str] = (),
+    model: Model | None = None,
 ) -> Improvement:
     """Models of a record, each with one effect more, up to as many as are there.
 
@@ -39,6 +41,8 @@ def improve(
         Effects at most.
     force : sequence of str
         Effects that a person wants added although the record doesn't ask for them; the held-out error then shows it.
+    model : Model or None
+        Whose structure is added to, fitted anew; the plain Hammerstein structure where none is given.
 
     Returns
     -------
@@ -48,11 +52,12 @@ def improve(
     Raises
     ------
     BadRequest
-        A forced effect is unknown.
+        A forced effect is unknown, or effects do not stand on the model given.
     """
     for effect in force:
         get(effect)
-    work = analyse(record, progress, most=MOST if max_effects is None else min(max_effects, MOST))
+    most = MOST if max_effects is None else min(max_effects, MOST)
+    work = analyse(record, progress, most=most, structure=structure_of(model))
     verdict = judge(work)
     row, against = helpful(steps(work))
     if max_effects is not None:
@@ -90,7 +95,8 @@ def helpful(row: list[Step]) -> tuple[list[Step], list[dict[str, Any]]]:
 
 def _reason(work: Analysis, step: Step) -> str:
     if step.added is None:
-        return "Recruitment and linear dynamics alone."
+        held = ", ".join(get(name).name.lower() for name in names(work.base))
+        return f"As given, with {held}." if held else "Recruitment and linear dynamics alone."
     if step.added in work.given:
         return "Seen in the raw samples."
     number = work.added.index(step.added)

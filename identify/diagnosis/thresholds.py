@@ -20,6 +20,8 @@ BORNE_OUT = 0.4
 """Share of a slow gain's evidence that a gain without a law must find, too."""
 PATCHER = 0.4
 """Of those that cannot be foreseen, and mend anything, more is asked for."""
+AFTER_LAWS = 0.92
+"""What evidence counts for efforts: of two that explain the same a law is believed, for it can be wrong elsewhere."""
 AT_WORK_ONLY = 0.85
 """What evidence counts for efforts of which the rests show nothing: they'd be the first to keep to the stimulation."""
 SEEN_AT_REST = 0.15

@@ -65,7 +65,8 @@ EXPERIMENT = {
 }  # fmt: skip
 
 
-def diagnosis() -> dict[str, Any]:
+def diagnosis(model_json: str | None = None) -> dict[str, Any]:
+    held = [effect["id"] for effect in json.loads(model_json)["effects"]] if model_json else []
     missing = {
         "effect": "fatigue", "name": "Fatigue", "probability": 0.93, "rms_before_nm": 0.12, "rms_after_nm": 0.041,
         "held_out_rms_before_nm": 0.2, "held_out_rms_after_nm": 0.042, "confused_with": ["threshold_drift"],
@@ -73,15 +74,23 @@ def diagnosis() -> dict[str, Any]:
         "parameters": {"depth": {"value": 0.4, "sd": 0.05, "unit": "1"}},
     }  # fmt: skip
     tried = [{"effect": name, "log_evidence_gain": gain} for name, gain in (("fatigue", 90.0), ("tremor", -4.0))]
-    return {
-        "verdict": "effect_missing", "noise_sd_nm": 0.04, "base": {}, "missing": [missing], "where": WHERE,
-        "candidates": [tried], "experiment": EXPERIMENT, "signatures": SIGNATURES, "library": {}, "notes": [],
+    found = {
+        "structure": held, "verdict": "effect_missing", "noise_sd_nm": 0.04, "base": {}, "missing": [missing],
+        "where": WHERE, "candidates": [tried], "experiment": EXPERIMENT, "signatures": SIGNATURES, "library": {},
+        "notes": [],
     }  # fmt: skip
+    if "fatigue" not in held:
+        return found
+    beside = [{"effect": "threshold_drift", "log_evidence_gain": 30.0}, tried[1]]
+    missing |= {"effect": "threshold_drift", "name": "Threshold drift", "confused_with": []}
+    return {**found, "missing": [missing], "candidates": [beside], "experiment": None, "signatures": {}}
 
 
-def improvement() -> dict[str, Any]:
-    steps = [{"added": added, "fit_percent": 97.0, "rms_nm": rms} for added, rms in ((None, 0.12), ("fatigue", 0.041))]
-    models = [model([]), model(["fatigue"])]
+def improvement(model_json: str | None = None) -> dict[str, Any]:
+    held = [effect["id"] for effect in json.loads(model_json)["effects"]] if model_json else []
+    new = "threshold_drift" if "fatigue" in held else "fatigue"
+    steps = [{"added": added, "fit_percent": 97.0, "rms_nm": rms} for added, rms in ((None, 0.12), (new, 0.041))]
+    models = [model(held), model([*held, new])]
     return {"verdict": "effect_missing", "noise_sd_nm": 0.04, "steps": steps, "models": models, "refused": []}
 
 
@@ -98,7 +107,7 @@ def answer(verb: str, arguments: dict[str, Any], say: Any) -> dict[str, Any]:
             }
         while (Path(arguments["data"]).parent / "fitting-slowly").exists():
             time.sleep(0.05)
-        document = model(list(arguments.get("effects", [])))
+        document = model([effect.partition(":")[0] for effect in arguments.get("effects", [])])
         return {"result": {"json": json.dumps(document), "model": document}}
     if verb == "comparison":
         return {"result": comparison()}
@@ -109,10 +118,10 @@ def answer(verb: str, arguments: dict[str, Any], say: Any) -> dict[str, Any]:
         say(progress=float(slow.read_text()) if slow.exists() else 0.5, text="trying fatigue")
         if slow.exists():
             time.sleep(60)
-        return {"result": diagnosis()}
+        return {"result": diagnosis(arguments.get("model_json"))}
     if verb == "improve":
         say(progress=0.5, text="adding fatigue")
-        return {"result": improvement()}
+        return {"result": improvement(arguments.get("model_json"))}
     if verb == "join":
         Path(arguments["out"]).write_text("\n".join(arguments["parts"]))
         return {"result": {"file_sha256": "0" * 64}}

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from api import cli
+from api import cli, terminal
 from tests.api.test_worker import made_up_csv
 
 GOOD = ["time_s,pulse_width_us,torque_nm,segment"] + [
@@ -122,6 +122,11 @@ def test_half_written_recording(capsys: pytest.CaptureFixture[str], tmp_path: Pa
         (["fit", "{record}", "--method", "magic"], "magic"),
         (["fit", "{record}", "--effects", "phlogiston"], "phlogiston"),
         (["fit", "{record}", "--fit-on", "polka"], "polka"),
+        (["fit", "{record}", "--effects", "auto,tremor"], "tremor"),
+        (["fit", "{record}", "--effects", "auto", "--method", "narx"], "narx"),
+        (["fit", "{record}", "--effects", "tremor,phlogiston"], "phlogiston"),
+        (["diagnose", "{record}", "--model", "nowhere.json"], "nowhere.json"),
+        (["diagnose", "{record}", "--model", "{record}"], "record.csv"),
         (["fit", "{record}", "-o", "/nowhere/at/all/M.json"], "/nowhere/at/all/M.json"),
         (["predict", "nowhere.json", "{record}", "-o", "x.csv"], "nowhere.json"),
         (["predict", "{record}", "{record}", "-o", "x.csv"], "record.csv"),
@@ -139,6 +144,35 @@ def test_bad_arguments_are_one_line(
 ) -> None:
     filled = [part.format(record=record, model=model) for part in arguments]
     assert named in refused(capsys, *filled)
+
+
+def test_diagnosis_refuses_a_model_it_cannot_criticise_on_this_record(
+    capsys: pytest.CaptureFixture[str], record: Path, model: Path, tmp_path: Path
+) -> None:
+    other, boxes = tmp_path / "other.json", tmp_path / "narx.json"
+    other.write_text(json.dumps({**json.loads(model.read_text()), "pulse_rate_hz": 25.0}))
+    words = refused(capsys, "diagnose", str(record), "--model", str(other))
+    assert "other.json" in words and "25 pulses a second" in words
+    assert cli.run(["fit", str(record), "--method", "narx", "-o", str(boxes)]) == 0
+    assert "effects do not stand on a model of narx" in refused(capsys, "diagnose", str(record), "--model", str(boxes))
+
+
+def test_progress_tells_share_and_time_left_after_a_second(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_s = [0.0]
+    monkeypatch.setattr("api.terminal.time.monotonic", lambda: now_s[0])
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
+    progress = terminal.progress_line()
+    for now_s[0], share in ((0.9, 0.1), (10.0, 0.25), (20.0, 0.02), (100.0, 0.5), (110.0, 1.0)):
+        progress(share, "tried tremor")
+    lines = capsys.readouterr().err.split(terminal.CLEARED)[1:]
+    assert [" ".join(line.split()) for line in lines] == [
+        "25 % about 30 s left tried tremor", "2 % tried tremor", "50 % about 1 min 40 s left tried tremor", "",
+    ]  # fmt: skip
+    monkeypatch.setattr("sys.stderr.isatty", lambda: False)
+    terminal.progress_line()(0.5, "into a file")
+    assert capsys.readouterr().err == ""
 
 
 def test_unforeseen_error_is_one_line_and_a_log(

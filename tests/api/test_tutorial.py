@@ -29,7 +29,7 @@ def test_every_block_runs_in_order(tmp_path: Path) -> None:
     (path,) = tmp_path.glob("*.csv")
     scope: dict[str, object] = {"path": path}
     pieces = blocks("python")
-    assert len(pieces) == 7
+    assert len(pieces) == 8
     for piece in pieces:
         exec(compile(piece, "tutorial.md", "exec"), scope)
     figure = notebook.plot(scope["better"])  # pyright: ignore[reportArgumentType]

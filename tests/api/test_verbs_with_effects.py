@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from api import missing
 from hardware_sim import hidden_records
 
 pytestmark = pytest.mark.slow
@@ -45,6 +46,24 @@ def test_improve_writes_a_model_that_predicts_better(tmp_path: Path) -> None:
         return float(np.sqrt(np.mean(np.square(gap))))
 
     assert rms_nm(better) < 0.5 * rms_nm(base)
+
+
+def test_what_a_model_holds_is_not_missing_in_it_and_auto_adds_what_improve_adds(tmp_path: Path) -> None:
+    record = hidden_records.generate("fatigue", "strong", seed=41, rate_hz=100)
+    data, held = tmp_path / "record.csv", tmp_path / "held.json"
+    hidden_records.write_csv(record, data)
+    fitted = json.loads(stimrig("fit", data, "--effects", "auto", "-o", held, "--json"))
+    improved = json.loads(stimrig("improve", data, "--json"))
+    added = [step["added"] for step in improved["steps"][1:]]
+    assert [effect["id"] for effect in fitted["effects"]] == added and "fatigue" in added
+    forms = [f"{effect['id']} ({effect['form']})" for effect in fitted["effects"]]
+    assert f"structure: {', '.join(forms)}\n" in stimrig("diagnose", data, "--model", held)
+    own = missing.diagnosis(str(data), lambda *_: None, held.read_text())
+    assert [name.partition(":")[0] for name in own["structure"]] == added
+    assert own["verdict"] == "nothing_missing" and own["missing"] == []
+    tried = {row["effect"] for rows in own["candidates"] for row in rows}
+    assert tried and not tried & set(added)
+    assert own["base"]["rms_nm"] == pytest.approx(fitted["fit"]["rms_nm"], rel=0.02)
 
 
 def test_fit_with_effects_gives_a_model_of_the_contract(tmp_path: Path) -> None:

@@ -147,6 +147,46 @@ def test_undo_of_what_was_not_in_use_approves_nothing(client: httpx.Client, mode
     assert client.get("/v1/participants/P017/model").status_code == 404
 
 
+# ---- a version's own structure ------------------------------------------------------------------------------
+
+
+def with_fatigue(client: httpx.Client, model: str) -> str:
+    return client.post(f"/v1/models/{model}/effects", json={"effects": ["fatigue"]}).json()["id"]
+
+
+def test_version_with_effects_is_criticised_with_them(client: httpx.Client, service: Service, model: str) -> None:
+    better = with_fatigue(client, model)
+    plain, own = (client.get(f"/v1/models/{name}/diagnosis").json() for name in (model, better))
+    assert (plain["structure"], [entry["effect"] for entry in plain["missing"]]) == ([], ["fatigue"])
+    assert (own["structure"], [entry["effect"] for entry in own["missing"]]) == (["fatigue"], ["threshold_drift"])
+    with signed_in(service) as browser:
+        page = browser.get(f"/models/{better}").text
+        assert "Structure criticised: fatigue" in page and 'id="effect-threshold_drift"' in page
+        assert 'id="effect-fatigue"' not in page
+        assert "Structure criticised: plain" in browser.get(f"/models/{model}").text
+    added = client.post(f"/v1/models/{better}/effects", json={"effects": ["threshold_drift"]})
+    assert added.status_code == 201 and added.json()["effects"] == ["fatigue", "threshold_drift"]
+
+
+def test_improving_a_version_adds_to_what_it_holds(client: httpx.Client, model: str) -> None:
+    better = with_fatigue(client, model)
+    rows = client.post(f"/v1/models/{better}/improve").json()["versions"]
+    assert rows[0]["id"] == better and rows[-1]["parent_id"] == better
+    assert rows[-1]["effects"] == ["fatigue", "threshold_drift"]
+
+
+def test_diagnosis_kept_before_structures_were_told_is_read(client: httpx.Client, service: Service, model: str) -> None:
+    """It was made of the plain structure, and kept with the first version."""
+    context = service.app.state.context
+    kept = until(lambda: context.analyses.known(model, "diagnosis"))
+    old = {key: value for key, value in kept.items() if key != "structure"} | {"noise_sd_nm": 0.123}
+    context.analyses._keep(model, "diagnosis", old)
+    assert client.get(f"/v1/models/{model}/diagnosis").json()["noise_sd_nm"] == 0.123
+    with signed_in(service) as browser:
+        assert "Structure criticised: plain" in browser.get(f"/models/{model}").text
+    assert client.get(f"/v1/models/{with_fatigue(client, model)}/diagnosis").json()["noise_sd_nm"] == 0.04
+
+
 def refusal(missing: list[dict[str, Any]], gains: list[list[tuple[str, float]]], effect: str) -> str | None:
     rounds = [[{"effect": name, "log_evidence_gain": gain} for name, gain in found] for found in gains]
     return evidence.refusal({"missing": missing, "candidates": rounds}, [], effect)
@@ -327,6 +367,7 @@ def test_real_worker_finds_what_is_missing_and_the_test_that_decides(tmp_path: P
     found = missing.diagnosis(path, lambda share, _text="": told.append(share))
     DiagnosisOut.model_validate(found)
     assert told == sorted(told) and told[-1] <= 1 and len(told) > 5
+    assert found["structure"] == []
     model = fit(path, lambda *_: None)
     compared = comparison(path, lambda *_: None, model["json"])
     ComparisonOut.model_validate(compared)
