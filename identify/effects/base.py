@@ -243,7 +243,6 @@ class Effect:
     band : bool
         Whether it is a narrow band of noise: sought in the residual's spectrum, and part of the noise while others are
         weighed.
-        Kinds of sequence that show it best.
     seen : callable or None
         `seen(raw)`: the form and its parameters where the raw samples show the effect beyond doubt, else None; `raw` is
         what `identify.estimation.prepare.inspect` saw. It is then taken as there, before any fit.
