@@ -10,7 +10,6 @@ import numpy as np
 from identify.diagnosis.analysis import analyse
 from identify.diagnosis.candidates import Progress
 from identify.diagnosis.improvement import helpful
-from identify.diagnosis.steps import steps
 from identify.effects import get
 from identify.errors import BadRequest, NotIdentifiable
 from identify.estimation.adding import names, with_effects
@@ -95,7 +94,7 @@ def _with_effects(
                 place="effects",
                 mend="Give one or the other.",
             )
-        last = helpful(steps(analyse(record, progress, fitted=rows)))[0][-1].fitted
+        last = helpful(analyse(record, progress, fitted=rows))[0][-1].fitted
         progress(1.0, "done")
         return finish(MAXIMUM_LIKELIHOOD.id, last, [f"effects added: {', '.join(names(last)) or 'none'}"])
     for name in wanted:

@@ -59,7 +59,7 @@ def improve(
     most = MOST if max_effects is None else min(max_effects, MOST)
     work = analyse(record, progress, most=most, structure=structure_of(model))
     verdict = judge(work)
-    row, against = helpful(steps(work))
+    row, against = helpful(work)
     if max_effects is not None:
         row = row[: max_effects + 1]
     reasons = [_reason(work, step) for step in row]
@@ -83,9 +83,10 @@ def improve(
     )
 
 
-def helpful(row: list[Step]) -> tuple[list[Step], list[dict[str, Any]]]:
+def helpful(work: Analysis) -> tuple[list[Step], list[dict[str, Any]]]:
     """The steps up to the first after which the error on rows not seen rises; and what is refused for that."""
-    for number in range(1, len(row)):
+    row = steps(work)
+    for number in range(1 + len(work.given), len(row)):
         before, after = (row[i].figures["held_out_rms_nm"] for i in (number - 1, number))
         if after is not None and before is not None and after > RISE * before:
             reason = f"The error on rows not seen would rise from {before:.3g} to {after:.3g} N·m."

@@ -145,8 +145,9 @@ def _plain(
     noise = work.raw.noise_sd_nm
     held = " and ".join(get(name).name.lower() for name in names(work.base))
     lines = [
-        f"The model {f'with {held}' if held else 'without effects'} fits {base['fit_percent']:.1f} % where noise of {noise:.3g} N·m allows "
-        f"{base['ceiling_percent']:.1f} %; on rows not fitted it errs by {base['held_out_rms_nm']:.3g} N·m."
+        f"The model {f'with {held}' if held else 'without effects'} fits {base['fit_percent']:.1f} % where noise of "
+        f"{noise:.3g} N·m allows {base['ceiling_percent']:.1f} %; on rows not fitted it errs by "
+        f"{base['held_out_rms_nm']:.3g} N·m."
     ]
     if verdict.kind == "nothing_missing":
         lines.append("Nothing is missing: what is left looks like noise, at work and at rest alike.")

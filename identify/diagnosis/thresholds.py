@@ -74,6 +74,8 @@ CLOSE = 0.8
 """Share of the best one's gain from which an effect that resembles it is named beside it."""
 RIVAL = 0.04
 """Probability from which an effect is named as one that the record can't tell from the best."""
+LEAST_WIDTHS = 8
+"""Pulse widths fitted, of fewer than which nothing is said of others."""
 LEAST_ROWS = 40
 """Intervals, a second at 40 pulses/s: of fewer nothing is said."""
 RISE = 1.05

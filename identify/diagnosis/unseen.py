@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from identify.diagnosis.thresholds import LEAST_ROWS
+from identify.diagnosis.thresholds import LEAST_ROWS, LEAST_WIDTHS
 from identify.effects import get
 from identify.estimation.joint import Fitted
 
@@ -43,12 +43,15 @@ class Unseen:
 def unseen(fitted: Fitted) -> Unseen | None:
     """The model on the intervals held out; None where there are none, or where a tremor is everywhere.
 
+    None, too, where so few widths were fitted that the curve between them is a guess.
+
     Efforts cannot be foreseen, but they are seldom: beside them the error is that of most intervals, the median.
     """
     setup = fitted.problem.setup
     grid = setup.grid
     rows = grid.held_out & ~grid.doubted & (2 * grid.count >= np.median(grid.count[setup.fitted]))
-    if rows.sum() < LEAST_ROWS or fitted.noise.band > 0.0:
+    few = np.unique(grid.pulse_width_us[setup.fitted]).size < LEAST_WIDTHS
+    if few or rows.sum() < LEAST_ROWS or fitted.noise.band > 0.0:
         return None
     residual = fitted.residual_nm[rows]
     scale = 1.0 / np.sqrt(np.maximum(np.diag(fitted.hessian), 1e-300))

@@ -338,7 +338,7 @@ def _applied(
     """Width of each interval, its lateness, and where it is not known what was applied.
 
     Where samples are missing the pulses tell, if the record has them. Else the last width seen is taken to be in force
-    still, and what comes after is doubted until a muscle has forgotten it, unless nothing was applied before and after.
+    still, and what comes after is doubted until a muscle has forgotten it.
     """
     width = record.pulse_width_us[middle]
     late = np.zeros(width.size) if record.late_s is None else record.late_s[middle]
@@ -353,9 +353,9 @@ def _applied(
             target[gaps] = told[gaps]
     elif gaps.any():
         for gap in runs(gaps):
-            if width[gap.start - 1] or width[min(gap.stop, width.size - 1)]:
-                after = slice(gap.start, gap.stop + round(FORGOTTEN_S / step_s))
-                doubted[after] |= part[after] == part[gap.start]
+            # Also between two rests: a part of a test may have been cut out.
+            after = slice(gap.start, gap.stop + round(FORGOTTEN_S / step_s))
+            doubted[after] |= part[after] == part[gap.start]
     return width, late if late.any() else None, doubted
 
 
