@@ -239,20 +239,10 @@ def test_without_the_ramp_where_its_pulses_are_known():
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(
-    strict=True,
-    reason="between two rests a gap is taken for rest: the torque that the PRBS left is named voluntary_effort at "
-    "0.96, and the fit's T is twice as long",
-)
 def test_without_the_prbs_where_nobody_knows_its_pulses():
     assert said(without(PRBS, pulses=False)(record_of("")))[:2] == answer("")[:2]
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(
-    strict=True,
-    reason="two widths are fitted and validate has eighteen: the error there, 0.46 N·m, is 17 times what is allowed, "
-    "since what is allowed knows nothing of the curve between two widths; unexplained_structure",
-)
 def test_without_the_ramp_where_nobody_knows_its_pulses():
     assert said(without(RAMP, pulses=False)(record_of("")))[:2] == answer("")[:2]
