@@ -250,7 +250,8 @@ def test_worker_joins_by_begin_and_leaves_a_file_with_the_parts(tmp_path: Path) 
     assert joined.sample_rate_hz == pytest.approx(400, abs=0.01)
     assert joined.parts[1].pause_s == pytest.approx(594.0, abs=0.03) and joined.parts[1].folded_s == 30.0
     assert joined.parts[0].begun_s == pytest.approx(1767225600.25)
-    assert identify.fit(joined).baseline_nm == pytest.approx(0.0, abs=0.05)
+    # Torque that follows at once is no second order: its zero is found to a fiftieth of its 5 N·m.
+    assert identify.fit(joined).baseline_nm == pytest.approx(0.0, abs=0.1)
     missing.joined(paths[::-1], str(exported), lambda *_: None)
     assert exported.read_bytes() == out.read_bytes()
     jobs.export_csv(str(out), lambda *_: None, str(exported))
