@@ -63,6 +63,9 @@ def fit(
     try:
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             if not wanted:
+                if len(record.parts) > 1 and chosen is not MAXIMUM_LIKELIHOOD:
+                    message = f"{method} takes one recording; this one is joined of {len(record.parts)}"
+                    raise BadRequest(message, place="method", mend="Use maximum-likelihood, or one of its parts.")
                 return chosen.fit(prepare(record)[0], names, **options)
             against = [method] if chosen is not MAXIMUM_LIKELIHOOD else sorted(set(options) & NO_EFFECTS_WITH)
             if against:
@@ -94,6 +97,9 @@ def _with_effects(
                 place="effects",
                 mend="Give one or the other.",
             )
+        if options:
+            given = ", ".join(sorted(options))
+            raise BadRequest(f"{AUTO} takes no options, and {given} is given", place="effects", mend="Leave it out.")
         last = helpful(analyse(record, progress, fitted=rows))[0][-1].fitted
         progress(1.0, "done")
         return finish(MAXIMUM_LIKELIHOOD.id, last, [f"effects added: {', '.join(names(last)) or 'none'}"])

@@ -109,7 +109,7 @@ def _series(model: Model, record: Record, predicted: np.ndarray, noise: float) -
 def _band(model: Model, record: Record, predicted: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray]:
     """95 % band for a measured sample: the model's uncertainty, where it carries one, and the noise."""
     half = np.full(predicted.size, BAND * noise)
-    if model.covariance is not None and not model.effects:
+    if model.covariance is not None:
         from identify.estimation.uncertainty import prediction_band
 
         lower, upper = prediction_band(model, record)

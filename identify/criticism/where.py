@@ -62,7 +62,9 @@ def worst_places(
     merged = _merge(pieces, record)
     merged.sort(key=lambda piece: -piece[2])
     return [
-        _place(record, residual_nm, piece, excess_total) for piece in merged[:most] if piece[2] > 0.02 * excess_total
+        _place(record, residual_nm, rows, piece, excess_total)
+        for piece in merged[:most]
+        if piece[2] > 0.02 * excess_total
     ]
 
 
@@ -89,11 +91,12 @@ def _merge(pieces: list[list[Any]], record: Record) -> list[list[Any]]:
     return result
 
 
-def _place(record: Record, residual_nm: np.ndarray, piece: list[Any], total: float) -> dict[str, Any]:
+def _place(record: Record, residual_nm: np.ndarray, rows: np.ndarray, piece: list[Any], total: float) -> dict[str, Any]:
     start, stop, excess, sign = piece[:4]
     name = record.segment_names[int(record.segment[start])]
     widths = record.pulse_width_us[start:stop]
-    error = float(np.mean(residual_nm[start:stop]))
+    looked_at = residual_nm[start:stop][rows[start:stop]]
+    error = float(np.mean(looked_at))
     direction = {1: "rising", -1: "falling", 0: "held"}[sign]
     share = excess / total
     return {
@@ -104,7 +107,7 @@ def _place(record: Record, residual_nm: np.ndarray, piece: list[Any], total: flo
         "direction": direction,
         "share_of_excess": float(share),
         "mean_error_nm": error,
-        "text": _words(name, widths, direction, error, float(np.sqrt(np.mean(residual_nm[start:stop] ** 2))), share),
+        "text": _words(name, widths, direction, error, float(np.sqrt(np.mean(looked_at**2))), share),
     }
 
 

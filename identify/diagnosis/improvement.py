@@ -12,8 +12,9 @@ from identify.diagnosis.steps import Step, steps
 from identify.diagnosis.thresholds import RISE
 from identify.diagnosis.verdict import judge
 from identify.effects import get
-from identify.estimation.adding import names, try_effect
+from identify.estimation.adding import add, names
 from identify.estimation.finish import finish
+from identify.estimation.prepare import Raw
 from identify.estimation.statistics import statistics
 from identify.model import Model
 from identify.records.record import Record
@@ -53,6 +54,8 @@ def improve(
     ------
     BadRequest
         A forced effect is unknown, or effects do not stand on the model given.
+    NotIdentifiable
+        A forced effect needs a column that the record lacks, or nothing in the record looks like it.
     """
     for effect in force:
         get(effect)
@@ -64,7 +67,7 @@ def improve(
         row = row[: max_effects + 1]
     reasons = [_reason(work, step) for step in row]
     for effect in force:
-        step = _forced(row[-1], effect)
+        step = _forced(row[-1], effect, work.raw)
         if step is not None:
             row.append(step)
             reasons.append("Added because a person asked for it; the record doesn't.")
@@ -128,13 +131,11 @@ def refused(work: Analysis) -> list[dict[str, Any]]:
     return rows
 
 
-def _forced(last: Step, effect: str) -> Step | None:
+def _forced(last: Step, effect: str, raw: Raw) -> Step | None:
     if effect in names(last.fitted):
         return None
-    candidate = try_effect(get(effect), last.fitted)
-    if candidate is None:
-        return None
-    return Step(effect, candidate.fitted, statistics(candidate.fitted))
+    fitted = add(last.fitted, get(effect), "", raw)
+    return Step(effect, fitted, statistics(fitted))
 
 
 def _models(row: list[Step]) -> list[Model]:

@@ -32,7 +32,7 @@ from identify.diagnosis.thresholds import (
 )
 from identify.diagnosis.unseen import Unseen, unseen
 from identify.effects import get
-from identify.estimation.adding import Candidate
+from identify.estimation.adding import Candidate, names
 
 
 @dataclass(frozen=True)
@@ -119,8 +119,8 @@ def _efforts(parameters: dict[str, float]) -> int:
 
 def _unhelpful(work: Analysis, number: int) -> bool:
     """Whether the error on rows not seen rises with the effect added in this round."""
-    if number + 1 >= len(work.chain):
-        return False
+    if number + 1 >= len(work.chain) or work.added[number] not in names(work.chain[number + 1]):
+        return False  # it took the place of one that was there then
     before, after = unseen(work.chain[number]), unseen(work.chain[number + 1])
     return (
         before is not None and after is not None and after.rms_nm > UNSEEN_RISE * max(before.rms_nm, after.allowed_nm)

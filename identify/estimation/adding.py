@@ -153,7 +153,8 @@ def add(base: Fitted, effect: Effect, form: str, raw: Raw) -> Fitted:
         if identifier == effect.id:
             problem = Problem(base.problem.setup, [*base.effects, (identifier, seen)])
             return solve(problem, start_from(problem, base, {len(base.effects): values}), base.noise)
-    found = try_effect(effect, base, forms)
+    # What only the raw samples show is not there where they do not.
+    found = None if any(form.settled for form in forms) else try_effect(effect, base, forms)
     if found is None:
         raise NotIdentifiable(f"nothing in the record looks like {effect.id}", mend="Leave it out.")
     return found.fitted

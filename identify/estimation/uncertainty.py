@@ -76,7 +76,7 @@ def prediction_band(model: Model, record: Record) -> tuple[np.ndarray, np.ndarra
     if covariance is None or not isinstance(linear, SecondOrder):
         raise ValueError("this model carries no covariance")
     grid = make_grid(record)
-    return _around(model, record, grid, _sd(slopes(model, grid, len(covariance.names)), covariance))
+    return _around(model, record, grid, _sd(slopes(model, grid, covariance.names), covariance))
 
 
 def _around(model: Model, record: Record, grid: Grid, sd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

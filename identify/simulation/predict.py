@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -127,17 +128,28 @@ def problem_of(model: Muscle, grid: Grid) -> tuple[Problem, np.ndarray]:
     return problem, problem.from_physical(values)
 
 
-def slopes(model: Muscle, grid: Grid, known: int) -> np.ndarray:
-    """Derivatives of each interval's mean torque by the first `known` parameters, shape (K, known)."""
+def slopes(model: Muscle, grid: Grid, names: Sequence[str]) -> np.ndarray:
+    """Derivatives of each interval's mean torque by named parameters of the model, shape (K, len(names)).
+
+    On another record the beginning of the model's own does not matter, and its baseline holds for all parts.
+    """
     problem, theta = problem_of(model, grid)
     jacobian = problem.run(theta, derivatives=True)[1]
     assert jacobian is not None
     # In the record's own sign the parameters in N·m turn with the torque: the same derivative.
-    turned = np.ones(known)
+    turned = np.ones(problem.size)
     turned[:3] = problem.setup.sign
     turned[problem.coefficients.stop :] = problem.setup.sign
-    per_unit = np.where(problem.log, problem.physical(theta), 1.0)[:known]
-    return (jacobian[:known] * (turned / per_unit)[:, None]).T
+    jacobian = jacobian * (turned / np.where(problem.log, problem.physical(theta), 1.0))[:, None]
+    if not same_data(model, grid.record):
+        jacobian[problem.baselines.start] = jacobian[list(problem.baselines)].sum(axis=0)
+        jacobian[problem.baselines.start + 1 : problem.initials.stop] = 0.0
+    place = {name: at for at, name in enumerate(problem.names)}
+    found = np.zeros((grid.size, len(names)))
+    for column, name in enumerate(names):
+        if name in place:
+            found[:, column] = jacobian[place[name]]
+    return found
 
 
 def refuse_rate(model: Muscle, record: Record) -> None:

@@ -49,4 +49,4 @@ def test_biceps_example_on_the_measured_data():
     said = run(SHARED)
     assert "20 trains" in said
     assert float(said.split("fit ")[1].split(" %")[0]) > 65
-    assert "usable with care" in said
+    assert "not usable" in said
