@@ -19,7 +19,8 @@ def diagnose(record: Record, model: Model | None = None, progress: Progress | No
     Parameters
     ----------
     record : Record
-        Pulse widths and torque; rows of `validate` are never used to fit or to choose.
+        Pulse widths and torque; rows of `validate` are never used to fit or to choose an effect; they may
+        only speak against one.
     model : Model or None
         Whose structure is criticised: its effects in their forms, fitted to this record. The plain Hammerstein
         structure where none is given.

@@ -11,7 +11,7 @@ import numpy as np
 from identify.errors import BadRecord
 
 HELD_OUT = "validate"
-"""Rows of this segment are never used to fit or to choose."""
+"""Rows of this segment are never used to fit or to choose an effect; they may only speak against one."""
 OPTIONAL = ("angle_rad", "velocity_rad_s", "late_s", "doubted")
 """Every column that a record may have or not: what cuts, joins or copies records goes by this list and loses none."""
 FORGOTTEN_S = 1.5
