@@ -56,10 +56,16 @@ def fit(
     ------
     BadRequest, BadRecord, NotIdentifiable
     """
-    names = None if fit_on is None else tuple(fit_on)
+    names = None if fit_on is None else (fit_on,) if isinstance(fit_on, str) else tuple(fit_on)
+    if names is not None and not names:
+        raise BadRequest("no segment is named", place="fit_on", mend="Name segments, or leave fit_on out.")
     chosen = method_of(method)
     known_options(chosen, options)
-    wanted = [effects] if isinstance(effects, str) else list(effects)
+    wanted = [effects] if isinstance(effects, str) else list(effects or ())
+    twice = {name for name in wanted if wanted.count(name) > 1}
+    if twice or not all(isinstance(name, str) for name in wanted):
+        given = ", ".join(map(str, sorted(twice, key=str) or wanted))
+        raise BadRequest(f"{given} is no list of different effects", place="effects", mend="Name each effect once.")
     try:
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             if not wanted:

@@ -74,8 +74,10 @@ CLOSE = 0.8
 """Share of the best one's gain from which an effect that resembles it is named beside it."""
 RIVAL = 0.04
 """Probability from which an effect is named as one that the record can't tell from the best."""
-LEAST_WIDTHS = 8
-"""Pulse widths fitted, of fewer than which nothing is said of others."""
+NEAR = 0.02
+"""Distance to a width that was fitted, as a share of the largest, beyond which the curve is a guess."""
+FORM = 0.01
+"""Error, as a share of the largest torque, that a curve of few knots may leave on rows not seen: nulls do."""
 LEAST_ROWS = 40
 """Intervals, a second at 40 pulses/s: of fewer nothing is said."""
 RISE = 1.05

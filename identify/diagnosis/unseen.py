@@ -6,9 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from identify.diagnosis.thresholds import LEAST_ROWS, LEAST_WIDTHS
+from identify.diagnosis.thresholds import FORM, LEAST_ROWS, NEAR
+from identify.dynamics.pulse_grid import Grid
 from identify.effects import get
 from identify.estimation.joint import Fitted
+from identify.records.record import FORGOTTEN_S
 
 MEDIAN = 0.6745
 """Median of the size of normal errors over their standard deviation."""
@@ -43,22 +45,34 @@ class Unseen:
 def unseen(fitted: Fitted) -> Unseen | None:
     """The model on the intervals held out; None where there are none, or where a tremor is everywhere.
 
-    None, too, where so few widths were fitted that the curve between them is a guess.
+    Rows count whose pulse widths, and those of the last seconds, were fitted: elsewhere the curve is a guess.
 
     Efforts cannot be foreseen, but they are seldom: beside them the error is that of most intervals, the median.
     """
     setup = fitted.problem.setup
     grid = setup.grid
     rows = grid.held_out & ~grid.doubted & (2 * grid.count >= np.median(grid.count[setup.fitted]))
-    few = np.unique(grid.pulse_width_us[setup.fitted]).size < LEAST_WIDTHS
-    if few or rows.sum() < LEAST_ROWS or fitted.noise.band > 0.0:
+    rows &= _covered(grid, setup.fitted)
+    if rows.sum() < LEAST_ROWS or fitted.noise.band > 0.0:
         return None
     residual = fitted.residual_nm[rows]
     scale = 1.0 / np.sqrt(np.maximum(np.diag(fitted.hessian), 1e-300))
     scaled = fitted.hessian * scale[:, None] * scale[None, :] + 1e-12 * np.eye(scale.size)
     slopes = fitted.slopes[:, rows] * scale[:, None]
     band = np.sum(slopes * np.linalg.solve(scaled, slopes), axis=0)
-    allowed = np.sqrt(fitted.noise.sd_nm**2 + float(np.mean(band)))
+    allowed = np.sqrt(fitted.noise.sd_nm**2 + float(np.mean(band)) + (FORM * setup.scale_nm) ** 2)
     if all(get(effect).foreseeable for effect, _ in fitted.effects):
         return Unseen(float(np.sqrt(np.mean(residual**2))), float(allowed))
     return Unseen(float(np.median(np.abs(residual)) / MEDIAN), float(allowed))
+
+
+def _covered(grid: Grid, fitted: np.ndarray) -> np.ndarray:
+    """bool, shape (K,): intervals before which, as long as a muscle remembers, all widths are among those fitted."""
+    widths = np.unique(grid.pulse_width_us[fitted])
+    if widths.size < 2:
+        return np.zeros(grid.size, bool)
+    after = np.clip(np.searchsorted(widths, grid.pulse_width_us), 1, widths.size - 1)
+    near = np.minimum(np.abs(grid.pulse_width_us - widths[after]), np.abs(grid.pulse_width_us - widths[after - 1]))
+    strange = near > NEAR * float(widths[-1])
+    memory = round(FORGOTTEN_S / grid.step_s)
+    return np.convolve(strange, np.ones(memory))[: grid.size] < 0.5

@@ -17,7 +17,7 @@ from identify.dynamics.mean_weights import mean_weights
 from identify.dynamics.second_order import hermite
 from identify.errors import BadRecord
 from identify.records.pulse_phase import pulse_phase_s
-from identify.records.record import FORGOTTEN_S, Record
+from identify.records.record import Record
 
 STANDS = 0.2
 """In intervals: a pulse less late (early) prolongs (cuts) the drive before it; one later is moved, its effect whole.
@@ -354,11 +354,13 @@ def _applied(
     elif gaps.any():
         for gap in runs(gaps):
             # Also between two rests: a part of a test may have been cut out.
-            after = slice(gap.start, gap.stop + round(FORGOTTEN_S / step_s))
+            after = slice(gap.start, gap.stop + round(GAP_S / step_s))
             doubted[after] |= part[after] == part[gap.start]
     return width, late if late.any() else None, doubted
 
 
+GAP_S = 4.0
+"""What a gap of unknown pulses leaves in the slowest muscle is forgotten after this, s."""
 LONGEST_S = 24 * 3600.0
 LONGEST_LATE_S = 1.0
 

@@ -21,6 +21,8 @@ LEAST_LINE = 30.0
 FOLLOWED_S = 1.0
 """Window over which hum's amplitude and phase are taken as even: the grid's frequency wanders more slowly."""
 MOST_HARMONICS = 8
+LEAST_SPREAD = 0.2
+"""Noise of a part over the largest of all parts, at least."""
 LEAST_ROWS = 8
 LEAST_EQUAL = 20
 """Samples at exactly the greatest (or smallest) value that count as clipping."""
@@ -294,8 +296,24 @@ def _spread(grid: Grid) -> np.ndarray | float:
         return 1.0
     record = grid.record
     kept = grid.counted & ~record.held_out
-    own = [white_noise(record, record.torque_nm[kept & (record.part == part)]) for part in range(parts)]
-    return (np.maximum(own, 1e-12) / max(float(np.mean(own)), 1e-12))[grid.part]
+    parts_sd = [_part_noise(record, record.torque_nm[kept & (record.part == part)]) for part in range(parts)]
+    own = np.array(parts_sd)
+    known = own[np.isfinite(own)]
+    if not known.size:
+        return 1.0
+    own = np.where(np.isfinite(own), own, known.mean())
+    # However quiet a part seems, it is not worth more than a few of another.
+    own = np.maximum(own, LEAST_SPREAD * own.max())
+    return (own / own.mean())[grid.part]
+
+
+def _part_noise(record: Record, torque_nm: np.ndarray) -> float:
+    """White noise of a sample of one part, not below what its counts leave, N·m; NaN where it has hardly a sample."""
+    if torque_nm.size < 16:
+        return float("nan")
+    step = np.abs(np.diff(torque_nm))
+    count = float(np.min(step[step > 0], initial=np.inf))
+    return max(white_noise(record, torque_nm), count / np.sqrt(12.0) if np.isfinite(count) else 0.0)
 
 
 def _reference(grid: Grid, rows: np.ndarray) -> float:

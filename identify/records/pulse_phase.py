@@ -6,6 +6,9 @@ import numpy as np
 
 from identify.records.record import Record
 
+NEARLY = 0.9
+"""Share of the pulse interval from which a sample is nearly as long."""
+
 
 def pulse_phase_s(record: Record) -> float:
     """Time of the pulse slots after the first sample, modulo the pulse interval, s.
@@ -18,6 +21,17 @@ def pulse_phase_s(record: Record) -> float:
     if changes.size == 0 or sample_s > 0.999 * step_s:
         return 0.0
     latest = np.mod(record.time_s[changes] - record.time_s[0], step_s)
+    if sample_s > NEARLY * step_s:
+        # Any phase but a sliver is explained by all changes: the sliver tells. It is the widest without a change.
+        ordered = np.sort(latest)
+        gaps = np.diff(np.r_[ordered, ordered[0] + step_s])
+        widest = int(np.argmax(gaps))
+        first = ordered[(widest + 1) % ordered.size]
+        return (
+            0.0
+            if gaps[widest] < 0.5 * (step_s - sample_s) or min(first, step_s - first) < 1e-3 * step_s
+            else float(first)
+        )
     trial = np.linspace(0.0, step_s, 401)[:-1]
     # How many changes each trial phase explains, with a tolerance of a hair for rounding.
     lag = np.mod(latest[:, None] - trial[None, :] + 1e-3 * sample_s, step_s)

@@ -177,8 +177,9 @@ def same_data(model: Muscle, record: Record) -> bool:
 
 
 def fingerprint(record: Record) -> str:
-    """SHA-256 of time, pulse width and torque."""
+    """SHA-256 of time since the record's start, to the microsecond, of pulse width and of torque."""
     digest = hashlib.sha256()
-    for column in (record.time_s, record.pulse_width_us, record.torque_nm):
+    own_us = np.round(1e6 * (record.time_s - record.time_s[0])).astype(np.int64)
+    for column in (own_us, record.pulse_width_us, record.torque_nm):
         digest.update(np.ascontiguousarray(column).data)
     return digest.hexdigest()
