@@ -17,7 +17,7 @@ from identify.dynamics.mean_weights import mean_weights
 from identify.dynamics.second_order import hermite
 from identify.errors import BadRecord
 from identify.records.pulse_phase import pulse_phase_s
-from identify.records.record import Record
+from identify.records.record import FORGOTTEN_S, Record
 
 STANDS = 0.2
 """In intervals: a pulse less late (early) prolongs (cuts) the drive before it; one later is moved, its effect whole.
@@ -338,7 +338,8 @@ def _applied(
     """Width of each interval, its lateness, and where it is not known what was applied.
 
     Where samples are missing the pulses tell, if the record has them. Else the last width seen is taken to be in force
-    still, and what comes after is doubted until a muscle has forgotten it.
+    still, and what comes after is doubted until a muscle has forgotten it, unless no pulse came before and the
+    torque after is the same.
     """
     width = record.pulse_width_us[middle]
     late = np.zeros(width.size) if record.late_s is None else record.late_s[middle]
@@ -353,14 +354,22 @@ def _applied(
             target[gaps] = told[gaps]
     elif gaps.any():
         for gap in runs(gaps):
-            # Also between two rests: a part of a test may have been cut out.
-            after = slice(gap.start, gap.stop + round(GAP_S / step_s))
-            doubted[after] |= part[after] == part[gap.start]
+            after = slice(gap.start, gap.stop + round(FORGOTTEN_S / step_s))
+            if width[gap.start - 1] or _moved(record, middle, gap):
+                doubted[after] |= part[after] == part[gap.start]
     return width, late if late.any() else None, doubted
 
 
-GAP_S = 4.0
-"""What a gap of unknown pulses leaves in the slowest muscle is forgotten after this, s."""
+def _moved(record: Record, middle: np.ndarray, gap: slice) -> bool:
+    """Whether the torque after a gap is another than before: between two rests something was cut out, no pause."""
+    before, after = middle[max(gap.start - 2, 0)], middle[min(gap.stop, middle.size - 1)]
+    near = max(round(record.sample_rate_hz / record.pulse_rate_hz), 1)
+    levels = [float(np.mean(record.torque_nm[at : at + near])) for at in (before, after)]
+    return abs(levels[1] - levels[0]) > MOVED * float(np.ptp(record.torque_nm))
+
+
+MOVED = 0.04
+"""Share of the torque's range by which rest differs from rest across a gap that was no pause."""
 LONGEST_S = 24 * 3600.0
 LONGEST_LATE_S = 1.0
 

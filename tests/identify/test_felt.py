@@ -226,12 +226,14 @@ def test_a_gap_in_a_sealed_recording_invents_no_pulse(tmp_path):
     assert not blind.doubted[: min(ends) - 5].any()
 
 
-def test_what_follows_a_gap_is_doubted_also_between_two_rests():
-    """A part of a test may have been cut out there: the muscle may still be letting go."""
+def test_a_gap_between_rests_is_a_pause_unless_the_torque_moved():
+    """A part of a test may have been cut out there: the muscle is still letting go."""
     time_s = np.r_[np.arange(400) / 400, 5 + np.arange(800) / 400]
     width = np.where((np.arange(1200) > 900) & (np.arange(1200) < 1000), 200.0, 0.0)
-    grid = make_grid(Record.from_arrays(time_s, width, np.zeros(1200)))
-    assert np.sum(grid.doubted & (grid.count > 0)) == 60
+    torque = np.where(width > 0, 5.0, 0.0)
+    assert not make_grid(Record.from_arrays(time_s, width, torque)).doubted.any()
+    letting_go = torque + np.where(time_s >= 5, 3.0 * np.exp(-(time_s - 5) / 0.3), 0.0)
+    assert make_grid(Record.from_arrays(time_s, width, letting_go)).doubted[-80:-20].all()
 
 
 # ---- the record ---------------------------------------------------------------------------------------------
