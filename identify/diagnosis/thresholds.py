@@ -78,6 +78,8 @@ NEAR = 0.02
 """Distance to a width that was fitted, as a share of the largest, beyond which the curve is a guess."""
 FORM = 0.01
 """Error, as a share of the largest torque, that a curve of few knots may leave on rows not seen: nulls do."""
+FORM_OF_EFFECTS = 0.003
+"""The same where an effect is named: its law must hold on rows not seen, too."""
 LEAST_ROWS = 40
 """Intervals, a second at 40 pulses/s: of fewer nothing is said."""
 RISE = 1.05

@@ -42,11 +42,12 @@ class Unseen:
         return self.rms_nm / self.allowed_nm
 
 
-def unseen(fitted: Fitted) -> Unseen | None:
+def unseen(fitted: Fitted, form: float = FORM) -> Unseen | None:
     """The model on the intervals held out; None where there are none, or where a tremor is everywhere.
 
     Rows count whose pulse widths, and those of the last seconds, were fitted: elsewhere the curve is a guess.
 
+    `form` is what the form of the model may err by there, as a share of the largest torque.
     Efforts cannot be foreseen, but they are seldom: beside them the error is that of most intervals, the median.
     """
     setup = fitted.problem.setup
@@ -60,7 +61,7 @@ def unseen(fitted: Fitted) -> Unseen | None:
     scaled = fitted.hessian * scale[:, None] * scale[None, :] + 1e-12 * np.eye(scale.size)
     slopes = fitted.slopes[:, rows] * scale[:, None]
     band = np.sum(slopes * np.linalg.solve(scaled, slopes), axis=0)
-    allowed = np.sqrt(fitted.noise.sd_nm**2 + float(np.mean(band)) + (FORM * setup.scale_nm) ** 2)
+    allowed = np.sqrt(fitted.noise.sd_nm**2 + float(np.mean(band)) + (form * setup.scale_nm) ** 2)
     if all(get(effect).foreseeable for effect, _ in fitted.effects):
         return Unseen(float(np.sqrt(np.mean(residual**2))), float(allowed))
     return Unseen(float(np.median(np.abs(residual)) / MEDIAN), float(allowed))

@@ -14,6 +14,8 @@ from identify.diagnosis.thresholds import (
     EVERYWHERE,
     EXPLAINED_BY_LAWS,
     FIRST_MARGIN,
+    FORM,
+    FORM_OF_EFFECTS,
     HELD,
     LAPSE,
     LEAST_BY_BAND,
@@ -173,7 +175,8 @@ def judge(work: Analysis) -> Verdict:
             strange = strange or _everywhere(work) or _no_effort(work, explained, structure)
     else:
         strange = strange or structure > STRUCTURE
-    before, after = unseen(first), unseen(last)
+    # Who names an effect says more than who names none, and is held to more.
+    before, after = (unseen(fitted, FORM_OF_EFFECTS if work.added else FORM) for fitted in (first, last))
     contradicted = after is not None and _contradicted(before, after)
     if after is not None and contradicted:
         strange = True
