@@ -25,6 +25,9 @@ from identify.noise.ar1 import noise_evidence
 from identify.recruitment.curve import Curve
 from identify.simulation.predict import fingerprint, predict_on
 
+EASED = 0.98
+"""Share of the penalty that is taken away to see what it hides."""
+
 
 def finish(method_id: str, fitted: Fitted, reasons: Sequence[str] = (), figures: dict[str, Any] | None = None) -> Model:
     """The model of a fit, with everything that MODEL.json tells.
@@ -68,7 +71,7 @@ def finish(method_id: str, fitted: Fitted, reasons: Sequence[str] = (), figures:
         extra=_parts(written),
     )
     model = _named(model, setup.grid)
-    model = model.with_(bands=bands(model), valid_for=valid_for(model, setup.grid, setup.fitted))
+    model = model.with_(bands=bands(model, _bent(fitted)), valid_for=valid_for(model, setup.grid, setup.fitted))
     return model.with_(quality=quality(model, setup.grid, setup.fitted, fitted.settled))
 
 
@@ -79,6 +82,18 @@ def _parts(fitted: Fitted) -> dict[str, Any]:
         return {}
     states = setup.sign * values[list(problem.initials)].reshape(-1, 2)
     return {"parts": np.c_[setup.unframed(values[list(problem.baselines)]), states].tolist()}
+
+
+def _bent(fitted: Fitted) -> np.ndarray:
+    """How far the recruitment coefficients would go with little of the penalty on bends left, N·m, to first order."""
+    problem = fitted.problem
+    mean, precision = problem.prior
+    at = problem.coefficients
+    eased = np.zeros_like(precision)
+    eased[at, at] = EASED * precision[at, at]
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(fitted.hessian), 1e-300))
+    left = (fitted.hessian - eased) * scale[:, None] * scale[None, :] + 1e-9 * np.eye(scale.size)
+    return (scale * np.linalg.solve(left, scale * (eased @ (fitted.theta - mean))))[at]
 
 
 def _named(model: Model, grid: Grid) -> Model:
