@@ -199,7 +199,8 @@ def patients() -> list[str]:
     return [
         f"## {len(found)} simulated patients",
         "",
-        "Gain 1.5-15 N·m, 10-90 % rise in 10-150 µs, threshold, Tω 0.1-0.6 s, ζ 0.6-1.2, delay 0-60 ms; 40 to 1600",
+        "Gain 1.5-15 N·m, 10-90 % rise in 10-150 µs, threshold, Tω 0.1-0.6 s, ζ 0.6-1.2, delay 0-60 ms (fitted with "
+        "`electromechanical_delay` where it is longer than a sample); 40 to 1600",
         "samples a second, noise 0.01, 0.03 or 0.10 N·m.",
         "",
         f"- did not converge or refused: {failed}",
