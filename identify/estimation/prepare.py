@@ -169,6 +169,8 @@ def _fit_hum(record: Record, time_s: np.ndarray, mains_hz: float, kept: np.ndarr
     rate_hz = record.sample_rate_hz
     width = max(round(rate_hz / record.pulse_rate_hz), 2)
     harmonics = [h for h in range(1, HARMONICS + 1) if h * mains_hz <= 0.5 * rate_hz + 1e-6]
+    # Smoothing reaches over the edges: rows beside those that are left out would be touched by them.
+    kept = np.convolve(~kept, np.ones(4 * width + 1), "same") < 0.5
 
     def smooth_out(values: np.ndarray) -> np.ndarray:
         box = np.ones(2 * width + 1) / (2 * width + 1)
