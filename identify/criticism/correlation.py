@@ -48,8 +48,8 @@ def correlation_tests(grid: Grid, residual_nm: np.ndarray) -> dict[str, Any]:
     torque = np.where(known, grid.torque_nm, 0.0)
     white, ar1 = _innovations(residual, known)
     signals = {"u": grid.pulse_width_us, "u2": grid.pulse_width_us**2, "y": torque - residual}
-    functions = {"residual": _auto(residual, known)} | {
-        name: _cross(white, _filtered(signal, ar1, known), known) for name, signal in signals.items()
+    functions = {"residual": _auto(residual)} | {
+        name: _cross(white, _filtered(signal, ar1, known)) for name, signal in signals.items()
     }
     bands = _bands({name: _filtered(signal, ar1, known) for name, signal in signals.items()}, known)
     tests = []
@@ -93,15 +93,13 @@ def _filtered(signal: np.ndarray, ar1: float, known: np.ndarray) -> np.ndarray:
     return np.where(known, out - out[known].mean(), 0.0)
 
 
-def _auto(residual: np.ndarray, known: np.ndarray) -> np.ndarray:
-    del known
+def _auto(residual: np.ndarray) -> np.ndarray:
     power = max(float(residual @ residual), 1e-30)
     return np.array([residual[lag:] @ residual[:-lag] / power for lag in range(1, LAGS + 1)])
 
 
-def _cross(residual: np.ndarray, signal: np.ndarray, known: np.ndarray) -> np.ndarray:
+def _cross(residual: np.ndarray, signal: np.ndarray) -> np.ndarray:
     """Correlation of the residual with the signal `lag` steps earlier, lags 0 to LAGS."""
-    del known
     size = max(float(np.linalg.norm(residual) * np.linalg.norm(signal)), 1e-30)
     return np.array([residual[lag:] @ signal[: residual.size - lag] / size for lag in range(LAGS + 1)])
 

@@ -26,7 +26,7 @@ from identify.diagnosis.thresholds import (
 from identify.diagnosis.unknown import WANDER
 from identify.effects import get, registry
 from identify.effects.base import Effect
-from identify.estimation.adding import Candidate, fit_form, given_by_samples, names, try_effect, with_effects
+from identify.estimation.adding import Candidate, added, fit_form, given_by_samples, names, try_effect, with_effects
 from identify.estimation.joint import Fitted, solve, start_from
 from identify.estimation.prepare import Raw, plain, prepare
 from identify.estimation.rows import fitted_rows
@@ -201,9 +201,7 @@ def _with_given(work: Analysis, base: Fitted) -> Fitted:
     for effect, form, values in given_by_samples(work.raw):
         if effect in names(base):
             continue
-        effects = [*base.effects, (effect, form)]
-        problem = Problem(base.problem.setup, effects)
-        base = solve(problem, start_from(problem, base, {len(effects) - 1: values}), base.noise)
+        base = added(base, effect, form, values)
         work.given.append(effect)
     return base
 

@@ -11,12 +11,17 @@ from identify.effects.base import Effect, Form, Parameter, Scene
 HARMONICS = 4
 
 
-def _hum(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
-    total = y
+def line(p: dict[str, Any], time_s: np.ndarray) -> np.ndarray:
+    """The mains line and its harmonics at given times, N·m."""
+    total = np.zeros(np.broadcast_shapes(np.shape(p["frequency_hz"]), time_s.shape))
     for h in range(1, HARMONICS + 1):
-        turn = 2 * np.pi * h * p["frequency_hz"] * scene.time_s
+        turn = 2 * np.pi * h * p["frequency_hz"] * time_s
         total = total + p[f"cos_{h}_nm"] * np.cos(turn) + p[f"sin_{h}_nm"] * np.sin(turn)
-    return np.asarray(total)
+    return total
+
+
+def _hum(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+    return y + line(p, scene.time_s)
 
 
 _PARTS = tuple(

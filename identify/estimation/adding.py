@@ -151,13 +151,18 @@ def add(base: Fitted, effect: Effect, form: str, raw: Raw) -> Fitted:
         raise BadRequest(f"{effect.id} has no form {form!r}", place="effects") from error
     for identifier, seen, values in given_by_samples(raw):
         if identifier == effect.id:
-            problem = Problem(base.problem.setup, [*base.effects, (identifier, seen)])
-            return solve(problem, start_from(problem, base, {len(base.effects): values}), base.noise)
+            return added(base, identifier, seen, values)
     # What only the raw samples show is not there where they do not.
     found = None if any(form.settled for form in forms) else try_effect(effect, base, forms)
     if found is None:
         raise NotIdentifiable(f"nothing in the record looks like {effect.id}", mend="Leave it out.")
     return found.fitted
+
+
+def added(base: Fitted, identifier: str, form: Form, values: dict[str, float]) -> Fitted:
+    """The model with one effect more, fitted from the values given."""
+    problem = Problem(base.problem.setup, [*base.effects, (identifier, form)])
+    return solve(problem, start_from(problem, base, {len(base.effects): values}), base.noise)
 
 
 def given_by_samples(raw: Raw) -> list[tuple[str, Form, dict[str, float]]]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from identify.dynamics.pulse_grid import Grid, make_grid, runs
-from identify.effects.mains_hum import HARMONICS
+from identify.effects.mains_hum import HARMONICS, line
 from identify.errors import NotIdentifiable
 from identify.estimation.joint import Fitted, solve
 from identify.estimation.projected import Solution, estimate
@@ -62,7 +62,7 @@ def inspect(record: Record, start_s: float | None = None) -> Raw:
     ceiling, floor = _flat(torque[kept]), _flat(-torque[kept])
     hum = _find_hum(record, own_s, kept)
     if hum is not None:
-        torque = torque - hum_at(hum, own_s)
+        torque = torque - line(hum, own_s)
         torque = torque - _wander(record, torque, hum["frequency_hz"], kept)
     noise = white_noise(record, torque[kept])
     return Raw(torque, noise, hum, ceiling, None if floor is None else -floor)
@@ -94,15 +94,6 @@ def white_noise(record: Record, torque: np.ndarray) -> float:
     difference = np.diff(torque, order)
     gain = {3: 20.0, 4: 70.0}[order]
     return float(np.sqrt(np.median(difference**2) / 0.4549 / gain))
-
-
-def hum_at(hum: dict[str, float], time_s: np.ndarray) -> np.ndarray:
-    """The hum at given times, N·m."""
-    total = np.zeros(time_s.shape)
-    for h in range(1, HARMONICS + 1):
-        turn = 2 * np.pi * h * hum["frequency_hz"] * time_s
-        total += hum[f"cos_{h}_nm"] * np.cos(turn) + hum[f"sin_{h}_nm"] * np.sin(turn)
-    return total
 
 
 def _find_hum(record: Record, own_s: np.ndarray, kept: np.ndarray) -> dict[str, float] | None:
