@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import replace
 
+from identify.diagnosis.side_by_side import side_by_side
 from identify.effects.base import Effect, Form
 from identify.estimation.adding import Candidate, names, try_effect
 from identify.estimation.joint import Fitted
+from identify.simulation.problem import Problem
 from identify.simulation.setup import Setup
 
 WORKERS = 2
@@ -15,6 +17,8 @@ FORMS = 3
 """Forms of an effect tried beside another effect."""
 
 Progress = Callable[[float, str], None]
+_Tried = tuple[str, Fitted, float, dict[str, float]]
+"""Form, fit without its problem (a function can't be sent from one process to another), gain, gains of all forms."""
 
 
 def applicable(effect: Effect, setup: Setup, present: Iterable[str]) -> bool:
@@ -43,26 +47,23 @@ def scan(
     """Every applicable effect added to a model, best first; `before` is what an earlier round found of them."""
     present = set(names(base))
     listed = [effect for effect in effects if applicable(effect, base.problem.setup, present)]
-    done = 0
-    found: list[Candidate] = []
-    # Costly ones first, so that both workers end together; the compiled parts release the interpreter.
+    # Costly ones first, so that all processes end together.
     listed.sort(key=lambda effect: -len(effect.forms))
-    with ThreadPoolExecutor(WORKERS) as pool:
-        earlier = {candidate.effect.id: candidate for candidate in before or []}
-        waiting = {
-            pool.submit(try_effect, effect, base, likeliest_forms(effect, earlier.get(effect.id))): effect
-            for effect in listed
-        }
-        try:
-            for future in as_completed(waiting):
-                done += 1
-                if progress is not None:
-                    text = f"tried {waiting[future].name.lower()}"
-                    progress(share[0] + (share[1] - share[0]) * done / len(listed), text)
-                candidate = future.result()
-                if candidate is not None:
-                    found.append(candidate)
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
-    return sorted(found, key=lambda candidate: -candidate.gain)
+    earlier = {candidate.effect.id: candidate for candidate in before or []}
+
+    def tried(number: int) -> _Tried | None:
+        effect = listed[number]
+        found = try_effect(effect, base, likeliest_forms(effect, earlier.get(effect.id)))
+        return found and (found.form.name, replace(found.fitted, problem=None), found.gain, found.forms)
+
+    found: list[Candidate] = []
+    for done, (number, result) in enumerate(side_by_side(tried, len(listed), WORKERS), start=1):
+        effect = listed[number]
+        if progress is not None:
+            progress(share[0] + (share[1] - share[0]) * done / len(listed), f"tried {effect.name.lower()}")
+        if result is not None:
+            form = effect.form(result[0])
+            added = [] if effect.band else [(effect.id, form)]
+            problem = Problem(base.problem.setup, [*base.effects, *added])
+            found.append(Candidate(effect, form, replace(result[1], problem=problem), *result[2:]))
+    return sorted(found, key=lambda candidate: (-candidate.gain, candidate.effect.id))

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from identify.dynamics.second_order import boundary_states, read_at, transition
+from identify.dynamics.second_order import transition
 
 if TYPE_CHECKING:
     from identify.dynamics.pulse_grid import Grid
@@ -44,16 +44,13 @@ class SecondOrder:
 
     def on_grid(self, grid: Grid, drive_nm: np.ndarray) -> np.ndarray:
         """Block means of the response to a drive by even slots, (K,) or (K, M) N·m, as it was felt, from rest."""
-        felt = grid.held(drive_nm)
-        torque, rate = boundary_states(self.time_constant_s, self.damping, grid.step_s, felt)
+        torque, rate = grid.states(self.time_constant_s, self.damping, drive_nm)
         return grid.block_mean(torque, rate, self.delay_s)
 
     def at_samples(self, grid: Grid, drive_nm: np.ndarray) -> np.ndarray:
         """The response at the record's samples, shape (N,)."""
-        felt = grid.held(drive_nm)
-        torque, rate = boundary_states(self.time_constant_s, self.damping, grid.step_s, felt)
-        position = grid.interval + grid.fraction - self.delay_s / grid.step_s
-        return read_at(torque, rate, position, grid.step_s)
+        torque, rate = grid.states(self.time_constant_s, self.damping, drive_nm)
+        return grid.at_samples(torque, rate, self.delay_s / grid.step_s)
 
     def discrete(self, sample_rate_hz: float) -> tuple[np.ndarray, np.ndarray, int]:
         """(b, a, d) of equations (1) to (3) at a sampling rate, exact for an input held between samples.
@@ -156,7 +153,7 @@ class Discrete:
         if np.allclose(position, np.round(position), atol=1e-6):
             return mean[np.clip(np.round(position).astype(np.int64), 0, mean.size - 1)]
         slope = np.gradient(mean) / grid.step_s
-        return read_at(np.r_[mean, mean[-1]], np.r_[slope, 0.0], position, grid.step_s)
+        return grid.at_samples(np.r_[mean, mean[-1]], np.r_[slope, 0.0], self.centre)
 
     def discrete(self, sample_rate_hz: float) -> tuple[np.ndarray, np.ndarray, int]:  # noqa: ARG002
         """(b, a, d) at the pulse rate, the only rate at which this block is defined."""

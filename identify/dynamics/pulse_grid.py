@@ -13,7 +13,8 @@ from functools import cached_property
 
 import numpy as np
 
-from identify.dynamics.mean_weights import mean_weights
+from identify.dynamics.boundary import boundary_states, read_at
+from identify.dynamics.mean_weights import mean_weights, read_means
 from identify.dynamics.second_order import hermite
 from identify.errors import BadRecord
 from identify.records.pulse_phase import pulse_phase_s
@@ -174,6 +175,14 @@ class Grid:
         at = np.stack([moved + whole, moved + whole + 1])
         return rows, late[rows], early[rows], moved, at, np.stack([1.0 - rest, rest])
 
+    def states(self, time_constant_s: float, damping: float, drive_nm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Torque and rate at the ends of the intervals, (K + 1,) or (K + 1, M), from rest; the drive as it was felt."""
+        return boundary_states(time_constant_s, damping, self.step_s, self.held(drive_nm))
+
+    def at_samples(self, torque_nm: np.ndarray, rate_nm_s: np.ndarray, lag: float) -> np.ndarray:
+        """The curve through boundary states at the record's samples, `lag` intervals late, shape (N,)."""
+        return read_at(torque_nm, rate_nm_s, self.interval + self.fraction - lag, self.step_s)
+
     def mean_weights(self, delay_s: float = 0.0) -> tuple[int, np.ndarray]:
         """How an interval's mean is read off the boundary states, for a model that lags by `delay_s`.
 
@@ -181,7 +190,7 @@ class Grid:
         -------
         first : int
             Offset of the earliest boundary used, relative to the interval (0 or negative).
-        weights : ndarray, shape (K, B, 2)
+        weights : ndarray, shape (K, B, 2), or (1, B, 2) where every interval has the same
             Weights of (y, y') at boundaries first, first + 1, … relative to each interval: the mean of interval k is
             sum over b of weights[k, b, 0] * y[k + first + b] + weights[k, b, 1] * y'[k + first + b].
         """
@@ -209,7 +218,7 @@ class Grid:
         row = np.zeros((int(offset.max()) - first + 2, 2))
         np.add.at(row, offset - first, cubic[:, :2])
         np.add.at(row, offset - first + 1, cubic[:, 2:])
-        return first, np.broadcast_to(row / self._pattern.size, (self.size, *row.shape))
+        return first, row[None] / self._pattern.size
 
     def _any_weights(self, delay_s: float) -> tuple[int, np.ndarray]:
         """Weights sample by sample, whatever their places."""
@@ -234,30 +243,9 @@ class Grid:
         ndarray, shape (K,) or (K, M)
         """
         first, weights = self.mean_weights(delay_s)
-        before, after = max(-first, 0), max(weights.shape[1] + first - 2, 0)
-        y = _padded(torque_nm, before, after, hold=True)
-        v = _padded(rate_nm_s, before, after, hold=False)
-        size = self.size
-        # As the states come, column by column; and in place, since fresh arrays of this size cost more than the sums.
-        result = np.zeros((size, *torque_nm.shape[1:]), order="F")
-        term = np.empty_like(result)
-        lift = (slice(None),) + (None,) * (torque_nm.ndim - 1)
-        for b in range(weights.shape[1]):
-            rows = slice(before + first + b, before + first + b + size)
-            for state, weight in ((y, weights[:, b, 0]), (v, weights[:, b, 1])):
-                factor = weight[0] if weight.strides == (0,) else weight[lift]
-                if np.any(factor):
-                    np.multiply(state[rows], factor, out=term)
-                    result += term
-        return result
-
-
-def _padded(values: np.ndarray, before: int, after: int, *, hold: bool) -> np.ndarray:
-    if not before and not after:
-        return values
-    head = np.repeat(values[:1], before, axis=0) if hold else np.zeros((before, *values.shape[1:]))
-    tail = np.repeat(values[-1:], after, axis=0) if hold else np.zeros((after, *values.shape[1:]))
-    return np.concatenate([head, values, tail])
+        torque, rate = (np.ascontiguousarray(np.atleast_2d(state.T)) for state in (torque_nm, rate_nm_s))
+        mean = read_means(torque, rate, first, weights)
+        return mean[0] if torque_nm.ndim == 1 else mean.T
 
 
 def runs(flags: np.ndarray) -> list[slice]:

@@ -2,7 +2,7 @@
 
 The linear block of the paper in physical terms, T² y'' + 2 ζ T y' + y = w, with w held over each pulse interval.
 The state (y, y') is carried from one pulse to the next by the matrix exponential; inside an interval y is a smooth
-curve, recovered to micronewton-metres by a cubic through the states at its two ends. A delay therefore needs no
+curve, read by a cubic through the states at its two ends. A delay therefore needs no
 states of its own: it shifts the times at which the curve is read.
 """
 
@@ -10,6 +10,27 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.linalg import lapack
+
+
+def step_matrix(time_constant_s: float, damping: float, step_s: float) -> tuple[float, float, float, float]:
+    """Transition of x = (y, y') over a step without drive, row by row; `boundary` compiles it, too."""
+    h = step_s / time_constant_s
+    decay = np.exp(-damping * h)
+    gap = damping * damping - 1.0
+    root = np.sqrt(abs(gap))
+    arg = root * h
+    if abs(gap) < 1e-10:
+        c, s = 1.0, h
+    elif gap < 0:
+        c, s = np.cos(arg), np.sin(arg) / root
+    else:
+        c, s = np.cosh(arg), np.sinh(arg) / root
+    return (
+        decay * (c + damping * s),
+        decay * s * time_constant_s,
+        -decay * s / time_constant_s,
+        decay * (c - damping * s),
+    )
 
 
 def transition(time_constant_s: float, damping: float, step_s: float) -> tuple[np.ndarray, np.ndarray]:
@@ -31,21 +52,7 @@ def transition(time_constant_s: float, damping: float, step_s: float) -> tuple[n
     gamma : ndarray, shape (2,)
         Input vector: x[k+1] = phi @ x[k] + gamma * w[k].
     """
-    h = step_s / time_constant_s
-    decay = np.exp(-damping * h)
-    gap = damping * damping - 1.0
-    root = np.sqrt(abs(gap))
-    arg = root * h
-    if abs(gap) < 1e-10:
-        c, s = 1.0, h
-    elif gap < 0:
-        c, s = np.cos(arg), np.sin(arg) / root
-    else:
-        c, s = np.cosh(arg), np.sinh(arg) / root
-    p11 = decay * (c + damping * s)
-    p12 = decay * s * time_constant_s
-    p21 = -decay * s / time_constant_s
-    p22 = decay * (c - damping * s)
+    p11, p12, p21, p22 = step_matrix(time_constant_s, damping, step_s)
     return np.array([[p11, p12], [p21, p22]]), np.array([1.0 - p11, -p21])
 
 
@@ -70,49 +77,6 @@ def recursion(a: np.ndarray, forced: np.ndarray) -> np.ndarray:
     return solved if forced.ndim == 2 else solved[:, 0]
 
 
-def boundary_states(
-    time_constant_s: float, damping: float, step_s: float, drive_nm: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """States at the ends of the pulse intervals, from rest.
-
-    Parameters
-    ----------
-    time_constant_s, damping, step_s : float
-        As in `transition`.
-    drive_nm : ndarray, shape (K,) or (K, M)
-        Held input of each interval; columns are filtered apart.
-
-    Returns
-    -------
-    torque_nm, rate_nm_s : ndarray, shape (K + 1,) or (K + 1, M)
-        y and y' at the start of interval 0, …, at the end of interval K - 1.
-    """
-    phi, gamma = transition(time_constant_s, damping, step_s)
-    trace, determinant = phi[0, 0] + phi[1, 1], phi[0, 0] * phi[1, 1] - phi[0, 1] * phi[1, 0]
-    lead = (phi - trace * np.eye(2)) @ gamma
-    a = np.array([1.0, -trace, determinant])
-    torque = _forced(a, gamma[0], lead[0], drive_nm)
-    if phi[0, 1] < 1e-3 * step_s:  # y' can't be had from y: a slow pulse rate, near a whole number of oscillations
-        return torque, _forced(a, gamma[1], lead[1], drive_nm)
-    # In place: fresh arrays of this size cost more than the sums.
-    rate = np.empty_like(torque)
-    inner = rate[:-1]
-    np.multiply(torque[:-1], -phi[0, 0], out=inner)
-    inner += torque[1:]
-    inner -= np.multiply(drive_nm, gamma[0], out=np.empty_like(inner))
-    inner /= phi[0, 1]
-    rate[-1] = phi[1, 0] * torque[-2] + phi[1, 1] * rate[-2] + gamma[1] * drive_nm[-1]
-    return torque, rate
-
-
-def _forced(a: np.ndarray, gain: float, lead: float, drive_nm: np.ndarray) -> np.ndarray:
-    right = np.empty((drive_nm.shape[0] + 1, *drive_nm.shape[1:]), order="F")
-    right[:2] = 0.0
-    np.multiply(drive_nm[:-1], lead, out=right[2:])
-    right[1:] += np.multiply(drive_nm, gain, out=np.empty_like(right[1:]))
-    return recursion(a, right)
-
-
 def hermite(fraction: np.ndarray, step_s: float) -> np.ndarray:
     """Weights of (y0, y0', y1, y1') for the cubic at `fraction` of a step; shape (..., 4)."""
     s = np.asarray(fraction, float)
@@ -125,47 +89,3 @@ def hermite(fraction: np.ndarray, step_s: float) -> np.ndarray:
         ],
         axis=-1,
     )
-
-
-def read_at(torque_nm: np.ndarray, rate_nm_s: np.ndarray, position: np.ndarray, step_s: float) -> np.ndarray:
-    """The curve through the boundary states, read at times given in steps.
-
-    Parameters
-    ----------
-    torque_nm, rate_nm_s : ndarray, shape (K + 1,)
-        Boundary states.
-    position : ndarray, shape (N,)
-        Times in steps since the start of interval 0; before 0 the muscle is at rest, after K the last state stands.
-    step_s : float
-        Length of a step, s.
-
-    Returns
-    -------
-    ndarray, shape (N,)
-    """
-    last = torque_nm.shape[0] - 2
-    interval = np.clip(np.floor(position).astype(np.int64), 0, last)
-    fraction = np.clip(position - interval, 0.0, 1.0)
-    weight = hermite(fraction, step_s)
-    value = (
-        weight[:, 0] * torque_nm[interval]
-        + weight[:, 1] * rate_nm_s[interval]
-        + weight[:, 2] * torque_nm[interval + 1]
-        + weight[:, 3] * rate_nm_s[interval + 1]
-    )
-    return np.where(position < 0, torque_nm[0], value)
-
-
-def free_states(time_constant_s: float, damping: float, step_s: float, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Undriven boundary states from a unit torque (column 0) and a unit rate (column 1); each (size + 1, 2)."""
-    phi, _ = transition(time_constant_s, damping, step_s)
-    trace = phi[0, 0] + phi[1, 1]
-    a = np.array([1.0, -trace, phi[0, 0] * phi[1, 1] - phi[0, 1] * phi[1, 0]])
-    start, turn = np.eye(2), phi - trace * np.eye(2)
-    states = []
-    for i in range(2):
-        forced = np.zeros((size + 1, 2), order="F")
-        forced[0] = start[i]
-        forced[1] = turn[i]
-        states.append(recursion(a, forced))
-    return states[0], states[1]

@@ -9,31 +9,12 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from identify.dynamics.boundary import step_matrix, through
+
 PARTS = 3
 """Steps in which a speed law is followed through a pulse interval."""
 LAWS = 27
 """Columns of the speed law: see `factor`."""
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _transition(time_constant_s, damping, step_s):  # pragma: no cover
-    h = step_s / time_constant_s
-    decay = np.exp(-damping * h)
-    gap = damping * damping - 1.0
-    root = np.sqrt(abs(gap))
-    arg = root * h
-    if abs(gap) < 1e-10:
-        c, s = 1.0, h
-    elif gap < 0:
-        c, s = np.cos(arg), np.sin(arg) / root
-    else:
-        c, s = np.cosh(arg), np.sinh(arg) / root
-    return (
-        decay * (c + damping * s),
-        decay * s * time_constant_s,
-        -decay * s / time_constant_s,
-        decay * (c - damping * s),
-    )
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -134,52 +115,6 @@ def _second(law, linear, inverse, y, v, lag_s, scale_nm):  # pragma: no cover
 
 
 @njit(cache=True, nogil=True)
-def _through(drive, torque, rate, rows, even, varied, begins, initial):  # pragma: no cover
-    """Four rows at a time through given transitions: each waits for itself alone, so four take hardly longer than one.
-
-    Parameters
-    ----------
-    rows : ndarray of int, shape (4,)
-        Which; a row may stand there several times.
-    even : ndarray, shape (4, 4)
-        Transition of each row, column by column, where it is the same in all intervals.
-    varied : ndarray, shape (4, K) or (4, 0)
-        Transition of each interval, the same for all rows, where it is not.
-    """
-    size = drive.shape[1]
-    a, b, c, d = rows
-    for part in range(begins.size):
-        start, stop = begins[part], begins[part + 1] if part + 1 < begins.size else size
-        ya, va, yb, vb = initial[a, part, 0], initial[a, part, 1], initial[b, part, 0], initial[b, part, 1]
-        yc, vc, yd, vd = initial[c, part, 0], initial[c, part, 1], initial[d, part, 0], initial[d, part, 1]
-        for r in range(4):
-            torque[rows[r], start], rate[rows[r], start] = initial[rows[r], part, 0], initial[rows[r], part, 1]
-        if varied.shape[1] == 0:
-            a1, a2, a3, a4 = even[0]
-            b1, b2, b3, b4 = even[1]
-            c1, c2, c3, c4 = even[2]
-            d1, d2, d3, d4 = even[3]
-            for k in range(start, stop):
-                wa, wb, wc, wd = drive[a, k], drive[b, k], drive[c, k], drive[d, k]
-                ya, va = wa + a1 * (ya - wa) + a2 * va, a3 * (ya - wa) + a4 * va
-                yb, vb = wb + b1 * (yb - wb) + b2 * vb, b3 * (yb - wb) + b4 * vb
-                yc, vc = wc + c1 * (yc - wc) + c2 * vc, c3 * (yc - wc) + c4 * vc
-                yd, vd = wd + d1 * (yd - wd) + d2 * vd, d3 * (yd - wd) + d4 * vd
-                torque[a, k + 1], torque[b, k + 1], torque[c, k + 1], torque[d, k + 1] = ya, yb, yc, yd
-                rate[a, k + 1], rate[b, k + 1], rate[c, k + 1], rate[d, k + 1] = va, vb, vc, vd
-        else:
-            for k in range(start, stop):
-                s1, s2, s3, s4 = varied[0, k], varied[1, k], varied[2, k], varied[3, k]
-                wa, wb, wc, wd = drive[a, k], drive[b, k], drive[c, k], drive[d, k]
-                ya, va = wa + s1 * (ya - wa) + s2 * va, s3 * (ya - wa) + s4 * va
-                yb, vb = wb + s1 * (yb - wb) + s2 * vb, s3 * (yb - wb) + s4 * vb
-                yc, vc = wc + s1 * (yc - wc) + s2 * vc, s3 * (yc - wc) + s4 * vc
-                yd, vd = wd + s1 * (yd - wd) + s2 * vd, s3 * (yd - wd) + s4 * vd
-                torque[a, k + 1], torque[b, k + 1], torque[c, k + 1], torque[d, k + 1] = ya, yb, yc, yd
-                rate[a, k + 1], rate[b, k + 1], rate[c, k + 1], rate[d, k + 1] = va, vb, vc, vd
-
-
-@njit(cache=True, nogil=True)
 def run_core(
     drive, time_constant_s, damping, law, multiplier, begins, initial, scale_nm, step_s, shared
 ):  # pragma: no cover
@@ -220,7 +155,7 @@ def run_core(
     varied = False
     for m in range(rows):
         base = time_constant_s[m]
-        b11, b12, b21, b22 = _transition(base, damping[m], step_s)
+        b11, b12, b21, b22 = step_matrix(base, damping[m], step_s)
         slow_s = base * (damping[m] + np.sqrt(max(damping[m] * damping[m] - 1.0, 0.0)))
         quick_s = 2.0 * damping[m] * base - slow_s
         lawful = False
@@ -238,14 +173,14 @@ def run_core(
             four[many % 4] = m
             many += 1
             if many % 4 == 0:
-                _through(drive, torque, rate, four, even, first, begins, initial)
+                through(drive, torque, rate, four, even, first, begins, initial)
             continue
         if not lawful and given == 0:
             plain[few % 4] = m
             step[few % 4, 0], step[few % 4, 1], step[few % 4, 2], step[few % 4, 3] = b11, b12, b21, b22
             few += 1
             if few % 4 == 0:
-                _through(drive, torque, rate, plain, step, none, begins, initial)
+                through(drive, torque, rate, plain, step, none, begins, initial)
             continue
         h = step_s / PARTS
         for k in range(size):
@@ -275,7 +210,7 @@ def run_core(
                 # The slower lag times d, the quicker times q: T² = quick·slow, 2 ζ T = quick + slow.
                 t = base * f * np.sqrt(d * q)
                 z = 0.5 * f * (quick_s * q + slow_s * d) / t
-                q11, q12, q21, q22 = _transition(t, z, h)
+                q11, q12, q21, q22 = step_matrix(t, z, h)
                 gap = y - w
                 y, v = w + q11 * gap + q12 * v, q21 * gap + q22 * v
                 p21, p22 = turned * p21, turned * p22
@@ -294,28 +229,8 @@ def run_core(
             rate[m, k + 1] = v
     if many % 4:
         four[many % 4 :] = four[0]
-        _through(drive, torque, rate, four, even, first, begins, initial)
+        through(drive, torque, rate, four, even, first, begins, initial)
     if few % 4:
         plain[few % 4 :], step[few % 4 :] = plain[0], step[0]
-        _through(drive, torque, rate, plain, step, none, begins, initial)
+        through(drive, torque, rate, plain, step, none, begins, initial)
     return torque, rate
-
-
-@njit(cache=True, nogil=True)
-def read_means(torque, rate, first, weights):  # pragma: no cover
-    """Means over intervals, shape (M, K), from boundary states of shape (M, K + 1)."""
-    rows, size = torque.shape[0], weights.shape[0]
-    out = np.zeros((rows, size))
-    for m in range(rows):
-        for k in range(size):
-            total = 0.0
-            for b in range(weights.shape[1]):
-                at = k + first + b
-                if at < 0:
-                    total += weights[k, b, 0] * torque[m, 0]
-                elif at > size:
-                    total += weights[k, b, 0] * torque[m, size]
-                else:
-                    total += weights[k, b, 0] * torque[m, at] + weights[k, b, 1] * rate[m, at]
-            out[m, k] = total
-    return out

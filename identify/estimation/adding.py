@@ -21,6 +21,8 @@ PATIENCE = 2
 """Steps of a chain (one bump, two bumps, …) without a gain after which it ends: one of four bumps hardly helps."""
 TOLERANCE = 0.1
 """Gain in log posterior below which a candidate's search ends: a fortieth of the least margin."""
+WORTHLESS = -2.0
+"""Log evidence gained that decides nothing: an effect that gains less is not worth more steps of a search."""
 BAND_COST = 16.0
 """Log evidence that a narrow band's three numbers cost."""
 
@@ -50,8 +52,13 @@ class Candidate:
     forms: dict[str, float]
 
 
-def try_effect(effect: Effect, base: Fitted, forms: Iterable[Form] | None = None) -> Candidate | None:
-    """The effect's best form added to a model; None where there is nothing to start from."""
+def try_effect(
+    effect: Effect, base: Fitted, forms: Iterable[Form] | None = None, least: float = WORTHLESS
+) -> Candidate | None:
+    """The effect's best form added to a model; None where there is nothing to start from.
+
+    What promises to gain less than `least` is not followed to its end.
+    """
     if effect.band:
         return try_band(effect, base)
     best: Fitted | None = None
@@ -66,8 +73,8 @@ def try_effect(effect: Effect, base: Fitted, forms: Iterable[Form] | None = None
         elif idle >= PATIENCE:
             continue
         # A chain needs each of its steps at its best: the next begins there.
-        rival = best if form.propose is None else None
-        found = fit_form(effect, form, base, residual, previous, rival)
+        floor = max(base.log_evidence + least - effect.prior, best.log_evidence if best else -np.inf)
+        found = fit_form(effect, form, base, residual, previous, None if form.propose else floor)
         if found is None:
             idle = PATIENCE
             continue
@@ -100,9 +107,9 @@ def fit_form(
     base: Fitted,
     residual: np.ndarray,
     previous: dict[str, float],
-    rival: Fitted | None = None,
+    floor: float | None = None,
 ) -> Fitted | None:
-    """One form added to a model, from each of its starting values; the best. Far behind the rival it is given up."""
+    """One form added to a model, from each of its starting values; the best. Far below the floor it is given up."""
     setup = base.problem.setup
     scene: Scene = setup.scene
     problem = Problem(setup, [*base.effects, (effect.id, form)])
@@ -115,7 +122,7 @@ def fit_form(
         if apart is not None and "base.time_constant_s" not in start and base.physical[1] >= apart:
             continue  # the base has its lags apart already
         theta = start_from(problem, base, {len(base.effects): start})
-        ahead = max((f.log_evidence for f in (best, rival) if f is not None), default=None)
+        ahead = max((least for least in (floor, best and best.log_evidence) if least is not None), default=None)
         found = solve(problem, theta, base.noise, tolerance=TOLERANCE, floor=ahead)
         if form.accept is not None and not form.accept(found.parameters_of(effect.id), scene):
             continue

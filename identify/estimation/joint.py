@@ -12,10 +12,8 @@ from identify.estimation.gram import gram
 from identify.noise.level import NoiseLevel, profile, whitened
 from identify.simulation.problem import Problem
 
-OCCAM = 60.0
-"""Least by which the evidence of a fit lies below its log posterior, about."""
-GIVE_UP = 4.0
-"""Steps as good as the last that a losing run is credited with before it is given up."""
+OPTIMISM = 3.0
+"""Times what a parabola promises that a losing run is credited with before it is given up."""
 
 
 @dataclass(frozen=True)
@@ -131,7 +129,7 @@ def solve(
     tolerance : float
         Gain in log posterior below which it stops.
     floor : float or None
-        Log evidence of a rival start: a run that stays far below it and hardly gains is given up.
+        Log evidence that is worth having: a run that promises less is given up.
     """
     at = _at(problem, np.clip(theta, problem.lower, problem.upper), noise, wide=True)
     assert at is not None
@@ -141,22 +139,28 @@ def solve(
             frozen[chosen.places.start : chosen.places.stop] = True
     damping, iterations = 1e-3, 0
     prior_mean, precision = problem.prior
+    hessian = None
     while iterations < most:
         iterations += 1
         products = gram(_whiten(problem, np.vstack([at.residual, at.slopes]), at.noise))
         gradient = products[0, 1:] - precision @ (at.theta - prior_mean)
         hessian = products[1:, 1:] + precision
-        if iterations > 1 and _expected(hessian, gradient, at.theta, problem, frozen) < 0.5 * tolerance:
+        promised = _expected(hessian, gradient, at.theta, problem, frozen)
+        # An effect's start may be one from which nothing is to be gained at first.
+        if (iterations > 1 or not problem.chosen) and promised < 0.5 * tolerance:
             break
+        if floor is not None and iterations > 1:
+            reached = at.value - 0.5 * _log_det_ratio(hessian, precision)
+            if reached + OPTIMISM * (promised + 1.0) < floor:
+                break
         found, damping = _advance(problem, at, hessian, gradient, damping, frozen)
         if found is None:
             break
-        gain, at = found.value - at.value, found
+        gain, at, hessian = found.value - at.value, found, None
         if gain < tolerance and iterations >= 2:
             break
-        if floor is not None and iterations >= 3 and at.value - OCCAM + GIVE_UP * gain < floor - 12.0:
-            break
-    hessian = gram(_whiten(problem, at.slopes, at.noise)) + precision
+    if hessian is None:
+        hessian = gram(_whiten(problem, at.slopes, at.noise)) + precision
     return Fitted(
         problem=problem,
         theta=at.theta,

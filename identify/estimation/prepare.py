@@ -104,6 +104,8 @@ def _find_hum(record: Record, own_s: np.ndarray, kept: np.ndarray) -> dict[str, 
     longest = max(runs(kept), key=lambda run: run.stop - run.start)
     # Differences whiten the muscle's own spectrum, so that neighbours are comparable.
     signal = np.diff(record.torque_nm[longest], 2)
+    # A length with a large prime factor takes five times as long: a hundredth of the samples is given up for it.
+    signal = signal[: signal.size - signal.size % (1 << max(signal.size.bit_length() - 7, 0))]
     window = np.hanning(signal.size)
     power = np.abs(np.fft.rfft((signal - signal.mean()) * window)) ** 2
     frequency = np.fft.rfftfreq(signal.size, 1.0 / rate_hz)
@@ -245,10 +247,9 @@ def to_fitted(solution: Solution, most: int = 20) -> Fitted:
     size, linear = solution.problem.basis.size, solution.linear
     values = np.zeros(problem.size)
     values[:3] = linear.time_constant_s, linear.damping, linear.delay_s
-    # Of the first part alone: how far the parts before run into a later one is not known here, and soon found.
     parts = setup.begins.size
     values[list(problem.baselines)] = setup.framed(solution.coefficients[size : size + parts])
-    values[list(problem.initials)[:2]] = setup.sign * solution.coefficients[size + parts : size + parts + 2]
+    values[list(problem.initials)] = setup.sign * solution.coefficients[size + parts :]
     values[problem.coefficients] = setup.sign * solution.coefficients[:size]
     noise = NoiseLevel(max(solution.ar1, 0.0), 0.5, float(np.sqrt(solution.variance)))
     return solve(problem, problem.from_physical(values), noise, most=most)

@@ -11,10 +11,13 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
+from numba import njit
 
+from identify.dynamics.boundary import held_states
 from identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUNDS_S, SecondOrder
+from identify.dynamics.mean_weights import read_means
 from identify.dynamics.pulse_grid import Grid
-from identify.dynamics.second_order import boundary_states, free_states
+from identify.dynamics.second_order import step_matrix
 from identify.errors import NotIdentifiable
 from identify.noise.ar1 import noise_evidence, whiten
 from identify.recruitment.curve import Basis
@@ -73,10 +76,26 @@ class Projection:
             raise NotIdentifiable("no row may be fitted", mend="Give rows outside `validate`.")
 
     @cached_property
-    def drive(self) -> np.ndarray:
-        """Basis functions of each interval's width, shape (K, P)."""
+    def rows_nm(self) -> np.ndarray:
+        """Held drive of each interval, row by row: basis functions, then nothing for what parts begin with."""
         widths, place = np.unique(self.grid.pulse_width_us, return_inverse=True)
-        return np.asfortranarray(self.basis.design(widths)[place])
+        rows = np.zeros((self.basis.size + 2 * self.grid.begins.size, self.grid.size))
+        rows[: self.basis.size] = self.grid.held(self.basis.design(widths)[place].T, axis=1)
+        return rows
+
+    @cached_property
+    def beginnings(self) -> np.ndarray:
+        """State with which each row begins each part: the basis functions at rest, then unit torques and rates."""
+        parts = self.grid.begins.size
+        found = np.zeros((len(self.rows_nm), parts, 2))
+        for part in range(parts):
+            found[self.basis.size + 2 * part :, part][:2] = np.eye(2)
+        return found
+
+    @cached_property
+    def levels(self) -> np.ndarray:
+        """Baseline of each part, shape (K, B)."""
+        return (self.grid.part[:, None] == np.arange(self.grid.begins.size)).astype(float)
 
     @cached_property
     def null(self) -> int:
@@ -101,20 +120,11 @@ class Projection:
 
     def columns(self, linear: SecondOrder) -> np.ndarray:
         """Block means of the response to each linear coefficient, shape (K, P + extras)."""
-        response = linear.on_grid(self.grid, self.drive)
-        return np.concatenate([response, *self._extra_columns(linear)], axis=1)
-
-    def _extra_columns(self, linear: SecondOrder) -> list[np.ndarray]:
-        grid = self.grid
-        states = free_states(linear.time_constant_s, linear.damping, grid.step_s, grid.size)
-        if grid.begins.size == 1:
-            return [np.ones((grid.size, 1)), grid.block_mean(*states, linear.delay_s)]
-        own = (grid.part[:, None] == np.arange(grid.begins.size)).astype(float)
-        tails = []
-        for part, begin in enumerate(grid.begins):
-            torque, rate = (np.concatenate([np.zeros((begin, 2)), s[: grid.size + 1 - begin]]) for s in states)
-            tails.append(own[:, part : part + 1] * grid.block_mean(torque, rate, linear.delay_s))
-        return [own, *tails]
+        even = np.tile(step_matrix(linear.time_constant_s, linear.damping, self.grid.step_s), (len(self.rows_nm), 1))
+        states = held_states(self.rows_nm, even, self.grid.begins, self.beginnings)
+        rows = read_means(*states, *self.grid.mean_weights(linear.delay_s))
+        size = self.basis.size
+        return np.concatenate([rows[:size], self.levels.T, rows[size:]]).T
 
     @property
     def searched(self) -> int:
@@ -123,21 +133,18 @@ class Projection:
 
     def slopes(self, linear: SecondOrder, coefficients: np.ndarray) -> np.ndarray:
         """Derivatives of the block means by log T, log ζ and (if searched) the delay, shape (K, 2 or 3)."""
-        step, size = 1e-6, self.basis.size
+        step, size, grid = 1e-6, self.basis.size, self.grid
         t, z, d = linear.time_constant_s, linear.damping, linear.delay_s
-        held, grid = self.drive @ coefficients[:size], self.grid
-        # The delay shifts only where the curve is read: the states are those of the other two's base.
-        torque, rate = boundary_states(t, z, grid.step_s, grid.held(held))
-        near = [SecondOrder(t * np.exp(step), z, d), SecondOrder(t, z * np.exp(step), d)]
-        values = [at.on_grid(grid, held) for at in near]
+        drive = coefficients[:size] @ self.rows_nm[:size]
+        begin = coefficients[size + grid.begins.size :].reshape(1, -1, 2)
+        even = [step_matrix(*at, grid.step_s) for at in ((t, z), (t * np.exp(step), z), (t, z * np.exp(step)))]
+        torque, rate = held_states(np.tile(drive, (3, 1)), np.array(even), grid.begins, np.tile(begin, (3, 1, 1)))
+        mean = read_means(torque, rate, *grid.mean_weights(d))
+        change = [mean[1] - mean[0], mean[2] - mean[0]]
         if self.delay_s is None:
-            near.append(SecondOrder(t, z, d + step))
-            values.append(grid.block_mean(torque, rate, d + step))
-        change = np.stack(values, axis=1) - grid.block_mean(torque, rate, d)[:, None]
-        first = size + self.grid.begins.size
-        here = np.hstack(self._extra_columns(linear)[1:])
-        tails = [(np.hstack(self._extra_columns(at)[1:]) - here) @ coefficients[first:] for at in near]
-        return (change + np.stack(tails, axis=1)) / step
+            # The delay shifts only where the curve is read.
+            change.append(read_means(torque[:1], rate[:1], *grid.mean_weights(d + step))[0] - mean[0])
+        return np.stack(change).T / step
 
 
 @dataclass(frozen=True)
@@ -355,11 +362,17 @@ def _assess(problem: Projection, linear: SecondOrder, target: np.ndarray, ar1: f
 
 def _solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Solve a symmetric system, scaled to a unit diagonal, with a hair of ridge against empty columns."""
+    solved = _scaled_solve(np.ascontiguousarray(matrix), np.ascontiguousarray(right.reshape(len(right), -1)))
+    return solved.reshape(right.shape)
+
+
+@njit(cache=True, nogil=True)
+def _scaled_solve(matrix, right):  # pragma: no cover
     scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    scaled = matrix * scale[:, None] * scale[None, :]
-    scaled[np.diag_indices_from(scaled)] = 1.0 + 1e-12
-    lift = scale if right.ndim == 1 else scale[:, None]
-    return lift * np.linalg.solve(scaled, lift * right)
+    scaled = matrix * scale.reshape(-1, 1) * scale
+    for i in range(scale.size):
+        scaled[i, i] = 1.0 + 1e-12
+    return scale.reshape(-1, 1) * np.linalg.solve(scaled, scale.reshape(-1, 1) * right)
 
 
 def _moved(linear: SecondOrder, step: np.ndarray) -> SecondOrder:

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from identify.dynamics.boundary import boundary_states
 from identify.dynamics.linear import SecondOrder
 from identify.dynamics.pulse_grid import Grid, runs
-from identify.dynamics.second_order import free_states
 from identify.errors import BadRequest, NotIdentifiable
 from identify.estimation.finish import completed
 from identify.methods.support.common import near_rest, quiet_level, segment_rows
@@ -88,8 +88,10 @@ def deconvolved(grid: Grid, ramp: np.ndarray, linear: SecondOrder) -> tuple[np.n
     columns = basis.design(np.clip((np.arange(grid.size) - first) * grid.step_s, 0.0, span))
     columns[last + 1 :] = 0.0
     # What earlier stimulation left in the muscle when the ramp sets out decays by the same dynamics.
-    left = np.zeros((grid.size, 2))
-    left[first:] = free_states(linear.time_constant_s, linear.damping, grid.step_s, grid.size - first)[0][:-1]
+    left, idle = np.zeros((grid.size, 2)), np.zeros(grid.size - first)
+    for column, state in enumerate(np.eye(2)):
+        states = boundary_states(linear.time_constant_s, linear.damping, grid.step_s, idle, (state[0], state[1]))
+        left[first:, column] = states[0][:-1]
     baseline = quiet_level(grid)
     design = np.c_[linear.on_grid(grid, columns), left][rows]
     target = grid.torque_nm[rows] - baseline

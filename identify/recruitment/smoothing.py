@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 
 LOWEST, HIGHEST = 1e-9, 1e9
 """Bounds of the weight, relative to the balance of data and penalty."""
@@ -62,28 +63,36 @@ def choose_weight(
     null : int, optional
         Dimension of what R leaves alone, where it is known already.
     """
-    balance = float(np.trace(gram)) / max(float(np.trace(roughness)), 1e-300)
+    # What the penalty leaves alone is a property of it, not of the data: where no data are, every shape looks bent.
+    straight = straight_lines(roughness) if null is None else null
+    freedom_left = max(rows - free - straight, 1)
+    weight, freedom, left = _weighed(gram, moment, energy, freedom_left, roughness, straight)
+    return Choice(weight, freedom, left / freedom_left)
+
+
+@njit(cache=True, nogil=True)
+def _weighed(gram, moment, energy, freedom_left, roughness, straight):  # pragma: no cover
+    size = len(gram)
+    balance = np.trace(gram) / max(np.trace(roughness), 1e-300)
     floor = 1e-11 * balance
-    root = np.linalg.cholesky(gram + floor * roughness + 1e-13 * np.trace(gram) / len(gram) * np.eye(len(gram)))
+    root = np.linalg.cholesky(gram + floor * roughness + 1e-13 * np.trace(gram) / size * np.eye(size))
     inverse = np.linalg.inv(root)
     half = inverse @ roughness @ inverse.T
     bent, turn = np.linalg.eigh((half + half.T) / 2)
-    bent = np.clip(bent, 0.0, None)
-    # What the penalty leaves alone is a property of it, not of the data: where no data are, every shape looks bent.
-    straight = np.arange(bent.size) < (straight_lines(roughness) if null is None else null)
-    part = turn.T @ (inverse @ moment)
-    freedom_left = max(rows - free - int(straight.sum()), 1)
-    weight = np.geomspace(LOWEST, HIGHEST, 73) * balance
-    bottom = np.maximum(1.0 + (weight[:, None] - floor) * bent, 1e-12)
-    squares = np.maximum(energy - (part**2 / bottom).sum(axis=1), 1e-14 * energy + 1e-300)
-    score = -freedom_left * np.log(squares) - np.log(bottom).sum(axis=1) + (~straight).sum() * np.log(weight)
+    bent = np.maximum(bent, 0.0)
+    part = (turn.T @ (inverse @ moment)) ** 2
+    weight = balance * np.exp(np.linspace(np.log(LOWEST), np.log(HIGHEST), 73))
+    score = np.empty(weight.size)
+    for i in range(weight.size):
+        bottom = np.maximum(1.0 + (weight[i] - floor) * bent, 1e-12)
+        squares = max(energy - (part / bottom).sum(), 1e-14 * energy + 1e-300)
+        score[i] = -freedom_left * np.log(squares) - np.log(bottom).sum() + (size - straight) * np.log(weight[i])
     best = int(np.argmax(score))
     chosen = weight[best]
     if 0 < best < weight.size - 1:  # the top of the parabola through three points
-        below, here, above = score[best - 1 : best + 2]
+        below, here, above = score[best - 1], score[best], score[best + 1]
         shift = 0.5 * (below - above) / min(below - 2 * here + above, -1e-12)
         chosen = weight[best] * (weight[1] / weight[0]) ** shift
     bottom = np.maximum(1.0 + (chosen - floor) * bent, 1e-12)
-    left = max(energy - float((part**2 / bottom).sum()), 1e-14 * energy)
-    kept = float(((1.0 - floor * bent) / bottom).sum())
-    return Choice(float(chosen), kept, left / freedom_left)
+    left = max(energy - (part / bottom).sum(), 1e-14 * energy)
+    return chosen, ((1.0 - floor * bent) / bottom).sum(), left

@@ -13,8 +13,8 @@ from functools import cached_property
 import numpy as np
 
 from identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUNDS_S
-from identify.dynamics.second_order import read_at
-from identify.dynamics.variable_speed import LAWS, read_means, run_core
+from identify.dynamics.mean_weights import read_means
+from identify.dynamics.variable_speed import LAWS, run_core
 from identify.effects.base import Form, Parameter
 from identify.recruitment.curve import Basis
 from identify.simulation.setup import Setup
@@ -157,9 +157,7 @@ class Problem:
         """Torque as the record counts it, at its samples, N·m; effects named in `skip` are left out of the sum."""
         walk = _Walk(self, theta, False)
         torque, rate, delay = walk.to_boundaries()
-        grid = self.setup.grid
-        position = grid.interval + grid.fraction - delay[0] / grid.step_s
-        value = read_at(torque[0], rate[0], position, grid.step_s)[None, :]
+        value = self.setup.grid.at_samples(torque[0], rate[0], delay[0] / self.setup.grid.step_s)[None, :]
         value = walk.add(value, self.setup.scene_at_samples, skip)
         return self.setup.unframed(walk.sense(value, self.setup.scene_at_samples)[0])
 
@@ -330,7 +328,7 @@ class _Walk:
             first, weights = grid.mean_weights(float(lag))
             own = delay == lag
             rows = slice(None) if own.all() else own
-            mean[rows] = read_means(torque[rows], rate[rows], first, np.ascontiguousarray(weights))
+            mean[rows] = read_means(torque[rows], rate[rows], first, weights)
         return mean
 
     def add(self, value: np.ndarray, scene=None, skip: frozenset[str] = frozenset()) -> np.ndarray:

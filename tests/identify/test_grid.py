@@ -8,8 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
+from identify.dynamics.boundary import boundary_states
 from identify.dynamics.pulse_grid import make_grid, runs
-from identify.dynamics.second_order import boundary_states, transition
+from identify.dynamics.second_order import transition
 from identify.errors import BadRecord
 from identify.noise.ar1 import best_ar1, log_likelihood, whiten
 from identify.records.record import Record

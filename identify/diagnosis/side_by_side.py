@@ -1,0 +1,102 @@
+"""Tasks done by this process and copies of it side by side, where the system can make copies.
+
+Threads wait for one another here: between two compiled parts each of them needs the interpreter.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from typing import Any
+
+if sys.platform == "linux":
+    import fcntl
+
+ROOM_BYTES = 2**20
+Copy = tuple[Any, Any]
+"""A process, and the end of a pipe from which its results come."""
+
+
+def side_by_side(work: Callable[[int], Any], count: int, processes: int) -> Iterator[tuple[int, Any]]:
+    """Number and result of each task as it is done; a result must be one that can be pickled.
+
+    A task that fails in a copy, or whose copy ends, is done again here, so that its error is seen here.
+
+    Parameters
+    ----------
+    work : callable
+        Called with the number of a task.
+    count : int
+        Of tasks, 255 at most.
+    processes : int
+        How many share them, this one included.
+    """
+    numbers, put = os.pipe()
+    os.write(put, bytes(range(count)))
+    os.close(put)
+    copies: list[Copy] = []
+    waiting = set(range(count))
+    try:
+        while len(copies) + 1 < min(processes, count) and (copy := _copy(work, numbers)):
+            copies.append(copy)
+        while number := os.read(numbers, 1):
+            waiting.discard(number[0])
+            yield number[0], work(number[0])
+            for _, results in copies:
+                yield from _come(results, waiting, wait=False)
+        for _, results in copies:
+            yield from _come(results, waiting, wait=True)
+        for number in sorted(waiting):
+            yield number, work(number)
+    finally:
+        os.close(numbers)
+        for process, results in copies:
+            process.kill()
+            process.join()
+            results.close()
+
+
+def _come(results: Any, waiting: set[int], *, wait: bool) -> Iterator[tuple[int, Any]]:
+    """What a copy has done so far, or until it ends."""
+    try:
+        while wait or results.poll():
+            number, result = results.recv()
+            waiting.discard(number)
+            yield number, result
+    except EOFError:
+        pass
+
+
+def _copy(work: Callable[[int], Any], numbers: int) -> Copy | None:
+    """A copy of this process at work; None where there can be none."""
+    if sys.platform != "linux":
+        return None
+    results, put = multiprocessing.Pipe(duplex=False)
+    with contextlib.suppress(OSError):
+        # Room for a result or two: a copy should not wait until this process has ended a task of its own.
+        fcntl.fcntl(put.fileno(), fcntl.F_SETPIPE_SZ, ROOM_BYTES)
+    process = multiprocessing.get_context("fork").Process(target=_work, args=(work, numbers, put), daemon=True)
+    try:
+        process.start()
+    except (OSError, AssertionError):  # too many processes; a daemon may have none
+        results.close()
+        return None
+    finally:
+        put.close()
+    return process, results
+
+
+def _work(work: Callable[[int], Any], numbers: int, put: Any) -> None:
+    """What a copy does, as long as there are tasks and somebody who waits for them."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # Whoever reads what the first process writes waits for the end of that one, not of this.
+    silent = os.open(os.devnull, os.O_RDWR)
+    for stream in (0, 1, 2):
+        os.dup2(silent, stream)
+    parent = os.getppid()
+    while (number := os.read(numbers, 1)) and os.getppid() == parent:
+        put.send((number[0], work(number[0])))

@@ -1,0 +1,146 @@
+"""States of second-order dynamics at the ends of the pulse intervals, and the curve between them, compiled."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from identify.dynamics import second_order
+
+step_matrix = njit(cache=True, nogil=True, inline="always")(second_order.step_matrix)
+
+
+@njit(cache=True, nogil=True)
+def through(drive, torque, rate, rows, even, varied, begins, initial):  # pragma: no cover
+    """Four rows at a time through given transitions: each waits for itself alone, so four take hardly longer than one.
+
+    Parameters
+    ----------
+    drive : ndarray, shape (M, K)
+        Held drive of each interval, N·m.
+    torque, rate : ndarray, shape (M, K + 1)
+        Where the states go.
+    rows : ndarray of int, shape (4,)
+        Which; a row may stand there several times.
+    even : ndarray, shape (4, 4)
+        Transition of each row, column by column, where it is the same in all intervals.
+    varied : ndarray, shape (4, K) or (4, 0)
+        Transition of each interval, the same for all rows, where it is not.
+    begins : ndarray of int, shape (B,)
+        Intervals at whose start a part of the record begins; the first is 0.
+    initial : ndarray, shape (M, B, 2)
+        State with which each part begins.
+    """
+    size = drive.shape[1]
+    a, b, c, d = rows
+    for part in range(begins.size):
+        start, stop = begins[part], begins[part + 1] if part + 1 < begins.size else size
+        ya, va, yb, vb = initial[a, part, 0], initial[a, part, 1], initial[b, part, 0], initial[b, part, 1]
+        yc, vc, yd, vd = initial[c, part, 0], initial[c, part, 1], initial[d, part, 0], initial[d, part, 1]
+        for r in range(4):
+            torque[rows[r], start], rate[rows[r], start] = initial[rows[r], part, 0], initial[rows[r], part, 1]
+        if varied.shape[1] == 0:
+            a1, a2, a3, a4 = even[0]
+            b1, b2, b3, b4 = even[1]
+            c1, c2, c3, c4 = even[2]
+            d1, d2, d3, d4 = even[3]
+            for k in range(start, stop):
+                wa, wb, wc, wd = drive[a, k], drive[b, k], drive[c, k], drive[d, k]
+                ya, va = wa + a1 * (ya - wa) + a2 * va, a3 * (ya - wa) + a4 * va
+                yb, vb = wb + b1 * (yb - wb) + b2 * vb, b3 * (yb - wb) + b4 * vb
+                yc, vc = wc + c1 * (yc - wc) + c2 * vc, c3 * (yc - wc) + c4 * vc
+                yd, vd = wd + d1 * (yd - wd) + d2 * vd, d3 * (yd - wd) + d4 * vd
+                torque[a, k + 1], torque[b, k + 1], torque[c, k + 1], torque[d, k + 1] = ya, yb, yc, yd
+                rate[a, k + 1], rate[b, k + 1], rate[c, k + 1], rate[d, k + 1] = va, vb, vc, vd
+        else:
+            for k in range(start, stop):
+                s1, s2, s3, s4 = varied[0, k], varied[1, k], varied[2, k], varied[3, k]
+                wa, wb, wc, wd = drive[a, k], drive[b, k], drive[c, k], drive[d, k]
+                ya, va = wa + s1 * (ya - wa) + s2 * va, s3 * (ya - wa) + s4 * va
+                yb, vb = wb + s1 * (yb - wb) + s2 * vb, s3 * (yb - wb) + s4 * vb
+                yc, vc = wc + s1 * (yc - wc) + s2 * vc, s3 * (yc - wc) + s4 * vc
+                yd, vd = wd + s1 * (yd - wd) + s2 * vd, s3 * (yd - wd) + s4 * vd
+                torque[a, k + 1], torque[b, k + 1], torque[c, k + 1], torque[d, k + 1] = ya, yb, yc, yd
+                rate[a, k + 1], rate[b, k + 1], rate[c, k + 1], rate[d, k + 1] = va, vb, vc, vd
+
+
+@njit(cache=True, nogil=True)
+def held_states(drive, even, begins, initial):  # pragma: no cover
+    """Boundary states, each (M, K + 1), of rows of held drives; `even` (M, 4) holds each row's transition."""
+    rows, size = drive.shape
+    torque, rate = np.empty((rows, size + 1)), np.empty((rows, size + 1))
+    four, step, none = np.zeros(4, np.int64), np.zeros((4, 4)), np.empty((4, 0))
+    for m in range(0, rows, 4):
+        for r in range(4):
+            four[r] = min(m + r, rows - 1)
+            step[r] = even[four[r]]
+        through(drive, torque, rate, four, step, none, begins, initial)
+    return torque, rate
+
+
+FROM_START = np.zeros(1, np.int64)
+
+
+def boundary_states(
+    time_constant_s: float,
+    damping: float,
+    step_s: float,
+    drive_nm: np.ndarray,
+    initial: tuple[float, float] = (0.0, 0.0),
+) -> tuple[np.ndarray, np.ndarray]:
+    """States at the ends of the pulse intervals.
+
+    Parameters
+    ----------
+    time_constant_s, damping, step_s : float
+        As in `transition`.
+    drive_nm : ndarray, shape (K,) or (K, M)
+        Held input of each interval; columns are filtered apart.
+    initial : tuple of float
+        Torque, N·m, and its rate, N·m/s, at the start; at rest by default.
+
+    Returns
+    -------
+    torque_nm, rate_nm_s : ndarray, shape (K + 1,) or (K + 1, M)
+        y and y' at the start of interval 0, …, at the end of interval K - 1.
+    """
+    drive = np.ascontiguousarray(np.atleast_2d(drive_nm.T), float)
+    even = np.tile(second_order.step_matrix(time_constant_s, damping, step_s), (len(drive), 1))
+    start = np.tile(np.asarray(initial, float), (len(drive), 1, 1))
+    torque, rate = held_states(drive, even, FROM_START, start)
+    return (torque[0], rate[0]) if drive_nm.ndim == 1 else (torque.T, rate.T)
+
+
+def read_at(torque_nm: np.ndarray, rate_nm_s: np.ndarray, position: np.ndarray, step_s: float) -> np.ndarray:
+    """The curve through the boundary states, read at times given in steps.
+
+    Parameters
+    ----------
+    torque_nm, rate_nm_s : ndarray, shape (K + 1,)
+        Boundary states.
+    position : ndarray, shape (N,)
+        Times in steps since the start of interval 0; before 0 the muscle is at rest, after K the last state stands.
+    step_s : float
+        Length of a step, s.
+
+    Returns
+    -------
+    ndarray, shape (N,)
+    """
+    return _read_at(torque_nm, rate_nm_s, position, step_s)
+
+
+@njit(cache=True, nogil=True)
+def _read_at(torque, rate, position, step_s):  # pragma: no cover
+    out = np.empty(position.size)
+    last = torque.size - 2
+    for n in range(position.size):
+        if position[n] < 0:
+            out[n] = torque[0]
+            continue
+        k = min(int(np.floor(position[n])), last)
+        s = min(position[n] - k, 1.0)
+        t = 1.0 - s
+        start = (1.0 + 2.0 * s) * torque[k] + s * step_s * rate[k]
+        out[n] = t * t * start + s * s * ((3.0 - 2.0 * s) * torque[k + 1] - t * step_s * rate[k + 1])
+    return out

@@ -1,0 +1,66 @@
+"""Tasks shared between this process and its copies."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+from identify.diagnosis.side_by_side import side_by_side
+from identify.errors import Cancelled
+
+HERE = os.getpid()
+
+
+def who(number: int) -> tuple[int, int]:
+    time.sleep(0.06)
+    return number * number, os.getpid()
+
+
+def children() -> list[str]:
+    return Path(f"/proc/{HERE}/task/{HERE}/children").read_text().split()
+
+
+@pytest.mark.parametrize("processes", [1, 2, 3])
+def test_every_task_is_done_once(processes):
+    found = dict(side_by_side(who, 40, processes))
+    assert {number: square for number, (square, _) in found.items()} == {n: n * n for n in range(40)}
+    assert len({process for _, process in found.values()}) == processes
+
+
+def test_a_copy_that_is_killed_loses_nothing():
+    def fatal(number: int) -> int:
+        if os.getpid() != HERE:
+            os.kill(os.getpid(), signal.SIGKILL)
+        time.sleep(0.02)
+        return number
+
+    assert dict(side_by_side(fatal, 9, 2)) == {n: n for n in range(9)}
+
+
+def test_an_error_in_a_copy_is_seen_here():
+    def failing(number: int) -> int:
+        time.sleep(0.02)
+        if number == 4:
+            raise ZeroDivisionError("four")
+        return number
+
+    with pytest.raises(ZeroDivisionError, match="four"):
+        dict(side_by_side(failing, 9, 2))
+
+
+def test_who_stops_half_way_leaves_no_copy_behind():
+    before = children()
+    with pytest.raises(Cancelled):
+        for number, _ in side_by_side(who, 50, 2):
+            if number >= 4:
+                raise Cancelled("enough")
+    assert children() == before
+
+
+def test_results_longer_than_a_pipe_arrive_whole():
+    found = dict(side_by_side(lambda number: bytes(3_000_000) + bytes([number]), 6, 2))
+    assert all(len(value) == 3_000_001 and value[-1] == number for number, value in found.items())
