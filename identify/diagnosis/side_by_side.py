@@ -13,9 +13,6 @@ import sys
 from collections.abc import Callable, Iterator
 from typing import Any
 
-if sys.platform == "linux":
-    import fcntl
-
 ROOM_BYTES = 2**20
 Copy = tuple[Any, Any]
 """A process, and the end of a pipe from which its results come."""
@@ -75,6 +72,8 @@ def _copy(work: Callable[[int], Any], numbers: int) -> Copy | None:
     """A copy of this process at work; None where there can be none."""
     if sys.platform != "linux":
         return None
+    import fcntl  # not there on every system
+
     results, put = multiprocessing.Pipe(duplex=False)
     with contextlib.suppress(OSError):
         # Room for a result or two: a copy should not wait until this process has ended a task of its own.

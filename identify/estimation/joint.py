@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import lapack
 
 from identify.effects.base import Form
 from identify.estimation.gram import gram
@@ -145,15 +145,16 @@ def solve(
         products = gram(_whiten(problem, np.vstack([at.residual, at.slopes]), at.noise))
         gradient = products[0, 1:] - precision @ (at.theta - prior_mean)
         hessian = products[1:, 1:] + precision
-        promised = _expected(hessian, gradient, at.theta, problem, frozen)
+        step = _step(hessian, gradient, min(damping, 1e-3), at.theta, problem, frozen)
+        promised = 0.5 * float(gradient @ step)  # were it the parabola that it looks like
         # An effect's start may be one from which nothing is to be gained at first.
         if (iterations > 1 or not problem.chosen) and promised < 0.5 * tolerance:
             break
         if floor is not None and iterations > 1:
-            reached = at.value - 0.5 * _log_det_ratio(hessian, precision)
+            reached = at.value - 0.5 * _log_det_ratio(problem, hessian)
             if reached + OPTIMISM * (promised + 1.0) < floor:
                 break
-        found, damping = _advance(problem, at, hessian, gradient, damping, frozen)
+        found, damping = _advance(problem, at, hessian, gradient, damping, frozen, step)
         if found is None:
             break
         gain, at, hessian = found.value - at.value, found, None
@@ -166,7 +167,7 @@ def solve(
         theta=at.theta,
         noise=at.noise,
         log_likelihood=at.log_likelihood,
-        log_evidence=at.value - 0.5 * _log_det_ratio(hessian, precision),
+        log_evidence=at.value - 0.5 * _log_det_ratio(problem, hessian),
         residual_nm=at.residual,
         slopes=at.slopes,
         hessian=hessian,
@@ -196,23 +197,23 @@ def _at(problem: Problem, theta: np.ndarray, noise: NoiseLevel, wide: bool = Fal
 
 
 def _advance(
-    problem: Problem, at: _Point, hessian: np.ndarray, gradient: np.ndarray, damping: float, frozen: np.ndarray
+    problem: Problem,
+    at: _Point,
+    hessian: np.ndarray,
+    gradient: np.ndarray,
+    damping: float,
+    frozen: np.ndarray,
+    step: np.ndarray,
 ) -> tuple[_Point | None, float]:
     """The next point that is no worse, with the damping to go on with; None where there is none near."""
-    for _ in range(6):
-        step = _step(hessian, gradient, damping, at.theta, problem, frozen)
+    for attempt in range(6):
+        if attempt or damping > 1e-3:
+            step = _step(hessian, gradient, damping, at.theta, problem, frozen)
         trial = _at(problem, np.clip(at.theta + step, problem.lower, problem.upper), at.noise)
         if trial is not None and trial.value > at.value - 1e-9:
             return trial, max(damping / 6.0, 1e-7)
         damping = max(damping * 8.0, 1e-3)
     return None, damping
-
-
-def _expected(
-    hessian: np.ndarray, gradient: np.ndarray, theta: np.ndarray, problem: Problem, frozen: np.ndarray
-) -> float:
-    """What a whole step would gain in log posterior, were it the parabola that it looks like."""
-    return 0.5 * float(gradient @ _step(hessian, gradient, 1e-7, theta, problem, frozen))
 
 
 def _step(
@@ -225,7 +226,10 @@ def _step(
     system = hessian[np.ix_(free, free)] / scale[:, None] / scale[None, :]
     system[np.diag_indices_from(system)] += damping
     step = np.zeros(theta.size)
-    step[free] = cho_solve(cho_factor(system, check_finite=False), gradient[free] / scale, check_finite=False) / scale
+    solved, failed = lapack.dposv(system, gradient[free] / scale)[1:]  # pyright: ignore[reportAttributeAccessIssue]
+    if failed:
+        raise np.linalg.LinAlgError("the information is not positive definite")
+    step[free] = solved / scale
     # Time constants and damping move by a factor of 2 at most, effects by a third of their range.
     limit = np.full(theta.size, np.inf)
     limit[:2] = 0.7
@@ -236,8 +240,8 @@ def _step(
     return step / over if over > 1.0 else step
 
 
-def _log_det_ratio(hessian: np.ndarray, precision: np.ndarray) -> float:
-    return float(np.linalg.slogdet(hessian)[1] - np.linalg.slogdet(precision)[1])
+def _log_det_ratio(problem: Problem, hessian: np.ndarray) -> float:
+    return float(np.linalg.slogdet(hessian)[1]) - problem.prior_log_det
 
 
 def start_from(problem: Problem, base: Fitted, values: dict[int, dict[str, float]]) -> np.ndarray:

@@ -128,6 +128,11 @@ class Problem:
         return mean, precision
 
     @cached_property
+    def prior_log_det(self) -> float:
+        """Logarithm of the determinant of the prior's precision."""
+        return float(np.linalg.slogdet(self.prior[1])[1])
+
+    @cached_property
     def step(self) -> np.ndarray:
         """Perturbations for derivatives."""
         size = np.full(self.size, 1e-5)
@@ -142,21 +147,20 @@ class Problem:
     def run(self, theta: np.ndarray, *, derivatives: bool = False) -> tuple[np.ndarray, np.ndarray | None]:
         """Predicted interval means, N·m, shape (K,), and derivatives, shape (P, K), per unit of `theta`."""
         walk = _Walk(self, theta, derivatives)
-        torque, rate, delay = walk.to_boundaries()
-        mean = walk.read(torque, rate, delay)
+        mean = walk.read(*walk.to_boundaries())
         mean = walk.add(mean)
         mean = walk.sense(mean)
         if not derivatives:
             return mean[0], None
+        places, steps = zip(*walk.owners, strict=True)
         jacobian = np.zeros((self.size, mean.shape[1]))
-        for row, (place, step) in enumerate(walk.owners, start=1):
-            jacobian[place] = (mean[row] - mean[0]) / step
+        jacobian[list(places)] = (mean[1:] - mean[0]) / np.array(steps)[:, None]
         return mean[0], jacobian
 
     def at_samples(self, theta: np.ndarray, skip: frozenset[str] = frozenset()) -> np.ndarray:
         """Torque as the record counts it, at its samples, N·m; effects named in `skip` are left out of the sum."""
         walk = _Walk(self, theta, False)
-        torque, rate, delay = walk.to_boundaries()
+        torque, rate, delay, _ = walk.to_boundaries()
         value = self.setup.grid.at_samples(torque[0], rate[0], delay[0] / self.setup.grid.step_s)[None, :]
         value = walk.add(value, self.setup.scene_at_samples, skip)
         return self.setup.unframed(walk.sense(value, self.setup.scene_at_samples)[0])
@@ -193,22 +197,25 @@ class _Walk:
     def named(chosen: Chosen, values: np.ndarray) -> dict[str, np.ndarray]:
         return {p.name: values[:, i : i + 1] for i, p in enumerate(chosen.parameters)}
 
-    def to_boundaries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def to_boundaries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """States that rows are read off, and for each row its delay, s, and the states that are its own."""
         setup, scene = self.setup, self.setup.scene
         drive = self.recruit()
         for chosen in self.forms("gain"):
             rows, values = self.join(chosen.places)
             drive = np.asarray(chosen.form.call(drive[rows], self.named(chosen, values), scene))
         torque, rate = self.dynamics(drive)
-        delay = np.full(torque.shape[0], self.value[2])
-        rows, values = self.join(self.problem.delay)
-        torque, rate, delay = torque[rows], rate[rows], values[:, 0]
+        # A delay changes where the states are read, and not the states: rows that differ by it share theirs.
+        owned, values = self.join(self.problem.delay)
+        delay = values[:, 0]
         for chosen in self.forms("delay"):
             rows, values = self.join(chosen.places)
-            torque, rate = torque[rows], rate[rows]
+            owned = owned[rows]
             lag = np.asarray(chosen.form.call(None, self.named(chosen, values), scene))
             delay = delay[rows] + lag.reshape(lag.shape[0], -1)[:, 0]
-        ends = setup.scene_at_ends
+        ends, bending = setup.scene_at_ends, self.forms("filter") or self.forms("output")
+        if bending:
+            torque, rate, owned = torque[owned], rate[owned], np.arange(owned.size)
         for chosen in self.forms("filter"):
             rows, values = self.join(chosen.places)
             delay = delay[rows]
@@ -217,7 +224,8 @@ class _Walk:
             rows, values = self.join(chosen.places)
             delay = delay[rows]
             torque, rate = self.bend(chosen, torque[rows], rate[rows], values)
-        return torque, rate, delay
+        owned = np.arange(delay.size) if bending else owned
+        return torque, rate, delay, owned
 
     def recruit(self) -> np.ndarray:
         setup, problem = self.setup, self.problem
@@ -321,14 +329,16 @@ class _Walk:
         sooner = np.asarray(chosen.form.call(torque - ahead * rate, p, ends))
         return bent, (later - sooner) / (2 * ahead)
 
-    def read(self, torque: np.ndarray, rate: np.ndarray, delay: np.ndarray) -> np.ndarray:
+    def read(self, torque: np.ndarray, rate: np.ndarray, delay: np.ndarray, owned: np.ndarray) -> np.ndarray:
         grid = self.setup.grid
-        mean = np.empty((torque.shape[0], grid.size))
+        mean = np.empty((delay.size, grid.size))
         for lag in np.unique(delay):
             first, weights = grid.mean_weights(float(lag))
-            own = delay == lag
-            rows = slice(None) if own.all() else own
-            mean[rows] = read_means(torque[rows], rate[rows], first, weights)
+            rows = np.flatnonzero(delay == lag)
+            own = owned[rows]
+            if own[-1] - own[0] + 1 == own.size and np.all(np.diff(own) == 1):
+                own = slice(own[0], own[-1] + 1)
+            mean[rows] = read_means(torque[own], rate[own], first, weights)
         return mean
 
     def add(self, value: np.ndarray, scene=None, skip: frozenset[str] = frozenset()) -> np.ndarray:
