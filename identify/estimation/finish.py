@@ -138,7 +138,6 @@ def _effect(fitted: Fitted, index: int) -> dict[str, Any]:
         "parameters": describe_parameters(fitted, index),
         "settings": {
             "scale_nm": setup.scale_nm,
-            "largest_us": float(setup.basis.largest_us),
             "noise_sd_nm": setup.noise_sd_nm,
             "zero_nm": setup.zero_nm,
             "sign": setup.sign,

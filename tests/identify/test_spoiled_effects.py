@@ -78,6 +78,10 @@ def test_settings_of_an_effect_are_checked(name: str, value: float, plain):
         identify.Model.from_dict(with_effect(plain, "fatigue", "fitness", good, **{name: value}))
 
 
+def test_a_fit_writes_the_settings_that_are_read_and_no_more(record):
+    assert set(identify.fit(record, effects=["fatigue"]).effects[0]["settings"]) == set(SETTINGS)
+
+
 def test_a_parameter_that_is_missing_is_told(plain):
     with pytest.raises(identify.BadModel, match=r"effects\.0\.parameters\.recovery_s: key is missing"):
         identify.Model.from_dict(with_effect(plain, "fatigue", "fitness", {"depth": 0.3, "onset_s": 20.0}))
