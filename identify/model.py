@@ -355,8 +355,9 @@ def _parameters(values: dict[str, Any], most: int = 4) -> str:
     for name, entry in list(values.items())[:most]:
         entry = entry if isinstance(entry, dict) else {"value": entry}
         spread = "" if entry.get("sd") is None else f" ± {quantity(entry['sd'], '')}"
-        unit = str(entry.get("unit") or "1")
-        parts.append(f"{name} {quantity(entry.get('value'), '')}{spread}" + ("" if unit == "1" else f" {unit}"))
+        unit, direction = str(entry.get("unit") or "1"), str(entry.get("direction") or "")
+        words = [f"{name} {quantity(entry.get('value'), '')}{spread}", "" if unit == "1" else unit, direction]
+        parts.append(" ".join(word for word in words if word))
     more = len(values) - most
     return ", ".join([*parts, *([f"{more} parameters more"] if more > 0 else [])])
 

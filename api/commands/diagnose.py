@@ -85,7 +85,8 @@ def effect_lines(effect: dict[str, Any]) -> list[str]:
         f"{number(effect.get('held_out_rms_before_nm'), 4)} -> {number(effect.get('held_out_rms_after_nm'), 4)} N·m",
     ]
     for name, parameter in (effect.get("parameters") or {}).items():
-        value, sd, unit = parameter.get("value"), parameter.get("sd"), parameter.get("unit") or ""
+        value, sd = parameter.get("value"), parameter.get("sd")
+        unit = f"{parameter.get('unit') or ''} {parameter.get('direction') or ''}".strip()
         lines.append(f"  {name} {number(value, 4)} ± {number(sd, 4)} {unit}".rstrip())
     if effect.get("confused_with"):
         lines.append(f"  this record cannot tell it from: {', '.join(effect['confused_with'])}")
