@@ -2,9 +2,9 @@
 
 A sign that was turned while the torque was near zero cannot be told from a muscle here; the identification sees it.
 
-An amplifier at its end is not a dead cell: its value is the most, or the least, of the test, and the torque has left it
-and come back to that very number. It may stand there longer, so that the identification can say that it clips, but not
-for long: torque beyond it is not seen, and no limit can hold.
+An amplifier at its end is not a dead cell: its value is the most, or the least, of the test, far from the first one,
+and the torque has left it and come back to that very number. It may stand there longer, so that the identification can
+say that it clips, but not for long: torque beyond it is not seen, and no limit can hold.
 """
 
 from __future__ import annotations
@@ -28,6 +28,9 @@ BIN_S = 0.1
 FASTEST_NM_S = 1000.0
 RAIL_VISITS = 2
 """How often a value must have been come to until it is an amplifier's end: a dying cell comes to its last one once."""
+RAIL_LEAST_NM = 0.5
+"""How far from the test's first torque an amplifier's end is, at least: at rest a coarse converter gives two or three
+values, of which the least comes again and again, and a cell that dies there is no clipped one."""
 
 
 class Plausible:
@@ -54,6 +57,7 @@ class Plausible:
     ) -> None:
         self._jump_nm, self._stuck_s, self._clipped_s, self._rate_hz = jump_nm, stuck_s, clipped_s, rate_hz
         self._rails = _Rail(1), _Rail(-1)
+        self._first_nm: float | None = None
         self._window_s, self._jitter_s, self._standstill_s = (
             real_s * speed for real_s in (RATE_WINDOW_S, JITTER_S, STANDSTILL_S)
         )
@@ -91,7 +95,9 @@ class Plausible:
 
     def _stuck(self, torque_nm: NDArray[np.float64], now_s: float) -> str | None:
         before_nm = self._last[0] if self._last else float(torque_nm[0])
+        self._first_nm = before_nm if self._first_nm is None else self._first_nm
         at_rail = [rail.holds(torque_nm, before_nm) for rail in self._rails]
+        at_end = any(at_rail) and abs(torque_nm[-1] - self._first_nm) >= RAIL_LEAST_NM
         if not (np.all(torque_nm == torque_nm[0]) and torque_nm[0] == before_nm):
             self._noisy += 1
             self._same_since_s = None
@@ -99,11 +105,11 @@ class Plausible:
         if self._same_since_s is None:
             self._same_since_s = now_s
         stood_s = now_s - self._same_since_s
-        allowed_s = self._clipped_s if any(at_rail) else self._stuck_s
+        allowed_s = self._clipped_s if at_end else self._stuck_s
         if self._noisy < 3 or stood_s < allowed_s:  # one without noise may well stand still
             return None
         told = f"load cell: its value has stood at exactly {torque_nm[0]:.3f} N·m"
-        if any(at_rail):
+        if at_end:
             return f"{told}, its end, for too long: more would not be seen; widen its range or stimulate less"
         return f"{told}; it is stuck, check its amplifier"
 

@@ -51,3 +51,21 @@ def test_a_cell_that_dies_anywhere_else_ends_the_test_within_half_a_second(tmp_p
     assert "it is stuck" in result.reason
     assert rig.clock.now_s() - rig.stimulator.sent[0][0] < at_s + 4.0
     assert rig.stimulator.sent[-1][0] - rig.stimulator.sent[0][0] < at_s + 0.55
+
+
+@pytest.mark.parametrize("at_s", [0.3, 4.9])  # before the first pulse, and in a later rest
+def test_a_coarse_cell_that_dies_at_rest_is_not_taken_for_one_at_its_end(tmp_path: Path, at_s: float):
+    """Of a coarse converter's few codes at rest the least one comes again and again."""
+    settings = {"on_s": 2.0, "off_s": 2.0, "repeats": 3}
+    rest = SegmentPlan(name="rest", sequence="rest", settings={"duration_s": 1.0})
+    rig = VirtualRig(tmp_path, [rest, SegmentPlan(name="hold", sequence="steps", settings=settings)])
+    rig.cell.noise_nm, rig.cell.step_nm = 0.03, 0.1
+
+    def die() -> None:
+        rig.cell.frozen, rig.cell.last_nm = True, -0.1
+
+    rig.at(at_s, die)
+    result = rig.execute()
+    assert result.outcome == "fault"
+    assert "it is stuck" in result.reason
+    assert result.duration_s < at_s + 0.6
