@@ -138,10 +138,11 @@ class Outcomes:
         return await self.analyses.join(model.recording_id, recording.id, row.participant), model.id
 
     def warnings(self, recording_id: str) -> list[str]:
-        """What the rig found doubtful about a recording, in sentences; of another tool's recording nothing is known."""
+        """What was found doubtful about a recording, in sentences: by the rig, or when its first model was made."""
         recording = self.store.get(Recording, recording_id)
         row = self.store.get(Test, recording.test_id) if recording is not None and recording.test_id else None
-        return list(row.summary.get("warnings") or []) if row is not None else []
+        found = row.summary.get("warnings") if row is not None else recording and recording.warnings
+        return list(found or [])
 
     async def missed_end(self, test_id: str, why: str) -> FinishedEvent:
         """The end of a test as the rig remembers it, or as its recording tells."""

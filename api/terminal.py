@@ -29,6 +29,16 @@ Data = Annotated[Path, typer.Argument(help="sealed recording (HDF5) or CSV file"
 ModelFile = Annotated[
     Path, typer.Argument(help="MODEL.json of `stimrig fit -o`", metavar="MODEL.json", show_default=False)
 ]
+HeldModel = Annotated[
+    Path | None,
+    typer.Option(
+        "--model",
+        help="MODEL.json whose structure is meant: what it holds is fitted anew to the record; "
+        "default: the plain structure, f(u) and then G of second order",
+        metavar="MODEL.json",
+        show_default=False,
+    ),
+]
 
 
 def names(text: str | None) -> tuple[str, ...]:
@@ -51,6 +61,25 @@ def load_model(path: Path) -> Any:
             return identify.Model.from_json(file.read(LARGEST_MODEL_BYTES))
     except OSError as error:
         raise InputError(f"{path}: {error.strerror}. Give a file written by `stimrig fit -o`.") from error
+    except identify.IdentifyError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def load_held(path: Path | None, data: Path) -> tuple[Any, Any, list[str]]:
+    """A record, the model whose structure is meant on it (none: the plain one), and the effects that this holds.
+
+    Raises
+    ------
+    InputError
+        As `load_model`; the model is one of another pulse rate, or one that effects do not stand on.
+    """
+    import identify
+    from api.structure import held_by
+
+    model = None if path is None else load_model(path)
+    record = identify.read(data)
+    try:
+        return record, model, held_by(model, record)
     except identify.IdentifyError as error:
         raise InputError(f"{path}: {error}") from error
 

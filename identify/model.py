@@ -214,6 +214,8 @@ class Model(Shown):
             raise BadModel(f"its parts do not go together ({_line(error)})", mend=model_shape.MEND) from error
         if not np.isfinite(table).all():
             raise BadModel("a curve that is not finite", place="recruitment.basis", mend=model_shape.MEND)
+        for index, entry in enumerate(model.effects):
+            _check_effect(entry, f"effects.{index}.parameters", model.recruitment.basis.largest_us)
         return model
 
     @classmethod
@@ -270,6 +272,35 @@ def _from_dict(data: dict[str, Any]) -> Model:
     )
 
 
+def _check_effect(entry: dict[str, Any], place: str, largest_us: float) -> None:
+    """Refuse parameters that no fit gives: some make an equation divide by zero. An effect unknown here is let pass."""
+    from identify.effects import registry  # here, since a service reads models and compiles nothing
+    from identify.effects.base import Scene
+
+    effect = registry().get(entry["id"])
+    form = effect and next((f for f in effect.forms if entry.get("form", "") in ("", f.name)), None)
+    if effect is None or form is None:
+        return
+    settings = {"scale_nm": 1.0} | entry.get("settings", {})
+    scene = Scene(
+        time_s=np.array([0.0, model_shape.LIKELY]),  # the fitted record's length is not in the file
+        pulse_width_us=np.zeros(2),
+        step_s=1.0,
+        scale_nm=settings["scale_nm"],
+        largest_us=largest_us,
+        zero_nm=settings.get("zero_nm", 0.0),
+    )
+    wanted = {}
+    for p in (p.on(scene) for p in form.parameters):
+        lower, upper = p.lower, p.upper
+        if effect.band or form.settled:  # solved for beside the fit, which knows no bounds
+            lower, upper = 1e-6 if p.scale == "log" else -model_shape.LIKELY, model_shape.LIKELY
+        hair = 1e-6 * (upper - lower) if np.isfinite(upper - lower) else 0.0
+        wanted[p.name] = model_shape.number(lower - hair, upper + hair)
+    given = {name: model_shape.bare(value) for name, value in entry["parameters"].items()}
+    model_shape.fields(wanted)(given, place)
+
+
 def _covariance(data: dict[str, Any] | None) -> Covariance | None:
     if not data:
         return None
@@ -324,8 +355,9 @@ def _parameters(values: dict[str, Any], most: int = 4) -> str:
     for name, entry in list(values.items())[:most]:
         entry = entry if isinstance(entry, dict) else {"value": entry}
         spread = "" if entry.get("sd") is None else f" ± {quantity(entry['sd'], '')}"
-        unit = str(entry.get("unit") or "1")
-        parts.append(f"{name} {quantity(entry.get('value'), '')}{spread}" + ("" if unit == "1" else f" {unit}"))
+        unit, direction = str(entry.get("unit") or "1"), str(entry.get("direction") or "")
+        words = [f"{name} {quantity(entry.get('value'), '')}{spread}", "" if unit == "1" else unit, direction]
+        parts.append(" ".join(word for word in words if word))
     more = len(values) - most
     return ", ".join([*parts, *([f"{more} parameters more"] if more > 0 else [])])
 

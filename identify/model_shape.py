@@ -164,8 +164,28 @@ LINEAR = kinds(
     },
     "discrete",
 )  # fmt: skip
+LIKELY = 1e6
+"""Larger than any torque, N·m, and any time, s, of a record."""
+
+
+def sign(value: Any, place: str) -> None:
+    """1 or -1."""
+    if isinstance(value, bool) or value not in (1, -1):
+        raise BadModel(f"{_short(value)} is no sign, 1 or -1", place=place, mend=MEND)
+
+
+def bare(value: Any) -> Any:
+    """A parameter's number, which may stand alone or with its spread and unit."""
+    return value["value"] if isinstance(value, dict) and "value" in value else value
+
+
+SETTINGS = {
+    "scale_nm": number(1e-9, LIKELY), "noise_sd_nm": number(0.0, LIKELY), "zero_nm": number(-LIKELY, LIKELY),
+    "sign": sign, "reference_s": number(-LIKELY, LIKELY),
+}  # fmt: skip
 EFFECT = fields(
-    {"id": text, "parameters": each(either(ANY, fields({"value": ANY})))}, {"form": text, "settings": each(ANY)}
+    {"id": text, "parameters": each(lambda value, place: ANY(bare(value), place))},
+    {"form": text, "settings": fields({}, SETTINGS)},
 )
 WHOLE = number(0, LONGEST)
 _NARX = fields(

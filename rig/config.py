@@ -65,6 +65,7 @@ class WatchSettings(_Numbers):
     missing_ack_s: float = Field(0.1, gt=0, le=0.5)
     late_pulse_periods: float = Field(0.4, gt=0, le=0.6)
     stuck_torque_s: float = Field(0.5, gt=0.05, le=10)
+    clipped_torque_s: float = Field(3.0, gt=0.05, le=10)
     stale_disk_s: float = Field(3.0, gt=0.5, le=10)
 
     def watch(self) -> Watch:
@@ -142,9 +143,10 @@ EMULATED_CELLS: dict[str, Callable[[int], dict[str, Any]]] = {
     "canopen": lambda _: {"start_frames": ["000#0101"], "stop_frames": ["000#0201"]},
 }
 """How a rig file describes the emulator's cells, by their names and samples a frame."""
-EMULATOR_WATCH = {"stale_torque_s": 0.5, "missing_ack_s": 0.5}
+EMULATOR_WATCH = {"stale_torque_s": 0.5, "missing_ack_s": 0.5, "clipped_torque_s": 10.0}
 """Nobody sits at an emulator, and it shares its processors with whatever else runs: a laptop's pause of 0.1 s, which
-would stop a rig that drives a person, does not end a demo."""
+would stop a rig that drives a person, does not end a demo. A hidden clipped amplifier is there to be diagnosed, and
+stands at its end for up to 6 s of the default ramp."""
 
 
 def for_emulator(ready: str, **overrides: Any) -> RigConfig:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 
 from api.structure import in_words
-from api.terminal import Data, InputError, Json, load_model, number, percent, progress_line, say, say_json
+from api.terminal import Data, HeldModel, Json, load_held, number, percent, progress_line, say, say_json
 
 VERDICTS = {
     "effect_missing": "An effect is missing in the model.",
@@ -24,28 +23,13 @@ def register(app: typer.Typer) -> None:
 
 def diagnose(
     data: Data,
-    model_json: Annotated[
-        Path | None,
-        typer.Option(
-            "--model",
-            help="MODEL.json whose structure is criticised: what it holds is fitted anew to the record; "
-            "default: the plain structure, f(u) and then G of second order",
-            metavar="MODEL.json",
-            show_default=False,
-        ),
-    ] = None,
+    model_json: HeldModel = None,
     as_json: Json = False,
 ) -> None:
     """What is missing in a model's structure, ranked; or that nothing is; or that it has no name here."""
     import identify
-    from api.structure import held_by
 
-    model = None if model_json is None else load_model(model_json)
-    record = identify.read(data)
-    try:
-        structure = held_by(model, record)
-    except identify.IdentifyError as error:
-        raise InputError(f"{model_json}: {error}") from error
+    record, model, structure = load_held(model_json, data)
     progress = progress_line()
     found = {"structure": structure, **identify.diagnose(record, model, progress).to_dict()}
     progress(1.0, "done")
@@ -85,7 +69,8 @@ def effect_lines(effect: dict[str, Any]) -> list[str]:
         f"{number(effect.get('held_out_rms_before_nm'), 4)} -> {number(effect.get('held_out_rms_after_nm'), 4)} N·m",
     ]
     for name, parameter in (effect.get("parameters") or {}).items():
-        value, sd, unit = parameter.get("value"), parameter.get("sd"), parameter.get("unit") or ""
+        value, sd = parameter.get("value"), parameter.get("sd")
+        unit = f"{parameter.get('unit') or ''} {parameter.get('direction') or ''}".strip()
         lines.append(f"  {name} {number(value, 4)} ± {number(sd, 4)} {unit}".rstrip())
     if effect.get("confused_with"):
         lines.append(f"  this record cannot tell it from: {', '.join(effect['confused_with'])}")

@@ -9,7 +9,8 @@ from typing import Annotated, Any
 
 import typer
 
-from api.terminal import Data, Json, number, progress_line, say, say_json, table, write
+from api.structure import in_words
+from api.terminal import Data, HeldModel, Json, load_held, number, progress_line, say, say_json, table, write
 
 
 def register(app: typer.Typer) -> None:
@@ -19,23 +20,24 @@ def register(app: typer.Typer) -> None:
 
 def improve(
     data: Data,
+    model_json: HeldModel = None,
     html: Annotated[Path | None, typer.Option(help="write a report with charts here")] = None,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="write the last MODEL.json here")] = None,
     as_json: Json = False,
 ) -> None:
-    """Add effects one by one to the plain structure while the evidence lasts; each step is a model."""
+    """Add effects one by one to a model's structure while the evidence lasts; each step is a model."""
     import identify
 
-    record = identify.read(data)
+    record, model, structure = load_held(model_json, data)
     progress = progress_line()
-    improved = identify.improve(record, progress=progress)
+    improved = identify.improve(record, progress=progress, model=model)
     progress(1.0, "done")
-    found, models = improved.to_dict(), improved.models
+    found, models = {"structure": structure, **improved.to_dict()}, improved.models
     del found["models"]
     if output is not None:
         write(output, json.dumps(models[-1].to_dict(), indent=1))
     if html is not None:
-        write(html, report(record, found, models, data))
+        write(html, report(record, found, models, data, model))
     if as_json:
         say_json(found)
         return
@@ -43,7 +45,7 @@ def improve(
     say(*[f"written to {path}" for path in (output, html) if path is not None])
 
 
-def report(record: Any, found: dict[str, Any], models: Sequence[Any], data: Path) -> str:
+def report(record: Any, found: dict[str, Any], models: Sequence[Any], data: Path, held: Any | None = None) -> str:
     """The report: what was found, what each effect is, what is left before and after."""
     import numpy as np
 
@@ -55,7 +57,8 @@ def report(record: Any, found: dict[str, Any], models: Sequence[Any], data: Path
     before, after = (thinned(identify.compare(model, record).to_dict()) for model in (models[0], models[-1]))
     labels = [str(record.segment_names[index]) for index in record.segment]
     segments = runs(labels, np.asarray(record.time_s))
-    return improvement_html(found, data.name, diagnosis(str(data), progress_line()), before, after, segments)
+    missing = diagnosis(str(data), progress_line(), None if held is None else held.to_json())
+    return improvement_html(found, data.name, missing, before, after, segments)
 
 
 def improvement_lines(found: dict[str, Any]) -> list[str]:
@@ -71,4 +74,6 @@ def improvement_lines(found: dict[str, Any]) -> list[str]:
         for step in found["steps"]
     ]
     header = ("added", "fit %", "rms N·m", "held-out %", "held-out rms N·m")
-    return [*table(header, rows), "", f"noise {number(found['noise_sd_nm'], 4)} N·m; verdict: {found['verdict']}"]
+    begun = f"structure: {in_words(found['structure'])}"
+    verdict = f"noise {number(found['noise_sd_nm'], 4)} N·m; verdict: {found['verdict']}"
+    return [begun, "", *table(header, rows), "", verdict]

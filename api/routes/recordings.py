@@ -92,7 +92,7 @@ async def take_in(context: Context, code: str, data: bytes, by: str) -> tuple[Re
     except BaseException:  # refused, or nobody waits for it any more
         part.unlink(missing_ok=True)
         raise
-    row = await asyncio.shield(asyncio.to_thread(_store, context, code, whole, data, by))
+    row = await asyncio.shield(asyncio.to_thread(_store, context, code, whole, data, by, warning))
     return row, await asyncio.to_thread(context.versions.add, found["json"], code, row.id, by), warning
 
 
@@ -129,10 +129,11 @@ def _write(context: Context, data: bytes) -> Path:
     return path
 
 
-def _store(context: Context, code: str, path: Path, data: bytes, by: str) -> Recording:
+def _store(context: Context, code: str, path: Path, data: bytes, by: str, warning: str) -> Recording:
     now = context.clock.utc()
     row = Recording(id=path.stem, participant=code, test_id=None, path=str(path), origin="upload", created_utc=now)
     row.file_sha256 = hashlib.sha256(data).hexdigest()
+    row.warnings = [warning] if warning else []
     with uploads.taken_in(path), context.store.write() as session:
         session.add(row)
         session.flush()

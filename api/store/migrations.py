@@ -12,7 +12,7 @@ from sqlalchemy import Column, Connection, Engine, inspect, text
 
 from api.store import tables
 
-VERSION = 3
+VERSION = 4
 """Raised whenever a table changes; the step that brings an older database there goes into `STEPS`."""
 
 
@@ -48,7 +48,7 @@ def make_tables(connection: Connection) -> None:
 
 
 def add_columns(connection: Connection) -> None:
-    """2: columns that tables made before versions were kept may lack, such as the end of an approval."""
+    """2, 4: columns that older tables lack, such as the end of an approval; an upload's warnings came with 4."""
     seen = inspect(connection)
     for table in tables.Table.metadata.sorted_tables:
         if not seen.has_table(table.name):
@@ -68,4 +68,4 @@ def _add(connection: Connection, table: str, column: Column[object]) -> None:
     connection.execute(text(f"ALTER TABLE {table} ADD COLUMN {column.name} {kind}"))
 
 
-STEPS: dict[int, Callable[[Connection], None]] = {1: make_tables, 2: add_columns, 3: make_tables}
+STEPS: dict[int, Callable[[Connection], None]] = {1: make_tables, 2: add_columns, 3: make_tables, 4: add_columns}

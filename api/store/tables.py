@@ -59,6 +59,8 @@ class Recording(Table):
     file_sha256: Mapped[str] = mapped_column(String(64))
     origin: Mapped[str] = mapped_column(String(20), default="rig")
     created_utc: Mapped[str] = mapped_column(String(32))
+    warnings: Mapped[list[str] | None] = mapped_column(JSON, default=None)
+    """What is in doubt about an upload; a test's doubts stand in its summary."""
 
 
 class Model(Table):

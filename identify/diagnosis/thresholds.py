@@ -80,7 +80,7 @@ FORM = 0.01
 """Error, as a share of the largest torque, that a curve of few knots may leave on rows not seen: nulls do."""
 FORM_OF_EFFECTS = 0.003
 """The same where an effect is named: its law must hold on rows not seen, too."""
-LEAST_ROWS = 40
+LEAST_UNSEEN_ROWS = 40
 """Intervals, a second at 40 pulses/s: of fewer nothing is said."""
 RISE = 1.05
 """Rise of the error on rows not seen that ends improving: less may be chance, of some hundred intervals."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from identify.diagnosis.thresholds import FORM, LEAST_ROWS, NEAR
+from identify.diagnosis.thresholds import FORM, LEAST_UNSEEN_ROWS, NEAR
 from identify.dynamics.pulse_grid import Grid
 from identify.effects import get
 from identify.estimation.joint import Fitted
@@ -54,7 +54,7 @@ def unseen(fitted: Fitted, form: float = FORM) -> Unseen | None:
     grid = setup.grid
     rows = grid.held_out & ~grid.doubted & (2 * grid.count >= np.median(grid.count[setup.fitted]))
     rows &= _covered(grid, setup.fitted)
-    if rows.sum() < LEAST_ROWS or fitted.noise.band > 0.0:
+    if rows.sum() < LEAST_UNSEEN_ROWS or fitted.noise.band > 0.0:
         return None
     residual = fitted.residual_nm[rows]
     scale = 1.0 / np.sqrt(np.maximum(np.diag(fitted.hessian), 1e-300))

@@ -138,7 +138,6 @@ def _effect(fitted: Fitted, index: int) -> dict[str, Any]:
         "parameters": describe_parameters(fitted, index),
         "settings": {
             "scale_nm": setup.scale_nm,
-            "largest_us": float(setup.basis.largest_us),
             "noise_sd_nm": setup.noise_sd_nm,
             "zero_nm": setup.zero_nm,
             "sign": setup.sign,
@@ -148,12 +147,17 @@ def _effect(fitted: Fitted, index: int) -> dict[str, Any]:
 
 
 def describe_parameters(fitted: Fitted, index: int) -> dict[str, dict[str, Any]]:
-    """Value, sd and unit of an effect's parameters by name."""
+    """Value, sd and unit of an effect's parameters by name; and the direction of torques where the record's is another.
+
+    An effect's torques count as the muscle pulls, but for what the sensor does, which knows the record's own alone.
+    """
     chosen = fitted.problem.chosen[index]
     matrix = fitted.covariance()
     values = fitted.physical
+    turned = fitted.problem.setup.sign < 0 and chosen.form.stage != "sensor"
     return {
         p.name: {"value": float(values[i]), "sd": float(np.sqrt(max(matrix[i, i], 0.0))), "unit": p.unit}
+        | ({"direction": "as the muscle pulls"} if turned and p.unit.startswith("N·m") else {})
         for i, p in zip(chosen.places, chosen.parameters, strict=True)
     }
 

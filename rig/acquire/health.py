@@ -33,6 +33,7 @@ class Watch:
     late_pulse_periods: float = 0.4
     stale_disk_s: float = 3.0
     stuck_torque_s: float = 0.5
+    clipped_torque_s: float = 3.0
 
 
 DEFAULT_WATCH = Watch()

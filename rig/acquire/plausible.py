@@ -1,7 +1,10 @@
 """Torque that no arm and no sound cell can give: a jump, a value that stands still, a rate that is another.
 
-A sign that was turned while the torque was near zero, or an amplifier that clips for a moment, cannot be told from a
-muscle here; the identification sees those.
+A sign that was turned while the torque was near zero cannot be told from a muscle here; the identification sees it.
+
+An amplifier at its end is not a dead cell: its value is the most, or the least, of the test, far from the first one,
+and the torque has left it and come back to that very number. It may stand there longer, so that the identification can
+say that it clips, but not for long: torque beyond it is not seen, and no limit can hold.
 """
 
 from __future__ import annotations
@@ -23,6 +26,11 @@ STANDSTILL_S = 0.3
 BIN_S = 0.1
 """Rig seconds of which the promptest block is kept for the rate."""
 FASTEST_NM_S = 1000.0
+RAIL_VISITS = 2
+"""How often a value must have been come to until it is an amplifier's end: a dying cell comes to its last one once."""
+RAIL_LEAST_NM = 0.5
+"""How far from the test's first torque an amplifier's end is, at least: at rest a coarse converter gives two or three
+values, of which the least comes again and again, and a cell that dies there is no clipped one."""
 
 
 class Plausible:
@@ -34,6 +42,8 @@ class Plausible:
         Largest change from one sample to the next.
     stuck_s
         How long, in rig seconds, exactly the same value may stand in a cell that had noise before.
+    clipped_s
+        The same at the amplifier's end.
     rate_hz
         Nominal.
     speed
@@ -42,8 +52,12 @@ class Plausible:
         How often the value changed shortly before the test: a cell that is stuck from its start on had noise then.
     """
 
-    def __init__(self, jump_nm: float, stuck_s: float, rate_hz: float, speed: float, noisy: int = 0) -> None:
-        self._jump_nm, self._stuck_s, self._rate_hz = jump_nm, stuck_s, rate_hz
+    def __init__(
+        self, jump_nm: float, stuck_s: float, clipped_s: float, rate_hz: float, speed: float, noisy: int = 0
+    ) -> None:
+        self._jump_nm, self._stuck_s, self._clipped_s, self._rate_hz = jump_nm, stuck_s, clipped_s, rate_hz
+        self._rails = _Rail(1), _Rail(-1)
+        self._first_nm: float | None = None
         self._window_s, self._jitter_s, self._standstill_s = (
             real_s * speed for real_s in (RATE_WINDOW_S, JITTER_S, STANDSTILL_S)
         )
@@ -80,7 +94,10 @@ class Plausible:
         )
 
     def _stuck(self, torque_nm: NDArray[np.float64], now_s: float) -> str | None:
-        before_nm = self._last[0] if self._last else torque_nm[0]
+        before_nm = self._last[0] if self._last else float(torque_nm[0])
+        self._first_nm = before_nm if self._first_nm is None else self._first_nm
+        at_rail = [rail.holds(torque_nm, before_nm) for rail in self._rails]
+        at_end = any(at_rail) and abs(torque_nm[-1] - self._first_nm) >= RAIL_LEAST_NM
         if not (np.all(torque_nm == torque_nm[0]) and torque_nm[0] == before_nm):
             self._noisy += 1
             self._same_since_s = None
@@ -88,9 +105,13 @@ class Plausible:
         if self._same_since_s is None:
             self._same_since_s = now_s
         stood_s = now_s - self._same_since_s
-        if self._noisy < 3 or stood_s < self._stuck_s:  # one without noise may well stand still
+        allowed_s = self._clipped_s if at_end else self._stuck_s
+        if self._noisy < 3 or stood_s < allowed_s:  # one without noise may well stand still
             return None
-        return f"load cell: its value has stood at exactly {torque_nm[0]:.3f} N·m; it is stuck, check its amplifier"
+        told = f"load cell: its value has stood at exactly {torque_nm[0]:.3f} N·m"
+        if at_end:
+            return f"{told}, its end, for too long: more would not be seen; widen its range or stimulate less"
+        return f"{told}; it is stuck, check its amplifier"
 
     def _off_rate(self, samples: NDArray[Any], now_s: float) -> str | None:
         if self._anew:
@@ -162,3 +183,20 @@ class Plausible:
         return (
             f"load cell: {rate_hz:.0f} samples/s come, the rig file says {self._rate_hz:g}; check its settings and bus"
         )
+
+
+class _Rail:
+    """The most that a cell has given (the least, with sign -1), and how often it came to that very number."""
+
+    def __init__(self, sign: int) -> None:
+        self._sign, self._end_nm, self._visits = sign, -np.inf, 0
+
+    def holds(self, torque_nm: NDArray[np.float64], before_nm: float) -> bool:
+        """Does the last of these samples stand at what may be the amplifier's end?"""
+        signed_nm = self._sign * np.concatenate(([before_nm], torque_nm))
+        most_nm = float(np.max(signed_nm))
+        if most_nm > self._end_nm:
+            self._end_nm, self._visits = most_nm, 0
+        there = signed_nm == self._end_nm
+        self._visits += int(np.sum(there[1:] & ~there[:-1]))
+        return bool(there[-1]) and self._visits >= RAIL_VISITS

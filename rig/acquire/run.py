@@ -114,6 +114,7 @@ class TestRun:
         self._plausible = Plausible(
             self._table["torque_jump_nm"].hi,
             self._watch.stuck_torque_s * self._clock.speed,
+            self._watch.clipped_torque_s * self._clock.speed,
             self._receiver.nominal_rate_hz,
             self._clock.speed,
             self._receiver.changes_lately(),

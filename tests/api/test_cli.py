@@ -126,6 +126,7 @@ def test_half_written_recording(capsys: pytest.CaptureFixture[str], tmp_path: Pa
         (["fit", "{record}", "--effects", "auto", "--method", "narx"], "narx"),
         (["fit", "{record}", "--effects", "tremor,phlogiston"], "phlogiston"),
         (["diagnose", "{record}", "--model", "nowhere.json"], "nowhere.json"),
+        (["improve", "{record}", "--model", "nowhere.json"], "nowhere.json"),
         (["diagnose", "{record}", "--model", "{record}"], "record.csv"),
         (["fit", "{record}", "-o", "/nowhere/at/all/M.json"], "/nowhere/at/all/M.json"),
         (["predict", "nowhere.json", "{record}", "-o", "x.csv"], "nowhere.json"),
@@ -146,15 +147,16 @@ def test_bad_arguments_are_one_line(
     assert named in refused(capsys, *filled)
 
 
-def test_diagnosis_refuses_a_model_it_cannot_criticise_on_this_record(
-    capsys: pytest.CaptureFixture[str], record: Path, model: Path, tmp_path: Path
+@pytest.mark.parametrize("verb", ["diagnose", "improve"])
+def test_a_model_that_cannot_be_criticised_on_this_record_is_refused(
+    capsys: pytest.CaptureFixture[str], record: Path, model: Path, tmp_path: Path, verb: str
 ) -> None:
     other, boxes = tmp_path / "other.json", tmp_path / "narx.json"
     other.write_text(json.dumps({**json.loads(model.read_text()), "pulse_rate_hz": 25.0}))
-    words = refused(capsys, "diagnose", str(record), "--model", str(other))
+    words = refused(capsys, verb, str(record), "--model", str(other))
     assert "other.json" in words and "25 pulses a second" in words
     assert cli.run(["fit", str(record), "--method", "narx", "-o", str(boxes)]) == 0
-    assert "effects do not stand on a model of narx" in refused(capsys, "diagnose", str(record), "--model", str(boxes))
+    assert "effects do not stand on a model of narx" in refused(capsys, verb, str(record), "--model", str(boxes))
 
 
 def test_progress_tells_share_and_time_left_after_a_second(

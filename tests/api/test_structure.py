@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -60,6 +61,21 @@ def test_structure_that_the_recording_does_not_bear_is_left_out_and_said(site: S
         assert "not with bad: no effect bad" in test["summary"]["warnings"][-1]
         with signed_in(site) as browser:
             assert csrf(browser) and "not with bad" in browser.get(f"/models/{test['model_id']}").text
+
+
+def test_an_uploads_model_page_says_what_was_left_out_of_its_structure(site: Service) -> None:
+    """The page, the REST answer and the report say the same, also when they are loaded again."""
+    site.app.state.context.settings.structure = ("bad",)
+    csv = "time_s,pulse_width_us,torque_nm,segment\n0,0,0,rest\n"
+    with site.client() as client, signed_in(site) as browser:
+        for code in ("P1", "P2"):
+            client.post("/v1/participants", json={"code": code})
+        (told,) = client.post("/v1/participants/P1/recordings", content=csv).json()["warnings"]
+        form, token = "/participants/P2/recordings", csrf(browser)
+        page = browser.post(form, data={"csrf": token}, files={"file": ("a.csv", csv)}, follow_redirects=True)
+        assert page.url.path.startswith("/models/") and html.escape(told) in page.text
+        assert html.escape(told) in browser.get(page.url.path).text
+        assert html.escape(told) in browser.get(f"{page.url.path}/report").text
 
 
 def test_administration_shows_it(site: Service, service: Service) -> None:

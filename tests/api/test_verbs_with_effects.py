@@ -64,6 +64,12 @@ def test_what_a_model_holds_is_not_missing_in_it_and_auto_adds_what_improve_adds
     tried = {row["effect"] for rows in own["candidates"] for row in rows}
     assert tried and not tried & set(added)
     assert own["base"]["rms_nm"] == pytest.approx(fitted["fit"]["rms_nm"], rel=0.02)
+    report = tmp_path / "report.html"
+    further = json.loads(stimrig("improve", data, "--model", held, "--html", report, "--json"))
+    assert [name.partition(":")[0] for name in further["structure"]] == added
+    assert [step["added"] for step in further["steps"]] == [None] and further["verdict"] == "nothing_missing"
+    assert further["steps"][0]["rms_nm"] == pytest.approx(fitted["fit"]["rms_nm"], rel=0.02)
+    assert "fatigue" in report.read_text().lower()
 
 
 def test_fit_with_effects_gives_a_model_of_the_contract(tmp_path: Path) -> None:

@@ -50,21 +50,30 @@ def test_an_unknown_effect_is_no_effect():
         identify.improve(hidden_muscles.record(rate_hz=100), force=["witchcraft"])
 
 
+def held(record: identify.Record, lower: np.ndarray, upper: np.ndarray) -> float:
+    """Share of the samples within a band."""
+    return float(np.mean((lower <= record.torque_nm) & (record.torque_nm <= upper)))
+
+
 def test_a_model_with_effects_carries_bands_and_a_verdict():
-    """Twice the noise, twice as wide a band; the verdict's gates are those of any model."""
-    widths = []
+    """The band holds the muscle's own torque, and without the effect it does not; twice the noise, twice as wide.
+
+    The verdict's gates are those of any model.
+    """
+    widths, clean = [], hidden_muscles.record("fatigue", seed=5, noise_nm=0.0)
     for noise_nm in (0.03, 0.06):
         record = hidden_muscles.record("fatigue", seed=5, noise_nm=noise_nm)
-        model = Model.from_json(identify.improve(record).models[-1].to_json())
+        base, model = (Model.from_json(each.to_json()) for each in identify.improve(record).models)
         assert [effect["id"] for effect in model.effects] == ["fatigue"]
         assert model.quality["verdict"] in ("usable", "usable with care")
         assert model.valid_for["pulse_rate_hz"] == [38.0, 42.0]
         lower, upper = prediction_band(model, record)
-        predicted = model.predict(record)
-        assert np.all(lower <= predicted) and np.all(predicted <= upper)
+        assert held(clean, lower, upper) > 0.8
+        assert held(clean, *prediction_band(base, record)) < 0.65
         curve = model.bands["recruitment"]
         assert np.all(np.asarray(curve["lower"]) <= np.asarray(curve["upper"]))
         widths.append(float(np.mean((upper - lower)[~record.held_out])))
+        assert widths[-1] < noise_nm  # the whole band: some two hundred samples a parameter
     assert 1.4 < widths[1] / widths[0] < 2.8
 
 

@@ -112,6 +112,11 @@ class FakeCell:
         self.skip = 0
         self.rate = 1.0
         self.noise_nm = 0.0
+        self.ceiling_nm = math.inf
+        self.step_nm = 0.0
+        self.sign = 1
+        self.frozen = False
+        self.last_nm = 0.0
         self._rng = np.random.default_rng(0)
         self.counter = 65000
         self.torque_nm = 0.0
@@ -149,6 +154,11 @@ class FakeCell:
         block["stamp_s"] = np.nan
         block["torque_nm"] = np.nan if self.nan else self.torque_nm + self.add_nm
         block["torque_nm"] += self.noise_nm * self._rng.standard_normal(n)
+        clipped_nm = self.sign * np.minimum(block["torque_nm"], self.ceiling_nm)
+        if self.step_nm:
+            clipped_nm = self.step_nm * np.round(clipped_nm / self.step_nm)
+        block["torque_nm"] = self.last_nm if self.frozen else clipped_nm
+        self.last_nm = block["torque_nm"][-1]
         block["counter"] = (self.counter + np.arange(n)) % 65536
         block["sync"][0] = len(self.stimulator.sent) > self._seen
         self._seen = len(self.stimulator.sent)

@@ -130,8 +130,10 @@ def test_half_a_second_is_the_emulators_alone(tmp_path: Path):
     line = {"stimulator": "/dev/pts/3", "can": {"interface": "slcan", "channel": "/dev/pts/4"}}
     where = {"data_dir": tmp_path, "socket": tmp_path / "s"}
     made = [config.for_emulator(json.dumps(line | more), **where) for more in ({}, {"watch": CLINIC_WATCH})]
-    waits = [(m.watch.stale_torque_s, m.watch.missing_ack_s) for m in (load(tmp_path, GOOD), *made)]
-    assert waits == [(0.1, 0.1), (0.5, 0.5), (0.1, 0.1)]
+    waits = [
+        (m.watch.stale_torque_s, m.watch.missing_ack_s, m.watch.clipped_torque_s) for m in (load(tmp_path, GOOD), *made)
+    ]
+    assert waits == [(0.1, 0.1, 3.0), (0.5, 0.5, 10.0), (0.1, 0.1, 3.0)]
 
 
 def test_the_emulators_line_never_leads_to_a_real_stimulator(tmp_path: Path):

@@ -72,7 +72,7 @@ def test_a_rig_that_runs_faster_than_the_world_still_sees_half_a_rate(tmp_path: 
 
 def heard(arrival_s: list[float], size: int = 16) -> list[str | None]:
     """What is said after each block of so many samples, given when each of them came, and at the end."""
-    judge = Plausible(5.0, 1e9, 1600.0, 1.0)
+    judge = Plausible(5.0, 1e9, 1e9, 1600.0, 1.0)
     found = []
     for i, now_s in enumerate(arrival_s):
         block = np.zeros(size, SAMPLE)
@@ -164,7 +164,7 @@ def test_a_backlog_that_is_read_slowly_is_no_rate(holes_s: list[tuple[float, flo
 
 
 def test_a_backlog_read_before_the_test_is_no_rate():
-    judge, found = Plausible(5.0, 1e9, 1600.0, 1.0), []
+    judge, found = Plausible(5.0, 1e9, 1e9, 1600.0, 1.0), []
     for i in range(1000):
         block = np.zeros(16, SAMPLE)
         now_s = i * 0.005 if i < 300 else 1.5 + (i - 300) * 0.01  # 1.5 s read at twice the rate
@@ -192,7 +192,7 @@ def test_a_backlog_read_while_arming_does_not_end_the_test(tmp_path: Path):
 
 
 def test_what_came_too_little_is_not_judged():
-    judge = Plausible(5.0, 1e9, 1600.0, 1.0)
+    judge = Plausible(5.0, 1e9, 1e9, 1600.0, 1.0)
     assert judge.wrong_at_end() is None
     block = np.zeros(16, SAMPLE)
     judge.wrong(block)

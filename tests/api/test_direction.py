@@ -1,0 +1,50 @@
+"""A cell mounted the other way round: a told torque is the record's own, or it says that it is the muscle's."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import identify
+from api.commands.diagnose import effect_lines
+from api.pages import why
+from api.pages.environment import environment
+from tests.identify import hidden_muscles
+
+PULLS = "as the muscle pulls"
+
+
+def drifting(sign: int) -> identify.Record:
+    """Downward by 0.03 N·m/s where the cell is inverted, from a baseline on the same side."""
+    record = hidden_muscles.record("baseline_drift", seed=5)
+    return record.with_torque(sign * (record.torque_nm + 0.5))
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_torque_told_of_an_effect_says_when_it_counts_as_the_muscle_pulls(sign: int) -> None:
+    model = identify.fit(drifting(sign), effects=["baseline_drift:linear"])
+    slope = model.effects[0]["parameters"]["slope_nm_per_s"]
+    assert slope["value"] == pytest.approx(0.03, abs=0.01)
+    assert np.sign(model.baseline_nm) == sign
+    assert slope.get("direction") == (None if sign > 0 else PULLS)
+    assert (f"N·m/s {PULLS}" in str(model)) == (sign < 0)
+
+
+def test_numbers_without_a_direction_and_those_of_the_sensor_say_nothing() -> None:
+    model = identify.fit(drifting(-1), effects=["fatigue"])
+    assert not any("direction" in p for p in model.effects[0]["parameters"].values())
+    record = drifting(-1)
+    hum_nm = 0.3 * np.sin(2 * np.pi * 50.0 * record.time_s)
+    hum = identify.fit(record.with_torque(record.torque_nm + hum_nm), effects=["mains_hum"]).effects[0]["parameters"]
+    assert hum["sin_1_nm"]["value"] == pytest.approx(0.3, abs=0.02)
+    assert "direction" not in hum["sin_1_nm"]
+
+
+def test_the_diagnosis_tells_it_too_in_a_terminal_and_on_the_page() -> None:
+    missing = identify.diagnose(drifting(-1)).missing
+    entry = next(entry for entry in missing if entry["effect"] == "baseline_drift")
+    assert any(line.endswith(PULLS) for line in effect_lines(entry))
+    effect = environment.get_template("why.html").make_module().effect  # type: ignore[attr-defined]
+    assert PULLS in effect(why.card(entry, {}), 1, {})
+    upright = identify.diagnose(drifting(1)).missing[0]
+    assert PULLS not in effect(why.card(upright, {}), 1, {})
