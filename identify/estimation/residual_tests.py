@@ -91,9 +91,10 @@ class Apart:
     def __init__(self, start: np.ndarray, stop: np.ndarray) -> None:
         length = stop - start
         total = int(length.sum())
-        self.lags = max(min(LAGS, int(length.min()) - 2, total // 4), 1)
-        pairs = np.array([int(np.sum(np.maximum(length - lag, 0))) for lag in range(1, self.lags + 1)])
-        self.pairs = np.r_[total, 0.5 * pairs]
+        # However short single stretches are: a lag counts as long as half of the rows have a partner there.
+        pairs = np.array([int(np.sum(np.maximum(length - lag, 0))) for lag in range(1, LAGS + 1)])
+        self.lags = max(min(int(np.sum(2 * pairs >= total)), total // 4), 1)
+        self.pairs = np.r_[total, 0.5 * pairs[: self.lags]]
         self.place = np.arange(total) + self.lags * (1 + np.repeat(np.arange(length.size), length))
         self.size = total + self.lags * (length.size + 1)
         self.inner = slice(self.lags, self.size - self.lags)

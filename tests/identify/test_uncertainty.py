@@ -10,7 +10,7 @@ import pytest
 
 import identify
 from identify.dynamics.linear import SecondOrder
-from identify.estimation.residual_tests import Apart, chi_square_p
+from identify.estimation.residual_tests import LAGS, Apart, chi_square_p
 from identify.estimation.uncertainty import prediction_band
 from identify.noise.ar1 import best_ar1, log_likelihood, noise_evidence, whiten
 from identify.noise.level import NoiseLevel, correlation_slopes
@@ -85,6 +85,11 @@ def test_correlations_after_a_fit_have_the_moments_that_are_told():
     assert np.allclose(covariance, [[2 * np.trace(a @ left @ b @ left) for b in forms] for a in forms])
     row = rng.standard_normal(90)
     assert np.allclose(apart.correlations(row), [row @ form @ row for form in forms])
+
+
+def test_a_sliver_between_doubted_rows_leaves_the_lags_alone():
+    assert Apart(np.array([0, 610]), np.array([600, 613])).lags == LAGS
+    assert Apart(np.arange(0, 1000, 10), np.arange(5, 1000, 10)).lags == 2
 
 
 def test_what_was_estimated_of_the_noise_is_known_lag_by_lag():
