@@ -52,14 +52,19 @@ def residual_tests(fitted: Fitted) -> dict[str, Any]:
 
 
 def _taken_out(fitted: Fitted) -> np.ndarray:
-    """Rows whose products with themselves sum to the smoother: H = rows.T @ rows, on whitened intervals in order."""
-    setup = fitted.problem.setup
-    own = whitened(fitted.slopes / setup.spread, setup.stretches, fitted.noise)
-    size = 1.0 / np.sqrt(np.maximum(np.diag(fitted.hessian), 1e-300))
+    """Rows whose products with themselves sum to the smoother: H = rows.T @ rows, on whitened intervals in order.
+
+    A parameter that stands at its bound took nothing out: what it would have explained is left in the residual.
+    """
+    problem, setup = fitted.problem, fitted.problem.setup
+    free = np.flatnonzero((fitted.theta > problem.lower) & (fitted.theta < problem.upper))
+    own = whitened(fitted.slopes[free] / setup.spread, setup.stretches, fitted.noise)
+    hessian, prior = (matrix[np.ix_(free, free)] for matrix in (fitted.hessian, problem.prior[1]))
+    size = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-300))
     both = size[:, None] * size[None, :]
-    root = np.linalg.cholesky(fitted.hessian * both + 1e-10 * np.eye(size.size))
+    root = np.linalg.cholesky(hessian * both + 1e-10 * np.eye(size.size))
     lift = solve_triangular(root, np.diag(size), lower=True)
-    values, vectors = np.linalg.eigh(lift @ (fitted.hessian - fitted.problem.prior[1]) @ lift.T)
+    values, vectors = np.linalg.eigh(lift @ (hessian - prior) @ lift.T)
     return (vectors[:, values > NEGLIGIBLE].T @ lift) @ own
 
 
@@ -146,11 +151,13 @@ def _structure(fitted: Fitted, white: np.ndarray, taken: np.ndarray) -> dict[str
     scale = np.linalg.norm(signals, axis=1)
     signals = signals[scale > 0] / scale[scale > 0][:, None]
     extra = whitened(signals / setup.spread, setup.stretches, fitted.noise)
-    # The penalised fit takes out less than a projection: the same smoother is applied to the signals.
-    inside = extra @ taken.T
-    values, vectors = np.linalg.eigh(extra @ extra.T - inside @ inside.T)
+    # The penalised fit takes out less than a projection: the same smoother is applied to the signals. A search stops
+    # near the top, not at it; what it left along the model's own slopes is not looked at.
+    left = extra - (extra @ taken.T) @ taken
+    # Under the null the score left·r has about the variance left·left (the smoother is nearly a projection).
+    values, vectors = np.linalg.eigh(left @ left.T)
     kept = values > 1e-6 * max(float(values.max()), 1e-300)
-    part = (vectors.T @ (extra @ white))[kept] / np.sqrt(values[kept])
+    part = (vectors.T @ (left @ white))[kept] / np.sqrt(values[kept])
     return _verdict(float(part @ part), max(int(kept.sum()), 1))
 
 

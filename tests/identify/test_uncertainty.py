@@ -69,6 +69,22 @@ def test_false_alarms_are_rare(trials):
         assert 0.35 < np.mean(p) < 0.65, name
 
 
+def test_false_alarms_are_rare_with_an_effect_that_is_not_there(trials):
+    """Its parameters stand at a bound or are next to undetermined, and the search stops near the top."""
+    models = [identify.fit(record, effects=["fatigue"]) for _, record, *_ in trials[:30]]
+    for name in ("whiteness", "structure"):
+        assert sum(not model.residual_tests[name]["passed"] for model in models) <= 2, name
+
+
+def test_a_delay_that_the_model_does_not_hold_is_told():
+    """The delay that is left open stands at its bound: the fit took nothing out along it."""
+    patient, failed = Patient(time_constant_s=0.25, delay_s=0.02), 0
+    for seed in range(8):
+        record, _ = make_record(patient, np.random.default_rng(seed), rate_hz=400, noise_nm=0.05)
+        failed += not identify.fit(record).residual_tests["structure"]["passed"]
+    assert failed >= 3  # none where the delay counts as fitted
+
+
 def test_correlations_after_a_fit_have_the_moments_that_are_told():
     rng = np.random.default_rng(3)
     start, stop = np.array([0, 70]), np.array([60, 100])
