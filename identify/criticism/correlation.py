@@ -47,7 +47,9 @@ def correlation_tests(grid: Grid, residual_nm: np.ndarray) -> dict[str, Any]:
     residual = residual - residual[known].mean()
     torque = np.where(known, grid.torque_nm, 0.0)
     white, ar1 = _innovations(residual, known)
-    signals = {"u": grid.pulse_width_us, "u2": grid.pulse_width_us**2, "y": torque - residual}
+    # As they were felt: with late pulses on even slots an error that goes with the drive is smeared over lags.
+    width = grid.pulse_width_us
+    signals = {"u": grid.held(width), "u2": grid.held(width**2), "y": torque - residual}
     functions = {"residual": _auto(residual)} | {
         name: _cross(white, _filtered(signal, ar1, known)) for name, signal in signals.items()
     }

@@ -113,7 +113,7 @@ def quiet_rows(fitted: Fitted) -> np.ndarray:
     part = setup.part_of(at_samples=False)
     baseline = physical[problem.baselines.start : problem.baselines.stop]
     torque = problem.run(fitted.theta)[0] - (baseline[0] if part is None else baseline[part])
-    drive = physical[problem.coefficients] @ setup.design
+    drive = setup.grid.held(physical[problem.coefficients] @ setup.design)
     level = QUIET * setup.scale_nm
     still = (np.abs(torque) < level) & (np.abs(drive) < level)
     # Half a second after the last torque: slow tails belong to work.

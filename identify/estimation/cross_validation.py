@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from identify.estimation.joint import Fitted
+from identify.noise.level import whitened
 
 BLOCK_S = 2.0
 FOLDS = 5
@@ -13,9 +14,10 @@ FOLDS = 5
 def held_out_change(fitted: Fitted) -> np.ndarray:
     """By how much each fitted row's block mean changes when its fold isn't fitted, N·m, shape (K,).
 
-    Blocks of 2 s go to five folds in turn. The refit without a fold is one Gauss-Newton step from the solution: exact
-    in all that is linear (recruitment, baseline), first order in the rest. The state in which the record begins is
-    kept: without its first seconds nobody would predict it backwards.
+    Blocks of 2 s go to five folds in turn. The refit without a fold is one Gauss-Newton step from the solution, under
+    the noise that the solution was found under: exact in all that is linear (recruitment, baseline), first order in the
+    rest. The state in which the record begins is kept: without its first seconds nobody would predict it backwards.
+    What comes of it is an error of prediction, as on `validate`: it is not whitened.
     """
     problem = fitted.problem
     setup, grid = problem.setup, problem.setup.grid
@@ -24,21 +26,19 @@ def held_out_change(fitted: Fitted) -> np.ndarray:
     fold = (np.cumsum(rows) // block) % FOLDS
     kept = np.delete(np.arange(problem.size), problem.initials)
     mean, precision = problem.prior
-    penalty = precision[np.ix_(kept, kept)] * fitted.noise.sd_nm**2
-    slopes = fitted.slopes[kept]
-    whole = slopes[:, rows] @ slopes[:, rows].T + penalty
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(whole), 1e-300))
-    design = slopes.T * scale
-    whole = whole * scale[:, None] * scale[None, :]
-    residual = np.where(rows, fitted.residual_nm, 0.0)
-    gradient = design[rows].T @ residual[rows] - scale * (penalty @ (fitted.theta - mean)[kept])
+    pull = (precision @ (fitted.theta - mean))[kept]
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(fitted.hessian)[kept], 1e-300))
+    slopes = fitted.slopes[kept] * scale[:, None]
+    penalty = precision[np.ix_(kept, kept)] * scale[:, None] * scale[None, :] + 1e-9 * np.eye(kept.size)
+    both = np.vstack([np.where(rows, fitted.residual_nm, 0.0), slopes]) / setup.spread
     change = np.zeros(grid.size)
     for number in range(FOLDS):
         left_out = rows & (fold == number)
         if not left_out.any() or left_out.sum() == rows.sum():
             continue
-        out = design[left_out]
-        left = whole - out.T @ out
-        step = np.linalg.solve(left + 1e-9 * np.eye(len(left)), gradient - out.T @ residual[left_out])
-        change[left_out] = out @ step
+        runs = grid.stretches(rows & ~left_out)
+        ends = np.array([r.start for r in runs], np.int64), np.array([r.stop for r in runs], np.int64)
+        white = whitened(both, ends, fitted.noise)
+        step = np.linalg.solve(white[1:] @ white[1:].T + penalty, white[1:] @ white[0] - scale * pull)
+        change[left_out] = step @ slopes[:, left_out]
     return change

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from identify.noise.narrow_band import profile_band, smooth_band, whiten_band
-from identify.noise.slow_and_white import SHORTEST, profile_noise, whiten_rows
+from identify.noise.slow_and_white import MEAN_OF_SLOW, SHORTEST, profile_noise, whiten_rows
 
 Stretches = tuple[np.ndarray, np.ndarray]
 
@@ -143,3 +143,52 @@ def band_part(residual: np.ndarray, stretches: Stretches, noise: NoiseLevel) -> 
         return np.zeros(residual.size)
     start, stop = stretches
     return smooth_band(residual, start, stop, noise.ar1, noise.share, noise.turn, noise.keep, noise.band)
+
+
+POINTS = 1 << 14
+"""Frequencies of a spectrum: a band that is kept for a thousand steps is drawn by ten of them."""
+NUDGE = 1e-4
+LEAST_SHARE = 1e-9
+
+
+def correlation_slopes(noise: NoiseLevel, lags: int) -> np.ndarray:
+    """How the innovations' correlations at lags 1 to `lags` move with what was estimated of the noise.
+
+    A number at its bound was not fitted to anything, and has no row; nor has one that the others leave without a say.
+
+    Returns
+    -------
+    ndarray, shape (numbers, lags)
+        The derivative of the log spectrum by a number is the spectrum of what whitening with a wrong one leaves.
+    """
+    slow = noise.share > LEAST_SHARE and noise.ar1 > LEAST_SHARE
+    names = []
+    if slow:
+        names += ["share"] if noise.share < 2.0 else []
+        names += ["ar1"] if noise.ar1 < 1.0 - SHORTEST - LEAST_SHARE else []
+    if noise.band > 0.0:
+        names += ["band", "turn", "keep"]
+    rows = []
+    for name in names:
+        # Away from the bounds, and for a share away from the bend at 1.
+        nudge = -NUDGE * max(1.0 - getattr(noise, name), NUDGE) if name in ("ar1", "keep") else -NUDGE
+        moved = replace(noise, **{name: max(getattr(noise, name) + nudge, 0.0)})
+        change = (_log_spectrum(moved) - _log_spectrum(noise)) / nudge
+        rows.append(np.fft.irfft(change)[1 : lags + 1])
+    return np.array(rows).reshape(len(rows), lags)
+
+
+def _log_spectrum(noise: NoiseLevel) -> np.ndarray:
+    """Log of the noise's spectrum from frequency 0 to half a turn a step, up to a constant."""
+    angle = np.linspace(0.0, np.pi, POINTS // 2 + 1)
+    if noise.band <= 0.0 and noise.share > 1.0:
+        mean = (noise.share - 1.0) * MEAN_OF_SLOW
+        return np.log(1.0 + mean * mean + 2.0 * mean * np.cos(angle)) + np.log(_pole(angle, noise.ar1))
+    white = max(1.0 - noise.share - noise.band, 1e-9)
+    band = 0.5 * (_pole(angle - noise.turn, noise.keep) + _pole(angle + noise.turn, noise.keep))
+    return np.log(white + noise.share * _pole(angle, noise.ar1) + noise.band * band)
+
+
+def _pole(angle: np.ndarray, keep: float) -> np.ndarray:
+    """Spectrum of noise of variance 1 whose correlation falls by the factor `keep` a step."""
+    return (1.0 - keep * keep) / (1.0 + keep * keep - 2.0 * keep * np.cos(angle))

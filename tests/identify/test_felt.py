@@ -11,6 +11,7 @@ from scipy.signal import cont2discrete, lfilter
 
 import identify
 from identify.criticism import compare
+from identify.criticism.correlation import correlation_tests
 from identify.dynamics import pulse_grid
 from identify.dynamics.pulse_grid import Grid, make_grid
 from identify.methods import methods
@@ -457,3 +458,14 @@ def test_a_record_of_nothing_but_doubt_is_refused():
         compare(model, blind)
     with pytest.raises(identify.IdentifyError, match="may be fitted"):
         identify.fit(blind)
+
+
+def test_correlations_are_taken_with_what_was_felt():
+    rng = np.random.default_rng(4)
+    widths, late_s, _ = late_pulses(rng.uniform(0.0, 300.0, 1200), rng)
+    record = Record.from_arrays(np.arange(1200) / 40, widths, np.zeros(1200), late_s=late_s)
+    grid = make_grid(record)
+    error_nm = grid.held(widths)[grid.interval]
+    found = {test["with"]: test for test in correlation_tests(grid, error_nm)["tests"]}
+    assert found["u"]["values"][0] == pytest.approx(1.0)
+    assert not found["u"]["passed"]

@@ -10,9 +10,10 @@ import pytest
 
 import identify
 from identify.dynamics.linear import SecondOrder
-from identify.estimation.residual_tests import chi_square_p
+from identify.estimation.residual_tests import LAGS, Apart, chi_square_p
 from identify.estimation.uncertainty import prediction_band
 from identify.noise.ar1 import best_ar1, log_likelihood, noise_evidence, whiten
+from identify.noise.level import NoiseLevel, correlation_slopes
 from tests.identify.patients import Patient, make_record
 
 RECORDS = 60
@@ -66,6 +67,53 @@ def test_false_alarms_are_rare(trials):
         assert failed <= 4, name
         p = np.array([model.residual_tests[name]["p_value"] for *_, model in trials])
         assert 0.35 < np.mean(p) < 0.65, name
+
+
+def test_false_alarms_are_rare_with_an_effect_that_is_not_there(trials):
+    """Its parameters stand at a bound or are next to undetermined, and the search stops near the top."""
+    models = [identify.fit(record, effects=["fatigue"]) for _, record, *_ in trials[:30]]
+    for name in ("whiteness", "structure"):
+        assert sum(not model.residual_tests[name]["passed"] for model in models) <= 2, name
+
+
+def test_a_delay_that_the_model_does_not_hold_is_told():
+    """The delay that is left open stands at its bound: the fit took nothing out along it."""
+    patient, failed = Patient(time_constant_s=0.25, delay_s=0.02), 0
+    for seed in range(8):
+        record, _ = make_record(patient, np.random.default_rng(seed), rate_hz=400, noise_nm=0.05)
+        failed += not identify.fit(record).residual_tests["structure"]["passed"]
+    assert failed >= 3  # none where the delay counts as fitted
+
+
+def test_correlations_after_a_fit_have_the_moments_that_are_told():
+    rng = np.random.default_rng(3)
+    start, stop = np.array([0, 70]), np.array([60, 100])
+    apart = Apart(start, stop)
+    basis = np.linalg.qr(rng.standard_normal((90, 12)).cumsum(axis=0))[0].T * np.linspace(0.5, 1.0, 12)[:, None]
+    left = np.eye(90) - basis.T @ basis
+    forms = [np.eye(90)]
+    for lag in range(1, apart.lags + 1):
+        one = np.diag(np.ones(90 - lag), lag)
+        one[:60, 60:] = 0.0
+        forms.append(0.5 * (one + one.T))
+    mean, covariance = apart.moments(basis)
+    assert np.allclose(mean, [np.trace(form @ left) for form in forms])
+    assert np.allclose(covariance, [[2 * np.trace(a @ left @ b @ left) for b in forms] for a in forms])
+    row = rng.standard_normal(90)
+    assert np.allclose(apart.correlations(row), [row @ form @ row for form in forms])
+
+
+def test_a_sliver_between_doubted_rows_leaves_the_lags_alone():
+    assert Apart(np.array([0, 610]), np.array([600, 613])).lags == LAGS
+    assert Apart(np.arange(0, 1000, 10), np.arange(5, 1000, 10)).lags == 2
+
+
+def test_what_was_estimated_of_the_noise_is_known_lag_by_lag():
+    lag = np.arange(12)
+    slopes = correlation_slopes(NoiseLevel(0.7, 1.0, 1.0), 12)
+    assert np.allclose(slopes[1] / slopes[1, 0], 0.7**lag, atol=1e-3)
+    assert len(correlation_slopes(NoiseLevel(0.7, 0.0, 1.0), 12)) == 0
+    assert np.all(np.isfinite(correlation_slopes(NoiseLevel(0.7, 0.3, 1.0, 0.8, 0.99, 0.4), 12)))
 
 
 @pytest.mark.parametrize(("tired", "verdict"), [(0.1, "usable with care"), (0.3, "not usable")])
