@@ -12,7 +12,6 @@ from math import erfc, sqrt
 from typing import Any
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from scipy.linalg import solve_triangular
 
 from identify.estimation.joint import Fitted
@@ -100,44 +99,45 @@ class Apart:
         pairs = np.array([int(np.sum(np.maximum(length - lag, 0))) for lag in range(1, LAGS + 1)])
         self.lags = max(min(int(np.sum(2 * pairs >= total)), total // 4), 1)
         self.pairs = np.r_[total, 0.5 * pairs[: self.lags]]
-        self.place = np.arange(total) + self.lags * (1 + np.repeat(np.arange(length.size), length))
-        self.size = total + self.lags * (length.size + 1)
-        self.inner = slice(self.lags, self.size - self.lags)
-        self.known = self._wide(np.ones(total))[self.inner]
+        gap = 2 * self.lags
+        self.place = np.arange(total) + gap * (1 + np.repeat(np.arange(length.size), length))
+        self.size = total + gap * (length.size + 1)
+        near = np.zeros(self.size + 1)
+        near[np.maximum(self.place - self.lags, 0)] += 1
+        near[self.place + self.lags + 1] -= 1
+        near = np.cumsum(near)[:-1] > 0
+        near[self.place] = False
+        self.beside = np.flatnonzero(near)
 
     def _wide(self, rows: np.ndarray) -> np.ndarray:
         wide = np.zeros((*rows.shape[:-1], self.size))
         wide[..., self.place] = rows
         return wide
 
-    def _shifted(self, wide: np.ndarray) -> np.ndarray:
-        """The row, and the means of what stands `lag` intervals to either side, where rows are; (1 + lags, size)."""
-        lags = self.lags
-        around = sliding_window_view(wide, self.size - 2 * lags)
-        return (around[lags:] + around[lags::-1]) * (0.5 * self.known)
-
     def correlations(self, row: np.ndarray) -> np.ndarray:
         """Sums of products of the row with itself at lags 0, 1, …, not scaled."""
         wide = self._wide(row)
-        return self._shifted(wide) @ wide[self.inner]
+        return np.array([wide[: self.size - lag] @ wide[lag:] for lag in range(self.lags + 1)])
 
     def moments(self, taken: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Mean and covariance of `correlations` for white noise of variance 1 of which H = taken.T @ taken is gone.
 
         Each is a form r'Sr: its mean is tr(SM) and the covariance of two is 2 tr(SMS'M), with M = I - H.
         """
-        mean = self.pairs[0] * np.eye(1, self.lags + 1)[0]
-        covariance = np.diag(self.pairs)
-        both = np.empty((self.lags + 1, len(taken), len(taken)))
-        wide = self._wide(taken)
-        inner = wide[:, self.inner]
-        for index, row in enumerate(wide):
-            shifted = self._shifted(row)
-            covariance -= 2.0 * (shifted @ shifted.T)
-            both[:, index] = shifted @ inner.T
-        mean -= np.trace(both, axis1=1, axis2=2)
-        flat = both.reshape(self.lags + 1, -1)
-        return mean, 2.0 * (covariance + flat @ flat.T)
+        wide, lag = self._wide(taken), np.arange(self.lags + 1)
+        products = np.stack([wide[:, : self.size - k] @ wide[:, k:].T for k in lag])
+        removed = np.trace(products, axis1=1, axis2=2)
+        # Row behind row: the zeros between them keep them apart.
+        line = wide.ravel()
+        further = [line[:-k] @ line[k:] for k in range(self.lags + 1, 2 * self.lags + 1)]
+        all_lags = np.r_[removed, further]
+        twice = 0.5 * (all_lags[np.abs(lag[:, None] - lag)] + all_lags[lag[:, None] + lag])
+        # S has no row where there is no interval: what its neighbours would put there is taken off again.
+        outside = 0.5 * (wide[:, self.beside[:, None] + lag] + wide[:, self.beside[:, None] - lag])
+        outside = outside.reshape(-1, lag.size)
+        both = (0.5 * (products + products.transpose(0, 2, 1))).reshape(lag.size, -1)
+        covariance = np.diag(self.pairs) - 2.0 * (twice - outside.T @ outside) + both @ both.T
+        return self.pairs[0] * (lag == 0) - removed, 2.0 * covariance
 
 
 def _structure(fitted: Fitted, white: np.ndarray, taken: np.ndarray) -> dict[str, Any]:

@@ -185,8 +185,11 @@ def _log_spectrum(noise: NoiseLevel) -> np.ndarray:
         mean = (noise.share - 1.0) * MEAN_OF_SLOW
         return np.log(1.0 + mean * mean + 2.0 * mean * np.cos(angle)) + np.log(_pole(angle, noise.ar1))
     white = max(1.0 - noise.share - noise.band, 1e-9)
-    band = 0.5 * (_pole(angle - noise.turn, noise.keep) + _pole(angle + noise.turn, noise.keep))
-    return np.log(white + noise.share * _pole(angle, noise.ar1) + noise.band * band)
+    power = white + noise.share * _pole(angle, noise.ar1)
+    if noise.band > 0.0:
+        band = _pole(angle - noise.turn, noise.keep) + _pole(angle + noise.turn, noise.keep)
+        power = power + 0.5 * noise.band * band
+    return np.log(power)
 
 
 def _pole(angle: np.ndarray, keep: float) -> np.ndarray:
