@@ -180,7 +180,8 @@ def correlation_slopes(noise: NoiseLevel, lags: int) -> np.ndarray:
 
 def _log_spectrum(noise: NoiseLevel) -> np.ndarray:
     """Log of the noise's spectrum from frequency 0 to half a turn a step, up to a constant."""
-    angle = np.linspace(0.0, np.pi, POINTS // 2 + 1)
+    # A narrow band is a hundred times as narrow as the slowest noise.
+    angle = np.linspace(0.0, np.pi, (POINTS if noise.band > 0.0 else POINTS // 4) // 2 + 1)
     if noise.band <= 0.0 and noise.share > 1.0:
         mean = (noise.share - 1.0) * MEAN_OF_SLOW
         return np.log(1.0 + mean * mean + 2.0 * mean * np.cos(angle)) + np.log(_pole(angle, noise.ar1))
