@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from identify.dynamics.mean_weights import mean_weights
-from identify.dynamics.second_order import hermite
+from identify.dynamics.second_order import Core, curve_weights
 from identify.errors import BadRecord
 from identify.records.pulse_phase import pulse_phase_s
 from identify.records.record import FORGOTTEN_S, Record
@@ -174,8 +174,15 @@ class Grid:
         at = np.stack([moved + whole, moved + whole + 1])
         return rows, late[rows], early[rows], moved, at, np.stack([1.0 - rest, rest])
 
-    def mean_weights(self, delay_s: float = 0.0) -> tuple[int, np.ndarray]:
+    def mean_weights(self, delay_s: float = 0.0, core: Core | None = None) -> tuple[int, np.ndarray]:
         """How an interval's mean is read off the boundary states, for a model that lags by `delay_s`.
+
+        Parameters
+        ----------
+        delay_s : float
+            Lag behind the pulses, s.
+        core : (float, float) or None
+            T, s, and ζ of the dynamics, whose curve is then exact between two states; a cubic where none is given.
 
         Returns
         -------
@@ -185,41 +192,43 @@ class Grid:
             Weights of (y, y') at boundaries first, first + 1, … relative to each interval: the mean of interval k is
             sum over b of weights[k, b, 0] * y[k + first + b] + weights[k, b, 1] * y'[k + first + b].
         """
-        if delay_s not in self._weights:
-            if len(self._weights) >= 4:  # a search asks for the same delay several times, then never again
+        if (delay_s, core) not in self._weights:
+            if len(self._weights) >= 8:  # a search asks for the same ones several times, then never again
                 self._weights.clear()
-            self._weights[delay_s] = self._even_weights(delay_s) if self._pattern.size else self._any_weights(delay_s)
-        return self._weights[delay_s]
+            self._weights[delay_s, core] = self._new_weights(delay_s, core)
+        return self._weights[delay_s, core]
 
     @cached_property
-    def _pattern(self) -> np.ndarray:
-        """Places of the samples in every interval, where all intervals are sampled alike; else empty."""
-        each = int(self.count[0])
-        if not each or np.any(self.count != each):
-            return np.zeros(0)
-        places = self.fraction.reshape(-1, each)
-        return places[0] if np.max(np.abs(places - places[0])) < 1e-9 else np.zeros(0)
+    def _places(self) -> tuple[np.ndarray, np.ndarray]:
+        """Places in an interval at which samples were taken, shape (U,), and which is that of each sample, (N,)."""
+        return np.unique(np.round(self.fraction, 8), return_inverse=True)
 
-    def _even_weights(self, delay_s: float) -> tuple[int, np.ndarray]:
-        """Weights where every interval has the same: one row, standing for all."""
-        shifted = self._pattern - delay_s / self.step_s
+    @cached_property
+    def _alike(self) -> bool:
+        """Whether all intervals are sampled at the same places."""
+        places, place = self._places
+        return bool(
+            np.all(self.count == places.size) and np.array_equal(place, np.tile(np.arange(places.size), self.size))
+        )
+
+    def _new_weights(self, delay_s: float, core: Core | None) -> tuple[int, np.ndarray]:
+        places, place = self._places
+        shifted = places - delay_s / self.step_s
         offset = np.floor(shifted).astype(np.int64)
-        cubic = hermite(shifted - offset, self.step_s)
-        first = int(offset.min())
-        row = np.zeros((int(offset.max()) - first + 2, 2))
-        np.add.at(row, offset - first, cubic[:, :2])
-        np.add.at(row, offset - first + 1, cubic[:, 2:])
-        return first, np.broadcast_to(row / self._pattern.size, (self.size, *row.shape))
-
-    def _any_weights(self, delay_s: float) -> tuple[int, np.ndarray]:
-        """Weights sample by sample, whatever their places."""
-        return mean_weights(self.fraction, self.interval, self.count, delay_s / self.step_s, self.step_s)
+        four = curve_weights(shifted - offset, self.step_s, core)
+        if self._alike:  # one row, standing for all
+            only = np.zeros(places.size, np.int64)
+            first, row = mean_weights(four, offset, np.arange(places.size), only, self.count[:1])
+            return first, np.broadcast_to(row[0], (self.size, *row.shape[1:]))
+        return mean_weights(four, offset, place, self.interval, self.count)
 
     @cached_property
-    def _weights(self) -> dict[float, tuple[int, np.ndarray]]:
+    def _weights(self) -> dict[tuple[float, Core | None], tuple[int, np.ndarray]]:
         return {}
 
-    def block_mean(self, torque_nm: np.ndarray, rate_nm_s: np.ndarray, delay_s: float = 0.0) -> np.ndarray:
+    def block_mean(
+        self, torque_nm: np.ndarray, rate_nm_s: np.ndarray, delay_s: float = 0.0, core: Core | None = None
+    ) -> np.ndarray:
         """Mean over each interval's samples of the curve through boundary states.
 
         Parameters
@@ -228,12 +237,14 @@ class Grid:
             States at the ends of the intervals; the muscle is taken to be at `torque_nm[0]` before the first.
         delay_s : float
             Lag of the curve behind the pulses, s; may be negative by less than a step.
+        core : (float, float) or None
+            As in `mean_weights`.
 
         Returns
         -------
         ndarray, shape (K,) or (K, M)
         """
-        first, weights = self.mean_weights(delay_s)
+        first, weights = self.mean_weights(delay_s, core)
         before, after = max(-first, 0), max(weights.shape[1] + first - 2, 0)
         y = _padded(torque_nm, before, after, hold=True)
         v = _padded(rate_nm_s, before, after, hold=False)

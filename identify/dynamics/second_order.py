@@ -2,8 +2,8 @@
 
 The linear block of the paper in physical terms, T² y'' + 2 ζ T y' + y = w, with w held over each pulse interval.
 The state (y, y') is carried from one pulse to the next by the matrix exponential; inside an interval y is a smooth
-curve, recovered to micronewton-metres by a cubic through the states at its two ends. A delay therefore needs no
-states of its own: it shifts the times at which the curve is read.
+curve, read off the states at its two ends: exactly for a held input, as a cubic where both lags are long. A delay
+therefore needs no states of its own: it shifts the times at which the curve is read.
 """
 
 from __future__ import annotations
@@ -11,8 +11,11 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import lapack
 
+Core = tuple[float, float]
+"""T, s, and ζ."""
 
-def transition(time_constant_s: float, damping: float, step_s: float) -> tuple[np.ndarray, np.ndarray]:
+
+def transition(time_constant_s: float, damping: float, step_s: float | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Exact transition of T² y'' + 2 ζ T y' + y = w over one step with w held.
 
     Parameters
@@ -21,8 +24,8 @@ def transition(time_constant_s: float, damping: float, step_s: float) -> tuple[n
         T, s, positive.
     damping : float
         ζ, positive, 1 is critical.
-    step_s : float
-        Length of the step, s.
+    step_s : float or ndarray
+        Length of the step, s; of several, the shape follows those below.
 
     Returns
     -------
@@ -37,7 +40,7 @@ def transition(time_constant_s: float, damping: float, step_s: float) -> tuple[n
     root = np.sqrt(abs(gap))
     arg = root * h
     if abs(gap) < 1e-10:
-        c, s = 1.0, h
+        c, s = h**0, h
     elif gap < 0:
         c, s = np.cos(arg), np.sin(arg) / root
     else:
@@ -127,7 +130,32 @@ def hermite(fraction: np.ndarray, step_s: float) -> np.ndarray:
     )
 
 
-def read_at(torque_nm: np.ndarray, rate_nm_s: np.ndarray, position: np.ndarray, step_s: float) -> np.ndarray:
+def curve_weights(fraction: np.ndarray, step_s: float, core: Core | None) -> np.ndarray:
+    """Weights of (y0, y0', y1, y1') for the curve of dynamics `core` at `fraction` of a step; shape (N, 4).
+
+    The cubic, with the least change that makes it exact wherever the input is held: a lag of a few milliseconds bends
+    the curve more sharply than a cubic can. Without `core` the cubic itself.
+    """
+    cubic = hermite(fraction, 1.0)
+    unit = np.array([1.0, step_s, 1.0, step_s])
+    if core is None:
+        return cubic * unit
+    ((_, from_rate), (_, rate)), (step, step_rate) = transition(*core, step_s * np.append(fraction, 1.0))
+    # All that is possible under a held input: standing still, the response to a step, and that to an initial rate.
+    ends = np.array(
+        [
+            [1.0, 0.0, 1.0, 0.0],
+            [0.0, 0.0, 1.0, step_s * step_rate[-1] / step[-1]],
+            [0.0, 1.0, from_rate[-1] / step_s, rate[-1]],
+        ]
+    )
+    inside = np.stack([np.ones_like(fraction), step[:-1] / step[-1], from_rate[:-1] / step_s], axis=-1)
+    return (cubic + (inside - cubic @ ends.T) @ np.linalg.solve(ends @ ends.T, ends)) * unit
+
+
+def read_at(
+    torque_nm: np.ndarray, rate_nm_s: np.ndarray, position: np.ndarray, step_s: float, core: Core | None = None
+) -> np.ndarray:
     """The curve through the boundary states, read at times given in steps.
 
     Parameters
@@ -138,6 +166,8 @@ def read_at(torque_nm: np.ndarray, rate_nm_s: np.ndarray, position: np.ndarray, 
         Times in steps since the start of interval 0; before 0 the muscle is at rest, after K the last state stands.
     step_s : float
         Length of a step, s.
+    core : (float, float) or None
+        T, s, and ζ of the dynamics; a cubic where none is given.
 
     Returns
     -------
@@ -146,7 +176,7 @@ def read_at(torque_nm: np.ndarray, rate_nm_s: np.ndarray, position: np.ndarray, 
     last = torque_nm.shape[0] - 2
     interval = np.clip(np.floor(position).astype(np.int64), 0, last)
     fraction = np.clip(position - interval, 0.0, 1.0)
-    weight = hermite(fraction, step_s)
+    weight = curve_weights(fraction, step_s, core)
     value = (
         weight[:, 0] * torque_nm[interval]
         + weight[:, 1] * rate_nm_s[interval]

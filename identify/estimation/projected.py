@@ -108,12 +108,12 @@ class Projection:
         grid = self.grid
         states = free_states(linear.time_constant_s, linear.damping, grid.step_s, grid.size)
         if grid.begins.size == 1:
-            return [np.ones((grid.size, 1)), grid.block_mean(*states, linear.delay_s)]
+            return [np.ones((grid.size, 1)), grid.block_mean(*states, linear.delay_s, linear.core)]
         own = (grid.part[:, None] == np.arange(grid.begins.size)).astype(float)
         tails = []
         for part, begin in enumerate(grid.begins):
             torque, rate = (np.concatenate([np.zeros((begin, 2)), s[: grid.size + 1 - begin]]) for s in states)
-            tails.append(own[:, part : part + 1] * grid.block_mean(torque, rate, linear.delay_s))
+            tails.append(own[:, part : part + 1] * grid.block_mean(torque, rate, linear.delay_s, linear.core))
         return [own, *tails]
 
     @property
@@ -132,8 +132,8 @@ class Projection:
         values = [at.on_grid(grid, held) for at in near]
         if self.delay_s is None:
             near.append(SecondOrder(t, z, d + step))
-            values.append(grid.block_mean(torque, rate, d + step))
-        change = np.stack(values, axis=1) - grid.block_mean(torque, rate, d)[:, None]
+            values.append(grid.block_mean(torque, rate, d + step, (t, z)))
+        change = np.stack(values, axis=1) - grid.block_mean(torque, rate, d, (t, z))[:, None]
         first = size + self.grid.begins.size
         here = np.hstack(self._extra_columns(linear)[1:])
         tails = [(np.hstack(self._extra_columns(at)[1:]) - here) @ coefficients[first:] for at in near]

@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUNDS_S
-from identify.dynamics.second_order import read_at
+from identify.dynamics.second_order import Core, read_at
 from identify.dynamics.variable_speed import LAWS, read_means, run_core
 from identify.effects.base import Form, Parameter
 from identify.recruitment.curve import Basis
@@ -159,7 +159,7 @@ class Problem:
         torque, rate, delay = walk.to_boundaries()
         grid = self.setup.grid
         position = grid.interval + grid.fraction - delay[0] / grid.step_s
-        value = read_at(torque[0], rate[0], position, grid.step_s)[None, :]
+        value = read_at(torque[0], rate[0], position, grid.step_s, walk.core(0))[None, :]
         value = walk.add(value, self.setup.scene_at_samples, skip)
         return self.setup.unframed(walk.sense(value, self.setup.scene_at_samples)[0])
 
@@ -272,6 +272,7 @@ class _Walk:
                 for new, factor in chosen.form.call(part[rows], self.named(chosen, values), setup.scene):
                     split.append((new, slower[rows] * factor))
             branches = split
+        self.cores = core
         torque, rate = self.respond(branches, core, law, initial, _NONE)
         # A law given as a function of whole arrays is met by a few passes, each with the torque of the last.
         for _ in range(4 if given else 0):
@@ -326,12 +327,19 @@ class _Walk:
     def read(self, torque: np.ndarray, rate: np.ndarray, delay: np.ndarray) -> np.ndarray:
         grid = self.setup.grid
         mean = np.empty((torque.shape[0], grid.size))
-        for lag in np.unique(delay):
-            first, weights = grid.mean_weights(float(lag))
-            own = delay == lag
-            rows = slice(None) if own.all() else own
+        alike: dict[tuple[float, Core], list[int]] = {}
+        for row, lag in enumerate(delay.tolist()):
+            alike.setdefault((lag, self.core(row)), []).append(row)
+        for (lag, core), own in alike.items():
+            first, weights = grid.mean_weights(lag, core)
+            rows = slice(None) if len(alike) == 1 else own
             mean[rows] = read_means(torque[rows], rate[rows], first, np.ascontiguousarray(weights))
         return mean
+
+    def core(self, row: int) -> Core:
+        """T and ζ of a row, as they are where nothing changes the speed; those that joined later have the base's."""
+        time_constant_s, damping = self.cores[row if row < len(self.cores) else 0].tolist()
+        return time_constant_s, damping
 
     def add(self, value: np.ndarray, scene=None, skip: frozenset[str] = frozenset()) -> np.ndarray:
         part = self.setup.part_of(scene is not None)

@@ -9,7 +9,9 @@ import pytest
 
 from identify.diagnosis import diagnose
 from identify.errors import Cancelled
+from identify.records.record import Record
 from tests.identify import hidden_muscles
+from tests.identify.patients import Patient
 
 KEYS = {"effect", "probability", "rms_before_nm", "rms_after_nm", "held_out_rms_before_nm", "held_out_rms_after_nm"}
 KEYS |= {"confused_with", "next_experiment", "parameters"}
@@ -46,6 +48,20 @@ def test_where_nothing_is_hidden_nothing_is_named(seed, ar1):
     result = diagnose(hidden_muscles.record(seed=seed, ar1=ar1))
     assert result.verdict == "nothing_missing" and result.missing == ()
     assert result.probability > 0.5
+
+
+@pytest.mark.parametrize(("slow_s", "quick_s", "noise_nm"), [(0.05, 0.002, 0.01), (0.05, 5e-5, 0.04)])
+def test_a_muscle_with_one_lag_to_be_seen_lacks_nothing(slow_s, quick_s, noise_nm):
+    rng = np.random.default_rng(1)
+    widths, names = hidden_muscles.protocol(rng)
+    lag_s = np.sqrt(slow_s * quick_s)
+    patient = Patient(time_constant_s=lag_s, damping=0.5 * (slow_s + quick_s) / lag_s)
+    torque = patient.torque(widths, 400.0)
+    time_s = np.arange(torque.size) / 400.0
+    slot = np.floor(40 * time_s + 1e-9).astype(int)
+    measured = torque + noise_nm * rng.standard_normal(torque.size)
+    result = diagnose(Record.from_arrays(time_s, widths[slot], measured, names[slot]))
+    assert result.verdict == "nothing_missing", result.missing
 
 
 def test_noise_is_estimated_and_places_are_worded():
