@@ -21,6 +21,7 @@ from identify.recruitment.curve import Basis
 from identify.recruitment.knots import (
     KNOTS,
     PILOT_KNOTS,
+    QUIET_KNOTS,
     adapted_knots,
     bending_order,
     even_knots,
@@ -33,6 +34,8 @@ from identify.recruitment.spline import SplineBasis
 STARTS_S = (0.12, 0.4)
 ROUNDING = 2e-5
 """Share of the torque's range below which a residual is not noise."""
+QUIET = 0.0015
+"""Noise of a sample over the range of torque, below which a spline errs visibly at a bend: it then has more knots."""
 INITIAL_RIDGE = 1e-8
 """Of the initial torque: enough for a state that no row sees to stay at rest, too little to be felt by any other."""
 RATE_S = 0.1
@@ -464,7 +467,8 @@ def estimate(
 ) -> tuple[Solution, float]:
     """The solution, and the evidence for AR(1) over white noise (ΔBIC)."""
     first = pilot_solution(grid, rows, delay_s)
-    problem, start = designed(first, knots)
+    quiet = 0.0 < grid.noise_sd_nm < QUIET * float(np.ptp(grid.torque_nm[rows]))
+    problem, start = designed(first, QUIET_KNOTS if knots is None and quiet else knots)
     solution = search(problem, start)
     ar1, delta_bic = noise_evidence(solution.residual_nm, problem.stretches)
     if delta_bic > 0 and knots is None and problem.basis.size < KNOTS:

@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 
+from hardware_sim.hidden_records import generate
 from identify.diagnosis import diagnose
 from identify.errors import Cancelled
 from identify.records.record import Record
@@ -61,6 +62,13 @@ def test_a_muscle_with_one_lag_to_be_seen_lacks_nothing(slow_s, quick_s, noise_n
     slot = np.floor(40 * time_s + 1e-9).astype(int)
     measured = torque + noise_nm * rng.standard_normal(torque.size)
     result = diagnose(Record.from_arrays(time_s, widths[slot], measured, names[slot]))
+    assert result.verdict == "nothing_missing", result.missing
+
+
+@pytest.mark.parametrize("noise_nm", [5e-5, 5e-4])
+def test_a_spline_s_own_error_is_nothing_missing(noise_nm):
+    made = generate(None, "middle", 1, noise_sd_nm=noise_nm)
+    result = diagnose(Record.from_arrays(made["time_s"], made["pulse_width_us"], made["torque_nm"], made["segment"]))
     assert result.verdict == "nothing_missing", result.missing
 
 
