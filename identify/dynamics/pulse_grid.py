@@ -61,6 +61,8 @@ class Grid:
         Intervals in which it is not known what was felt.
     part : ndarray of int, shape (K,)
         Index into the record's `parts`; the pause between two belongs to the part before it.
+    resumed : ndarray of int
+        Intervals at whose start nobody knows the muscle's state: what was applied just before is not known.
     noise_sd_nm : float
         White noise of a sample, as the raw samples show it, N·m; 0 where nobody has looked.
     """
@@ -80,6 +82,7 @@ class Grid:
     late_s: np.ndarray | None
     doubted: np.ndarray
     part: np.ndarray
+    resumed: np.ndarray
     noise_sd_nm: float = 0.0
 
     @property
@@ -111,6 +114,11 @@ class Grid:
     def begins(self) -> np.ndarray:
         """Intervals at which the parts of the record begin, shape (B,), the first 0."""
         return np.searchsorted(self.part, np.arange(len(self.record.parts))).astype(np.int64)
+
+    @cached_property
+    def starts(self) -> np.ndarray:
+        """Intervals at whose start the state is open, shape (S,): those at which parts begin, and those resumed."""
+        return np.union1d(self.begins, self.resumed)
 
     @property
     def delay_bounds_s(self) -> tuple[float, float]:
@@ -317,7 +325,7 @@ def make_grid(record: Record) -> Grid:
     following = record.part[np.minimum(first_of, record.time_s.size - 1)]
     part = record.part[middle]
     pause = (count == 0) & (following != part)
-    width, late_s, doubted = _applied(record, middle, start_s, step_s, (count == 0) & ~pause, part)
+    width, late_s, doubted, resumed = _applied(record, middle, start_s, step_s, (count == 0) & ~pause, part)
     # Between two parts nothing is stimulated, whatever the first one ended with.
     width[pause] = 0.0
     if late_s is not None:
@@ -340,21 +348,22 @@ def make_grid(record: Record) -> Grid:
         late_s=late_s,
         doubted=doubted,
         part=part,
+        resumed=resumed,
     )
 
 
 def _applied(
     record: Record, middle: np.ndarray, start_s: float, step_s: float, gaps: np.ndarray, part: np.ndarray
-) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
-    """Width of each interval, its lateness, and where it is not known what was applied.
+) -> tuple[np.ndarray, np.ndarray | None, np.ndarray, np.ndarray]:
+    """Width of each interval, its lateness, where it is not known what was applied, and where the state is open then.
 
     Where samples are missing the pulses tell, if the record has them. Else the last width seen is taken to be in force
-    still, and what comes after is doubted until a muscle has forgotten it, unless no pulse came before and the
-    torque after is the same.
+    still, unless no pulse came before and the torque after is the same; what comes after begins in a state of its own,
+    and is doubted as long as a delay may show what was applied in the gap; where held out, until that is forgotten.
     """
     width = record.pulse_width_us[middle]
     late = np.zeros(width.size) if record.late_s is None else record.late_s[middle]
-    doubted = np.zeros(width.size, bool)
+    doubted, resumed = np.zeros(width.size, bool), []
     if gaps.any() and record.pulses is not None:
         known = record.pulses
         place = np.round((known.time_s - start_s) / step_s).astype(np.int64)
@@ -365,10 +374,16 @@ def _applied(
             target[gaps] = told[gaps]
     elif gaps.any():
         for gap in runs(gaps):
-            after = slice(gap.start, gap.stop + round(FORGOTTEN_S / step_s))
-            if width[gap.start - 1] or _moved(record, middle, gap):
-                doubted[after] |= part[after] == part[gap.start]
-    return width, late if late.any() else None, doubted
+            if not (width[gap.start - 1] or _moved(record, middle, gap)):
+                continue
+            # Rows held out can't say in which state they begin: there the muscle must have forgotten.
+            unseen = record.held_out[middle[gap.stop]]
+            reach_s = FORGOTTEN_S if unseen else LONGEST_DELAY_S
+            after = slice(gap.start, gap.stop + round(reach_s / step_s))
+            doubted[after] |= part[after] == part[gap.start]
+            if not unseen:
+                resumed.append(gap.stop)
+    return width, late if late.any() else None, doubted, np.array(resumed, np.int64)
 
 
 def _moved(record: Record, middle: np.ndarray, gap: slice) -> bool:
@@ -381,6 +396,8 @@ def _moved(record: Record, middle: np.ndarray, gap: slice) -> bool:
 
 MOVED = 0.04
 """Share of the torque's range by which rest differs from rest across a gap that was no pause."""
+LONGEST_DELAY_S = 0.25
+"""So long after a pulse a muscle may begin to answer; longer memory is in its state."""
 LONGEST_S = 24 * 3600.0
 LONGEST_LATE_S = 1.0
 

@@ -93,14 +93,14 @@ class Projection:
 
     @property
     def extras(self) -> int:
-        """Linear columns that aren't recruitment: of each part baseline, initial torque and its rate."""
-        return 3 * self.grid.begins.size
+        """Linear columns that aren't recruitment: baselines, and of each open state a torque and its rate."""
+        return self.grid.begins.size + 2 * self.grid.starts.size
 
     @cached_property
     def ridge(self) -> np.ndarray:
         """Penalty on baselines and initial states: a state that no row sees stays at rest."""
-        parts = self.grid.begins.size
-        return INITIAL_RIDGE * np.r_[np.zeros(parts), np.tile([1.0, RATE_S**2], parts)]
+        states = np.tile([1.0, RATE_S**2], self.grid.starts.size)
+        return INITIAL_RIDGE * np.r_[np.zeros(self.grid.begins.size), states]
 
     def columns(self, linear: SecondOrder) -> np.ndarray:
         """Block means of the response to each linear coefficient, shape (K, P + extras)."""
@@ -110,13 +110,14 @@ class Projection:
     def _extra_columns(self, linear: SecondOrder) -> list[np.ndarray]:
         grid = self.grid
         states = free_states(linear.time_constant_s, linear.damping, grid.step_s, grid.size)
-        if grid.begins.size == 1:
+        if grid.starts.size == 1:
             return [np.ones((grid.size, 1)), grid.block_mean(*states, linear.delay_s, linear.core)]
         own = (grid.part[:, None] == np.arange(grid.begins.size)).astype(float)
+        since = np.searchsorted(grid.starts, np.arange(grid.size), side="right") - 1
         tails = []
-        for part, begin in enumerate(grid.begins):
-            torque, rate = (np.concatenate([np.zeros((begin, 2)), s[: grid.size + 1 - begin]]) for s in states)
-            tails.append(own[:, part : part + 1] * grid.block_mean(torque, rate, linear.delay_s, linear.core))
+        for number, start in enumerate(grid.starts):
+            torque, rate = (np.concatenate([np.zeros((start, 2)), s[: grid.size + 1 - start]]) for s in states)
+            tails.append((since == number)[:, None] * grid.block_mean(torque, rate, linear.delay_s, linear.core))
         return [own, *tails]
 
     @property

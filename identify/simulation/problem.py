@@ -72,12 +72,13 @@ class Problem:
         ]
         numbers = ["", *(f"_{part}" for part in range(2, parts + 1))]
         table += [Parameter(f"baseline{number}_nm", "N·m", -span, span) for number in numbers]
-        for number in numbers:
+        states = setup.starts.size
+        for number in ["", *(f"_{state}" for state in range(2, states + 1))]:
             table.append(Parameter(f"initial_torque{number}_nm", "N·m", -span, span))
             table.append(Parameter(f"initial_rate{number}_nm_s", "N·m/s", -10 * span, 10 * span))
         self.delay = range(2, 3)
         self.baselines = range(3, 3 + parts)
-        self.initials = range(3 + parts, 3 + 3 * parts)
+        self.initials = range(3 + parts, 3 + parts + 2 * states)
         self.coefficients = slice(len(table), len(table) + setup.basis.size)
         table += [Parameter(f"recruitment_{i}_nm", "N·m", -np.inf, np.inf) for i in range(setup.basis.size)]
         self.chosen: list[Chosen] = []
@@ -122,7 +123,7 @@ class Problem:
         sd[2] = max((self.upper[2] - self.lower[2]) / 2.0, 1e-5)
         scale = self.setup.scale_nm
         sd[list(self.baselines)] = 0.5 * scale
-        sd[list(self.initials)] = np.tile([scale, 5.0 * scale], len(self.baselines))
+        sd[list(self.initials)] = np.tile([scale, 5.0 * scale], self.setup.starts.size)
         precision = np.diag(1.0 / sd**2)
         precision[self.coefficients, self.coefficients] = self.setup.penalty
         return mean, precision
@@ -299,7 +300,7 @@ class _Walk:
                 np.ascontiguousarray(core[:, 1]),
                 law,
                 multiplier,
-                setup.begins,
+                setup.starts,
                 begin,
                 setup.scale_nm,
                 setup.grid.step_s,

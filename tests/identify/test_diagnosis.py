@@ -51,8 +51,11 @@ def test_where_nothing_is_hidden_nothing_is_named(seed, ar1):
     assert result.probability > 0.5
 
 
-@pytest.mark.parametrize(("slow_s", "quick_s", "noise_nm"), [(0.05, 0.002, 0.01), (0.05, 5e-5, 0.04)])
-def test_a_muscle_with_one_lag_to_be_seen_lacks_nothing(slow_s, quick_s, noise_nm):
+@pytest.mark.parametrize(
+    ("slow_s", "quick_s", "noise_nm", "gaps_s"),
+    [(0.05, 0.002, 0.01, ()), (0.05, 5e-5, 0.04, ()), (0.6, 0.1, 0.02, ((4.2, 5.6), (11.0, 11.6)))],
+)
+def test_a_quick_muscle_and_a_slow_one_with_gaps_lack_nothing(slow_s, quick_s, noise_nm, gaps_s):
     rng = np.random.default_rng(1)
     widths, names = hidden_muscles.protocol(rng)
     lag_s = np.sqrt(slow_s * quick_s)
@@ -61,7 +64,10 @@ def test_a_muscle_with_one_lag_to_be_seen_lacks_nothing(slow_s, quick_s, noise_n
     time_s = np.arange(torque.size) / 400.0
     slot = np.floor(40 * time_s + 1e-9).astype(int)
     measured = torque + noise_nm * rng.standard_normal(torque.size)
-    result = diagnose(Record.from_arrays(time_s, widths[slot], measured, names[slot]))
+    record = Record.from_arrays(time_s, widths[slot], measured, names[slot])
+    for begin_s, end_s in gaps_s:
+        record = record.take((record.time_s < begin_s) | (record.time_s >= end_s))
+    result = diagnose(record)
     assert result.verdict == "nothing_missing", result.missing
 
 
