@@ -26,7 +26,16 @@ from identify.diagnosis.thresholds import (
 from identify.diagnosis.unknown import WANDER
 from identify.effects import get, registry
 from identify.effects.base import Effect
-from identify.estimation.adding import Candidate, added, fit_form, given_by_samples, names, try_effect, with_effects
+from identify.estimation.adding import (
+    BAND_COST,
+    Candidate,
+    added,
+    fit_form,
+    given_by_samples,
+    names,
+    try_effect,
+    with_effects,
+)
 from identify.estimation.joint import Fitted, solve, start_from
 from identify.estimation.prepare import Raw, plain, prepare
 from identify.estimation.rows import fitted_rows
@@ -52,6 +61,8 @@ class Analysis:
         The model without effects.
     given : list of str
         Effects seen in the raw samples.
+    with_given : list of Fitted
+        The base with the first of them, with the first two, ….
     rounds : list of list of Candidate
         Candidates of each round, best first; round i starts from chain[i].
     chain : list of Fitted
@@ -74,6 +85,7 @@ class Analysis:
     raw: Raw
     base: Fitted
     given: list[str] = field(default_factory=list)
+    with_given: list[Fitted] = field(default_factory=list)
     rounds: list[list[Candidate]] = field(default_factory=list)
     chain: list[Fitted] = field(default_factory=list)
     added: list[str] = field(default_factory=list)
@@ -119,8 +131,8 @@ def analyse(
         work.rounds.append(candidates)
         nameless = try_effect(WANDER, work.last)
         work.nameless.append(nameless.gain if nameless else 0.0)
-        work.margins.append(_margin(work, None))
-        enough = [c for c in candidates if c.gain >= _margin(work, c)]
+        work.margins.append(_margin(work, len(work.added)))
+        enough = [c for c in candidates if c.gain >= _margin(work, len(work.added), c)]
         if not enough:
             break
         _take(work, enough[0].fitted, enough[0].effect.id)
@@ -157,9 +169,9 @@ def _at_rest(work: Analysis, candidate: Candidate) -> bool:
     return seen_at_rest(work.quiet, candidate.fitted, candidate.effect.id) >= SEEN_AT_REST
 
 
-def _margin(work: Analysis, candidate: Candidate | None) -> float:
-    """Log evidence that the next effect must gain: a patch on the first one's imperfect form isn't an effect."""
-    if not work.added:
+def _margin(work: Analysis, number: int, candidate: Candidate | None = None) -> float:
+    """Log evidence that an effect must gain in a round: a patch on the first one's imperfect form isn't an effect."""
+    if not number:
         return FIRST_MARGIN
     share = PATCH if candidate is None else _patch(work, candidate)
     return max(NEXT_MARGIN, share * work.rounds[0][0].gain)
@@ -203,6 +215,7 @@ def _with_given(work: Analysis, base: Fitted) -> Fitted:
             continue
         base = added(base, effect, form, values)
         work.given.append(effect)
+        work.with_given.append(base)
     return base
 
 
@@ -214,8 +227,7 @@ def _exchange(work: Analysis) -> None:
         without = _without(last, effect)
         if without is not None and without.log_evidence > work.last.log_evidence - 1.0:
             work.added.remove(effect)
-            work.chain[-1] = without
-            work.left[-1] = left_over(without, work.quiet, work.raw.noise_sd_nm)
+            _rebuild(work, without)
             return
         if without is None:
             continue
@@ -226,10 +238,41 @@ def _exchange(work: Analysis) -> None:
                 continue
             found = fit_form(rival.effect, rival.form, without, without.residual_nm, {})
             if found is not None and found.log_evidence > work.last.log_evidence + 2.0:
+                won = found.log_evidence - work.last.log_evidence
                 work.added[index] = rival.effect.id
-                work.chain[-1] = found
-                work.left[-1] = left_over(found, work.quiet, work.raw.noise_sd_nm)
+                _rebuild(work, found, index, won)
                 return
+
+
+def _rebuild(work: Analysis, last: Fitted, index: int = -1, won: float = 0.0) -> None:
+    """Chain, rounds and margins as they would be, had the effects of the last model been added one after the other.
+
+    In the round `index` an effect beat, by `won`, one that had gained more alone.
+    """
+    wanted, tried = work.added, work.rounds[: len(work.added)]
+    work.added, work.chain, work.left = [], work.chain[:1], work.left[:1]
+    work.rounds, work.margins, work.nameless = [], [], work.nameless[: len(wanted)]
+    for number, effect in enumerate(wanted):
+        before = work.last
+        fitted = last if number == len(wanted) - 1 else _part(last, before, [*names(before), effect])
+        known = next((c for c in tried[number] if c.effect.id == effect), None)
+        described = get(effect)
+        gain = fitted.log_evidence - before.log_evidence + described.prior - (BAND_COST if described.band else 0.0)
+        form = dict(fitted.effects).get(effect, described.forms[0])
+        found = Candidate(described, form, fitted, gain, (known.forms if known else {}) | {form.name: gain})
+        found = _tempered(work, found)
+        most = found.gain - won if number == index else np.inf
+        rivals = [replace(c, gain=min(c.gain, most)) for c in tried[number] if c.effect.id != effect]
+        work.rounds.append(sorted([found, *rivals], key=lambda c: -c.gain))
+        work.margins.append(_margin(work, number))
+        _take(work, fitted, effect)
+
+
+def _part(last: Fitted, before: Fitted, kept: list[str]) -> Fitted:
+    """The last model with only some of its effects, from where they stand in it."""
+    problem = Problem(last.problem.setup, [(effect, form) for effect, form in last.effects if effect in kept])
+    noise = last.noise if any(get(name).band for name in kept) else before.noise
+    return solve(problem, start_from(problem, last, {}), noise)
 
 
 def _without(fitted: Fitted, effect: str) -> Fitted | None:

@@ -9,7 +9,7 @@ from identify.diagnosis import structure_of
 from identify.diagnosis.analysis import MOST, Analysis, analyse
 from identify.diagnosis.candidates import Progress
 from identify.diagnosis.steps import Step, steps
-from identify.diagnosis.thresholds import RISE
+from identify.diagnosis.unseen import rise
 from identify.diagnosis.verdict import judge
 from identify.effects import get
 from identify.estimation.adding import add, names
@@ -90,9 +90,9 @@ def helpful(work: Analysis) -> tuple[list[Step], list[dict[str, Any]]]:
     """The steps up to the first after which the error on rows not seen rises; and what is refused for that."""
     row = steps(work)
     for number in range(1 + len(work.given), len(row)):
-        before, after = (row[i].figures["held_out_rms_nm"] for i in (number - 1, number))
-        if after is not None and before is not None and after > RISE * before:
-            reason = f"The error on rows not seen would rise from {before:.3g} to {after:.3g} N·m."
+        errors = rise(row[number - 1].fitted, row[number].fitted)
+        if errors is not None:
+            reason = f"The error on rows not seen would rise from {errors[0]:.3g} to {errors[1]:.3g} N·m."
             return row[:number], [{"effect": row[number].added, "log_evidence_gain": None, "reason": reason}]
     return row, []
 
@@ -104,7 +104,7 @@ def _reason(work: Analysis, step: Step) -> str:
     if step.added in work.given:
         return "Seen in the raw samples."
     number = work.added.index(step.added)
-    gain = work.rounds[number][0].gain if number < len(work.rounds) else 0.0
+    gain = next(c.gain for c in work.rounds[number] if c.effect.id == step.added)
     return f"Log evidence rises by {gain:.0f}; {work.margins[number]:.0f} would do."
 
 

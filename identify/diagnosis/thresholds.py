@@ -61,7 +61,7 @@ UNSEEN_RATIO = 2.5
 UNSEEN_SHARE = 0.5
 """And in proportion to what the plain structure leaves there: a law close to the truth takes most, not all."""
 UNSEEN_RISE = 1.1
-"""Rise of the error on rows not seen that speaks against an effect."""
+"""Rise of the error on rows not seen that speaks against an effect, and ends improving."""
 DOUBTED = 0.45
 """Probability at most of what something speaks against."""
 HELD = 0.3
@@ -82,5 +82,3 @@ FORM_OF_EFFECTS = 0.003
 """The same where an effect is named: its law must hold on rows not seen, too."""
 LEAST_UNSEEN_ROWS = 40
 """Intervals, a second at 40 pulses/s: of fewer nothing is said."""
-RISE = 1.05
-"""Rise of the error on rows not seen that ends improving: less may be chance, of some hundred intervals."""

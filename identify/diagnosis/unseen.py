@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from identify.diagnosis.thresholds import FORM, LEAST_UNSEEN_ROWS, NEAR
+from identify.diagnosis.thresholds import FORM, LEAST_UNSEEN_ROWS, NEAR, UNSEEN_RISE
 from identify.dynamics.pulse_grid import Grid
 from identify.effects import get
 from identify.estimation.joint import Fitted
@@ -65,6 +65,14 @@ def unseen(fitted: Fitted, form: float = FORM) -> Unseen | None:
     if all(get(effect).foreseeable for effect, _ in fitted.effects):
         return Unseen(float(np.sqrt(np.mean(residual**2))), float(allowed))
     return Unseen(float(np.median(np.abs(residual)) / MEDIAN), float(allowed))
+
+
+def rise(before: Fitted, after: Fitted) -> tuple[float, float] | None:
+    """Errors on the intervals held out, N·m, without and with an effect, where they rise and so speak against it."""
+    old, new = unseen(before), unseen(after)
+    if old is None or new is None or new.rms_nm <= UNSEEN_RISE * max(old.rms_nm, new.allowed_nm):
+        return None
+    return old.rms_nm, new.rms_nm
 
 
 def _covered(grid: Grid, fitted: np.ndarray) -> np.ndarray:

@@ -28,13 +28,12 @@ from identify.diagnosis.thresholds import (
     STRUCTURE,
     TEMPERATURE,
     UNSEEN_RATIO,
-    UNSEEN_RISE,
     UNSEEN_SHARE,
     UNSTEADY,
 )
-from identify.diagnosis.unseen import Unseen, unseen
+from identify.diagnosis.unseen import Unseen, rise, unseen
 from identify.effects import get
-from identify.estimation.adding import Candidate, names
+from identify.estimation.adding import Candidate
 
 
 @dataclass(frozen=True)
@@ -97,8 +96,7 @@ def _no_effort(work: Analysis, explained: float, structure: float) -> bool:
     if explained < LEAST_BY_EFFORTS and structure > STRUCTURE:
         return True
     effort = work.added[0]
-    # Where a rival took its place since, it was still there in an earlier model, or in the last.
-    holder = next(fitted for fitted in work.chain[1:] if effort in dict(fitted.effects))
+    holder = work.chain[1]
     if seen_at_rest(work.quiet, holder, effort) >= SEEN_AT_REST:
         return False
     return "resisting" in dict(holder.effects)[effort].name or _efforts(holder.parameters_of(effort)) >= MANY
@@ -107,7 +105,7 @@ def _no_effort(work: Analysis, explained: float, structure: float) -> bool:
 def _everywhere(work: Analysis) -> bool:
     """Whether what looks like efforts lasts for much of the test: efforts are seldom."""
     effort = work.added[0]
-    holder = next(fitted for fitted in work.chain[1:] if effort in dict(fitted.effects))
+    holder = work.chain[1]
     widths = [value for name, value in holder.parameters_of(effort).items() if name.startswith(("width_", "decay_"))]
     setup = holder.problem.setup
     return 2.0 * sum(widths) > EVERYWHERE * float(setup.fitted.sum()) * setup.grid.step_s
@@ -117,16 +115,6 @@ def _efforts(parameters: dict[str, float]) -> int:
     """How many efforts the bumps make: those close to one another are one."""
     centres = np.sort([value for name, value in parameters.items() if name.startswith("centre_")])
     return int(np.sum(np.diff(centres) > APART_S)) + 1 if centres.size else 0
-
-
-def _unhelpful(work: Analysis, number: int) -> bool:
-    """Whether the error on rows not seen rises with the effect added in this round."""
-    if number + 1 >= len(work.chain) or work.added[number] not in names(work.chain[number + 1]):
-        return False  # it took the place of one that was there then
-    before, after = unseen(work.chain[number]), unseen(work.chain[number + 1])
-    return (
-        before is not None and after is not None and after.rms_nm > UNSEEN_RISE * max(before.rms_nm, after.allowed_nm)
-    )
 
 
 def _contradicted(before: Unseen | None, after: Unseen) -> bool:
@@ -147,14 +135,12 @@ def judge(work: Analysis) -> Verdict:
     found: dict[str, float] = dict.fromkeys(work.given, 0.99)
     rivals: dict[str, dict[str, float]] = {}
     for number, effect in enumerate(work.added):
-        if number >= len(work.rounds):
-            break
         rivals[effect] = shares(
             [c for c in work.rounds[number] if c.effect.id == effect or c.effect.id not in work.added]
         )
         # What was added later stands on what was added before.
         found[effect] = min([rivals[effect].get(effect, 0.5), *(found[e] for e in work.added[:number] if e in found)])
-        if _unhelpful(work, number):
+        if rise(work.chain[number], work.chain[number + 1]) is not None:
             found[effect] = min(found[effect], DOUBTED)
             notes.append(f"{get(effect).name}: the error on rows not seen rises with it.")
     structure = left.ratio

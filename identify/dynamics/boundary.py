@@ -111,36 +111,72 @@ def boundary_states(
     return (torque[0], rate[0]) if drive_nm.ndim == 1 else (torque.T, rate.T)
 
 
-def read_at(torque_nm: np.ndarray, rate_nm_s: np.ndarray, position: np.ndarray, step_s: float) -> np.ndarray:
-    """The curve through the boundary states, read at times given in steps.
-
-    Parameters
-    ----------
-    torque_nm, rate_nm_s : ndarray, shape (K + 1,)
-        Boundary states.
-    position : ndarray, shape (N,)
-        Times in steps since the start of interval 0; before 0 the muscle is at rest, after K the last state stands.
-    step_s : float
-        Length of a step, s.
-
-    Returns
-    -------
-    ndarray, shape (N,)
-    """
-    return _read_at(torque_nm, rate_nm_s, position, step_s)
+CUBIC = (0.0, 1.0)
+"""In place of T and ζ where no dynamics are given."""
 
 
 @njit(cache=True, nogil=True)
-def _read_at(torque, rate, position, step_s):  # pragma: no cover
-    out = np.empty(position.size)
-    last = torque.size - 2
-    for n in range(position.size):
-        if position[n] < 0:
-            out[n] = torque[0]
-            continue
-        k = min(int(np.floor(position[n])), last)
-        s = min(position[n] - k, 1.0)
+def curve_weights(fraction, step_s, time_constant_s, damping):  # pragma: no cover
+    """Weights of (y0, y0', y1, y1') for the curve between two boundary states, shape (N, 4).
+
+    The cubic, with the least change that makes it exact wherever the input is held: a lag of a few milliseconds bends
+    the curve more sharply than a cubic can.
+
+    Parameters
+    ----------
+    fraction : ndarray, shape (N,)
+        Place in the step, 0 to 1.
+    step_s, time_constant_s, damping : float
+        Of the step, and T and ζ of the dynamics; T = 0 for the cubic itself.
+    """
+    out = np.empty((fraction.size, 4))
+    exact = time_constant_s > 0.0
+    ends, lift, reached = np.zeros((3, 4)), np.zeros((3, 4)), 1.0
+    if exact:
+        # All that is possible under a held input: standing still, the response to a step, that to an initial rate.
+        p11, p12, p21, p22 = step_matrix(time_constant_s, damping, step_s)
+        ends[0, 0] = ends[0, 2] = ends[1, 2] = ends[2, 1] = 1.0
+        ends[1, 3] = -step_s * p21 / (1.0 - p11)
+        ends[2, 2], ends[2, 3] = p12 / step_s, p22
+        lift = np.ascontiguousarray(np.linalg.solve(ends @ ends.T, ends))
+        reached = 1.0 - p11
+    for n in range(fraction.size):
+        s = fraction[n]
         t = 1.0 - s
-        start = (1.0 + 2.0 * s) * torque[k] + s * step_s * rate[k]
-        out[n] = t * t * start + s * s * ((3.0 - 2.0 * s) * torque[k + 1] - t * step_s * rate[k + 1])
+        cubic = np.array([(1.0 + 2.0 * s) * t * t, s * t * t, s * s * (3.0 - 2.0 * s), -s * s * t])
+        if exact:
+            own = step_matrix(time_constant_s, damping, s * step_s)
+            inside = np.array([1.0, (1.0 - own[0]) / reached, own[1] / step_s])
+            cubic += (inside - ends @ cubic) @ lift
+        out[n] = cubic
+        out[n, 1] *= step_s
+        out[n, 3] *= step_s
+    return out
+
+
+@njit(cache=True, nogil=True)
+def read_at(torque, rate, interval, place, offset, weights):  # pragma: no cover
+    """The curve through boundary states at samples, shape (N,); before them the first stands, after them the last.
+
+    Parameters
+    ----------
+    torque, rate : ndarray, shape (K + 1,)
+        Boundary states.
+    interval, place : ndarray of int, shape (N,)
+        Interval of each sample, and which of the places in an interval is its own.
+    offset : ndarray of int, shape (U,)
+        Intervals from the one of the sample to that in which the curve is read, for each place.
+    weights : ndarray, shape (U, 4)
+        As `curve_weights` gives them.
+    """
+    out = np.empty(interval.size)
+    last = torque.size - 1
+    for n in range(interval.size):
+        k, w = interval[n] + offset[place[n]], weights[place[n]]
+        if k < 0:
+            out[n] = torque[0]
+        elif k >= last:
+            out[n] = torque[last]
+        else:
+            out[n] = w[0] * torque[k] + w[1] * rate[k] + w[2] * torque[k + 1] + w[3] * rate[k + 1]
     return out

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from identify.dynamics.second_order import transition
+from identify.dynamics.second_order import Core, transition
 
 if TYPE_CHECKING:
     from identify.dynamics.pulse_grid import Grid
 
 
-TIME_CONSTANT_BOUNDS_S = (0.012, 4.0)
+TIME_CONSTANT_BOUNDS_S = (0.003, 4.0)
 DAMPING_BOUNDS = (0.15, 8.0)
 """What a muscle's dynamics are looked for in; at the upper damping the second lag is too short to be seen."""
 
@@ -37,6 +37,11 @@ class SecondOrder:
     delay_s: float = 0.0
 
     @property
+    def core(self) -> Core:
+        """T, s, and ζ."""
+        return self.time_constant_s, self.damping
+
+    @property
     def memory_s(self) -> float:
         """Time after which an impulse is forgotten to about 1 part in 1000, s."""
         slowest = self.damping - np.sqrt(max(self.damping**2 - 1.0, 0.0))
@@ -44,13 +49,13 @@ class SecondOrder:
 
     def on_grid(self, grid: Grid, drive_nm: np.ndarray) -> np.ndarray:
         """Block means of the response to a drive by even slots, (K,) or (K, M) N·m, as it was felt, from rest."""
-        torque, rate = grid.states(self.time_constant_s, self.damping, drive_nm)
-        return grid.block_mean(torque, rate, self.delay_s)
+        torque, rate = grid.states(self.core, drive_nm)
+        return grid.block_mean(torque, rate, self.delay_s, self.core)
 
     def at_samples(self, grid: Grid, drive_nm: np.ndarray) -> np.ndarray:
         """The response at the record's samples, shape (N,)."""
-        torque, rate = grid.states(self.time_constant_s, self.damping, drive_nm)
-        return grid.at_samples(torque, rate, self.delay_s / grid.step_s)
+        torque, rate = grid.states(self.core, drive_nm)
+        return grid.at_samples(torque, rate, self.delay_s / grid.step_s, self.core)
 
     def discrete(self, sample_rate_hz: float) -> tuple[np.ndarray, np.ndarray, int]:
         """(b, a, d) of equations (1) to (3) at a sampling rate, exact for an input held between samples.

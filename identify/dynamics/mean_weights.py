@@ -7,17 +7,19 @@ from numba import njit
 
 
 @njit(cache=True, nogil=True)
-def mean_weights(fraction, interval, count, shift, step_s):  # pragma: no cover
-    """Weights of the boundary states in each interval's mean of samples read `shift` steps late.
+def mean_weights(four, offset, place, interval, count):  # pragma: no cover
+    """Weights of the boundary states in each interval's mean of its samples.
 
     Parameters
     ----------
-    fraction, interval : ndarray, shape (N,)
-        Place of each sample in its interval, 0 to 1, and which that is.
+    four : ndarray, shape (U, 4)
+        Weights of (y, y') before and after each place in an interval at which samples were taken.
+    offset : ndarray of int, shape (U,)
+        Steps from the sample's interval to the one in which its curve is read.
+    place, interval : ndarray of int, shape (N,)
+        Of each sample.
     count : ndarray of int, shape (K,)
         Samples in each interval.
-    shift, step_s : float
-        Lag, in steps, and the length of a step, s.
 
     Returns
     -------
@@ -26,21 +28,15 @@ def mean_weights(fraction, interval, count, shift, step_s):  # pragma: no cover
     weights : ndarray, shape (K, B, 2)
         For (y, y').
     """
-    low, high = 1 << 30, -(1 << 30)
-    for n in range(fraction.size):
-        o = int(np.floor(fraction[n] - shift))
-        low, high = min(low, o), max(high, o)
-    weights = np.zeros((count.size, high - low + 2, 2))
-    for n in range(fraction.size):
-        at = fraction[n] - shift
-        o = int(np.floor(at))
-        s = at - o
-        k, b = interval[n], o - low
-        r, t = 1.0 / count[k], 1.0 - s
-        weights[k, b, 0] += r * (1 + 2 * s) * t * t
-        weights[k, b, 1] += r * step_s * s * t * t
-        weights[k, b + 1, 0] += r * s * s * (3 - 2 * s)
-        weights[k, b + 1, 1] -= r * step_s * s * s * t
+    low = offset.min()
+    weights = np.zeros((count.size, offset.max() - low + 2, 2))
+    for n in range(place.size):
+        u, k = place[n], interval[n]
+        b, r = offset[u] - low, 1.0 / count[k]
+        weights[k, b, 0] += r * four[u, 0]
+        weights[k, b, 1] += r * four[u, 1]
+        weights[k, b + 1, 0] += r * four[u, 2]
+        weights[k, b + 1, 1] += r * four[u, 3]
     return low, weights
 
 

@@ -13,9 +13,9 @@ from functools import cached_property
 
 import numpy as np
 
-from identify.dynamics.boundary import boundary_states, read_at
+from identify.dynamics.boundary import CUBIC, boundary_states, curve_weights, read_at
 from identify.dynamics.mean_weights import mean_weights, read_means
-from identify.dynamics.second_order import hermite
+from identify.dynamics.second_order import Core
 from identify.errors import BadRecord
 from identify.records.pulse_phase import pulse_phase_s
 from identify.records.record import FORGOTTEN_S, Record
@@ -62,6 +62,8 @@ class Grid:
         Intervals in which it is not known what was felt.
     part : ndarray of int, shape (K,)
         Index into the record's `parts`; the pause between two belongs to the part before it.
+    resumed : ndarray of int
+        Intervals at whose start nobody knows the muscle's state: what was applied just before is not known.
     noise_sd_nm : float
         White noise of a sample, as the raw samples show it, N·m; 0 where nobody has looked.
     """
@@ -81,6 +83,7 @@ class Grid:
     late_s: np.ndarray | None
     doubted: np.ndarray
     part: np.ndarray
+    resumed: np.ndarray
     noise_sd_nm: float = 0.0
 
     @property
@@ -112,6 +115,11 @@ class Grid:
     def begins(self) -> np.ndarray:
         """Intervals at which the parts of the record begin, shape (B,), the first 0."""
         return np.searchsorted(self.part, np.arange(len(self.record.parts))).astype(np.int64)
+
+    @cached_property
+    def starts(self) -> np.ndarray:
+        """Intervals at whose start the state is open, shape (S,): those at which parts begin, and those resumed."""
+        return np.union1d(self.begins, self.resumed)
 
     @property
     def delay_bounds_s(self) -> tuple[float, float]:
@@ -175,16 +183,28 @@ class Grid:
         at = np.stack([moved + whole, moved + whole + 1])
         return rows, late[rows], early[rows], moved, at, np.stack([1.0 - rest, rest])
 
-    def states(self, time_constant_s: float, damping: float, drive_nm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def states(self, core: Core, drive_nm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Torque and rate at the ends of the intervals, (K + 1,) or (K + 1, M), from rest; the drive as it was felt."""
-        return boundary_states(time_constant_s, damping, self.step_s, self.held(drive_nm))
+        return boundary_states(*core, self.step_s, self.held(drive_nm))
 
-    def at_samples(self, torque_nm: np.ndarray, rate_nm_s: np.ndarray, lag: float) -> np.ndarray:
-        """The curve through boundary states at the record's samples, `lag` intervals late, shape (N,)."""
-        return read_at(torque_nm, rate_nm_s, self.interval + self.fraction - lag, self.step_s)
+    def at_samples(
+        self, torque_nm: np.ndarray, rate_nm_s: np.ndarray, lag: float, core: Core | None = None
+    ) -> np.ndarray:
+        """The curve of dynamics `core` through boundary states at the samples, `lag` intervals late, shape (N,)."""
+        places, place = self._places
+        offset = np.floor(places - lag)
+        four = curve_weights(places - lag - offset, self.step_s, *(core or CUBIC))
+        return read_at(torque_nm, rate_nm_s, self.interval, place, offset.astype(np.int64), four)
 
-    def mean_weights(self, delay_s: float = 0.0) -> tuple[int, np.ndarray]:
+    def mean_weights(self, delay_s: float = 0.0, core: Core | None = None) -> tuple[int, np.ndarray]:
         """How an interval's mean is read off the boundary states, for a model that lags by `delay_s`.
+
+        Parameters
+        ----------
+        delay_s : float
+            Lag behind the pulses, s.
+        core : (float, float) or None
+            T, s, and ζ of the dynamics, whose curve is then exact between two states; a cubic where none is given.
 
         Returns
         -------
@@ -194,41 +214,46 @@ class Grid:
             Weights of (y, y') at boundaries first, first + 1, … relative to each interval: the mean of interval k is
             sum over b of weights[k, b, 0] * y[k + first + b] + weights[k, b, 1] * y'[k + first + b].
         """
-        if delay_s not in self._weights:
-            if len(self._weights) >= 4:  # a search asks for the same delay several times, then never again
+        if (delay_s, core) not in self._weights:
+            if len(self._weights) >= 8:  # a search asks for the same ones several times, then never again
                 self._weights.clear()
-            self._weights[delay_s] = self._even_weights(delay_s) if self._pattern.size else self._any_weights(delay_s)
-        return self._weights[delay_s]
+            self._weights[delay_s, core] = self._new_weights(delay_s, core)
+        return self._weights[delay_s, core]
 
     @cached_property
-    def _pattern(self) -> np.ndarray:
-        """Places of the samples in every interval, where all intervals are sampled alike; else empty."""
+    def _alike(self) -> bool:
+        """Whether all intervals are sampled at the same places."""
         each = int(self.count[0])
         if not each or np.any(self.count != each):
-            return np.zeros(0)
+            return False
         places = self.fraction.reshape(-1, each)
-        return places[0] if np.max(np.abs(places - places[0])) < 1e-9 else np.zeros(0)
-
-    def _even_weights(self, delay_s: float) -> tuple[int, np.ndarray]:
-        """Weights where every interval has the same: one row, standing for all."""
-        shifted = self._pattern - delay_s / self.step_s
-        offset = np.floor(shifted).astype(np.int64)
-        cubic = hermite(shifted - offset, self.step_s)
-        first = int(offset.min())
-        row = np.zeros((int(offset.max()) - first + 2, 2))
-        np.add.at(row, offset - first, cubic[:, :2])
-        np.add.at(row, offset - first + 1, cubic[:, 2:])
-        return first, row[None] / self._pattern.size
-
-    def _any_weights(self, delay_s: float) -> tuple[int, np.ndarray]:
-        """Weights sample by sample, whatever their places."""
-        return mean_weights(self.fraction, self.interval, self.count, delay_s / self.step_s, self.step_s)
+        return bool(np.max(np.abs(places - places[0])) < 1e-9)
 
     @cached_property
-    def _weights(self) -> dict[float, tuple[int, np.ndarray]]:
+    def _places(self) -> tuple[np.ndarray, np.ndarray]:
+        """Places in an interval at which samples were taken, shape (U,), and which is that of each sample, (N,)."""
+        if self._alike:
+            each = int(self.count[0])
+            return self.fraction[:each], np.tile(np.arange(each), self.size)
+        return np.unique(np.round(self.fraction, 8), return_inverse=True)
+
+    def _new_weights(self, delay_s: float, core: Core | None) -> tuple[int, np.ndarray]:
+        places, place = self._places
+        shifted = places - delay_s / self.step_s
+        offset = np.floor(shifted).astype(np.int64)
+        four = curve_weights(shifted - offset, self.step_s, *(core or CUBIC))
+        if self._alike:  # one row, standing for all
+            only = np.zeros(places.size, np.int64)
+            return mean_weights(four, offset, np.arange(places.size), only, self.count[:1])
+        return mean_weights(four, offset, place, self.interval, self.count)
+
+    @cached_property
+    def _weights(self) -> dict[tuple[float, Core | None], tuple[int, np.ndarray]]:
         return {}
 
-    def block_mean(self, torque_nm: np.ndarray, rate_nm_s: np.ndarray, delay_s: float = 0.0) -> np.ndarray:
+    def block_mean(
+        self, torque_nm: np.ndarray, rate_nm_s: np.ndarray, delay_s: float = 0.0, core: Core | None = None
+    ) -> np.ndarray:
         """Mean over each interval's samples of the curve through boundary states.
 
         Parameters
@@ -237,12 +262,14 @@ class Grid:
             States at the ends of the intervals; the muscle is taken to be at `torque_nm[0]` before the first.
         delay_s : float
             Lag of the curve behind the pulses, s; may be negative by less than a step.
+        core : (float, float) or None
+            As in `mean_weights`.
 
         Returns
         -------
         ndarray, shape (K,) or (K, M)
         """
-        first, weights = self.mean_weights(delay_s)
+        first, weights = self.mean_weights(delay_s, core)
         torque, rate = (np.ascontiguousarray(np.atleast_2d(state.T)) for state in (torque_nm, rate_nm_s))
         mean = read_means(torque, rate, first, weights)
         return mean[0] if torque_nm.ndim == 1 else mean.T
@@ -294,7 +321,7 @@ def make_grid(record: Record) -> Grid:
     following = record.part[np.minimum(first_of, record.time_s.size - 1)]
     part = record.part[middle]
     pause = (count == 0) & (following != part)
-    width, late_s, doubted = _applied(record, middle, start_s, step_s, (count == 0) & ~pause, part)
+    width, late_s, doubted, resumed = _applied(record, middle, start_s, step_s, (count == 0) & ~pause, part)
     # Between two parts nothing is stimulated, whatever the first one ended with.
     width[pause] = 0.0
     if late_s is not None:
@@ -317,21 +344,22 @@ def make_grid(record: Record) -> Grid:
         late_s=late_s,
         doubted=doubted,
         part=part,
+        resumed=resumed,
     )
 
 
 def _applied(
     record: Record, middle: np.ndarray, start_s: float, step_s: float, gaps: np.ndarray, part: np.ndarray
-) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
-    """Width of each interval, its lateness, and where it is not known what was applied.
+) -> tuple[np.ndarray, np.ndarray | None, np.ndarray, np.ndarray]:
+    """Width of each interval, its lateness, where it is not known what was applied, and where the state is open then.
 
     Where samples are missing the pulses tell, if the record has them. Else the last width seen is taken to be in force
-    still, and what comes after is doubted until a muscle has forgotten it, unless no pulse came before and the
-    torque after is the same.
+    still, unless no pulse came before and the torque after is the same; what comes after begins in a state of its own,
+    and is doubted as long as a delay may show what was applied in the gap; where held out, until that is forgotten.
     """
     width = record.pulse_width_us[middle]
     late = np.zeros(width.size) if record.late_s is None else record.late_s[middle]
-    doubted = np.zeros(width.size, bool)
+    doubted, resumed = np.zeros(width.size, bool), []
     if gaps.any() and record.pulses is not None:
         known = record.pulses
         place = np.round((known.time_s - start_s) / step_s).astype(np.int64)
@@ -342,10 +370,16 @@ def _applied(
             target[gaps] = told[gaps]
     elif gaps.any():
         for gap in runs(gaps):
-            after = slice(gap.start, gap.stop + round(FORGOTTEN_S / step_s))
-            if width[gap.start - 1] or _moved(record, middle, gap):
-                doubted[after] |= part[after] == part[gap.start]
-    return width, late if late.any() else None, doubted
+            if not (width[gap.start - 1] or _moved(record, middle, gap)):
+                continue
+            # Rows held out can't say in which state they begin: there the muscle must have forgotten.
+            unseen = record.held_out[middle[gap.stop]]
+            reach_s = FORGOTTEN_S if unseen else LONGEST_DELAY_S
+            after = slice(gap.start, gap.stop + round(reach_s / step_s))
+            doubted[after] |= part[after] == part[gap.start]
+            if not unseen:
+                resumed.append(gap.stop)
+    return width, late if late.any() else None, doubted, np.array(resumed, np.int64)
 
 
 def _moved(record: Record, middle: np.ndarray, gap: slice) -> bool:
@@ -358,6 +392,8 @@ def _moved(record: Record, middle: np.ndarray, gap: slice) -> bool:
 
 MOVED = 0.04
 """Share of the torque's range by which rest differs from rest across a gap that was no pause."""
+LONGEST_DELAY_S = 0.25
+"""So long after a pulse a muscle may begin to answer; longer memory is in its state."""
 LONGEST_S = 24 * 3600.0
 LONGEST_LATE_S = 1.0
 

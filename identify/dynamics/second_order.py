@@ -2,14 +2,17 @@
 
 The linear block of the paper in physical terms, T² y'' + 2 ζ T y' + y = w, with w held over each pulse interval.
 The state (y, y') is carried from one pulse to the next by the matrix exponential; inside an interval y is a smooth
-curve, read by a cubic through the states at its two ends. A delay therefore needs no
-states of its own: it shifts the times at which the curve is read.
+curve, read off the states at its two ends: exactly for a held input, as a cubic where both lags are long. A delay
+therefore needs no states of its own: it shifts the times at which the curve is read.
 """
 
 from __future__ import annotations
 
 import numpy as np
 from scipy.linalg import lapack
+
+Core = tuple[float, float]
+"""T, s, and ζ."""
 
 
 def step_matrix(time_constant_s: float, damping: float, step_s: float) -> tuple[float, float, float, float]:
@@ -42,8 +45,8 @@ def transition(time_constant_s: float, damping: float, step_s: float) -> tuple[n
         T, s, positive.
     damping : float
         ζ, positive, 1 is critical.
-    step_s : float
-        Length of the step, s.
+    step_s : float or ndarray
+        Length of the step, s; of several, the shape follows those below.
 
     Returns
     -------
@@ -75,17 +78,3 @@ def recursion(a: np.ndarray, forced: np.ndarray) -> np.ndarray:
         bands, forced if forced.ndim == 2 else forced[:, None], uplo="L", overwrite_b=True
     )
     return solved if forced.ndim == 2 else solved[:, 0]
-
-
-def hermite(fraction: np.ndarray, step_s: float) -> np.ndarray:
-    """Weights of (y0, y0', y1, y1') for the cubic at `fraction` of a step; shape (..., 4)."""
-    s = np.asarray(fraction, float)
-    return np.stack(
-        [
-            (1 + 2 * s) * (1 - s) ** 2,
-            s * (1 - s) ** 2 * step_s,
-            s * s * (3 - 2 * s),
-            s * s * (s - 1) * step_s,
-        ],
-        axis=-1,
-    )

@@ -76,12 +76,13 @@ def finish(method_id: str, fitted: Fitted, reasons: Sequence[str] = (), figures:
 
 
 def _parts(fitted: Fitted) -> dict[str, Any]:
-    """Baseline, N·m, initial torque, N·m, and its rate, N·m/s, of each part of a record that has several."""
+    """Baseline, N·m, torque, N·m, and its rate, N·m/s, wherever the state is open in a record, if more than once."""
     problem, setup, values = fitted.problem, fitted.problem.setup, fitted.physical
-    if setup.begins.size == 1:
+    if setup.starts.size == 1:
         return {}
     states = setup.sign * values[list(problem.initials)].reshape(-1, 2)
-    return {"parts": np.c_[setup.unframed(values[list(problem.baselines)]), states].tolist()}
+    baselines = setup.unframed(values[list(problem.baselines)])[setup.grid.part[setup.starts]]
+    return {"parts": np.c_[baselines, states].tolist()}
 
 
 def _bent(fitted: Fitted) -> np.ndarray:

@@ -24,6 +24,8 @@ MOST_HARMONICS = 8
 LEAST_SPREAD = 0.2
 """Noise of a part over the largest of all parts, at least."""
 LEAST_ROWS = 8
+HARDLY_FELT_S, QUICK_S = 1e-3, 3e-3
+"""A second lag below the first changes next to nothing, so a search is stuck there: it begins anew at QUICK_S."""
 LEAST_EQUAL = 20
 """Samples at exactly the greatest (or smallest) value that count as clipping."""
 
@@ -252,7 +254,15 @@ def to_fitted(solution: Solution, most: int = 20) -> Fitted:
     values[list(problem.initials)] = setup.sign * solution.coefficients[size + parts :]
     values[problem.coefficients] = setup.sign * solution.coefficients[:size]
     noise = NoiseLevel(max(solution.ar1, 0.0), 0.5, float(np.sqrt(solution.variance)))
-    return solve(problem, problem.from_physical(values), noise, most=most)
+    fitted = solve(problem, problem.from_physical(values), noise, most=most)
+    values = fitted.physical
+    quick_s, slow_s = 0.5 * values[0] / values[1], 2.0 * values[0] * values[1]
+    if not most or quick_s > HARDLY_FELT_S:
+        return fitted
+    values[0] = np.sqrt(QUICK_S * slow_s)
+    values[1:3] = 0.5 * (QUICK_S + slow_s) / values[0], 0.0
+    theta = np.clip(problem.from_physical(values), problem.lower, problem.upper)
+    return max(fitted, solve(problem, theta, noise, most=most), key=lambda found: found.log_evidence)
 
 
 def setup_of(solution: Solution) -> Setup:

@@ -24,6 +24,7 @@ from identify.recruitment.curve import Basis
 from identify.recruitment.knots import (
     KNOTS,
     PILOT_KNOTS,
+    QUIET_KNOTS,
     adapted_knots,
     bending_order,
     even_knots,
@@ -36,6 +37,8 @@ from identify.recruitment.spline import SplineBasis
 STARTS_S = (0.12, 0.4)
 ROUNDING = 2e-5
 """Share of the torque's range below which a residual is not noise."""
+QUIET = 0.0015
+"""Noise of a sample over the range of torque, below which a spline errs visibly at a bend: it then has more knots."""
 INITIAL_RIDGE = 1e-8
 """Of the initial torque: enough for a state that no row sees to stay at rest, too little to be felt by any other."""
 RATE_S = 0.1
@@ -77,19 +80,18 @@ class Projection:
 
     @cached_property
     def rows_nm(self) -> np.ndarray:
-        """Held drive of each interval, row by row: basis functions, then nothing for what parts begin with."""
+        """Held drive of each interval, row by row: basis functions, then nothing for open states."""
         widths, place = np.unique(self.grid.pulse_width_us, return_inverse=True)
-        rows = np.zeros((self.basis.size + 2 * self.grid.begins.size, self.grid.size))
+        rows = np.zeros((self.basis.size + 2 * self.grid.starts.size, self.grid.size))
         rows[: self.basis.size] = self.grid.held(self.basis.design(widths)[place].T, axis=1)
         return rows
 
     @cached_property
     def beginnings(self) -> np.ndarray:
-        """State with which each row begins each part: the basis functions at rest, then unit torques and rates."""
-        parts = self.grid.begins.size
-        found = np.zeros((len(self.rows_nm), parts, 2))
-        for part in range(parts):
-            found[self.basis.size + 2 * part :, part][:2] = np.eye(2)
+        """State of each row where states are open: the basis functions at rest, then unit torques and rates."""
+        found = np.zeros((len(self.rows_nm), self.grid.starts.size, 2))
+        for number in range(self.grid.starts.size):
+            found[self.basis.size + 2 * number :, number][:2] = np.eye(2)
         return found
 
     @cached_property
@@ -109,20 +111,20 @@ class Projection:
 
     @property
     def extras(self) -> int:
-        """Linear columns that aren't recruitment: of each part baseline, initial torque and its rate."""
-        return 3 * self.grid.begins.size
+        """Linear columns that aren't recruitment: baselines, and of each open state a torque and its rate."""
+        return self.grid.begins.size + 2 * self.grid.starts.size
 
     @cached_property
     def ridge(self) -> np.ndarray:
         """Penalty on baselines and initial states: a state that no row sees stays at rest."""
-        parts = self.grid.begins.size
-        return INITIAL_RIDGE * np.r_[np.zeros(parts), np.tile([1.0, RATE_S**2], parts)]
+        states = np.tile([1.0, RATE_S**2], self.grid.starts.size)
+        return INITIAL_RIDGE * np.r_[np.zeros(self.grid.begins.size), states]
 
     def columns(self, linear: SecondOrder) -> np.ndarray:
         """Block means of the response to each linear coefficient, shape (K, P + extras)."""
-        even = np.tile(step_matrix(linear.time_constant_s, linear.damping, self.grid.step_s), (len(self.rows_nm), 1))
-        states = held_states(self.rows_nm, even, self.grid.begins, self.beginnings)
-        rows = read_means(*states, *self.grid.mean_weights(linear.delay_s))
+        even = np.tile(step_matrix(*linear.core, self.grid.step_s), (len(self.rows_nm), 1))
+        torque, rate = held_states(self.rows_nm, even, self.grid.starts, self.beginnings)
+        rows = read_means(torque, rate, *self.grid.mean_weights(linear.delay_s, linear.core))
         size = self.basis.size
         return np.concatenate([rows[:size], self.levels.T, rows[size:]]).T
 
@@ -137,13 +139,19 @@ class Projection:
         t, z, d = linear.time_constant_s, linear.damping, linear.delay_s
         drive = coefficients[:size] @ self.rows_nm[:size]
         begin = coefficients[size + grid.begins.size :].reshape(1, -1, 2)
-        even = [step_matrix(*at, grid.step_s) for at in ((t, z), (t * np.exp(step), z), (t, z * np.exp(step)))]
-        torque, rate = held_states(np.tile(drive, (3, 1)), np.array(even), grid.begins, np.tile(begin, (3, 1, 1)))
-        mean = read_means(torque, rate, *grid.mean_weights(d))
+        near = [(t, z), (t * np.exp(step), z), (t, z * np.exp(step))]
+        even = np.array([step_matrix(*core, grid.step_s) for core in near])
+        torque, rate = held_states(np.tile(drive, (3, 1)), even, grid.starts, np.tile(begin, (3, 1, 1)))
+
+        def read(row: int, delay_s: float) -> np.ndarray:
+            at = slice(row, row + 1)
+            return read_means(torque[at], rate[at], *grid.mean_weights(delay_s, near[row]))[0]
+
+        mean = [read(row, d) for row in range(3)]
         change = [mean[1] - mean[0], mean[2] - mean[0]]
         if self.delay_s is None:
             # The delay shifts only where the curve is read.
-            change.append(read_means(torque[:1], rate[:1], *grid.mean_weights(d + step))[0] - mean[0])
+            change.append(read(0, d + step) - mean[0])
         return np.stack(change).T / step
 
 
@@ -477,7 +485,8 @@ def estimate(
 ) -> tuple[Solution, float]:
     """The solution, and the evidence for AR(1) over white noise (ΔBIC)."""
     first = pilot_solution(grid, rows, delay_s)
-    problem, start = designed(first, knots)
+    quiet = 0.0 < grid.noise_sd_nm < QUIET * float(np.ptp(grid.torque_nm[rows]))
+    problem, start = designed(first, QUIET_KNOTS if knots is None and quiet else knots)
     solution = search(problem, start)
     ar1, delta_bic = noise_evidence(solution.residual_nm, problem.stretches)
     if delta_bic > 0 and knots is None and problem.basis.size < KNOTS:

@@ -9,6 +9,8 @@ from identify.recruitment.spline import SplineBasis
 KNOTS = 31
 SMOOTH_KNOTS = 19
 """Enough where a pilot's curve takes more than a quarter of the range to rise: less to compute, nothing lost."""
+QUIET_KNOTS = 61
+"""Where the noise is so small that what fewer knots leave at a bend would look like an effort or a tremor."""
 PILOT_KNOTS = 9
 NARROWEST_US = 0.5
 STRAIGHTEST = 0.003

@@ -120,8 +120,8 @@ def problem_of(model: Muscle, grid: Grid) -> tuple[Problem, np.ndarray]:
     values[:3] = model.linear.time_constant_s, model.linear.damping, model.linear.delay_s
     values[list(problem.baselines)] = setup.framed(np.asarray(model.baseline_nm))
     if same_data(model, grid.record):
-        parts = np.asarray(model.extra.get("parts", [[model.baseline_nm, *model.initial]]))[: grid.begins.size]
-        values[list(problem.baselines)[: len(parts)]] = setup.framed(parts[:, 0])
+        parts = np.asarray(model.extra.get("parts", [[model.baseline_nm, *model.initial]]))[: grid.starts.size]
+        values[np.array(problem.baselines)[grid.part[grid.starts[: len(parts)]]]] = setup.framed(parts[:, 0])
         values[list(problem.initials)[: 2 * len(parts)]] = setup.sign * parts[:, 1:].ravel()
     values[problem.coefficients] = setup.sign * model.recruitment.coefficients_nm
     values[problem.coefficients.stop :] = parameters

@@ -14,6 +14,7 @@ import numpy as np
 
 from identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUNDS_S
 from identify.dynamics.mean_weights import read_means
+from identify.dynamics.second_order import Core
 from identify.dynamics.variable_speed import LAWS, run_core
 from identify.effects.base import Form, Parameter
 from identify.recruitment.curve import Basis
@@ -72,12 +73,13 @@ class Problem:
         ]
         numbers = ["", *(f"_{part}" for part in range(2, parts + 1))]
         table += [Parameter(f"baseline{number}_nm", "N·m", -span, span) for number in numbers]
-        for number in numbers:
+        states = setup.starts.size
+        for number in ["", *(f"_{state}" for state in range(2, states + 1))]:
             table.append(Parameter(f"initial_torque{number}_nm", "N·m", -span, span))
             table.append(Parameter(f"initial_rate{number}_nm_s", "N·m/s", -10 * span, 10 * span))
         self.delay = range(2, 3)
         self.baselines = range(3, 3 + parts)
-        self.initials = range(3 + parts, 3 + 3 * parts)
+        self.initials = range(3 + parts, 3 + parts + 2 * states)
         self.coefficients = slice(len(table), len(table) + setup.basis.size)
         table += [Parameter(f"recruitment_{i}_nm", "N·m", -np.inf, np.inf) for i in range(setup.basis.size)]
         self.chosen: list[Chosen] = []
@@ -122,7 +124,7 @@ class Problem:
         sd[2] = max((self.upper[2] - self.lower[2]) / 2.0, 1e-5)
         scale = self.setup.scale_nm
         sd[list(self.baselines)] = 0.5 * scale
-        sd[list(self.initials)] = np.tile([scale, 5.0 * scale], len(self.baselines))
+        sd[list(self.initials)] = np.tile([scale, 5.0 * scale], self.setup.starts.size)
         precision = np.diag(1.0 / sd**2)
         precision[self.coefficients, self.coefficients] = self.setup.penalty
         return mean, precision
@@ -161,7 +163,8 @@ class Problem:
         """Torque as the record counts it, at its samples, N·m; effects named in `skip` are left out of the sum."""
         walk = _Walk(self, theta, False)
         torque, rate, delay, _ = walk.to_boundaries()
-        value = self.setup.grid.at_samples(torque[0], rate[0], delay[0] / self.setup.grid.step_s)[None, :]
+        grid = self.setup.grid
+        value = grid.at_samples(torque[0], rate[0], delay[0] / grid.step_s, walk.core(0))[None, :]
         value = walk.add(value, self.setup.scene_at_samples, skip)
         return self.setup.unframed(walk.sense(value, self.setup.scene_at_samples)[0])
 
@@ -278,6 +281,7 @@ class _Walk:
                 for new, factor in chosen.form.call(part[rows], self.named(chosen, values), setup.scene):
                     split.append((new, slower[rows] * factor))
             branches = split
+        self.cores = core
         torque, rate = self.respond(branches, core, law, initial, _NONE)
         # A law given as a function of whole arrays is met by a few passes, each with the torque of the last.
         for _ in range(4 if given else 0):
@@ -304,7 +308,7 @@ class _Walk:
                 np.ascontiguousarray(core[:, 1]),
                 law,
                 multiplier,
-                setup.begins,
+                setup.starts,
                 begin,
                 setup.scale_nm,
                 setup.grid.step_s,
@@ -332,14 +336,20 @@ class _Walk:
     def read(self, torque: np.ndarray, rate: np.ndarray, delay: np.ndarray, owned: np.ndarray) -> np.ndarray:
         grid = self.setup.grid
         mean = np.empty((delay.size, grid.size))
-        for lag in np.unique(delay):
-            first, weights = grid.mean_weights(float(lag))
-            rows = np.flatnonzero(delay == lag)
+        alike: dict[tuple[float, Core], list[int]] = {}
+        for row, lag in enumerate(delay.tolist()):
+            alike.setdefault((lag, self.core(row)), []).append(row)
+        for (lag, core), rows in alike.items():
             own = owned[rows]
             if own[-1] - own[0] + 1 == own.size and np.all(np.diff(own) == 1):
                 own = slice(own[0], own[-1] + 1)
-            mean[rows] = read_means(torque[own], rate[own], first, weights)
+            mean[rows] = read_means(torque[own], rate[own], *grid.mean_weights(lag, core))
         return mean
+
+    def core(self, row: int) -> Core:
+        """T and ζ of a row, as they are where nothing changes the speed; those that joined later have the base's."""
+        time_constant_s, damping = self.cores[row if row < len(self.cores) else 0].tolist()
+        return time_constant_s, damping
 
     def add(self, value: np.ndarray, scene=None, skip: frozenset[str] = frozenset()) -> np.ndarray:
         part = self.setup.part_of(scene is not None)

@@ -69,6 +69,11 @@ class Setup:
         """Intervals at which the parts of the record begin, shape (B,), the first 0."""
         return self.grid.begins
 
+    @property
+    def starts(self) -> np.ndarray:
+        """Intervals at whose start the state is open, shape (S,)."""
+        return self.grid.starts
+
     def part_of(self, at_samples: bool) -> np.ndarray | None:
         """Part of each sample or of each interval; None where there is one part."""
         if self.begins.size == 1:

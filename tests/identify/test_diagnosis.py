@@ -7,9 +7,12 @@ import json
 import numpy as np
 import pytest
 
+from hardware_sim.hidden_records import generate
 from identify.diagnosis import diagnose
 from identify.errors import Cancelled
+from identify.records.record import Record
 from tests.identify import hidden_muscles
+from tests.identify.patients import Patient
 
 KEYS = {"effect", "probability", "rms_before_nm", "rms_after_nm", "held_out_rms_before_nm", "held_out_rms_after_nm"}
 KEYS |= {"confused_with", "next_experiment", "parameters"}
@@ -46,6 +49,33 @@ def test_where_nothing_is_hidden_nothing_is_named(seed, ar1):
     result = diagnose(hidden_muscles.record(seed=seed, ar1=ar1))
     assert result.verdict == "nothing_missing" and result.missing == ()
     assert result.probability > 0.5
+
+
+@pytest.mark.parametrize(
+    ("slow_s", "quick_s", "noise_nm", "gaps_s"),
+    [(0.05, 0.002, 0.01, ()), (0.05, 5e-5, 0.04, ()), (0.6, 0.1, 0.02, ((4.2, 5.6), (11.0, 11.6)))],
+)
+def test_a_quick_muscle_and_a_slow_one_with_gaps_lack_nothing(slow_s, quick_s, noise_nm, gaps_s):
+    rng = np.random.default_rng(1)
+    widths, names = hidden_muscles.protocol(rng)
+    lag_s = np.sqrt(slow_s * quick_s)
+    patient = Patient(time_constant_s=lag_s, damping=0.5 * (slow_s + quick_s) / lag_s)
+    torque = patient.torque(widths, 400.0)
+    time_s = np.arange(torque.size) / 400.0
+    slot = np.floor(40 * time_s + 1e-9).astype(int)
+    measured = torque + noise_nm * rng.standard_normal(torque.size)
+    record = Record.from_arrays(time_s, widths[slot], measured, names[slot])
+    for begin_s, end_s in gaps_s:
+        record = record.take((record.time_s < begin_s) | (record.time_s >= end_s))
+    result = diagnose(record)
+    assert result.verdict == "nothing_missing", result.missing
+
+
+@pytest.mark.parametrize("noise_nm", [5e-5, 5e-4])
+def test_a_spline_s_own_error_is_nothing_missing(noise_nm):
+    made = generate(None, "middle", 1, noise_sd_nm=noise_nm)
+    result = diagnose(Record.from_arrays(made["time_s"], made["pulse_width_us"], made["torque_nm"], made["segment"]))
+    assert result.verdict == "nothing_missing", result.missing
 
 
 def test_noise_is_estimated_and_places_are_worded():

@@ -220,10 +220,11 @@ def test_a_gap_in_a_sealed_recording_invents_no_pulse(tmp_path):
     assert np.array_equal(grid.pulse_width_us, true["widths"][: grid.size])
     model = identify.fit(record)
     assert model.linear.time_constant_s == pytest.approx(0.15, rel=0.01)
-    # A record that does not know its pulses holds the last width, and doubts what comes after.
+    # A record that does not know its pulses holds the last width, and begins anew after it.
     blind = make_grid(without(record))
     assert not np.array_equal(blind.pulse_width_us, true["widths"][: grid.size])
-    assert blind.doubted[ends[0] + 12 : ends[0] + 12 + 55].all()
+    assert blind.resumed.size == len(ends) and grid.resumed.size == 0
+    assert all(blind.doubted[k + 1 : k + 20].all() for k in ends)
     assert not blind.doubted[: min(ends) - 5].any()
 
 
@@ -234,7 +235,8 @@ def test_a_gap_between_rests_is_a_pause_unless_the_torque_moved():
     torque = np.where(width > 0, 5.0, 0.0)
     assert not make_grid(Record.from_arrays(time_s, width, torque)).doubted.any()
     letting_go = torque + np.where(time_s >= 5, 3.0 * np.exp(-(time_s - 5) / 0.3), 0.0)
-    assert make_grid(Record.from_arrays(time_s, width, letting_go)).doubted[-80:-20].all()
+    grid = make_grid(Record.from_arrays(time_s, width, letting_go))
+    assert grid.starts.tolist() == [0, 200] and grid.doubted[40:208].all()
 
 
 # ---- the record ---------------------------------------------------------------------------------------------

@@ -9,11 +9,13 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from identify.dynamics.boundary import boundary_states
+from identify.dynamics.linear import SecondOrder
 from identify.dynamics.pulse_grid import make_grid, runs
 from identify.dynamics.second_order import transition
 from identify.errors import BadRecord
 from identify.noise.ar1 import best_ar1, log_likelihood, whiten
 from identify.records.record import Record
+from tests.identify.patients import Patient
 
 PULSE_RATE_HZ = 40.0
 FINE = 200  # steps of the reference integration in each pulse interval
@@ -52,6 +54,23 @@ def test_block_means_match_fine_integration(rate_hz: int, delay_s: float) -> Non
     assert np.array_equal(grid.pulse_width_us, widths_us[: grid.size])
     states = boundary_states(time_constant_s, damping, grid.step_s, widths_us[: grid.size] / 40.0)
     assert np.abs(grid.block_mean(*states, delay_s) - grid.torque_nm).max() < 2e-5
+
+
+@pytest.mark.parametrize("skipped", [0, 3])
+@pytest.mark.parametrize("damping", [0.15, 1.0, 2.0, 8.0])
+@pytest.mark.parametrize("time_constant_s", [0.012, 0.03, 0.15])
+def test_the_curve_is_exact_however_short_a_lag_is(time_constant_s: float, damping: float, skipped: int) -> None:
+    """A second lag of 0.8 ms and more; `skipped` samples leave a first interval unlike the others."""
+    patient = Patient(time_constant_s=time_constant_s, damping=damping)
+    widths_us = schedule()
+    torque = patient.torque(widths_us, 400.0)
+    time_s = np.arange(torque.size) / 400.0
+    slot = np.floor(time_s * PULSE_RATE_HZ + 1e-9).astype(int)
+    grid = make_grid(Record.from_arrays(time_s[skipped:], widths_us[slot][skipped:], torque[skipped:]))
+    linear = SecondOrder(time_constant_s, damping)
+    drive = patient.recruitment(grid.pulse_width_us)
+    assert np.abs(linear.on_grid(grid, drive) - grid.torque_nm).max() < 1e-6
+    assert np.abs(linear.at_samples(grid, drive) - torque[skipped:]).max() < 1e-6
 
 
 @given(
