@@ -17,7 +17,7 @@ from identify.dynamics.boundary import held_states
 from identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUNDS_S, SecondOrder
 from identify.dynamics.mean_weights import read_means
 from identify.dynamics.pulse_grid import Grid
-from identify.dynamics.second_order import step_matrix
+from identify.dynamics.second_order import Core, step_matrix
 from identify.errors import NotIdentifiable
 from identify.noise.ar1 import noise_evidence, whiten
 from identify.recruitment.curve import Basis
@@ -139,7 +139,7 @@ class Projection:
         t, z, d = linear.time_constant_s, linear.damping, linear.delay_s
         drive = coefficients[:size] @ self.rows_nm[:size]
         begin = coefficients[size + grid.begins.size :].reshape(1, -1, 2)
-        near = [(t, z), (t * np.exp(step), z), (t, z * np.exp(step))]
+        near: list[Core] = [(t, z), (t * np.exp(step), z), (t, z * np.exp(step))]
         even = np.array([step_matrix(*core, grid.step_s) for core in near])
         torque, rate = held_states(np.tile(drive, (3, 1)), even, grid.starts, np.tile(begin, (3, 1, 1)))
 
