@@ -173,8 +173,10 @@ def _margin(work: Analysis, number: int, candidate: Candidate | None = None) -> 
     """Log evidence that an effect must gain in a round: a patch on the first one's imperfect form isn't an effect."""
     if not number:
         return FIRST_MARGIN
-    share = PATCH if candidate is None else _patch(work, candidate)
-    return max(NEXT_MARGIN, share * work.rounds[0][0].gain)
+    first = work.rounds[0][0]
+    # A narrow band is noise: it has no form that a law could patch.
+    share = 0.0 if first.effect.band else PATCH if candidate is None else _patch(work, candidate)
+    return max(NEXT_MARGIN, share * first.gain)
 
 
 def _patch(work: Analysis, candidate: Candidate) -> float:
