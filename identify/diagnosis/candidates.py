@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 
@@ -12,7 +13,8 @@ from identify.estimation.joint import Fitted
 from identify.simulation.problem import Problem
 from identify.simulation.setup import Setup
 
-WORKERS = 2
+WORKERS = min(2, os.cpu_count() or 1)
+"""Processes that try effects side by side."""
 FORMS = 3
 """Forms of an effect tried beside another effect."""
 

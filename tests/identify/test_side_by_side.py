@@ -9,8 +9,10 @@ from pathlib import Path
 
 import pytest
 
+from identify.diagnosis import candidates, diagnose
 from identify.diagnosis.side_by_side import side_by_side
 from identify.errors import Cancelled
+from tests.identify import hidden_muscles
 
 HERE = os.getpid()
 
@@ -64,3 +66,12 @@ def test_who_stops_half_way_leaves_no_copy_behind():
 def test_results_longer_than_a_pipe_arrive_whole():
     found = dict(side_by_side(lambda number: bytes(3_000_000) + bytes([number]), 6, 2))
     assert all(len(value) == 3_000_001 and value[-1] == number for number, value in found.items())
+
+
+def test_a_diagnosis_does_not_depend_on_who_did_what(monkeypatch):
+    record = hidden_muscles.record("fatigue", seed=11, rate_hz=100)
+    told = []
+    for processes in (1, 2):
+        monkeypatch.setattr(candidates, "WORKERS", processes)
+        told.append(diagnose(record).to_dict())
+    assert told[0] == told[1]
