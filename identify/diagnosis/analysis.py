@@ -263,6 +263,8 @@ def _rebuild(work: Analysis, last: Fitted, index: int = -1, won: float = 0.0) ->
         form = dict(fitted.effects).get(effect, described.forms[0])
         found = Candidate(described, form, fitted, gain, (known.forms if known else {}) | {form.name: gain})
         found = _tempered(work, found)
+        if fitted is last and found.gain < _margin(work, number, found):
+            return  # beside the others as they are now it is not worth its place
         # Rivals of the other rounds were measured beside another model: they gain what was added at most.
         most = found.gain - (won if number == index else 0.0)
         rivals = [replace(c, gain=min(c.gain, most)) for c in tried[number] if c.effect.id != effect]

@@ -42,13 +42,14 @@ class Unseen:
         return self.rms_nm / self.allowed_nm
 
 
-def unseen(fitted: Fitted, form: float = FORM) -> Unseen | None:
+def unseen(fitted: Fitted, form: float = FORM, beside: Fitted | None = None) -> Unseen | None:
     """The model on the intervals held out; None where there are none, or where a tremor is everywhere.
 
     Rows count whose pulse widths, and those of the last seconds, were fitted: elsewhere the curve is a guess.
 
     `form` is what the form of the model may err by there, as a share of the largest torque.
-    Efforts cannot be foreseen, but they are seldom: beside them the error is that of most intervals, the median.
+    Efforts cannot be foreseen, but they are seldom: where the model, or the one that it is compared with, holds one, the
+    error is that of most intervals, the median.
     """
     setup = fitted.problem.setup
     grid = setup.grid
@@ -62,14 +63,14 @@ def unseen(fitted: Fitted, form: float = FORM) -> Unseen | None:
     slopes = fitted.slopes[:, rows] * scale[:, None]
     band = np.sum(slopes * np.linalg.solve(scaled, slopes), axis=0)
     allowed = np.sqrt(fitted.noise.sd_nm**2 + float(np.mean(band)) + (form * setup.scale_nm) ** 2)
-    if all(get(effect).foreseeable for effect, _ in fitted.effects):
+    if all(get(effect).foreseeable for effect, _ in [*fitted.effects, *(beside.effects if beside else [])]):
         return Unseen(float(np.sqrt(np.mean(residual**2))), float(allowed))
     return Unseen(float(np.median(np.abs(residual)) / MEDIAN), float(allowed))
 
 
 def rise(before: Fitted, after: Fitted) -> tuple[float, float] | None:
     """Errors on the intervals held out, N·m, without and with an effect, where they rise and so speak against it."""
-    old, new = unseen(before), unseen(after)
+    old, new = unseen(before, beside=after), unseen(after)
     if old is None or new is None or new.rms_nm <= UNSEEN_RISE * max(old.rms_nm, new.allowed_nm):
         return None
     return old.rms_nm, new.rms_nm

@@ -162,7 +162,8 @@ def judge(work: Analysis) -> Verdict:
     else:
         strange = strange or structure > STRUCTURE
     # Who names an effect says more than who names none, and is held to more.
-    before, after = (unseen(fitted, FORM_OF_EFFECTS if work.added else FORM) for fitted in (first, last))
+    form = FORM_OF_EFFECTS if work.added else FORM
+    before, after = (unseen(fitted, form, last) for fitted in (first, last))
     contradicted = after is not None and _contradicted(before, after)
     if after is not None and contradicted:
         strange = True
