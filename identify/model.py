@@ -92,7 +92,7 @@ class Model(Shown):
     noise : Noise
         The residual's account.
     effects : tuple of dict
-        Effects, each {"id", "form", "parameters", …} as its engine writes it; empty for the base model.
+        Effects, each {"id", "form", "parameters", …} as the fit writes it; empty for the plain structure.
     covariance : Covariance or None
         All parameters.
     fit, residual_tests, valid_for, quality, bands, data : dict
@@ -325,7 +325,7 @@ def _words(model: Model) -> Sheet:
         ("held out", fit_words(fit, "held_out_")),
         ("noise", f"{quantity(model.noise.white_sd_nm, 'N·m')} white, sd of a sample"),
         ("dynamics", _dynamics(model.linear)),
-        ("recruitment", f"{quantity(float(torque_nm[top]), 'N·m')} at most, at {quantity(float(width_us[top]), 'µs')}"),
+        ("recruitment", f"largest {quantity(float(torque_nm[top]), 'N·m')}, at {quantity(float(width_us[top]), 'µs')}"),
         ("baseline", quantity(model.baseline_nm, "N·m")),
         *[(str(effect["id"]), _parameters(effect.get("parameters", {}))) for effect in model.effects],
     ]
