@@ -6,11 +6,11 @@ gives about ten lines, `repr` one, a notebook a table.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, TypedDict
 
+from identify.caution import caution
 from identify.model import Model
 from identify.plain_json import plain
 from identify.shown import Sheet, Shown, both_words, fit_words, probability, quantity, torque
@@ -24,8 +24,6 @@ VERDICTS = {
 GOES_WITH = {"residual": "itself", "u": "the pulse width", "u2": "the pulse width's square", "y": "the torque"}
 FEW = 3
 """Rows of a long table that a summary shows."""
-WITHIN_NOISE = 1.3
-"""Error on rows not fitted, over all the noise, up to which what is left passes for noise."""
 
 
 class Figures(TypedDict):
@@ -241,20 +239,6 @@ class Improvement(_Result):
         added = ", ".join(str(step["added"]) for step in self.steps[1:]) or "no effect"
         before, after = (torque(step, "held_out_rms_nm") for step in (self.steps[0], self.steps[-1]))
         return Sheet(f"Improvement: {added} added, held-out rms from {before} to {after}", tuple(rows))
-
-
-def caution(found: Mapping[str, Any]) -> str:
-    """What stands against "nothing is missing" in a diagnosis: an error on rows not fitted beyond all noise."""
-    if found["verdict"] != "nothing_missing":
-        return ""
-    error_nm = (found.get("base") or {}).get("held_out_rms_nm")
-    noise_nm = math.hypot(found["noise_sd_nm"], (found.get("slow_noise") or {}).get("sd_nm") or 0.0)
-    if error_nm is None or not error_nm > WITHIN_NOISE * noise_nm > 0.0:
-        return ""
-    return (
-        f"On rows not fitted the error is {error_nm / noise_nm:.1f} times the noise: this record is too short or too "
-        "poor to tell whether something is missing. Record PRBS, ramp and validate."
-    )
 
 
 def _held(model: Model) -> str:
