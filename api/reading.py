@@ -23,7 +23,7 @@ def figures(document: dict[str, Any]) -> dict[str, Any]:
     fit = document.get("fit") or {}
     names = (
         "fit_percent", "ceiling_percent", "held_out_fit_percent", "held_out_ceiling_percent",
-        "rms_nm", "held_out_rms_nm", "noise_sd_nm",
+        "rms_nm", "held_out_rms_nm", "held_out_by", "noise_sd_nm",
     )  # fmt: skip
     return {name: fit.get(name) for name in names}
 

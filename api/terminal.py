@@ -170,13 +170,15 @@ def model_report(document: dict[str, Any]) -> list[str]:
     fit, judged = reading.figures(document), reading.quality(document)
     dynamics, curve = reading.dynamics(document), reading.recruitment(document)
     effects = ", ".join(effect["id"] for effect in document.get("effects") or []) or "none"
+    in_turn = "in turn, cross-validated: " if fit["held_out_by"] == "cross-validation" else ""
     lines = [
         f"model          {document['model_id']}  ({document['method']}, effects: {effects})",
-        f"fit            {percent(fit['fit_percent'])}  (ceiling {number(fit['ceiling_percent'])} %), "
+        f"fit            {percent(fit['fit_percent'])}  (the noise allows {number(fit['ceiling_percent'])} %), "
         f"rms {number(fit['rms_nm'], 4)} N·m, noise {number(fit['noise_sd_nm'], 4)} N·m",
         "held out       nothing"
         if fit["held_out_rms_nm"] is None
-        else f"held out       {percent(fit['held_out_fit_percent'])}, rms {number(fit['held_out_rms_nm'], 4)} N·m",
+        else f"held out       {in_turn}{percent(fit['held_out_fit_percent'])}, "
+        f"rms {number(fit['held_out_rms_nm'], 4)} N·m",
     ]
     if dynamics["time_constant_s"] is not None:
         lines.append(

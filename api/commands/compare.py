@@ -35,15 +35,17 @@ def compare(
     if as_json:
         say_json(found)
         return
-    say(f"{data} against {model_json}", "", *model_report(model.to_dict()), "", *comparison_lines(found))
+    about = f"{model_json}, its figures on what it was fitted to"
+    say(about, *model_report(model.to_dict()), "", f"{data} against it, all rows", *comparison_lines(found))
     if html is not None:
         say("", f"report         {html}")
 
 
 def comparison_lines(found: dict[str, Any]) -> list[str]:
     """The comparison in words, the worst places, and where the error above the noise sits."""
-    lines = list(found.get("plain") or [])
     places = [place["text"] for place in found.get("where") or []]
+    named_below = {f"{text}." for text in places}
+    lines = [line for line in found.get("plain") or [] if line not in named_below]
     if places:
         lines += ["", "worst places", *[f"  {text}" for text in places]]
     for kind in ("segment", "level", "direction", "frequency"):
@@ -53,4 +55,6 @@ def comparison_lines(found: dict[str, Any]) -> list[str]:
         ]
         if shares:
             lines.append(f"by {kind:12}{', '.join(shares)}")
+    if any(line.startswith("by ") for line in lines):
+        lines.append("               in % of the error above the noise")
     return lines
