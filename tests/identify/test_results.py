@@ -207,7 +207,7 @@ def test_nothing_missing_names_no_worst_place_and_says_when_the_record_is_too_po
     base = {**found.base, "held_out_rms_nm": found.noise_sd_nm}
     calm = str(dataclasses.replace(found, base=base))
     assert "error sits" not in calm and "too short or too poor" not in calm
-    poor = str(dataclasses.replace(found, base={**base, "held_out_rms_nm": 9 * found.noise_sd_nm}))
+    poor = str(dataclasses.replace(found, base={**base, "held_out_rms_nm": 20 * found.noise_sd_nm}))
     assert "too short or too poor" in poor
 
 
