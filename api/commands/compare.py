@@ -21,7 +21,10 @@ def compare(
     html: Annotated[Path | None, typer.Option(help="write a report with charts here")] = None,
     as_json: Json = False,
 ) -> None:
-    """Measurement against the model's free run: where it fails, and by how much."""
+    """Measurement against model: where it fails, and by how much.
+
+    The model runs free: it is given the pulse widths alone, never the measured torque.
+    """
     import identify
     from api.jobs import clean, curves, thinned
     from api.report import comparison_html
