@@ -105,7 +105,7 @@ def _reason(work: Analysis, step: Step) -> str:
         return "Seen in the raw samples."
     number = work.added.index(step.added)
     gain = work.rounds[number][0].gain if number < len(work.rounds) else 0.0
-    return f"Log evidence rises by {gain:.0f}; {work.margins[number]:.0f} would do."
+    return f"Log evidence rises by {gain:.0f}; {work.margins[number]:.3g} would do."
 
 
 def refused(work: Analysis) -> list[dict[str, Any]]:
