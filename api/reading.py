@@ -7,7 +7,7 @@ import math
 from typing import Any
 
 THRESHOLD_SHARE = 0.05
-"""The threshold is where the recruitment curve has risen by this share of its range."""
+"""The threshold is where the recruitment curve has gone this share of its way to the plateau."""
 
 
 UNDEFINED = "not defined: the torque is level there"
@@ -23,7 +23,7 @@ def figures(document: dict[str, Any]) -> dict[str, Any]:
     fit = document.get("fit") or {}
     names = (
         "fit_percent", "ceiling_percent", "held_out_fit_percent", "held_out_ceiling_percent",
-        "rms_nm", "held_out_rms_nm", "noise_sd_nm",
+        "rms_nm", "held_out_rms_nm", "held_out_by", "noise_sd_nm",
     )  # fmt: skip
     return {name: fit.get(name) for name in names}
 
@@ -71,22 +71,25 @@ def _sentence(clause: str) -> str:
 
 
 def recruitment(document: dict[str, Any]) -> dict[str, float | None]:
-    """Threshold (µs), plateau (N·m) and the width at which 95 % of it is reached (µs)."""
+    """Threshold (µs), plateau (N·m) and the width at which 95 % of it is reached (µs).
+
+    Where stimulation lowers the record's torque the curve falls, and its plateau is below zero.
+    """
     width_us, torque_nm = document["recruitment"]["pulse_width_us"], document["recruitment"]["torque_nm"]
-    low, high = torque_nm[0], max(torque_nm)
-    rise = high - low
+    low, high = torque_nm[0], max(torque_nm, key=lambda torque: abs(torque - torque_nm[0]))
+    way = [(torque - low) / (high - low) if high != low else 0.0 for torque in torque_nm]
     return {
-        "threshold_us": _crossing(width_us, torque_nm, low + THRESHOLD_SHARE * rise),
+        "threshold_us": _crossing(width_us, way, THRESHOLD_SHARE),
         "plateau_nm": high,
-        "saturation_us": _crossing(width_us, torque_nm, low + (1 - THRESHOLD_SHARE) * rise),
+        "saturation_us": _crossing(width_us, way, 1 - THRESHOLD_SHARE),
     }
 
 
-def _crossing(width_us: list[float], torque_nm: list[float], level_nm: float) -> float | None:
+def _crossing(width_us: list[float], way: list[float], level: float) -> float | None:
     for index in range(1, len(width_us)):
-        before, after = torque_nm[index - 1], torque_nm[index]
-        if before < level_nm <= after:
-            share = (level_nm - before) / (after - before)
+        before, after = way[index - 1], way[index]
+        if before < level <= after:
+            share = (level - before) / (after - before)
             return width_us[index - 1] + share * (width_us[index] - width_us[index - 1])
     return None
 
@@ -114,7 +117,8 @@ def validity(document: dict[str, Any]) -> str | None:
     if known.get("pulse_width_us"):
         named.append("pulse widths of {:.0f}–{:.0f} µs".format(*known["pulse_width_us"]))
     if known.get("torque_nm"):
-        named.append(f"torques up to {known['torque_nm'][1]:.1f} N·m")
+        largest = max(known["torque_nm"], key=abs)
+        named.append(f"torques {'up' if largest >= 0 else 'down'} to {largest:.1f} N·m")
     if known.get("pulse_rate_hz"):
         named.append("{:.0f}–{:.0f} pulses/s".format(*known["pulse_rate_hz"]))
     return f"Valid for {', '.join(named)}." if named else None

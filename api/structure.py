@@ -1,4 +1,4 @@
-"""Which structure is meant: what a model holds, in words.
+"""Which structure is meant: what a model holds, in words; and the words of the test that decides on it.
 
 A structure is a model's method, order and set of effects; here it is named by its effects, each `id` or `id:form`. None
 of them: the plain structure, f(u) and then G of second order.
@@ -32,3 +32,8 @@ def in_words(structure: Sequence[str]) -> str:
     """For people: "plain", or "fatigue (fitness), tremor"."""
     pairs = (effect.partition(":") for effect in structure)
     return ", ".join(f"{name} ({form})" if form else name for name, _, form in pairs) or PLAIN
+
+
+def worded(experiment: str) -> str:
+    """An experiment's sentence without the figure that only its ranking needs."""
+    return experiment.split(": expected log evidence")[0].rstrip(".") + "." if experiment else ""

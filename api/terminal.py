@@ -24,8 +24,9 @@ class InputError(Exception):
     """Bad input: one line on standard error, exit 2."""
 
 
+DATA_HELP = "sealed recording (HDF5), or CSV file with the columns time_s,pulse_width_us,torque_nm,segment"
 Json = Annotated[bool, typer.Option("--json", help="one JSON object on standard output, nothing else there")]
-Data = Annotated[Path, typer.Argument(help="sealed recording (HDF5) or CSV file", metavar="DATA", show_default=False)]
+Data = Annotated[Path, typer.Argument(help=DATA_HELP, metavar="DATA", show_default=False)]
 ModelFile = Annotated[
     Path, typer.Argument(help="MODEL.json of `stimrig fit -o`", metavar="MODEL.json", show_default=False)
 ]
@@ -33,8 +34,8 @@ HeldModel = Annotated[
     Path | None,
     typer.Option(
         "--model",
-        help="MODEL.json whose structure is meant: what it holds is fitted anew to the record; "
-        "default: the plain structure, f(u) and then G of second order",
+        help="begin with this model's structure: its effects, their numbers fitted anew to DATA; default: the plain "
+        "structure, a recruitment curve f(u) and then second-order dynamics G, without effects",
         metavar="MODEL.json",
         show_default=False,
     ),
@@ -170,13 +171,15 @@ def model_report(document: dict[str, Any]) -> list[str]:
     fit, judged = reading.figures(document), reading.quality(document)
     dynamics, curve = reading.dynamics(document), reading.recruitment(document)
     effects = ", ".join(effect["id"] for effect in document.get("effects") or []) or "none"
+    in_turn = "in turn, cross-validated: " if fit["held_out_by"] == "cross-validation" else ""
     lines = [
         f"model          {document['model_id']}  ({document['method']}, effects: {effects})",
-        f"fit            {percent(fit['fit_percent'])}  (ceiling {number(fit['ceiling_percent'])} %), "
+        f"fit            {percent(fit['fit_percent'])}  (the noise allows {number(fit['ceiling_percent'])} %), "
         f"rms {number(fit['rms_nm'], 4)} N·m, noise {number(fit['noise_sd_nm'], 4)} N·m",
         "held out       nothing"
         if fit["held_out_rms_nm"] is None
-        else f"held out       {percent(fit['held_out_fit_percent'])}, rms {number(fit['held_out_rms_nm'], 4)} N·m",
+        else f"held out       {in_turn}{percent(fit['held_out_fit_percent'])}, "
+        f"rms {number(fit['held_out_rms_nm'], 4)} N·m",
     ]
     if dynamics["time_constant_s"] is not None:
         lines.append(

@@ -13,7 +13,7 @@ from identify.dynamics.linear import Discrete, Linear, SecondOrder, linear_from_
 from identify.errors import BadModel
 from identify.plain_json import plain
 from identify.recruitment.curve import Curve, basis_from_dict
-from identify.shown import Sheet, Shown, fit_words, quantity
+from identify.shown import Sheet, Shown, fit_words, held_out_label, quantity
 from identify.strict_json import BadJson, parse
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ class Model(Shown):
     noise : Noise
         The residual's account.
     effects : tuple of dict
-        Effects, each {"id", "form", "parameters", …} as its engine writes it; empty for the base model.
+        Effects, each {"id", "form", "parameters", …} as the fit writes it; empty for the plain structure.
     covariance : Covariance or None
         All parameters.
     fit, residual_tests, valid_for, quality, bands, data : dict
@@ -322,10 +322,10 @@ def _words(model: Model) -> Sheet:
     top = int(np.argmax(np.abs(torque_nm)))
     rows = [
         ("fit", fit_words(fit)),
-        ("held out", fit_words(fit, "held_out_")),
+        (held_out_label(fit), fit_words(fit, "held_out_")),
         ("noise", f"{quantity(model.noise.white_sd_nm, 'N·m')} white, sd of a sample"),
         ("dynamics", _dynamics(model.linear)),
-        ("recruitment", f"{quantity(float(torque_nm[top]), 'N·m')} at most, at {quantity(float(width_us[top]), 'µs')}"),
+        ("recruitment", f"largest {quantity(float(torque_nm[top]), 'N·m')}, at {quantity(float(width_us[top]), 'µs')}"),
         ("baseline", quantity(model.baseline_nm, "N·m")),
         *[(str(effect["id"]), _parameters(effect.get("parameters", {}))) for effect in model.effects],
     ]
@@ -336,7 +336,8 @@ def _words(model: Model) -> Sheet:
         first = model.quality.get("reasons", [])[:1]
         rows.append(("quality", ": ".join([str(model.quality.get("verdict", "")), *first])))
     rows.append(("made", f"{model.created} from {model.data.get('name') or 'a record without a name'}"))
-    figures = f"fit {quantity(fit.get('fit_percent'), '%')}, held out {quantity(fit.get('held_out_fit_percent'), '%')}"
+    unseen = f"{held_out_label(fit)} {quantity(fit.get('held_out_fit_percent'), '%')}"
+    figures = f"fit {quantity(fit.get('fit_percent'), '%')}, {unseen}"
     return Sheet(f"Model {model.model_id[:8]}, {model.method}, {named}: {figures}", tuple(rows))
 
 

@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, TypedDict
 
+from identify.caution import caution
 from identify.model import Model
 from identify.plain_json import plain
 from identify.shown import Sheet, Shown, both_words, fit_words, probability, quantity, torque
@@ -23,7 +24,6 @@ VERDICTS = {
 GOES_WITH = {"residual": "itself", "u": "the pulse width", "u2": "the pulse width's square", "y": "the torque"}
 FEW = 3
 """Rows of a long table that a summary shows."""
-BASE = "no effects"
 
 
 class Figures(TypedDict):
@@ -132,8 +132,8 @@ class Diagnosis(_Result):
     slow_noise : dict
         `sd_nm`, and `ar1`, the correlation of neighbouring pulse intervals.
     base : dict
-        The model without effects: `fit_percent`, `rms_nm`, `ceiling_percent`, each with a `held_out_` one beside it,
-        and `held_out`, where those come from.
+        The model of the structure that was criticised: `fit_percent`, `rms_nm`, `ceiling_percent`, each with a
+        `held_out_` one beside it, and `held_out_by`, where those come from.
     verdict : str
         "effect_missing", "nothing_missing" or "unexplained_structure".
     probability : float
@@ -180,15 +180,17 @@ class Diagnosis(_Result):
         slow = quantity(self.slow_noise.get("sd_nm"), "N·m")
         rows = [
             ("noise", f"{quantity(self.noise_sd_nm, 'N·m')} white, {slow} slow, sd"),
-            (BASE, both_words(self.base)),
+            ("the model", both_words(self.base)),
             *[(str(row["effect"]), _found(row)) for row in self.missing],
         ]
         if self.missing:
             rows.append(("with all", both_words(self.with_all)))
         told = [row for row in self.missing if row["confused_with"]]
         rows += [("next test", row["next_experiment"]) for row in told[:1]]
-        rows += [("error sits" if number == 0 else "", row["text"]) for number, row in enumerate(self.where[:FEW])]
-        rows += [("note", text) for text in self.notes]
+        # Where nothing is missing the worst of the noise is no place to look at.
+        places = () if self.verdict == "nothing_missing" else self.where[:FEW]
+        rows += [("error sits" if number == 0 else "", row["text"]) for number, row in enumerate(places)]
+        rows += [("note", text) for text in (*self.notes, caution(vars(self))) if text]
         verdict = VERDICTS.get(self.verdict, self.verdict)
         named = "".join(f", {row['effect']}" for row in self.missing)
         return Sheet(f"Diagnosis: {verdict}{named} (probability {probability(self.probability)})", tuple(rows))
@@ -203,7 +205,7 @@ class Improvement(_Result):
     noise_sd_nm : float
         White measurement noise of a sample, N·m.
     verdict : str
-        As in `Diagnosis`.
+        As in `Diagnosis`: on the first of the models, before anything was added.
     steps : tuple of dict
         `added` (None in the first), `fit_percent`, `rms_nm`, `held_out_rms_nm`, `held_out_fit_percent`,
         `ceiling_percent`, `model_id`, `reason`.
@@ -220,10 +222,13 @@ class Improvement(_Result):
     refused: tuple[Row, ...]
 
     def _sheet(self) -> Sheet:
-        rows = [(str(step["added"] or BASE), both_words(step)) for step in self.steps]
+        rows = [
+            (str(step["added"] or _held(model)), both_words({**model.fit, **step}))
+            for step, model in zip(self.steps, self.models, strict=True)
+        ]
         rows += [
             ("noise", f"{quantity(self.noise_sd_nm, 'N·m')}, sd of a sample"),
-            ("verdict", VERDICTS.get(self.verdict, self.verdict)),
+            ("at first", VERDICTS.get(self.verdict, self.verdict)),
         ]
         rows += [
             ("refused" if number == 0 else "", f"{row['effect']}: {row['reason']}")
@@ -234,6 +239,10 @@ class Improvement(_Result):
         added = ", ".join(str(step["added"]) for step in self.steps[1:]) or "no effect"
         before, after = (torque(step, "held_out_rms_nm") for step in (self.steps[0], self.steps[-1]))
         return Sheet(f"Improvement: {added} added, held-out rms from {before} to {after}", tuple(rows))
+
+
+def _held(model: Model) -> str:
+    return ", ".join(str(effect["id"]) for effect in model.effects) or "no effects"
 
 
 def _figures(figures: Figures) -> str:

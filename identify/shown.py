@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 
 NONE = "–"
+SURE, LIKELY = 0.9, 0.6
+"""Probabilities above which a thing is very probably, and probably, so."""
 LONGEST = 300
 """Characters of a line at most."""
 
@@ -103,7 +105,17 @@ def fit_words(figures: Mapping[str, Any], prefix: str = "") -> str:
 def both_words(figures: Mapping[str, Any]) -> str:
     """The same on fitted rows and on rows held out, in one line."""
     held_out = f"{quantity(figures.get('held_out_fit_percent'), '%')}, rms {torque(figures, 'held_out_rms_nm')}"
-    return f"{fit_words(figures)}; held out {held_out}"
+    return f"{fit_words(figures)}; {held_out_label(figures)} {held_out}"
+
+
+def held_out_label(figures: Mapping[str, Any]) -> str:
+    """What the held-out figures are: those of `validate`; without it, of blocks left out of the fit in turn."""
+    return "cross-validated" if figures.get("held_out_by") == "cross-validation" else "held out"
+
+
+def sure(value: float) -> str:
+    """A probability in a word."""
+    return "very probably" if value > SURE else "probably" if value > LIKELY else "possibly"
 
 
 def torque(figures: Mapping[str, Any], key: str) -> str:

@@ -21,7 +21,10 @@ def compare(
     html: Annotated[Path | None, typer.Option(help="write a report with charts here")] = None,
     as_json: Json = False,
 ) -> None:
-    """Measurement against the model's free run: where it fails, and by how much."""
+    """Measurement against model: where it fails, and by how much.
+
+    The model runs free: it is given the pulse widths alone, never the measured torque.
+    """
     import identify
     from api.jobs import clean, curves, thinned
     from api.report import comparison_html
@@ -35,15 +38,17 @@ def compare(
     if as_json:
         say_json(found)
         return
-    say(f"{data} against {model_json}", "", *model_report(model.to_dict()), "", *comparison_lines(found))
+    about = f"{model_json}, its figures on what it was fitted to"
+    say(about, *model_report(model.to_dict()), "", f"{data} against it, all rows", *comparison_lines(found))
     if html is not None:
         say("", f"report         {html}")
 
 
 def comparison_lines(found: dict[str, Any]) -> list[str]:
     """The comparison in words, the worst places, and where the error above the noise sits."""
-    lines = list(found.get("plain") or [])
     places = [place["text"] for place in found.get("where") or []]
+    named_below = {f"{text}." for text in places}
+    lines = [line for line in found.get("plain") or [] if line not in named_below]
     if places:
         lines += ["", "worst places", *[f"  {text}" for text in places]]
     for kind in ("segment", "level", "direction", "frequency"):
@@ -53,4 +58,6 @@ def comparison_lines(found: dict[str, Any]) -> list[str]:
         ]
         if shares:
             lines.append(f"by {kind:12}{', '.join(shares)}")
+    if any(line.startswith("by ") for line in lines):
+        lines.append("               in % of the error above the noise")
     return lines

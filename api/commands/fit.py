@@ -24,15 +24,20 @@ def fit(
     effects: Annotated[
         str,
         typer.Option(
-            help="effects around it, comma-separated (see `stimrig effects`), each `id` or `id:form`; or `auto`: those "
-            "that the record asks for, as `improve` adds them. With maximum-likelihood alone"
+            help="effects that the model is to hold, comma-separated (`stimrig effects` lists them), each `id` or "
+            "`id:form`; or `auto`: those that the record asks for, as `improve` adds them. Only with maximum-likelihood"
         ),
     ] = "",
-    fit_on: Annotated[str, typer.Option(help="segments to fit on, comma-separated; never `validate`")] = "",
+    fit_on: Annotated[
+        str,
+        typer.Option(
+            help="segments to fit on, comma-separated, never `validate`; default: all others, or what the method needs"
+        ),
+    ] = "",
     output: Annotated[Path | None, typer.Option("-o", "--output", help="write MODEL.json here")] = None,
     as_json: Json = False,
 ) -> None:
-    """Identify a model: recruitment curve, linear dynamics, effects."""
+    """Identify a model: recruitment curve, linear dynamics, effects. Says how well it fits and whether it is usable."""
     import identify
 
     record = identify.read(data)

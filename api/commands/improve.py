@@ -9,8 +9,12 @@ from typing import Annotated, Any
 
 import typer
 
+from api.commands.diagnose import VERDICTS
 from api.structure import in_words
 from api.terminal import Data, HeldModel, Json, load_held, number, progress_line, say, say_json, table, write
+
+FEW = 3
+"""Refused effects that are named."""
 
 
 def register(app: typer.Typer) -> None:
@@ -25,7 +29,10 @@ def improve(
     output: Annotated[Path | None, typer.Option("-o", "--output", help="write the last MODEL.json here")] = None,
     as_json: Json = False,
 ) -> None:
-    """Add effects one by one to a model's structure while the evidence lasts; each step is a model."""
+    """Add effects one by one to a model's structure while the evidence lasts; each step is a model.
+
+    Takes 5 to 40 s. Without -o nothing is kept.
+    """
     import identify
 
     record, model, structure = load_held(model_json, data)
@@ -42,7 +49,7 @@ def improve(
         say_json(found)
         return
     say(*improvement_lines(found))
-    say(*[f"written to {path}" for path in (output, html) if path is not None])
+    say(*[f"written to     {path}" for path in (output, html) if path is not None])
 
 
 def report(record: Any, found: dict[str, Any], models: Sequence[Any], data: Path, held: Any | None = None) -> str:
@@ -74,6 +81,10 @@ def improvement_lines(found: dict[str, Any]) -> list[str]:
         for step in found["steps"]
     ]
     header = ("added", "fit %", "rms N·m", "held-out %", "held-out rms N·m")
-    begun = f"structure: {in_words(found['structure'])}"
-    verdict = f"noise {number(found['noise_sd_nm'], 4)} N·m; verdict: {found['verdict']}"
-    return [begun, "", *table(header, rows), "", verdict]
+    lines = [f"structure      {in_words(found['structure'])}", "", *table(header, rows), ""]
+    lines.append(f"noise          {number(found['noise_sd_nm'], 4)} N·m: what no model can explain")
+    lines.append(f"at first       {VERDICTS.get(found['verdict'], found['verdict'])}")
+    refused = [f"{row['effect']}: {row['reason']}" for row in found.get("refused") or []]
+    if len(refused) > FEW:
+        refused[FEW:] = [f"and {len(refused) - FEW} effects more (--json says which)"]
+    return [*lines, *[f"{'not added' if not number else '':15}{text}" for number, text in enumerate(refused)]]

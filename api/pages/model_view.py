@@ -87,7 +87,8 @@ def gather(context: Context, row: Model, measured: dict[str, Any], diagnosis: di
     rows = why.versions([context.versions.public(version) for version in context.versions.lineage(row)], row.id)
     segments = (measured["curves"] or {}).get("segments") or []
     signatures = (found or {}).get("signatures") or {}
-    quiet = view is not None and view["kind"] == "nothing"  # then the worst of the noise is no place to look at
+    # Where all is noise the worst of it is no place to look at.
+    quiet = view is not None and view["kind"] in ("nothing", "unsure") and not why.noisy(comparison or {})
     if view is not None and quiet:
         view["places"] = []
     places = view["places"] if view else why_charts.places_of(comparison or {})

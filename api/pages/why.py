@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from api.structure import in_words
+from api.structure import in_words, worded
+from identify.caution import caution
 
 SPLITS = {
     "segment": "By segment",
@@ -59,7 +60,7 @@ def headline(
 ) -> dict[str, str]:
     """The verdict on this model: kind, title, sentence."""
     times = times_noise(comparison)
-    beside = "" if times is None else f" Its error on rows it has not seen is {times:.1f} times the noise."
+    beside = "" if times is None else f" Its error{_on(comparison)} is {times:.1f} times the noise."
     if diagnosis["verdict"] == "unexplained_structure":
         where = diagnosis.get("where") or []
         sits = f" It sits mostly here: {where[0]['text']}." if where else ""
@@ -72,9 +73,15 @@ def headline(
     if missing:
         names = " and ".join((entry.get("name") or entry["effect"]).lower() for entry in missing)
         many = len(missing) > 1
-        title = f"{len(missing)} effects are missing in this model" if many else "An effect is missing in this model"
+        sure = " possibly" if max(entry.get("probability") or 1.0 for entry in missing) <= LIKELY else ""
+        title = f"{len(missing)} effects are" if many else "An effect is"
+        title = f"{title}{sure} missing in this model"
         return {"kind": "missing", "title": title, "words": f"The recording asks for {names}.{beside}"}
     more = " more" if effects else ""
+    poor = caution(diagnosis)
+    if poor:
+        title = "This recording cannot tell whether something is missing"
+        return {"kind": "unsure", "title": title, "words": poor}
     if times is not None and times > NOISE_LIKE:
         title = f"The library names nothing{more} that this recording asks for"
         return {
@@ -87,6 +94,10 @@ def headline(
         "title": f"Nothing{more} is missing: what is left is noise",
         "words": f"No effect of the library would explain more than noise does.{beside}",
     }
+
+
+def _on(comparison: dict[str, Any] | None) -> str:
+    return " on rows it has not seen" if comparison and comparison.get("held_out") else ""
 
 
 def times_noise(comparison: dict[str, Any] | None) -> float | None:
@@ -154,11 +165,6 @@ def splits(comparison: dict[str, Any] | None) -> list[dict[str, Any]]:
         if rows:
             found.append({"title": title, "rows": rows, "most": max(row["share_of_excess"] for row in rows) or 1.0})
     return found
-
-
-def worded(experiment: str) -> str:
-    """An experiment's sentence without the figure that only its ranking needs."""
-    return experiment.split(": expected log evidence")[0].rstrip(".") + "." if experiment else ""
 
 
 def tidy_experiment(found: dict[str, Any], library: dict[str, Any]) -> dict[str, Any]:

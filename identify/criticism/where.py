@@ -119,4 +119,4 @@ def _words(name: str, widths: np.ndarray, direction: str, error: float, size: fl
         what = f"model too {'low' if error > 0 else 'high'} by {abs(error):.2g} N·m"
     else:
         what = f"model off by {size:.2g} N·m both ways"
-    return f"{part}, {span}: {what}, {100 * share:.0f} % of what is left"
+    return f"{part}, {span}: {what}, {100 * share:.0f} % of the error above the noise"

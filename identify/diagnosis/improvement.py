@@ -105,7 +105,7 @@ def _reason(work: Analysis, step: Step) -> str:
         return "Seen in the raw samples."
     number = work.added.index(step.added)
     gain = next(c.gain for c in work.rounds[number] if c.effect.id == step.added)
-    return f"Log evidence rises by {gain:.0f}; {work.margins[number]:.0f} would do."
+    return f"Log evidence rises by {gain:.0f}; {work.margins[number]:.3g} would do."
 
 
 def refused(work: Analysis) -> list[dict[str, Any]]:

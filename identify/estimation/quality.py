@@ -161,7 +161,7 @@ def _ceiling(model: Model) -> dict[str, Any]:
         fit >= ceiling - UNDER_CEILING_POINTS,
         "care",
         f"the fit, {fit:.1f} %, is {ceiling - fit:.1f} points below what the noise allows ({ceiling:.1f} %): "
-        "an effect is missing, or the noise is slow; run diagnose",
+        "an effect is missing, or the noise is slow; see the diagnosis",
     )
 
 
@@ -194,7 +194,7 @@ def _gap(model: Model) -> dict[str, Any]:
         return _gate(True, "care", "")
     far = gap > LARGEST_GAP and not error <= WITHIN_NOISE * noise
     much = "too much" if far else "something"
-    return _gate(gap <= GOOD_GAP, "refuse" if far else "care", f"{says}: {much} is missing in it; run diagnose")
+    return _gate(gap <= GOOD_GAP, "refuse" if far else "care", f"{says}: {much} is missing in it; see the diagnosis")
 
 
 def _reach(model: Model) -> tuple[float, float, str, float]:
@@ -217,7 +217,7 @@ def _residual(model: Model, span_nm: float) -> dict[str, Any]:
     if model.noise.block_sd_nm < NEGLIGIBLE * span_nm:
         return _gate(True, "care", "")
     failed = [name for name, test in model.residual_tests.items() if not test.get("passed", True)]
-    return _gate(not failed, "care", f"the residual is not noise ({', '.join(failed)} test): run diagnose")
+    return _gate(not failed, "care", f"the residual is not noise ({', '.join(failed)} test): see the diagnosis")
 
 
 def _sensor(grid: Grid, baseline_nm: float) -> dict[str, Any]:

@@ -78,7 +78,7 @@ def _why(fitted: Fitted) -> list[str]:
     time_constant_s, damping, delay_s = fitted.physical[:3]
     noise = fitted.noise
     said = "white" if noise.is_white else f"slow and white, {100 * min(noise.share, 1.0):.0f} % of its variance slow"
-    enough = "a white residual" if noise.is_white else "but the residual isn't white: run diagnose"
+    enough = "a white residual" if noise.is_white else "but the residual isn't white: see the diagnosis"
     return [
         f"second order: T {time_constant_s:.4g} s, damping {damping:.3g}, delay {1e3 * delay_s:.1f} ms; {enough}",
         f"noise taken as {said}",

@@ -28,6 +28,9 @@ HEADER = ",".join(REQUIRED)
 BLOCK = 4096
 LONGEST_LINE = 10_000
 """Characters; no row of numbers has as many."""
+LEAST_LARGEST_US = 1.0
+"""A record whose largest pulse width is less has it in another unit."""
+SEPARATED = "Separate with commas, not {!r}, and write numbers with a decimal point."
 CUT = "Every row needs every column; was the file cut off?"
 
 
@@ -65,6 +68,13 @@ def read_csv(content: bytes, path: Path, pulse_rate_hz: float | None = None) -> 
             f"{columns['pulse_width_us'][negative[0]]:g} µs is negative",
             place=f"{name}, line {lines[negative[0]]}, column pulse_width_us",
             mend="A pulse width is 0 (no pulse) or positive.",
+        )
+    largest_us = float(columns["pulse_width_us"].max())
+    if 0.0 < largest_us < LEAST_LARGEST_US:
+        raise BadRecord(
+            f"the largest is {largest_us:g} µs, and no stimulator gives so little",
+            place=f"{name}, line {lines[int(columns['pulse_width_us'].argmax())]}, column pulse_width_us",
+            mend="Give µs: multiply seconds by 1000000, milliseconds by 1000.",
         )
     doubted = columns.get("doubted", np.zeros(0))
     if (bad := np.flatnonzero((doubted != 0) & (doubted != 1))).size:
@@ -212,7 +222,7 @@ def _header(first: list[str], name: str) -> dict[str, int]:
     missing = [column for column in REQUIRED if column not in header]
     if missing:
         separator = next((mark for mark in ";\t" if len(header) == 1 and mark in header[0]), None)
-        mend = f"Separate with commas, not {separator!r}." if separator else f"The first line must be {HEADER}."
+        mend = SEPARATED.format(separator) if separator else f"The first line must be {HEADER}."
         raise BadRecord(f"no column {', '.join(missing)}", place=f"{name}, line 1", mend=mend)
     # One of them alone is a column of somebody else's.
     of_parts = ("part", *parts_csv.CELLS) if {"part", "pause_s"} <= set(header) else ()

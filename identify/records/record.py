@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from identify.errors import BadRecord
+from identify.shown import Sheet, Shown, quantity
 
 HELD_OUT = "validate"
 """Rows of this segment are never used to fit or to choose an effect; they may only speak against one."""
@@ -84,8 +85,8 @@ class Pulses:
     lost: np.ndarray
 
 
-@dataclass(frozen=True)
-class Record:
+@dataclass(frozen=True, repr=False)
+class Record(Shown):
     """Pulse widths applied and torque measured, uniformly sampled.
 
     Parameters
@@ -187,6 +188,23 @@ class Record:
             **optional,
         )
 
+    def _sheet(self) -> Sheet:
+        sizes = np.bincount(self.segment, minlength=len(self.segment_names)) / self.sample_rate_hz
+        played = [f"{name} {quantity(float(s), 's')}" for name, s in zip(self.segment_names, sizes, strict=True)]
+        unseen_s = float(np.sum(self.held_out)) / self.sample_rate_hz
+        widths = np.unique(self.pulse_width_us)
+        rows = [
+            ("segments", ", ".join(played)),
+            ("held out", quantity(unseen_s, "s") if unseen_s else f"no rows of `{HELD_OUT}`"),
+            ("widths", f"{_from_to(self.pulse_width_us, 'µs')}, {widths.size} different"),
+            ("torque", _from_to(self.torque_nm, "N·m")),
+        ]
+        if self.columns():
+            rows.append(("more", ", ".join(self.columns())))
+        rates = f"{quantity(self.sample_rate_hz, 'samples/s')}, {quantity(self.pulse_rate_hz, 'pulses/s')}"
+        long = quantity(self.time_s.size / self.sample_rate_hz, "s")
+        return Sheet(f"Record {self.source.name or 'without a name'}: {long}, {rates}", tuple(rows))
+
     def columns(self) -> dict[str, np.ndarray]:
         """The optional columns that this record has, by name."""
         found = {name: getattr(self, name) for name in OPTIONAL}
@@ -280,3 +298,7 @@ def _coded(
     first = {name: index for index, name in reversed(list(enumerate(names)))}
     same = np.array([first[name] for name in names], np.int64)
     return same[np.asarray(segment, np.int64)], [str(name) for name in names]
+
+
+def _from_to(values: np.ndarray, unit: str) -> str:
+    return f"{quantity(float(values.min()), unit)} to {quantity(float(values.max()), unit)}"

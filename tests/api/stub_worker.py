@@ -53,7 +53,8 @@ def comparison() -> dict[str, Any]:
 
 WHERE = [{
     "segment": "prbs", "start_s": 3.0, "end_s": 4.5, "pulse_width_us": [0.0, 300.0], "direction": "falling",
-    "share_of_excess": 0.31, "text": "falling prbs, 0-300 µs: model too high by 0.4 N·m, 31 % of what is left",
+    "share_of_excess": 0.31,
+    "text": "falling prbs, 0-300 µs: model too high by 0.4 N·m, 31 % of the error above the noise",
 }]  # fmt: skip
 SIGNATURES = {"time_s": [0.0, 1.0, 2.0], "fatigue": {"seen_nm": [0.0, 0.1, 0.2], "expected_nm": [0.0, 0.1, 0.15]}}
 EXPERIMENT = {

@@ -53,7 +53,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
 
 def test_fit_reports_and_writes_a_model(capsys: pytest.CaptureFixture[str], record: Path, model: Path) -> None:
     code, out, _ = run(capsys, "fit", str(record))
-    assert code == 0 and "Tω" in out and "ceiling" in out and "threshold" in out
+    assert code == 0 and "Tω" in out and "the noise allows" in out and "threshold" in out
     assert json.loads(model.read_text())["recruitment"]["pulse_width_us"]
 
 

@@ -40,7 +40,7 @@ def test_a_clinicians_whole_way(tab: Any, service: Service) -> None:
         tab.locator(f'.figure-box[data-figure="{figure}"]:has(.main-svg)').wait_for()
     for words in ("Torque (N·m)", "Residual (N·m)", "Pulse width (µs)", "Time (s)"):
         assert tab.locator(".figure-box").get_by_text(words).first.is_visible(), words
-    assert "ceiling 98.60 %" in tab.inner_text("main")
+    assert "noise allows 98.60 %" in tab.inner_text("main")
     tab.get_by_label("Reason").fill("close to its ceiling")
     tab.get_by_label("Your password, once more").fill(PASSWORD)
     tab.get_by_role("button", name="Approve").click()
@@ -197,7 +197,7 @@ def test_hidden_effect_is_found_and_added_by_clicking(tab: Any, service: Service
         tab.locator("[data-figure=residual] .main-svg").first.wait_for()
         assert tab.evaluate("document.documentElement.scrollWidth <= innerWidth"), width
     tab.set_viewport_size({"width": WIDE[0], "height": WIDE[1]})
-    assert tab.get_by_text("31 % of what is left").is_visible()
+    assert tab.locator(".place-share", has_text="31 %").is_visible()
     tab.get_by_role("button", name="Add this effect").click()
     tab.get_by_role("heading", name="The error over the versions").wait_for()
     tab.locator("[data-figure=falling] .main-svg").first.wait_for()

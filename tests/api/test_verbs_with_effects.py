@@ -57,7 +57,7 @@ def test_what_a_model_holds_is_not_missing_in_it_and_auto_adds_what_improve_adds
     added = [step["added"] for step in improved["steps"][1:]]
     assert [effect["id"] for effect in fitted["effects"]] == added and "fatigue" in added
     forms = [f"{effect['id']} ({effect['form']})" for effect in fitted["effects"]]
-    assert f"structure: {', '.join(forms)}\n" in stimrig("diagnose", data, "--model", held)
+    assert f"structure      {', '.join(forms)}\n" in stimrig("diagnose", data, "--model", held)
     own = missing.diagnosis(str(data), lambda *_: None, held.read_text())
     assert [name.partition(":")[0] for name in own["structure"]] == added
     assert own["verdict"] == "nothing_missing" and own["missing"] == []

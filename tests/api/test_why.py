@@ -263,7 +263,7 @@ def test_worker_joins_by_begin_and_leaves_a_file_with_the_parts(tmp_path: Path) 
 WORDS = "falling ramp, 120-180 µs: model too high by 0.4 N·m"
 PLACE = {
     "segment": "ramp", "start_s": 1.0, "end_s": 2.0, "pulse_width_us": [120, 180], "share_of_excess": 0.31,
-    "direction": "falling", "text": f"{WORDS}, 31 % of what is left",
+    "direction": "falling", "text": f"{WORDS}, 31 % of the error above the noise",
 }  # fmt: skip
 FATIGUE = {"effect": "fatigue", "name": "Fatigue", "probability": 0.97, "rms_before_nm": 0.2, "rms_after_nm": 0.05}
 

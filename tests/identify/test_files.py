@@ -69,6 +69,11 @@ def test_rounded_times_become_even(tmp_path):
         (changed(9, 0, "inf"), HEADER, r"line 9, column time_s: inf is no measurement"),
         (changed(5, 1, "-3"), HEADER, r"line 5, column pulse_width_us: -3 µs is negative"),
         (changed(5, 1, "1e9"), HEADER, r"line 5, column pulse_width_us: 1e9 is no measurement"),
+        (
+            [f"{i / 40},{0.0003 * (i % 2)},0.5,prbs" for i in range(60)],
+            HEADER,
+            r"line 3, column pulse_width_us: the largest is 0.0003 µs.*multiply seconds by 1000000",
+        ),
         (changed(12, 0, "0.1"), HEADER, r"line 12, column time_s: time runs backwards"),
         (changed(12, 0, "0.2250"), HEADER, r"line 12, column time_s: time stands still"),
         (changed(21, 0, "0.95"), HEADER, r"line 21, column time_s: uneven sampling"),

@@ -195,6 +195,28 @@ def test_the_notebooks_view_is_the_summary_as_a_table(results, name):
     assert parsed.words[0] == found.summary().splitlines()[0]
 
 
+def test_a_record_shows_itself_in_a_few_lines(record):
+    lines = str(record).splitlines()
+    assert len(lines) == 5 and repr(record) == f"<{lines[0]}>" and "100 samples/s, 40 pulses/s" in lines[0]
+    assert "validate" in lines[1] and "µs" in lines[3] and "N·m" in lines[4] and "<table>" in record._repr_html_()
+    assert "held out  no rows" in str(record.take(~record.held_out))
+
+
+def test_nothing_missing_names_no_worst_place_and_says_when_the_record_is_too_poor_to_tell(results):
+    found = dataclasses.replace(results["diagnosis"], verdict="nothing_missing", missing=(), notes=())
+    base = {**found.base, "held_out_rms_nm": found.noise_sd_nm}
+    calm = str(dataclasses.replace(found, base=base))
+    assert "error sits" not in calm and "too short or too poor" not in calm
+    poor = str(dataclasses.replace(found, base={**base, "held_out_rms_nm": 20 * found.noise_sd_nm}))
+    assert "too short or too poor" in poor
+
+
+def test_what_is_cross_validated_is_not_called_held_out():
+    bare = hidden_muscles.record(seed=13, rate_hz=100, validate=False)
+    model = identify.fit(bare)
+    assert "cross-validated" in str(model) and "held out" not in repr(model)
+
+
 def test_words_of_a_file_stay_words(results):
     """Whatever stands in a MODEL.json or in a recording's names: no tag, no line of its own, no escape sequence."""
     model = results["model"].with_(method=WORDS, model_id=WORDS, quality={"verdict": WORDS}, data={"name": WORDS})
@@ -215,7 +237,7 @@ def test_a_model_of_another_version_with_little_in_it_still_shows_itself(results
     for key in ("fit", "quality", "valid_for", "data", "created", "model_id", "noise", "effects"):
         del bare[key]
     model = identify.Model.from_dict(bare)
-    assert "fit –, held out –" in repr(model) and "N·m at most" in str(model)
+    assert "fit –, held out –" in repr(model) and "recruitment  largest" in str(model)
 
 
 @pytest.mark.parametrize(
