@@ -51,6 +51,9 @@ say "installing the locked list requirements/$what.txt (the first time takes a m
 $venv/bin/python -m pip install --quiet --disable-pip-version-check --require-hashes -r "requirements/$what.txt"
 $venv/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
 
+say "compiling, once (half a minute)"
+$venv/bin/python -m identify.diagnosis.warm_up
+
 if [ "$what" = test ] && ! command -v chromium >/dev/null 2>&1; then
   debian chromium
 fi

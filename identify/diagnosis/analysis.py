@@ -57,8 +57,10 @@ class Analysis:
         As given.
     raw : Raw
         What was seen before averaging.
-    base : Fitted
+    plain : Fitted
         The model without effects.
+    base : Fitted
+        The structure that is criticised.
     given : list of str
         Effects seen in the raw samples.
     with_given : list of Fitted
@@ -83,6 +85,7 @@ class Analysis:
 
     record: Record
     raw: Raw
+    plain: Fitted
     base: Fitted
     given: list[str] = field(default_factory=list)
     with_given: list[Fitted] = field(default_factory=list)
@@ -94,6 +97,11 @@ class Analysis:
     losses: dict[str, float] = field(default_factory=dict)
     quiet: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
     left: list[Left] = field(default_factory=list)
+
+    @property
+    def held(self) -> list[str]:
+        """Effects of the structure that is criticised."""
+        return names(self.base)
 
     @property
     def last(self) -> Fitted:
@@ -116,9 +124,9 @@ def analyse(
     """
     listed = list(registry().values() if effects is None else effects)
     grid, raw = prepare(record)
-    base = plain(grid, fitted_rows(grid, None) if fitted is None else fitted)
-    base = with_effects(base, structure, raw)
-    work = Analysis(record, raw, base)
+    without = plain(grid, fitted_rows(grid, None) if fitted is None else fitted)
+    base = with_effects(without, structure, raw)
+    work = Analysis(record, raw, without, base)
     start = _with_given(work, base)
     work.chain, work.quiet = [start], quiet_rows(start)
     work.left = [left_over(start, work.quiet, raw.noise_sd_nm)]
@@ -171,12 +179,16 @@ def _at_rest(work: Analysis, candidate: Candidate) -> bool:
 
 def _margin(work: Analysis, number: int, candidate: Candidate | None = None) -> float:
     """Log evidence that an effect must gain in a round: a patch on the first one's imperfect form isn't an effect."""
-    if not number:
+    if not number and not work.held:
         return FIRST_MARGIN
-    first = work.rounds[0][0]
-    # A narrow band is noise: it has no form that a law could patch.
-    share = 0.0 if first.effect.band else PATCH if candidate is None else _patch(work, candidate)
-    return max(NEXT_MARGIN, share * first.gain)
+    return max(NEXT_MARGIN, (PATCH if candidate is None else _patch(work, candidate)) * _first_gain(work))
+
+
+def _first_gain(work: Analysis) -> float:
+    """What the first effect gained, or those that were held; a narrow band is noise, with no form to be patched."""
+    if work.held:
+        return 0.0 if any(get(name).band for name in work.held) else work.base.log_evidence - work.plain.log_evidence
+    return 0.0 if work.rounds[0][0].effect.band else work.rounds[0][0].gain
 
 
 def _patch(work: Analysis, candidate: Candidate) -> float:
@@ -188,9 +200,11 @@ def _patch(work: Analysis, candidate: Candidate) -> float:
     if stage in ("gain", "pulse_width") and work.nameless[-1] > BORNE_OUT * candidate.gain:
         return SEEN_APART
     for name, form in work.last.effects:
-        if name in work.added and (form.stage in DYNAMIC and stage in DYNAMIC):
+        if name in work.given:
+            continue
+        if form.stage in DYNAMIC and stage in DYNAMIC:
             return KINDRED
-        if name in work.added and (name in effect.resembles or effect.id in get(name).resembles):
+        if name in effect.resembles or effect.id in get(name).resembles:
             return KINDRED
     return PATCH
 
@@ -206,7 +220,7 @@ def _exhausted(work: Analysis) -> bool:
     left, last = work.left[-1], work.last
     if last.noise.ar1 > SLOWEST and left.slow_nm > left.white_nm:
         return False  # noise so slow may be a drift: the rests can't say what is ideal
-    least = max(NEXT_MARGIN, SEEN_APART * work.rounds[0][0].gain)
+    least = max(NEXT_MARGIN, SEEN_APART * _first_gain(work))
     return left.ideal - last.log_likelihood < least and left.ratio < least
 
 

@@ -24,6 +24,8 @@ AFTER_LAWS = 0.92
 """What evidence counts for efforts: of two that explain the same a law is believed, for it can be wrong elsewhere."""
 AT_WORK_ONLY = 0.85
 """What evidence counts for efforts of which the rests show nothing: they'd be the first to keep to the stimulation."""
+ONLY_AT_WORK = 0.85
+"""Probability at most of efforts of which the rests show nothing: it may be something that the stimulation does."""
 SEEN_AT_REST = 0.15
 """Least share of an effort's torque, rests against work, that counts as seen at rest."""
 DYNAMIC = {"speed", "branch", "delay", "filter"}

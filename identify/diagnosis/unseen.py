@@ -48,8 +48,8 @@ def unseen(fitted: Fitted, form: float = FORM, beside: Fitted | None = None) -> 
     Rows count whose pulse widths, and those of the last seconds, were fitted: elsewhere the curve is a guess.
 
     `form` is what the form of the model may err by there, as a share of the largest torque.
-    Efforts cannot be foreseen, but they are seldom: where the model, or the one that it is compared with, holds one, the
-    error is that of most intervals, the median.
+    Efforts cannot be foreseen, but they are seldom: where the model or the one beside it holds one, the median error
+    counts.
     """
     setup = fitted.problem.setup
     grid = setup.grid

@@ -23,6 +23,7 @@ from identify.diagnosis.thresholds import (
     LEAST_EXPLAINED,
     MANY,
     NAMELESS,
+    ONLY_AT_WORK,
     RELATIVE,
     SEEN_AT_REST,
     STRUCTURE,
@@ -102,6 +103,15 @@ def _no_effort(work: Analysis, explained: float, structure: float) -> bool:
     return "resisting" in dict(holder.effects)[effort].name or _efforts(holder.parameters_of(effort)) >= MANY
 
 
+def _only_at_work(work: Analysis, number: int) -> bool:
+    """Whether an added torque that nobody can foresee is seen nowhere in the rests."""
+    effect, holder = work.added[number], work.chain[number + 1]
+    form = dict(holder.effects).get(effect)
+    if form is None or form.stage != "additive" or get(effect).foreseeable:
+        return False
+    return seen_at_rest(work.quiet, holder, effect) < SEEN_AT_REST
+
+
 def _everywhere(work: Analysis) -> bool:
     """Whether what looks like efforts lasts for much of the test: efforts are seldom."""
     effort = work.added[0]
@@ -126,10 +136,11 @@ def _contradicted(before: Unseen | None, after: Unseen) -> bool:
 
 def judge(work: Analysis) -> Verdict:
     """The verdict on an analysis."""
-    first, last = work.chain[0], work.last
+    first, last = work.plain if work.held else work.chain[0], work.last
+    effects = [*work.held, *work.added]
     left = work.left[-1]
     possible = max(left.ideal - first.log_likelihood, 1.0)
-    explained = (last.log_likelihood - first.log_likelihood) / possible if work.added else 0.0
+    explained = (last.log_likelihood - first.log_likelihood) / possible if effects else 0.0
     held = held_readings(work.record)
     notes: list[str] = []
     found: dict[str, float] = dict.fromkeys(work.given, 0.99)
@@ -140,6 +151,8 @@ def judge(work: Analysis) -> Verdict:
         )
         # What was added later stands on what was added before.
         found[effect] = min([rivals[effect].get(effect, 0.5), *(found[e] for e in work.added[:number] if e in found)])
+        if _only_at_work(work, number):
+            found[effect] = min(found[effect], ONLY_AT_WORK)
         if rise(work.chain[number], work.chain[number + 1]) is not None:
             found[effect] = min(found[effect], DOUBTED)
             notes.append(f"{get(effect).name}: the error on rows not seen rises with it.")
@@ -151,18 +164,18 @@ def judge(work: Analysis) -> Verdict:
     strange = held > HELD
     if strange:
         notes.append(f"{100 * held:.0f} % of the readings repeat the one before exactly: the converter holds or steps.")
-    if work.added:
+    if effects:
         strange = strange or (explained < LEAST_EXPLAINED and structure > STRUCTURE)
         lawless = work.nameless[0] > work.rounds[0][0].gain + NAMELESS
         strange = strange or (lawless and explained < EXPLAINED_BY_LAWS)
-        if get(work.added[0]).band:
+        if get(effects[0]).band:
             strange = strange or (explained < LEAST_BY_BAND and structure > UNSTEADY)
-        elif not get(work.added[0]).foreseeable:
+        elif work.added and not get(work.added[0]).foreseeable:
             strange = strange or _everywhere(work) or _no_effort(work, explained, structure)
     else:
         strange = strange or structure > STRUCTURE
     # Who names an effect says more than who names none, and is held to more.
-    form = FORM_OF_EFFECTS if work.added else FORM
+    form = FORM_OF_EFFECTS if effects else FORM
     before, after = (unseen(fitted, form, last) for fitted in (first, last))
     contradicted = after is not None and _contradicted(before, after)
     if after is not None and contradicted:

@@ -29,3 +29,7 @@ def warm() -> None:
         for form in effect.forms[:6] if effect.foreseeable else effect.forms[:1]:
             problem = Problem(setup, [(effect.id, form)])
             problem.run(start_from(problem, base, {0: form.starts(setup.scene)[0]}), derivatives=True)
+
+
+if __name__ == "__main__":
+    warm()

@@ -150,7 +150,7 @@ def solve(
         # An effect's start may be one from which nothing is to be gained at first.
         if (iterations > 1 or not problem.chosen) and promised < 0.5 * tolerance:
             break
-        if floor is not None and iterations > 1:
+        if floor is not None:
             reached = at.value - 0.5 * _log_det_ratio(problem, hessian)
             if reached + OPTIMISM * (promised + 1.0) < floor:
                 break
