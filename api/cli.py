@@ -20,8 +20,11 @@ from api import commands
 from api.terminal import InputError, clear_progress
 
 
-def build() -> typer.Typer:
-    """The command line with every verb found in `api/commands`."""
+def build(verb: str = "") -> typer.Typer:
+    """The command line with the verb's file in `api/commands`; with every file where none bears its name.
+
+    No verb waits until the libraries of all others are loaded.
+    """
     app = typer.Typer(
         name="stimrig",
         help="Identify electrically stimulated muscle, see where the model fails, learn what is missing.",
@@ -31,8 +34,10 @@ def build() -> typer.Typer:
         rich_markup_mode=None,
         context_settings={"help_option_names": ["-h", "--help"]},
     )
-    for info in sorted(pkgutil.iter_modules(commands.__path__), key=lambda info: info.name):
-        importlib.import_module(f"{commands.__name__}.{info.name}").register(app)
+    app.callback()(lambda: None)  # one verb alone stays a verb
+    names = sorted(info.name for info in pkgutil.iter_modules(commands.__path__))
+    for name in [verb] if verb in names else names:
+        importlib.import_module(f"{commands.__name__}.{name}").register(app)
     return app
 
 
@@ -47,7 +52,7 @@ def run(arguments: list[str] | None = None) -> int:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     verb = next((word for word in (arguments if arguments is not None else sys.argv[1:]) if word[:1] != "-"), "")
     try:
-        code = build()(arguments, standalone_mode=False)
+        code = build(verb)(arguments, standalone_mode=False)
         sys.stdout.flush()
         return code if isinstance(code, int) else 0
     except (KeyboardInterrupt, typer.Abort):
@@ -69,7 +74,8 @@ def _one_line(verb: str, error: Exception) -> int:
     code = getattr(error, "code", 1)
     if isinstance(error, TyperException):
         message = error.format_message().strip()
-        if not message:  # the help was printed
+        if not message or message.startswith("Usage:"):  # no verb was given: the help itself, not in one line
+            print(message, file=sys.stderr)
             return 2
         print(f"{name}: {flat(message)} (see {name} --help)", file=sys.stderr)
         return 2

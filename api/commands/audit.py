@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from api.terminal import Json, say, say_json, write
+from api import audit
+from api.errors import ApiError
+from api.settings import Settings
+from api.store import Store
+from api.store.tables import AuditEntry
+from api.terminal import InputError, Json, say, say_json, write
 
 DataDir = Annotated[Path | None, typer.Option("--data", help="data folder; default ./var, or STIMRIG_DATA_DIR")]
 
@@ -28,9 +33,6 @@ def verify(
     as_json: Json = False,
 ) -> None:
     """Exit 0 if the chain holds; 1 if an entry was changed, taken out or put in."""
-    from api import audit  # loads the database's library, for which no other verb should wait
-    from api.audit_trail import read_export, stored
-
     entries = read_export(file) if file is not None else stored(data)
     broken = audit.first_broken(entries)
     missing = bool(head) and head not in {entry.hash for entry in entries}
@@ -55,9 +57,55 @@ def export(
     data: DataDir = None,
 ) -> None:
     """Write the trail, one entry a line; `verify --file` checks it without the database."""
-    from api import audit
-    from api.audit_trail import stored
-
     entries = stored(data)
     write(output, "".join(json.dumps(entry.as_dict(), sort_keys=True) + "\n" for entry in entries))
     say(f"{len(entries)} entries written to {output}; head {entries[-1].hash if entries else audit.GENESIS}")
+
+
+def stored(data: Path | None) -> list[AuditEntry]:
+    """The trail in the database, read only.
+
+    Raises
+    ------
+    InputError
+        There is no database.
+    """
+    given: dict[str, Any] = {} if data is None else {"data_dir": data}
+    settings = Settings(**given)
+    if settings.database_url is None and not (settings.data_dir / "stimrig.db").is_file():
+        raise InputError(f"{settings.data_dir / 'stimrig.db'}: there is no database. Give the data folder with --data.")
+    try:
+        store = Store(settings.database)
+    except ApiError as error:
+        raise InputError(str(error)) from error
+    try:
+        return store.all(AuditEntry, order=AuditEntry.seq)
+    finally:
+        store.close()
+
+
+def read_export(path: Path) -> list[AuditEntry]:
+    """An exported trail.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, or a line is no entry.
+    """
+    try:
+        lines = path.read_text("utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: {error}. Give a file written by `stimrig audit export`.") from error
+    columns = {column.name for column in AuditEntry.__table__.columns}
+    entries = []
+    for number, line in enumerate(lines, start=1):
+        try:
+            fields = json.loads(line)
+        except ValueError as error:
+            raise InputError(
+                f"{path}, line {number}: no JSON. Give a file written by `stimrig audit export`."
+            ) from error
+        if not isinstance(fields, dict) or set(fields) != columns:
+            raise InputError(f"{path}, line {number}: no entry of an audit trail.")
+        entries.append(AuditEntry(**fields))
+    return entries

@@ -213,3 +213,16 @@ def test_emulate_hands_everything_on() -> None:
         [sys.executable, "-m", "api.cli", "emulate", "--help"], capture_output=True, text=True, check=True
     )
     assert "--hidden SEED" in helped.stdout
+
+
+@pytest.mark.parametrize("given", [[], ["audit"]])
+def test_without_a_verb_the_help_is_told_line_by_line(given, capsys):
+    assert cli.run(given) == 2
+    told = capsys.readouterr().err
+    assert told.startswith("Usage:") and len(told.splitlines()) > 6
+
+
+def test_a_verb_does_not_wait_for_the_libraries_of_others():
+    code = "import sys; from api.cli import build; build('diagnose'); print('sqlalchemy' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"

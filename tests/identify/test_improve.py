@@ -85,3 +85,11 @@ def test_every_step_keeps_what_the_structure_held():
     assert [step["added"] for step in result.steps] == [None, "mains_hum", "fatigue"]
     for model in result.models:
         assert model.effects[0]["id"] == "baseline_drift"
+
+
+@pytest.mark.parametrize("hidden", ["fatigue", "threshold_drift", "asymmetric_relaxation"])
+def test_what_improving_ends_with_lacks_nothing(hidden):
+    record = hidden_muscles.record(hidden, seed=11, rate_hz=100)
+    model = identify.improve(record).models[-1]
+    assert [effect["id"] for effect in model.effects] == [hidden]
+    assert identify.diagnose(record, model).verdict == "nothing_missing"
