@@ -129,7 +129,7 @@ def curve_weights(fraction, step_s, time_constant_s, damping):  # pragma: no cov
     step_s, time_constant_s, damping : float
         Of the step, and T and ζ of the dynamics; T = 0 for the cubic itself.
     """
-    out = np.empty((fraction.size, 4))
+    out = np.zeros((fraction.size, 4))
     exact = time_constant_s > 0.0
     ends, lift, reached = np.zeros((3, 4)), np.zeros((3, 4)), 1.0
     if exact:
@@ -143,14 +143,18 @@ def curve_weights(fraction, step_s, time_constant_s, damping):  # pragma: no cov
     for n in range(fraction.size):
         s = fraction[n]
         t = 1.0 - s
-        cubic = np.array([(1.0 + 2.0 * s) * t * t, s * t * t, s * s * (3.0 - 2.0 * s), -s * s * t])
+        c0, c1, c2, c3 = (1.0 + 2.0 * s) * t * t, s * t * t, s * s * (3.0 - 2.0 * s), -s * s * t
         if exact:
             own = step_matrix(time_constant_s, damping, s * step_s)
-            inside = np.array([1.0, (1.0 - own[0]) / reached, own[1] / step_s])
-            cubic += (inside - ends @ cubic) @ lift
-        out[n] = cubic
-        out[n, 1] *= step_s
-        out[n, 3] *= step_s
+            short = (1.0, (1.0 - own[0]) / reached, own[1] / step_s)
+            for i in range(3):
+                missing = short[i] - ends[i, 0] * c0 - ends[i, 1] * c1 - ends[i, 2] * c2 - ends[i, 3] * c3
+                for j in range(4):
+                    out[n, j] += missing * lift[i, j]
+        out[n, 0] += c0
+        out[n, 1] = step_s * (out[n, 1] + c1)
+        out[n, 2] += c2
+        out[n, 3] = step_s * (out[n, 3] + c3)
     return out
 
 

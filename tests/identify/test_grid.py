@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
+from identify.dynamics import pulse_grid
 from identify.dynamics.boundary import boundary_states
 from identify.dynamics.linear import SecondOrder
 from identify.dynamics.pulse_grid import make_grid, runs
@@ -54,6 +55,25 @@ def test_block_means_match_fine_integration(rate_hz: int, delay_s: float) -> Non
     assert np.array_equal(grid.pulse_width_us, widths_us[: grid.size])
     states = boundary_states(time_constant_s, damping, grid.step_s, widths_us[: grid.size] / 40.0)
     assert np.abs(grid.block_mean(*states, delay_s) - grid.torque_nm).max() < 2e-5
+
+
+def test_a_clock_that_wanders_is_followed_at_a_bounded_price(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A real recording has a place of its own for every sample; curves are worked out for some of them."""
+    patient = Patient(time_constant_s=0.03, damping=2.0)
+    widths_us = schedule()
+    torque = patient.torque(widths_us, 1600.0)
+    even_s = np.arange(torque.size) / 1600.0
+    time_s = even_s + 1e-4 * np.sin(np.arange(torque.size) ** 1.1)
+    slot = np.floor(even_s * PULSE_RATE_HZ + 1e-9).astype(int)
+    record = Record.from_arrays(time_s, widths_us[slot], torque)
+    linear, told = SecondOrder(0.03, 2.0), []
+    for most in (pulse_grid.PLACES, 10**9):
+        monkeypatch.setattr(pulse_grid, "PLACES", most)
+        grid = make_grid(record)
+        told.append((len(grid._places[0]), linear.on_grid(grid, patient.recruitment(grid.pulse_width_us))))
+    (few, coarse), (many, exact) = told
+    assert few <= 1025 < many
+    assert np.abs(coarse - exact).max() < 2e-5 * np.ptp(torque)
 
 
 @pytest.mark.parametrize("skipped", [0, 3])
