@@ -13,6 +13,8 @@ import sys
 from collections.abc import Callable, Iterator
 from typing import Any
 
+from numba.core.compiler_lock import global_compiler_lock
+
 ROOM_BYTES = 2**20
 Copy = tuple[Any, Any]
 """A process, and the end of a pipe from which its results come."""
@@ -64,7 +66,7 @@ def _come(results: Any, waiting: set[int], *, wait: bool) -> Iterator[tuple[int,
             number, result = results.recv()
             waiting.discard(number)
             yield number, result
-    except EOFError:
+    except (EOFError, OSError):  # it ended; OSError: in the middle of a result
         pass
 
 
@@ -80,7 +82,9 @@ def _copy(work: Callable[[int], Any], numbers: int) -> Copy | None:
         fcntl.fcntl(put.fileno(), fcntl.F_SETPIPE_SZ, ROOM_BYTES)
     process = multiprocessing.get_context("fork").Process(target=_work, args=(work, numbers, put), daemon=True)
     try:
-        process.start()
+        # Were another thread compiling, the copy would wait for ever for a lock whose holder it does not have.
+        with global_compiler_lock:
+            process.start()
     except (OSError, AssertionError):  # too many processes; a daemon may have none
         results.close()
         return None

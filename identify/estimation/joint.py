@@ -129,7 +129,7 @@ def solve(
     tolerance : float
         Gain in log posterior below which it stops.
     floor : float or None
-        Log evidence that is worth having: a run that promises less is given up.
+        Log evidence that is worth having: a run that promises less after its first step is given up.
     """
     at = _at(problem, np.clip(theta, problem.lower, problem.upper), noise, wide=True)
     assert at is not None
@@ -145,12 +145,14 @@ def solve(
         products = gram(_whiten(problem, np.vstack([at.residual, at.slopes]), at.noise))
         gradient = products[0, 1:] - precision @ (at.theta - prior_mean)
         hessian = products[1:, 1:] + precision
-        step = _step(hessian, gradient, min(damping, 1e-3), at.theta, problem, frozen)
-        promised = 0.5 * float(gradient @ step)  # were it the parabola that it looks like
+        step, shortened = _step(hessian, gradient, min(damping, 1e-3), at.theta, problem, frozen)
+        # By the whole step, were it the parabola that it looks like: of one shortened the next ones do the rest.
+        promised = 0.5 * float(gradient @ step) * shortened
         # An effect's start may be one from which nothing is to be gained at first.
         if (iterations > 1 or not problem.chosen) and promised < 0.5 * tolerance:
             break
-        if floor is not None:
+        # What the first step promises, from a start that may be far off, says little: a sixth of what came, in a trial.
+        if floor is not None and iterations > 1:
             reached = at.value - 0.5 * _log_det_ratio(problem, hessian)
             if reached + OPTIMISM * (promised + 1.0) < floor:
                 break
@@ -208,7 +210,7 @@ def _advance(
     """The next point that is no worse, with the damping to go on with; None where there is none near."""
     for attempt in range(6):
         if attempt or damping > 1e-3:
-            step = _step(hessian, gradient, damping, at.theta, problem, frozen)
+            step, _ = _step(hessian, gradient, damping, at.theta, problem, frozen)
         trial = _at(problem, np.clip(at.theta + step, problem.lower, problem.upper), at.noise)
         if trial is not None and trial.value > at.value - 1e-9:
             return trial, max(damping / 6.0, 1e-7)
@@ -218,8 +220,8 @@ def _advance(
 
 def _step(
     hessian: np.ndarray, gradient: np.ndarray, damping: float, theta: np.ndarray, problem: Problem, frozen: np.ndarray
-) -> np.ndarray:
-    """Damped Newton step; parameters at a bound that want further out stay."""
+) -> tuple[np.ndarray, float]:
+    """Damped Newton step, and by what it is shortened; parameters at a bound that want further out stay."""
     stuck = frozen | ((theta <= problem.lower) & (gradient < 0)) | ((theta >= problem.upper) & (gradient > 0))
     free = np.flatnonzero(~stuck)
     scale = np.sqrt(np.diag(hessian)[free])
@@ -236,8 +238,8 @@ def _step(
     for chosen in problem.chosen:
         for place in chosen.places:
             limit[place] = (problem.upper[place] - problem.lower[place]) / 3.0
-    over = float(np.max(np.abs(step) / limit))
-    return step / over if over > 1.0 else step
+    shortened = max(float(np.max(np.abs(step) / limit)), 1.0)
+    return step / shortened, shortened
 
 
 def _log_det_ratio(problem: Problem, hessian: np.ndarray) -> float:

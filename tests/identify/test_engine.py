@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 import identify
+from hardware_sim.hidden_records import generate
 from identify.effects import get
-from identify.estimation.adding import fitted_with
+from identify.estimation.adding import fitted_with, try_effect
 from identify.estimation.prepare import plain, prepare
 from identify.estimation.tremor import predict_fitted
 from identify.noise.level import NoiseLevel, band_part, profile, whitened
@@ -108,11 +109,21 @@ def test_warming_up_touches_every_compiled_part():
 
 def test_an_effect_asked_for_gets_the_form_that_the_diagnosis_would_give():
     """A spring with a toe: the forms before it in the list hardly help, and must not end the search."""
-    from hardware_sim.hidden_records import generate
-
     made = generate(("series_compliance",), "strong", 81)
     assert made["truth"]["formulation"] == ["mass on a spring that stiffens"]
     record = Record.from_arrays(made["time_s"], made["pulse_width_us"], made["torque_nm"], made["segment"])
     model = identify.fit(record, effects=["series_compliance"])
     assert model.effects[0]["form"] == "toe"
     assert model.fit["held_out_rms_nm"] < 1.3 * made["truth"]["noise"]["sd_nm"]
+
+
+def test_a_form_whose_start_promises_little_is_followed_all_the_same():
+    """Beside a spring of one stiffness the first step of one that stiffens promises a sixth of what it gains."""
+    made = generate("series_compliance", "middle", 5, rate_hz=100)
+    record = Record.from_arrays(made["time_s"], made["pulse_width_us"], made["torque_nm"], made["segment"])
+    grid, _ = prepare(record)
+    effect = get("series_compliance")
+    found = try_effect(effect, plain(grid, grid.fitted), [effect.form("series"), effect.form("toe")])
+    assert found is not None
+    assert found.form.name == "toe"
+    assert found.gain > found.forms["series"] + 400

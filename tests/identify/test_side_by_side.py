@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import os
 import signal
+import struct
+import threading
 import time
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import pytest
+from numba.core.compiler_lock import global_compiler_lock
 
 from identify.diagnosis import candidates, diagnose
 from identify.diagnosis.side_by_side import side_by_side
@@ -41,6 +45,44 @@ def test_a_copy_that_is_killed_loses_nothing():
         return number
 
     assert dict(side_by_side(fatal, 9, 2)) == {n: n for n in range(9)}
+
+
+def test_a_copy_that_ends_within_a_result_loses_nothing(monkeypatch):
+    def half(results: Connection, result: object) -> None:
+        os.write(results.fileno(), struct.pack("!i", 1000) + bytes(500))
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    def slow(number: int) -> int:
+        time.sleep(0.02)
+        return number
+
+    monkeypatch.setattr(Connection, "send", half)
+    assert dict(side_by_side(slow, 9, 2)) == {n: n for n in range(9)}
+
+
+def test_a_copy_does_not_wait_for_what_another_thread_compiles():
+    held = threading.Event()
+
+    def compiling() -> None:
+        with global_compiler_lock:
+            held.set()
+            time.sleep(0.3)
+
+    def locked(number: int) -> int:
+        time.sleep(0.02)
+        if os.getpid() != HERE:
+            signal.alarm(5)
+        with global_compiler_lock:
+            return os.getpid()
+
+    other = threading.Thread(target=compiling)
+    other.start()
+    held.wait()
+    began = time.monotonic()
+    found = dict(side_by_side(locked, 9, 2))
+    other.join()
+    assert len(set(found.values())) == 2
+    assert time.monotonic() - began < 4.0
 
 
 def test_an_error_in_a_copy_is_seen_here():
