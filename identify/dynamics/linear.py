@@ -50,12 +50,12 @@ class SecondOrder:
     def on_grid(self, grid: Grid, drive_nm: np.ndarray) -> np.ndarray:
         """Block means of the response to a drive by even slots, (K,) or (K, M) N·m, as it was felt, from rest."""
         torque, rate = grid.states(self.core, drive_nm)
-        return grid.block_mean(torque, rate, self.delay_s, self.core)
+        return grid.block_mean(torque, rate, self.delay_s, grid.curve(self.core))
 
     def at_samples(self, grid: Grid, drive_nm: np.ndarray) -> np.ndarray:
         """The response at the record's samples, shape (N,)."""
         torque, rate = grid.states(self.core, drive_nm)
-        return grid.at_samples(torque, rate, self.delay_s / grid.step_s, self.core)
+        return grid.at_samples(torque, rate, self.delay_s / grid.step_s, grid.curve(self.core))
 
     def discrete(self, sample_rate_hz: float) -> tuple[np.ndarray, np.ndarray, int]:
         """(b, a, d) of equations (1) to (3) at a sampling rate, exact for an input held between samples.

@@ -199,7 +199,7 @@ class Grid:
         """The curve of dynamics `core` through boundary states at the samples, `lag` intervals late, shape (N,)."""
         places, place = self._places
         offset = np.floor(places - lag)
-        four = curve_weights(places - lag - offset, self.step_s, *self._curve(core))
+        four = curve_weights(places - lag - offset, self.step_s, *(core or CUBIC))
         return read_at(torque_nm, rate_nm_s, self.interval, place, offset.astype(np.int64), four)
 
     def mean_weights(self, delay_s: float = 0.0, core: Core | None = None) -> tuple[int, np.ndarray]:
@@ -220,12 +220,11 @@ class Grid:
             Weights of (y, y') at boundaries first, first + 1, … relative to each interval: the mean of interval k is
             sum over b of weights[k, b, 0] * y[k + first + b] + weights[k, b, 1] * y'[k + first + b].
         """
-        curve = self._curve(core)
-        if (delay_s, curve) not in self._weights:
+        if (delay_s, core) not in self._weights:
             if len(self._weights) >= 8:  # a search asks for the same ones several times, then never again
                 self._weights.clear()
-            self._weights[delay_s, curve] = self._new_weights(delay_s, curve)
-        return self._weights[delay_s, curve]
+            self._weights[delay_s, core] = self._new_weights(delay_s, core)
+        return self._weights[delay_s, core]
 
     @cached_property
     def _alike(self) -> bool:
@@ -248,26 +247,27 @@ class Grid:
             places = places / PLACES
         return places, place
 
-    def _curve(self, core: Core | None) -> Core:
-        """The dynamics, or a cubic: where both lags are long it is exact enough, and the same for all."""
-        if core is None:
-            return CUBIC
+    def curve(self, core: Core) -> Core | None:
+        """How to read the curve of dynamics `core`: as its own, or, where both lags are long, as a cubic for all alike.
+
+        Whoever compares neighbours reads them as one of them, for a derivative knows no jump.
+        """
         time_constant_s, damping = core
         quick_s = time_constant_s / (max(damping, 1.0) + np.sqrt(max(damping * damping - 1.0, 0.0)))
-        return CUBIC if quick_s > LONG * self.step_s else core
+        return None if quick_s > LONG * self.step_s else core
 
-    def _new_weights(self, delay_s: float, core: Core) -> tuple[int, np.ndarray]:
+    def _new_weights(self, delay_s: float, core: Core | None) -> tuple[int, np.ndarray]:
         places, place = self._places
         shifted = places - delay_s / self.step_s
         offset = np.floor(shifted).astype(np.int64)
-        four = curve_weights(shifted - offset, self.step_s, *core)
+        four = curve_weights(shifted - offset, self.step_s, *(core or CUBIC))
         if self._alike:  # one row, standing for all
             only = np.zeros(places.size, np.int64)
             return mean_weights(four, offset, np.arange(places.size), only, self.count[:1])
         return mean_weights(four, offset, place, self.interval, self.count)
 
     @cached_property
-    def _weights(self) -> dict[tuple[float, Core], tuple[int, np.ndarray]]:
+    def _weights(self) -> dict[tuple[float, Core | None], tuple[int, np.ndarray]]:
         return {}
 
     def block_mean(

@@ -73,8 +73,8 @@ def try_effect(
         elif idle >= PATIENCE:
             continue
         # A chain needs each of its steps at its best: the next begins there.
-        floor = max(base.log_evidence + least - effect.prior, best.log_evidence if best else -np.inf)
-        found = fit_form(effect, form, base, residual, previous, None if form.propose else floor)
+        bars = () if form.propose else (base.log_evidence + least - effect.prior, best and best.log_evidence)
+        found = fit_form(effect, form, base, residual, previous, *bars)
         if found is None:
             idle = PATIENCE
             continue
@@ -107,9 +107,10 @@ def fit_form(
     base: Fitted,
     residual: np.ndarray,
     previous: dict[str, float],
-    floor: float | None = None,
+    least: float | None = None,
+    rival: float | None = None,
 ) -> Fitted | None:
-    """One form added to a model, from each of its starting values; the best. Far below the floor it is given up."""
+    """One form added to a model, from each of its starting values; the best. `least` and `rival` as in `solve`."""
     setup = base.problem.setup
     scene: Scene = setup.scene
     problem = Problem(setup, [*base.effects, (effect.id, form)])
@@ -122,12 +123,12 @@ def fit_form(
         if apart is not None and "base.time_constant_s" not in start and base.physical[1] >= apart:
             continue  # the base has its lags apart already
         theta = start_from(problem, base, {len(base.effects): start})
-        ahead = max((least for least in (floor, best and best.log_evidence) if least is not None), default=None)
-        found = solve(problem, theta, base.noise, tolerance=TOLERANCE, floor=ahead)
+        found = solve(problem, theta, base.noise, tolerance=TOLERANCE, least=least, rival=rival)
         if form.accept is not None and not form.accept(found.parameters_of(effect.id), scene):
             continue
         if best is None or found.log_evidence > best.log_evidence:
             best = found
+            rival = max(found.log_evidence, rival if rival is not None else -np.inf)
     return best
 
 

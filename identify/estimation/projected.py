@@ -124,7 +124,7 @@ class Projection:
         """Block means of the response to each linear coefficient, shape (K, P + extras)."""
         even = np.tile(step_matrix(*linear.core, self.grid.step_s), (len(self.rows_nm), 1))
         torque, rate = held_states(self.rows_nm, even, self.grid.starts, self.beginnings)
-        rows = read_means(torque, rate, *self.grid.mean_weights(linear.delay_s, linear.core))
+        rows = read_means(torque, rate, *self.grid.mean_weights(linear.delay_s, self.grid.curve(linear.core)))
         size = self.basis.size
         return np.concatenate([rows[:size], self.levels.T, rows[size:]]).T
 
@@ -141,11 +141,12 @@ class Projection:
         begin = coefficients[size + grid.begins.size :].reshape(1, -1, 2)
         near: list[Core] = [(t, z), (t * np.exp(step), z), (t, z * np.exp(step))]
         even = np.array([step_matrix(*core, grid.step_s) for core in near])
+        exact = grid.curve(near[0])
         torque, rate = held_states(np.tile(drive, (3, 1)), even, grid.starts, np.tile(begin, (3, 1, 1)))
 
         def read(row: int, delay_s: float) -> np.ndarray:
             at = slice(row, row + 1)
-            return read_means(torque[at], rate[at], *grid.mean_weights(delay_s, near[row]))[0]
+            return read_means(torque[at], rate[at], *grid.mean_weights(delay_s, exact and near[row]))[0]
 
         mean = [read(row, d) for row in range(3)]
         change = [mean[1] - mean[0], mean[2] - mean[0]]

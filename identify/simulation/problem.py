@@ -164,7 +164,7 @@ class Problem:
         walk = _Walk(self, theta, False)
         torque, rate, delay, _ = walk.to_boundaries()
         grid = self.setup.grid
-        value = grid.at_samples(torque[0], rate[0], delay[0] / grid.step_s, walk.core(0))[None, :]
+        value = grid.at_samples(torque[0], rate[0], delay[0] / grid.step_s, walk.curves()[0])[None, :]
         value = walk.add(value, self.setup.scene_at_samples, skip)
         return self.setup.unframed(walk.sense(value, self.setup.scene_at_samples)[0])
 
@@ -336,9 +336,10 @@ class _Walk:
     def read(self, torque: np.ndarray, rate: np.ndarray, delay: np.ndarray, owned: np.ndarray) -> np.ndarray:
         grid = self.setup.grid
         mean = np.empty((delay.size, grid.size))
-        alike: dict[tuple[float, Core], list[int]] = {}
-        for row, lag in enumerate(delay.tolist()):
-            alike.setdefault((lag, self.core(row)), []).append(row)
+        alike: dict[tuple[float, Core | None], list[int]] = {}
+        curves = self.curves()
+        for row, lag in enumerate(delay.tolist()):  # rows that joined later are read as the base
+            alike.setdefault((lag, curves[row if row < len(curves) else 0]), []).append(row)
         for (lag, core), rows in alike.items():
             own = owned[rows]
             if own[-1] - own[0] + 1 == own.size and np.all(np.diff(own) == 1):
@@ -346,10 +347,10 @@ class _Walk:
             mean[rows] = read_means(torque[own], rate[own], *grid.mean_weights(lag, core))
         return mean
 
-    def core(self, row: int) -> Core:
-        """T and ζ of a row, as they are where nothing changes the speed; those that joined later have the base's."""
-        time_constant_s, damping = self.cores[row if row < len(self.cores) else 0].tolist()
-        return time_constant_s, damping
+    def curves(self) -> list[Core | None]:
+        """How rows' curves are read: by their T and ζ as they are where nothing changes the speed, or all as cubics."""
+        cores: list[Core] = [(time_constant_s, damping) for time_constant_s, damping in self.cores.tolist()]
+        return [*cores] if self.setup.grid.curve(cores[0]) else [None] * len(cores)
 
     def add(self, value: np.ndarray, scene=None, skip: frozenset[str] = frozenset()) -> np.ndarray:
         part = self.setup.part_of(scene is not None)
