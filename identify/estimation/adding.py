@@ -73,8 +73,8 @@ def try_effect(
         elif idle >= PATIENCE:
             continue
         # A chain needs each of its steps at its best: the next begins there.
-        bars = () if form.propose else (base.log_evidence + least - effect.prior, best and best.log_evidence)
-        found = fit_form(effect, form, base, residual, previous, *bars)
+        floor = max(base.log_evidence + least - effect.prior, best.log_evidence if best else -np.inf)
+        found = fit_form(effect, form, base, residual, previous, -np.inf if form.propose else floor)
         if found is None:
             idle = PATIENCE
             continue
@@ -107,10 +107,9 @@ def fit_form(
     base: Fitted,
     residual: np.ndarray,
     previous: dict[str, float],
-    least: float | None = None,
-    rival: float | None = None,
+    floor: float = -np.inf,
 ) -> Fitted | None:
-    """One form added to a model, from each of its starting values; the best. `least` and `rival` as in `solve`."""
+    """One form added to a model, from each of its starting values; the best. What stays below the floor is given up."""
     setup = base.problem.setup
     scene: Scene = setup.scene
     problem = Problem(setup, [*base.effects, (effect.id, form)])
@@ -123,12 +122,12 @@ def fit_form(
         if apart is not None and "base.time_constant_s" not in start and base.physical[1] >= apart:
             continue  # the base has its lags apart already
         theta = start_from(problem, base, {len(base.effects): start})
-        found = solve(problem, theta, base.noise, tolerance=TOLERANCE, least=least, rival=rival)
+        found = solve(problem, theta, base.noise, tolerance=TOLERANCE, floor=floor)
         if form.accept is not None and not form.accept(found.parameters_of(effect.id), scene):
             continue
         if best is None or found.log_evidence > best.log_evidence:
             best = found
-            rival = max(found.log_evidence, rival if rival is not None else -np.inf)
+            floor = max(floor, found.log_evidence)
     return best
 
 
@@ -161,7 +160,8 @@ def add(base: Fitted, effect: Effect, form: str, raw: Raw) -> Fitted:
         if identifier == effect.id:
             return added(base, identifier, seen, values)
     # What only the raw samples show is not there where they do not.
-    found = None if any(form.settled for form in forms) else try_effect(effect, base, forms)
+    # And what somebody asks for is fitted to its end, whatever it gains.
+    found = None if any(form.settled for form in forms) else try_effect(effect, base, forms, -np.inf)
     if found is None:
         raise NotIdentifiable(f"nothing in the record looks like {effect.id}", mend="Leave it out.")
     return found.fitted

@@ -112,8 +112,7 @@ def solve(
     *,
     most: int = 20,
     tolerance: float = 0.02,
-    least: float | None = None,
-    rival: float | None = None,
+    floor: float | None = None,
 ) -> Fitted:
     """Most probable parameters, from a start.
 
@@ -129,10 +128,8 @@ def solve(
         Steps at most.
     tolerance : float
         Gain in log posterior below which it stops.
-    least : float or None
-        Log evidence that is worth having: a run that promises less is given up.
-    rival : float or None
-        Log evidence of another start or form: a run that promises less after its first step is given up.
+    floor : float or None
+        Log evidence that is worth having: a run that promises less after its first step is given up.
     """
     at = _at(problem, np.clip(theta, problem.lower, problem.upper), noise, wide=True)
     assert at is not None
@@ -154,12 +151,10 @@ def solve(
         # An effect's start may be one from which nothing is to be gained at first.
         if (iterations > 1 or not problem.chosen) and promised < 0.5 * tolerance:
             break
-        # What the first step promises, from a start that may be far off, says little beside a rival: a sixth of what
-        # came, in a trial.
-        bars = [bar for bar in (least, rival if iterations > 1 else None) if bar is not None]
-        if bars:
+        # What the first step promises, from a start that may be far off, says little: a sixth of what came, in a trial.
+        if floor is not None and iterations > 1:
             reached = at.value - 0.5 * _log_det_ratio(problem, hessian)
-            if reached + OPTIMISM * (promised + 1.0) < max(bars):
+            if reached + OPTIMISM * (promised + 1.0) < floor:
                 break
         found, damping = _advance(problem, at, hessian, gradient, damping, frozen, step)
         if found is None:
