@@ -73,8 +73,9 @@ def try_effect(
         elif idle >= PATIENCE:
             continue
         # A chain needs each of its steps at its best: the next begins there.
+        whole = form.propose is not None or least == -np.inf
         floor = max(base.log_evidence + least - effect.prior, best.log_evidence if best else -np.inf)
-        found = fit_form(effect, form, base, residual, previous, -np.inf if form.propose else floor)
+        found = fit_form(effect, form, base, residual, previous, -np.inf if whole else floor)
         if found is None:
             idle = PATIENCE
             continue

@@ -204,20 +204,12 @@ def test_diagnosis_stays_whichever_samples_show_the_muscle(hidden, relation):
     assert said(SAMPLING[relation](record_of(hidden)))[:2] == answer(hidden)[:2]
 
 
-FAR_ROWS = pytest.mark.xfail(
-    strict=True,
-    reason="validate, after 19 s of drift, speaks against threshold_drift: unexplained_structure at 0.45 with it, "
-    "effect_missing at 0.96 without",
-)
-
-
 def _diagnoses() -> list:
     cases = []
     for hidden in HIDDEN:
         for relation in SAMPLING:
-            far = (hidden, relation) == ("threshold_drift", "without validate")
             if relation != "in 5 mN·m":
-                cases.append(pytest.param(hidden, relation, marks=[FAR_ROWS] if far else []))
+                cases.append((hidden, relation))
     return cases
 
 

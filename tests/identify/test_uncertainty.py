@@ -124,7 +124,7 @@ def test_what_is_missing_is_not_silent(tired: float, verdict: str):
     assert model.quality["verdict"] == verdict
     gates = model.quality["gates"]
     assert not gates["residual"]["passed"] and not gates["gap"]["passed"]
-    assert any("diagnose" in reason for reason in model.quality["reasons"])
+    assert any("diagnosis" in reason for reason in model.quality["reasons"])
     assert model.quality["reasons"][0] in model.quality["words"]
 
 
