@@ -205,12 +205,7 @@ def test_diagnosis_stays_whichever_samples_show_the_muscle(hidden, relation):
 
 
 def _diagnoses() -> list:
-    cases = []
-    for hidden in HIDDEN:
-        for relation in SAMPLING:
-            if relation != "in 5 mN·m":
-                cases.append((hidden, relation))
-    return cases
+    return [(hidden, relation) for hidden in HIDDEN for relation in SAMPLING if relation != "in 5 mN·m"]
 
 
 @pytest.mark.slow
