@@ -124,9 +124,9 @@ def analyse(
     """
     listed = list(registry().values() if effects is None else effects)
     grid, raw = prepare(record)
-    without = plain(grid, fitted_rows(grid, None) if fitted is None else fitted)
-    base = with_effects(without, structure, raw)
-    work = Analysis(record, raw, without, base)
+    bare = plain(grid, fitted_rows(grid, None) if fitted is None else fitted)
+    base = with_effects(bare, structure, raw)
+    work = Analysis(record, raw, bare, base)
     start = _with_given(work, base)
     work.chain, work.quiet = [start], quiet_rows(start)
     work.left = [left_over(start, work.quiet, raw.noise_sd_nm)]

@@ -30,7 +30,7 @@ def side_by_side(work: Callable[[int], Any], count: int, processes: int) -> Iter
     work : callable
         Called with the number of a task.
     count : int
-        Of tasks, 255 at most.
+        Of tasks, 256 at most: each number is one byte.
     processes : int
         How many share them, this one included.
     """
