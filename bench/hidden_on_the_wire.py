@@ -17,8 +17,8 @@ from typing import Any
 
 import httpx
 
-from api.launcher import Services
-from api.session import ReportedError, checked, ensure_participant, run_test
+from api.cli.launcher import Services
+from api.cli.rest_session import ReportedError, checked, ensure_participant, run_test
 from api.settings import Settings
 
 TOKEN = "token-of-the-hidden-patients"

@@ -20,8 +20,8 @@ from pathlib import Path
 from typing import Any
 
 from api.errors import ApiError
-from api.fitting import Fitting
-from api.worker_process import Places
+from api.workers.pool import Fitting
+from api.workers.process import Places
 from bench.hostile_shapes import SECRET, Hostile, all_files, good
 
 LONGEST_LINE = 400

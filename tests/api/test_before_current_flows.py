@@ -11,9 +11,9 @@ from typing import Any
 import httpx
 import pytest
 
-from api.auth import Principal
 from api.clock import Clock
-from api.questions import LIFE_S, MOST, Question, Questions
+from api.people.auth import Principal
+from api.sessions.questions import LIFE_S, MOST, Question, Questions
 from rig import messages as m
 from tests.api.conftest import Service, run_test, wait_done
 from tests.api.test_access import csrf, signed_in

@@ -15,7 +15,7 @@ from typing import Any
 
 import httpx
 
-from api.launcher import Child
+from api.cli.launcher import Child
 from tests.api.conftest import TOKEN, wait_done
 
 ROOT = Path(__file__).parents[2]

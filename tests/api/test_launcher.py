@@ -13,8 +13,8 @@ from pathlib import Path
 import httpx
 import pytest
 
-from api.launcher import LaunchError, Services
-from api.session import run_test
+from api.cli.launcher import LaunchError, Services
+from api.cli.rest_session import run_test
 from api.settings import Settings
 from tests.api.conftest import TOKEN
 

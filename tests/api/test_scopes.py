@@ -10,8 +10,8 @@ import httpx
 import pytest
 from fastapi.routing import APIRoute
 
-from api import pages, routes
-from api.auth import Scope
+from api.people.auth import Scope
+from api.web import pages, routes
 from tests.api.conftest import STUB, TOKEN, Service, run_service, run_test
 
 SCOPES = ("read-live", "run-test", "rearm", "approve-model", "read-model", "administer")

@@ -17,11 +17,11 @@ from typing import Any
 import httpx
 import pytest
 
-from api import confinement
 from api.errors import ApiError
-from api.fitting import WORKER, Fitting
-from api.jobs import find_recording
-from api.worker_process import Places
+from api.workers import confinement
+from api.workers.pool import WORKER, Fitting
+from api.workers.process import Places
+from api.workers.verbs import find_recording
 from bench import hostile_files, hostile_shapes
 from tests.api.conftest import STUB, Service, run_service
 from tests.api.test_problems import problem
@@ -109,7 +109,9 @@ attempt('memory', lambda: bytearray({confinement.MEMORY_BYTES}))
 
 
 def test_what_cannot_be_shut_is_said() -> None:
-    program = "import json, api.confinement as c\nc.LIBC = None\nc.FORBIDDEN = {}\nprint(json.dumps(c.confine()))"
+    program = (
+        "import json, api.workers.confinement as c\nc.LIBC = None\nc.FORBIDDEN = {}\nprint(json.dumps(c.confine()))"
+    )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, cwd=ROOT, timeout=120)
     assert set(json.loads(done.stdout)) == {"files", "network"}, done.stderr
 
@@ -246,7 +248,7 @@ def test_a_row_that_is_not_written_leaves_no_file(
             def full(*_: object, **__: object) -> None:
                 raise OSError("disk full")
 
-            monkeypatch.setattr("api.routes.recordings.audit.write", full)
+            monkeypatch.setattr("api.web.routes.recordings.audit.write", full)
             assert client.post("/v1/participants/P017/recordings", content=b"a,b\n").status_code == 500
             monkeypatch.undo()
         assert not list((tmp_path / "recordings").rglob("upload-*"))

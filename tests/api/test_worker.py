@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from api.errors import ApiError
-from api.fitting import Fitting
+from api.workers.pool import Fitting
 from tests.api.conftest import STUB
 from tests.api.fake_rig import default_widths, muscle
 
@@ -93,7 +93,7 @@ def made_up_csv(path: Path) -> Path:
 
 
 def test_real_worker_fits_draws_and_tells_bad_data(tmp_path: Path) -> None:
-    from api.fitting import WORKER
+    from api.workers.pool import WORKER
 
     good, bad = made_up_csv(tmp_path / "good.csv"), tmp_path / "bad.csv"
     bad.write_text("time_s,pulse_width_us,segment\n0,0,prbs\n")
