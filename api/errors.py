@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from rig.messages import Problem as RigProblem
+if TYPE_CHECKING:
+    from rig.messages import Problem as RigProblem
 
 RIG_STATUS = {
     "busy": 409,
@@ -49,6 +50,10 @@ class NotFoundError(ApiError):
 
     def __init__(self, what: str, name: str, mend: str = "") -> None:
         super().__init__(404, "not-found", f"No such {what}", f"There is no {what} {name!r}. {mend}".strip())
+
+
+class SettingsError(Exception):
+    """A setting does not hold: one line, by the name of its environment variable."""
 
 
 def from_rig(problem: RigProblem, **extra: Any) -> ApiError:

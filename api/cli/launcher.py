@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from api import owner_only
+from api.cli.errors import LaunchError
 from api.settings import Settings
 from api.store.lock import HeldError, refuse_if_held
 
@@ -31,14 +32,6 @@ SEAL_S = 35.0
 RESTART_S = (0.2, 0.5, 1.0, 2.0, 5.0)
 LIBC = ctypes.CDLL(None, use_errno=True)
 PR_SET_PDEATHSIG = 1
-
-
-class LaunchError(Exception):
-    """A process did not come up, or ended; `code` is the exit code to leave with."""
-
-    def __init__(self, message: str, code: int = 1) -> None:
-        super().__init__(message)
-        self.code = code
 
 
 @dataclass
@@ -236,7 +229,7 @@ class Services:
             self.rig.start()
         except LaunchError as error:
             place = str(self.settings.rig_file)
-            if error.code == 2 and self.settings.rig_file is not None and place not in str(error):
+            if error.exit_code == 2 and self.settings.rig_file is not None and place not in str(error):
                 raise LaunchError(f"{place}: {error}", 2) from error
             raise
 

@@ -17,7 +17,10 @@ import typer
 from typer.exceptions import TyperException
 
 from api.cli import commands
-from api.cli.terminal import InputError, clear_progress
+from api.cli.errors import CommandError
+from api.cli.terminal import clear_progress
+from api.errors import ApiError, SettingsError
+from identify.errors import IdentifyError
 
 
 def build(verb: str = "") -> typer.Typer:
@@ -70,8 +73,6 @@ def _one_line(verb: str, error: Exception) -> int:
     """The error's line, and the exit code it stands for."""
     name = f"stimrig {verb}".strip()
     clear_progress()
-    expected = any(kind.__name__ in ("IdentifyError", "ApiError") for kind in type(error).__mro__)
-    code = getattr(error, "code", 1)
     if isinstance(error, TyperException):
         message = error.format_message().strip()
         if not message or message.startswith("Usage:"):  # no verb was given: the help itself, not in one line
@@ -79,20 +80,12 @@ def _one_line(verb: str, error: Exception) -> int:
             return 2
         print(f"{name}: {flat(message)} (see {name} --help)", file=sys.stderr)
         return 2
-    if isinstance(error, InputError) or expected:
+    if isinstance(error, CommandError | IdentifyError | ApiError | SettingsError):
         print(f"{name}: {flat(str(error))}", file=sys.stderr)
-        return 2
-    if type(error).__name__ == "ValidationError" and getattr(error, "title", "") == "Settings":
-        from api.settings import refusal
-
-        print(f"{name}: {flat(refusal(error))}", file=sys.stderr)  # pyright: ignore[reportArgumentType]
-        return 2
-    if type(error).__name__ in ("LaunchError", "ReportedError") and isinstance(code, int):
-        print(f"{name}: {flat(str(error))}", file=sys.stderr)
-        return code
+        return error.exit_code if isinstance(error, CommandError) else 2
     log = Path(tempfile.gettempdir()) / f"stimrig-error-{os.getpid()}.log"
     log.write_text("".join(traceback.format_exception(error)))
-    print(f"{name}: unforeseen: {type(error).__name__}: {flat(str(error))} (log: {log})", file=sys.stderr)
+    print(f"{name}: unexpected: {type(error).__name__}: {flat(str(error))} (log: {log})", file=sys.stderr)
     return 1
 
 

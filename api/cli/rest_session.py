@@ -9,17 +9,10 @@ from typing import Any
 
 import httpx
 
+from api.cli.errors import ReportedError
 from api.cli.terminal import number
 
 Watch = Callable[[], object]
-
-
-class ReportedError(Exception):
-    """A step failed; its words go to the person, exit 1 (2 where the input was at fault)."""
-
-    def __init__(self, message: str, code: int = 1) -> None:
-        super().__init__(message)
-        self.code = code
 
 
 def checked(response: httpx.Response) -> httpx.Response:

@@ -12,16 +12,14 @@ from typing import Annotated, Any
 
 import typer
 
+from api.cli.errors import InputError
+
 LARGEST_MODEL_BYTES = 32 * 2**20
 PATIENCE_S = 1.0
 """What takes no longer shows no progress."""
 LEAST_PACE = 0.05
 """Share from which the time that passed says how long it takes."""
 CLEARED = "\r\x1b[K"
-
-
-class InputError(Exception):
-    """Bad input: one line on standard error, exit 2."""
 
 
 DATA_HELP = "sealed recording (HDF5), or CSV file with the columns time_s,pulse_width_us,torque_nm,segment"

@@ -15,14 +15,14 @@ from api.clock import Clock
 from api.errors import ApiError, NotFoundError
 from api.models import effect_evidence
 from api.models.registry import Versions
-from api.models.starting_effects import Beginnings
+from api.models.starting_effects import StartingEffects
 from api.settings import Settings
 from api.store import Store, audit, uploads
 from api.store.tables import Analysis, Model, Recording
-from api.workers.pool import Fitting, Job
+from api.workers.pool import Call, Pool
 
 log = logging.getLogger("stimrig.analyses")
-OnJob = Callable[[Job], None]
+OnCall = Callable[[Call], None]
 OWN_DIAGNOSIS = "diagnosis of its structure"
 """The name under which that of a version is kept whose structure is not the plain one."""
 HALF_DONE = 0.5
@@ -41,13 +41,13 @@ def structure_of(model: Model) -> list[str]:
 
 
 class Analyses:
-    """Asks the workers once for each finding; a second asker shares the first one's job."""
+    """Asks the workers once for each finding; a second asker shares the first one's call."""
 
-    def __init__(self, store: Store, clock: Clock, fitting: Fitting, versions: Versions, settings: Settings) -> None:
-        self.store, self.clock, self.fitting, self.versions = store, clock, fitting, versions
+    def __init__(self, store: Store, clock: Clock, pool: Pool, versions: Versions, settings: Settings) -> None:
+        self.store, self.clock, self.pool, self.versions = store, clock, pool, versions
         self.settings = settings
-        self.beginnings = Beginnings(store, fitting, settings)
-        self.running: dict[tuple[str, str], Job] = {}
+        self.starting_effects = StartingEffects(store, pool, settings)
+        self.running: dict[tuple[str, str], Call] = {}
         self._ids: list[str] | None = None
 
     def path(self, recording_id: str) -> str:
@@ -69,33 +69,33 @@ class Analyses:
         """Measured, predicted and commanded curves, thinned to what a screen shows."""
         return await self._kept(model, "curves", {"model_json": model.document.decode()})
 
-    async def diagnosis(self, model: Model, on_job: OnJob | None = None) -> dict[str, Any]:
+    async def diagnosis(self, model: Model, on_call: OnCall | None = None) -> dict[str, Any]:
         """What is missing in the model's own structure; that of the plain one is shared by all that have it."""
         place, kind, given = await asyncio.to_thread(self._criticised, model)
-        return await self._kept(place, kind, given, verb="diagnosis", on_job=on_job)
+        return await self._kept(place, kind, given, verb="diagnosis", on_call=on_call)
 
     def _criticised(self, model: Model) -> tuple[Model, str, dict[str, Any]]:
         """With which version a diagnosis is kept, under which name, and what the worker is given for it."""
         if is_plain(model):
-            return self.eldest(model), "diagnosis", {}
+            return self.first_version(model), "diagnosis", {}
         return model, OWN_DIAGNOSIS, {"model_json": model.document.decode()}
 
-    def eldest(self, model: Model) -> Model:
+    def first_version(self, model: Model) -> Model:
         """The first version made from the model's recording: what is found of its plain structure is kept with it."""
         rows = self.store.all(Model, Model.recording_id == model.recording_id, order=Model.created_utc, limit=1)
         return rows[0]
 
     def _plain_eldest(self, model: Model) -> Model:
         """The recording's first version where that is plain like the model, else the model."""
-        eldest = self.eldest(model)
-        return eldest if is_plain(eldest) else model
+        first_version = self.first_version(model)
+        return first_version if is_plain(first_version) else model
 
     def known_diagnosis(self, model: Model) -> dict[str, Any] | None:
         """The diagnosis if it has been made."""
         place, kind, _ = self._criticised(model)
         return self.known(place.id, kind)
 
-    async def foresee(self, model: Model) -> None:
+    async def diagnose_ahead(self, model: Model) -> None:
         """Diagnose before anybody asks, with low priority; a new test ends it, and nobody is told."""
         place, kind, given = await asyncio.to_thread(self._criticised, model)
         try:
@@ -117,34 +117,34 @@ class Analyses:
         verb: str | None = None,
         recording_id: str | None = None,
         background: bool = False,
-        on_job: OnJob | None = None,
+        on_call: OnCall | None = None,
     ) -> dict[str, Any]:
         known = await asyncio.to_thread(self.known, model.id, kind)
         if known is not None:
             return known
         path = await asyncio.to_thread(self.path, recording_id or model.recording_id)
         key = (model.id, kind)
-        job = self.running.get(key)
-        if job is not None and job.background and not background and job.progress < HALF_DONE:
-            self.fitting.cancel(job)  # somebody waits now: on a busy machine low priority could take minutes
-            job = None
-        if job is None:
-            job = self._begin(key, verb or kind, background, {"data": path, **given})
-        if on_job is not None:
-            on_job(job)
-        found = await asyncio.shield(job.result)
+        call = self.running.get(key)
+        if call is not None and call.background and not background and call.progress < HALF_DONE:
+            self.pool.cancel(call)  # somebody waits now: on a busy machine low priority could take minutes
+            call = None
+        if call is None:
+            call = self._begin(key, verb or kind, background, {"data": path, **given})
+        if on_call is not None:
+            on_call(call)
+        found = await asyncio.shield(call.result)
         await asyncio.to_thread(self._keep, model.id, kind, found)
         return found
 
-    def _begin(self, key: tuple[str, str], verb: str, background: bool, arguments: dict[str, Any]) -> Job:
-        job = self.running[key] = self.fitting.submit(verb, background=background, **arguments)
+    def _begin(self, key: tuple[str, str], verb: str, background: bool, arguments: dict[str, Any]) -> Call:
+        call = self.running[key] = self.pool.submit(verb, background=background, **arguments)
 
         def done(_future: object) -> None:
-            if self.running.get(key) is job:
+            if self.running.get(key) is call:
                 del self.running[key]
 
-        job.result.add_done_callback(done)
-        return job
+        call.result.add_done_callback(done)
+        return call
 
     def _keep(self, model_id: str, kind: str, found: dict[str, Any]) -> None:
         with self.store.write() as session:
@@ -160,7 +160,7 @@ class Analyses:
         *,
         force: bool = False,
         reason: str = "",
-        on_job: OnJob | None = None,
+        on_call: OnCall | None = None,
     ) -> Model:
         """A new version: the model's effects and these, fitted together anew.
 
@@ -183,20 +183,20 @@ class Analyses:
             detail = "Forcing an effect goes against the evidence; say why, it is kept in the audit trail."
             raise ApiError(422, "reason-missing", "A forced effect wants a reason", detail)
         if not force:
-            effect_evidence.demand(await self.diagnosis(model, on_job), model.effects, added)
+            effect_evidence.require(await self.diagnosis(model, on_call), model.effects, added)
         path = await asyncio.to_thread(self.path, model.recording_id)
         held = {effect.partition(":")[0]: effect for effect in structure_of(model)}
         asked = [held.get(effect, effect) for effect in effects]
-        job = self.fitting.submit("fit", data=path, method=model.method, effects=asked)
-        if on_job is not None:
-            on_job(job)
-        found = await asyncio.shield(job.result)
+        call = self.pool.submit("fit", data=path, method=model.method, effects=asked)
+        if on_call is not None:
+            on_call(call)
+        found = await asyncio.shield(call.result)
         return await asyncio.to_thread(self._store_added, found["json"], model, added, by, force, reason)
 
     async def check_known(self, effects: list[str]) -> None:
         """Refuse effects that are not in the library."""
         if self._ids is None:
-            found = await asyncio.shield(self.fitting.submit("effects").result)
+            found = await asyncio.shield(self.pool.submit("effects").result)
             self._ids = sorted(entry["id"] for entry in found["effects"])
         unknown = [effect for effect in effects if effect not in self._ids]
         if unknown:
@@ -213,7 +213,7 @@ class Analyses:
                 audit.write(session, self.clock.utc(), by, action, row.id, effects=added, reason=reason)
         return row
 
-    async def improve(self, model: Model, by: str, on_job: OnJob | None = None) -> tuple[dict[str, Any], list[Model]]:
+    async def improve(self, model: Model, by: str, on_call: OnCall | None = None) -> tuple[dict[str, Any], list[Model]]:
         """Effects added to the model's structure one by one while the evidence lasts, each step a version.
 
         They descend from the model; of the plain structure, from the recording's first version if that has it, too.
@@ -221,10 +221,10 @@ class Analyses:
         path = await asyncio.to_thread(self.path, model.recording_id)
         plain = await asyncio.to_thread(is_plain, model)
         given: dict[str, Any] = {} if plain else {"model_json": model.document.decode()}
-        job = self.fitting.submit("improve", data=path, **given)
-        if on_job is not None:
-            on_job(job)
-        found = await asyncio.shield(job.result)
+        call = self.pool.submit("improve", data=path, **given)
+        if on_call is not None:
+            on_call(call)
+        found = await asyncio.shield(call.result)
         first = await asyncio.to_thread(self._plain_eldest, model) if plain else model
         rows = await asyncio.to_thread(self._store_steps, found, first, by)
         return {key: value for key, value in found.items() if key != "models"}, rows
@@ -254,8 +254,8 @@ class Analyses:
         made = self.settings.exports_dir / f"{identity}.csv"  # all that a worker may write to
         kept = self.settings.recordings_dir / made.name
         try:
-            job = self.fitting.submit("join", urgent=True, parts=paths, out=str(made))
-            digest = (await asyncio.shield(job.result))["file_sha256"]
+            call = self.pool.submit("join", urgent=True, parts=paths, out=str(made))
+            digest = (await asyncio.shield(call.result))["file_sha256"]
             await asyncio.to_thread(made.replace, uploads.part_of(kept))
         except BaseException:
             made.unlink(missing_ok=True)

@@ -8,7 +8,7 @@ from typing import Any
 from api.errors import ApiError
 
 
-def demand(diagnosis: dict[str, Any], present: Sequence[str], added: Sequence[str]) -> None:
+def require(diagnosis: dict[str, Any], present: Sequence[str], added: Sequence[str]) -> None:
     """Refuse effects that the recording does not ask for.
 
     Raises

@@ -179,7 +179,7 @@ class Versions:
             self._read[row.etag] = summary.quality(json.loads(row.document))
         return self._read[row.etag]
 
-    def public(self, row: Model) -> dict[str, Any]:
+    def document(self, row: Model) -> dict[str, Any]:
         """A version as clients see it, without the model itself."""
         decision = self.decision(row.id)
         holding = self.approved(row.participant)

@@ -11,15 +11,15 @@ from api.settings import Settings
 from api.store import Store
 from api.store.tables import Model
 from api.structure import in_words
-from api.workers.pool import Fitting, Job
+from api.workers.pool import Call, Pool
 from api.workers.process import WORKER, Places
 
 
-class Beginnings:
+class StartingEffects:
     """The fit after a test or an upload, in the participant's structure."""
 
-    def __init__(self, store: Store, fitting: Fitting, settings: Settings) -> None:
-        self.store, self.fitting, self.settings = store, fitting, settings
+    def __init__(self, store: Store, pool: Pool, settings: Settings) -> None:
+        self.store, self.pool, self.settings = store, pool, settings
 
     def structure(self, participant: str) -> list[str]:
         """Ids of the effects that the participant's next recording is fitted with; none for the plain structure."""
@@ -27,7 +27,7 @@ class Beginnings:
         return list(rows[0].effects if rows else self.settings.structure)
 
     async def fit(
-        self, participant: str, path: str, on_job: Callable[[Job], None] | None = None, **how: Any
+        self, participant: str, path: str, on_call: Callable[[Call], None] | None = None, **how: Any
     ) -> tuple[dict[str, Any], str]:
         """The model of a recording, and what had to be left out of its structure (empty where nothing had).
 
@@ -40,11 +40,11 @@ class Beginnings:
             The recording gives no model in the plain structure either.
         """
 
-        def begun(**more: Any) -> Job:
-            job = self.fitting.submit("fit", data=path, **more, **how)
-            if on_job is not None:
-                on_job(job)
-            return job
+        def begun(**more: Any) -> Call:
+            call = self.pool.submit("fit", data=path, **more, **how)
+            if on_call is not None:
+                on_call(call)
+            return call
 
         effects = await asyncio.to_thread(self.structure, participant)
         if not effects:
@@ -70,13 +70,13 @@ async def refuse_unknown(settings: Settings, worker: tuple[str, ...] = WORKER) -
     if not settings.structure:
         return
     reads = [settings.effects_dir] if settings.effects_dir else []
-    fitting = Fitting(1, worker, Places(reads))
+    pool = Pool(1, worker, Places(reads))
     try:
-        found = await fitting.submit("effects").result
+        found = await pool.submit("effects").result
     except ApiError as error:
         raise OSError(f"STIMRIG_STRUCTURE: the library of effects cannot be read: {error}") from error
     finally:
-        await fitting.close()
+        await pool.close()
     known = sorted(entry["id"] for entry in found["effects"])
     unknown = [effect for effect in settings.structure if effect not in known]
     if unknown:

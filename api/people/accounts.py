@@ -174,7 +174,7 @@ class People:
             self.auth.end_sessions(session, row.token_hash)
         self.auth.revoke(row.token_hash[:16], by)
 
-    def public(self) -> list[dict[str, Any]]:
+    def documents(self) -> list[dict[str, Any]]:
         """All users, without their hashes."""
         found = []
         for row in self.store.all(User, order=User.name):

@@ -15,7 +15,7 @@ from api.models.registry import Versions
 from api.sessions.rig_client import RigClient
 from api.store import Store, audit
 from api.store.tables import Recording, Test
-from api.workers.pool import Fitting, Job
+from api.workers.pool import Call, Pool
 from rig.messages import FinishedEvent
 
 log = logging.getLogger("stimrig.outcomes")
@@ -25,7 +25,7 @@ SEQUENCE = "sequence"
 OPEN_STATES = ("requested", "running", "sealing", "identifying")
 
 
-class Outcomes:
+class Lifecycle:
     """Takes over what a test leaves behind.
 
     Parameters
@@ -35,14 +35,14 @@ class Outcomes:
     """
 
     def __init__(
-        self, store: Store, clock: Clock, rig: RigClient, fitting: Fitting, versions: Versions,
+        self, store: Store, clock: Clock, rig: RigClient, pool: Pool, versions: Versions,
         analyses: Analyses, recordings_dir: Path,
         on_progress: Callable[[str], None],
     ) -> None:  # fmt: skip
-        self.store, self.clock, self.rig, self.fitting, self.versions = store, clock, rig, fitting, versions
+        self.store, self.clock, self.rig, self.pool, self.versions = store, clock, rig, pool, versions
         self.analyses, self.recordings_dir, self.on_progress = analyses, recordings_dir, on_progress
-        self.jobs: dict[str, Job] = {}
-        self._foreseen: set[asyncio.Task[None]] = set()
+        self.calls: dict[str, Call] = {}
+        self._ahead: set[asyncio.Task[None]] = set()
 
     def update(self, test_id: str, **fields: Any) -> Test:
         """Change a test's row."""
@@ -101,11 +101,11 @@ class Outcomes:
             await asyncio.to_thread(self.update, test_id, state="failed", reason=reason)
             return
 
-        def take(job: Job) -> None:
-            self.jobs[test_id] = job
+        def take(call: Call) -> None:
+            self.calls[test_id] = call
 
         try:
-            found, warning = await self.analyses.beginnings.fit(
+            found, warning = await self.analyses.starting_effects.fit(
                 row.participant, recording.path, take, urgent=True, on_progress=lambda _job: self.on_progress(test_id)
             )
         except ApiError as error:
@@ -113,7 +113,7 @@ class Outcomes:
             await asyncio.to_thread(self.update, test_id, state="failed", reason=reason)
             return
         finally:
-            self.jobs.pop(test_id, None)
+            self.calls.pop(test_id, None)
         model = await asyncio.to_thread(
             self.versions.add, found["json"], row.participant, recording.id, f"test {test_id}", parent
         )
@@ -123,9 +123,9 @@ class Outcomes:
         if last_sample_unix_s is not None:
             summary["last_sample_to_model_s"] = round(self.clock.unix_s() - last_sample_unix_s, 3)
         await asyncio.to_thread(self.update, test_id, state="completed", model_id=model.id, summary=summary)
-        foreseen = asyncio.create_task(self.analyses.foresee(model))
-        self._foreseen.add(foreseen)
-        foreseen.add_done_callback(self._foreseen.discard)
+        ahead = asyncio.create_task(self.analyses.diagnose_ahead(model))
+        self._ahead.add(ahead)
+        ahead.add_done_callback(self._ahead.discard)
 
     async def _record_of(self, row: Test) -> tuple[Recording, str | None]:
         """What is identified: the test's recording, or that joined to the one of the model it was made to judge."""
@@ -153,9 +153,9 @@ class Outcomes:
         return event.model_copy(update=found)
 
     async def _find_recording(self, test_id: str) -> dict[str, Any]:
-        job = self.fitting.submit("find_recording", urgent=True, folder=str(self.recordings_dir), test_id=test_id)
+        call = self.pool.submit("find_recording", urgent=True, folder=str(self.recordings_dir), test_id=test_id)
         try:
-            return (await job.result).get("found") or {}
+            return (await call.result).get("found") or {}
         except ApiError as error:
             log.warning("looking for the recording of %s: %s", test_id, error)
             return {}

@@ -1,7 +1,7 @@
-"""What a person is asked before a deed that matters: bound to exactly what is shown, once, for five minutes.
+"""What a person is asked before an action that matters: bound to exactly what is shown, once, for five minutes.
 
 A question is kept here and not in the page, so that nothing but its answer comes back: a form gone stale, a second
-click, *Back* or a reload cannot make the deed another one, or do it twice.
+click, *Back* or a reload cannot make the action another one, or do it twice.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Question:
         Whom it is about; also its place among the addresses.
     title, button : str
         The question, and what the button says that means yes.
-    deed : callable
+    action : callable
         Does it; gives the address that it leads to.
     rows : list of Row
         What it is bound to, in words.
@@ -57,7 +57,7 @@ class Question:
     participant: str
     title: str
     button: str
-    deed: Callable[[], Awaitable[str]]
+    action: Callable[[], Awaitable[str]]
     rows: list[Row] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     stimulates: bool = False
@@ -114,7 +114,7 @@ class Questions:
     async def yes(self, question: Question) -> str:
         """Do it, once; who says yes again comes to what came of it."""
         if question.answer is None:
-            question.answer = asyncio.ensure_future(question.deed())
+            question.answer = asyncio.ensure_future(question.action())
         return await asyncio.shield(question.answer)
 
 

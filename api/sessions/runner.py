@@ -20,14 +20,14 @@ from api.logs import current_test
 from api.models.analyses import Analyses
 from api.models.registry import Versions
 from api.sessions import profiles
-from api.sessions.lifecycle import OPEN_STATES, Outcomes
+from api.sessions.lifecycle import OPEN_STATES, Lifecycle
 from api.sessions.limits import limits_of
 from api.sessions.live import Hub
 from api.sessions.requests import TestIn
 from api.sessions.rig_client import AnyEvent, RigClient
 from api.store import Store, audit
 from api.store.tables import Participant, Test
-from api.workers.pool import Fitting
+from api.workers.pool import Pool
 from rig.messages import (
     FinishedEvent,
     LiveEvent,
@@ -83,17 +83,17 @@ class Seen:
         return {**preview, "torque_time_nms": None} == {**self.preview, "torque_time_nms": None}
 
 
-class Trials:
+class Runner:
     """Starts tests, one at a time, and follows each to its model."""
 
     def __init__(
-        self, store: Store, clock: Clock, rig: RigClient, fitting: Fitting, versions: Versions, analyses: Analyses,
+        self, store: Store, clock: Clock, rig: RigClient, pool: Pool, versions: Versions, analyses: Analyses,
         recordings_dir: Path,
     ) -> None:  # fmt: skip
-        self.store, self.clock, self.rig, self.versions, self.fitting = store, clock, rig, versions, fitting
+        self.store, self.clock, self.rig, self.versions, self.pool = store, clock, rig, versions, pool
         self.hub = Hub(clock)
         self.current: Current | None = None
-        self.outcomes = Outcomes(store, clock, rig, fitting, versions, analyses, recordings_dir, self.announce)
+        self.lifecycle = Lifecycle(store, clock, rig, pool, versions, analyses, recordings_dir, self.announce)
         self._lock = asyncio.Lock()
         self._halted_s = -math.inf
         self._notes = ThreadPoolExecutor(2, "notes-of-stops")
@@ -146,7 +146,7 @@ class Trials:
             await asyncio.to_thread(self._check_joins, body)
         current = self.current = Current(plan.test_id, plan.participant, by)
         current_test.set(plan.test_id)
-        self.fitting.cancel_background()
+        self.pool.cancel_background()
         try:
             preview = await self._previewed(plan)
             if seen is not None and not seen.same(preview):
@@ -158,7 +158,7 @@ class Trials:
         except BaseException:
             self.current = None
             raise
-        return await asyncio.to_thread(self.outcomes.update, row.id, state="running")
+        return await asyncio.to_thread(self.lifecycle.update, row.id, state="running")
 
     async def _command(self, plan: TestPlan, body: TestIn, version: str) -> None:
         try:
@@ -170,7 +170,7 @@ class Trials:
             await self.rig.ask(StartRequest(plan=plan), timeout_s=15.0)
         except ApiError as error:
             await asyncio.to_thread(
-                self.outcomes.update, plan.test_id, state="refused", reason=error.detail or error.title
+                self.lifecycle.update, plan.test_id, state="refused", reason=error.detail or error.title
             )
             if error.code == "rig-unreachable":  # it may have heard us all the same
                 await self._stop_quietly(f"start of {plan.test_id} was not answered")
@@ -325,17 +325,17 @@ class Trials:
         if self.current is not None and self.current.test_id == event.test_id:
             self.current.ending = True
         try:
-            row = await asyncio.to_thread(self.outcomes.take_recording, event)
+            row = await asyncio.to_thread(self.lifecycle.take_recording, event)
             if row is None:
                 return
             self.announce(row.id)
             if row.state == "identifying":
                 self._release(event.test_id)
-                await self.outcomes.identify(row.id, event.last_sample_unix_s)
+                await self.lifecycle.identify(row.id, event.last_sample_unix_s)
         except Exception as error:
             log.exception("the test could not be taken over", extra={"test_id": event.test_id})
             await asyncio.to_thread(
-                self.outcomes.update, event.test_id, state="failed", reason=" ".join(str(error).split())
+                self.lifecycle.update, event.test_id, state="failed", reason=" ".join(str(error).split())
             )
         finally:
             self._release(event.test_id)
@@ -368,9 +368,9 @@ class Trials:
         current_test.set(test_id)
         row: Test = await asyncio.to_thread(self.store.get, Test, test_id)
         if row.recording_id is not None:
-            await self.outcomes.identify(test_id)
+            await self.lifecycle.identify(test_id)
         else:
-            await self._finish(await self.outcomes.missed_end(test_id, why))
+            await self._finish(await self.lifecycle.missed_end(test_id, why))
         self._release(test_id)
         self.announce(test_id)
 
@@ -380,16 +380,16 @@ class Trials:
         """Tell the listeners of the live channel how the test stands."""
         row = self.store.get(Test, test_id)
         if row is not None:
-            self.hub.send({"type": "test", "test": self.public(row)})
+            self.hub.send({"type": "test", "test": self.document(row)})
 
-    def public(self, row: Test) -> dict[str, Any]:
+    def document(self, row: Test) -> dict[str, Any]:
         """A test as clients see it."""
         planned = {key: value for key, value in row.plan.get("preview", {}).items() if key != "pulse_width_us"}
         running = row.state in ("requested", "running")
         start = (0.0, planned.get("duration_s", 0.0), None)
         end = (row.summary.get("duration_s", 0.0), row.summary.get("duration_s", 0.0), None)
         elapsed_s, duration_s, segment = (self.hub.position(row.id) or start) if running else end
-        job, rig = self.outcomes.jobs.get(row.id), self.rig.status
+        call, rig = self.lifecycle.calls.get(row.id), self.rig.status
         sealing = running and rig is not None and rig.test_id == row.id and rig.state == "sealing"
         model = self.versions.get(row.model_id) if row.model_id else None
         return {
@@ -404,7 +404,7 @@ class Trials:
             "duration_s": duration_s,
             "time_left_s": max(0.0, duration_s - elapsed_s),
             "progress": min(1.0, elapsed_s / duration_s) if duration_s else 0.0,
-            "identification": job.public() if job else None,
+            "identification": call.document() if call else None,
             "requested_by": row.requested_by,
             "requested_utc": row.requested_utc,
             "finished_utc": row.finished_utc,
@@ -415,7 +415,7 @@ class Trials:
             "model_id": row.model_id,
             "model_url": f"/v1/models/{row.model_id}" if row.model_id else None,
             "summary": row.summary,
-            "fit": self.versions.public(model) if model else None,
+            "fit": self.versions.document(model) if model else None,
         }
 
     async def close(self) -> None:

@@ -12,7 +12,7 @@ KEPT = 200
 
 
 @dataclass(frozen=True)
-class Told:
+class StopResult:
     """One press of the button on a page, and its answer.
 
     Parameters
@@ -31,13 +31,13 @@ class Told:
     answer: StopEvidence | ApiError
 
 
-class StopsTold:
+class StopLog:
     """The newest answers, each under a key that nobody guesses: who pressed may have no session any more."""
 
     def __init__(self) -> None:
-        self._told: dict[str, Told] = {}
+        self._told: dict[str, StopResult] = {}
 
-    def keep(self, told: Told) -> str:
+    def keep(self, told: StopResult) -> str:
         """Keep an answer; its key."""
         while len(self._told) >= KEPT:
             self._told.pop(next(iter(self._told)))
@@ -45,7 +45,7 @@ class StopsTold:
         self._told[key] = told
         return key
 
-    def get(self, key: str) -> Told:
+    def get(self, key: str) -> StopResult:
         """An answer by its key; 404 where it is kept no longer."""
         told = self._told.get(key)
         if told is None:

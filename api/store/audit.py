@@ -21,7 +21,7 @@ def entry_hash(entry: dict[str, Any]) -> str:
 
 
 def write(session: Session, at_utc: str, who: str, action: str, subject: str, **detail: Any) -> None:
-    """Append an entry in the caller's transaction, so that deed and entry stand or fall together."""
+    """Append an entry in the caller's transaction, so that action and entry stand or fall together."""
     last = session.scalars(select(AuditEntry).order_by(AuditEntry.seq.desc()).limit(1)).first()
     fields = {
         "seq": last.seq + 1 if last else 1,

@@ -28,7 +28,7 @@ def software_version() -> str:
 
 
 class Service(FastAPI):
-    """The application, with its headers outermost: an unforeseen error's answer has them, too."""
+    """The application, with its headers outermost: an unexpected error's answer has them, too."""
 
     def build_middleware_stack(self) -> ASGIApp:
         """Starlette's, within the headers."""

@@ -21,8 +21,8 @@ from api.people.auth import Auth, Principal, Scope
 from api.people.pace import Guesses
 from api.sessions.questions import Questions
 from api.sessions.rig_client import RigClient
-from api.sessions.runner import Trials
-from api.sessions.stop_log import StopsTold
+from api.sessions.runner import Runner
+from api.sessions.stop_log import StopLog
 from api.sessions.stop_right import StopRights
 from api.settings import Settings
 from api.store import Store, uploads
@@ -30,9 +30,9 @@ from api.store.lock import ServiceLock
 from api.store.tables import Recording
 from api.web.guards import anyone_signed_in, require
 from api.web.stop_guard import Press, anyone_who_may_stop
-from api.workers.pool import WORKER, Fitting
+from api.workers.pool import WORKER, Pool
 from api.workers.process import Places
-from api.workers.tracker import Tasks
+from api.workers.tracker import Jobs
 
 
 @dataclass
@@ -46,36 +46,36 @@ class Context:
     people: People
     stop_rights: StopRights
     rig: RigClient
-    fitting: Fitting
+    pool: Pool
     versions: Versions
-    trials: Trials
+    runner: Runner
     analyses: Analyses
-    tasks: Tasks
+    jobs: Jobs
     lock: ServiceLock
     questions: Questions
     drawn_token: str | None = None
     limits_turn: asyncio.Lock = field(default_factory=asyncio.Lock)
     """Who changes a participant's limits, and who lets a calibration send by them, take turns: once a change is
     answered nothing begins with what was before."""
-    stops: StopsTold = field(default_factory=StopsTold)
+    stops: StopLog = field(default_factory=StopLog)
     started_s: float = field(default_factory=time.monotonic)
 
     async def open(self) -> None:
         """Connect, warm the workers, take up what a restart left open."""
         uploads.settle(self.settings.recordings_dir, self.store)
         self.rig.start()
-        self.fitting.warm()
+        self.pool.warm()
         for _ in range(20):  # a rig that is there answers within milliseconds
             if self.rig.connected or self.rig.path is None:
                 break
             await asyncio.sleep(0.05)
-        await self.trials.resume()
+        await self.runner.resume()
 
     async def close(self) -> None:
         """Let everything go."""
-        await self.trials.close()
-        await self.tasks.close()
-        await self.fitting.close()
+        await self.runner.close()
+        await self.jobs.close()
+        await self.pool.close()
         await self.rig.close()
         self.people.close()
         self.store.close()
@@ -110,16 +110,16 @@ def _build(settings: Settings, clock: Clock, worker: tuple[str, ...], lock: Serv
     configured = settings.admin_token.get_secret_value() if settings.admin_token else None
     drawn = auth.first_administrator(configured)
     rig = RigClient(settings.rig_socket, clock)
-    fitting = Fitting(settings.workers, worker, places(settings, store))
+    pool = Pool(settings.workers, worker, places(settings, store))
     versions = Versions(store, clock)
-    analyses = Analyses(store, clock, fitting, versions, settings)
-    trials = Trials(store, clock, rig, fitting, versions, analyses, settings.recordings_dir)
-    tasks = Tasks(fitting)
+    analyses = Analyses(store, clock, pool, versions, settings)
+    runner = Runner(store, clock, rig, pool, versions, analyses, settings.recordings_dir)
+    jobs = Jobs(pool)
     people = People(store, clock, auth, guesses)
     rights = StopRights(owner_only.key(settings.data_dir / "stop-right.key"), clock)
     questions = Questions(clock)
     return Context(
-        settings, clock, store, auth, people, rights, rig, fitting, versions, trials, analyses, tasks, lock,
+        settings, clock, store, auth, people, rights, rig, pool, versions, runner, analyses, jobs, lock,
         questions, drawn
     )  # fmt: skip
 

@@ -79,4 +79,4 @@ def install(app: FastAPI) -> None:
     async def unexpected(request: Request, error: Exception) -> Response:
         log.exception("unexpected error in %s %s", request.method, request.url.path, exc_info=error)
         detail = "Nothing was lost. The service's log (logs/api.log in the data folder) says more."
-        return respond(request, ApiError(500, "internal", "Something unforeseen went wrong here", detail))
+        return respond(request, ApiError(500, "internal", "Something unexpected went wrong here", detail))

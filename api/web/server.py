@@ -14,13 +14,12 @@ import socket
 import sys
 
 import uvicorn
-from pydantic import ValidationError
 from starlette.types import ASGIApp
 
 from api import logs
-from api.errors import ApiError
+from api.errors import ApiError, SettingsError
 from api.models import starting_effects
-from api.settings import Settings, refusal
+from api.settings import Settings
 from api.store.lock import ServiceLock
 from api.web.app import create_app
 from api.web.connections import protocol, raise_file_limit
@@ -40,10 +39,7 @@ def main() -> int:
         lock.tell(url)
         asyncio.run(starting_effects.refuse_unknown(settings))  # before a first token is drawn: it is told only once
         app = create_app(settings, lock=lock)
-    except ValidationError as error:
-        print(f"stimrig: {refusal(error)}", file=sys.stderr)
-        return 2
-    except (ApiError, OSError) as error:
+    except (ApiError, SettingsError, OSError) as error:
         print(f"stimrig: {error}", file=sys.stderr)
         return 2
     ready = {"url": url, "port": listener.getsockname()[1], "drawn_token": app.state.context.drawn_token}

@@ -55,7 +55,7 @@ async def _within(patience_s: float, request: Request, coming: asyncio.Task[tupl
     await asyncio.wait([coming], timeout=patience_s)
     reason, in_form = coming.result() if coming.done() else (DEFAULT_REASON, "")
     context, right = request.app.state.context, request.headers.get(HEADER) or in_form
-    current, status = context.trials.current, context.rig.status
+    current, status = context.runner.current, context.rig.status
     running = {current.test_id if current else None, status.test_id if status else None}
     by = context.stop_rights.holder(right, running)
     if by is not None:

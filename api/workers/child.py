@@ -1,8 +1,8 @@
-"""A worker process: one job at a time from standard input, one JSON object a line each way.
+"""A worker process: one call at a time from standard input, one JSON object a line each way.
 
-``{"job": 1, "verb": "fit", "arguments": {…}}`` in; ``progress``, then ``result`` or ``error`` out.
-It ends when its input closes, so it never outlives the service; a cancelled job's worker is killed. Before the first
-job it shuts itself in (`api.workers.confinement`): what it reads, others may have made. ``--reads`` and ``--writes``
+``{"call": 1, "verb": "fit", "arguments": {…}}`` in; ``progress``, then ``result`` or ``error`` out.
+It ends when its input closes, so it never outlives the service; a cancelled call's worker is killed. Before the first
+call it shuts itself in (`api.workers.confinement`): what it reads, others may have made. ``--reads`` and ``--writes``
 name the folders that stay open.
 """
 
@@ -16,13 +16,14 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from api.workers import confinement
+from identify.errors import IdentifyError
 
 PROCESSOR_S = 900.0
-"""Of processor time for a job that names no other bound."""
+"""Of processor time for a call that names no other bound."""
 
 
 def main() -> None:
-    """Serve jobs until the input closes."""
+    """Serve calls until the input closes."""
     out = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)  # whatever a library prints must not fall into the protocol
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as in `api.cli`: small matrices gain nothing from a second
@@ -31,7 +32,7 @@ def main() -> None:
     for line in sys.stdin:
         request = json.loads(line)
         confinement.limit_time(request.get("processor_s", PROCESSOR_S))
-        say(out, {"job": request["job"], **run(request, out)})
+        say(out, {"call": request["call"], **run(request, out)})
 
 
 def shut_in() -> dict[str, str]:
@@ -44,11 +45,11 @@ def shut_in() -> dict[str, str]:
 
 
 def run(request: dict[str, Any], out: TextIO) -> dict[str, Any]:
-    """Do one job; its result or its error as an object."""
+    """Do one call; its result or its error as an object."""
     from api.workers import verbs
 
     def progress(fraction: float, text: str = "") -> None:
-        say(out, {"job": request["job"], "progress": float(fraction), "text": str(text)})
+        say(out, {"call": request["call"], "progress": float(fraction), "text": str(text)})
 
     try:
         return {"result": verbs.VERBS[request["verb"]](progress=progress, **request["arguments"])}
@@ -60,8 +61,8 @@ def describe(error: Exception) -> dict[str, Any]:
     """An error as the service shows it: expected ones in their own words, others by name."""
     import traceback
 
-    if any(kind.__name__ == "IdentifyError" for kind in type(error).__mro__):
-        place, mend = getattr(error, "place", None), getattr(error, "mend", None)
+    if isinstance(error, IdentifyError):
+        place, mend = error.place, error.mend
         return {"expected": True, "detail": one_line(error), "place": text_or_none(place), "mend": text_or_none(mend)}
     if isinstance(error, MemoryError):
         megabytes = confinement.MEMORY_BYTES // 2**20

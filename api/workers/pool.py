@@ -12,12 +12,12 @@ from typing import Any
 
 from api.errors import ApiError
 from api.logs import current_test
-from api.workers.process import WORKER, Job, Places, Worker
+from api.workers.process import WORKER, Call, Places, Worker
 
 log = logging.getLogger("stimrig.fitting")
 
 
-class Fitting:
+class Pool:
     """A few workers and a queue; the fit after a test goes before everything else.
 
     One worker more, of low priority, does what nobody waits for yet; a new test ends what it does.
@@ -36,7 +36,7 @@ class Fitting:
         places = places or Places()
         self.workers = [Worker(command, places) for _ in range(workers)]
         self.workers.append(Worker(command, places, background=True))
-        self.queue: deque[Job] = deque()
+        self.queue: deque[Call] = deque()
         self.done_count = 0
         self.failed_count = 0
         self.busy_s = 0.0
@@ -49,18 +49,18 @@ class Fitting:
         *,
         urgent: bool = False,
         background: bool = False,
-        on_progress: Callable[[Job], None] | None = None,
+        on_progress: Callable[[Call], None] | None = None,
         **arguments: Any,
-    ) -> Job:
-        """Queue a job; await ``job.result``."""
-        job = Job(next(self._numbers), verb, arguments, urgent, background, on_progress=on_progress)
-        job.result.add_done_callback(_retrieve)
+    ) -> Call:
+        """Queue a call; await ``call.result``."""
+        call = Call(next(self._numbers), verb, arguments, urgent, background, on_progress=on_progress)
+        call.result.add_done_callback(_retrieve)
         if urgent:
-            self.queue.appendleft(job)
+            self.queue.appendleft(call)
         else:
-            self.queue.append(job)
+            self.queue.append(call)
         self._dispatch()
-        return job
+        return call
 
     def warm(self) -> None:
         """Have every worker load identify before it is needed."""
@@ -69,65 +69,65 @@ class Fitting:
                 self.submit("warm")
 
     def cancel_background(self) -> int:
-        """End what nobody waits for, so that a test has the machine to itself; how many jobs that were."""
-        open_jobs = [job for job in self.queue if job.background]
-        open_jobs += [worker.job for worker in self.workers if worker.job is not None and worker.job.background]
-        for job in open_jobs:
-            self.cancel(job)
-        return len(open_jobs)
+        """End what nobody waits for, so that a test has the machine to itself; how many calls that were."""
+        open_calls = [call for call in self.queue if call.background]
+        open_calls += [worker.call for worker in self.workers if worker.call is not None and worker.call.background]
+        for call in open_calls:
+            self.cancel(call)
+        return len(open_calls)
 
-    def cancel(self, job: Job) -> None:
-        """Take a job off the queue, or end the process that does it."""
-        if job.state == "queued":
-            self.queue.remove(job)
+    def cancel(self, call: Call) -> None:
+        """Take a call off the queue, or end the process that does it."""
+        if call.state == "queued":
+            self.queue.remove(call)
         for worker in self.workers:
-            if worker.job is job:
-                job.state = "cancelled"
+            if worker.call is call:
+                call.state = "cancelled"
                 worker.kill()
                 return
-        if not job.result.done():
-            job.state = "cancelled"
-            job.result.set_exception(ApiError(409, "cancelled", "The job was cancelled", "Start it again if wanted."))
+        if not call.result.done():
+            call.state = "cancelled"
+            call.result.set_exception(ApiError(409, "cancelled", "The job was cancelled", "Start it again if wanted."))
 
     def _dispatch(self) -> None:
         for worker in self.workers:
-            job = self._next_for(worker) if worker.job is None else None
-            if job is not None:
-                self.queue.remove(job)
-                worker.job = job
-                task = asyncio.create_task(self._work(worker, job))
+            call = self._next_for(worker) if worker.call is None else None
+            if call is not None:
+                self.queue.remove(call)
+                worker.call = call
+                task = asyncio.create_task(self._work(worker, call))
                 self._tasks.add(task)
                 task.add_done_callback(self._tasks.discard)
 
-    def _next_for(self, worker: Worker) -> Job | None:
-        """The next job for a worker; the first of several is kept free for the fit after a test."""
+    def _next_for(self, worker: Worker) -> Call | None:
+        """The next call for a worker; the first of several is kept free for the fit after a test."""
         reserved = worker is self.workers[0] and len(self.workers) > 2
-        for job in self.queue:
-            fits = job.background == worker.background
-            if fits and (not reserved or job.urgent or job.verb == "warm"):
-                return job
+        for call in self.queue:
+            fits = call.background == worker.background
+            if fits and (not reserved or call.urgent or call.verb == "warm"):
+                return call
         return None
 
-    async def _work(self, worker: Worker, job: Job) -> None:
-        job.state, job.started_s = "running", time.monotonic()
-        current_test.set(job.test_id)  # a task of its own; whoever happened to dispatch it may have had another test
+    async def _work(self, worker: Worker, call: Call) -> None:
+        call.state, call.started_s = "running", time.monotonic()
+        current_test.set(call.test_id)  # a task of its own; whoever happened to dispatch it may have had another test
         try:
-            result = await worker.run(job)
-            job.state, job.progress = "done", 1.0
+            result = await worker.run(call)
+            call.state, call.progress = "done", 1.0
             self.done_count += 1
-            log.info("%s done in %.1f s", job.verb, job.elapsed_s)
-            if not job.result.done():
-                job.result.set_result(result)
+            log.info("%s done in %.1f s", call.verb, call.elapsed_s)
+            if not call.result.done():
+                call.result.set_result(result)
         except (ApiError, OSError, ValueError) as error:
-            if job.state != "cancelled":
-                job.state = "failed"
+            if call.state != "cancelled":
+                call.state = "failed"
             self.failed_count += 1
-            log.warning("%s: %s", job.verb, error)
-            if not job.result.done():
-                job.result.set_exception(error)
+            log.warning("%s: %s", call.verb, error)
+            if not call.result.done():
+                call.result.set_exception(error)
         finally:
-            self.busy_s += time.monotonic() - job.started_s
-            worker.job = None
+            self.busy_s += time.monotonic() - call.started_s
+            worker.call = None
             self._dispatch()
 
     async def close(self) -> None:
@@ -140,6 +140,6 @@ class Fitting:
 
 
 def _retrieve(future: asyncio.Future[dict[str, Any]]) -> None:
-    """A failed job nobody waits for is in the log already."""
+    """A failed call nobody waits for is in the log already."""
     if not future.cancelled():
         future.exception()

@@ -1,4 +1,4 @@
-"""One worker process: started with nothing but what it needs, told a job at a time, ended when it takes too long."""
+"""One worker process: started with nothing but what it needs, told a call at a time, ended when it takes too long."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ PASSED_ON = (
     "PATH", "LANG", "LC_ALL", "LD_LIBRARY_PATH", "PYTHONPATH", "PYTHONDONTWRITEBYTECODE", "PYTHONUNBUFFERED",
     "NUMBA_CACHE_DIR", "OPENBLAS_NUM_THREADS", "STIMRIG_EFFECTS_DIR",
 )  # fmt: skip
-"""All of the service's environment that a worker gets: no token, no setting of the service, nothing unforeseen."""
+"""All of the service's environment that a worker gets: no token, no setting of the service, nothing unexpected."""
 PROCESSOR_S = {"fit": 300.0, "effects": 60.0, "export_csv": 120.0, "find_recording": 120.0, "join": 120.0}
 LONGEST_PROCESSOR_S = 1200.0
-"""What a job may compute; improving a long record takes minutes on a slow machine."""
+"""What a call may compute; improving a long record takes minutes on a slow machine."""
 WALL_FACTOR = 3.0
 """A machine that does other things, too, takes longer; then the worker is ended."""
 
@@ -45,7 +45,7 @@ def environment() -> dict[str, str]:
 
 
 class Places:
-    """The folders that stay open to workers; a job that names another one makes it known.
+    """The folders that stay open to workers; a call that names another one makes it known.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ class Places:
         return tuple(part for option, paths in sides for path in sorted(paths) for part in (option, str(path)))
 
     def learn(self, arguments: dict[str, Any]) -> None:
-        """Take in the folders of a job's files: recordings of a rig that runs by itself lie where that rig says."""
+        """Take in the folders of a call's files: recordings of a rig that runs by itself lie where that rig says."""
         files = [arguments.get("data"), *(arguments.get("parts") or [])]
         wanted = {Path(file).absolute().parent for file in files if file}
         wanted |= {Path(arguments["folder"]).absolute()} if arguments.get("folder") else set()
@@ -76,8 +76,8 @@ def _covered(path: Path, known: set[Path]) -> bool:
 
 
 @dataclass
-class Job:
-    """One job: what, how far, and a future for its result."""
+class Call:
+    """One call: what, how far, and a future for its result."""
 
     id: int
     verb: str
@@ -89,7 +89,7 @@ class Job:
     text: str = ""
     started_s: float | None = None
     result: asyncio.Future[dict[str, Any]] = field(default_factory=lambda: asyncio.get_running_loop().create_future())
-    on_progress: Callable[[Job], None] | None = None
+    on_progress: Callable[[Call], None] | None = None
     test_id: str | None = field(default_factory=current_test.get)
 
     @property
@@ -104,7 +104,7 @@ class Job:
             return None
         return self.elapsed_s * (1.0 - self.progress) / self.progress
 
-    def public(self) -> dict[str, Any]:
+    def document(self) -> dict[str, Any]:
         """What a client sees of it."""
         left = self.time_left_s
         return {
@@ -118,13 +118,13 @@ class Job:
 
 
 class Worker:
-    """One worker process, started when first needed and again after a job was cancelled."""
+    """One worker process, started when first needed and again after a call was cancelled."""
 
     def __init__(self, command: tuple[str, ...], places: Places, *, background: bool = False) -> None:
         self.command, self.places, self.background = command, places, background
         self.started_with: tuple[str, ...] = ()
         self.process: asyncio.subprocess.Process | None = None
-        self.job: Job | None = None
+        self.call: Call | None = None
 
     async def start(self) -> asyncio.subprocess.Process:
         """The running process, fresh if there is none, or if the one there is cannot reach a folder it needs now."""
@@ -140,15 +140,15 @@ class Worker:
             self.started_with = arguments
         return self.process
 
-    async def run(self, job: Job) -> dict[str, Any]:
-        """Do a job to its end; its result, or its error raised."""
-        self.places.learn(job.arguments)
+    async def run(self, call: Call) -> dict[str, Any]:
+        """Do a call to its end; its result, or its error raised."""
+        self.places.learn(call.arguments)
         process = await self.start()
-        processor_s = PROCESSOR_S.get(job.verb, LONGEST_PROCESSOR_S)
-        request = {"job": job.id, "verb": job.verb, "arguments": job.arguments, "processor_s": processor_s}
+        processor_s = PROCESSOR_S.get(call.verb, LONGEST_PROCESSOR_S)
+        request = {"call": call.id, "verb": call.verb, "arguments": call.arguments, "processor_s": processor_s}
         try:
             async with asyncio.timeout(WALL_FACTOR * processor_s):
-                found = await self._converse(process, request, job)
+                found = await self._converse(process, request, call)
                 if found is not None:
                     return found
                 await process.wait()
@@ -158,17 +158,17 @@ class Worker:
             raise ApiError(500, "worker-died", "The worker process was ended", detail) from error
         except TimeoutError:
             await self.close()
-            raise too_long(job.verb, WALL_FACTOR * processor_s) from None
-        if job.state == "cancelled":
+            raise too_long(call.verb, WALL_FACTOR * processor_s) from None
+        if call.state == "cancelled":
             raise ApiError(409, "cancelled", "The job was cancelled", "Start it again if it is still wanted.")
         if process.returncode == -signal.SIGXCPU:
-            raise too_long(job.verb, processor_s)
-        how = f"{ending(process.returncode)} while it did the {job.verb}"
+            raise too_long(call.verb, processor_s)
+        how = f"{ending(process.returncode)} while it did the {call.verb}"
         detail = f"{how}. The data are safe; ask again. See logs/api.log."
         raise ApiError(500, "worker-died", "The worker process died", detail)
 
     async def _converse(
-        self, process: asyncio.subprocess.Process, request: dict[str, Any], job: Job
+        self, process: asyncio.subprocess.Process, request: dict[str, Any], call: Call
     ) -> dict[str, Any] | None:
         """Ask and listen; None where the process ended without an answer."""
         assert process.stdin is not None and process.stdout is not None
@@ -177,15 +177,15 @@ class Worker:
             message = json.loads(line)
             if left_open := message.get("left_open"):
                 log.warning("a worker is not shut in: %s (see stimrig doctor)", left_open)
-            if message.get("job") != job.id:
+            if message.get("call") != call.id:
                 continue
             if "result" in message:
                 return message["result"]
             if "error" in message:
-                raise job_error(job.verb, message["error"])
-            job.progress, job.text = message["progress"], message["text"]
-            if job.on_progress is not None:
-                job.on_progress(job)
+                raise call_error(call.verb, message["error"])
+            call.progress, call.text = message["progress"], message["text"]
+            if call.on_progress is not None:
+                call.on_progress(call)
         return None
 
     def kill(self) -> None:
@@ -201,7 +201,7 @@ class Worker:
             await self.process.wait()
 
 
-def job_error(verb: str, error: dict[str, Any]) -> ApiError:
+def call_error(verb: str, error: dict[str, Any]) -> ApiError:
     """A worker's error as a problem."""
     if error.get("expected"):
         extra = {key: error[key] for key in ("place", "mend") if error.get(key)}
@@ -211,7 +211,7 @@ def job_error(verb: str, error: dict[str, Any]) -> ApiError:
 
 
 def too_long(verb: str, seconds: float) -> ApiError:
-    """A job that was ended because it computed for too long."""
+    """A call that was ended because it computed for too long."""
     detail = f"The {verb} was ended after {seconds:g} s. Cut the recording, or resample it to a lower rate."
     return ApiError(422, "data", "The data do not allow it", detail)
 

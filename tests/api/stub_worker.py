@@ -150,6 +150,6 @@ for line in sys.stdin:
     request = json.loads(line)
 
     def say(**fields: Any) -> None:
-        print(json.dumps({"job": request["job"], **fields}), flush=True)  # noqa: B023
+        print(json.dumps({"call": request["call"], **fields}), flush=True)  # noqa: B023
 
     say(**answer(request["verb"], request["arguments"], say))

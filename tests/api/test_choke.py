@@ -137,7 +137,7 @@ def test_too_many_previews_at_once_are_refused_before_they_are_read(
         await asyncio.to_thread(go_on.wait, 120)
         return {"duration_s": 1.0}
 
-    monkeypatch.setattr(service.app.state.context.trials, "preview", slow)
+    monkeypatch.setattr(service.app.state.context.runner, "preview", slow)
     with ThreadPoolExecutor(1) as pool:
         first = pool.submit(client.post, "/v1/preview", json={"participant": participant})
         assert asked.wait(60)

@@ -132,8 +132,8 @@ def test_a_reader_sees_no_deeds_and_may_stop(blank: Any, service: Service) -> No
     assert blank.get_by_text("Nothing to see here").is_visible() and blank.get_by_text("C4").count() == 0
     blank.goto(f"{service.url}/models/{model}")
     blank.get_by_text("A clinician approves or rejects it.").wait_for()
-    for deed in ("Approve", "Reject", "Improve", "Add this effect", "Run it now", "Undo"):
-        assert blank.get_by_role("button", name=deed).count() == 0, deed
+    for action in ("Approve", "Reject", "Improve", "Add this effect", "Run it now", "Undo"):
+        assert blank.get_by_role("button", name=action).count() == 0, action
     blank.goto(f"{service.url}/administration")
     blank.get_by_role("heading", name="Not allowed").wait_for()
     blank.get_by_role("button", name="Stop stimulation").click()

@@ -13,7 +13,8 @@ from pathlib import Path
 import httpx
 import pytest
 
-from api.cli.launcher import LaunchError, Services
+from api.cli.errors import LaunchError
+from api.cli.launcher import Services
 from api.cli.rest_session import run_test
 from api.settings import Settings
 from tests.api.conftest import TOKEN

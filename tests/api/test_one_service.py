@@ -18,7 +18,8 @@ import httpx
 import pytest
 
 from api.cli import main
-from api.cli.launcher import LaunchError, Services
+from api.cli.errors import LaunchError
+from api.cli.launcher import Services
 from api.settings import Settings
 from api.store import Store, lock
 from api.store.lock import HeldError, ServiceLock

@@ -19,7 +19,7 @@ class Held:
 
     def __init__(self, service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
         self.reached, self.free = threading.Event(), threading.Event()
-        target = service.app.state.context.trials
+        target = service.app.state.context.runner
         write = target._write_intent
 
         def slowly(*arguments: Any) -> Any:

@@ -230,7 +230,7 @@ def test_what_goes_wrong_has_the_same_head(
     service: Service, client: httpx.Client, participant: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def broken() -> None:
-        raise RuntimeError("unforeseen")
+        raise RuntimeError("unexpected")
 
     monkeypatch.setattr(service.app.state.context.people, "public", broken)
     model = run_test(client, participant)

@@ -8,7 +8,8 @@ from typing import Annotated, Any
 
 import typer
 
-from api.cli.terminal import InputError, Json, say, say_json, write
+from api.cli.errors import InputError
+from api.cli.terminal import Json, say, say_json, write
 from api.errors import ApiError
 from api.settings import Settings
 from api.store import Store, audit

@@ -13,8 +13,9 @@ from typing import Annotated, Any
 import httpx
 import typer
 
+from api.cli.errors import ReportedError
 from api.cli.launcher import Services
-from api.cli.rest_session import ReportedError, approve_and_fetch, checked, ensure_participant, report_lines, run_test
+from api.cli.rest_session import approve_and_fetch, checked, ensure_participant, report_lines, run_test
 from api.cli.terminal import Json, number, say, say_json
 from api.settings import Settings
 
@@ -36,7 +37,7 @@ def demo(
     tell: Callable[..., None] = (lambda *_: None) if as_json else say
     folder = data or Path("var") / "demo" / datetime.now().strftime("%Y%m%d-%H%M%S")
     token = secrets.token_urlsafe(32)
-    settings = Settings(data_dir=folder, port=0, rig_file=None)  # pyright: ignore[reportCallIssue]
+    settings = Settings(data_dir=folder, port=0, rig_file=None)
     tell("starting the emulated rig, the rig process and the service")
     with Services(settings, emulate.split(), token) as services:
         found = play(services, token, tell)

@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from api.cli.terminal import Data, InputError, Json, ModelFile, load_model, number, percent, say, say_json
+from api.cli.errors import InputError
+from api.cli.terminal import Data, Json, ModelFile, load_model, number, percent, say, say_json
 
 
 def register(app: typer.Typer) -> None:

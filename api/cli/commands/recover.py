@@ -9,8 +9,8 @@ from typing import Annotated
 
 import typer
 
-from api.cli.launcher import LaunchError
-from api.cli.terminal import InputError, Json
+from api.cli.errors import InputError, LaunchError
+from api.cli.terminal import Json
 
 
 def register(app: typer.Typer) -> None:

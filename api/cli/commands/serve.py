@@ -10,9 +10,10 @@ from typing import Annotated
 
 import typer
 
+from api.cli.errors import InputError
 from api.cli.launcher import Services
 from api.cli.stop_key import StopKey, at_rig
-from api.cli.terminal import InputError, say
+from api.cli.terminal import say
 from api.settings import Settings
 from rig.messages import Status
 
@@ -34,7 +35,7 @@ def serve(
 ) -> None:
     """The service and the page, until Ctrl-C or SIGTERM."""
     given = {"port": port, "host": host, "rig_file": rig, "rig_socket": rig_socket, "data_dir": data}
-    settings = Settings(**{key: value for key, value in given.items() if value is not None})  # pyright: ignore[reportArgumentType]
+    settings = Settings(**{key: value for key, value in given.items() if value is not None})
     found = attachable(settings, emulate) if settings.rig_socket else None
     ended: list[int] = []
     for number in (signal.SIGTERM, signal.SIGINT):

@@ -11,10 +11,11 @@ from typing import Annotated, Any
 import httpx
 import typer
 
+from api.cli.errors import InputError, ReportedError
 from api.cli.launcher import Services
-from api.cli.rest_session import ReportedError, checked, ensure_participant, report_lines, run_test
+from api.cli.rest_session import checked, ensure_participant, report_lines, run_test
 from api.cli.stop_key import StopKey, at_rig, at_service
-from api.cli.terminal import InputError, Json, say, say_json
+from api.cli.terminal import Json, say, say_json
 from api.settings import Settings
 
 
@@ -81,7 +82,7 @@ def save(path: Path, recording: bytes) -> None:
 def on_own_services(rig: Path | None, data: Path | None, emulate: str, participant: str) -> dict[str, Any]:
     """Start rig and service for this one test."""
     given = {"rig_file": rig, "data_dir": data}
-    settings = Settings(**{key: value for key, value in given.items() if value is not None})  # pyright: ignore[reportArgumentType]
+    settings = Settings(**{key: value for key, value in given.items() if value is not None})
     settings.port = 0
     token = secrets.token_urlsafe(32)
 

@@ -48,7 +48,7 @@ async def shown(request: Request, context: Context, key: dict[str, Any] | None =
     def gather() -> dict[str, Any]:
         entries = context.store.all(AuditEntry, order=AuditEntry.seq)
         return {
-            "users": [{**user, "role": role_of(user["scopes"])} for user in context.people.public()],
+            "users": [{**user, "role": role_of(user["scopes"])} for user in context.people.documents()],
             "tokens": [token for token in tokens.list_tokens(context, None) if token["origin"] == "issued"],  # pyright: ignore[reportArgumentType]
             "entries": entries[: -NEWEST - 1 : -1],
             "count": len(entries),

@@ -80,7 +80,7 @@ async def begin(request: Request, context: Ctx, who: Tester, code: str) -> Respo
         participant=code,
         title=f"Calibrate {code} with {current}?",
         button=f"Yes, calibrate with {current}",
-        deed=open_it,
+        action=open_it,
         rows=[
             Row("Current of every pulse", current, f"{row.profile['current_ma']:g} mA"),
             Row("One step", f"{values['step_us']:g} µs"),

@@ -44,7 +44,7 @@ async def side(context: Context, row: Model, other: Model) -> dict[str, Any]:
     """One model's figures, and its error on the other one's recording."""
     document = json.loads(row.document)
     found: dict[str, Any] = {
-        "model": await asyncio.to_thread(context.versions.public, row),
+        "model": await asyncio.to_thread(context.versions.document, row),
         "recruitment": summary.recruitment(document),
         "dynamics": summary.dynamics(document),
         "curves": None,

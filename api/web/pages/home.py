@@ -50,7 +50,7 @@ def _overview(context: Context) -> list[dict[str, Any]]:
             {
                 "code": participant.code,
                 "last": tests[0] if tests else None,
-                "newest": context.versions.public(models[0]) if models else None,
+                "newest": context.versions.document(models[0]) if models else None,
                 "approved": context.versions.approved(participant.code),
             }
         )

@@ -21,7 +21,7 @@ from api.web.pages.checked import checked
 from api.web.pages.render import page
 from api.web.requests import EffectsIn
 from api.web.routes import criticism
-from api.workers.tracker import Task
+from api.workers.tracker import Job
 
 router = APIRouter(include_in_schema=False)
 TITLES = {"diagnosis": "Diagnosing", "add-effects": "Adding the effect", "improve": "Improving the model"}
@@ -35,7 +35,7 @@ async def model(request: Request, context: Ctx, who: ModelReader, model_id: str,
     measured = await measurement(context, row)
     diagnosis = await looked_at(context, row, who.name, diagnose)
     shown = await asyncio.to_thread(gather, context, row, measured, diagnosis)
-    version = await asyncio.to_thread(context.versions.public, row)
+    version = await asyncio.to_thread(context.versions.document, row)
     return page(
         request,
         "model.html",
@@ -45,7 +45,10 @@ async def model(request: Request, context: Ctx, who: ModelReader, model_id: str,
         dynamics=summary.dynamics(document),
         validity=summary.validity(document),
         problem=measured["problem"],
-        reasons=[*version["reasons"][1:], *await asyncio.to_thread(context.trials.outcomes.warnings, row.recording_id)],
+        reasons=[
+            *version["reasons"][1:],
+            *await asyncio.to_thread(context.runner.lifecycle.warnings, row.recording_id),
+        ],
         hdf5=not (await asyncio.to_thread(context.analyses.path, row.recording_id)).endswith(".csv"),
         now_utc=context.clock.utc(),
         may_test=who.may(Scope.RUN_TEST),
@@ -68,25 +71,27 @@ async def measurement(context: Context, row: Model) -> dict[str, Any]:
 
 
 async def looked_at(context: Context, row: Model, by: str, diagnose: int) -> dict[str, Any]:
-    """The diagnosis if it is there; else the task that makes it, begun if nobody has."""
+    """The diagnosis if it is there; else the job that makes it, begun if nobody has."""
     known = await asyncio.to_thread(context.analyses.known_diagnosis, row)
     if known is not None:
-        return {"found": known, "task": None}
-    tasks = [task for task in context.tasks.all.values() if (task.kind, task.subject) == ("diagnosis", row.id)]
-    newest = tasks[-1] if tasks else None
+        return {"found": known, "job": None}
+    jobs = [job for job in context.jobs.all.values() if (job.kind, job.subject) == ("diagnosis", row.id)]
+    newest = jobs[-1] if jobs else None
     if diagnose == 1 or (newest is None and diagnose != 0):
         newest = criticism.begin_diagnosis(context, row, by)
         await asyncio.sleep(0.05)
     if newest is not None and newest.state == "completed":  # it was done between the two looks
         known = await asyncio.to_thread(context.analyses.known_diagnosis, row)
-    return {"found": known, "task": newest}
+    return {"found": known, "job": newest}
 
 
 def gather(context: Context, row: Model, measured: dict[str, Any], diagnosis: dict[str, Any]) -> dict[str, Any]:
     """What the section "Why does it fail?" shows."""
-    found, comparison, task = diagnosis["found"], measured["comparison"], diagnosis["task"]
+    found, comparison, job = diagnosis["found"], measured["comparison"], diagnosis["job"]
     view = explanation.view(found, comparison, row.effects) if found else None
-    rows = explanation.versions([context.versions.public(version) for version in context.versions.lineage(row)], row.id)
+    rows = explanation.versions(
+        [context.versions.document(version) for version in context.versions.lineage(row)], row.id
+    )
     segments = (measured["curves"] or {}).get("segments") or []
     signatures = (found or {}).get("signatures") or {}
     # Where all is noise the worst of it is no place to look at.
@@ -98,8 +103,8 @@ def gather(context: Context, row: Model, measured: dict[str, Any], diagnosis: di
         "quiet": quiet,
         "why": view,
         # One that has just ended is shown as running once more: the page asks after it, and then shows what it found.
-        "job": task.public() if task and not found and task.state in ("running", "completed") else None,
-        "why_problem": task.problem if task and task.state == "failed" else None,
+        "job": job.document() if job and not found and job.state in ("running", "completed") else None,
+        "why_problem": job.problem if job and job.state == "failed" else None,
         "places": places,
         "splits": explanation.splits(comparison),
         "tests": view["tests"] if view else [],
@@ -111,9 +116,9 @@ def gather(context: Context, row: Model, measured: dict[str, Any], diagnosis: di
 @router.post("/models/{model_id}/diagnosis/cancel")
 async def cancel_diagnosis(context: Ctx, _who: Tester, model_id: str) -> Response:
     """Stop diagnosing; the page then offers to begin anew."""
-    for task in list(context.tasks.all.values()):
-        if (task.kind, task.subject) == ("diagnosis", model_id):
-            context.tasks.cancel(task)
+    for job in list(context.jobs.all.values()):
+        if (job.kind, job.subject) == ("diagnosis", model_id):
+            context.jobs.cancel(job)
     return RedirectResponse(f"/models/{model_id}?diagnose=0#why", 303)
 
 
@@ -129,14 +134,14 @@ async def add_effect(
     """Add one effect."""
     row = await asyncio.to_thread(context.versions.get, model_id)
     body = checked(EffectsIn, effects=[effect], reason=reason[:500], force=bool(force))
-    return await to_task(criticism.begin_adding(context, row, body, who.name))
+    return await to_job(criticism.begin_adding(context, row, body, who.name))
 
 
 @router.post("/models/{model_id}/improve")
 async def improve(context: Ctx, who: Tester, model_id: str) -> Response:
     """Add what is missing, one by one."""
     row = await asyncio.to_thread(context.versions.get, model_id)
-    return await to_task(criticism.begin_improving(context, row, who.name))
+    return await to_job(criticism.begin_improving(context, row, who.name))
 
 
 @router.post("/models/{model_id}/undo")
@@ -164,37 +169,37 @@ async def run_experiment(context: Ctx, who: Tester, model_id: str) -> Response:
 # ---- long work ----------------------------------------------------------------------------------------------
 
 
-async def to_task(task: Task) -> Response:
+async def to_job(job: Job) -> Response:
     """To the result where it is there at once, else to the page that waits for it."""
     try:
-        await asyncio.wait_for(task.done.wait(), 0.3)
+        await asyncio.wait_for(job.done.wait(), 0.3)
     except TimeoutError:
-        return RedirectResponse(f"/jobs/{task.id}", 303)
-    return RedirectResponse(result_page(task) or f"/jobs/{task.id}", 303)
+        return RedirectResponse(f"/jobs/{job.id}", 303)
+    return RedirectResponse(result_page(job) or f"/jobs/{job.id}", 303)
 
 
-def result_page(task: Task) -> str | None:
+def result_page(job: Job) -> str | None:
     """The page on which the result is seen."""
-    if task.result_url is None:
+    if job.result_url is None:
         return None
-    return task.result_url.removeprefix("/v1").removesuffix("/diagnosis") + "#why"
+    return job.result_url.removeprefix("/v1").removesuffix("/diagnosis") + "#why"
 
 
 @router.get("/jobs/{job_id}")
 async def job(request: Request, context: Ctx, _who: ModelReader, job_id: str) -> Response:
     """Long work: how far it is; on to its result once it is done."""
-    task = context.tasks.get(job_id)
-    target = result_page(task)
+    job = context.jobs.get(job_id)
+    target = result_page(job)
     if target:
         return RedirectResponse(target, 303)
-    title = task.problem.title if task.state == "failed" and task.problem else TITLES[task.kind]
-    status = task.problem.status if task.problem and task.state == "failed" else 200
-    return page(request, "job.html", status, job=task.public(), problem=task.problem, title=title)
+    title = job.problem.title if job.state == "failed" and job.problem else TITLES[job.kind]
+    status = job.problem.status if job.problem and job.state == "failed" else 200
+    return page(request, "job.html", status, job=job.document(), problem=job.problem, title=title)
 
 
 @router.post("/jobs/{job_id}/cancel")
 async def cancel(context: Ctx, _who: Tester, job_id: str) -> Response:
     """Cancel it."""
-    task = context.tasks.get(job_id)
-    context.tasks.cancel(task)
-    return RedirectResponse(f"/models/{task.subject}#why", 303)
+    job = context.jobs.get(job_id)
+    context.jobs.cancel(job)
+    return RedirectResponse(f"/models/{job.subject}#why", 303)

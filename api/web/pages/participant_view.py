@@ -45,8 +45,8 @@ async def shown(
             "form": form or limits_form.fresh(row.profile),
             "meanwhile": participants.meanwhile(context, code),
             "fields": limits_form.fields(context.rig.status),
-            "tests": [context.trials.public(test) for test in history],
-            "models": [context.versions.public(model) for model in context.versions.of(code)],
+            "tests": [context.runner.document(test) for test in history],
+            "models": [context.versions.document(model) for model in context.versions.of(code)],
         }
 
     return page(request, "participant.html", status, **await asyncio.to_thread(gather))
@@ -105,7 +105,7 @@ def _question(row: Participant, new: dict[str, Any], doubts: list[str], save: An
         participant=row.code,
         title=f"Set these limits for {row.code}?",
         button=f"Yes, set {', '.join(values)}",
-        deed=save,
+        action=save,
         rows=lines,
         warnings=doubts,
     )

@@ -1,4 +1,4 @@
-"""A question before a deed that matters, as a page: what is about to happen, and one button that says it."""
+"""A question before an action that matters, as a page: what is about to happen, and one button that says it."""
 
 from __future__ import annotations
 

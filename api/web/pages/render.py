@@ -44,7 +44,7 @@ def stop_right(request: Request, principal: Principal | None) -> str | None:
     context = request.app.state.context
     if principal is None:
         return getattr(request.state, "stop_right", None)
-    current = context.trials.current
+    current = context.runner.current
     return context.stop_rights.give(principal.name, current.test_id if current else None)
 
 
@@ -59,7 +59,7 @@ def bar_of(context: Context, principal: Principal | None) -> dict[str, Any]:
     return {
         "rig": context.rig.status,
         "connected": context.rig.connected,
-        "current": context.trials.current,
+        "current": context.runner.current,
         "now": rig_state.now(context, principal),
         "may_rearm": principal is not None and principal.may(Scope.REARM),
     }

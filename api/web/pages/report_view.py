@@ -42,7 +42,7 @@ async def report(request: Request, context: Ctx, _who: ModelReader, model_id: st
     return page(
         request,
         "report_sheet.html",
-        model=await asyncio.to_thread(context.versions.public, row),
+        model=await asyncio.to_thread(context.versions.document, row),
         document=document,
         recruitment=summary.recruitment(document),
         dynamics=summary.dynamics(document),
@@ -50,8 +50,8 @@ async def report(request: Request, context: Ctx, _who: ModelReader, model_id: st
         drawn=drawn,
         problem=measured["problem"],
         why=explanation.view(found, measured["comparison"], row.effects) if found else None,
-        versions=explanation.versions([context.versions.public(version) for version in lineage], row.id),
+        versions=explanation.versions([context.versions.document(version) for version in lineage], row.id),
         recording=recording,
-        warnings=await asyncio.to_thread(context.trials.outcomes.warnings, row.recording_id),
+        warnings=await asyncio.to_thread(context.runner.lifecycle.warnings, row.recording_id),
         now_utc=context.clock.utc(),
     )

@@ -42,7 +42,7 @@ def state_of(context: Context) -> str:
 
 def torque_now(context: Context) -> tuple[float | None, float | None]:
     """The newest torque (N·m) and its age (s); no torque where it is old or no number, no age where none ever came."""
-    torque_nm, age_s = context.trials.hub.torque()
+    torque_nm, age_s = context.runner.hub.torque()
     status = context.rig.status
     known = status is not None and status.torque_nm is not None and age_s is not None and age_s <= TORQUE_OLD_S
     return (torque_nm if known else None), age_s
@@ -63,7 +63,7 @@ def now(context: Context, principal: Principal | None) -> dict[str, Any]:
     }
     if principal is None:
         return told
-    current = context.trials.current
+    current = context.runner.current
     return {
         **told,
         "torque_nm": torque_nm,

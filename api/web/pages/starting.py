@@ -54,15 +54,15 @@ async def ask(context: Context, who: Principal, body: TestIn, back: str = "") ->
         409: a test runs, or a calibration is wanted first; what the rig refuses.
     """
     row = await asyncio.to_thread(participants.find, context, body.participant)
-    context.trials.refuse_second()
+    context.runner.refuse_second()
     standing = await asyncio.to_thread(calibrated, context, row)
     if not standing.may_start:
         detail = f"{row.code}'s calibration: {standing.words}. This rig starts no test without one of today."
         raise ApiError(409, "calibrate-first", "Calibrate first", detail)
-    seen = Seen(profiles.version(row.profile), await context.trials.preview(body))
+    seen = Seen(profiles.version(row.profile), await context.runner.preview(body))
 
-    async def deed() -> str:
-        test = await context.trials.start(body, who.name, seen)
+    async def action() -> str:
+        test = await context.runner.start(body, who.name, seen)
         return f"/tests/{test.id}"
 
     strength = f"{row.profile['current_ma']:g} mA, {number(widest_us(seen.preview), 0, 'µs')}"
@@ -70,7 +70,7 @@ async def ask(context: Context, who: Principal, body: TestIn, back: str = "") ->
         participant=row.code,
         title=f"Start the {KINDS.get(body.kind, body.kind)} of {row.code}?",
         button=f"Start now: {strength}",
-        deed=deed,
+        action=action,
         rows=rows(row, seen.preview, standing, rig_words(context)),
         warnings=[] if standing.state == "valid" else [f"{row.code} is not calibrated: {NOBODY}."],
         stimulates=True,

@@ -26,7 +26,7 @@ router = APIRouter(include_in_schema=False)
 async def test(request: Request, context: Ctx, _who: LiveReader, test_id: str) -> Response:
     """A test: live while it runs, its outcome after."""
     row = await asyncio.to_thread(tests.find, context, test_id)
-    document = await asyncio.to_thread(context.trials.public, row)
+    document = await asyncio.to_thread(context.runner.document, row)
     planned = (row.plan.get("preview") or {}).get("pulse_width_us") or []
     data = {"test": document, "planned_us": planned, "pulse_rate_hz": row.plan.get("pulse_rate_hz", 40.0)}
     shown: dict[str, Any] = await drawn(context, row) if document["done"] else {"drawn": None, "drawn_problem": None}
@@ -58,7 +58,7 @@ async def measured(context: Context, model_id: str) -> Markup | None:
 async def what_was_recorded(context: Context, row: Test) -> Markup:
     """Torque and the pulses that were sent, up to the test's end; the rest of the plan faint."""
     path = await asyncio.to_thread(context.analyses.path, str(row.recording_id))
-    found = await context.fitting.submit("recorded", urgent=True, data=path).result
+    found = await context.pool.submit("recorded", urgent=True, data=path).result
     plan_us = (row.plan.get("preview") or {}).get("pulse_width_us") or []
     figure = model_charts.recorded(found, plan_us, row.plan.get("pulse_rate_hz", 40.0), row.state)
     return svg(figure, 1160.0, 460.0, "Torque that was measured and pulses that were sent, over time")

@@ -37,7 +37,7 @@ async def begin(
     """
     async with context.limits_turn:
         row = await asyncio.to_thread(participants.find, context, code)
-        context.trials.refuse_second()
+        context.runner.refuse_second()
         version = profiles.version(row.profile)
         if seen not in (None, version):
             raise participants.stale(row)

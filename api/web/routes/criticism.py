@@ -12,7 +12,7 @@ from api.store.tables import Model
 from api.web.dependencies import PROBLEM, Context, Ctx, ModelReader, Tester
 from api.web.requests import EffectsIn
 from api.web.responses import ComparisonOut, DiagnosisOut, ImprovementOut, JobOut, VersionOut
-from api.workers.tracker import Task
+from api.workers.tracker import Job
 
 router = APIRouter(prefix="/v1", tags=["criticism"], responses=PROBLEM)
 LATER: dict[int | str, dict[str, Any]] = {202: {"model": JobOut, "description": "begun; see `Location`"}}
@@ -61,7 +61,7 @@ async def add_effects(
         return later(begin_adding(context, row, body, who.name))
     new = await context.analyses.add_effects(row, body.effects, who.name, force=body.force, reason=body.reason)
     response.headers["Location"] = f"/v1/models/{new.id}"
-    return await asyncio.to_thread(context.versions.public, new)
+    return await asyncio.to_thread(context.versions.document, new)
 
 
 @router.post("/models/{model_id}/improve", status_code=201, response_model=ImprovementOut, responses=LATER)
@@ -72,63 +72,63 @@ async def improve(context: Ctx, who: Tester, model_id: str, response: Response, 
         return later(begin_improving(context, row, who.name))
     found, rows = await context.analyses.improve(row, who.name)
     response.headers["Location"] = f"/v1/models/{rows[-1].id}"
-    versions = await asyncio.to_thread(lambda: [context.versions.public(new) for new in rows])
+    versions = await asyncio.to_thread(lambda: [context.versions.document(new) for new in rows])
     return {**found, "versions": versions}
 
 
 @router.get("/effects")
 async def effects(context: Ctx, _who: ModelReader) -> dict[str, Any]:
     """The library of effects."""
-    return await context.fitting.submit("effects").result
+    return await context.pool.submit("effects").result
 
 
 @router.get("/jobs/{job_id}", response_model=JobOut)
 def job(context: Ctx, _who: ModelReader, job_id: str) -> dict[str, Any]:
     """Long work: how far, how long yet, and where its result lies."""
-    return context.tasks.get(job_id).public()
+    return context.jobs.get(job_id).document()
 
 
 @router.delete("/jobs/{job_id}", response_model=JobOut)
 async def cancel(context: Ctx, _who: Tester, job_id: str) -> dict[str, Any]:
     """Cancel it. What is done already stays done."""
-    task = context.tasks.get(job_id)
-    context.tasks.cancel(task)
-    await asyncio.wait_for(task.done.wait(), 10)
-    return task.public()
+    job = context.jobs.get(job_id)
+    context.jobs.cancel(job)
+    await asyncio.wait_for(job.done.wait(), 10)
+    return job.document()
 
 
-def later(task: Task) -> Response:
+def later(job: Job) -> Response:
     """202, with the job's address."""
-    return JSONResponse(task.public(), status_code=202, headers={"Location": f"/v1/jobs/{task.id}"})
+    return JSONResponse(job.document(), status_code=202, headers={"Location": f"/v1/jobs/{job.id}"})
 
 
-def begin_diagnosis(context: Context, model: Model, by: str) -> Task:
+def begin_diagnosis(context: Context, model: Model, by: str) -> Job:
     """Diagnose while the person looks on."""
 
-    async def work(task: Task) -> str:
-        await context.analyses.diagnosis(model, task.take)
+    async def work(job: Job) -> str:
+        await context.analyses.diagnosis(model, job.take)
         return f"/v1/models/{model.id}/diagnosis"
 
-    return context.tasks.start("diagnosis", model.id, by, work)
+    return context.jobs.start("diagnosis", model.id, by, work)
 
 
-def begin_adding(context: Context, model: Model, body: EffectsIn, by: str) -> Task:
+def begin_adding(context: Context, model: Model, body: EffectsIn, by: str) -> Job:
     """Add effects while the person looks on."""
 
-    async def work(task: Task) -> str:
+    async def work(job: Job) -> str:
         new = await context.analyses.add_effects(
-            model, body.effects, by, force=body.force, reason=body.reason, on_job=task.take
+            model, body.effects, by, force=body.force, reason=body.reason, on_call=job.take
         )
         return f"/v1/models/{new.id}"
 
-    return context.tasks.start("add-effects", model.id, by, work)
+    return context.jobs.start("add-effects", model.id, by, work)
 
 
-def begin_improving(context: Context, model: Model, by: str) -> Task:
+def begin_improving(context: Context, model: Model, by: str) -> Job:
     """Improve while the person looks on."""
 
-    async def work(task: Task) -> str:
-        _, rows = await context.analyses.improve(model, by, task.take)
+    async def work(job: Job) -> str:
+        _, rows = await context.analyses.improve(model, by, job.take)
         return f"/v1/models/{rows[-1].id}"
 
-    return context.tasks.start("improve", model.id, by, work)
+    return context.jobs.start("improve", model.id, by, work)

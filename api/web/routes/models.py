@@ -47,14 +47,14 @@ def matches(if_none_match: str, etag: str) -> bool:
 def versions(context: Ctx, _who: ModelReader, code: str) -> list[dict[str, Any]]:
     """A participant's model versions, newest first, with their errors and what each added."""
     participants.find(context, code)
-    return [context.versions.public(row) for row in context.versions.of(code)]
+    return [context.versions.document(row) for row in context.versions.of(code)]
 
 
 @router.get("/models/{model_id}", response_model=VersionOut)
 def one_model(context: Ctx, _who: ModelReader, model_id: str) -> dict[str, Any]:
     """A version: its errors, its verdict, its lineage, and the model."""
     row = context.versions.get(model_id)
-    return {**context.versions.public(row), "model": json.loads(row.document)}
+    return {**context.versions.document(row), "model": json.loads(row.document)}
 
 
 @router.get("/models/{model_id}/file", response_class=Response)
@@ -69,18 +69,18 @@ def model_file(context: Ctx, _who: ModelReader, model_id: str) -> Response:
 def approve(context: Ctx, who: Approver, model_id: str, body: DecisionIn | None = None) -> dict[str, Any]:
     """Let the controller have this version."""
     context.versions.decide(model_id, True, who.name, body.reason if body else "")
-    return context.versions.public(context.versions.get(model_id))
+    return context.versions.document(context.versions.get(model_id))
 
 
 @router.post("/models/{model_id}/reject", response_model=VersionOut)
 def reject(context: Ctx, who: Approver, model_id: str, body: DecisionIn | None = None) -> dict[str, Any]:
     """Keep this version from the controller."""
     context.versions.decide(model_id, False, who.name, body.reason if body else "")
-    return context.versions.public(context.versions.get(model_id))
+    return context.versions.document(context.versions.get(model_id))
 
 
 @router.post("/models/{model_id}/undo", response_model=VersionOut)
 def undo(context: Ctx, who: Approver, model_id: str, body: DecisionIn | None = None) -> dict[str, Any]:
     """Go back to the version this one was made from; nothing is deleted."""
     parent = context.versions.undo(model_id, who.name, body.reason if body else "")
-    return context.versions.public(parent)
+    return context.versions.document(parent)

@@ -46,7 +46,7 @@ def metrics(context: Ctx) -> PlainTextResponse:
 
 def _figures(context: Context) -> list[tuple[str, str, str, dict[str, float]]]:
     states = Counter(row.state for row in context.store.all(Test))
-    newest, rig = context.trials.hub.newest, context.rig
+    newest, rig = context.runner.hub.newest, context.rig
     return [
         ("stimrig_up_seconds", "gauge", "Time since start", {"": time.monotonic() - context.started_s}),
         ("stimrig_rig_connected", "gauge", "1 where the rig's socket is open", {"": float(rig.connected)}),
@@ -61,13 +61,13 @@ def _figures(context: Context) -> list[tuple[str, str, str, dict[str, float]]]:
         ("stimrig_approved_models", "gauge", "Participants with one approved today", {"": float(_approved(context))}),
         ("stimrig_audit_entries", "gauge", "Entries of the audit trail", {"": float(_audit_entries(context))}),
         ("stimrig_free_disk_bytes", "gauge", "Free where the data lie", {"": float(_free_bytes(context))}),
-        ("stimrig_live_listeners", "gauge", "Open live channels", {"": float(context.trials.hub.listeners)}),
+        ("stimrig_live_listeners", "gauge", "Open live channels", {"": float(context.runner.hub.listeners)}),
         ("stimrig_lost_samples", "gauge", "Lost in the newest test", {"": float(newest.lost_samples if newest else 0)}),
         ("stimrig_dropped_pulses", "gauge", "Dropped in it", {"": float(newest.dropped_pulses if newest else 0)}),
-        ("stimrig_jobs_done_total", "counter", "Analyses done", {"": float(context.fitting.done_count)}),
-        ("stimrig_jobs_failed_total", "counter", "Analyses failed", {"": float(context.fitting.failed_count)}),
-        ("stimrig_jobs_busy_seconds_total", "counter", "Time in analyses", {"": context.fitting.busy_s}),
-        ("stimrig_jobs_queued", "gauge", "Analyses waiting", {"": float(len(context.fitting.queue))}),
+        ("stimrig_jobs_done_total", "counter", "Analyses done", {"": float(context.pool.done_count)}),
+        ("stimrig_jobs_failed_total", "counter", "Analyses failed", {"": float(context.pool.failed_count)}),
+        ("stimrig_jobs_busy_seconds_total", "counter", "Time in analyses", {"": context.pool.busy_s}),
+        ("stimrig_jobs_queued", "gauge", "Analyses waiting", {"": float(len(context.pool.queue))}),
     ]
 
 

@@ -114,7 +114,7 @@ def stale(row: Participant) -> ApiError:
 
 def meanwhile(context: Context, code: str) -> str:
     """What a change of this participant's limits means for what goes on; empty where nothing does."""
-    current, status = context.trials.current, context.rig.status
+    current, status = context.runner.current, context.rig.status
     if current is not None and current.participant == code:
         return (
             "The test that runs keeps the limits that it was begun with; changed ones hold from the next test on. "
@@ -181,4 +181,4 @@ def tests_of(context: Ctx, _who: Tester, code: str) -> list[dict[str, Any]]:
     """A participant's tests, newest first."""
     find(context, code)
     rows = context.store.all(Test, Test.participant == code, order=Test.requested_utc.desc())
-    return [context.trials.public(row) for row in rows]
+    return [context.runner.document(row) for row in rows]

@@ -73,7 +73,7 @@ async def add_user(context: Ctx, who: Administrator, body: UserIn) -> dict[str, 
 @router.get("/users")
 def list_users(context: Ctx, _who: Administrator) -> list[dict[str, Any]]:
     """All users."""
-    return context.people.public()
+    return context.people.documents()
 
 
 @router.put("/users/{name}/password", status_code=204)

@@ -27,9 +27,9 @@ class WidthsIn(Body):
 async def prediction(context: Ctx, _who: ModelReader, model_id: str, body: WidthsIn) -> dict[str, Any]:
     """Mean torque the pulses give in each pulse's period, N·m, after a second of rest; effects included."""
     row = await asyncio.to_thread(context.versions.get, model_id)
-    job = context.fitting.submit(
+    call = context.pool.submit(
         "forecast", urgent=True, model_json=row.document.decode(), pulse_width_us=body.pulse_width_us,
         pulse_rate_hz=body.pulse_rate_hz,
     )  # fmt: skip
-    found = await job.result
+    found = await call.result
     return {"model_id": row.id, "pulse_rate_hz": body.pulse_rate_hz, **found}

@@ -42,7 +42,7 @@ async def recording_csv(context: Ctx, _who: ModelReader, recording_id: str) -> F
     out = context.settings.exports_dir / f"{secrets.token_hex(8)}.csv"
     gone = BackgroundTask(out.unlink, missing_ok=True)
     try:
-        await context.fitting.submit("export_csv", data=str(source), out=str(out)).result
+        await context.pool.submit("export_csv", data=str(source), out=str(out)).result
     except ApiError:
         out.unlink(missing_ok=True)
         raise
@@ -74,7 +74,7 @@ async def upload(context: Ctx, who: Tester, code: str, request: Request, respons
     data = await bounded_body(request, context.settings.max_upload_mb)
     row, model, warning = await take_in(context, code, data, who.name)
     response.headers["Location"] = f"/v1/recordings/{row.id}"
-    return {"recording_id": row.id, "model": context.versions.public(model), "warnings": [warning] if warning else []}
+    return {"recording_id": row.id, "model": context.versions.document(model), "warnings": [warning] if warning else []}
 
 
 async def take_in(context: Context, code: str, data: bytes, by: str) -> tuple[Recording, Model, str]:
@@ -99,7 +99,7 @@ async def take_in(context: Context, code: str, data: bytes, by: str) -> tuple[Re
 async def _identified(context: Context, code: str, path: Path) -> tuple[dict[str, Any], str]:
     """The model of an upload; every reason why there is none is about the upload, and tells nothing of this machine."""
     try:
-        return await context.analyses.beginnings.fit(code, str(path))
+        return await context.analyses.starting_effects.fit(code, str(path))
     except ApiError as error:
         if error.code == "worker-died":
             detail = f"{error.detail.partition('. ')[0]}. Is the file damaged? Nothing of it was kept."

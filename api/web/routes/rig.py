@@ -10,7 +10,7 @@ from fastapi.responses import JSONResponse, RedirectResponse, Response
 
 from api.errors import ApiError
 from api.sessions.requests import TestIn
-from api.sessions.stop_log import Told
+from api.sessions.stop_log import StopResult
 from api.store import audit
 from api.web.browser_session import wants_html
 from api.web.dependencies import PROBLEM, Context, Ctx, LiveReader, MayStop, Rearmer, Tester
@@ -23,7 +23,7 @@ router = APIRouter(prefix="/v1", tags=["rig"], responses=PROBLEM)
 def rig_state(context: Context) -> dict[str, Any]:
     """What is known of the rig, and how old it is."""
     status = context.rig.status
-    current = context.trials.current
+    current = context.runner.current
     return {
         "connected": context.rig.connected,
         "age_s": context.rig.age_s,
@@ -52,20 +52,20 @@ async def stop(request: Request, context: Ctx, press: MayStop) -> Response:
     """
     if wants_html(request):
         return await stop_on_page(request, context, press)
-    evidence = await context.trials.stop(press.reason, press.by)
+    evidence = await context.runner.stop(press.reason, press.by)
     return JSONResponse({"stopped": evidence.confirmed, "evidence": evidence.model_dump(), "rig": rig_state(context)})
 
 
 async def stop_on_page(request: Request, context: Context, press: Press) -> Response:
     """Stop, and lead to the page that tells what came of it: that one can be loaded again and stops nothing."""
-    current = context.trials.current
+    current = context.runner.current
     answer: StopEvidence | ApiError
     try:
-        answer = await context.trials.stop(press.reason, press.by)
+        answer = await context.runner.stop(press.reason, press.by)
     except ApiError as error:
         answer = error
     right, test_id = getattr(request.state, "stop_right", None), current.test_id if current else None
-    told = Told(press.by, press.reason, context.clock.utc(), test_id, right, answer)
+    told = StopResult(press.by, press.reason, context.clock.utc(), test_id, right, answer)
     return RedirectResponse(f"/stopped/{context.stops.keep(told)}", 303)
 
 
@@ -94,4 +94,4 @@ async def rearm(context: Ctx, who: Rearmer) -> dict[str, Any]:
 @router.post("/preview", response_model=dict[str, Any])
 async def preview(context: Ctx, _who: Tester, body: TestIn) -> Response:
     """A test's duration, dose and pulse widths, without playing it. 503 where too many are asked for at once."""
-    return JSONResponse(await context.trials.preview(body))
+    return JSONResponse(await context.runner.preview(body))

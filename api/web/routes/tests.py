@@ -29,22 +29,22 @@ def find(context: Context, test_id: str) -> Test:
 @router.post("", status_code=202)
 async def start_test(context: Ctx, who: Tester, body: TestIn, response: Response) -> dict[str, Any]:
     """Start a test; `Location` is where its progress is read. One at a time: 409 names the holder."""
-    row = await context.trials.start(body, who.name)
+    row = await context.runner.start(body, who.name)
     response.headers["Location"] = f"/v1/tests/{row.id}"
-    return context.trials.public(row)
+    return context.runner.document(row)
 
 
 @router.get("")
 def list_tests(context: Ctx, _who: LiveReader, limit: int = 50) -> list[dict[str, Any]]:
     """The newest tests."""
     rows = context.store.all(Test, order=Test.requested_utc.desc(), limit=max(1, min(limit, 500)))
-    return [context.trials.public(row) for row in rows]
+    return [context.runner.document(row) for row in rows]
 
 
 @router.get("/{test_id}")
 def one_test(context: Ctx, _who: LiveReader, test_id: str) -> dict[str, Any]:
     """A test: state, segment, progress, time left; at its end recording, model, summary and fit."""
-    return context.trials.public(find(context, test_id))
+    return context.runner.document(find(context, test_id))
 
 
 @router.websocket("/{test_id}/live")
@@ -61,13 +61,13 @@ async def live(socket: WebSocket, test_id: str) -> None:
         await socket.send_json({"type": "problem", "problem": error.body(socket.url.path)})
         await socket.close(4404 if error.status == 404 else 4401, error.title)
         return
-    queue = context.trials.hub.open()
+    queue = context.runner.hub.open()
     try:
         await _pump(socket, context, row, queue)
     except (WebSocketDisconnect, RuntimeError):
         pass
     finally:
-        context.trials.hub.close(queue)
+        context.runner.hub.close(queue)
 
 
 def _admit(socket: WebSocket, context: Context, test_id: str) -> Test:
@@ -86,7 +86,7 @@ async def _pump(socket: WebSocket, context: Context, row: Test, queue: asyncio.Q
         history = queue.get_nowait()
         if history["test_id"] == row.id:
             await socket.send_json(history)
-        document = await asyncio.to_thread(lambda: context.trials.public(find(context, row.id)))
+        document = await asyncio.to_thread(lambda: context.runner.document(find(context, row.id)))
         await socket.send_json({"type": "test", "test": document})
         while not document["done"] and not gone.done():
             try:
