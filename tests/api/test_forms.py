@@ -18,7 +18,7 @@ from tests.api.test_access import csrf, signed_in
 from tests.api.test_profiles import calibrate, limits
 
 PAGE = "/participants/P017"
-PAGES = Path(__file__).parents[2] / "api" / "pages"
+PAGES = Path(__file__).parents[2] / "api" / "web" / "pages"
 
 
 @pytest.fixture
