@@ -7,7 +7,7 @@ zero. The tighter of the table, the rig file and the participant's profile wins,
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from rig.errors import RefusedError
 from rig.messages import Bound, Profile, TestPlan
@@ -210,8 +210,7 @@ def tightened(table: dict[str, Limit], name: str, hi: float, owner: str, lo: flo
         raise RefusedError(f"{owner}: {name} {hi:g} {row.unit} must be at least {lo:g} {row.unit}")
     if hi >= row.hi and lo <= row.lo:
         return table
-    bounds = Limit(name, lo, min(hi, row.hi), row.unit, row.reason, row.source, owner)
-    return {**table, name: bounds}
+    return {**table, name: replace(row, lo=lo, hi=min(hi, row.hi), owner=owner)}
 
 
 def at_least(table: dict[str, Limit], name: str, lo: float, owner: str) -> dict[str, Limit]:
@@ -221,7 +220,7 @@ def at_least(table: dict[str, Limit], name: str, lo: float, owner: str) -> dict[
         raise RefusedError(f"{owner}: {name} {lo:g} {row.unit} must be at most {row.hi:g} {row.unit}")
     if lo <= row.lo:
         return table
-    return {**table, name: Limit(name, lo, row.hi, row.unit, row.reason, row.source, owner)}
+    return {**table, name: replace(row, lo=lo, owner=owner)}
 
 
 def for_profile(table: dict[str, Limit], profile: Profile, owner: str = "participant's profile") -> dict[str, Limit]:

@@ -87,7 +87,7 @@ class Trial:
         if self.state == "uncertain":
             raise UncertainError(f"{self.reason}; look at the participant and the rig, then re-arm")
         if self.state == "disconnected":
-            raise DeviceError(f"{self.reason}; mend it, then re-arm")
+            raise DeviceError(f"{self.reason}; correct that, then re-arm")
 
     def armed(self) -> Trial:
         """The device is ready and the first pulse is due."""
