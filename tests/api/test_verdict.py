@@ -16,7 +16,7 @@ from api.models import summary
 from api.models.registry import Versions
 from api.workers.process import WORKER
 from tests.api.conftest import run_service
-from tests.identify.patients import Patient, make_record
+from tests.harness.patients import Patient, make_record
 
 GATE = {"passed": False, "severity": "refuse", "says": "the dynamics are unstable"}
 
