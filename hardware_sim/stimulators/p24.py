@@ -11,6 +11,7 @@ from typing import Any
 
 from hardware_sim.stimulators import sciencemode4
 from hardware_sim.stimulators.board import Board
+from hardware_sim.stimulators.framing import Packet
 from hardware_sim.stimulators.p24_mid_level import MidLevel
 from hardware_sim.stimulators.p24_points import (
     ELECTRODE,
@@ -24,7 +25,6 @@ from hardware_sim.stimulators.p24_points import (
     parse_points,
     within_limits,
 )
-from hardware_sim.stimulators.sciencemode4 import Packet
 from hardware_sim.timeline import Event
 
 LL_INIT, LL_CHANNEL_CONFIG, LL_STOP = 0, 2, 4

@@ -17,6 +17,7 @@ from typing import Any
 
 from hardware_sim.stimulators import sciencemode2
 from hardware_sim.stimulators.board import Board
+from hardware_sim.stimulators.framing import Packet
 from hardware_sim.stimulators.rehastim2_channels import (
     CHANNELS,
     NO_ERROR,
@@ -29,7 +30,6 @@ from hardware_sim.stimulators.rehastim2_channels import (
     parse_pulse,
     parse_start,
 )
-from hardware_sim.stimulators.sciencemode2 import Packet
 from hardware_sim.timeline import Event
 
 INIT, INIT_ACK, UNKNOWN_COMMAND, WATCHDOG = 1, 2, 3, 4
