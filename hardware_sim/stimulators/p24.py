@@ -1,4 +1,4 @@
-"""Hasomed RehaMove P24's firmware, ScienceMode 4: general commands and low level; mid level next door.
+"""Hasomed RehaMove P24's firmware, ScienceMode 4: general commands and low level. The mid level is in `p24_mid_level`.
 
 Low level: the host sends one LLChannelConfig per pulse. Silence means no stimulation.
 """
@@ -76,7 +76,7 @@ class Firmware:
 
     @property
     def high_voltage_on(self) -> bool:
-        """Whether the source that drives the pulses is up."""
+        """Whether the source that drives the pulses is on."""
         return self._level != NO_LEVEL and self._source != HIGH_VOLTAGE_OFF and self._board.high_voltage_works
 
     def received(self, data: bytes) -> None:
