@@ -29,6 +29,8 @@ def test_no_pulse_outside_passes(width_us: float, current_ma: float, most_us: fl
     profile = Profile(current_ma=most_ma, max_pulse_width_us=most_us)
     table = limits.for_profile(HARD_LIMITS, profile)
     verdict = admit(Pulse(width_us, current_ma), table)
+    inside = 0 <= width_us <= most_us and 0 <= current_ma <= most_ma and width_us * current_ma * 1e-3 <= 40.0
+    assert isinstance(verdict, Admitted) == inside
     if isinstance(verdict, Admitted):
         assert 0 <= verdict.pulse_width_us <= min(most_us, 500)
         assert 0 <= verdict.current_ma <= min(most_ma, 100)

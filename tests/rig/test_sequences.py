@@ -90,6 +90,7 @@ def test_every_sequence_stays_between_zero_and_c(name: str, rate_hz: float, c_us
     assert len(widths) == sequences.pulse_count(name, settings, rate_hz)
     assert widths.dtype == np.float64
     assert np.all((widths >= 0) & (widths <= c_us * (1 + 1e-12)))
+    assert widths.max() == 0 if name == "rest" else widths.max() > 0.8 * c_us
     assert np.array_equal(widths, sequences.build(name, settings, rate_hz))  # pure
 
 
