@@ -10,7 +10,7 @@ from rig import journal as jn
 from rig import limits
 from rig.clock import VirtualClock
 from rig.errors import DeviceError
-from rig.gate import LATE_ACK_S, Gate
+from rig.gate import Gate
 from rig.journal import Journal, Kind
 from rig.messages import Profile
 from rig.signals import Ack, Pulse, PulseStatus
@@ -30,10 +30,12 @@ def test_a_new_gate_is_shut_and_empty():
     stimulator = FakeStimulator(clock)
     lost: list[str] = []
     gate = Gate(stimulator, clock, lambda _: None, lost.append)
-    assert (gate.is_open, gate.on_its_way, gate.last_pulse_s) == (False, None, None)
+    assert gate.is_open is False
+    assert (gate.on_its_way, gate.last_pulse_s) == (None, None)
     assert (gate.lateness_s, gate.ack_delay_s, gate.charge_uc, gate.dropped) == ([], [], 0.0, 0)
     assert gate.still_possible() == ""
     assert gate.fire(0, Pulse(100, 20), clock.now_s(), clock.now_s()) == PulseStatus.REFUSED
+    stimulator.on_ack(Ack(1, clock.now_s()))  # of whoever used the device before
     stimulator.on_lost("unplugged")
     assert lost == ["unplugged"]
 
@@ -171,7 +173,7 @@ def test_the_error_of_an_ack_stands_in_the_journal_with_its_pulse(tmp_path: Path
 def test_late_acks_are_noted_by_real_time(tmp_path: Path, speed: float):
     setup = Setup(tmp_path)
     setup.clock.speed = speed
-    for number, real_s in ((1, LATE_ACK_S - 0.001), (2, LATE_ACK_S + 0.001)):
+    for number, real_s in ((1, 0.014), (2, 0.016)):
         setup.stimulator.ack_delay_s = None
         setup.fire(100)
         setup.wait(real_s * speed)
@@ -187,13 +189,69 @@ def test_late_acks_are_noted_by_real_time(tmp_path: Path, speed: float):
     ]
 
 
+def test_an_ack_after_exactly_the_time_allowed_is_not_late(tmp_path: Path):
+    clock = VirtualClock(start_s=0.0)
+    stimulator = FakeStimulator(clock)
+    stimulator.ack_delay_s = None
+    gate = Gate(stimulator, clock, lambda _: None, lambda _: None)
+    gate.open(Journal(tmp_path / "j"), limits.HARD_LIMITS)
+    gate.fire(0, Pulse(100, 20), 0.0, 0.0)
+    stimulator.on_ack(Ack(1, 0.015))
+    assert sum(kind == Kind.EVENT for kind, _ in jn.read(tmp_path / "j").blocks) == 1, "arm alone"
+
+
+def test_how_long_a_pulse_has_been_on_its_way(tmp_path: Path):
+    setup = Setup(tmp_path)
+    setup.stimulator.ack_delay_s = None
+    setup.fire(100)
+    setup.wait(2.0)
+    assert "was sent 2000 ms ago" in setup.gate.still_possible()
+    setup.gate.shut()
+    assert setup.gate.is_open is False
+
+
+def test_a_pulse_that_becomes_late_while_its_intent_is_written_is_dropped(tmp_path: Path):
+    setup = Setup(tmp_path)
+    append = setup.journal.append
+
+    def slow(kind: Kind, payload: bytes) -> None:
+        append(kind, payload)
+        setup.clock.advance(0.5)
+
+    setup.journal.append = slow
+    assert setup.gate.fire(7, Pulse(100, 20), T0_S, T0_S + 0.01) == PulseStatus.DROPPED
+    assert setup.stimulator.sent == []
+    assert (setup.gate.dropped, setup.gate.charge_uc, setup.gate.on_its_way) == (1, 0.0, None)
+    assert [jn.SKIPPED.unpack(p) for p in blocks(setup, Kind.SKIPPED)] == [(7, PulseStatus.DROPPED, T0_S + 0.5)]
+
+
+def test_pulses_are_rounded_to_the_steps_of_the_device_behind_the_gate(tmp_path: Path):
+    setup = Setup(tmp_path)
+    setup.stimulator.steps = limits.Steps(pulse_width_us=4.0, current_ma=2.0, shortest_us=20.0)
+    assert setup.fire(19.0) == PulseStatus.REST
+    assert setup.fire(103.0, 19.9) == PulseStatus.UNACKNOWLEDGED
+    assert [pulse for _, pulse in setup.stimulator.sent] == [limits.Admitted(100, 18.0)]
+
+
+def test_a_pulse_exactly_a_second_old_no_longer_counts(tmp_path: Path):
+    setup = Setup(tmp_path, current_ma=100.0, max_pulse_width_us=400.0)
+    setup.stimulator.ack_delay_s = 0.0
+    for _ in range(40):
+        assert setup.fire(400, 100.0) == PulseStatus.UNACKNOWLEDGED
+        setup.wait(1 / 64)
+    setup.wait(T0_S + 1.0 - setup.clock.now_s())
+    assert setup.fire(400, 100.0) == PulseStatus.UNACKNOWLEDGED
+    setup.wait(1 / 128)
+    assert setup.fire(400, 100.0) != PulseStatus.UNACKNOWLEDGED
+
+
 def test_after_its_release_a_journal_gets_nothing_more(tmp_path: Path):
     setup = Setup(tmp_path)
     setup.stimulator.ack_delay_s = None
     setup.fire(100)
     before = setup.path.read_bytes()
     setup.gate.release()
-    assert not setup.gate.is_open
+    assert setup.gate.is_open is False
     setup.stimulator.on_ack(Ack(1, setup.clock.now_s()))
     assert setup.fire(100) == PulseStatus.REFUSED
     assert setup.path.read_bytes() == before

@@ -173,6 +173,11 @@ def test_a_bound_that_leaves_nothing_is_refused_and_says_what_would_do():
         with pytest.raises(RefusedError) as raised:
             narrow()
         assert str(raised.value) == words
+    whole = Profile(max_pulse_width_us=250, current_ma=15, max_torque_nm=9, rest_between_tests_s=30)
+    narrowed = limits.for_profile(HARD_LIMITS, whole)
+    assert {name: row.owner for name, row in narrowed.items() if row != HARD_LIMITS[name]} == dict.fromkeys(
+        ("pulse_width_us", "current_ma", "torque_nm", "rest_between_tests_s"), "participant's profile"
+    )
     gentle = limits.for_plan(HARD_LIMITS, request(Profile(max_torque_nm=0.9), max_torque_nm=0.8))
     assert (gentle["torque_nm"].lo, gentle["torque_nm"].hi) == (-0.8, 0.8)
 
