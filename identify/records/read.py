@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from identify.records import bounds
+from identify.errors import BadRecord
+from identify.records import bounds, columns
 from identify.records.record import Record
 
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 
 
-def read(path: str | Path, pulse_rate_hz: float | None = None) -> Record:
-    """Read a record.
+def read(
+    path: str | Path, pulse_rate_hz: float | None = None, map: Mapping[str, str] | Iterable[str] | None = None
+) -> Record:
+    """Read a record; its `notes` say what was assumed.
 
     Parameters
     ----------
@@ -20,6 +24,9 @@ def read(path: str | Path, pulse_rate_hz: float | None = None) -> Record:
         `late_s`, `doubted`, and the columns of a joined record), or a sealed recording.
     pulse_rate_hz : float, optional
         Pulses a second; by default what the recording says, else 40.
+    map : mapping or sequence of str, optional
+        Columns of another tool's file by ours: `{"torque_nm": "Drehmoment:Nm"}`, or `["torque_nm=Drehmoment:Nm"]`. The
+        unit after the last colon may be left out where the column's name holds it; `#3` is the third column.
 
     Raises
     ------
@@ -29,11 +36,16 @@ def read(path: str | Path, pulse_rate_hz: float | None = None) -> Record:
     path = Path(path)
     if pulse_rate_hz is not None:
         bounds.check_rate(pulse_rate_hz, "pulse rate")
+    given = columns.parsed(map)
     content = bounds.content_of(path)
     if content.startswith(HDF5_MAGIC):
         from identify.records.recording import read_recording
 
+        if given:
+            raise BadRecord(
+                "columns are mapped, and a sealed recording has its own", place=str(path), mend="Leave --map out."
+            )
         return read_recording(content, path, pulse_rate_hz)
     from identify.records.csv import read_csv
 
-    return read_csv(content, path, pulse_rate_hz)
+    return read_csv(content, path, pulse_rate_hz, given)
