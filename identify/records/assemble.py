@@ -89,6 +89,20 @@ def optional(columns: Columns) -> dict[str, Any]:
     return {name: columns[name] for name in OPTIONAL if name in columns}
 
 
+def check_numbers(columns: Columns, at: Callable[[int, str], str]) -> None:
+    """Refuse numbers that no measurement gives; NaN is none, and may be.
+
+    Raises
+    ------
+    BadRecord
+        Infinite, or beyond what is measured.
+    """
+    for name, column in columns.items():
+        if (bad := np.flatnonzero(~(np.abs(column) <= bounds.largest(name)) & ~np.isnan(column))).size:
+            mend = "Cut the record before it; values must be finite."
+            raise BadRecord(f"{column[bad[0]]:g} is no measurement", place=at(int(bad[0]), name), mend=mend)
+
+
 def without_holes(found: Found) -> Found:
     """Without the rows in which a number is missing: they are gaps like any other.
 

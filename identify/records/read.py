@@ -1,4 +1,4 @@
-"""Records from files: CSV, or a sealed recording (HDF5, docs/recording.md)."""
+"""Records from files: tables of text (CSV), MAT files, or a sealed recording (HDF5); see docs/recording.md."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 
 from identify.errors import BadRecord
 from identify.records import bounds, columns
+from identify.records.mat_file import is_mat
 from identify.records.record import Record
 
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
@@ -21,7 +22,8 @@ def read(
     ----------
     path : str or Path
         CSV with the header `time_s,pulse_width_us,torque_nm,segment` (and optionally `angle_rad`, `velocity_rad_s`,
-        `late_s`, `doubted`, and the columns of a joined record), or a sealed recording.
+        `late_s`, `doubted`, and the columns of a joined record), a table or MAT file of another tool, or a sealed
+        recording.
     pulse_rate_hz : float, optional
         Pulses a second; by default what the recording says, else 40.
     map : mapping or sequence of str, optional
@@ -42,10 +44,12 @@ def read(
         from identify.records.recording import read_recording
 
         if given:
-            raise BadRecord(
-                "columns are mapped, and a sealed recording has its own", place=str(path), mend="Leave --map out."
-            )
+            raise BadRecord("a sealed recording has its own columns", place=str(path), mend="Leave --map out.")
         return read_recording(content, path, pulse_rate_hz)
+    if is_mat(content) or path.suffix.lower() == ".mat":
+        from identify.records.mat import read_mat
+
+        return read_mat(content, path, pulse_rate_hz, given)
     from identify.records.csv import read_csv
 
     return read_csv(content, path, pulse_rate_hz, given)

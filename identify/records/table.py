@@ -10,14 +10,11 @@ import numpy as np
 
 from identify.errors import BadRecord
 from identify.records import bounds
-from identify.records.bounds import LARGEST
 from identify.records.columns import Column
 from identify.records.text import Row, is_number
 
 BLOCK = 4096
 CUT = "Every row needs every column; was the file cut off?"
-LARGEST_CALENDAR_S = 1e11
-"""Times may be counted from 1970, or from 1904."""
 MISSING = {"", "nan", "na", "n/a", "#n/a", "null", "none", "-", "--"}
 """What tools write where they have no number."""
 
@@ -114,8 +111,7 @@ class Table:
                 self._number(cell, column, line)
         if found.factor != 1.0:
             values *= found.factor
-        largest = LARGEST_CALENDAR_S if column == "time_s" else LARGEST[column]
-        bad = np.flatnonzero(~(np.abs(values) <= largest) & ~np.isnan(values))
+        bad = np.flatnonzero(~(np.abs(values) <= bounds.largest(column)) & ~np.isnan(values))
         if bad.size:
             raise BadRecord(
                 f"{_shown(cells[bad[0]].strip())} is no measurement",
