@@ -10,6 +10,7 @@ import numpy as np
 
 from identify.errors import BadRecord
 from identify.records import bounds, clock, segments
+from identify.records.columns import MAY_LACK
 from identify.records.record import OPTIONAL, Record, Source
 
 LEAST_LARGEST_US = 1.0
@@ -90,7 +91,7 @@ def optional(columns: Columns) -> dict[str, Any]:
 
 
 def check_numbers(columns: Columns, at: Callable[[int, str], str]) -> None:
-    """Refuse numbers that no measurement gives; NaN is none, and may be.
+    """Refuse numbers that no measurement gives; NaN stands where there is none, in the columns that may lack one.
 
     Raises
     ------
@@ -98,7 +99,8 @@ def check_numbers(columns: Columns, at: Callable[[int, str], str]) -> None:
         Infinite, or beyond what is measured.
     """
     for name, column in columns.items():
-        if (bad := np.flatnonzero(~(np.abs(column) <= bounds.largest(name)) & ~np.isnan(column))).size:
+        missing = np.isnan(column) if name in MAY_LACK else False
+        if (bad := np.flatnonzero(~(np.abs(column) <= bounds.largest(name)) & ~np.asarray(missing))).size:
             mend = "Cut the record before it; values must be finite."
             raise BadRecord(f"{column[bad[0]]:g} is no measurement", place=at(int(bad[0]), name), mend=mend)
 

@@ -14,6 +14,8 @@ from identify.records import units
 from identify.records.record import OPTIONAL
 
 NEEDED = ("time_s", "pulse_width_us", "torque_nm")
+MAY_LACK = (*NEEDED, "angle_rad", "velocity_rad_s")
+"""Columns in which a number may be missing: a row without one is left out."""
 TARGETS = (*NEEDED, "segment", *OPTIONAL)
 NAMES = {
     "time_s": "time t timestamp elapsed_time zeit temps tiempo tempo",

@@ -10,7 +10,7 @@ import numpy as np
 
 from identify.errors import BadRecord
 from identify.records import bounds
-from identify.records.columns import Column
+from identify.records.columns import MAY_LACK, Column
 from identify.records.text import Row, is_number
 
 BLOCK = 4096
@@ -111,10 +111,12 @@ class Table:
                 self._number(cell, column, line)
         if found.factor != 1.0:
             values *= found.factor
-        bad = np.flatnonzero(~(np.abs(values) <= bounds.largest(column)) & ~np.isnan(values))
+        missing = np.isnan(values) if column in MAY_LACK else False
+        bad = np.flatnonzero(~(np.abs(values) <= bounds.largest(column)) & ~np.asarray(missing))
         if bad.size:
+            shown = _shown(cells[bad[0]].strip())
             raise BadRecord(
-                f"{_shown(cells[bad[0]].strip())} is no measurement",
+                f"{shown} is no measurement" if shown else "empty",
                 place=self.at(lines[bad[0]], column),
                 mend="Remove the row's cause, or cut the record before it; values must be finite.",
             )

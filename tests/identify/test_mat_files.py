@@ -43,7 +43,12 @@ def saved(path: Path, content: dict[str, Any], **how: Any) -> Path:
 
 def ways(record: Record) -> dict[str, tuple[dict[str, Any], dict[str, str] | None, dict[str, Any]]]:
     plain = columns(record)
-    with_more = plain | {"comment": "a Monday", "raw": np.ones((3, 4, 5)), "z": 1j, "many": np.full((2, 2), 1.0, object)}
+    with_more = plain | {
+        "comment": "a Monday",
+        "raw": np.ones((3, 4, 5)),
+        "z": 1j,
+        "many": np.full((2, 2), 1.0, object),
+    }
     own = {"t": record.time_s * 1e3, "pw": record.pulse_width_us * 1e-6, "M": record.torque_nm * 1e3}
     rows = np.array(plain["segment"], "U")
     return {
