@@ -22,10 +22,11 @@ from api.workers import confinement
 from api.workers.pool import WORKER, Pool
 from api.workers.process import Places
 from api.workers.verbs import find_recording
-from bench import hostile_files, hostile_shapes
+from bench import hostile_files
 from tests.api.conftest import STUB, Service, run_service
 from tests.api.test_problems import problem
 from tests.api.test_worker import made_up_csv, with_pool
+from tests.harness import hostile_shapes
 
 SECRET = "the-administrators-token"
 ROOT = Path(__file__).parents[2]
