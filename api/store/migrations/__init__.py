@@ -1,6 +1,6 @@
 """From an older database to today's by Alembic's revisions, in one transaction. A newer database is left alone.
 
-Each change of a table is one file in `versions`; docs/decisions/0008-alembic.md says how to add one. Databases from
+Each change of a table is one file in `versions`; docs/decisions/0009-alembic.md says how to add one. Databases from
 before Alembic kept a number in the table `schema_version`: they are taken over at the revision of that number.
 """
 
