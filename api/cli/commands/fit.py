@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from api.cli.terminal import Data, Json, model_report, names, progress_line, say, say_json, write
+from api.cli.terminal import Data, Json, model_report, names, say, say_json, write
+from api.progress_bar import progress_bar
 
 
 def register(app: typer.Typer) -> None:
@@ -41,9 +42,10 @@ def fit(
     import identify
 
     record = identify.read(data)
-    model = identify.fit(
-        record, method=method, effects=names(effects), fit_on=names(fit_on) or None, progress=progress_line()
-    )
+    with progress_bar() as progress:
+        model = identify.fit(
+            record, method=method, effects=names(effects), fit_on=names(fit_on) or None, progress=progress
+        )
     if output is not None:
         write(output, model.to_json())
     if as_json:

@@ -10,7 +10,8 @@ from typing import Annotated, Any
 import typer
 
 from api.cli.commands.diagnose import VERDICTS
-from api.cli.terminal import Data, HeldModel, Json, load_held, number, progress_line, say, say_json, table, write
+from api.cli.terminal import Data, HeldModel, Json, load_held, number, say, say_json, table, write
+from api.progress_bar import progress_bar
 from api.structure import in_words
 
 FEW = 3
@@ -36,9 +37,8 @@ def improve(
     import identify
 
     record, model, structure = load_held(model_json, data)
-    progress = progress_line()
-    improved = identify.improve(record, progress=progress, model=model)
-    progress(1.0, "done")
+    with progress_bar() as progress:
+        improved = identify.improve(record, progress=progress, model=model)
     found, models = {"structure": structure, **improved.to_dict()}, improved.models
     del found["models"]
     if output is not None:
@@ -64,7 +64,8 @@ def report(record: Any, found: dict[str, Any], models: Sequence[Any], data: Path
     before, after = (thinned(identify.compare(model, record).to_dict()) for model in (models[0], models[-1]))
     labels = [str(record.segment_names[index]) for index in record.segment]
     segments = runs(labels, np.asarray(record.time_s))
-    missing = diagnosis(str(data), progress_line(), None if held is None else held.to_json())
+    with progress_bar() as progress:
+        missing = diagnosis(str(data), progress, None if held is None else held.to_json())
     return improvement_html(found, data.name, missing, before, after, segments)
 
 
