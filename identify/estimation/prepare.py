@@ -234,7 +234,7 @@ def refuse_stillness(grid: Grid) -> None:
         raise NotIdentifiable("the torque never changes", mend="Check the load cell and the electrodes.")
 
 
-def plain(grid: Grid, rows: np.ndarray) -> Fitted:
+def fit_plain(grid: Grid, rows: np.ndarray) -> Fitted:
     """The plain structure fitted, and with it the set-up that all candidates of a record share.
 
     Knots and stiffness are chosen for the plain structure, then never again.
@@ -250,7 +250,7 @@ def to_fitted(solution: Solution, most: int = 20) -> Fitted:
     values = np.zeros(problem.size)
     values[:3] = linear.time_constant_s, linear.damping, linear.delay_s
     parts = setup.begins.size
-    values[list(problem.baselines)] = setup.framed(solution.coefficients[size : size + parts])
+    values[list(problem.baselines)] = setup.to_muscle(solution.coefficients[size : size + parts])
     values[list(problem.initials)] = setup.sign * solution.coefficients[size + parts :]
     values[problem.coefficients] = setup.sign * solution.coefficients[:size]
     noise = NoiseLevel(max(solution.ar1, 0.0), 0.5, float(np.sqrt(solution.variance)))

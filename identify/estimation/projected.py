@@ -19,7 +19,7 @@ from identify.dynamics.mean_weights import read_means
 from identify.dynamics.pulse_grid import Grid
 from identify.dynamics.second_order import Core, step_matrix
 from identify.errors import NotIdentifiable
-from identify.noise.ar1 import noise_evidence, whiten
+from identify.noise.ar1 import ar1_or_white, whiten
 from identify.recruitment.curve import Basis
 from identify.recruitment.knots import (
     KNOTS,
@@ -489,12 +489,12 @@ def estimate(
     quiet = 0.0 < grid.noise_sd_nm < QUIET * float(np.ptp(grid.torque_nm[rows]))
     problem, start = designed(first, QUIET_KNOTS if knots is None and quiet else knots)
     solution = search(problem, start)
-    ar1, delta_bic = noise_evidence(solution.residual_nm, problem.stretches)
+    ar1, delta_bic = ar1_or_white(solution.residual_nm, problem.stretches)
     if delta_bic > 0 and knots is None and problem.basis.size < KNOTS:
         # Structure may be a bend that few knots can't follow: look again with all before calling it noise.
         problem, start = designed(first, KNOTS)
         solution = search(problem, start)
-        ar1, delta_bic = noise_evidence(solution.residual_nm, problem.stretches)
+        ar1, delta_bic = ar1_or_white(solution.residual_nm, problem.stretches)
     # What is left of a record without noise is rounding and the spline's own error: not worth a noise model.
     still = solution.variance < (ROUNDING * float(np.ptp(problem.target[rows]))) ** 2
     for _ in range(0 if still else 3):
@@ -502,7 +502,7 @@ def estimate(
             break
         solution = search(problem, solution.linear, ar1=ar1)
         before = ar1
-        ar1, delta_bic = noise_evidence(solution.residual_nm, problem.stretches)
+        ar1, delta_bic = ar1_or_white(solution.residual_nm, problem.stretches)
         if abs(ar1 - before) < 0.01:
             break
     return solution, delta_bic

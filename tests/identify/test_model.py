@@ -11,7 +11,7 @@ from scipy.signal import lfilter
 
 import identify
 from identify.dynamics.linear import Discrete, SecondOrder
-from identify.estimation.quality import check
+from identify.estimation.quality import range_warnings
 from identify.records.record import Record
 from identify.recruitment.curve import Curve
 from identify.recruitment.power import PowerBasis
@@ -136,14 +136,14 @@ def test_bases_of_the_spline_span_equation_8():
 
 def test_warns_and_refuses_outside_what_it_holds_for(case):
     record, model = case
-    assert check(model, record) == []
+    assert range_warnings(model, record) == []
     wider = replace(record, pulse_width_us=record.pulse_width_us * 1.5)
-    assert any("above the largest fitted" in warning for warning in check(model, wider))
+    assert any("above the largest fitted" in warning for warning in range_warnings(model, wider))
     assert "above the largest fitted" in identify.compare(model, wider).plain[-1]
     with pytest.raises(identify.BadModel, match="pulses a second"):
         identify.predict(model, replace(record, pulse_rate_hz=20.0))
     slightly = replace(record, pulse_rate_hz=44.0)
-    assert any("fit again" in warning for warning in check(model, slightly))
+    assert any("fit again" in warning for warning in range_warnings(model, slightly))
 
 
 def test_predicts_at_the_records_own_rate(case):

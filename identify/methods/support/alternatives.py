@@ -17,7 +17,7 @@ HIGHEST_POWER = 9
 
 
 def power_series(first: Solution, order: int | None = None) -> tuple[Solution, str]:
-    """Joint estimate with the power series (6), of given order or of least BIC, and why."""
+    """Joint estimate with the power series (6), of given order or of smallest BIC, and the reason."""
     old = first.problem
     largest = float(np.max(old.grid.pulse_width_us))
     found: dict[int, tuple[float, Solution]] = {}
@@ -31,7 +31,7 @@ def power_series(first: Solution, order: int | None = None) -> tuple[Solution, s
         found[power] = (-2 * likelihood + power * np.log(rows), solution)
         linear = solution.linear
     best = min(found, key=lambda power: found[power][0])
-    return found[best][1], f"power series of order {best}" + ("" if order else ": least BIC")
+    return found[best][1], f"power series of order {best}" + ("" if order else ", by BIC")
 
 
 def sigmoid(first: Solution) -> Solution:
@@ -71,10 +71,10 @@ def sigmoid(first: Solution) -> Solution:
 
 
 def monotone(solution: Solution) -> Solution:
-    """The solution with a recruitment curve that never falls (or never rises, where stimulation pulls the other way).
+    """The solution with a recruitment curve that never falls (or never rises, if stimulation lowers the torque).
 
-    A B-spline curve rises where its coefficients do: the coefficients are sums of steps of one sign, found by
-    non-negative least squares of the same penalised problem, at the same dynamics.
+    A B-spline curve rises if its coefficients rise. The coefficients are sums of steps of one sign, found by
+    non-negative least squares for the same penalised problem and the same dynamics.
     """
     from scipy.optimize import nnls
 
