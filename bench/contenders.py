@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import BSpline
 from scipy.optimize import least_squares
-from scipy.signal import cont2discrete, lfilter
 
 import identify
 from identify.records.record import Record
+from tests.harness.patients import second_order, sigmoid
 
 PULSE_RATE_HZ = 40.0
 SPLINES = 8
@@ -69,10 +69,8 @@ def oracle(task: Task) -> Callable[[], np.ndarray]:
 
     def simulate(x: np.ndarray) -> np.ndarray:
         gain, steep, middle, period, damping = x
-        decay = np.exp(-steep * width)
-        drive = gain * (1 - decay) / (1 + np.exp(min(steep * middle, 600.0)) * decay)
-        b, a = cont2discrete(([1.0], [period**2, 2 * damping * period, 1.0]), 1 / rate, method="zoh")[:2]
-        return lfilter(np.ravel(b), np.ravel(a), drive)
+        drive = sigmoid(width, gain, steep, np.exp(min(steep * middle, 600.0)))
+        return second_order(drive, period, damping, rate)
 
     measured = task.record.torque_nm[: task.fitted]
     start = np.array([6.9 * 1.2, 0.041 * 0.8, 190.0 * 1.1, 0.5284 * 0.8, 0.6369 * 1.2])

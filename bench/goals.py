@@ -13,7 +13,6 @@ import tempfile
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,62 +25,13 @@ from identify.estimation.uncertainty import prediction_band
 from identify.paper import muscle
 from identify.paper.table1 import simulate
 from identify.records.record import Record
+from tests.harness.patients import Patient, make_record
 
 TARGET = Path(__file__).parent.parent / "docs" / "identification.md"
 ACCURACY_SEEDS = range(710_000, 710_040)
 PATIENT_SEEDS = range(720_000, 720_300)
 CALIBRATION_SEEDS = range(730_000, 730_300)
 NOISE_NM = (0.0, 0.02, 0.04, 0.06, 0.08, 0.10)
-
-
-@dataclass(frozen=True)
-class Patient:
-    """A simulated patient: sigmoid, second order, delay."""
-
-    gain_nm: float
-    rise_us: float
-    middle_us: float
-    time_constant_s: float
-    damping: float
-    delay_s: float
-
-    @classmethod
-    def draw(cls, rng: np.random.Generator) -> Patient:
-        """Gain, slope (10 to 90 % within 10 to 150 µs), threshold, Tω 0.1-0.6 s, ζ 0.6-1.2, delay 0-60 ms.
-
-        A delay beyond a sample is an effect: the fit then holds `electromechanical_delay`.
-        """
-        return cls(
-            gain_nm=float(rng.uniform(1.5, 15.0)),
-            rise_us=float(np.exp(rng.uniform(np.log(10.0), np.log(150.0)))),
-            middle_us=float(rng.uniform(40.0, 200.0)),
-            time_constant_s=float(rng.uniform(0.1, 0.6)),
-            damping=float(rng.uniform(0.6, 1.2)),
-            delay_s=float(rng.uniform(0.0, 0.06)),
-        )
-
-    def recruitment(self, width_us: np.ndarray) -> np.ndarray:
-        steep = 4.4 / self.rise_us
-        decay = np.exp(-steep * np.asarray(width_us, float))
-        return self.gain_nm * (1 - decay) / (1 + np.exp(min(steep * self.middle_us, 600.0)) * decay)
-
-    def record(self, rng: np.random.Generator, rate_hz: float, noise_nm: float) -> tuple[Record, np.ndarray]:
-        """A record of this patient, simulated at 8 kHz, and its clean torque."""
-        from scipy.signal import cont2discrete, lfilter
-
-        widths, names = muscle.protocol()
-        fine = 8000
-        drive = np.repeat(self.recruitment(widths), fine // 40)
-        late = round(self.delay_s * fine)
-        drive = np.r_[np.zeros(late), drive][: drive.size]
-        transfer = ([1.0], [self.time_constant_s**2, 2 * self.damping * self.time_constant_s, 1.0])
-        b, a = cont2discrete(transfer, 1 / fine, method="zoh")[:2]
-        size = round(widths.size / 40 * rate_hz)
-        at = np.round(np.arange(size) * fine / rate_hz).astype(int)
-        clean = lfilter(np.ravel(b), np.ravel(a), drive)[at] + rng.uniform(-1, 1)
-        slot = np.minimum((np.arange(size) * 40 / rate_hz + 1e-9).astype(int), widths.size - 1)
-        noise = noise_nm * rng.standard_normal(size)
-        return Record.from_arrays(np.arange(size) / rate_hz, widths[slot], clean + noise, np.array(names)[slot]), clean
 
 
 DELAY = "electromechanical_delay"
@@ -91,6 +41,14 @@ def fitted(record: Record, patient: Patient, extra: bool = False) -> identify.Mo
     """The structure that holds the patient: with a delay where it is longer than a sample, and always if `extra`."""
     longer = patient.delay_s > 1.0 / record.sample_rate_hz
     return identify.fit(record, effects=[f"{DELAY}:delay"] if longer or extra else [])
+
+
+def record_of(patient: Patient, rng: np.random.Generator, rate_hz: float, noise_nm: float) -> tuple[Record, np.ndarray]:
+    """A record of this patient in the paper's test, with a baseline, and its clean torque."""
+    baseline_nm = float(rng.uniform(-1, 1))
+    return make_record(
+        patient, rng, rate_hz=rate_hz, noise_nm=noise_nm, baseline_nm=baseline_nm, pulses=muscle.protocol()
+    )
 
 
 def delay_of(model: identify.Model) -> tuple[float, float]:
@@ -168,7 +126,7 @@ def one_patient(seed: int) -> dict[str, Any]:
     rng = np.random.default_rng(seed)
     patient = Patient.draw(rng)
     rate, noise = float(rng.choice([40, 100, 400, 1000, 1600])), float(rng.choice([0.01, 0.03, 0.1]))
-    record, clean = patient.record(rng, rate, noise)
+    record, clean = record_of(patient, rng, rate, noise)
     try:
         model = fitted(record, patient)
     except identify.IdentifyError as error:
@@ -215,7 +173,7 @@ def one_calibration(seed: int) -> dict[str, float]:
     """Shares of the 95 % bands of one record that cover the truth."""
     rng = np.random.default_rng(seed)
     patient = Patient.draw(rng)
-    record, clean = patient.record(rng, 400.0, 0.05)
+    record, clean = record_of(patient, rng, 400.0, 0.05)
     model = fitted(record, patient)
     assert model.covariance is not None
     late_s = (

@@ -1,8 +1,8 @@
 """`python -m bench.hostile_files [--count N] [--seed S] [--json]`: files as weapons, through the service's own workers.
 
-Each file (`bench/hostile_shapes.py`) goes the way of an upload: a worker fits it, shut in as in the service. A model
-goes the way of a comparison. Printed: how many were tried, refused in one clear line, taken as sound, and how many
-ended in a crash or an error that nobody foresaw (none is wanted); the workers' peak memory and the longest time.
+Each file (`tests/harness/hostile_shapes.py`) goes the way of an upload: a worker fits it, confined as in the service.
+A model goes the way of a comparison. Printed: how many were tried, refused in one clear line, taken as sound, and how
+many ended in a crash or an error that nobody expected (none is wanted); the workers' peak memory and the longest time.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from typing import Any
 from api.errors import ApiError
 from api.fitting import Fitting
 from api.worker_process import Places
-from bench.hostile_shapes import SECRET, Hostile, all_files, good
+from tests.harness.hostile_shapes import SECRET, Hostile, all_files, good
 
 LONGEST_LINE = 400
 

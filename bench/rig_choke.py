@@ -28,7 +28,7 @@ import numpy as np
 from api.launcher import Services
 from api.settings import Settings
 from rig.messages import stop_socket
-from tests.wire.processes import RigClient, control
+from tests.harness.processes import RigClient, control
 
 TOKEN = "administrator-token-of-the-bench"
 HOLD = [

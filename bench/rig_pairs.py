@@ -11,8 +11,8 @@ import sys
 import tempfile
 from pathlib import Path
 
-from tests.wire.behaviour import CELLS, STIMULATORS, TRANSPORTS, check_all, options
-from tests.wire.processes import Bench
+from tests.harness.device_pairs import CELLS, STIMULATORS, TRANSPORTS, check_all, options
+from tests.harness.processes import Bench
 
 
 def main() -> None:

@@ -1,6 +1,6 @@
-"""The control line for tests: a Unix socket, one JSON object a line each way. No part of the rig.
+"""The control line for tests: a Unix socket with one JSON object per line each way. It is no part of the rig.
 
-`{"cmd": "state"}`, `{"cmd": "pulses", "since": 0}`, `{"cmd": "faults"}` (what there is),
+Commands: `{"cmd": "state"}`, `{"cmd": "pulses", "since": 0}`, `{"cmd": "faults"}` (lists them),
 `{"cmd": "fault", "name": …, "on": true, "for_s": …, <settings>}`. Answers carry `"ok"`; if it is false, `"error"`.
 """
 
@@ -10,22 +10,39 @@ import json
 import math
 import socket
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
+from hardware_sim.electrodes import Electrodes
 from hardware_sim.errors import FaultError, HardwareSimError
+from hardware_sim.faults.registry import Faults
 from hardware_sim.reactor import Reactor
-
-if TYPE_CHECKING:
-    from hardware_sim.emulator import Emulator
+from hardware_sim.timeline import Timeline, WallClock
 
 LONGEST_LINE = 65536
 SEND_TIMEOUT_S = 1.0
 
 
+class Controlled(Protocol):
+    """What the control line reads and changes."""
+
+    electrodes: Electrodes
+    faults: Faults
+    timeline: Timeline
+    clock: WallClock
+
+    def catch_up(self) -> None:
+        """Simulate everything up to the present."""
+        ...
+
+    def state(self) -> dict[str, Any]:
+        """The present state, as plain values."""
+        ...
+
+
 class Control:
     """Answers any number of clients, in the emulator's own thread."""
 
-    def __init__(self, reactor: Reactor, path: Path, emulator: Emulator) -> None:
+    def __init__(self, reactor: Reactor, path: Path, emulator: Controlled) -> None:
         self.path = path
         self._reactor, self._emulator = reactor, emulator
         self._clients: dict[socket.socket, bytes] = {}
@@ -42,7 +59,7 @@ class Control:
         }
 
     def close(self) -> None:
-        """Hang up."""
+        """Close the socket and every connection."""
         for client in list(self._clients):
             self._drop(client)
         self._reactor.remove(self._listener)
@@ -109,7 +126,7 @@ class Control:
             self._clients[client] = rest[-LONGEST_LINE:]
             for line in lines:
                 client.sendall(json.dumps(self.answer(line)).encode() + b"\n")
-        except OSError:  # gone, or does not read: it cannot be allowed to hold the rig's time
+        except OSError:  # the client has gone or does not read; it must not block the emulator
             data = b""
         if not data:
             self._drop(client)

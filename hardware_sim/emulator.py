@@ -24,7 +24,7 @@ from hardware_sim.pseudo_terminal import PseudoTerminal
 from hardware_sim.reactor import Reactor
 from hardware_sim.scan import pick
 from hardware_sim.settings import Settings
-from hardware_sim.stimulators.board import Board
+from hardware_sim.stimulators.board import Board, FirmwareProtocol
 from hardware_sim.timeline import Timeline, WallClock
 
 TICK_S = 0.0025
@@ -61,7 +61,7 @@ class Emulator:
         self.timeline.followers.append(self.load_cell.produce)
         self.electrodes = Electrodes(muscle, self.load_cell.raise_sync)
         self.board = Board(self.timeline, self.electrodes, self._write, lambda: self.port.unread_bytes())
-        self.firmware = pick(stimulators, "Firmware", settings.stimulator, "stimulator")(self.board)
+        self.firmware: FirmwareProtocol = pick(stimulators, "Firmware", settings.stimulator, "stimulator")(self.board)
         self.faults = Faults(self)
         self._received = cell.received
         self._transport_class = pick(transports, "Transport", settings.transport, "transport")

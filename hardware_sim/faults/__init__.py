@@ -1,1 +1,1 @@
-"""What breaks, when: a fault is one function marked `@fault` in any file of this folder, found by scanning."""
+"""Faults that a test can switch on: a fault is one function marked `@fault` in any file of this folder."""

@@ -1,87 +1,78 @@
-"""What breaks on the load cell's side."""
+"""Faults of the load cell, its adapter and the CAN bus."""
 
 from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterable
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterable
 
 from hardware_sim.errors import FaultError
 from hardware_sim.faults.registry import Undo, fault, hooked
+from hardware_sim.faults.target import Target
 from hardware_sim.load_cells.frames import Frame
 
-if TYPE_CHECKING:
-    from hardware_sim.emulator import Emulator
-
 BUS_OFF_CLASS, BUS_ERROR_CLASS = 0x20000040, 0x20000080
-"""Error frames' ids as Linux reports them: flag of error frames and class."""
+"""Ids of error frames as Linux reports them: the flag of error frames and the class."""
 
 
 @fault
-def cell_silent(emulator: Emulator) -> Undo:
+def cell_silent(target: Target) -> Undo:
     """No frame comes any more; the connection stays."""
-    return hooked(emulator.load_cell.frame_hooks, lambda _frame: ())
+    return hooked(target.load_cell.frame_hooks, lambda _frame: ())
 
 
 @fault
-def cell_unplugged(emulator: Emulator) -> Undo:
-    """The adapter is pulled; undone, it is back under another port, and clients must connect anew."""
-    emulator.unplug_cell()
-    return emulator.plug_cell
+def cell_unplugged(target: Target) -> Undo:
+    """The adapter is pulled. When undone, it is back under another port, and clients must connect again."""
+    target.unplug_cell()
+    return target.plug_cell
 
 
 @fault
-def frames_dropped(emulator: Emulator, probability: float = 0.1) -> Undo:
+def frames_dropped(target: Target, probability: float = 0.1) -> Undo:
     """Frames are lost at random."""
-    return hooked(
-        emulator.load_cell.frame_hooks,
-        lambda frame: () if emulator.random.random() < probability else (frame,),
-    )
+    return _frame_fault(target, probability, lambda _frame: ())
 
 
 @fault
-def frames_duplicated(emulator: Emulator, probability: float = 0.1) -> Undo:
+def frames_duplicated(target: Target, probability: float = 0.1) -> Undo:
     """Frames come twice at random."""
-    return hooked(
-        emulator.load_cell.frame_hooks,
-        lambda frame: (frame, frame) if emulator.random.random() < probability else (frame,),
-    )
+    return _frame_fault(target, probability, lambda frame: (frame, frame))
 
 
 @fault
-def frames_out_of_order(emulator: Emulator, probability: float = 0.1) -> Undo:
+def frames_out_of_order(target: Target, probability: float = 0.1) -> Undo:
     """At random a frame comes after the one that follows it."""
-    kept: list[Frame] = []
+    held: list[Frame] = []
 
     def swap(frame: Frame) -> Iterable[Frame]:
-        if kept:
-            return (frame, kept.pop())
-        if emulator.random.random() < probability:
-            kept.append(frame)
+        if held:
+            return (frame, held.pop())
+        if target.random.random() < probability:
+            held.append(frame)
             return ()
         return (frame,)
 
-    return hooked(emulator.load_cell.frame_hooks, swap)
+    return hooked(target.load_cell.frame_hooks, swap)
 
 
 @fault
-def frames_corrupt(emulator: Emulator, probability: float = 0.1) -> Undo:
-    """One bit of a frame's data is another, at random: an adapter's fault, since CAN's CRC would catch it."""
+def frames_corrupt(target: Target, probability: float = 0.1) -> Undo:
+    """One bit of a frame's data flips at random: a fault of the adapter, since CAN's CRC would catch it."""
 
     def flip(frame: Frame) -> Iterable[Frame]:
-        if frame.error or not frame.data or emulator.random.random() >= probability:
+        if frame.error or not frame.data or target.random.random() >= probability:
             return (frame,)
         data = bytearray(frame.data)
-        data[emulator.random.randrange(len(data))] ^= 1 << emulator.random.randrange(8)
+        data[target.random.randrange(len(data))] ^= 1 << target.random.randrange(8)
         return (frame._replace(data=bytes(data)),)
 
-    return hooked(emulator.load_cell.frame_hooks, flip)
+    return hooked(target.load_cell.frame_hooks, flip)
 
 
 @fault
-def torque_stuck(emulator: Emulator) -> Undo:
-    """The value stays at what it was, noise and all; the counter goes on."""
+def torque_stuck(target: Target) -> Undo:
+    """The reading stays at its present value, without noise; the counter goes on."""
     first: list[float] = []
 
     def hold(torque_nm: float) -> float:
@@ -89,103 +80,111 @@ def torque_stuck(emulator: Emulator) -> Undo:
             first.append(torque_nm)
         return first[0]
 
-    return hooked(emulator.load_cell.torque_hooks, hold)
+    return hooked(target.load_cell.torque_hooks, hold)
 
 
 @fault
-def torque_nan(emulator: Emulator, probability: float = 1.0) -> Undo:
-    """The value is not a number."""
+def torque_nan(target: Target, probability: float = 1.0) -> Undo:
+    """The reading is not a number."""
     return hooked(
-        emulator.load_cell.torque_hooks,
-        lambda torque_nm: math.nan if emulator.random.random() < probability else torque_nm,
+        target.load_cell.torque_hooks,
+        lambda torque_nm: math.nan if target.random.random() < probability else torque_nm,
     )
 
 
 @fault
-def torque_sign_flipped(emulator: Emulator) -> Undo:
+def torque_sign_flipped(target: Target) -> Undo:
     """The cell is mounted the other way round."""
-    return hooked(emulator.load_cell.torque_hooks, lambda torque_nm: -torque_nm)
+    return hooked(target.load_cell.torque_hooks, lambda torque_nm: -torque_nm)
 
 
 @fault
-def torque_saturated(emulator: Emulator, limit_nm: float = 3.0) -> Undo:
-    """The amplifier stops at ± `limit_nm`."""
-    return hooked(emulator.load_cell.torque_hooks, lambda torque_nm: min(max(torque_nm, -limit_nm), limit_nm))
+def torque_saturated(target: Target, limit_nm: float = 3.0) -> Undo:
+    """The amplifier saturates at ± `limit_nm`."""
+    return hooked(target.load_cell.torque_hooks, lambda torque_nm: min(max(torque_nm, -limit_nm), limit_nm))
 
 
 @fault
-def torque_step(emulator: Emulator, step_nm: float = 40.0) -> Undo:
-    """The value jumps: a knock on the fixture, or a spasm above the limit."""
-    return hooked(emulator.load_cell.torque_hooks, lambda torque_nm: torque_nm + step_nm)
+def torque_step(target: Target, step_nm: float = 40.0) -> Undo:
+    """The reading jumps: a knock on the fixture, or a spasm above the limit."""
+    return hooked(target.load_cell.torque_hooks, lambda torque_nm: torque_nm + step_nm)
 
 
 @fault
-def bus_off(emulator: Emulator) -> Undo:
+def bus_off(target: Target) -> Undo:
     """The adapter reports bus-off once, then nothing comes."""
-    time_us = emulator.load_cell.time_us(emulator.timeline.now_s)
-    emulator.load_cell.add_frame(Frame(BUS_OFF_CLASS, bytes(8), time_us, error=True))
-    return hooked(emulator.load_cell.frame_hooks, lambda _frame: ())
+    time_us = target.load_cell.time_us(target.timeline.now_s)
+    target.load_cell.add_frame(Frame(BUS_OFF_CLASS, bytes(8), time_us, error=True))
+    return hooked(target.load_cell.frame_hooks, lambda _frame: ())
 
 
 @fault
-def error_frames(emulator: Emulator, probability: float = 0.1) -> Undo:
-    """Error frames between the others; nothing is lost."""
-
-    def add(frame: Frame) -> Iterable[Frame]:
-        if emulator.random.random() < probability:
-            return (frame, Frame(BUS_ERROR_CLASS, bytes(8), frame.time_us, error=True))
-        return (frame,)
-
-    return hooked(emulator.load_cell.frame_hooks, add)
+def error_frames(target: Target, probability: float = 0.1) -> Undo:
+    """Error frames come between the others; nothing is lost."""
+    return _frame_fault(
+        target, probability, lambda frame: (frame, Frame(BUS_ERROR_CLASS, bytes(8), frame.time_us, error=True))
+    )
 
 
 @fault
-def counter_jump(emulator: Emulator, step: int = 1000) -> Undo:
+def counter_jump(target: Target, step: int = 1000) -> Undo:
     """The counter jumps once; no sample is lost."""
-    emulator.load_cell.counter += int(step)
+    target.load_cell.counter += int(step)
     return lambda: None
 
 
 @fault
-def rate_off(emulator: Emulator, percent: float = 5.0) -> Undo:
-    """The cell samples faster (or slower, below zero) than it says."""
-    emulator.load_cell.set_rate_factor(1.0 + percent / 100.0)
-    return lambda: emulator.load_cell.set_rate_factor(1.0)
+def rate_off(target: Target, percent: float = 5.0) -> Undo:
+    """The cell samples faster than nominal, or slower if `percent` is negative."""
+    target.load_cell.set_rate_factor(1.0 + percent / 100.0)
+    return lambda: target.load_cell.set_rate_factor(1.0)
 
 
 @fault
-def clock_jitter(emulator: Emulator, sd_us: float = 100.0) -> Undo:
+def clock_jitter(target: Target, sd_us: float = 100.0) -> Undo:
     """Each sample is taken off its time at random, never by more than 0.45 of a period."""
-    if not 0 <= sd_us < math.inf:
-        raise FaultError(f"setting 'sd_us' of fault 'clock_jitter' must be a number from 0 on, not {sd_us:g}")
-    emulator.load_cell.set_jitter(sd_us * 1e-6)
-    return lambda: emulator.load_cell.set_jitter(emulator.settings.clock_jitter_us * 1e-6)
+    _check_not_negative("clock_jitter", "sd_us", sd_us)
+    before_s = target.load_cell.jitter_s
+    target.load_cell.set_jitter(sd_us * 1e-6)
+    return lambda: target.load_cell.set_jitter(before_s)
 
 
 @fault
-def delivery_jitter(emulator: Emulator, largest_s: float = 0.02) -> Undo:
-    """Frames come late by up to `largest_s` at random, in order and with their own stamps: a busy adapter."""
-    if not 0 <= largest_s < math.inf:
-        raise FaultError(f"setting 'largest_s' of fault 'delivery_jitter' must be from 0 on, not {largest_s:g}")
-    kept: deque[Frame] = deque()
+def delivery_jitter(target: Target, largest_s: float = 0.02) -> Undo:
+    """A busy adapter: frames come up to `largest_s` late at random, in order and with their own time stamps."""
+    _check_not_negative("delivery_jitter", "largest_s", largest_s)
+    waiting: deque[Frame] = deque()
     last_s = 0.0
 
     def release() -> None:
-        if kept:
-            emulator.load_cell.add_frame(kept.popleft())
+        if waiting:
+            target.load_cell.add_frame(waiting.popleft())
 
-    def keep_back(frame: Frame) -> Iterable[Frame]:
+    def delay(frame: Frame) -> Iterable[Frame]:
         nonlocal last_s
-        last_s = max(last_s, emulator.timeline.now_s + emulator.random.uniform(0.0, largest_s))
-        kept.append(frame)
-        emulator.timeline.at(last_s, release)
+        last_s = max(last_s, target.timeline.now_s + target.random.uniform(0.0, largest_s))
+        waiting.append(frame)
+        target.timeline.at(last_s, release)
         return ()
 
-    unhook = hooked(emulator.load_cell.frame_hooks, keep_back)
+    unhook = hooked(target.load_cell.frame_hooks, delay)
 
     def undo() -> None:
         unhook()
-        while kept:  # else they would come after younger ones
+        while waiting:  # otherwise they would come after newer ones
             release()
 
     return undo
+
+
+def _frame_fault(target: Target, probability: float, change: Callable[[Frame], Iterable[Frame]]) -> Undo:
+    """Send `change(frame)` instead of a frame, with this probability."""
+    return hooked(
+        target.load_cell.frame_hooks,
+        lambda frame: change(frame) if target.random.random() < probability else (frame,),
+    )
+
+
+def _check_not_negative(fault_name: str, setting: str, value: float) -> None:
+    if not 0 <= value < math.inf:
+        raise FaultError(f"setting '{setting}' of fault '{fault_name}' must be a number from 0 on, not {value:g}")

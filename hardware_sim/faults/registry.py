@@ -1,7 +1,7 @@
 """Faults by name, switched on and off at any moment.
 
-A fault is a function marked `@fault`. It takes the emulator and, by keyword, its settings with their defaults;
-it makes the fault happen and returns what undoes it. Its name is the function's.
+A fault is a function marked `@fault`. It takes the target and, by keyword, its settings with their defaults.
+It makes the fault happen and returns a function that undoes it. The function's name is the fault's name.
 """
 
 from __future__ import annotations
@@ -10,13 +10,11 @@ import importlib
 import inspect
 import pkgutil
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 from hardware_sim import faults
 from hardware_sim.errors import FaultError
-
-if TYPE_CHECKING:
-    from hardware_sim.emulator import Emulator
+from hardware_sim.faults.target import Target
 
 Undo = Callable[[], None]
 Make = TypeVar("Make", bound=Callable[..., Undo])
@@ -25,29 +23,36 @@ _FAULTS: dict[str, Callable[..., Undo]] = {}
 
 
 def fault(make: Make) -> Make:
-    """Enter a fault into the library under its function's name."""
+    """Register a fault under its function's name."""
     _FAULTS[make.__name__] = make
     return make
 
 
 def library() -> dict[str, Callable[..., Undo]]:
-    """All faults there are, by name."""
+    """All faults, by name."""
     for entry in pkgutil.iter_modules(faults.__path__):
         importlib.import_module(f"{faults.__name__}.{entry.name}")
     return dict(sorted(_FAULTS.items()))
 
 
 def hooked(hooks: list[Hook], hook: Hook) -> Undo:
-    """Put `hook` among `hooks`; the result takes it out again."""
+    """Add `hook` to `hooks`; the result removes it."""
     hooks.append(hook)
     return lambda: hooks.remove(hook)
 
 
-class Faults:
-    """The faults of one emulator: which are on, and what undoes them."""
+def replaced(owner: object, attribute: str, value: object) -> Undo:
+    """Set an attribute of `owner`; the result sets it back."""
+    before = getattr(owner, attribute)
+    setattr(owner, attribute, value)
+    return lambda: setattr(owner, attribute, before)
 
-    def __init__(self, emulator: Emulator) -> None:
-        self._emulator = emulator
+
+class Faults:
+    """Which faults of one target are on, and what undoes them."""
+
+    def __init__(self, target: Target) -> None:
+        self._target = target
         self._library = library()
         self._on: dict[str, Undo] = {}
 
@@ -68,7 +73,7 @@ class Faults:
         Raises
         ------
         FaultError
-            No such fault, or no such setting, or a setting of another kind than its default.
+            No such fault, or no such setting, or a setting of another type than its default.
         """
         make = self._find(name)
         known = _settings(make)
@@ -80,13 +85,13 @@ class Faults:
                 raise FaultError(f"setting '{key}' of fault '{name}' must be like {known[key]!r}, not {value!r}")
         if name in self._on:
             self.off(name)
-        undo = make(self._emulator, **settings)
+        undo = make(self._target, **settings)
         self._on[name] = undo
         if for_s is not None:
-            self._emulator.timeline.after(for_s, lambda: self._end(name, undo))
+            self._target.timeline.after(for_s, lambda: self._end(name, undo))
 
     def off(self, name: str) -> None:
-        """Switch a fault off; nothing where it is off already.
+        """Switch a fault off; nothing happens if it is off already.
 
         Raises
         ------
@@ -99,7 +104,7 @@ class Faults:
             undo()
 
     def _end(self, name: str, undo: Undo) -> None:
-        if self._on.get(name) is undo:  # else it has been switched anew since
+        if self._on.get(name) is undo:  # otherwise it was switched on again in the meantime
             self.off(name)
 
     def _find(self, name: str) -> Callable[..., Undo]:

@@ -1,130 +1,107 @@
-"""What breaks on the stimulator's side."""
+"""Faults of the stimulator and its line."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from hardware_sim.faults.registry import Undo, fault, hooked
-
-if TYPE_CHECKING:
-    from hardware_sim.emulator import Emulator
+from hardware_sim.faults.registry import Undo, fault, hooked, replaced
+from hardware_sim.faults.target import Target
 
 HALF_A_FRAME = bytes.fromhex("f0815581")
 
 
 @fault
-def stimulator_unplugged(emulator: Emulator, mid_frame: bool = True) -> Undo:
-    """The cable is pulled, with half a frame on it; undone, the port is back under another name."""
+def stimulator_unplugged(target: Target, mid_frame: bool = True) -> Undo:
+    """The cable is pulled after half a frame was sent. When undone, the port is back under another name."""
     if mid_frame:
-        emulator.port.write(HALF_A_FRAME)
-    emulator.unplug_stimulator()
-    return emulator.plug_stimulator
+        target.board.write(HALF_A_FRAME)
+    target.unplug_stimulator()
+    return target.plug_stimulator
 
 
 @fault
-def no_ack(emulator: Emulator) -> Undo:
+def no_ack(target: Target) -> Undo:
     """The stimulator obeys but answers nothing."""
-    return hooked(emulator.board.outgoing, lambda _frame: None)
+    return hooked(target.board.outgoing, lambda _frame: None)
 
 
 @fault
-def late_ack(emulator: Emulator, delay_s: float = 0.2) -> Undo:
+def late_ack(target: Target, delay_s: float = 0.2) -> Undo:
     """The stimulator's answers come `delay_s` late."""
 
-    def keep_back(frame: bytes) -> None:
-        emulator.timeline.after(delay_s, lambda: emulator.board.write(frame))
+    def delay(frame: bytes) -> None:
+        target.timeline.after(delay_s, lambda: target.board.write(frame))
 
-    return hooked(emulator.board.outgoing, keep_back)
+    return hooked(target.board.outgoing, delay)
 
 
 @fault
-def line_stalled(emulator: Emulator, to_device: bool = True, to_host: bool = True) -> Undo:
-    """The line holds what it is given, in either direction or both, and lets all of it go at once when undone."""
+def line_stalled(target: Target, to_device: bool = True, to_host: bool = True) -> Undo:
+    """The line stores all bytes in one direction or both. When undone, it delivers all of them at once."""
     commands, answers = bytearray(), bytearray()
-
-    def hold(kept: bytearray, data: bytes) -> None:
-        kept.extend(data)
-
     undo = []
     if to_device:
-        undo.append(hooked(emulator.board.incoming, lambda data: hold(commands, data)))
+        undo.append(hooked(target.board.incoming, lambda data: commands.extend(data)))
     if to_host:
-        undo.append(hooked(emulator.board.outgoing, lambda data: hold(answers, data)))
+        undo.append(hooked(target.board.outgoing, lambda data: answers.extend(data)))
 
-    def let_go() -> None:
+    def deliver() -> None:
         for take_out in undo:
             take_out()
         if answers:
-            emulator.board.write(bytes(answers))
+            target.board.write(bytes(answers))
         if commands:
-            emulator.firmware.received(bytes(commands))
+            target.firmware.received(bytes(commands))
 
-    return let_go
+    return deliver
 
 
 @fault
-def frames_doubled(emulator: Emulator, probability: float = 1.0) -> Undo:
+def frames_doubled(target: Target, probability: float = 1.0) -> Undo:
     """What the host sends arrives twice, with this probability for each piece read."""
-    return hooked(emulator.board.incoming, lambda data: data * 2 if emulator.random.random() < probability else data)
+    return hooked(target.board.incoming, lambda data: data * 2 if target.random.random() < probability else data)
 
 
 @fault
-def corrupt_answers(emulator: Emulator, probability: float = 1.0) -> Undo:
-    """One byte of an answer is another, with this probability."""
-    return hooked(emulator.board.outgoing, lambda frame: _garble(emulator, frame, probability))
+def corrupt_answers(target: Target, probability: float = 1.0) -> Undo:
+    """One byte of an answer is changed, with this probability."""
+    return hooked(target.board.outgoing, lambda frame: _corrupted(target, frame, probability))
 
 
 @fault
-def corrupt_commands(emulator: Emulator, probability: float = 1.0) -> Undo:
-    """One byte of what the host sends is another, with this probability for each piece read."""
-    return hooked(emulator.board.incoming, lambda data: _garble(emulator, data, probability))
+def corrupt_commands(target: Target, probability: float = 1.0) -> Undo:
+    """One byte of what the host sends is changed, with this probability for each piece read."""
+    return hooked(target.board.incoming, lambda data: _corrupted(target, data, probability))
 
 
 @fault
-def electrode_error(emulator: Emulator) -> Undo:
+def electrode_error(target: Target) -> Undo:
     """An electrode has come off."""
-
-    def back() -> None:
-        emulator.electrodes.attached = True
-
-    emulator.electrodes.attached = False
-    return back
+    return replaced(target.board.electrodes, "attached", False)
 
 
 @fault
-def emergency_switch(emulator: Emulator) -> Undo:
-    """The emergency switch is pressed: a RehaStim 2 says so, a P24 sees open electrodes."""
-
-    def back() -> None:
-        emulator.electrodes.cut = False
-
-    emulator.electrodes.cut = True
-    return back
+def emergency_switch(target: Target) -> Undo:
+    """The emergency switch is pressed: a RehaStim 2 reports it, a P24 sees open electrodes."""
+    return replaced(target.board.electrodes, "cut", True)
 
 
 @fault
-def high_voltage_error(emulator: Emulator) -> Undo:
-    """The high-voltage source fails; of a RehaStim 2, the stimulation module."""
-
-    def back() -> None:
-        emulator.board.high_voltage_works = True
-
-    emulator.board.high_voltage_works = False
-    return back
+def high_voltage_error(target: Target) -> Undo:
+    """The high-voltage source fails; in a RehaStim 2, the stimulation module."""
+    return replaced(target.board, "high_voltage_works", False)
 
 
 @fault
-def device_reset(emulator: Emulator, mid_frame: bool = False) -> Undo:
-    """The stimulator starts anew, once, with its port staying; nothing is initialised any more."""
+def device_reset(target: Target, mid_frame: bool = False) -> Undo:
+    """The stimulator restarts once. Its port stays, and nothing is initialised any more."""
     if mid_frame:
-        emulator.board.write(HALF_A_FRAME)
-    emulator.firmware.reset()
+        target.board.write(HALF_A_FRAME)
+    target.firmware.reset()
     return lambda: None
 
 
-def _garble(emulator: Emulator, data: bytes, probability: float) -> bytes:
-    if not data or emulator.random.random() >= probability:
+def _corrupted(target: Target, data: bytes, probability: float) -> bytes:
+    if not data or target.random.random() >= probability:
         return data
-    garbled = bytearray(data)
-    garbled[emulator.random.randrange(len(data))] ^= emulator.random.randrange(1, 256)
-    return bytes(garbled)
+    corrupted = bytearray(data)
+    corrupted[target.random.randrange(len(data))] ^= target.random.randrange(1, 256)
+    return bytes(corrupted)

@@ -84,6 +84,7 @@ class LoadCell:
 
     def set_jitter(self, sd_s: float) -> None:
         """Standard deviation of each sample's own time, from the next sample but one on."""
+        self.jitter_s = sd_s
         self._jitter = Noise(sd_s, JITTER_SEED) if sd_s else None
 
     def produce(self, until_s: float) -> None:

@@ -15,7 +15,7 @@ from api import cli, reading
 from api.versions import Versions
 from api.worker_process import WORKER
 from tests.api.conftest import run_service
-from tests.identify.patients import Patient, make_record
+from tests.harness.patients import Patient, make_record
 
 GATE = {"passed": False, "severity": "refuse", "says": "the dynamics are unstable"}
 

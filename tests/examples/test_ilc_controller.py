@@ -15,6 +15,8 @@ import h5py
 import numpy as np
 import pytest
 
+from tests.harness.patients import Patient
+
 PATH = Path(__file__).parents[2] / "examples" / "ilc_controller.py"
 
 
@@ -28,26 +30,19 @@ def ilc() -> ModuleType:
     return module
 
 
-def second_order(
-    widths_us: np.ndarray, period_s: float, damping: float, plateau_nm: float, middle_us: float
-) -> np.ndarray:
-    """A sigmoid and two lags by small Euler steps: written apart from the controller's own arithmetic."""
-    torque, rate, out = 0.0, 0.0, []
-    for width in widths_us:
-        level = plateau_nm / (1 + np.exp(-(width - middle_us) / 22)) - plateau_nm / (1 + np.exp(middle_us / 22))
-        total = 0.0
-        for _ in range(50):
-            rate += ((level - torque - 2 * damping * period_s * rate) / period_s**2) * 0.0005
-            torque += rate * 0.0005
-            total += torque
-        out.append(total / 50)
-    return np.array(out)
+def patient_of(period_s: float, damping: float, plateau_nm: float, middle_us: float) -> Patient:
+    return Patient(plateau_nm, 1 / 22, float(np.exp(middle_us / 22)), period_s, damping)
+
+
+def felt(patient: Patient, widths_us: np.ndarray) -> np.ndarray:
+    """Mean torque of each pulse interval, N·m."""
+    return patient.torque(widths_us, 2000.0).reshape(-1, 50).mean(axis=1)
 
 
 def model_of(period_s: float, damping: float, plateau_nm: float, middle_us: float) -> dict[str, Any]:
     """MODEL.json as far as the controller reads it: the linear part as a recursion at 400 Hz."""
     widths = np.arange(0.0, 301.0, 2.0)
-    levels = plateau_nm / (1 + np.exp(-(widths - middle_us) / 22)) - plateau_nm / (1 + np.exp(middle_us / 22))
+    levels = patient_of(period_s, damping, plateau_nm, middle_us).recruitment(widths)
     step = 1 / 400
     poles = np.roots([period_s**2, 2 * damping * period_s, 1.0])
     a = np.poly(np.exp(poles * step)).real
@@ -65,6 +60,10 @@ def model_of(period_s: float, damping: float, plateau_nm: float, middle_us: floa
     }  # fmt: skip
 
 
+MODEL = (0.40, 0.65, 6.6, 148.0)
+UNLIKE_THE_MODEL = patient_of(0.46, 0.68, 7.2, 152.0)
+
+
 class Muscle:
     """Stands where the service stands: 10 % stronger, 15 % slower, threshold shifted, noisy; may drop pulses."""
 
@@ -77,10 +76,7 @@ class Muscle:
         assert np.all(np.diff(np.r_[0, widths_us]) <= 50) and np.all(widths_us == np.round(widths_us))
         if self.drops:
             sent[self.rng.integers(0, sent.size, 3)] = 0.0
-        return second_order(sent, 0.46, 0.68, 7.2, 152.0) + 0.01 * self.rng.standard_normal(sent.size), sent
-
-
-MODEL = (0.40, 0.65, 6.6, 148.0)
+        return felt(UNLIKE_THE_MODEL, sent) + 0.01 * self.rng.standard_normal(sent.size), sent
 
 
 def test_imports_nothing_of_ours() -> None:
@@ -123,7 +119,7 @@ def test_noise_is_not_played_back(ilc: ModuleType) -> None:
 
         def play(widths_us: np.ndarray, rng: np.random.Generator = rng) -> tuple[np.ndarray, np.ndarray]:
             slow = np.convolve(rng.standard_normal(widths_us.size + 20), np.ones(20) / np.sqrt(20), "valid")
-            return second_order(widths_us, 0.46, 0.68, 7.2, 152.0) + noise_nm * slow[: widths_us.size], widths_us
+            return felt(UNLIKE_THE_MODEL, widths_us) + noise_nm * slow[: widths_us.size], widths_us
 
         muscle.play = play  # pyright: ignore[reportAttributeAccessIssue]
         trials = ilc.learn(muscle, model_of(*MODEL), reference, "norm-optimal", 10)

@@ -18,14 +18,11 @@ from hardware_sim.patients.calcium import CalciumMuscle
 from hardware_sim.patients.paper import PaperMuscle
 from hardware_sim.patients.paper import Parameters as PaperParameters
 from hardware_sim.records import simulate
+from tests.harness.patients import Patient
 
 PERIOD_S = 0.025
-T, ZETA = 0.5284, 0.6369
-
-
-def sigmoid(u: np.ndarray) -> np.ndarray:
-    """Eq. (35), as the paper writes it."""
-    return 6.8994 * (np.exp(0.0410 * u) - 1) / (np.exp(0.0410 * u) + 2.3897e3)
+PAPER = Patient()
+T, ZETA = PAPER.time_constant_s, PAPER.damping
 
 
 def train(widths_us: np.ndarray) -> np.ndarray:
@@ -37,7 +34,7 @@ def integrated(widths_us: np.ndarray, period_s: float, sample_s: np.ndarray, tim
 
     def held(t: float) -> float:
         k = int(np.searchsorted(times_s, t, side="right")) - 1
-        return float(sigmoid(widths_us[k])) if k >= 0 and t < times_s[k] + period_s else 0.0
+        return float(PAPER.recruitment(widths_us[k])) if k >= 0 and t < times_s[k] + period_s else 0.0
 
     edges = np.unique(np.concatenate([[0.0], times_s, times_s + period_s, [sample_s[-1] + 1e-9]]))
     edges = edges[edges <= sample_s[-1] + 1e-9]
@@ -62,7 +59,7 @@ class TestPaper:
     def test_recruitment_is_equation_35(self) -> None:
         widths = np.arange(0.0, 501.0)
         curve = [PaperMuscle().recruitment_nm(w, 20.0) for w in widths]
-        np.testing.assert_allclose(curve, sigmoid(widths), atol=1e-12)
+        np.testing.assert_allclose(curve, PAPER.recruitment(widths), atol=1e-12)
         assert PaperMuscle().recruitment_nm(4095.0, 130.0) == pytest.approx(6.8994)
 
     def test_an_equal_train_is_the_step_response(self) -> None:
@@ -72,12 +69,12 @@ class TestPaper:
         wd = math.sqrt(1 - ZETA**2) / T
         decay = np.exp(-ZETA / T * t)
         step = 1 - decay * (np.cos(wd * t) + ZETA / math.sqrt(1 - ZETA**2) * np.sin(wd * t))
-        np.testing.assert_allclose(torque, sigmoid(np.array(250.0)) * step, atol=1e-9)
+        np.testing.assert_allclose(torque, PAPER.recruitment(np.array(250.0)) * step, atol=1e-9)
 
     def test_prbs_against_scipy(self) -> None:
         widths = np.repeat(np.random.default_rng(1).integers(0, 2, 40) * 300.0, 4)
         torque = simulate(PaperMuscle(), train(widths), widths, 20.0, 1600.0, widths.size * PERIOD_S)
-        held = np.repeat(sigmoid(widths), 40)
+        held = np.repeat(PAPER.recruitment(widths), 40)
         _, expected, _ = lsim(([1], [T**2, 2 * ZETA * T, 1]), held, np.arange(held.size) / 1600, interp=False)
         np.testing.assert_allclose(torque, expected, atol=1e-9)
 
@@ -110,7 +107,7 @@ class TestPaper:
     def test_other_dampings(self, damping: float) -> None:
         muscle = PaperMuscle(PaperParameters(damping_ratio=damping))
         torque = simulate(muscle, [0.0], [300.0], 20.0, 1600.0, 1.0)
-        held = np.where(np.arange(1600) < 40, sigmoid(np.array(300.0)), 0.0)
+        held = np.where(np.arange(1600) < 40, PAPER.recruitment(np.array(300.0)), 0.0)
         _, expected, _ = lsim(([1], [T**2, 2 * damping * T, 1]), held, np.arange(1600) / 1600, interp=False)
         np.testing.assert_allclose(torque, expected, atol=1e-9)
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 import identify
 from identify.methods import methods
 from identify.records.record import Record
-from tests.identify.patients import Patient, make_record
+from tests.harness.patients import Patient, make_record
 
 METHODS = tuple(methods())
 

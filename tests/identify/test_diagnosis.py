@@ -11,8 +11,8 @@ from hardware_sim.hidden_records import generate
 from identify.diagnosis import diagnose
 from identify.errors import Cancelled
 from identify.records.record import Record
+from tests.harness.patients import Patient
 from tests.identify import hidden_muscles
-from tests.identify.patients import Patient
 
 KEYS = {"effect", "probability", "rms_before_nm", "rms_after_nm", "held_out_rms_before_nm", "held_out_rms_after_nm"}
 KEYS |= {"confused_with", "next_experiment", "parameters"}

@@ -7,7 +7,6 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from scipy.signal import cont2discrete, lfilter
 
 import identify
 from identify.criticism import compare
@@ -18,7 +17,7 @@ from identify.methods import methods
 from identify.records.read import read
 from identify.records.record import OPTIONAL, Record
 from identify.simulation.predict import predict
-from tests.identify.patients import FINE_HZ, Patient, make_record, protocol
+from tests.harness.patients import FINE_HZ, Patient, make_record, protocol, second_order
 
 PULSE_S = 0.025
 FINE = round(FINE_HZ * PULSE_S)
@@ -51,10 +50,8 @@ def torque_of(widths_us: np.ndarray, late_s: np.ndarray, rate_hz: float, patient
     felt = np.arange(widths_us.size) * FINE + np.round(late_s * FINE_HZ).astype(int)
     for k in np.flatnonzero(widths_us > 0):
         drive[felt[k] : felt[k] + FINE] += effect[k]
-    t, z = patient.time_constant_s, patient.damping
-    b, a = cont2discrete(([1.0], [t * t, 2 * z * t, 1.0]), 1 / FINE_HZ, method="zoh")[:2]  # pyright: ignore
-    torque = lfilter(np.ravel(b), np.ravel(a), drive[: widths_us.size * FINE])
-    return np.asarray(torque)[:: round(FINE_HZ / rate_hz)]
+    torque = second_order(drive[: widths_us.size * FINE], patient.time_constant_s, patient.damping, FINE_HZ)
+    return torque[:: round(FINE_HZ / rate_hz)]
 
 
 def seal(

@@ -10,7 +10,7 @@ import pytest
 
 import identify
 from identify.records.read import read
-from tests.identify.patients import Patient, make_record
+from tests.harness.patients import Patient, make_record
 
 HEADER = "time_s,pulse_width_us,torque_nm,segment"
 ROWS = [f"{i / 40:.4f},{100 * (i % 3)},{0.1 * i:.3f},prbs" for i in range(20)]

@@ -16,7 +16,7 @@ from identify.dynamics.second_order import transition
 from identify.errors import BadRecord
 from identify.noise.ar1 import best_ar1, log_likelihood, whiten
 from identify.records.record import Record
-from tests.identify.patients import Patient
+from tests.harness.patients import Patient
 
 PULSE_RATE_HZ = 40.0
 FINE = 200  # steps of the reference integration in each pulse interval

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 import identify
-from bench import hostile_shapes as shapes
 from identify.records import bounds
 from identify.records.hdf5 import StrictFile
 from identify.strict_json import BadJson, parse
+from tests.harness import hostile_shapes as shapes
 
 
 def told(path: Path) -> str:

@@ -12,7 +12,7 @@ from identify.estimation.figures import best_fit_percent
 from identify.methods import Method, method_of, methods
 from identify.methods.support.output_error import choose_order, output_error
 from identify.paper import table1
-from tests.identify.patients import Patient, make_record, multilevel, prbs
+from tests.harness.patients import Patient, make_record, multilevel, prbs
 
 ALL = ("maximum-likelihood", "narx", "ramp-deconvolution", "separable-least-squares", "two-stage")
 

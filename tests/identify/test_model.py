@@ -17,7 +17,7 @@ from identify.recruitment.curve import Curve
 from identify.recruitment.power import PowerBasis
 from identify.recruitment.sigmoid import SigmoidBasis
 from identify.recruitment.spline import SplineBasis
-from tests.identify.patients import Patient, make_record
+from tests.harness.patients import Patient, make_record
 
 KEYS = {
     "schema_version", "model_id", "sample_rate_hz", "method", "created", "linear", "recruitment", "valid_for",

@@ -13,7 +13,7 @@ from identify.criticism import compare
 from identify.dynamics.pulse_grid import make_grid
 from identify.estimation.figures import UNDEFINED, best_fit_percent, ceiling_percent
 from identify.estimation.quality import quality
-from tests.identify.patients import Patient, make_record
+from tests.harness.patients import Patient, make_record
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from identify.estimation.residual_tests import LAGS, PaddedRows, chi_square_p
 from identify.estimation.uncertainty import prediction_band
 from identify.noise.ar1 import ar1_or_white, best_ar1, log_likelihood, whiten
 from identify.noise.level import NoiseLevel, correlation_slopes
-from tests.identify.patients import Patient, make_record
+from tests.harness.patients import Patient, make_record
 
 RECORDS = 60
 """Enough to see a band that is off by a tenth; `python -m bench goals` counts 300."""

@@ -9,13 +9,15 @@ from typing import Any
 
 import pytest
 
-from bench import faults
-from bench.faults import BEGIN, DOCUMENT, END, Log, order, write_between
-from bench.faults_cases import CASES, PHASES, WINDOW_S, plan_of
-from bench.faults_judge import Verdict, judge_times
-from bench.faults_table import table
 from rig import limits, plan
 from rig.messages import Profile, SegmentPlan, TestPlan
+from tests.harness.campaign import command
+from tests.harness.campaign.cases import CASES, PHASES, WINDOW_S, plan_of
+from tests.harness.campaign.command import BEGIN, DOCUMENT, END, write_between
+from tests.harness.campaign.judge import Verdict, judge_times
+from tests.harness.campaign.log import Log
+from tests.harness.campaign.runner import order
+from tests.harness.campaign.table import table
 
 
 def began(path: Path, **fields: float) -> Log:
@@ -61,16 +63,10 @@ def test_what_the_campaign_could_not_judge_is_made_again_and_not_counted(
 
         def close(self) -> None: ...
 
-    monkeypatch.setattr(faults, "Worker", Fake)
-    monkeypatch.setattr(faults, "DOCUMENT", document)
-    monkeypatch.setattr(faults, "ROOT", tmp_path)
-    monkeypatch.setattr(faults.signal, "signal", lambda *_: None)
-    options = ["faults", "--injections", "8", "--workers", "1", "--out", str(path)]
-    for argv, code in (([*options], 1), ([*options, "--resume"], 0)):
-        monkeypatch.setattr("sys.argv", argv)
-        with pytest.raises(SystemExit) as ended:
-            faults.main()
-        assert ended.value.code == code
+    monkeypatch.setattr(command.signal, "signal", lambda *_: None)
+    options = ["--injections", "8", "--workers", "1", "--out", str(path)]
+    for arguments, code in ((options, 1), ([*options, "--resume"], 0)):
+        assert command.main(arguments, document, Fake) == code  # pyright: ignore[reportArgumentType]
         written = document.read_text("utf-8")
         assert written.startswith("# mine\n")
         assert written.endswith("\n\nmy notes\n")

@@ -10,7 +10,7 @@ import pytest
 from rig import config
 from rig.devices import find
 from rig.errors import ConfigError
-from tests.wire.processes import CLINIC_WATCH
+from tests.harness.processes import CLINIC_WATCH
 
 GOOD = """
 data_dir = "var"

@@ -8,12 +8,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bench.rig_fuzz import fuzz, fuzz_plans
 from rig import limits
 from rig.errors import RefusedError
 from rig.limits import HARD_LIMITS, Admitted, Refusal, admit
 from rig.messages import Profile, Status, TestPlan
 from rig.signals import Pulse
+from tests.harness.limits_fuzz import fuzz, fuzz_plans
 
 anything = st.one_of(
     st.floats(allow_nan=True, allow_infinity=True),

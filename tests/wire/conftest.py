@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.wire.processes import Bench, RigClient
+from tests.harness.processes import Bench, RigClient
 
 SPEED = 2.0
 

@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 import pytest
 
-from tests.wire.processes import Bench, RigClient, control, short_plan
+from tests.harness.processes import Bench, RigClient, control, short_plan
 
 pytestmark = pytest.mark.wire
 

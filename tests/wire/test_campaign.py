@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from bench.faults import campaign, order
-from bench.faults_cases import CASES, PHASES
-from bench.faults_table import table
+from tests.harness.campaign.cases import CASES, PHASES
+from tests.harness.campaign.runner import campaign, order
+from tests.harness.campaign.table import table
 
 pytestmark = [pytest.mark.wire, pytest.mark.slow]
 

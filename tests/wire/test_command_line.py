@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.wire.processes import ROOT, Bench, Process, RigClient
+from tests.harness.processes import ROOT, Bench, Process, RigClient
 
 pytestmark = pytest.mark.wire
 

@@ -14,7 +14,7 @@ import pytest
 
 from rig import archive
 from rig.config import EMULATOR_WATCH
-from tests.wire.processes import Bench, RigClient, control, default_plan, kill_hard, short_plan
+from tests.harness.processes import Bench, RigClient, control, default_plan, kill_hard, short_plan
 
 pytestmark = pytest.mark.wire
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from tests.wire.behaviour import HOLD, check_all, felt, options
-from tests.wire.processes import Bench, control, kill_hard, short_plan
+from tests.harness.device_pairs import HOLD, check_all, felt, options
+from tests.harness.processes import Bench, control, kill_hard, short_plan
 
 pytestmark = pytest.mark.wire
 

@@ -6,7 +6,7 @@ import os
 
 import pytest
 
-from bench.soak import soak
+from tests.harness.soak import soak
 
 MINUTES = float(os.environ.get("STIMRIG_SOAK_MINUTES", "2"))
 

@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from tests.wire.processes import Bench, RigClient, default_plan, short_plan
+from tests.harness.processes import Bench, RigClient, default_plan, short_plan
 
 pytestmark = pytest.mark.wire
 

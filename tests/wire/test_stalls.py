@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from bench.rig_stalls import Case, stalls
-from tests.wire.processes import Bench, RigClient, default_plan
+from tests.harness.processes import Bench, RigClient, default_plan
+from tests.harness.stalls import Case, stalls
 
 pytestmark = [pytest.mark.wire, pytest.mark.realtime, pytest.mark.slow]
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from rig import align, archive
-from tests.wire.processes import Bench, RigClient, control, default_plan, short_plan
+from tests.harness.processes import Bench, RigClient, control, default_plan, short_plan
 
 pytestmark = pytest.mark.wire
 

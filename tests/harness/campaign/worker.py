@@ -1,4 +1,4 @@
-"""One emulated rig that is broken and mended again and again."""
+"""One emulated rig that is broken and repaired again and again."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ import time
 from pathlib import Path
 from typing import Any
 
-from bench.faults_cases import CASES, WINDOW_S, Case, plan_of
-from bench.faults_judge import Verdict, judge_file, judge_intervals, judge_outcome, judge_times
-from tests.wire.processes import CLINIC_WATCH, Bench, RigClient, busy_process, control, default_plan, kill_hard
+from tests.harness.campaign.cases import CASES, WINDOW_S, Case, plan_of
+from tests.harness.campaign.judge import Verdict, judge_file, judge_intervals, judge_outcome, judge_times
+from tests.harness.processes import CLINIC_WATCH, Bench, RigClient, busy_process, control, default_plan, kill_hard
 
 DISK_MB = 96
-MODULE = "bench.faults_host"
+MODULE = "tests.harness.campaign.host"
 
 
 class StoppedBefore(RuntimeError):
@@ -105,7 +105,7 @@ class Worker:
         if stop is not None and event["outcome"] != "completed":
             verdict.confirmed, verdict.evidence = stop["confirmed"], stop["detail"]
         felt = self._delivered(before)
-        self._mend(case, verdict, undo)
+        self._repair(case, verdict, undo)
         if self.bench is not None:
             felt = self._delivered(before)  # one that came after the end that was told would be seen here
         verdict.felt = len(felt)
@@ -134,7 +134,7 @@ class Worker:
 
     def _refused(self, case: Case, verdict: Verdict, reply: dict[str, Any], undo: Any) -> None:
         verdict.outcome, verdict.reason = "refused", reply["problem"]["detail"]
-        self._mend(case, verdict, undo)
+        self._repair(case, verdict, undo)
 
     def _wait_phase(self, client: RigClient, phase: str, rng: random.Random) -> None:
         """Until the segment has begun and a random part of it has passed."""
@@ -254,7 +254,7 @@ class Worker:
         self._healed = True
         return client.wait_finished(test_id, timeout_s=25)
 
-    def _mend(self, case: Case, verdict: Verdict, undo: Any) -> None:
+    def _repair(self, case: Case, verdict: Verdict, undo: Any) -> None:
         if case.name == "disk_slow" and self._healed:
             self._healed = False
         else:
@@ -304,7 +304,7 @@ class Worker:
         return [pulse for pulse in self._felt(since) if pulse["delivered"]]
 
     def _ready(self) -> RigClient:
-        """A rig that is ready; a new pair where the last one could not be mended."""
+        """A rig that is ready; a new pair where the last one could not be repaired."""
         if self.client is not None and (self._condemned or self._settled(self.client)["state"] != "ready"):
             self._drop()
         self._condemned = False

@@ -7,8 +7,8 @@ from itertools import groupby
 
 import numpy as np
 
-from bench.faults_cases import CASES, PHASES
-from bench.faults_judge import BOUND_MS, SHORTEST_MS, Verdict
+from tests.harness.campaign.cases import CASES, PHASES
+from tests.harness.campaign.judge import BOUND_MS, SHORTEST_MS, Verdict
 
 HEAD = (
     "| fault | phase | n | ended | last pulse after fault, ms | after it was known, ms | confirmed | file opens "
@@ -69,7 +69,7 @@ def _together(found: list[Verdict]) -> list[str]:
         f"- tests that ended early and were told a reason: {sum(bool(v.reason) for v in ended)} of {len(ended)}",
         f"- stops confirmed by device and torque: {_share([v.confirmed for v in ended if v.confirmed is not None])}"
         + reasons,
-        f"- re-armed after the fault was mended: {_share([v.rearmed for v in found if v.rearmed is not None])}",
+        f"- re-armed after the fault was removed: {_share([v.rearmed for v in found if v.rearmed is not None])}",
         f"- injections with anything wrong: {sum(bool(v.wrong) for v in found)} of {len(found)}",
     ]
 

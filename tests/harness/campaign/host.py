@@ -1,4 +1,4 @@
-"""The rig on a host that can be made to fail: `python -m bench.faults_host` takes the rig's arguments.
+"""The rig on a host that can be made to fail: `python -m tests.harness.campaign.host` takes the rig's arguments.
 
 SIGUSR1 makes the disk slow, then well again; by turns each write to a journal takes 0.4 s, or bringing it to the disk
 takes 5 s. SIGUSR2 moves the wall clock on by an hour. The rig itself knows of none of it.

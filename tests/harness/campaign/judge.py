@@ -9,9 +9,9 @@ from typing import Any
 import h5py
 import numpy as np
 
-from bench.faults_cases import CASES
 from rig import archive
 from rig.errors import RecordingError
+from tests.harness.campaign.cases import CASES
 
 BOUND_MS = 50.0
 SHORTEST_MS = 8.0

@@ -1,5 +1,7 @@
-"""Simulated patients for the tests of `identify`, written apart from `identify.dynamics`: scipy's state space, finely
-stepped, so that no test marks its own homework."""
+"""Simulated patients for tests and benches: sigmoid recruitment, second-order dynamics, delay, finely stepped.
+
+Written apart from `identify` and `hardware_sim`, with scipy's discretisation, so that neither is tested against itself.
+"""
 
 from __future__ import annotations
 
@@ -13,9 +15,22 @@ from identify.records.record import Record
 FINE_HZ = 8000
 
 
+def sigmoid(width_us: np.ndarray, gain_nm: float, a2: float, a3: float) -> np.ndarray:
+    """The paper's recruitment curve, eq. (35), N·m; `a2` per µs."""
+    decay = np.exp(-a2 * np.asarray(width_us, float))
+    return gain_nm * (1 - decay) / (1 + a3 * decay)
+
+
+def second_order(drive_nm: np.ndarray, time_constant_s: float, damping: float, rate_hz: float) -> np.ndarray:
+    """Torque from rest for a drive that is held over each sample, N·m, shape as `drive_nm`."""
+    transfer = ([1.0], [time_constant_s**2, 2 * damping * time_constant_s, 1.0])
+    b, a = cont2discrete(transfer, 1 / rate_hz, method="zoh")[:2]  # pyright: ignore
+    return np.asarray(lfilter(np.ravel(b), np.ravel(a), drive_nm))
+
+
 @dataclass(frozen=True)
 class Patient:
-    """Sigmoid (30) or any other curve, second order, delay."""
+    """The paper's muscle unless told otherwise; `gain` in N·m, `a2` per µs."""
 
     gain: float = 6.8994
     a2: float = 0.0410
@@ -24,9 +39,27 @@ class Patient:
     damping: float = 0.6369
     delay_s: float = 0.0
 
+    @classmethod
+    def with_rise(cls, rise_us: float, middle_us: float, **others: float) -> Patient:
+        """A patient whose recruitment rises from 10 to 90 % over `rise_us`, about `middle_us`."""
+        a2 = 4.4 / rise_us
+        return cls(a2=a2, a3=float(np.exp(min(a2 * middle_us, 600.0))), **others)
+
+    @classmethod
+    def draw(cls, rng: np.random.Generator) -> Patient:
+        """Gain 1.5-15 N·m, rise 10-150 µs, middle 40-200 µs, T 0.1-0.6 s, damping 0.6-1.2, delay 0-60 ms."""
+        gain = float(rng.uniform(1.5, 15.0))
+        rise_us = float(np.exp(rng.uniform(np.log(10.0), np.log(150.0))))
+        middle_us = float(rng.uniform(40.0, 200.0))
+        time_constant_s, damping = float(rng.uniform(0.1, 0.6)), float(rng.uniform(0.6, 1.2))
+        delay_s = float(rng.uniform(0.0, 0.06))
+        return cls.with_rise(
+            rise_us, middle_us, gain=gain, time_constant_s=time_constant_s, damping=damping, delay_s=delay_s
+        )
+
     def recruitment(self, width_us: np.ndarray) -> np.ndarray:
-        decay = np.exp(-self.a2 * np.asarray(width_us, float))
-        return self.gain * (1 - decay) / (1 + self.a3 * decay)
+        """Steady torque, N·m."""
+        return sigmoid(width_us, self.gain, self.a2, self.a3)
 
     def torque(self, widths_us: np.ndarray, rate_hz: float, pulse_rate_hz: float = 40.0) -> np.ndarray:
         """Clean torque sampled at rate_hz for one width a pulse."""
@@ -34,9 +67,7 @@ class Patient:
         drive = np.repeat(self.recruitment(widths_us), fine)
         late = round(self.delay_s * FINE_HZ)
         drive = np.r_[np.zeros(late), drive][: drive.size]
-        t, z = self.time_constant_s, self.damping
-        b, a = cont2discrete(([1.0], [t * t, 2 * z * t, 1.0]), 1 / FINE_HZ, method="zoh")[:2]  # pyright: ignore
-        torque = lfilter(np.ravel(b), np.ravel(a), drive)
+        torque = second_order(drive, self.time_constant_s, self.damping, FINE_HZ)
         at = np.round(np.arange(round(widths_us.size / pulse_rate_hz * rate_hz)) * FINE_HZ / rate_hz).astype(int)
         return torque[at]
 
@@ -81,9 +112,10 @@ def make_record(
     top_us: float = 300.0,
     validate: bool = True,
     baseline_nm: float = 0.0,
+    pulses: tuple[np.ndarray, list[str]] | None = None,
 ) -> tuple[Record, np.ndarray]:
-    """A record and its clean torque."""
-    widths, names = protocol(rng, top_us, validate)
+    """A record and its clean torque; `pulses`: a width and a segment for each pulse, drawn if None."""
+    widths, names = pulses or protocol(rng, top_us, validate)
     clean = patient.torque(widths, rate_hz) + baseline_nm
     n = clean.size
     slot = np.minimum((np.arange(n) * 40 / rate_hz + 1e-9).astype(int), widths.size - 1)

@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 
 from rig import archive
-from tests.wire.processes import Bench, RigClient, control, kill_hard, short_plan
+from tests.harness.processes import Bench, RigClient, control, kill_hard, short_plan
 
 STIMULATORS = ("p24", "rehastim2")
 CELLS = {

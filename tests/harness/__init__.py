@@ -1,0 +1,1 @@
+"""What tests and benches share: emulated rigs as processes, muscles, hostile files, campaigns."""

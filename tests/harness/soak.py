@@ -1,0 +1,156 @@
+"""A long session: torque at 1600 samples/s throughout, a test every few minutes, fits in another process all the time.
+
+Real time, on the emulated rig. Counts lost samples, lateness of pulses, CPU and memory.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tests.harness.processes import CLINIC_WATCH, ROOT, Bench, RigClient, control, default_plan
+
+FITTER = """
+import sys, time
+from pathlib import Path
+from identify.fitting import fit
+from identify import read
+fits = 0
+while True:
+    newest = sorted(Path(sys.argv[1]).glob('*.h5'))[-1:]
+    if not newest:
+        sum(range(10000))  # before the first recording: busy all the same
+        continue
+    fit(read(newest[0]))
+    fits += 1
+    print(fits, flush=True)
+"""
+"""Fits the newest recording again and again."""
+
+
+@contextlib.contextmanager
+def fitting(recordings: Path, wanted: bool) -> Iterator[list[str]]:
+    """A process that fits without a pause; a line for each fit."""
+    if not wanted:
+        yield []
+        return
+    process = subprocess.Popen(
+        [sys.executable, "-c", FITTER, str(recordings)], cwd=ROOT, stdout=subprocess.PIPE, text=True
+    )
+    lines: list[str] = []
+    assert process.stdout is not None
+    stdout = process.stdout
+    threading.Thread(target=lambda: lines.extend(stdout), daemon=True).start()
+    try:
+        yield lines
+    finally:
+        if process.poll() is not None:
+            print("the fitting process ended early", file=sys.stderr)
+        process.kill()
+        process.wait()
+
+
+@contextlib.contextmanager
+def fitting_one(bench: Bench, client: RigClient, wanted: bool) -> Iterator[list[str]]:
+    """Play the default test, then fit its recording again and again in another process, whatever is recorded beside."""
+    folder = bench.folder / "to-fit"
+    folder.mkdir()
+    if wanted:
+        assert client.start(default_plan("to-fit"))["ok"]
+        path = client.wait_finished("to-fit")["recording_path"]
+        shutil.copy(path, folder)
+    with fitting(folder, wanted) as fits:
+        end_s = time.monotonic() + 180
+        while wanted and not fits:  # the first one compiles
+            if time.monotonic() > end_s:
+                raise TimeoutError("no fit came to its end in 180 s")
+            time.sleep(0.1)
+        yield fits
+
+
+def memory_mb(pid: int) -> float:
+    """Resident memory of a process."""
+    pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+def soak(minutes: float, every_minutes: float, fit: bool = True, patient: bool = False) -> dict[str, Any]:
+    """Run a session and give its figures; `patient`: with a rig that does not end a test for a torque 0.1 s old."""
+    with tempfile.TemporaryDirectory(prefix="rig-soak-") as folder:
+        bench = Bench(Path(folder))
+        try:
+            client = bench.start_rig(watch=None if patient else CLINIC_WATCH)
+            client.ask("subscribe")
+            with fitting(bench.data / "recordings", fit) as fits:
+                return _session(bench, client, minutes, every_minutes) | {"fits_beside": len(fits)}
+        finally:
+            bench.close()
+
+
+def _session(bench: Bench, client: Any, minutes: float, every_minutes: float) -> dict[str, Any]:
+    assert bench.rig is not None
+    pid, began_s = bench.rig.popen.pid, time.monotonic()
+    memory, tests, oldest_ms, live = [memory_mb(pid)], [], 0.0, 0
+    load = os.getloadavg()[0]
+    while time.monotonic() - began_s < 60 * minutes:
+        next_s = time.monotonic() + 60 * every_minutes
+        name = f"soak{len(tests)}"
+        reply = client.start(default_plan(name))
+        if not reply["ok"]:
+            tests.append({"outcome": "refused", "reason": reply["problem"]["detail"], "summary": {}})
+            client.ask("rearm", by="soak")
+        else:
+            tests.append(client.wait_finished(name, timeout_s=120))
+            if tests[-1]["outcome"] != "completed":
+                client.ask("rearm", by="soak")
+        memory.append(memory_mb(pid))
+        while time.monotonic() < min(next_s, began_s + 60 * minutes):
+            while not client.events.empty():
+                event = client.events.get_nowait()
+                if event["event"] == "live":
+                    live += 1
+                    oldest_ms = max(oldest_ms, 1e3 * event["torque_age_s"])
+            time.sleep(0.5)
+    felt = len(control(bench.emulator.ready["control"], {"cmd": "pulses", "since": 0})["pulses"])
+    figures = _figures(tests, felt)
+    status = client.status()
+    return figures | {
+        "minutes": round((time.monotonic() - began_s) / 60, 2),
+        "load_average": [round(load, 1), round(os.getloadavg()[0], 1)],
+        "memory_mb": [round(memory[0], 1), round(memory[-1], 1)],
+        "oldest_torque_ms": round(oldest_ms, 1),
+        "measured_rate_hz": status["load_cell"].get("measured_rate_hz"),
+        "state": status["state"],
+    }
+
+
+def _figures(tests: list[dict[str, Any]], felt: int) -> dict[str, Any]:
+    done = [t["summary"] for t in tests if t["outcome"] == "completed"]
+
+    def worst(name: str) -> float | None:
+        return round(max((t["lateness_ms"][name] for t in done), default=float("nan")), 3)
+
+    return {
+        "tests": len(tests),
+        "completed": len(done),
+        "reasons": [t["reason"] for t in tests if t["outcome"] != "completed"],
+        "samples": sum(t["samples"] for t in done),
+        "lost_samples": sum(t["lost_samples"] for t in done),
+        "pulses_felt": felt,
+        "pulses_sent": sum(t["summary"].get("pulses", 0) for t in tests),
+        "dropped_pulses": sum(t["dropped_pulses"] for t in done),
+        "lateness_ms": {name: worst(name) for name in ("median", "p99", "max")},
+        "alignment_error_ms": round(max((t["alignment"]["error_ms"] for t in done), default=float("nan")), 3),
+        "cpu_percent": round(float(np.mean([t["cpu_percent"] for t in done])) if done else float("nan"), 1),
+    }
