@@ -10,10 +10,10 @@ from identify.criticism.correlation import correlation_tests
 from identify.criticism.doubt import left_out, refuse_doubted
 from identify.criticism.shares import by_direction, by_frequency, by_level, by_segment, by_time
 from identify.criticism.where import worst_places
-from identify.dynamics.pulse_grid import make_grid
+from identify.dynamics.make_grid import make_grid
 from identify.estimation.figures import UNDEFINED, best_fit_percent, ceiling_percent, rms
-from identify.estimation.prepare import inspect
 from identify.estimation.quality import range_warnings
+from identify.estimation.samples import inspect
 from identify.model import Model
 from identify.records.record import Record
 from identify.results import Comparison, FitStatistics

@@ -15,7 +15,7 @@ from identify.effects import get
 from identify.estimation.effect_fit import add_effect, effect_names
 from identify.estimation.evaluation import evaluate
 from identify.estimation.finish import finish
-from identify.estimation.prepare import Raw
+from identify.estimation.samples import Raw
 from identify.model import Model
 from identify.records.record import Record
 from identify.results import Improvement

@@ -37,8 +37,9 @@ from identify.estimation.effect_fit import (
     with_effects,
 )
 from identify.estimation.joint import Fitted, solve, start_from
-from identify.estimation.prepare import Raw, fit_plain, prepare
+from identify.estimation.prepare import fit_plain, prepare
 from identify.estimation.rows import fitted_rows
+from identify.estimation.samples import Raw
 from identify.noise.level import NoiseLevel
 from identify.records.record import Record
 from identify.simulation.problem import Problem

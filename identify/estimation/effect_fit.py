@@ -11,8 +11,9 @@ from identify.effects import get, registry
 from identify.effects.base import STAGES, Effect, Form, Scene
 from identify.errors import BadRequest, NotIdentifiable
 from identify.estimation.joint import Fitted, solve, start_from
-from identify.estimation.prepare import Raw, fit_plain, prepare
+from identify.estimation.prepare import fit_plain, prepare
 from identify.estimation.rows import fitted_rows
+from identify.estimation.samples import Raw
 from identify.noise.level import find_band
 from identify.records.record import Record
 from identify.simulation.problem import Problem

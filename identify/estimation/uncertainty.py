@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from identify.dynamics.linear import SecondOrder
-from identify.dynamics.pulse_grid import Grid, make_grid
+from identify.dynamics.make_grid import make_grid
+from identify.dynamics.pulse_grid import Grid
 from identify.model import Covariance, Model
 from identify.records.record import Record
 from identify.recruitment.curve import Basis

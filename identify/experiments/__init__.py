@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from identify.dynamics.pulse_grid import make_grid
+from identify.dynamics.make_grid import make_grid
 from identify.effects import get
 from identify.errors import BadRequest
 from identify.estimation.effect_fit import fitted_with

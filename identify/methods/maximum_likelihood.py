@@ -16,8 +16,8 @@ from identify.dynamics.pulse_grid import Grid
 from identify.errors import BadRequest
 from identify.estimation.finish import finish
 from identify.estimation.joint import Fitted
+from identify.estimation.pilot import estimate
 from identify.estimation.prepare import to_fitted
-from identify.estimation.projected import estimate
 from identify.estimation.rows import fitted_rows
 from identify.methods.support.alternatives import monotone, power_series, sigmoid
 from identify.methods.support.common import flag, order_option
@@ -61,7 +61,7 @@ class MaximumLikelihood:
         elif kind == "sigmoid":
             solution, reason = sigmoid(solution), "sigmoid (30)"
         elif kind == "spline":
-            size = solution.problem.basis.size
+            size = solution.projection.basis.size
             reason = f"spline of {size} coefficients, smoothed to {solution.freedom:.1f} effective ones"
         else:
             raise BadRequest(

@@ -23,15 +23,10 @@ from identify.dynamics.linear import Discrete, SecondOrder
 from identify.dynamics.pulse_grid import Grid
 from identify.errors import BadRequest
 from identify.estimation.finish import finish, finish_discrete
+from identify.estimation.pilot import pilot_curve, pilot_solution
 from identify.estimation.prepare import to_fitted
-from identify.estimation.projected import (
-    Projection,
-    Solution,
-    pilot_curve,
-    pilot_solution,
-    project,
-    search,
-)
+from identify.estimation.projected_search import project, search
+from identify.estimation.projection import Projection, Solution
 from identify.methods.support.common import active_level, flag, near_rest, order_option, quiet_level, segment_rows
 from identify.methods.support.output_error import OutputError, choose_order, equation_error, output_error, stable
 from identify.model import Model
@@ -107,13 +102,13 @@ def physical(
     both = near_rest(grid, prbs) | near_rest(grid, ramp)
     solution = _recruitment(grid, near_rest(grid, ramp), linear, knots)
     for _ in range(iterations):
-        basis = solution.problem.basis
+        basis = solution.projection.basis
         shape = FixedShape(Curve(basis, solution.coefficients[: basis.size]))
         linear = search(Projection(grid, shape, np.zeros((1, 1)), both), linear).linear
         solution = _recruitment(grid, near_rest(grid, ramp), linear, knots)
     reasons.append(f"after stage two: T {linear.time_constant_s:.4g} s, damping {linear.damping:.3g}")
     # The last curve and the last dynamics; baseline and noise are estimated from both segments.
-    final = Projection(grid, solution.problem.basis, solution.problem.roughness, both)
+    final = Projection(grid, solution.projection.basis, solution.projection.roughness, both)
     return project(final, linear, weight=solution.weight), reasons
 
 

@@ -11,7 +11,8 @@ import numpy as np
 
 from identify.dynamics import narx
 from identify.dynamics.linear import Discrete, Linear, SecondOrder
-from identify.dynamics.pulse_grid import Grid, make_grid
+from identify.dynamics.make_grid import make_grid
+from identify.dynamics.pulse_grid import Grid
 from identify.effects import get
 from identify.errors import BadModel
 from identify.records.record import Record

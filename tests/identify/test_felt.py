@@ -12,7 +12,8 @@ import identify
 from identify.criticism import compare
 from identify.criticism.correlation import correlation_tests
 from identify.dynamics import pulse_grid
-from identify.dynamics.pulse_grid import Grid, make_grid
+from identify.dynamics.make_grid import make_grid
+from identify.dynamics.pulse_grid import Grid
 from identify.methods import methods
 from identify.records.read import read
 from identify.records.record import OPTIONAL, Record

@@ -11,7 +11,8 @@ from scipy.integrate import solve_ivp
 from identify.dynamics import pulse_grid
 from identify.dynamics.boundary import boundary_states
 from identify.dynamics.linear import SecondOrder
-from identify.dynamics.pulse_grid import make_grid, runs
+from identify.dynamics.make_grid import make_grid
+from identify.dynamics.pulse_grid import runs
 from identify.dynamics.second_order import transition
 from identify.errors import BadRecord
 from identify.noise.ar1 import best_ar1, log_likelihood, whiten

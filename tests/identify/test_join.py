@@ -10,7 +10,8 @@ import pytest
 
 import identify
 from identify import Record
-from identify.dynamics.pulse_grid import Grid, make_grid, runs
+from identify.dynamics.make_grid import make_grid
+from identify.dynamics.pulse_grid import Grid, runs
 from identify.estimation.prepare import fit_plain, prepare
 from identify.records import parts_csv
 from identify.records.join import PAUSE_S, join

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUNDS_S, SecondOrder
-from identify.estimation.projected import Projection, Solution, project, search
+from identify.estimation.projected_search import project, search
+from identify.estimation.projection import Projection, Solution
 from identify.noise.ar1 import log_likelihood, whiten
 from identify.recruitment.power import PowerBasis
 from identify.recruitment.sigmoid import SigmoidBasis
@@ -18,7 +19,7 @@ HIGHEST_POWER = 9
 
 def power_series(first: Solution, order: int | None = None) -> tuple[Solution, str]:
     """Joint estimate with the power series (6), of given order or of smallest BIC, and the reason."""
-    old = first.problem
+    old = first.projection
     largest = float(np.max(old.grid.pulse_width_us))
     found: dict[int, tuple[float, Solution]] = {}
     linear = first.linear
@@ -38,7 +39,7 @@ def sigmoid(first: Solution) -> Solution:
     """Joint estimate with the sigmoid (30): shape and dynamics searched, gain and baseline projected out."""
     from scipy.optimize import least_squares
 
-    old, start = first.problem, first.linear
+    old, start = first.projection, first.linear
     largest = float(np.max(old.grid.pulse_width_us))
     curve = old.basis.design(np.linspace(0.0, largest, 401)) @ first.coefficients[: old.basis.size]
     half = curve[np.argmax(np.abs(curve))] / 2
@@ -78,7 +79,7 @@ def monotone(solution: Solution) -> Solution:
     """
     from scipy.optimize import nnls
 
-    problem, size = solution.problem, solution.problem.basis.size
+    problem, size = solution.projection, solution.projection.basis.size
     white = whiten(solution.columns, problem.stretches, solution.ar1)
     target = whiten(problem.target, problem.stretches, solution.ar1)
     penalty = np.zeros((white.shape[1], white.shape[1]))
