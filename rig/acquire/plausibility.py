@@ -1,10 +1,11 @@
-"""Torque that no arm and no sound cell can give: a jump, a value that stands still, a rate that is another.
+"""Detects torque that neither an arm nor a working load cell can give: a jump, a stuck value, a wrong sample rate.
 
-A sign that was turned while the torque was near zero cannot be told from a muscle here; the identification sees it.
+A sign that is reversed while the torque is near zero cannot be detected here; the identification detects it.
 
-An amplifier at its end is not a dead cell: its value is the most, or the least, of the test, far from the first one,
-and the torque has left it and come back to that very number. It may stand there longer, so that the identification can
-say that it clips, but not for long: torque beyond it is not seen, and no limit can hold.
+A saturated amplifier is not a dead cell. Its value is the largest or smallest of the test, far from the first one, and
+the torque has left this value and returned to exactly the same one. Saturation may last longer than a stuck value, so
+that the identification can report clipping. It must still end soon: torque beyond the range is not seen, so no torque
+limit can act.
 """
 
 from __future__ import annotations
@@ -17,39 +18,40 @@ import numpy as np
 from numpy.typing import NDArray
 
 RATE_WINDOW_S = 3.0
-"""Real seconds over which the rate is taken, between the promptest blocks of its first and last third."""
+"""Real seconds over which the rate is measured, between the least delayed blocks of the first and last third."""
 RATE_TOLERANCE = 0.035
 JITTER_S = 0.06
-"""At the test's end: how late even the promptest block of a third may be, or as late as the longest standstill."""
+"""At the test's end: delay that even the least delayed block of a third may have; at least the longest standstill."""
 STANDSTILL_S = 0.3
-"""After a longer standstill of host or line a third of the window may hold late blocks alone: begin anew."""
+"""After a longer standstill of host or line a third of the window may hold only late blocks: start again."""
 BIN_S = 0.1
-"""Rig seconds of which the promptest block is kept for the rate."""
+"""Rig seconds per bin; the least delayed block of each bin is kept for the rate."""
 FASTEST_NM_S = 1000.0
 RAIL_VISITS = 2
-"""How often a value must have been come to until it is an amplifier's end: a dying cell comes to its last one once."""
+"""How often the torque must reach an extreme value before it counts as saturation: a failing cell reaches its last
+value once."""
 RAIL_LEAST_NM = 0.5
-"""How far from the test's first torque an amplifier's end is, at least: at rest a coarse converter gives two or three
-values, of which the least comes again and again, and a cell that dies there is no clipped one."""
+"""Smallest distance of a saturation value from the test's first torque. At rest a coarse converter gives two or three
+values and returns to the smallest again and again; a cell that fails there is not saturated."""
 
 
-class Plausible:
-    """Judges the samples of one test, block by block.
+class PlausibilityCheck:
+    """Checks the samples of one test, block by block.
 
     Parameters
     ----------
     jump_nm
         Largest change from one sample to the next.
     stuck_s
-        How long, in rig seconds, exactly the same value may stand in a cell that had noise before.
+        How long, in rig seconds, a cell that had noise before may repeat exactly the same value.
     clipped_s
-        The same at the amplifier's end.
+        The same for a saturated amplifier.
     rate_hz
         Nominal.
     speed
-        Rig seconds a real second.
+        Rig seconds per real second.
     noisy
-        How often the value changed shortly before the test: a cell that is stuck from its start on had noise then.
+        How often the value changed shortly before the test, so that a cell that is stuck from the start is found.
     """
 
     def __init__(
@@ -70,27 +72,27 @@ class Plausible:
         self._from_s: float | None = None
         self._prompt: list[tuple[float, int]] = []
 
-    def wrong(self, samples: NDArray[Any]) -> str | None:
-        """What is wrong with this block, None if nothing is."""
+    def fault(self, samples: NDArray[Any]) -> str | None:
+        """What is wrong with this block; None: nothing."""
         torque_nm, now_s = samples["torque_nm"], float(samples["host_time_s"][-1])
         found = self._jumped(torque_nm, now_s) or self._stuck(torque_nm, now_s) or self._off_rate(samples, now_s)
         self._last = float(torque_nm[-1]), now_s
         return found
 
     def begin(self) -> None:
-        """Let what came before say nothing of the rate: an old backlog may have been read. From any thread."""
+        """Start the measurement of the rate again, since an old backlog may have been read. From any thread."""
         self._anew = True
 
     def _jumped(self, torque_nm: NDArray[np.float64], now_s: float) -> str | None:
         before_nm, before_s = self._last or (float(torque_nm[0]), now_s)
         steps_nm = np.abs(np.diff(torque_nm, prepend=before_nm))
-        steps_nm[0] -= FASTEST_NM_S * max(0.0, now_s - before_s - 0.02)  # after a gap it may have gone far
+        steps_nm[0] -= FASTEST_NM_S * max(0.0, now_s - before_s - 0.02)  # during a gap it may change a lot
         worst_nm = float(np.max(steps_nm))
-        if worst_nm <= self._jump_nm or np.isnan(worst_nm):  # no number is told elsewhere
+        if worst_nm <= self._jump_nm or np.isnan(worst_nm):  # NaN is reported elsewhere
             return None
         return (
             f"load cell: torque_jump_nm {worst_nm:.2f} N·m from one sample to the next is outside "
-            f"0 … {self._jump_nm:g}: a knock, a loose cable, or a turned sign"
+            f"0 … {self._jump_nm:g}: a knock, a loose cable, or a reversed sign"
         )
 
     def _stuck(self, torque_nm: NDArray[np.float64], now_s: float) -> str | None:
@@ -106,12 +108,12 @@ class Plausible:
             self._same_since_s = now_s
         stood_s = now_s - self._same_since_s
         allowed_s = self._clipped_s if at_end else self._stuck_s
-        if self._noisy < 3 or stood_s < allowed_s:  # one without noise may well stand still
+        if self._noisy < 3 or stood_s < allowed_s:  # a cell without noise may repeat a value
             return None
-        told = f"load cell: its value has stood at exactly {torque_nm[0]:.3f} N·m"
+        text = f"load cell: its value has stayed at exactly {torque_nm[0]:.3f} N·m"
         if at_end:
-            return f"{told}, its end, for too long: more would not be seen; widen its range or stimulate less"
-        return f"{told}; it is stuck, check its amplifier"
+            return f"{text}, the end of its range, for too long: higher torque is not seen; widen it or stimulate less"
+        return f"{text}; it is stuck, check its amplifier"
 
     def _off_rate(self, samples: NDArray[Any], now_s: float) -> str | None:
         if self._anew:
@@ -127,10 +129,10 @@ class Plausible:
         rate_hz = self._rate((begin_s, begin_s + third_s), (now_s - third_s, now_s))
         if rate_hz is None or abs(rate_hz / self._rate_hz - 1) <= RATE_TOLERANCE:
             return None
-        return self._told(rate_hz)
+        return self._rate_message(rate_hz)
 
     def _counted_from(self, count: int, now_s: float) -> float:
-        """Time from which the rate is counted: after a standstill, when what piled up has been read."""
+        """Start of the rate measurement: after a standstill, when the backlog has been read."""
         gap_s = 0.0 if self._last is None else now_s - self._last[1]
         behind_s = gap_s - count / self._rate_hz
         self._longest_s = max(self._longest_s, behind_s)
@@ -141,18 +143,18 @@ class Plausible:
         return self._from_s
 
     def _rate(self, early: tuple[float, float], late: tuple[float, float]) -> float | None:
-        """Samples a second between the promptest blocks of two spans of time, s; None where one has no block."""
+        """Samples per second between the least delayed blocks of two time spans, s; None if one span has no block."""
         first, last = self._promptest(*early), self._promptest(*late)
         if first is None or last is None or last[0] <= first[0]:
             return None
         return (last[1] - first[1]) / (last[0] - first[0])
 
     def _delay_s(self, block: tuple[float, int]) -> float:
-        """By how much a block came late, up to a constant, if the rate is the nominal one."""
+        """Delay of a block, up to a constant, if the rate is nominal."""
         return block[0] - block[1] / self._rate_hz
 
     def _promptest(self, from_s: float, to_s: float) -> tuple[float, int] | None:
-        """The block that came with the least delay: one that piled up, or that a busy host read late, is not it."""
+        """The block with the least delay in a time span; blocks of a backlog or of a busy host have more."""
         low, high = bisect_left(self._prompt, (from_s, 0)), bisect_right(self._prompt, (to_s, sys.maxsize))
         return min(self._prompt[low:high], key=self._delay_s, default=None)
 
@@ -163,11 +165,11 @@ class Plausible:
         elif self._delay_s((now_s, number)) < self._delay_s(kept[-1]):
             kept[-1] = now_s, number
 
-    def wrong_at_end(self) -> str | None:
-        """Was the rate over the whole test another than the rig file's? None: no, or too little came to tell.
+    def fault_at_end(self) -> str | None:
+        """Whether the rate over the whole test differs from the rig file's; None: no, or there were too few samples.
 
-        `wrong` says nothing in a test shorter than its window, or where longer standstills follow one another.
-        The longest standstill may bend this rate by that much, which is allowed for.
+        `fault` cannot measure the rate in a test shorter than its window, or between frequent long standstills.
+        The tolerance allows for the error that the longest standstill can cause.
         """
         if len(self._prompt) < 3:
             return None
@@ -177,22 +179,20 @@ class Plausible:
         tolerance = RATE_TOLERANCE + max(self._jitter_s, self._longest_s) / (end_s - begin_s)
         if rate_hz is None or abs(rate_hz / self._rate_hz - 1) <= tolerance:
             return None
-        return self._told(rate_hz)
+        return self._rate_message(rate_hz)
 
-    def _told(self, rate_hz: float) -> str:
-        return (
-            f"load cell: {rate_hz:.0f} samples/s come, the rig file says {self._rate_hz:g}; check its settings and bus"
-        )
+    def _rate_message(self, rate_hz: float) -> str:
+        return f"load cell: {rate_hz:.0f} samples/s arrive, the rig file says {self._rate_hz:g}; check settings and bus"
 
 
 class _Rail:
-    """The most that a cell has given (the least, with sign -1), and how often it came to that very number."""
+    """The largest value that a cell has given (smallest with sign -1), and how often it reached exactly this value."""
 
     def __init__(self, sign: int) -> None:
         self._sign, self._end_nm, self._visits = sign, -np.inf, 0
 
     def holds(self, torque_nm: NDArray[np.float64], before_nm: float) -> bool:
-        """Does the last of these samples stand at what may be the amplifier's end?"""
+        """Whether the last of these samples may be saturated."""
         signed_nm = self._sign * np.concatenate(([before_nm], torque_nm))
         most_nm = float(np.max(signed_nm))
         if most_nm > self._end_nm:
