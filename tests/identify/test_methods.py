@@ -48,7 +48,7 @@ def test_options_that_a_method_does_not_have(clean_record):
         identify.fit(clean_record[0], method="two-stage", taps=3)
     with pytest.raises(identify.BadRequest, match="order"):
         identify.fit(clean_record[0], method="two-stage", order="two")
-    with pytest.raises(identify.BadRequest, match="unusable option"):
+    with pytest.raises(identify.BadRequest, match="invalid option"):
         identify.fit(clean_record[0], knots="many")
 
 

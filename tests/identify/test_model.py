@@ -143,7 +143,7 @@ def test_warns_and_refuses_outside_what_it_holds_for(case):
     with pytest.raises(identify.BadModel, match="pulses a second"):
         identify.predict(model, replace(record, pulse_rate_hz=20.0))
     slightly = replace(record, pulse_rate_hz=44.0)
-    assert any("fit again" in warning for warning in range_warnings(model, slightly))
+    assert any("fit a model at that rate" in warning for warning in range_warnings(model, slightly))
 
 
 def test_predicts_at_the_records_own_rate(case):

@@ -105,7 +105,7 @@ def test_rivals_and_the_test_between_them_keep_to_the_schema(record, monkeypatch
     monkeypatch.setattr(import_module("identify.diagnosis.result"), "RIVAL", 0.0)
     found = identify.diagnose(record)
     assert found.missing[0]["next_experiment_plan"]["segments"] and errors("diagnosis", found.to_dict()) == []
-    assert "can't tell it from" in str(found) and "next test" in str(found)
+    assert "cannot separate it from" in str(found) and "next test" in str(found)
 
 
 def test_the_check_sees_a_key_too_many_and_one_too_few(results):
@@ -206,7 +206,7 @@ def test_nothing_missing_names_no_worst_place_and_says_when_the_record_is_too_po
     found = dataclasses.replace(results["diagnosis"], verdict="nothing_missing", missing=(), notes=())
     base = {**found.base, "held_out_rms_nm": found.noise_sd_nm}
     calm = str(dataclasses.replace(found, base=base))
-    assert "error sits" not in calm and "too short or too poor" not in calm
+    assert "error in" not in calm and "too short or too poor" not in calm
     poor = str(dataclasses.replace(found, base={**base, "held_out_rms_nm": 20 * found.noise_sd_nm}))
     assert "too short or too poor" in poor
 
