@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 import pytest
 
-from api import cli
+from api.cli import main
 from rig import archive, assembly, journal, recover
 from rig.control.latch import lock_folder
 from rig.errors import RecordingError
@@ -197,12 +197,12 @@ def test_the_verb_gives_one_line_and_an_exit_code(
 ):
     monkeypatch.chdir(ROOT)
     (tmp_path / "t.journal").write_bytes(played[0])
-    assert cli.run(["recover", str(tmp_path / "t.journal"), "--json"]) == 0
+    assert main.run(["recover", str(tmp_path / "t.journal"), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert (found["pulses"], found["note"]) == (played[1], "")
     (tmp_path / "noise").write_bytes(b"no journal")
     for wrong in ("noise", "nowhere", "-x"):
-        assert cli.run(["recover", "--", str(tmp_path / wrong)]) == 2
+        assert main.run(["recover", "--", str(tmp_path / wrong)]) == 2
         told = capsys.readouterr()
         assert told.out == ""
         assert told.err.startswith("stimrig recover: journal ")
