@@ -13,7 +13,7 @@ from identify.dynamics.linear import Discrete, Linear, SecondOrder, linear_from_
 from identify.errors import BadModel
 from identify.json_values import json_value
 from identify.recruitment.curve import Curve, basis_from_dict
-from identify.shown import Sheet, Shown, fit_words, held_out_label, quantity
+from identify.shown import Sheet, Shown, estimate, fit_words, held_out_label, quantity
 from identify.strict_json import BadJson, parse
 
 if TYPE_CHECKING:
@@ -322,13 +322,14 @@ def _words(model: Model) -> Sheet:
     named = ", ".join(str(effect["id"]) for effect in model.effects) or "no effects"
     width_us, torque_nm = model.recruitment.table()
     top = int(np.argmax(np.abs(torque_nm)))
+    largest = estimate(float(torque_nm[top]), _curve_sd(model, float(width_us[top])), "N·m")
     rows = [
         ("fit", fit_words(fit)),
         (held_out_label(fit), fit_words(fit, "held_out_")),
         ("noise", f"{quantity(model.noise.white_sd_nm, 'N·m')} white, sd of a sample"),
-        ("dynamics", _dynamics(model.linear)),
-        ("recruitment", f"largest {quantity(float(torque_nm[top]), 'N·m')}, at {quantity(float(width_us[top]), 'µs')}"),
-        ("baseline", quantity(model.baseline_nm, "N·m")),
+        ("dynamics", _dynamics(model)),
+        ("recruitment", f"largest {largest}, at {quantity(float(width_us[top]), 'µs')}"),
+        ("baseline", estimate(model.baseline_nm, _sd(model, "baseline_nm"), "N·m")),
         *[(str(effect["id"]), _parameters(effect.get("parameters", {}))) for effect in model.effects],
     ]
     if "pulse_width_us" in known and "pulse_rate_hz" in known:
@@ -343,11 +344,30 @@ def _words(model: Model) -> Sheet:
     return Sheet(f"Model {model.model_id[:8]}, {model.method}, {named}: {figures}", tuple(rows))
 
 
-def _dynamics(linear: Linear) -> str:
+def _sd(model: Model, name: str, factor: float = 1.0) -> float | None:
+    """Standard deviation of a parameter; None if the model has none."""
+    known = model.covariance
+    return factor * known.sd(name) if known is not None and name in known.names else None
+
+
+def _curve_sd(model: Model, width_us: float) -> float | None:
+    """Standard deviation of the recruitment curve at a pulse width, N·m; None if the model has none."""
+    known, basis = model.covariance, model.recruitment.basis
+    places = [place for place in range(basis.size) if known and f"recruitment_{place}_nm" in known.names]
+    if known is None or len(places) < basis.size:
+        return None
+    rows = [known.names.index(f"recruitment_{place}_nm") for place in places]
+    design = basis.design(np.array([width_us]))[0]
+    return float(np.sqrt(max(design @ known.matrix[np.ix_(rows, rows)] @ design, 0.0)))
+
+
+def _dynamics(model: Model) -> str:
+    linear = model.linear
     if isinstance(linear, SecondOrder):
         return (
-            f"time constant {quantity(linear.time_constant_s, 's')}, damping {quantity(linear.damping, '1')}, "
-            f"delay {quantity(1e3 * linear.delay_s, 'ms')}"
+            f"time constant {estimate(linear.time_constant_s, _sd(model, 'time_constant_s'), 's')}, "
+            f"damping {estimate(linear.damping, _sd(model, 'damping'), '1')}, "
+            f"delay {estimate(1e3 * linear.delay_s, _sd(model, 'delay_s', 1e3), 'ms')}"
         )
     step = quantity(1e3 * linear.step_s, "ms")
     return f"order {len(linear.a) - 1} in steps of {step}, delay {quantity(linear.delay_samples, 'steps')}"
@@ -357,12 +377,10 @@ def _parameters(values: dict[str, Any], most: int = 4) -> str:
     parts = []
     for name, entry in list(values.items())[:most]:
         entry = entry if isinstance(entry, dict) else {"value": entry}
-        spread = "" if entry.get("sd") is None else f" ± {quantity(entry['sd'], '')}"
-        unit, direction = str(entry.get("unit") or "1"), str(entry.get("direction") or "")
-        words = [f"{name} {quantity(entry.get('value'), '')}{spread}", "" if unit == "1" else unit, direction]
-        parts.append(" ".join(word for word in words if word))
+        value = estimate(entry.get("value"), entry.get("sd"), str(entry.get("unit") or "1"))
+        parts.append(f"{name} {value} {entry.get('direction') or ''}".rstrip())
     more = len(values) - most
-    return ", ".join([*parts, *([f"{more} parameters more"] if more > 0 else [])])
+    return ", ".join([*parts, *([f"{more} more parameters"] if more > 0 else [])])
 
 
 def _span(value: Any, unit: str) -> str:

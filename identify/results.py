@@ -13,7 +13,7 @@ from typing import Any, TypedDict
 from identify.caution import caution
 from identify.json_values import json_value
 from identify.model import Model
-from identify.shown import Sheet, Shown, both_words, fit_words, probability, quantity, torque
+from identify.shown import Sheet, Shown, both_words, estimate, fit_words, probability, quantity, torque
 
 Row = Mapping[str, Any]
 VERDICTS = {
@@ -22,6 +22,8 @@ VERDICTS = {
     "unexplained_structure": "an error is left that no effect in the library explains",
 }
 CORRELATED_WITH = {"residual": "itself", "u": "the pulse width", "u2": "the pulse width's square", "y": "the torque"}
+MOST_PARAMETERS = 3
+"""Parameters of an effect that a summary shows."""
 FEW = 3
 """Number of rows of a long table that a summary shows."""
 
@@ -265,5 +267,7 @@ def _found(row: Row) -> str:
         f"{torque(row, 'rms_after_nm')}, held out from {torque(row, 'held_out_rms_before_nm')} to "
         f"{torque(row, 'held_out_rms_after_nm')}"
     )
+    for name, entry in list(row["parameters"].items())[:MOST_PARAMETERS]:
+        text += f"; {name} {estimate(entry['value'], entry['sd'], entry['unit'])}"
     others = ", ".join(row["confused_with"])
     return f"{text}; this record cannot separate it from {others}" if others else text

@@ -4,11 +4,18 @@ from __future__ import annotations
 
 import html
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+
+from identify.errors import BadRequest
+
+Plotter = Callable[[Any, Any], Any]
+"""`plotter(result, record) -> figure`: draws a model, comparison, diagnosis or improvement. The record may be None."""
+_plotters: list[Plotter] = []
+"""At most one; `identify` itself draws nothing and imports no plotting library."""
 
 NONE = "–"
 SURE, LIKELY = 0.9, 0.6
@@ -53,6 +60,18 @@ class Sheet:
         return f"<table>{caption}<tbody>{rows}</tbody></table>"
 
 
+def register_plotter(plotter: Plotter) -> None:
+    """Set the function that draws results; it replaces an earlier one.
+
+    Parameters
+    ----------
+    plotter : callable
+        `plotter(result, record) -> figure`, with a `Model`, `Comparison`, `Diagnosis` or `Improvement` as result, and
+        a `Record` or None. It raises `BadRequest` if it cannot draw this result.
+    """
+    _plotters[:] = [plotter]
+
+
 class Shown:
     """Base class of results that are printed and shown in notebooks."""
 
@@ -71,6 +90,28 @@ class Shown:
 
     def _repr_html_(self) -> str:
         return self._sheet().html()
+
+    def plot(self, record: Any = None) -> Any:
+        """Draw the result with the registered plotter.
+
+        Parameters
+        ----------
+        record : Record or None
+            The measurement to draw beside it; a model needs one.
+
+        Returns
+        -------
+        figure
+            Whatever the plotter returns.
+
+        Raises
+        ------
+        BadRequest
+            No plotter is registered, or it cannot draw this result.
+        """
+        if not _plotters:
+            raise BadRequest("no plotter is registered", place="plot", mend="Import stimrig first; it registers one.")
+        return _plotters[0](self, record)
 
 
 def one_line(text: str) -> str:
@@ -93,6 +134,12 @@ def quantity(value: Any, unit: str) -> str:
         return NONE
     digits = f"{value:.1f}" if unit == "%" else f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
     return digits if unit in ("", "1") else f"{digits} {unit}"
+
+
+def estimate(value: Any, sd: Any, unit: str) -> str:
+    """An estimate with its standard deviation, such as "0.53 ± 0.01 s"; without the ± if there is no deviation."""
+    spread = "" if sd is None or quantity(sd, "") == NONE else f" ± {sd:.2g}"
+    return f"{quantity(value, '')}{spread}{'' if unit in ('', '1') else f' {unit}'}"
 
 
 def fit_words(figures: Mapping[str, Any], prefix: str = "") -> str:

@@ -89,7 +89,9 @@ def test_a_residual_that_is_not_noise_asks_for_care_alone(record: identify.Recor
     alarmed = model.with_(residual_tests={"whiteness": {"passed": False}})
     found = quality(alarmed, grid, grid.fitted)
     assert found["verdict"] == "usable with care"
-    assert found["words"] == "Check this before use: the residual is not pure noise (whiteness test): see the diagnosis."
+    assert (
+        found["words"] == "Check this before use: the residual is not pure noise (whiteness test): see the diagnosis."
+    )
 
 
 def test_what_refuses_is_said_first(record: identify.Record, model: identify.Model) -> None:
