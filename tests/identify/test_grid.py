@@ -130,11 +130,14 @@ def test_critical_damping_has_no_seam() -> None:
     np.testing.assert_allclose(above, at, atol=1e-5)
 
 
-def test_a_delay_of_nothing_changes_no_bit() -> None:
+def test_means_are_those_of_the_curve_at_the_samples_and_a_delay_shifts_them() -> None:
     grid = make_grid(Record.from_arrays(np.arange(4000) / 400, np.repeat(schedule()[:400], 10), np.zeros(4000)))
     states = boundary_states(0.3, 0.8, grid.step_s, grid.pulse_width_us)
-    assert np.array_equal(grid.block_mean(*states), grid.block_mean(*states, 0.0))
-    assert grid.mean_weights(0.0)[0] == 0
+    at_once, late = grid.block_mean(*states), grid.block_mean(*states, grid.step_s)
+    sampled = grid.at_samples(*states, 0.0).reshape(-1, 10).mean(axis=1)
+    assert np.ptp(at_once) > 100.0
+    np.testing.assert_allclose(at_once, sampled, atol=1e-9)
+    np.testing.assert_allclose(late[1:], at_once[:-1], atol=1e-9)
 
 
 def test_held_out_rows_are_never_fitted() -> None:

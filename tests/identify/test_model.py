@@ -78,7 +78,7 @@ def test_bad_models_are_refused(case):
         ("[]", "JSON object"),
         ("{}", "schema version"),
         (json.dumps(document | {"schema_version": "9.0"}), "schema version 9.0"),
-        (json.dumps({k: v for k, v in document.items() if k != "linear"}), "linear: key is missing"),
+        (json.dumps({k: v for k, v in document.items() if k != "linear"}), "linear: the key is missing"),
         (json.dumps(document | {"linear": {"kind": "second-order", "time_constant_s": "x"}}), "'x' is no number"),
         (json.dumps(document | {"recruitment": {"basis": {"kind": "magic"}}}), "unknown basis"),
     ):
@@ -163,6 +163,6 @@ def test_a_polynomial_whose_parts_do_not_go_together_is_refused(case):
         "baseline_nm": 0.0,
     }  # fmt: skip
     identify.Model.from_dict(document | {"extra": {"narx": narx}})
-    for change, says in (({"terms": [[0], []]}, "differ in number"), ({"terms": [[1]]}, "not there")):
+    for change, says in (({"terms": [[0], []]}, "differ in number"), ({"terms": [[1]]}, "does not exist")):
         with pytest.raises(identify.BadModel, match=says):
             identify.Model.from_dict(document | {"extra": {"narx": narx | change}})
