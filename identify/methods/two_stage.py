@@ -2,7 +2,7 @@
 
 With the two levels of the PRBS, w is proportional to u (15), which gives a first linear part. With it, the spline is
 found on the ramp (stage one). With the spline, the linear part is found again (stage two). One iteration is made.
-There are three differences from the paper, whose text fails with output noise (docs/table1.md):
+There are three differences from the paper, whose text fails with output noise (docs/results/table1.md):
 
 - the linear part minimises the output error (12), not the equation error (25), which makes the poles 4 times too slow;
 - the spline is fitted to the output of G; the inverse of G (26) is unstable because of a zero near -1;

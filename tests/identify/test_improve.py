@@ -40,7 +40,7 @@ def test_each_step_is_a_model_that_predicts_what_the_step_says(improved):
 def test_what_is_not_there_is_refused_with_a_reason_and_can_be_forced(improved):
     _, result = improved
     assert result.steps[-1]["added"] == "electromechanical_delay"
-    assert "person" in result.steps[-1]["reason"]
+    assert "on request" in result.steps[-1]["reason"]
     refusals = {row["effect"]: row["reason"] for row in result.refused}
     assert "log evidence" in refusals["electromechanical_delay"]
 

@@ -79,7 +79,7 @@ def test_bad_models_are_refused(case):
         ("{}", "schema version"),
         (json.dumps(document | {"schema_version": "9.0"}), "schema version 9.0"),
         (json.dumps({k: v for k, v in document.items() if k != "linear"}), "linear: the key is missing"),
-        (json.dumps(document | {"linear": {"kind": "second-order", "time_constant_s": "x"}}), "'x' is no number"),
+        (json.dumps(document | {"linear": {"kind": "second-order", "time_constant_s": "x"}}), "'x' is not a number"),
         (json.dumps(document | {"recruitment": {"basis": {"kind": "magic"}}}), "unknown basis"),
     ):
         with pytest.raises(identify.BadModel, match=says):
