@@ -12,17 +12,17 @@ class IdentifyError(Exception):
         What is wrong, in one line.
     place : str
         Where: file, line and column, segment, parameter. May be empty.
-    mend : str
+    fix : str
         What to do. May be empty.
     """
 
-    def __init__(self, message: str, *, place: str = "", mend: str = "") -> None:
-        self.message, self.place, self.mend = message, place, mend
+    def __init__(self, message: str, *, place: str = "", fix: str = "") -> None:
+        self.message, self.place, self.fix = message, place, fix
         super().__init__(str(self))
 
     def __str__(self) -> str:
         head = f"{self.place}: {self.message}" if self.place else self.message
-        return f"{head}. {self.mend}" if self.mend else head
+        return f"{head}. {self.fix}" if self.fix else head
 
 
 class BadRecord(IdentifyError):

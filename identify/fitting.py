@@ -63,34 +63,34 @@ def fit(
     """
     names = None if fit_on is None else (fit_on,) if isinstance(fit_on, str) else tuple(fit_on)
     if names is not None and not names:
-        raise BadRequest("no segment is named", place="fit_on", mend="Name segments, or leave out fit_on.")
+        raise BadRequest("no segment is named", place="fit_on", fix="Name segments, or leave out fit_on.")
     chosen = method_of(method)
     check_options(chosen, options)
     wanted = [effects] if isinstance(effects, str) else list(effects or ())
     twice = {name for name in wanted if wanted.count(name) > 1}
     if twice or not all(isinstance(name, str) for name in wanted):
         given = ", ".join(map(str, sorted(twice, key=str) or wanted))
-        raise BadRequest(f"not a list of different effects: {given}", place="effects", mend="Name each effect once.")
+        raise BadRequest(f"not a list of different effects: {given}", place="effects", fix="Name each effect once.")
     try:
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             if not wanted:
                 if len(record.parts) > 1 and chosen is not MAXIMUM_LIKELIHOOD:
                     message = f"{method} takes a single recording; this record has {len(record.parts)} parts"
-                    raise BadRequest(message, place="method", mend="Use maximum-likelihood, or give one of the parts.")
+                    raise BadRequest(message, place="method", fix="Use maximum-likelihood, or give one of the parts.")
                 return chosen.fit(prepare(record)[0], names, **options)
             against = [method] if chosen is not MAXIMUM_LIKELIHOOD else sorted(set(options) & NO_EFFECTS_WITH)
             if against:
                 message = f"effects cannot be fitted with {' and '.join(against)}"
-                raise BadRequest(message, place="effects", mend="Use maximum-likelihood without this option.")
+                raise BadRequest(message, place="effects", fix="Use maximum-likelihood without this option.")
             return _with_effects(record, wanted, names, options, progress or _quiet)
     except np.linalg.LinAlgError as error:
         raise NotIdentifiable(
-            f"{method} finds no solution on this record ({error})", mend="Check that torque follows the pulses."
+            f"{method} finds no solution on this record ({error})", fix="Check that torque follows the pulses."
         ) from error
     except (TypeError, ValueError) as error:
         if options:
             given = ", ".join(f"{key}={value}" for key, value in options.items())
-            raise BadRequest(f"invalid option ({error})", place=given, mend="See the options of the method.") from error
+            raise BadRequest(f"invalid option ({error})", place=given, fix="See the options of the method.") from error
         raise
 
 
@@ -106,12 +106,12 @@ def _with_effects(
             raise BadRequest(
                 f"{AUTO} chooses the effects itself, but {others} is given as well",
                 place="effects",
-                mend=f"Give {AUTO}, or a list of effects.",
+                fix=f"Give {AUTO}, or a list of effects.",
             )
         if options:
             given = ", ".join(sorted(options))
             raise BadRequest(
-                f"{AUTO} takes no options, but {given} is given", place="effects", mend="Leave out the options."
+                f"{AUTO} takes no options, but {given} is given", place="effects", fix="Leave out the options."
             )
         last = helpful(search_effects(record, progress, fitted=rows))[0][-1].fitted
         progress(1.0, "done")

@@ -197,13 +197,13 @@ class Model(Shown):
             A key is missing, or its value is not valid.
         """
         if not isinstance(data, dict):
-            raise BadModel("not a JSON object", mend="Give a file written by `stimrig fit -o`.")
+            raise BadModel("not a JSON object", fix="Give a file written by `stimrig fit -o`.")
         version = str(data.get("schema_version", ""))[:20]
         if version.split(".")[0] != SCHEMA_VERSION.split(".")[0]:
             raise BadModel(
                 f"schema version {version or 'missing'}, this software reads {SCHEMA_VERSION}",
                 place="schema_version",
-                mend="Fit the record again with this version.",
+                fix="Fit the record again with this version.",
             )
         model_schema.MODEL(data, "")
         try:
@@ -211,9 +211,9 @@ class Model(Shown):
             with np.errstate(all="ignore"):
                 table = model.recruitment.table()[1]
         except (KeyError, TypeError, ValueError, IndexError, AttributeError, ArithmeticError) as error:
-            raise BadModel(f"the parts do not match ({_line(error)})", mend=model_schema.MEND) from error
+            raise BadModel(f"the parts do not match ({_line(error)})", fix=model_schema.FIX) from error
         if not np.isfinite(table).all():
-            raise BadModel("the curve is not finite", place="recruitment.basis", mend=model_schema.MEND)
+            raise BadModel("the curve is not finite", place="recruitment.basis", fix=model_schema.FIX)
         for index, entry in enumerate(model.effects):
             _check_effect(entry, f"effects.{index}.parameters", model.recruitment.basis.largest_us)
         return model
@@ -228,11 +228,11 @@ class Model(Shown):
             Not JSON, too long, too deep, with a duplicate key or an invalid number, or not a model.
         """
         if len(text) > LARGEST_TEXT:
-            raise BadModel(f"more than {LARGEST_TEXT} characters", mend="Give a file written by `stimrig fit -o`.")
+            raise BadModel(f"more than {LARGEST_TEXT} characters", fix="Give a file written by `stimrig fit -o`.")
         try:
             return cls.from_dict(parse(text))
         except BadJson as error:
-            raise BadModel(str(error), mend=model_schema.MEND) from error
+            raise BadModel(str(error), fix=model_schema.FIX) from error
 
     def with_(self, **changes: Any) -> Model:
         """A copy of the model with some fields changed."""
@@ -307,9 +307,7 @@ def _covariance(data: dict[str, Any] | None) -> Covariance | None:
     names, size = tuple(data["names"]), len(data["names"])
     values, matrix = np.asarray(data["values"], float), np.asarray(data["matrix"], float)
     if values.shape != (size,) or matrix.shape != (size, size):
-        raise BadModel(
-            "names, values and matrix differ in size", place="uncertainty.covariance", mend=model_schema.MEND
-        )
+        raise BadModel("names, values and matrix differ in size", place="uncertainty.covariance", fix=model_schema.FIX)
     return Covariance(names, values, matrix)
 
 

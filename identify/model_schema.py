@@ -13,7 +13,7 @@ from typing import Any
 from identify.errors import BadModel
 
 Check = Callable[[Any, str], None]
-MEND = "Fit the record again."
+FIX = "Fit the record again."
 MOST_KNOTS = 1000
 LONGEST = 10_000
 
@@ -23,7 +23,7 @@ def number(lo: float, hi: float) -> Check:
 
     def check(value: Any, place: str) -> None:
         if isinstance(value, bool) or not isinstance(value, int | float) or not (lo <= value <= hi):
-            raise BadModel(f"{_short(value)} is not a number from {lo:g} to {hi:g}", place=place, mend=MEND)
+            raise BadModel(f"{_short(value)} is not a number from {lo:g} to {hi:g}", place=place, fix=FIX)
 
     return check
 
@@ -31,7 +31,7 @@ def number(lo: float, hi: float) -> Check:
 def text(value: Any, place: str) -> None:
     """A text, not too long."""
     if not isinstance(value, str) or len(value) > LONGEST:
-        raise BadModel(f"{_short(value)} is not a text, or too long", place=place, mend=MEND)
+        raise BadModel(f"{_short(value)} is not a text, or too long", place=place, fix=FIX)
 
 
 def anything(value: Any, place: str) -> None:
@@ -66,11 +66,11 @@ def several(inner: Check, least: int = 0, most: int = LONGEST, rising: bool = Fa
     def check(value: Any, place: str) -> None:
         if not isinstance(value, list) or not (least <= len(value) <= most):
             what = f"a list of {len(value)}" if isinstance(value, list) else _short(value)
-            raise BadModel(f"{what}, not a list of {least} to {most}", place=place, mend=MEND)
+            raise BadModel(f"{what}, not a list of {least} to {most}", place=place, fix=FIX)
         for index, item in enumerate(value):
             inner(item, f"{place}.{index}")
         if rising and any(not (b > a) for a, b in pairwise(value)):
-            raise BadModel("the values are not strictly rising", place=place, mend=MEND)
+            raise BadModel("the values are not strictly rising", place=place, fix=FIX)
 
     return check
 
@@ -93,7 +93,7 @@ def fields(wanted: Mapping[str, Check], optional: Mapping[str, Check] | None = N
         found = _object(value, place)
         for name, inner in wanted.items():
             if name not in found:
-                raise BadModel("the key is missing", place=prefix + name, mend=MEND)
+                raise BadModel("the key is missing", place=prefix + name, fix=FIX)
             inner(found[name], prefix + name)
         for name, inner in (optional or {}).items():
             if name in found:
@@ -109,7 +109,7 @@ def kinds(known: Mapping[str, Check], default: str = "") -> Check:
         kind = _object(value, place).get("kind", default)
         if not isinstance(kind, str) or kind not in known:
             message = f"unknown {place.rpartition('.')[2]} {_short(kind)}"
-            raise BadModel(message, place=f"{place}.kind", mend=f"Known: {', '.join(known)}.")
+            raise BadModel(message, place=f"{place}.kind", fix=f"Known: {', '.join(known)}.")
         known[kind](value, place)
 
     return check
@@ -117,7 +117,7 @@ def kinds(known: Mapping[str, Check], default: str = "") -> Check:
 
 def _object(value: Any, place: str) -> dict[str, Any]:
     if not isinstance(value, dict):
-        raise BadModel(f"{_short(value)} is not a JSON object", place=place, mend=MEND)
+        raise BadModel(f"{_short(value)} is not a JSON object", place=place, fix=FIX)
     return value
 
 
@@ -171,7 +171,7 @@ PLAUSIBLE = 1e6
 def sign(value: Any, place: str) -> None:
     """1 or -1."""
     if isinstance(value, bool) or value not in (1, -1):
-        raise BadModel(f"{_short(value)} is not 1 or -1", place=place, mend=MEND)
+        raise BadModel(f"{_short(value)} is not 1 or -1", place=place, fix=FIX)
 
 
 def parameter_value(value: Any) -> Any:
@@ -203,10 +203,10 @@ def narx(value: Any, place: str) -> None:
     """A NARX polynomial: one weight per term, and terms that use existing variables."""
     _NARX(value, place)
     if len(value["terms"]) != len(value["weights"]):
-        raise BadModel("terms and weights differ in number", place=place, mend=MEND)
+        raise BadModel("terms and weights differ in number", place=place, fix=FIX)
     largest = max((index for term in value["terms"] for index in term), default=-1)
     if not (largest < len(value["variables"])):
-        raise BadModel(f"a term uses variable {largest}, which does not exist", place=f"{place}.terms", mend=MEND)
+        raise BadModel(f"a term uses variable {largest}, which does not exist", place=f"{place}.terms", fix=FIX)
 
 
 COVARIANCE = fields(

@@ -110,7 +110,7 @@ class Shown:
             No plotter is registered, or it cannot draw this result.
         """
         if not _plotters:
-            raise BadRequest("no plotter is registered", place="plot", mend="Import stimrig first; it registers one.")
+            raise BadRequest("no plotter is registered", place="plot", fix="Import stimrig first; it registers one.")
         return _plotters[0](self, record)
 
 

@@ -11,7 +11,7 @@ from identify.criticism.doubt import left_out, refuse_doubted
 from identify.criticism.shares import by_direction, by_frequency, by_level, by_segment, by_time
 from identify.criticism.where import worst_places
 from identify.dynamics.make_grid import make_grid
-from identify.estimation.figures import UNDEFINED, best_fit_percent, ceiling_percent, rms
+from identify.estimation.fit_statistics import UNDEFINED, best_fit_percent, ceiling_percent, rms
 from identify.estimation.quality import range_warnings
 from identify.estimation.samples import inspect
 from identify.model import Model

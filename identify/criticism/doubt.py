@@ -37,7 +37,7 @@ def refuse_doubted(grid: Grid) -> None:
         Fewer than eight pulse intervals are known.
     """
     if np.sum(~grid.doubted & (grid.count > 0)) < LEAST:
-        raise BadRecord("nearly all samples are doubted", place="doubted", mend="Give a record with known pulses.")
+        raise BadRecord("nearly all samples are doubted", place="doubted", fix="Give a record with known pulses.")
 
 
 def _lost(grid: Grid) -> int:

@@ -60,7 +60,7 @@ def structure_of(model: Model | None) -> list[str]:
         raise BadRequest(
             f"effects cannot be added to a model of {model.method}",
             place="model",
-            mend="Give a model of maximum-likelihood or two-stage.",
+            fix="Give a model of maximum-likelihood or two-stage.",
         )
     return [f"{effect['id']}:{effect.get('form', '')}" for effect in model.effects]
 

@@ -24,7 +24,7 @@ def make_grid(record: Record) -> Grid:
     if not rate_hz >= 0.999 * record.pulse_rate_hz:
         raise BadRecord(
             f"sampled at {rate_hz:.4g} Hz, below the {record.pulse_rate_hz:g} pulses a second",
-            mend="Record at 40 Hz or faster.",
+            fix="Record at 40 Hz or faster.",
         )
     start_s = record.time_s[0] + pulse_phase_s(record)
     # A small shift, so that a sample taken at the pulse itself falls into the interval that starts with the pulse.
@@ -34,7 +34,7 @@ def make_grid(record: Record) -> Grid:
     start_s, position, interval = start_s + lowest * step_s, position - lowest, interval - lowest
     size = int(interval[-1]) + 1
     if size < 8:
-        raise BadRecord(f"only {size} pulse intervals long", mend="Give at least a few seconds of data.")
+        raise BadRecord(f"only {size} pulse intervals long", fix="Give at least a few seconds of data.")
     count = np.bincount(interval, minlength=size)
     filled = np.maximum(count, 1)
 
@@ -136,7 +136,7 @@ def check_arrays(record: Record) -> None:
         Not finite, negative widths, time that does not rise, an impossible pulse rate, or longer than a day.
     """
     if not 1.0 <= record.pulse_rate_hz <= 200.0:
-        raise BadRecord(f"{record.pulse_rate_hz:g} pulses a second", place="pulse_rate_hz", mend="Give 1 to 200 Hz.")
+        raise BadRecord(f"{record.pulse_rate_hz:g} pulses a second", place="pulse_rate_hz", fix="Give 1 to 200 Hz.")
     columns = {"time_s": record.time_s, "pulse_width_us": record.pulse_width_us, "torque_nm": record.torque_nm}
     for name, column in columns.items():
         finite = np.isfinite(column)
@@ -144,19 +144,19 @@ def check_arrays(record: Record) -> None:
             raise BadRecord(
                 "not finite",
                 place=f"{name}, sample {int(np.argmin(finite))}",
-                mend="Cut the record before this sample.",
+                fix="Cut the record before this sample.",
             )
     if record.late_s is not None and (wild := np.flatnonzero(~(np.abs(record.late_s) <= LONGEST_LATE_S))).size:
         raise BadRecord(
             f"{record.late_s[wild[0]]:g} s late",
             place=f"late_s, sample {int(wild[0])}",
-            mend="Give `late_s` in seconds.",
+            fix="Give `late_s` in seconds.",
         )
     if np.any(record.pulse_width_us < 0):
         place = f"pulse_width_us, sample {int(np.argmax(record.pulse_width_us < 0))}"
-        raise BadRecord("negative", place=place, mend="A pulse width is 0 (no pulse) or positive.")
+        raise BadRecord("negative", place=place, fix="A pulse width is 0 (no pulse) or positive.")
     if np.any(np.diff(record.time_s) <= 0):
         place = f"time_s, sample {int(np.argmax(np.diff(record.time_s) <= 0)) + 1}"
-        raise BadRecord("time does not rise", place=place, mend="Sort the samples by time; each time once.")
+        raise BadRecord("time does not rise", place=place, fix="Sort the samples by time; each time once.")
     if record.time_s[-1] - record.time_s[0] > LONGEST_S:
-        raise BadRecord("longer than a day", place="time_s", mend="Give the time in seconds.")
+        raise BadRecord("longer than a day", place="time_s", fix="Give the time in seconds.")

@@ -42,7 +42,7 @@ def _from_file(path: Path) -> Effect:
         effect = module.EFFECT
     except Exception as error:
         raise BadEffect(
-            f"{type(error).__name__}: {error}", place=str(path), mend="See docs/add-an-effect.md."
+            f"{type(error).__name__}: {error}", place=str(path), fix="See docs/add-an-effect.md."
         ) from error
     return effect
 
@@ -81,7 +81,7 @@ def get(effect_id: str) -> Effect:
     """
     effects = registry()
     if effect_id not in effects:
-        raise BadRequest(f"unknown effect {effect_id!r}", mend=f"Known: {', '.join(sorted(effects))}.")
+        raise BadRequest(f"unknown effect {effect_id!r}", fix=f"Known: {', '.join(sorted(effects))}.")
     return effects[effect_id]
 
 

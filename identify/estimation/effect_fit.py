@@ -155,7 +155,7 @@ def add_effect(base: Fitted, effect: Effect, form: str, raw: Raw) -> Fitted:
     """
     for need in effect.needs:
         if getattr(base.problem.setup.grid.record, need) is None:
-            raise NotIdentifiable(f"{effect.id} needs the column {need}", place=need, mend="Record this column.")
+            raise NotIdentifiable(f"{effect.id} needs the column {need}", place=need, fix="Record this column.")
     try:
         forms = [effect.form(form)] if form else list(effect.forms)
     except KeyError as error:
@@ -167,7 +167,7 @@ def add_effect(base: Fitted, effect: Effect, form: str, raw: Raw) -> Fitted:
     # A requested effect is fitted to its end, whatever it gains.
     found = None if any(form.fixed for form in forms) else try_effect(effect, base, forms, -np.inf)
     if found is None:
-        raise NotIdentifiable(f"the record shows nothing that looks like {effect.id}", mend="Leave this effect out.")
+        raise NotIdentifiable(f"the record shows nothing that looks like {effect.id}", fix="Leave this effect out.")
     return found.fitted
 
 

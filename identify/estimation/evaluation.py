@@ -6,7 +6,7 @@ from typing import Any
 
 from identify.estimation.band_effect import predict_fitted
 from identify.estimation.cross_validation import held_out_change
-from identify.estimation.figures import fit_statistics, white_sd
+from identify.estimation.fit_statistics import fit_statistics, white_sd
 from identify.estimation.joint import Fitted
 
 

@@ -15,7 +15,7 @@ from identify.dynamics.narx import run
 from identify.dynamics.pulse_grid import Grid, runs
 from identify.estimation.band_effect import band_as_effect
 from identify.estimation.evaluation import evaluate
-from identify.estimation.figures import fit_statistics, white_sd
+from identify.estimation.fit_statistics import fit_statistics, white_sd
 from identify.estimation.joint import Fitted
 from identify.estimation.quality import quality, valid_for
 from identify.estimation.residual_tests import residual_tests

@@ -44,10 +44,10 @@ def pilot_solution(grid: Grid, rows: np.ndarray, delay_s: float | None = None) -
     if not largest > 0 or np.ptp(seen) <= 0:
         raise NotIdentifiable(
             "the pulse width never changes in the fitted rows" if largest > 0 else "the record has no pulse",
-            mend="Record a PRBS and a ramp.",
+            fix="Record a PRBS and a ramp.",
         )
     if np.ptp(grid.torque_nm[rows]) <= 0:
-        raise NotIdentifiable("the torque never changes", mend="Check the load cell and the electrodes.")
+        raise NotIdentifiable("the torque never changes", fix="Check the load cell and the electrodes.")
     basis = SplineBasis(even_knots(largest, PILOT_KNOTS))
     order = bending_order(grid.pulse_width_us[rows])
     projection = Projection(grid, basis, spline_roughness(basis, order=order), rows, delay_s)

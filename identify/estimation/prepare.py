@@ -57,12 +57,12 @@ def check_activity(grid: Grid) -> None:
     if grid.fitted.sum() < LEAST_ROWS:
         raise NotIdentifiable(
             f"only {int(grid.fitted.sum())} pulse intervals may be fitted",
-            mend="Give rows of segments other than `validate`.",
+            fix="Give rows of segments other than `validate`.",
         )
     if not np.max(grid.pulse_width_us[grid.fitted]) > 0:
-        raise NotIdentifiable("the record has no pulse", mend="Record a PRBS and a ramp.")
+        raise NotIdentifiable("the record has no pulse", fix="Record a PRBS and a ramp.")
     if not np.ptp(grid.torque_nm[grid.fitted]) > 0:
-        raise NotIdentifiable("the torque never changes", mend="Check the load cell and the electrodes.")
+        raise NotIdentifiable("the torque never changes", fix="Check the load cell and the electrodes.")
 
 
 def fit_plain(grid: Grid, rows: np.ndarray) -> Fitted:

@@ -50,7 +50,7 @@ class Projection:
     def __post_init__(self) -> None:
         self.stretches = self.grid.stretches(self.rows)
         if not self.stretches:
-            raise NotIdentifiable("no row may be fitted", mend="Give rows outside `validate`.")
+            raise NotIdentifiable("no row may be fitted", fix="Give rows outside `validate`.")
 
     @cached_property
     def rows_nm(self) -> np.ndarray:

@@ -34,7 +34,7 @@ def fitted_rows(grid: Grid, fit_on: Sequence[str] | None) -> np.ndarray:
         rows = grid.fitted
     if rows.sum() < 8:
         raise NotIdentifiable(
-            f"only {int(rows.sum())} pulse intervals may be fitted", mend="Give rows of segments other than `validate`."
+            f"only {int(rows.sum())} pulse intervals may be fitted", fix="Give rows of segments other than `validate`."
         )
     return rows
 
@@ -50,6 +50,6 @@ def check_segments(grid: Grid, names: Sequence[str]) -> None:
     there = tuple(dict.fromkeys(grid.record.segment_names))
     for name in names:
         if name == HELD_OUT:
-            raise BadRequest("rows of `validate` are never fitted", place="fit_on", mend="Name other segments.")
+            raise BadRequest("rows of `validate` are never fitted", place="fit_on", fix="Name other segments.")
         if name not in there:
-            raise BadRequest(f"no segment {name!r} in the record", place="fit_on", mend=f"It has: {', '.join(there)}.")
+            raise BadRequest(f"no segment {name!r} in the record", place="fit_on", fix=f"It has: {', '.join(there)}.")

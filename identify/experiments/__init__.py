@@ -47,7 +47,7 @@ def next_experiment(record: Record, rivals: Sequence[str]) -> dict[str, Any]:
     """
     names = list(dict.fromkeys(rivals))
     if not names:
-        raise BadRequest("no rival was named", place="rivals", mend="Name two effects.")
+        raise BadRequest("no rival was named", place="rivals", fix="Name two effects.")
     for name in names:
         get(name)
     fits = {name: fitted_with(record, [name]) for name in names}

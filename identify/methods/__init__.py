@@ -69,7 +69,7 @@ def method_of(name: str) -> Method:
         if isinstance(found, Method) and found.id == name:
             return found
     if name not in methods():
-        raise BadRequest(f"unknown method {name!r}", place="method", mend=f"Known: {', '.join(methods())}.")
+        raise BadRequest(f"unknown method {name!r}", place="method", fix=f"Known: {', '.join(methods())}.")
     return methods()[name]
 
 
@@ -84,4 +84,4 @@ def check_options(chosen: Method, options: Mapping[str, Any]) -> None:
     for name in options:
         if name not in chosen.options:
             known = ", ".join(chosen.options) or "none"
-            raise BadRequest(f"unknown option {name!r} of {chosen.id}", place=name, mend=f"Known: {known}.")
+            raise BadRequest(f"unknown option {name!r} of {chosen.id}", place=name, fix=f"Known: {known}.")

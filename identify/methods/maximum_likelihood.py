@@ -65,7 +65,7 @@ class MaximumLikelihood:
             reason = f"spline of {size} coefficients, smoothed to {solution.freedom:.1f} effective ones"
         else:
             raise BadRequest(
-                f"unknown recruitment {kind!r}", place="recruitment", mend="Give spline, power-series or sigmoid."
+                f"unknown recruitment {kind!r}", place="recruitment", fix="Give spline, power-series or sigmoid."
             )
         if flag(options.get("monotone", False), "monotone"):
             return to_fitted(monotone(solution), most=0), [reason, "recruitment constrained to be monotone"]

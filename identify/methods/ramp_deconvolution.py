@@ -43,12 +43,12 @@ class RampDeconvolution:
         frequency = float(options.get("natural_frequency_rad_s", NATURAL_FREQUENCY_RAD_S))
         if not 0.05 <= frequency <= 100.0:
             raise BadRequest(
-                f"{frequency:g} rad/s is out of range", place="natural_frequency_rad_s", mend="Give 0.05 to 100 rad/s."
+                f"{frequency:g} rad/s is out of range", place="natural_frequency_rad_s", fix="Give 0.05 to 100 rad/s."
             )
         ramp = segment_rows(grid, fit_on or ("ramp",), self.id)
         if np.unique(grid.pulse_width_us[ramp]).size < 8:
             raise NotIdentifiable(
-                "the ramp has fewer than 8 pulse widths", mend="Record a triangular ramp over the whole range."
+                "the ramp has fewer than 8 pulse widths", fix="Record a triangular ramp over the whole range."
             )
         linear = SecondOrder(1.0 / frequency, 1.0)
         drive, baseline = deconvolved(grid, ramp, linear)

@@ -39,21 +39,21 @@ class SeparableLeastSquares:
     def fit(self, grid: Grid, fit_on: tuple[str, ...] | None, **options: Any) -> Model:
         """Fit on the named segments, or on all that may be fitted."""
         if "taps" in options and "memory_s" in options:
-            raise BadRequest("both taps and memory_s are given", place="options", mend="Give one of them.")
+            raise BadRequest("both taps and memory_s are given", place="options", fix="Give one of them.")
         taps = int(options.get("taps", TAPS))
         if "memory_s" in options:
             taps = round(float(options["memory_s"]) / grid.step_s) + 1
         if not 2 <= taps <= 2000:
-            raise BadRequest(f"{taps} taps is out of range", place="taps", mend="Give 2 to 2000.")
+            raise BadRequest(f"{taps} taps is out of range", place="taps", fix="Give 2 to 2000.")
         rows = fitted_rows(grid, fit_on)
         if rows.sum() <= taps + 4:
             raise NotIdentifiable(
                 f"{int(rows.sum())} pulse intervals are too few for {taps} taps",
-                mend="Record longer, or use fewer taps.",
+                fix="Record longer, or use fewer taps.",
             )
         seen = grid.pulse_width_us[rows]
         if not np.ptp(seen) > 0:
-            raise NotIdentifiable("the pulse width never changes", mend="Record a PRBS and a ramp.")
+            raise NotIdentifiable("the pulse width never changes", fix="Record a PRBS and a ramp.")
         basis, response = separate(grid, rows, taps)
         gain = float(response.sum())
         block = Discrete(tuple(response / gain), (1.0,), 0, grid.step_s, float(np.mean(grid.fraction)))

@@ -61,7 +61,7 @@ class TwoStage:
             raise BadRequest(
                 "two-stage needs two segments, the first for the dynamics, the second for the recruitment",
                 place="fit_on",
-                mend="Give, for example, prbs,ramp.",
+                fix="Give, for example, prbs,ramp.",
             )
         prbs = segment_rows(grid, names[:1], self.id)
         ramp = segment_rows(grid, names[1:], self.id)

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from identify.estimation.figures import best_fit_percent
+from identify.estimation.fit_statistics import best_fit_percent
 from identify.fitting import fit
 from identify.paper import muscle
 from identify.records.record import Record

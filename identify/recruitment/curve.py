@@ -99,6 +99,6 @@ def basis_from_dict(data: dict[str, Any]) -> Basis:
     kinds = {"cubic-spline": SplineBasis, "power-series": PowerBasis, "sigmoid": SigmoidBasis}
     if data.get("kind") not in kinds:
         raise BadModel(
-            f"unknown basis {data.get('kind')!r}", place="recruitment.basis.kind", mend=f"Known: {', '.join(kinds)}."
+            f"unknown basis {data.get('kind')!r}", place="recruitment.basis.kind", fix=f"Known: {', '.join(kinds)}."
         )
     return kinds[data["kind"]].from_dict(data)

@@ -89,7 +89,7 @@ def problem_of(model: Muscle, grid: Grid) -> tuple[Problem, np.ndarray]:
         As `predict`.
     """
     if not isinstance(model.linear, SecondOrder):
-        raise BadModel("only second-order dynamics can have effects", mend="Fit with maximum-likelihood.")
+        raise BadModel("only second-order dynamics can have effects", fix="Fit with maximum-likelihood.")
     settings = model.effects[0].get("settings", {}) if model.effects else {}
     setup = Setup(
         grid=grid,
@@ -111,13 +111,13 @@ def problem_of(model: Muscle, grid: Grid) -> tuple[Problem, np.ndarray]:
             form = effect.form(entry.get("form", ""))
             parameters += [float(_value(entry["parameters"][p.name])) for p in form.parameters]
         except Exception as error:
-            raise BadModel(f"{error}", place=f"effects.{entry.get('id')}", mend="Install the effect's file.") from error
+            raise BadModel(f"{error}", place=f"effects.{entry.get('id')}", fix="Install the effect's file.") from error
         for need in effect.needs:
             if getattr(grid.record, need) is None:
                 raise BadModel(
                     f"{effect.id} needs the column {need}",
                     place=need,
-                    mend="Record this column, or fit without the effect.",
+                    fix="Record this column, or fit without the effect.",
                 )
         effects.append((effect.id, form))
     problem = Problem(setup, effects)
@@ -169,7 +169,7 @@ def refuse_rate(model: Muscle, record: Record) -> None:
         raise BadModel(
             f"the model holds for {model.pulse_rate_hz:g} pulses a second, the record has {record.pulse_rate_hz:g}",
             place="pulse_rate_hz",
-            mend="Fit a model at that rate.",
+            fix="Fit a model at that rate.",
         )
 
 

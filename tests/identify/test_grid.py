@@ -151,7 +151,7 @@ def test_held_out_rows_are_never_fitted() -> None:
 def test_what_cannot_be_put_on_the_grid_is_refused(rate_hz: int, size: int) -> None:
     with pytest.raises(BadRecord) as refusal:
         make_grid(Record.from_arrays(np.arange(size) / rate_hz, np.zeros(size), np.zeros(size)))
-    assert refusal.value.mend
+    assert refusal.value.fix
 
 
 def test_runs() -> None:

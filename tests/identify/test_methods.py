@@ -8,7 +8,7 @@ import pytest
 import identify
 from identify.dynamics.linear import Discrete, SecondOrder
 from identify.dynamics.make_grid import make_grid
-from identify.estimation.figures import best_fit_percent
+from identify.estimation.fit_statistics import best_fit_percent
 from identify.methods import Method, method_of, methods
 from identify.methods.support.output_error import choose_order, output_error
 from identify.paper import table1

@@ -11,7 +11,7 @@ import pytest
 import identify
 from identify.criticism import compare
 from identify.dynamics.make_grid import make_grid
-from identify.estimation.figures import UNDEFINED, best_fit_percent, ceiling_percent
+from identify.estimation.fit_statistics import UNDEFINED, best_fit_percent, ceiling_percent
 from identify.estimation.quality import quality
 from tests.harness.patients import Patient, make_record
 

@@ -22,7 +22,7 @@ def segment_rows(grid: Grid, names: tuple[str, ...], method_id: str) -> np.ndarr
     if not rows.any():
         raise NotIdentifiable(
             f"{method_id} needs a segment {' or '.join(names)}; the record has {', '.join(there)}",
-            mend="Name the segments to use with fit_on, or use maximum-likelihood, which takes any.",
+            fix="Name the segments to use with fit_on, or use maximum-likelihood, which takes any.",
         )
     return rows
 
@@ -70,7 +70,7 @@ def active_level(grid: Grid, rows: np.ndarray) -> float:
     """
     widths = grid.pulse_width_us[rows]
     if not np.ptp(widths) > 0:
-        raise NotIdentifiable("the pulse width never changes in the segment for the dynamics", mend="Record a PRBS.")
+        raise NotIdentifiable("the pulse width never changes in the segment for the dynamics", fix="Record a PRBS.")
     return float(np.max(widths))
 
 
@@ -94,7 +94,7 @@ def order_option(value: object) -> str | tuple[int, int, int]:
         raise BadRequest(
             f"invalid order {value!r}",
             place="order",
-            mend="Give second-order, auto, or poles,zeros,delay such as 2,1,1.",
+            fix="Give second-order, auto, or poles,zeros,delay such as 2,1,1.",
         )
     return poles, zeros, delay
 
@@ -109,5 +109,5 @@ def flag(value: object, name: str) -> bool:
     """
     text = str(value).lower()
     if text not in {"true", "false", "1", "0", "yes", "no"}:
-        raise BadRequest(f"invalid value {value!r}", place=name, mend="Give true or false.")
+        raise BadRequest(f"invalid value {value!r}", place=name, fix="Give true or false.")
     return text in {"true", "1", "yes"}

@@ -112,7 +112,7 @@ def output_error(
     """
     poles, zeros, delay = order
     if not np.ptp(drive) > 0:
-        raise NotIdentifiable("the input of the linear block never changes", mend="Record a PRBS.")
+        raise NotIdentifiable("the input of the linear block never changes", fix="Record a PRBS.")
     target = np.where(rows, np.nan_to_num(torque), 0.0)
 
     def solve(a: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
