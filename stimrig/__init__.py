@@ -15,6 +15,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from identify.shown import register_plotter
+from stimrig import errors
 
 if TYPE_CHECKING:
     from api.charts.figures import plot
@@ -45,6 +46,7 @@ __all__ = [
     "compare",
     "diagnose",
     "effects",
+    "errors",
     "fit",
     "improve",
     "next_experiment",
@@ -62,7 +64,7 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return [*__all__, "errors"]
+    return __all__
 
 
 def _draw(result: Any, record: Any) -> Any:

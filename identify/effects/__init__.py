@@ -1,4 +1,4 @@
-"""The library of physical effects: one file each, found by scanning this package, entry points and a folder.
+"""The library of physical effects: one file each, found in this package, in entry points and in a user's folder.
 
 A user's own effect is a file with `EFFECT = Effect(...)`, found in the folder named by the environment variable
 STIMRIG_EFFECTS_DIR, or through an entry point of the group `stimrig.effects`. See `docs/add-an-effect.md`.
@@ -24,7 +24,7 @@ _NOT_EFFECTS = {"base", "kernels", "shapes"}
 
 
 class BadEffect(IdentifyError):
-    """A user's effect that can't be loaded or doesn't keep its promises."""
+    """A user's effect cannot be loaded, or does not do what an effect must."""
 
 
 def _own() -> list[Effect]:
@@ -42,7 +42,7 @@ def _from_file(path: Path) -> Effect:
         effect = module.EFFECT
     except Exception as error:
         raise BadEffect(
-            f"{type(error).__name__}: {error}", place=str(path), mend="See docs/add-an-effect.md."
+            f"{type(error).__name__}: {error}", place=str(path), fix="See docs/add-an-effect.md."
         ) from error
     return effect
 
@@ -66,7 +66,7 @@ def registry() -> dict[str, Effect]:
     Raises
     ------
     BadEffect
-        A user's file can't be loaded.
+        A user's file cannot be loaded.
     """
     return dict(_everything(os.environ.get(FOLDER_VARIABLE, "")))
 
@@ -77,16 +77,16 @@ def get(effect_id: str) -> Effect:
     Raises
     ------
     BadRequest
-        There is none of that name.
+        No effect has this id.
     """
     effects = registry()
     if effect_id not in effects:
-        raise BadRequest(f"no effect is called {effect_id!r}", mend=f"Known: {', '.join(sorted(effects))}.")
+        raise BadRequest(f"unknown effect {effect_id!r}", fix=f"Known: {', '.join(sorted(effects))}.")
     return effects[effect_id]
 
 
 def library() -> list[dict[str, Any]]:
-    """The library as plain data, for `stimrig effects` and the page."""
+    """The library as dicts, for `stimrig effects` and the page."""
     return [_describe(effect) for effect in registry().values()]
 
 
@@ -115,7 +115,7 @@ def _describe(effect: Effect) -> dict[str, Any]:
         "separated_by": effect.separated_by,
         "plain": effect.plain,
         "needs": list(effect.needs),
-        "foreseeable": effect.foreseeable,
+        "predictable": effect.predictable,
     }
 
 

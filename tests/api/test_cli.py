@@ -7,7 +7,6 @@ import io
 import json
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -170,7 +169,6 @@ def test_progress_tells_share_and_text_to_who_looks(monkeypatch: pytest.MonkeyPa
         monkeypatch.setattr("sys.stderr", shown)
         with progress_bar() as progress:
             for share in (0.25, 0.5):
-                time.sleep(0.15)  # tqdm draws ten times a second at most
                 progress(share, "tried tremor")
         lines = [" ".join(line.split()) for line in shown.getvalue().split("\r")]
         assert any(line.startswith("50 %") and line.endswith("left tried tremor") for line in lines) == looks
@@ -182,7 +180,6 @@ def test_work_that_is_done_within_a_second_shows_no_bar(monkeypatch: pytest.Monk
     shown.isatty = lambda: True
     monkeypatch.setattr("sys.stderr", shown)
     with progress_bar() as progress:
-        time.sleep(0.15)
         progress(0.5, "tried tremor")
     assert "tried" not in shown.getvalue()
 

@@ -140,7 +140,7 @@ def test_every_shape_of_model_is_refused_in_one_line(hostile: shapes.Hostile) ->
         ('{"b": {"a": 1, "a": 1}}', "'a' stands twice"),
         ("NaN", "NaN is no number"),
         ("[1e999]", "1e999 is no number"),
-        ("1" * 5000, "a number without an end"),
+        ("1" * 5000, "a number with too many digits"),
         ('{"a": ', "not JSON"),
         (b"\xff", "not UTF-8"),
     ],
