@@ -268,6 +268,12 @@ def test_efforts_seen_at_rest_are_efforts(made: Made):
     assert made.judged().kind == "effect_missing"
 
 
+def test_efforts_are_looked_for_in_the_model_to_which_they_were_added(made: Made):
+    made.at_rest = 0.14
+    found = made.add(EFFORT, 50.0, 80.0, **EFFORTS).add(FIRST, 50.0, 90.0).judged()
+    assert found.found == {EFFORT: 0.85, FIRST: 0.85}
+
+
 def test_an_effort_that_was_exchanged_is_looked_for_nowhere(made: Made):
     made.add(EFFORT, 50.0, 90.0)
     made.work.chain[1].effects = ()
@@ -323,6 +329,13 @@ def test_a_tremor_takes_most_of_the_power(made: Made, busy_nm: float, ratio: flo
     found = made.leaves(ratio=ratio, busy_nm=busy_nm, white_nm=0.2).judged()
     assert found.explained == pytest.approx(1 - (busy_nm**2 - 0.04) / 0.05)
     assert (found.kind == "unexplained_structure") is strange
+
+
+def test_a_tremor_that_takes_exactly_as_much_as_is_asked_for(made: Made):
+    made.add(TREMOR, 50.0, 90.0)
+    made.work.chain[-1].noise.band = 0.5
+    found = made.leaves(ratio=60.1, busy_nm=0.06**0.5).judged()
+    assert (found.explained, found.kind) == (0.94, "effect_missing")
 
 
 def test_a_structure_that_holds_effects_is_measured_from_the_plain_one(made: Made):
