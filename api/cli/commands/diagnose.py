@@ -12,7 +12,7 @@ from api.structure import in_words, worded
 VERDICTS = {
     "effect_missing": "An effect is missing in the model.",
     "nothing_missing": "Nothing is missing: what is left looks like noise.",
-    "unexplained_structure": "Structure is left that no effect of the library explains.",
+    "unexplained_structure": "The error has structure that no effect of the library explains.",
 }
 
 

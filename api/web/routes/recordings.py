@@ -69,7 +69,7 @@ def held(context: Context, recording_id: str) -> tuple[Recording, Path]:
 
 @router.post("/participants/{code}/recordings", status_code=201, openapi_extra=UPLOAD)
 async def upload(context: Ctx, who: Tester, code: str, request: Request, response: Response) -> dict[str, Any]:
-    """Take in a recording of another tool (CSV or HDF5 as the request's body) and identify a model from it."""
+    """Upload a recording of another tool (CSV or HDF5 as the request's body) and identify a model from it."""
     await asyncio.to_thread(participants.find, context, code)
     data = await bounded_body(request, context.settings.max_upload_mb)
     row, model, warning = await take_in(context, code, data, who.name)
