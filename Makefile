@@ -27,7 +27,7 @@ lint: setup-test ## style, types, layers
 bench: $(VENV)-bench/.bench ## the figures in docs/, measured on this machine
 	@$(VENV)-bench/bin/python -m bench
 
-faults: setup-test ## the fault campaign on the emulated rig (docs/faults.md)
+faults: setup-test ## the fault campaign on the emulated rig (docs/results/faults.md)
 	@$(BIN)/python -m bench.faults
 
 setup: $(VENV)/.run ## the virtual environment from the hash-locked list

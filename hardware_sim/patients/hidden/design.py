@@ -1,4 +1,4 @@
-"""What is sent to the muscle: pulse widths 40 times a second, segment by segment, and how the joint moves."""
+"""The test design: pulse widths at 40 pulses/s, segment by segment, and how the joint moves."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ UNRECORDED = "unrecorded"
 
 
 @dataclass(frozen=True)
-class Protocol40:
+class Design:
     """Pulse widths held over each 25 ms, shape (n,), the segment of each, and the joint's movement (or None)."""
 
     width_us: Floats
     segment: np.ndarray
     movement: tuple[Floats, Floats, Floats] | None = None  # frequencies Hz, amplitudes rad, phases rad
-    early_s: float = 0.0  # by which the pulses come before their time
+    early_s: float = 0.0  # the pulses come this much before their time
 
     @property
     def held_out(self) -> np.ndarray:
-        """Rows that must not be fitted."""
+        """Which rows must not be fitted."""
         return self.segment == "validate"
 
     @property
@@ -34,8 +34,8 @@ class Protocol40:
         """Length, s."""
         return self.width_us.size / PULSES_PER_S
 
-    def then(self, pause_s: float, second: Protocol40) -> Protocol40:
-        """This test, an unrecorded pause and another test, the joint moving on as it does."""
+    def then(self, pause_s: float, second: Design) -> Design:
+        """This test, an unrecorded pause and a second test; the joint keeps moving."""
         pause = round(pause_s * PULSES_PER_S)
         width_us = np.concatenate([self.width_us, np.zeros(pause), second.width_us])
         segment = np.concatenate([self.segment, np.full(pause, UNRECORDED), second.segment])
@@ -51,7 +51,7 @@ class Protocol40:
         return angle, np.cos(turn) @ (amplitude * 2.0 * np.pi * frequency)
 
     def fine(self, step_s: float) -> tuple[Floats, Floats, Floats, Floats]:
-        """Width, pulse, angle and velocity at every step. Torque at step k answers to widths before k."""
+        """Width, pulse, angle and velocity at every step. Torque at step k depends on widths before k."""
         count = round(self.duration_s / step_s)
         early = round(self.early_s / step_s)
         held = np.floor((np.arange(count) - 1 + early) * (step_s * PULSES_PER_S) + 1e-9).astype(int)
@@ -104,7 +104,7 @@ def make_design(
     validate_s: float = 16.0,
     with_validate: bool = True,
     moving: bool = False,
-) -> Protocol40:
+) -> Design:
     """A pre-session test.
 
     `full`: rest 2 s, PRBS 12.7 s, rest 3 s, ramp 5 s up and 5 s down, rest 2 s, multi-level `validate`, rest 2 s.
@@ -115,7 +115,6 @@ def make_design(
     ValueError
         No such design.
     """
-    name = "full" if name == "default" else name
     if name not in DESIGNS:
         raise ValueError(f"design {name!r}: one of {', '.join(DESIGNS)}")
     rest = lambda seconds: ("rest", np.zeros(round(seconds * PULSES_PER_S)))  # noqa: E731
@@ -143,4 +142,4 @@ def make_design(
         count = int(rng.integers(2, 4))
         amplitude = np.deg2rad(rng.uniform(10.0, 22.0, count))
         movement = (rng.uniform(0.03, 0.35, count), amplitude, rng.uniform(0.0, 2.0 * np.pi, count))
-    return Protocol40(width, segment, movement)
+    return Design(width, segment, movement)

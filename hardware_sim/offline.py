@@ -1,4 +1,4 @@
-"""Records made offline, without the wire: fast, for benches and for studies of hidden effects."""
+"""The torque of a muscle offline, without the wire and without waiting."""
 
 from __future__ import annotations
 

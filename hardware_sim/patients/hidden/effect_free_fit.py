@@ -1,8 +1,8 @@
-"""How much a hidden effect shows: what the best effect-free Hammerstein model leaves of a noise-free record.
+"""How much a hidden effect shows: the residual of the best Hammerstein model without effects, on a noise-free record.
 
-A cubic spline with many knots (half of them where the base really rises: a privilege the identification does not
-have) times a second-order system, fitted by variable projection (Golub and Pereyra 1973) at the pulse rate.
-Held-out rows take no part. Only the size of a hidden effect is set by this; no verdict rests on it.
+A cubic spline with many knots, then a second-order system, fitted by variable projection (Golub and Pereyra 1973) at
+the pulse rate. Half of the knots lie where the base really rises, which the identification cannot know. Held-out rows
+are not fitted. This only sets the magnitude of a hidden effect; no verdict depends on it.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def _filter(t_omega_s: float, zeta: float, step_s: float) -> tuple[Floats, Float
     return np.array([0.0, y1, b2]), np.array([1.0, -a1, a2])
 
 
-# Loops and not a linear-algebra library: its threads wait for one another where several processes share few cores.
+# Loops instead of a linear-algebra library, whose threads wait for one another if several processes share few cores.
 @helper
 def _normal_equations(basis, b, a, y, held_out):
     """Filter each column (second order, no feed-through); Gram matrix and moments over the rows to fit."""
@@ -88,7 +88,7 @@ def _product(x, coefficients):
 
 
 @dataclass
-class Yardstick:
+class EffectFreeFit:
     """The effect-free fit for one base and one design, at the pulse rate.
 
     Parameters
@@ -139,7 +139,7 @@ class Yardstick:
                 xtol=1e-4,
                 ftol=1e-5,
             )
-            for start in starts  # the last fit's end may be a trap for the next
+            for start in starts  # the last fit's end may be a local minimum for the next
         ]
         best = min(results, key=lambda result: result.cost)
         self._start = best.x
