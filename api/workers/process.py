@@ -29,7 +29,14 @@ PASSED_ON = (
     "NUMBA_CACHE_DIR", "OPENBLAS_NUM_THREADS", "STIMRIG_EFFECTS_DIR",
 )  # fmt: skip
 """All of the service's environment that a worker gets: no token, no setting of the service, nothing unexpected."""
-PROCESSOR_S = {"fit": 300.0, "effects": 60.0, "export_csv": 120.0, "find_recording": 120.0, "join": 120.0}
+PROCESSOR_S = {
+    "fit": 300.0,
+    "effects": 60.0,
+    "export_csv": 120.0,
+    "plain_csv": 120.0,
+    "find_recording": 120.0,
+    "join": 120.0,
+}
 LONGEST_PROCESSOR_S = 1200.0
 """What a call may compute; improving a long record takes minutes on a slow machine."""
 WALL_FACTOR = 3.0

@@ -33,7 +33,7 @@ async def upload(context: Ctx, who: Tester, code: str, file: Annotated[UploadFil
     data = await file.read()
     if not data:
         raise ApiError(422, "empty", "No file came", "Go back and choose a CSV file or a sealed recording (HDF5).")
-    _row, model, _warning = await recordings.take_in(context, code, data, who.name)
+    _row, model, _warnings = await recordings.take_in(context, code, data, who.name)
     return RedirectResponse(f"/models/{model.id}", 303)
 
 
