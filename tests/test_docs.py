@@ -32,6 +32,7 @@ NAMES = [str(page.relative_to(ROOT)) for page in PAGES]
 FOLDERS = {path.name for path in ROOT.iterdir() if path.is_dir()} - {"var"}
 PACKAGES = ("rig", "identify", "api", "hardware_sim", "bench", "tests", "stimrig", "examples")
 LINK = re.compile(r"\]\(([^)\s]+)\)")
+ENTRY_POINTS = "stimrig.effects"
 QUOTE = re.compile(r"<!-- quote: ([^|]+?) \| (.+?) \| ([^|]+?) -->")
 
 
@@ -88,7 +89,7 @@ def test_paths_and_names_in_backticks_exist(page: Path) -> None:
         name = word.split("::")[0]
         if re.fullmatch(r"[\w.\-]+(/[\w.\-]+)*/?", name) and "/" in name and name.split("/")[0] in FOLDERS:
             assert (ROOT / name).exists(), word
-        if re.fullmatch(rf"({'|'.join(PACKAGES)})(\.\w+)+", word) and not re.search(r"\.(md|toml|py|json|log)$", word):
+        if re.fullmatch(rf"({'|'.join(PACKAGES)})(\.\w+)+", word) and not re.search(r"\.(md|toml|py|json|log|env)$", word):
             assert resolves(word), word
 
 
@@ -102,10 +103,10 @@ def resolves(name: str) -> bool:
             continue
         for part in parts[count:]:
             if not hasattr(found, part):
-                return name == "stimrig.effects"
+                return name == ENTRY_POINTS
             found = getattr(found, part)
         return True
-    return False
+    return name == ENTRY_POINTS
 
 
 @pytest.mark.parametrize("page", PAGES, ids=NAMES)
@@ -134,7 +135,7 @@ def check_verb(words: str, line: str) -> None:
     if command.name == "emulate":  # its options are the emulator's own
         return
     known = {option for parameter in command.params for option in parameter.opts} | {"--help", "-h"}
-    options = {word.split("=")[0].strip("[]`.,") for word in given if re.match(r"\[?-", word)}
+    options = {word.split("=")[0].strip("[]`.,") for word in given if re.match(r"\[?-\S+$", word)}
     assert options <= known, line
 
 
