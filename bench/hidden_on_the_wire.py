@@ -13,9 +13,8 @@ import json
 import tempfile
 from pathlib import Path
 
-import httpx
-
-from api.cli.errors import ReportedError
+from api.cli.errors import CommandError
+from api.client.errors import ServiceError
 from tests.harness.hidden_on_the_wire import run
 
 
@@ -32,7 +31,7 @@ def main() -> None:
         try:
             with tempfile.TemporaryDirectory(prefix="hidden-") as folder:
                 row = run(seed, options.speed, Path(folder))
-        except (ReportedError, httpx.HTTPError) as error:
+        except (CommandError, ServiceError) as error:
             rows.append({"seed": seed, "agrees": False, "error": str(error)})
             print(f"{seed}  FAILED: {error}", flush=True)
             continue

@@ -8,10 +8,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import httpx
-
 from api.cli.launcher import Services
-from api.cli.rest_session import checked, ensure_participant, run_test
+from api.client.rest import Client
 from api.settings import Settings
 
 TOKEN = "token-of-the-hidden-patients"
@@ -27,25 +25,24 @@ def reveal(seed: int) -> dict[str, Any]:
     return json.loads(done.stdout)
 
 
-def play(client: httpx.Client) -> dict[str, Any]:
+def play(client: Client) -> dict[str, Any]:
     """The whole path; nothing in it knows the seed."""
-    ensure_participant(client, PARTICIPANT)
-    test = run_test(client, PARTICIPANT)
+    client.ensure_participant(PARTICIPANT)
+    test = client.run_test(PARTICIPANT)
     model, tests = test["model_id"], [test]
-    found = checked(client.get(f"/v1/models/{model}/diagnosis")).json()
+    found = client.diagnosis(model)
     steps = [summary(client, model)]
     first, experiment = found, None
     if found["verdict"] == "effect_missing" and found.get("experiment"):
         experiment = found["experiment"]
-        body = {"kind": "next-experiment", "segments": experiment["segments"], "joins": model}
-        tests.append(run_test(client, PARTICIPANT, **body))
+        plan = {"kind": "next-experiment", "segments": experiment["segments"], "joins": model}
+        tests.append(client.run_test(PARTICIPANT, **plan))
         model = tests[-1]["model_id"]
-        found = checked(client.get(f"/v1/models/{model}/diagnosis")).json()
+        found = client.diagnosis(model)
         steps.append(summary(client, model))
     if found["verdict"] == "effect_missing":
         for entry in found["missing"]:
-            made = client.post(f"/v1/models/{model}/effects", json={"effects": [entry["effect"]]})
-            model = checked(made).json()["id"]
+            model = client.add_effects(model, [entry["effect"]])["id"]
             steps.append(summary(client, model))
     return {
         "verdict": found["verdict"],
@@ -68,10 +65,9 @@ def punctuality(summaries: list[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def summary(client: httpx.Client, model_id: str) -> dict[str, Any]:
+def summary(client: Client, model_id: str) -> dict[str, Any]:
     """A version's errors."""
-    version = checked(client.get(f"/v1/models/{model_id}")).json()
-    comparison = checked(client.get(f"/v1/models/{model_id}/comparison")).json()
+    version, comparison = client.version(model_id), client.comparison(model_id)
     held = comparison.get("held_out") or comparison
     return {
         "effects": version["effects"],
@@ -95,10 +91,8 @@ def run(seed: int, speed: float, folder: Path) -> dict[str, Any]:
     """One seed on services of its own."""
     settings = Settings(data_dir=folder, port=0)
     options = ["--hidden", str(seed), "--speed", str(speed), "--noise-seed", str(seed)]
-    with Services(settings, options, TOKEN) as services:
-        headers = {"Authorization": f"Bearer {TOKEN}"}
-        with httpx.Client(base_url=services.url, headers=headers, timeout=600) as client:
-            found = play(client)
+    with Services(settings, options, TOKEN) as services, Client(services.url, TOKEN, timeout_s=600) as client:
+        found = play(client)
     truth = reveal(seed)
     last = found["steps"][-1]["times_noise"]
     return {
