@@ -91,3 +91,10 @@ def test_no_private_name_crosses_modules_of_identify() -> None:
         ]
         offenders += [f"{path.relative_to(ROOT)}: {name}" for name in names if name.startswith("_")]
     assert offenders == []
+
+
+def test_tests_import_nothing_from_the_benches() -> None:
+    """What both need is in tests/harness."""
+    pattern = re.compile(r"""^\s*(?:from|import)\s+bench\b|import_module\(["']bench\b""", re.M)
+    found = [path for path in (ROOT / "tests").rglob("*.py") if pattern.search(path.read_text(encoding="utf-8"))]
+    assert found == []
