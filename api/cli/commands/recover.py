@@ -28,6 +28,6 @@ def recover(
     command = [sys.executable, "-m", "rig.recover", *options, "--", str(journal)]
     ended = subprocess.run(command, capture_output=True, text=True)
     if ended.returncode:
-        words = (ended.stderr.strip().splitlines() or ["it ended without a word"])[-1].removeprefix("recover: ")
+        words = (ended.stderr.strip().splitlines() or ["it ended without a message"])[-1].removeprefix("recover: ")
         raise InputError(words) if ended.returncode == 2 else LaunchError(words, ended.returncode)
     print(ended.stdout, end="")
