@@ -84,7 +84,7 @@ class Child:
         self.end()
         words = self.last_words() or (f"it ended with code {code}" if code is not None else "it did not start in time")
         words = words.removeprefix(f"{self.name}: ").removeprefix("stimrig: ").removeprefix("stimrig emulate: ")
-        if code == 2:  # bad input: the words name the place and the mend
+        if code == 2:  # bad input: the words name the place and the fix
             return LaunchError(words, 2)
         return LaunchError(f"{self.name}: {words} (log: {self.log})")
 

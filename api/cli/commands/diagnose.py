@@ -27,7 +27,7 @@ def diagnose(
     columns: ColumnMap = None,
     as_json: Json = False,
 ) -> None:
-    """What is missing in a model's structure, ranked; or that nothing is; or that what is left has no name here.
+    """What is missing in a model's structure, most probable first; or nothing; or structure that no effect explains.
 
     Takes 5 to 30 s. DATA decides: a model given with --model lends its structure, not its numbers.
     """
