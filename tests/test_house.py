@@ -12,7 +12,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 FIXED_TOP_LEVEL = {"pyproject.toml", "rig", "identify", "api", "hardware_sim", "tests", "deploy"}
 BESIDE = {
-    "README.md", "Makefile", "stimrig", "docs", "examples", "bench", "requirements", "LICENSE",
+    "README.md", "CONTRIBUTING.md", "Makefile", "stimrig", "docs", "examples", "bench", "requirements", "LICENSE",
     ".ci", ".gitignore", ".pre-commit-config.yaml",
 }  # fmt: skip
 
