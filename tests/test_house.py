@@ -12,7 +12,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 FIXED_TOP_LEVEL = {"pyproject.toml", "rig", "identify", "api", "hardware_sim", "tests", "deploy"}
 BESIDE = {
-    "README.md", "Makefile", "stimrig", "docs", "examples", "bench", "requirements", "LICENSE",
+    "README.md", "CONTRIBUTING.md", "Makefile", "stimrig", "docs", "examples", "bench", "requirements", "LICENSE",
     ".ci", ".gitignore", ".pre-commit-config.yaml",
 }  # fmt: skip
 
@@ -76,13 +76,6 @@ def test_the_emulator_and_identify_import_nothing_of_one_another_or_the_rig() ->
             assert not pattern.search(path.read_text(encoding="utf-8")), path
 
 
-def test_tests_import_nothing_from_the_benches() -> None:
-    """What both need is in tests/harness."""
-    pattern = re.compile(r"""^\s*(?:from|import)\s+bench\b|import_module\(["']bench\b""", re.M)
-    found = [path for path in (ROOT / "tests").rglob("*.py") if pattern.search(path.read_text(encoding="utf-8"))]
-    assert found == []
-
-
 def test_no_private_name_crosses_modules_of_identify() -> None:
     """A name with an underscore belongs to its module; import-linter sees modules, not names."""
     offenders = []
@@ -98,3 +91,10 @@ def test_no_private_name_crosses_modules_of_identify() -> None:
         ]
         offenders += [f"{path.relative_to(ROOT)}: {name}" for name in names if name.startswith("_")]
     assert offenders == []
+
+
+def test_tests_import_nothing_from_the_benches() -> None:
+    """What both need is in tests/harness."""
+    pattern = re.compile(r"""^\s*(?:from|import)\s+bench\b|import_module\(["']bench\b""", re.M)
+    found = [path for path in (ROOT / "tests").rglob("*.py") if pattern.search(path.read_text(encoding="utf-8"))]
+    assert found == []

@@ -109,7 +109,7 @@ def answer(verb: str, arguments: dict[str, Any], say: Any) -> dict[str, Any]:
         while (Path(arguments["data"]).parent / "fitting-slowly").exists():
             time.sleep(0.05)
         document = model([effect.partition(":")[0] for effect in arguments.get("effects", [])])
-        return {"result": {"json": json.dumps(document), "model": document}}
+        return {"result": {"json": json.dumps(document), "model": document, "notes": []}}
     if verb == "comparison":
         return {"result": comparison()}
     if verb == "curves":
@@ -123,6 +123,8 @@ def answer(verb: str, arguments: dict[str, Any], say: Any) -> dict[str, Any]:
     if verb == "improve":
         say(progress=0.5, text="adding fatigue")
         return {"result": improvement(arguments.get("model_json"))}
+    if verb == "forecast":
+        return {"result": {"torque_nm": [width / 100 for width in arguments["pulse_width_us"]]}}
     if verb == "join":
         Path(arguments["out"]).write_text("\n".join(arguments["parts"]))
         return {"result": {"file_sha256": "0" * 64}}
@@ -135,6 +137,14 @@ def answer(verb: str, arguments: dict[str, Any], say: Any) -> dict[str, Any]:
     if verb == "export_csv":
         Path(arguments["out"]).write_text("time_s,pulse_width_us,torque_nm,segment\n0.0,0.0,0.0,rest\n")
         return {"result": {"rows": 1}}
+    if verb == "plain_csv":
+        from api.workers.verbs import plain_csv
+        from identify.errors import IdentifyError
+
+        try:
+            return {"result": plain_csv(progress=lambda *_: None, **arguments)}
+        except IdentifyError as error:
+            return {"error": {"expected": True, "detail": str(error), "place": error.place}}
     if verb == "find_recording":
         from api.workers.verbs import find_recording
 
