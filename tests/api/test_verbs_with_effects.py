@@ -26,7 +26,7 @@ def stimrig(*words: object) -> str:
 
 
 def test_improve_writes_a_model_that_predicts_better(tmp_path: Path) -> None:
-    record = hidden_records.generate("fatigue", "strong", seed=41, rate_hz=100)
+    record = hidden_records.generate("fatigue", "strong", seed=41, rate_hz=100, design="short")
     data = tmp_path / "record.csv"
     hidden_records.write_csv(record, data)
     base, better = tmp_path / "base.json", tmp_path / "better.json"
@@ -49,7 +49,7 @@ def test_improve_writes_a_model_that_predicts_better(tmp_path: Path) -> None:
 
 
 def test_what_a_model_holds_is_not_missing_in_it_and_auto_adds_what_improve_adds(tmp_path: Path) -> None:
-    record = hidden_records.generate("fatigue", "strong", seed=41, rate_hz=100)
+    record = hidden_records.generate("fatigue", "strong", seed=41, rate_hz=100, design="short")
     data, held = tmp_path / "record.csv", tmp_path / "held.json"
     hidden_records.write_csv(record, data)
     fitted = json.loads(stimrig("fit", data, "--effects", "auto", "-o", held, "--json"))
