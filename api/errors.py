@@ -1,19 +1,11 @@
-"""Every error a client can meet, as RFC 9457 ``application/problem+json``: the one mapping place."""
+"""The service's errors: each is a problem that a client can be shown as it is (RFC 9457)."""
 
 from __future__ import annotations
 
-import logging
-from http import HTTPStatus
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from fastapi import FastAPI, Request
-from fastapi.exceptions import RequestValidationError
-from fastapi.responses import JSONResponse, Response
-from starlette.exceptions import HTTPException
-
-from rig.messages import Problem as RigProblem
-
-log = logging.getLogger("stimrig.api")
+if TYPE_CHECKING:
+    from rig.messages import Problem as RigProblem
 
 RIG_STATUS = {
     "busy": 409,
@@ -60,73 +52,11 @@ class NotFoundError(ApiError):
         super().__init__(404, "not-found", f"No such {what}", f"There is no {what} {name!r}. {mend}".strip())
 
 
+class SettingsError(Exception):
+    """A setting does not hold: one line, by the name of its environment variable."""
+
+
 def from_rig(problem: RigProblem, **extra: Any) -> ApiError:
     """The rig's refusal as an API problem."""
     status = RIG_STATUS.get(problem.code, 409)
     return ApiError(status, f"rig-{problem.code}", problem.title, problem.detail, **extra)
-
-
-def from_validation(error: RequestValidationError) -> ApiError:
-    """Fields that do not hold, each named with what would do."""
-    found = []
-    for item in error.errors():
-        place = ".".join(str(part) for part in item.get("loc", ()) if part != "body") or "body"
-        found.append({"field": place, "detail": str(item.get("msg", "")), "got": _short(item.get("input"))})
-    names = "; ".join(f"{item['field']}: {item['detail']}" for item in found)
-    return ApiError(422, "invalid-input", "The request does not hold what the route expects", names, errors=found)
-
-
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 80 else text[:77] + "..."
-
-
-def _from_http(error: HTTPException) -> ApiError:
-    phrase = HTTPStatus(error.status_code).phrase
-    problem = ApiError(error.status_code, phrase.lower().replace(" ", "-"), phrase, _http_detail(error))
-    problem.headers = dict(error.headers or {})
-    return problem
-
-
-def _http_detail(error: HTTPException) -> str:
-    if error.status_code == 404:
-        return "There is nothing at this address. /openapi.json lists what there is."
-    if error.status_code == 405:
-        return "The address is right, the method is not. /openapi.json lists what there is."
-    return str(error.detail)
-
-
-def respond(request: Request, problem: ApiError) -> Response:
-    """The problem as JSON, or as a page where a browser's form asked."""
-    from api.pages.render import problem_page, wants_html
-
-    if wants_html(request):
-        return problem_page(request, problem)
-    return JSONResponse(
-        problem.body(str(request.url.path)),
-        status_code=problem.status,
-        media_type="application/problem+json",
-        headers=problem.headers,
-    )
-
-
-def install(app: FastAPI) -> None:
-    """Hang the mapping into the application."""
-
-    @app.exception_handler(ApiError)
-    async def known(request: Request, error: ApiError) -> Response:
-        return respond(request, error)
-
-    @app.exception_handler(RequestValidationError)
-    async def invalid(request: Request, error: RequestValidationError) -> Response:
-        return respond(request, from_validation(error))
-
-    @app.exception_handler(HTTPException)
-    async def http(request: Request, error: HTTPException) -> Response:
-        return respond(request, _from_http(error))
-
-    @app.exception_handler(Exception)
-    async def unexpected(request: Request, error: Exception) -> Response:
-        log.exception("unexpected error in %s %s", request.method, request.url.path, exc_info=error)
-        detail = "Nothing was lost. The service's log (logs/api.log in the data folder) says more."
-        return respond(request, ApiError(500, "internal", "Something unforeseen went wrong here", detail))

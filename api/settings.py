@@ -4,16 +4,23 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import Field, SecretStr, ValidationError, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
+
+from api.errors import SettingsError
 
 
 class Settings(BaseSettings):
     """Settings of the service.
 
     Every field has an environment variable: ``data_dir`` is ``STIMRIG_DATA_DIR``.
+
+    Raises
+    ------
+    SettingsError
+        A value does not hold; the message names its environment variable.
     """
 
     model_config = SettingsConfigDict(env_prefix="STIMRIG_", extra="ignore")
@@ -35,6 +42,12 @@ class Settings(BaseSettings):
     structure: Annotated[tuple[str, ...], NoDecode] = Field(
         default=(), description="effects, comma-separated, that a new participant's models begin with; default: none"
     )
+
+    def __init__(self, **given: Any) -> None:
+        try:
+            super().__init__(**given)
+        except ValidationError as error:
+            raise SettingsError(refusal(error)) from error
 
     @field_validator("structure", mode="before")
     @classmethod

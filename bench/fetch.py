@@ -20,7 +20,7 @@ from pathlib import Path
 import httpx
 import numpy as np
 
-from api.launcher import Child
+from api.cli.launcher import Child
 from api.settings import Settings
 
 TOKEN = "bench-of-the-fetch-is-not-a-secret"
@@ -100,7 +100,7 @@ def main() -> None:
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="stimrig-fetch-") as folder:
         settings = Settings(data_dir=Path(folder))
-        api = Child("api", [sys.executable, "-m", "api.server"], Path(folder) / "api.log")
+        api = Child("api", [sys.executable, "-m", "api.web.server"], Path(folder) / "api.log")
         api.environment = {
             "STIMRIG_DATA_DIR": str(settings.data_dir),
             "STIMRIG_PORT": "0",

@@ -17,8 +17,9 @@ from typing import Any
 
 import httpx
 
-from api.launcher import Services
-from api.session import ReportedError, checked, ensure_participant, run_test
+from api.cli.errors import ReportedError
+from api.cli.launcher import Services
+from api.cli.rest_session import checked, ensure_participant, run_test
 from api.settings import Settings
 
 TOKEN = "token-of-the-hidden-patients"

@@ -20,8 +20,8 @@ from pathlib import Path
 from typing import Any
 
 from api.errors import ApiError
-from api.fitting import Fitting
-from api.worker_process import Places
+from api.workers.pool import Pool
+from api.workers.process import Places
 from tests.harness.hostile_shapes import SECRET, Hostile, all_files, good
 
 LONGEST_LINE = 400
@@ -67,23 +67,23 @@ async def run(count: int, seed: int, say: Any = None) -> Tally:
         beside.mkdir()
         uploads.mkdir()
         (uploads / "sound.h5").write_bytes(good())
-        fitting = Fitting(1, places=Places([uploads]))
+        pool = Pool(1, places=Places([uploads]))
         try:
-            await fitting.submit("warm").result
+            await pool.submit("warm").result
             for hostile in all_files(beside, seed, count):
-                await one(fitting, uploads, hostile, tally)
+                await one(pool, uploads, hostile, tally)
                 if say is not None and tally.tried % 50 == 0:
                     say(f"{tally.tried} files, {len(tally.failed)} not as they should be")
         finally:
-            await fitting.close()
+            await pool.close()
     return tally
 
 
-async def one(fitting: Fitting, uploads: Path, hostile: Hostile, tally: Tally) -> None:
+async def one(pool: Pool, uploads: Path, hostile: Hostile, tally: Tally) -> None:
     """Have a worker read one file; its memory is counted from anew."""
     path = uploads / f"upload{hostile.suffix}"
     path.write_bytes(hostile.content)
-    worker = fitting.workers[0]
+    worker = pool.workers[0]
     process = await worker.start()
     reset_peak(process.pid)
     began = time.monotonic()
@@ -91,10 +91,10 @@ async def one(fitting: Fitting, uploads: Path, hostile: Hostile, tally: Tally) -
     try:
         if hostile.suffix == ".json":
             text = hostile.content.decode("latin-1")
-            job = fitting.submit("comparison", data=str(uploads / "sound.h5"), model_json=text)
+            call = pool.submit("comparison", data=str(uploads / "sound.h5"), model_json=text)
         else:
-            job = fitting.submit("fit", data=str(path))
-        found = json.dumps(await job.result)
+            call = pool.submit("fit", data=str(path))
+        found = json.dumps(await call.result)
     except ApiError as problem:
         error = problem
     taken_s = time.monotonic() - began

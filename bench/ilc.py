@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from api.launcher import Services
+from api.cli.launcher import Services
 from api.settings import Settings
 from examples import ilc_controller as ilc
 

@@ -25,7 +25,7 @@ from typing import Any
 import httpx
 import numpy as np
 
-from api.launcher import Services
+from api.cli.launcher import Services
 from api.settings import Settings
 from rig.messages import stop_socket
 from tests.harness.processes import RigClient, control

@@ -1,1 +1,1 @@
-"""What stands across the wire: stimulator, load cell and muscle, in a process of their own."""
+"""The emulated hardware: stimulator, load cell and muscle, in a process of their own."""

@@ -53,7 +53,7 @@ def _run(emulator: Emulator, options: argparse.Namespace) -> int:
     signals: list[int] = []
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda caught, _frame: signals.append(caught))
-    # before the ready line: a parent may die as soon as it has read it
+    # before the ready line, since a parent may die as soon as it has read it
     orphaned = _orphan_watch() if options.die_with_parent else lambda: False
     ready = emulator.ready()
     if options.no_json:
@@ -67,14 +67,16 @@ def _run(emulator: Emulator, options: argparse.Namespace) -> int:
 
 
 def _take_priority() -> None:
-    """Real-time priority where the system allows it: a real device does not slow down with the host's load."""
+    """Real-time priority if the system allows it: a real device does not slow down under the host's load."""
     with contextlib.suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
 
 
 def _orphan_watch() -> Callable[[], bool]:
-    """Whether the parent has gone. Asked of the kernel each time: a death signal would follow the thread
-    that started this process, not the process."""
+    """A function that says whether the parent has ended.
+
+    It asks the kernel each time. A death signal would depend on the thread that started this process.
+    """
     parent = os.getppid()
     return lambda: os.getppid() != parent
 

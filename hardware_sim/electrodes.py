@@ -1,4 +1,4 @@
-"""Where the stimulator's pulses meet the skin: what was fired, what reached the muscle, the sync line."""
+"""The electrodes: which pulses were fired, which reached the muscle, and the sync line."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ class FiredPulse:
 class Electrodes:
     """One pair on one muscle, at one of the stimulator's outputs.
 
-    `raise_sync` is called for each pulse that flows. `cut` is the emergency switch: a device that watches it says
-    so, to any other it looks like an open electrode.
+    `raise_sync` is called for each pulse that flows. `cut` is the emergency switch: some devices report it, to the
+    others it looks like an open electrode.
     """
 
     def __init__(self, muscle: Muscle, raise_sync: Callable[[], None] = lambda: None) -> None:
@@ -66,7 +66,7 @@ class Electrodes:
 def phase(points: Sequence[Point]) -> tuple[float, float, bool]:
     """Width (µs) and mean current (mA) of a shape's positive phase, and whether its charge sums to zero.
 
-    A shape without a positive phase is judged by its negative one: nerves answer to either.
+    The negative phase counts if there is no positive one: nerves respond to both.
     """
     net_us_ma = sum(width * current for width, current in points)
     for sign in (1, -1):

@@ -1,4 +1,4 @@
-"""The emulator: stimulator, muscle and load cell put together, and the loop that lets time pass."""
+"""The emulator: stimulator, muscle and load cell together, and the loop that advances time."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ from hardware_sim.stimulators.board import Board, FirmwareProtocol
 from hardware_sim.timeline import Timeline, WallClock
 
 TICK_S = 0.0025
-"""How often frames are handed over, in real time: four at 1600 samples/s."""
+"""How often frames are delivered, in real time: four at a time at 1600 samples/s."""
 SHORTEST_TICK_S = 0.0005
 
 
 class Emulator:
-    """The rig's other side in one process and one thread.
+    """The devices of a rig in one process and one thread.
 
-    Time moves in `run`: each turn takes muscle, cell and firmware up to now, hands the frames over, and waits
-    for the host or the next tick. A command from the host takes time up to its arrival first.
+    Time advances in `run`: each turn simulates muscle, cell and firmware up to the present, delivers the frames, and
+    waits for the host or the next tick. Before a command from the host is obeyed, time advances to its arrival.
     """
 
     def __init__(self, muscle: Muscle, settings: Settings) -> None:
@@ -92,7 +92,7 @@ class Emulator:
         }
 
     def run(self, stopping: Callable[[], bool]) -> None:
-        """Let time pass until `stopping`."""
+        """Advance time until `stopping`."""
         tick_s = max(SHORTEST_TICK_S, TICK_S / self.settings.speed)
         next_tick_s = time.monotonic()
         while not stopping():
@@ -107,40 +107,40 @@ class Emulator:
                 self.catch_up()
 
     def catch_up(self) -> None:
-        """Take everything up to the present."""
+        """Simulate everything up to the present."""
         self.timeline.run_until(self.clock.now_s())
 
     def close(self) -> None:
-        """Pull everything out and leave nothing behind."""
+        """Unplug both devices and remove all files."""
         self._control.close()
         self.unplug_stimulator()
         self.unplug_cell()
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def plug_stimulator(self) -> None:
-        """The stimulator's port appears, and the link points to it."""
+        """Make a port for the stimulator and a link to it."""
         self.port = PseudoTerminal()
         self._reactor.add(self.port, self._read)
         self._link.unlink(missing_ok=True)
         self._link.symlink_to(self.port.path)
 
     def unplug_stimulator(self) -> None:
-        """The stimulator's port is gone; the device itself goes on."""
+        """Remove the stimulator's port; the device itself goes on."""
         if self.port.is_open:
             self._reactor.remove(self.port)
             self.port.close()
         self._link.unlink(missing_ok=True)
 
     def plug_cell(self) -> None:
-        """The cell's adapter appears, on a port of its own."""
+        """Make the cell's adapter, on a new port."""
         self.transport = self._transport_class(self._reactor, self._received)
 
     def unplug_cell(self) -> None:
-        """The cell's adapter is gone."""
+        """Remove the cell's adapter."""
         self.transport.close()
 
     def state(self) -> dict[str, Any]:
-        """Where everything stands, for the control line."""
+        """The present state, for the control line."""
         log = self.electrodes.log
         last_s = log[-1].time_s if log else None
         return {
@@ -191,7 +191,7 @@ def _cell(settings: Settings) -> CellProtocol:
     Raises
     ------
     SettingsError
-        It has no frame for so many samples.
+        It has no frame of so many samples.
     """
     kind = pick(cells, "Cell", settings.cell, "load cell")
     if settings.samples_per_frame not in kind.layouts:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 class HardwareSimError(Exception):
-    """Base of everything the emulator raises on purpose; its text names the place and the mend."""
+    """Base of everything the emulator raises on purpose; its text names the place and the remedy."""
 
 
 class PatientError(HardwareSimError):
@@ -17,7 +17,3 @@ class SettingsError(HardwareSimError):
 
 class FaultError(HardwareSimError):
     """A fault of that name does not exist, or its settings make no sense."""
-
-
-class FrameError(HardwareSimError):
-    """Bytes on the stimulator's line that are no frame."""

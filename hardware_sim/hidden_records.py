@@ -1,6 +1,6 @@
-"""Records of muscles with something hidden in them, made off line for developing and judging the diagnosis.
+"""Offline records of muscles with a hidden effect, for developing and judging the diagnosis.
 
-Seeds 0 to 99 are for development; report on seeds from 1000.
+Seeds 0 to 99 are for development; reported figures use seeds from 1000.
 """
 
 from __future__ import annotations
@@ -9,51 +9,20 @@ import argparse
 import json
 import math
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.random import Generator
 
-from hardware_sim.patients.hidden.draw import draw_pair, draw_scenario, effect_ids, outside_ids, rng_of
+from hardware_sim.patients.hidden.design import UNRECORDED, Design, make_design
+from hardware_sim.patients.hidden.draw import Scenario, draw_pair, draw_scenario, effect_ids, outside_ids, rng_of
 from hardware_sim.patients.hidden.kernels import Floats
-from hardware_sim.patients.hidden.protocol import UNRECORDED, make_design
 from hardware_sim.patients.hidden.scenario import simulate
+from hardware_sim.patients.hidden.sensor_noise import NOISES, SLOW_CORRELATION_S, draw_noise
 
-NOISES = ("white", "ar1", "slow")
-SLOW_CORRELATION_S = 0.075
-
-
-def _ar1(rng: Generator, count: int, sd_nm: float, rho: float) -> Floats:
-    from scipy.signal import lfilter
-
-    innovations = rng.normal(0.0, sd_nm * math.sqrt(1.0 - rho * rho), count)
-    innovations[0] = rng.normal(0.0, sd_nm)
-    return np.asarray(lfilter([1.0], [1.0, -rho], innovations))
-
-
-def draw_noise(
-    kind: str, rng: Generator, count: int, rate_hz: float, sd_nm: float, rho_40hz: float, slow_sd_nm: float
-) -> Floats:
-    """Sensor noise at the record's rate, N·m, shape (count,).
-
-    `white`; `ar1`: first-order, with autocorrelation `rho_40hz` over 25 ms and sd `sd_nm`; `slow`: sd `slow_sd_nm`
-    with a correlation time of 75 ms beside the white.
-
-    Raises
-    ------
-    ValueError
-        No such kind.
-    """
-    if kind == "white":
-        return rng.normal(0.0, sd_nm, count)
-    if kind == "ar1":
-        return _ar1(rng, count, sd_nm, rho_40hz ** (40.0 / rate_hz))
-    if kind == "slow":
-        slow = _ar1(rng, count, slow_sd_nm, math.exp(-1.0 / (rate_hz * SLOW_CORRELATION_S)))
-        return rng.normal(0.0, sd_nm, count) + slow
-    raise ValueError(f"noise {kind!r}: one of {', '.join(NOISES)}")
+SLOWEST_SIMULATION_HZ = 1600
 
 
 def generate(
@@ -83,10 +52,10 @@ def generate(
     effect
         An id, several, or None for nothing hidden.
     strength
-        `weak`, `middle` or `strong`: the best effect-free Hammerstein fit leaves 2 to 5, 5 to 10, over 10 times
-        `noise_sd_nm` in the held-out rows (of a noise-free twin of this record).
+        `weak`, `middle` or `strong`: the best effect-free Hammerstein fit leaves an error of 2 to 5, 5 to 10, over 10
+        times `noise_sd_nm` in the held-out rows of the same record without noise.
     seed
-        Settles everything.
+        Decides every random number.
     rate_hz
         40 to 2000; torque is point-sampled from a simulation at 1600 Hz or more.
     design
@@ -94,7 +63,7 @@ def generate(
     noise, rho_40hz, slow_sd_nm
         See `draw_noise`; without `rho_40hz` it is drawn between 0.5 and 0.99.
     steep
-        Recruitment that rises within 5 to 25 µs.
+        Recruitment that rises from 10 to 90 % within 5 to 25 µs.
     moving
         The joint moves slowly, `angle_rad` and `velocity_rad_s` are recorded (always so where an effect needs it).
     pulsed
@@ -102,10 +71,10 @@ def generate(
     formulation
         Which of the effect's formulations; drawn if None.
     sampled_late_s
-        The load cell samples this much later than its time stamps say (negative: earlier), to a simulation step.
+        The load cell samples this much later than its time stamps say; negative: earlier. Rounded to a simulation step.
     again_after_s
-        The patient rests that long, unrecorded, and does a second test of the same design: two records joined, with a
-        jump of time between them.
+        After this unrecorded rest the patient does a second test of the same design: two records joined, with a jump of
+        time between them.
 
     Returns
     -------
@@ -121,6 +90,7 @@ def generate(
     if not 40 <= rate_hz <= 2000:
         raise ValueError(f"rate {rate_hz} Hz: give 40 to 2000")
     names = () if effect is None else (effect,) if isinstance(effect, str) else tuple(effect)
+    design_settings = {"validate_s": validate_s, "with_validate": with_validate}
     scenario = draw_scenario(
         names,
         strength if names else "middle",
@@ -131,51 +101,54 @@ def generate(
         pulsed=pulsed,
         formulation=formulation,
         design=design,
-        validate_s=validate_s,
-        with_validate=with_validate,
+        **design_settings,
     )
-    every = math.ceil(1600 / rate_hz)
-    step_s = 1.0 / (rate_hz * every)
     sequence = scenario.design
     if again_after_s is not None:
-        top_us = float(scenario.base.largest_width_us)
-        second = make_design(design, rng_of(seed, "again"), top_us, validate_s=validate_s, with_validate=with_validate)
-        sequence = sequence.then(again_after_s, second)
+        largest_us = float(scenario.base.largest_width_us)
+        sequence = sequence.then(
+            again_after_s, make_design(design, rng_of(seed, "again"), largest_us, **design_settings)
+        )
     rng = rng_of(seed, "noise", *names, strength)
     rho = float(1.0 - np.exp(rng.uniform(np.log(0.01), np.log(0.5)))) if rho_40hz is None else rho_40hz
-    width, _, angle, velocity = sequence.fine(step_s)
-    fine_noise = np.zeros(width.size)
-    count = len(range(0, width.size, every))
-    fine_noise[::every] = draw_noise(noise, rng, count, rate_hz, noise_sd_nm, rho, slow_sd_nm)
-    shift = round(sampled_late_s / step_s)
-    if shift:  # noise is drawn at the samples, so a late sample is an early pulse
-        sequence = replace(sequence, early_s=shift * step_s)
-    torque = simulate(scenario.base, scenario.stages(), sequence, step_s, fine_noise)[::every]
-    held = np.minimum(np.floor(np.arange(count) / rate_hz * 40 + 1e-9).astype(int), sequence.width_us.size - 1)
-    record: dict[str, Any] = {
-        "time_s": np.arange(count) / rate_hz,
-        "pulse_width_us": sequence.width_us[held],
-        "torque_nm": torque,
-        "segment": sequence.segment[held],
-    }
-    if sequence.movement is not None:
-        record |= {"angle_rad": angle[::every], "velocity_rad_s": velocity[::every]}
+
+    def noise_nm(count: int) -> Floats:
+        return draw_noise(noise, rng, count, rate_hz, noise_sd_nm, rho, slow_sd_nm)
+
+    record = _sampled(scenario, sequence, rate_hz, sampled_late_s, noise_nm)
     conditions = {"kind": noise, "sd_nm": noise_sd_nm}
     if noise == "ar1":
         conditions["rho_40hz"] = round(rho, 5)
     if noise == "slow":
         conditions |= {"slow_sd_nm": slow_sd_nm, "slow_correlation_s": SLOW_CORRELATION_S}
-    if again_after_s is not None:
-        recorded = record["segment"] != UNRECORDED
-        record = {name: column[recorded] for name, column in record.items()}
-    record["truth"] = scenario.truth(noise_sd_nm) | {
-        "seed": seed,
-        "noise": conditions,
-        "steep": steep,
-        "design": design,
-        "rate_hz": rate_hz,
+    about = {"seed": seed, "noise": conditions, "steep": steep, "design": design, "rate_hz": rate_hz}
+    return record | {"truth": scenario.truth(noise_sd_nm) | about}
+
+
+def _sampled(
+    scenario: Scenario, design: Design, rate_hz: float, late_s: float, noise_nm: Callable[[int], Floats]
+) -> dict[str, Any]:
+    """The columns of a record of this design, without its unrecorded rows."""
+    every = math.ceil(SLOWEST_SIMULATION_HZ / rate_hz)
+    step_s = 1.0 / (rate_hz * every)
+    width, _, angle, velocity = design.fine(step_s)
+    count = len(range(0, width.size, every))
+    fine_noise = np.zeros(width.size)
+    fine_noise[::every] = noise_nm(count)
+    # the noise belongs to the samples, so samples that are late are simulated as pulses that are early
+    early = replace(design, early_s=round(late_s / step_s) * step_s)
+    torque = simulate(scenario.base, scenario.stages(), early, step_s, fine_noise)[::every]
+    held = np.minimum(np.floor(np.arange(count) / rate_hz * 40 + 1e-9).astype(int), design.width_us.size - 1)
+    columns: dict[str, Any] = {
+        "time_s": np.arange(count) / rate_hz,
+        "pulse_width_us": design.width_us[held],
+        "torque_nm": torque,
+        "segment": design.segment[held],
     }
-    return record
+    if design.movement is not None:
+        columns |= {"angle_rad": angle[::every], "velocity_rad_s": velocity[::every]}
+    recorded = columns["segment"] != UNRECORDED
+    return {name: column[recorded] for name, column in columns.items()}
 
 
 def write_csv(record: dict[str, Any], path: str | Path) -> None:
@@ -215,7 +188,7 @@ def _record_of(effect: str | None, strength: str, seed: int, settings: argparse.
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Write a set of records with `truth.json`."""
+    """Write a set of records and `truth.json`."""
     parser = argparse.ArgumentParser(prog="python -m hardware_sim.hidden_records", description=main.__doc__)
     parser.add_argument("--out", type=Path, required=True, help="folder, made if absent")
     parser.add_argument("--seeds", type=_seeds, default=range(1), help="first:last, last not included")

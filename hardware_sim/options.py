@@ -27,14 +27,16 @@ class OneLineParser(argparse.ArgumentParser):
 
 
 def parse(arguments: Sequence[str] | None = None, prog: str = "stimrig emulate") -> argparse.Namespace:
-    """The options as given; exits with 2 and one line on a slip."""
+    """The options as given; bad input ends with one line and exit code 2."""
     parser = OneLineParser(
         prog=prog,
         description="The emulated rig: a stimulator on a serial line, a CAN load cell, and a muscle between "
         "them. Prints one JSON line once its devices answer, then runs until SIGTERM or Ctrl-C.",
     )
     _who(parser.add_argument_group("the muscle"))
-    _devices(parser.add_argument_group("the devices"))
+    devices = parser.add_argument_group("the devices")
+    _devices(devices)
+    _samples(devices)
     _process(parser.add_argument_group("the process"))
     return parser.parse_args(arguments)
 
@@ -62,7 +64,6 @@ def settings(options: argparse.Namespace, patient: str) -> Settings:
         clock_jitter_us=options.clock_jitter_us,
         samples_per_frame=options.samples_per_frame,
         sync=not options.no_sync,
-        faults=tuple(options.fault),
     )
 
 
@@ -75,7 +76,7 @@ def _who(group: argparse._ArgumentGroup) -> None:
         help=f"{', '.join(registry.names())}, or a TOML or JSON file with 'patient' and a table 'parameters' "
         "(default: %(default)s)",
     )
-    who.add_argument("--hidden", type=int, metavar="SEED", help="a patient with an effect that SEED hides")
+    who.add_argument("--hidden", type=int, metavar="SEED", help="a patient with a hidden effect, drawn by SEED")
     who.add_argument("--reveal", type=int, metavar="SEED", help="print what --hidden SEED hides, and exit")
 
 
@@ -94,6 +95,17 @@ def _devices(group: argparse._ArgumentGroup) -> None:
         choices=modules_with(cells, "Cell"),
         help="the cell's frames (default: %(default)s: id 0x181, float32 N·m, counter, status)",
     )
+    group.add_argument("--no-sync", action="store_true", help="no sync line from the stimulator to the cell")
+    group.add_argument(
+        "--fault",
+        action="append",
+        default=[],
+        metavar="NAME[,SETTING=NUMBER…]",
+        help="switch a fault on from the start; may be repeated",
+    )
+
+
+def _samples(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
         "--noise-nm",
         type=float,
@@ -120,7 +132,6 @@ def _devices(group: argparse._ArgumentGroup) -> None:
         help="samples in each frame: plain takes 1 or 3 (16-bit counts of 2 mN·m and a counter of frames), "
         "counts takes 1 to 4 (default: 1)",
     )
-    group.add_argument("--no-sync", action="store_true", help="no sync line from the stimulator to the cell")
     group.add_argument(
         "--clock-ppm", type=float, default=0.0, metavar="PPM", help="drift of the cell's clock (default: 0)"
     )
@@ -131,18 +142,11 @@ def _devices(group: argparse._ArgumentGroup) -> None:
         metavar="SD",
         help="standard deviation of each sample's own time, never more than 0.45 of a period (default: 0)",
     )
-    group.add_argument(
-        "--fault",
-        action="append",
-        default=[],
-        metavar="NAME[,SETTING=NUMBER…]",
-        help="switch a fault on from the start; may be repeated",
-    )
 
 
 def _process(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
-        "--speed", type=float, default=1.0, metavar="FACTOR", help="let time run FACTOR times faster (tests)"
+        "--speed", type=float, default=1.0, metavar="FACTOR", help="let time run FACTOR times faster, for tests"
     )
     group.add_argument("--no-json", action="store_true", help="print readable lines instead of the JSON line")
     group.add_argument("--die-with-parent", action="store_true", help="end when the process that started it does")

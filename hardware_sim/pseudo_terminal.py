@@ -1,4 +1,4 @@
-"""A serial port that is not there: the master's side of a pseudo-terminal."""
+"""An emulated serial port: the master's side of a pseudo-terminal."""
 
 from __future__ import annotations
 
@@ -9,19 +9,18 @@ import termios
 import tty
 
 INPUT_SPEED, OUTPUT_SPEED = 4, 5
-"""Places in what `tcgetattr` gives."""
+"""Indices into the result of `tcgetattr`."""
 
 
 class PseudoTerminal:
     """A raw pseudo-terminal that outlives its clients and never blocks.
 
-    The emulator keeps the slave side open itself: else the master would report EIO each time the rig closes
-    the port. What nobody reads waits in `pending` like in a device's FIFO, and beyond `fifo_bytes` whole
-    messages are dropped.
+    The emulator keeps the slave side open itself. Otherwise the master would report EIO each time the rig closes the
+    port. Unread messages wait as in a device's FIFO; a message that would exceed `fifo_bytes` is dropped whole.
 
-    A pseudo-terminal knows no parity, and the C library reports a setting that changed nothing but parity as
-    invalid. A second client could therefore not open the port with even parity, as a port on hardware lets it.
-    `forget_speed` sets the speed back, so that each client changes something.
+    A pseudo-terminal has no parity, and the C library reports a change of nothing but parity as invalid. A second
+    client could therefore not open the port with even parity, as it could on hardware. `forget_speed` sets the speed
+    back, so that each client changes something.
     """
 
     def __init__(self, fifo_bytes: int = 65536) -> None:
@@ -40,7 +39,7 @@ class PseudoTerminal:
         return self._master
 
     def read(self) -> bytes:
-        """What the client has written since; empty where there is nothing."""
+        """What the client has written since the last call; empty if nothing."""
         self.forget_speed(settled=True)
         try:
             return os.read(self._master, 65536)
@@ -48,9 +47,10 @@ class PseudoTerminal:
             return b""
 
     def forget_speed(self, settled: bool = False) -> None:
-        """Set back a speed that a client set before the last call; not at once, in the middle of its opening.
+        """Set back the speed that a client has set.
 
-        At once where it is `settled`: who writes has opened.
+        Not before the second call that sees it, since the client may still be opening the port; at once if `settled`,
+        since a client that writes has opened it.
         """
         if not self.is_open:
             return
@@ -61,14 +61,14 @@ class PseudoTerminal:
             termios.tcsetattr(self._slave, termios.TCSANOW, settings)
 
     def unread_bytes(self) -> int:
-        """How much the client has yet to read."""
+        """How many bytes the client has not read yet."""
         if not self.is_open:
             return 0
         (queued,) = struct.unpack("i", fcntl.ioctl(self._slave, termios.FIONREAD, bytes(4)))
         return queued + len(self._pending)
 
     def write(self, message: bytes) -> None:
-        """Queue one message for the client and hand over what fits."""
+        """Queue one message for the client and send what fits."""
         if not self.is_open:
             return
         if len(self._pending) + len(message) > self._fifo_bytes:
@@ -78,7 +78,7 @@ class PseudoTerminal:
         self.flush()
 
     def flush(self) -> None:
-        """Hand over as much of what is pending as fits."""
+        """Send as much of the queue as fits."""
         if not (self._pending and self.is_open):
             return
         try:

@@ -16,7 +16,7 @@ class HasDescriptor(Protocol):
 
 
 class Reactor:
-    """Calls back whoever has something to read."""
+    """Calls a function for each descriptor that has something to read."""
 
     def __init__(self) -> None:
         self._readers: dict[int, Callable[[], None]] = {}

@@ -1,6 +1,6 @@
-"""The same record as another recorder gives it: what changes nothing about the muscle.
+"""The same record as another recorder gives it: changes that change nothing about the muscle.
 
-Each kind alone, several with `+`, or `real`, all that a clinic's recorder does at once.
+Each kind alone, several with `+`, or `real`: all that a clinic's recorder does at once.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ import numpy as np
 from numpy.random import Generator
 
 from hardware_sim.patients.hidden.draw import rng_of
-from hardware_sim.patients.hidden.kernels import Floats
 
 KINDS = ("plain", "real", "offset", "start", "counts", "negative", "scaled", "shifted", "gap")
 COUNT_NM = 0.005
@@ -55,16 +54,16 @@ def _gaps(record: dict[str, Any], rng: Generator) -> tuple[list[list[float]], np
     raise ValueError("the record has no room for two gaps outside validate")
 
 
-def _taken(record: dict[str, Any], rows: Any) -> dict[str, Any]:
-    """Some rows of every column."""
+def _rows_of(record: dict[str, Any], rows: Any) -> dict[str, Any]:
+    """These rows of every column."""
     return {name: column[rows] for name, column in record.items()}
 
 
 def recorded(made: dict[str, Any], kind: str, seed: int) -> dict[str, Any]:
     """The record `made` as another recorder gives it.
 
-    Joint angle and velocity lose the rows that torque loses, and keep their values: only the load cell is turned
-    round, shifted or scaled.
+    Joint angle and velocity lose the rows that torque loses and keep their values: only the load cell is turned round,
+    shifted or scaled.
 
     Parameters
     ----------
@@ -77,7 +76,7 @@ def recorded(made: dict[str, Any], kind: str, seed: int) -> dict[str, Any]:
         missing twice, outside `validate`. `real`: start, counts, an offset within ±12 N·m, and negative for odd
         seeds. Several with `+`.
     seed
-        Settles, with what is hidden, all that is drawn.
+        Decides, together with what is hidden, every random number.
 
     Returns
     -------
@@ -96,29 +95,27 @@ def recorded(made: dict[str, Any], kind: str, seed: int) -> dict[str, Any]:
             raise ValueError(f"recorder {name!r}: one of {', '.join(KINDS)}")
     truth = made["truth"]
     rng = {name: rng_of(seed, "recorder", name, *truth["effects"], truth["strength"]) for name in KINDS}
-    all_of = {"start", "counts", "offset", *(["negative"] if seed % 2 else [])} if "real" in kinds else set()
-    asked = {*kinds} | all_of
+    all_of_real = {"start", "counts", "offset", *(["negative"] if seed % 2 else [])} if "real" in kinds else set()
+    asked = {*kinds} | all_of_real
 
     record = {name: column.copy() for name, column in made.items() if isinstance(column, np.ndarray)}
-    told: dict[str, Any] = {"kind": kind, "scale": 1.0, "offset_nm": 0.0, "cut_s": 0.0, "gaps_s": []}
+    recorder: dict[str, Any] = {"kind": kind, "scale": 1.0, "offset_nm": 0.0, "cut_s": 0.0, "gaps_s": []}
     if "start" in asked:
         first = _start(record, rng["start"])
-        told["cut_s"] = float(record["time_s"][first] - record["time_s"][0])
-        record = _taken(record, slice(first, None))
+        recorder["cut_s"] = float(record["time_s"][first] - record["time_s"][0])
+        record = _rows_of(record, slice(first, None))
         record["time_s"] = record["time_s"] - record["time_s"][0]
     if "gap" in asked:
-        told["gaps_s"], kept = _gaps(record, rng["gap"])
-        record = _taken(record, kept)
+        recorder["gaps_s"], kept = _gaps(record, rng["gap"])
+        record = _rows_of(record, kept)
     if "shifted" in asked:
         record["time_s"] = record["time_s"] + SHIFT_S
-    if "scaled" in asked:
-        told["scale"] = 10.0 if seed % 2 else 0.1
-    if "negative" in asked:
-        told["scale"] = -told["scale"]
+    size = (10.0 if seed % 2 else 0.1) if "scaled" in asked else 1.0
+    recorder["scale"] = -size if "negative" in asked else size
     if "offset" in asked:
         largest = LARGEST_OFFSET_NM["offset" if "offset" in kinds else "real"]
-        told["offset_nm"] = float(rng["offset"].uniform(-largest, largest))
-    torque: Floats = record["torque_nm"] * told["scale"] + told["offset_nm"]
+        recorder["offset_nm"] = float(rng["offset"].uniform(-largest, largest))
+    record["torque_nm"] = record["torque_nm"] * recorder["scale"] + recorder["offset_nm"]
     if "counts" in asked:
-        torque = np.round(torque / COUNT_NM) * COUNT_NM
-    return {**record, "torque_nm": torque, "truth": truth, "recorder": told}
+        record["torque_nm"] = np.round(record["torque_nm"] / COUNT_NM) * COUNT_NM
+    return {**record, "truth": truth, "recorder": recorder}

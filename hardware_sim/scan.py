@@ -1,4 +1,4 @@
-"""Finding kinds by scanning a package: adding one is adding a file."""
+"""Finding the modules of a package, so that a new device or patient is one new file."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from hardware_sim.errors import SettingsError
 
 
 def modules_with(package: ModuleType, attribute: str) -> dict[str, ModuleType]:
-    """Modules of `package` that define `attribute` themselves, by file name."""
+    """Modules of `package` that themselves define the class `attribute`, by file name."""
     found = {}
     for entry in sorted(pkgutil.iter_modules(package.__path__), key=lambda entry: entry.name):
         module = importlib.import_module(f"{package.__name__}.{entry.name}")
@@ -26,7 +26,7 @@ def pick(package: ModuleType, attribute: str, name: str, kind: str) -> type:
     Raises
     ------
     SettingsError
-        There is none of that name; lists those there are.
+        There is no such module; the message lists all.
     """
     found = modules_with(package, attribute)
     if name not in found:

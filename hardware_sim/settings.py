@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from hardware_sim.errors import SettingsError
 
@@ -19,7 +19,7 @@ RANGES = {
 
 @dataclass(frozen=True)
 class Settings:
-    """How the emulated rig is made up; each number's range is in `RANGES`."""
+    """How the emulated rig is set up; each number's range is in `RANGES`."""
 
     patient: str = "paper"
     stimulator: str = "p24"
@@ -34,7 +34,6 @@ class Settings:
     clock_jitter_us: float = 0.0
     samples_per_frame: int = 1
     sync: bool = True
-    faults: tuple[str, ...] = field(default=())
 
     def __post_init__(self) -> None:
         for name, (low, high) in RANGES.items():

@@ -1,6 +1,6 @@
-"""The emulator's time: a row of events on a clock that somebody else moves.
+"""The emulator's time: events on a clock that the caller advances.
 
-The process moves it with the machine's monotonic clock; tests move it by hand and finish fast.
+The process advances it with the machine's monotonic clock, tests advance it by hand and finish fast.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections.abc import Callable
 
 
 class Event:
-    """Something that is to happen at `time_s`; `cancel` makes it not happen."""
+    """An action planned for `time_s`."""
 
     __slots__ = ("action", "time_s")
 
@@ -21,15 +21,15 @@ class Event:
         self.action: Callable[[], None] | None = action
 
     def cancel(self) -> None:
-        """Let the event pass without a deed."""
+        """Do nothing when the time comes."""
         self.action = None
 
 
 class Timeline:
     """Events in the order of their time, in seconds of the emulator's own clock.
 
-    `followers` are called with the new time before time moves there, so that whatever is continuous
-    (the sampled muscle) has been taken up to an event before the event changes it.
+    `followers` are called with the new time before time advances to it, so that continuous processes (the sampled
+    muscle) are simulated up to an event before the event changes them.
     """
 
     def __init__(self) -> None:
@@ -39,7 +39,7 @@ class Timeline:
         self._order = itertools.count()
 
     def at(self, time_s: float, action: Callable[[], None]) -> Event:
-        """Do `action` when time reaches `time_s`; at once when it has passed and time next moves."""
+        """Do `action` when time reaches `time_s`, or at the next advance if that has passed."""
         event = Event(max(time_s, self.now_s), action)
         heapq.heappush(self._events, (event.time_s, next(self._order), event))
         return event
@@ -49,11 +49,11 @@ class Timeline:
         return self.at(self.now_s + delay_s, action)
 
     def next_s(self) -> float | None:
-        """Time of the next event, or None where there is none."""
+        """Time of the next event, or None."""
         return self._events[0][0] if self._events else None
 
     def run_until(self, time_s: float) -> None:
-        """Move time to `time_s`, with everything that happens on the way."""
+        """Advance time to `time_s`, with all events up to it."""
         while self._events and self._events[0][0] <= time_s:
             event_s, _, event = heapq.heappop(self._events)
             if event.action is not None:

@@ -1,8 +1,8 @@
 """`python -m rig`: the process that owns the devices.
 
-Prints one JSON line on standard output when its socket answers, logs on standard error. Any key in its terminal, if it
-has one, stops stimulation. Runs until SIGTERM or SIGINT: then it stops stimulation first, sees that it stopped, seals
-and exits 0. Exit 2: a mistake in the rig file.
+It prints one JSON line on standard output when its socket is ready, and logs to standard error. If it has a terminal,
+any key in it stops stimulation. It runs until SIGTERM or SIGINT: then it stops stimulation, confirms the stop, seals
+the recording and exits 0. Exit 2: an error in the rig file.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ SWITCH_INTERVAL_S = 0.0005
 """How long a thread may hold the interpreter while the sender waits; Python's default is 5 ms."""
 PROCESS_PRIORITY = 10
 BEAT_PERIOD_S = 0.5
-"""How often the process looks whether its parent lives, and whether it lives itself (deploy: WatchdogSec)."""
+"""How often the process checks its parent and its own threads, s (see WatchdogSec in deploy/)."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -58,11 +58,11 @@ def _parser() -> argparse.ArgumentParser:
     source = parser.add_mutually_exclusive_group(required=True)
     source.add_argument("--config", type=Path, metavar="FILE", help="rig file (TOML), see docs/rig-file.md")
     source.add_argument("--emulator-json", metavar="LINE", help="JSON line of `stimrig emulate`, or a file with it")
-    parser.add_argument("--socket", type=Path, help="Unix socket to listen on; wins over the rig file")
-    parser.add_argument("--data", type=Path, help="folder for journals and recordings; wins over the rig file")
-    parser.add_argument("--clock-speed", type=float, help="with --emulator-json only: its rig seconds a real second")
+    parser.add_argument("--socket", type=Path, help="Unix socket to listen on; overrides the rig file")
+    parser.add_argument("--data", type=Path, help="folder for journals and recordings; overrides the rig file")
+    parser.add_argument("--clock-speed", type=float, help="with --emulator-json only: rig seconds per real second")
     parser.add_argument("--check", action="store_true", help="check the rig file and the DBC, then exit")
-    parser.add_argument("--die-with-parent", action="store_true", help="end, as by SIGTERM, when the parent has died")
+    parser.add_argument("--die-with-parent", action="store_true", help="end as on SIGTERM when the parent has died")
     parser.add_argument("--verbose", action="store_true")
     return parser
 
@@ -75,7 +75,7 @@ def _configure(options: argparse.Namespace) -> configuration.RigConfig:
 
 
 def _check(config: configuration.RigConfig) -> None:
-    """Make both devices without opening them: that reads the DBC, too."""
+    """Create both devices without opening them; this reads the DBC, too."""
     clock = MonotonicClock(config.clock_speed)
     devices.find("stimulator", config.stimulator.device).create(config.stimulator, clock)
     devices.find("load_cell", config.load_cell.device).create(config.load_cell, clock)
@@ -92,7 +92,7 @@ async def _serve(config: configuration.RigConfig, parent: int | None) -> None:
         loop.add_signal_handler(number, stop.set)
     server, notifier = Server(), Notifier()
     if not config.require_calibration:
-        log.warning("require_calibration is false: tests start without a calibration; no person may sit here")
+        log.warning("require_calibration is false: tests start without a calibration; connect no person to this rig")
     rig = Rig(config, MonotonicClock(config.clock_speed), server.publish)
     await asyncio.to_thread(rig.open)
     await server.start(rig, config.socket)
@@ -102,7 +102,7 @@ async def _serve(config: configuration.RigConfig, parent: int | None) -> None:
         if key.watched:
             log.info("any key in this terminal stops stimulation; Ctrl-C ends the rig")
         while not stop.is_set() and parent in (None, os.getppid()):
-            # in a worker thread: an event loop that hangs, or threads that all wait, feed nothing
+            # in a worker thread: if the event loop hangs or all threads wait, the watchdog is not fed
             notifier.alive(await asyncio.to_thread(rig.trouble))
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(stop.wait(), BEAT_PERIOD_S)
@@ -126,7 +126,7 @@ def _handler() -> logging.Handler:
 
 
 class _JsonLines(logging.Formatter):
-    """One JSON object a line, with the test's id where there is one."""
+    """One JSON object per line, with the test's id if there is one."""
 
     def format(self, record: logging.LogRecord) -> str:
         line = {

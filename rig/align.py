@@ -1,8 +1,8 @@
-"""The load cell's clock on the test's clock, with a standard error.
+"""Aligns the load cell's clock with the test's clock, and estimates the standard error.
 
-Best by the sync line: the cell saw each pulse begin, and the host knows when it wrote each pulse. Without one,
-the cell's counter is fitted to the host's receive times along their lower envelope: a sample can come late,
-never early. What that cannot see is the shortest delay of the transport itself, which stays in the result.
+The sync line is the best source: the cell saw each pulse begin, and the host knows when it wrote each pulse. Without
+one, the cell's counter is fitted to the lower envelope of the host's receive times: a sample can come late, never
+early. This fit cannot see the shortest delay of the transport itself, which stays in the result.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ MAX_POINTS = 400
 MISFIT_WINDOWS = 8
 COARSE_MISFIT_S = 0.005
 BELIEVED_RATES = 0.25, 4.0
-"""No two clocks differ by more. Outside, samples of seconds were read in a moment: the rate is not known."""
+"""No two clocks differ by more. A rate outside means that a backlog was read at once: the rate is unknown."""
 
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """How the times were got.
+    """How the times were obtained.
 
     Attributes
     ----------
     error_ms
-        Standard error of the offset, ms; NaN where too little came to tell.
+        Standard error of the offset, ms; NaN if there were too few samples to estimate it.
     delay_ms
         Median time from a sample's aligned time to its arrival at the host, ms.
     rate_ppm
@@ -94,9 +94,9 @@ def align(
         line, method = _robust_line(*pairs), "sync"
         misfit_s = _misfit(line, *pairs)
         coarse_s = 0.0 if sure else _misfit(envelope, *_earliest(cell_s, host_s))
-        if coarse_s > COARSE_MISFIT_S:  # then edges may have been taken for those of other pulses
+        if coarse_s > COARSE_MISFIT_S:  # then edges may have been matched to the wrong pulses
             misfit_s = max(misfit_s, coarse_s)
-        # Pulses often keep step with the samples, so where in its sample a pulse began does not average out.
+        # Pulses are often synchronous with the samples, so a pulse's position in its sample does not average out.
         error_s = float(np.hypot(line.error_s, 1 / sample_rate_hz / np.sqrt(12)))
         error_s = float(np.hypot(error_s, misfit_s))
     else:
@@ -134,9 +134,9 @@ def _median_slope(x: Array, y: Array) -> float:
 
 
 def _misfit(line: _Line, cell_s: Array, host_s: Array) -> float:
-    """How far the line misses what changes slowly (a clock that is no line), s: the worst of windows' medians.
+    """Largest slow deviation from the line (a clock with a drifting rate), s: the worst of the windows' medians.
 
-    What medians of so few points scatter by themselves is not counted.
+    The scatter that medians of so few points have by chance is subtracted.
     """
     residual_s = host_s - line.at(cell_s)
     parts = np.array_split(residual_s, int(np.clip(len(residual_s) // 5, 1, MISFIT_WINDOWS)))
@@ -184,9 +184,9 @@ def _edges(
 
 
 def _in_step(edge_s: Array, written_s: Array) -> bool:
-    """As many edges as pulses, in the same rhythm: then each belongs to its own, however late the samples came.
+    """Whether there are as many edges as pulses, at the same intervals: then they belong together in this order.
 
-    A stall of the host bends the envelope, and the nearest pulse may then be a wrong one.
+    A stall of the host bends the envelope, and the nearest pulse may then be the wrong one.
     """
     lead_s = written_s - _robust_line(edge_s, written_s).at(edge_s)
     return float(np.quantile(np.abs(lead_s), 0.9)) < 0.25 * float(np.min(np.diff(written_s)))

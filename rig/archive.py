@@ -1,7 +1,7 @@
-"""A recording -> HDF5, as `docs/recording.md` lays it out, and the hashes that prove it unchanged.
+"""Writes a recording to HDF5, as `docs/recording.md` describes, with hashes that prove it unchanged.
 
-The file is built in memory and then written as plain bytes to a temporary file, synced and renamed: a full disk
-is then an error that can be told, not a crash within the HDF5 library.
+The file is built in memory, then written as plain bytes to a temporary file, synced and renamed. So a full disk gives
+an error message, not a crash inside the HDF5 library.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ COLUMNS: tuple[tuple[str, str, str], ...] = (
     (
         "pulses/written_time_s",
         "s",
-        "when the last byte was handed to the line, at latest when its ack had been read; NaN where nothing was sent",
+        "when the last byte was written to the line, at the latest when its ack was read; NaN where nothing was sent",
     ),
-    ("pulses/acknowledged_time_s", "s", "when the device's ack had been read; NaN where none came"),
+    ("pulses/acknowledged_time_s", "s", "when the device's ack was read; NaN where none came"),
     (
         "pulses/status",
         "1",
@@ -52,7 +52,7 @@ COLUMNS: tuple[tuple[str, str, str], ...] = (
 
 @dataclass(frozen=True, slots=True)
 class Sealed:
-    """Where the recording is, and what proves it."""
+    """A sealed recording: its file and its hashes."""
 
     path: Path
     file_sha256: str
@@ -96,7 +96,7 @@ def write_atomically(path: Path, data: bytes) -> None:
     Raises
     ------
     RecordingError
-        The disk refused; nothing half-written is left.
+        Disk error; no partial file is left.
     """
     temporary = None
     try:
@@ -113,22 +113,24 @@ def write_atomically(path: Path, data: bytes) -> None:
     except OSError as error:
         if temporary is not None:
             Path(temporary).unlink(missing_ok=True)
-        raise RecordingError(f"{path}: {error.strerror}; the journal is kept, free the disk and re-arm") from None
+        raise RecordingError(
+            f"{path}: {error.strerror}; the journal is kept; free some disk space and re-arm"
+        ) from None
 
 
 def place(recording: Recording, folder: Path) -> Path:
-    """Where it is sealed: by its time and its test."""
+    """Path of its sealed file: named by time and test."""
     stamp = recording.attributes["created_utc"].replace("-", "").replace(":", "")[:15]
     return folder / f"{stamp}Z_{recording.attributes['test_id']}.h5"
 
 
 def seal(recording: Recording, folder: Path) -> Sealed:
-    """Seal a recording into `folder`, verify what was written, and say where it is.
+    """Seal a recording into `folder` and verify what was written.
 
     Raises
     ------
     RecordingError
-        The disk refused, or the file read back differs; the journal is left alone.
+        Disk error, or the file reads back differently; the journal is not touched.
     """
     path = place(recording, folder)
     data = to_bytes(recording)
@@ -145,14 +147,14 @@ def verify(path: Path) -> str:
     Raises
     ------
     RecordingError
-        Not a recording, or its content does not match the hash that it carries.
+        Not a recording, or its content does not match its hash.
     """
     try:
         with h5py.File(path, "r") as file:
             columns = {p: np.asarray(file[p]) for p, _, _ in COLUMNS}
             stated = str(file.attrs["content_sha256"])
     except (OSError, KeyError) as error:
-        raise RecordingError(f"{path}: not a recording that can be read ({error})") from None
+        raise RecordingError(f"{path}: not a readable recording ({error})") from None
     actual = content_sha256(columns)
     if actual != stated:
         raise RecordingError(f"{path}: content does not match its SHA-256; it was changed after sealing")

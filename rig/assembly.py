@@ -1,8 +1,8 @@
-"""Journal -> recording: what happened, as arrays; and where the journal is damaged, what can still be told.
+"""Turns a journal into a recording (arrays); from a damaged journal it recovers what it can.
 
-Header and plan lie in a journal twice. Where both copies of one are damaged, the blocks tell the rest: each pulse has
-an intent with its width and current, then what was written and what was acknowledged. What had to be inferred, and what
-may be missing, is said in `journal_note`; nothing that may have been felt is left out without a word.
+A journal contains header and plan twice. If both copies are damaged, they are inferred from the blocks: each pulse has
+an intent with its width and current, then a block when it was written and one when it was acknowledged. `journal_note`
+says what was inferred and what may be missing. No pulse that may have been felt is left out without a note.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from rig.signals import SAMPLE, PulseStatus
 FORMAT = "stimrig-recording"
 FORMAT_VERSION = 1
 EVIDENCE = (Kind.START, Kind.INTENT, Kind.WRITTEN, Kind.SKIPPED, Kind.ACKED, Kind.TORQUE)
-"""What shows that the test had begun."""
+"""Blocks that show that the test had begun."""
 LIKELY_RATE_HZ = 40.0
-"""Where neither header nor intents tell the pulse rate."""
+"""Assumed if neither header nor intents give the pulse rate."""
 
 
 @dataclass(slots=True)
 class Recording:
-    """A test as arrays: `columns` by the paths of `COLUMNS`, `names` of the segments, attributes of the root."""
+    """A test as arrays: `columns` by the paths of `archive.COLUMNS`, `names` of segments, attributes of the file."""
 
     columns: dict[str, NDArray[Any]]
     names: list[str]
@@ -42,28 +42,28 @@ class Recording:
 
 
 def assemble(contents: JournalContents, outcome: str = "fault", reason: str = "") -> Recording:
-    """A recording from a journal, whole, half-written or damaged.
+    """Make a recording from a journal, complete, partial or damaged.
 
     Parameters
     ----------
     contents
         What `journal.read` could read.
     outcome, reason
-        Used where the journal does not say how the test ended.
+        Used if the journal does not say how the test ended.
 
     Raises
     ------
     RecordingError
-        There is nothing to seal, or what there is cannot be understood.
+        There is nothing to seal, or the content is not valid.
     """
     try:
         return _assembled(contents, outcome, reason)
     except (KeyError, IndexError, TypeError, ValueError, struct.error) as error:
-        raise RecordingError(f"journal {contents.path}: cannot be understood ({error!r}); it is kept") from None
+        raise RecordingError(f"journal {contents.path}: its content is not valid ({error!r}); it is kept") from None
 
 
 def _assembled(contents: JournalContents, outcome: str, reason: str) -> Recording:
-    _refuse_nothing(contents)
+    _refuse_empty(contents)
     notes = _damage(contents)
     header = contents.first_json(Kind.HEADER) or _header_of_blocks(contents, notes)
     planned = next((np.frombuffer(p, "<f8") for k, p in contents.blocks if k == Kind.PLAN), None)
@@ -109,17 +109,17 @@ def _assembled(contents: JournalContents, outcome: str, reason: str) -> Recordin
     return Recording(columns, names, attributes, alignment, events)
 
 
-def _refuse_nothing(contents: JournalContents) -> None:
-    """Raises RecordingError where neither header and plan nor any block shows that something was played."""
+def _refuse_empty(contents: JournalContents) -> None:
+    """Raise RecordingError if neither header and plan nor any block shows that something was played."""
     kinds = {kind for kind, _ in contents.blocks}
     if kinds & set(EVIDENCE) or kinds >= {Kind.HEADER, Kind.PLAN}:
         return
     if contents.damaged:
         raise RecordingError(
-            f"journal {contents.path}: {contents.damaged_bytes} bytes cannot be read, and what is left tells of no "
+            f"journal {contents.path}: {contents.damaged_bytes} bytes cannot be read, and the rest contains no "
             "pulse and no torque; it is kept"
         )
-    raise RecordingError(f"journal {contents.path}: ends before its plan, no pulse was sent; nothing to seal")
+    raise RecordingError(f"journal {contents.path}: it ends before its plan, so no pulse was sent; nothing to seal")
 
 
 def _damage(contents: JournalContents) -> list[str]:
@@ -132,16 +132,16 @@ def _damage(contents: JournalContents) -> list[str]:
 
 
 def _header_of_blocks(contents: JournalContents, notes: list[str]) -> dict[str, Any]:
-    """What the blocks tell where both copies of the header are damaged."""
+    """A header inferred from the blocks, if both copies are damaged."""
     intents = _intents(contents)
     rate_hz = LIKELY_RATE_HZ
     if len(intents) > 1 and intents[-1][0] > intents[0][0]:
         rate_hz = round((intents[-1][0] - intents[0][0]) / (intents[-1][2] - intents[0][2]), 6)
     else:
-        notes.append(f"the pulse rate is not known, {rate_hz:g} pulses/s were assumed")
+        notes.append(f"the pulse rate is unknown, {rate_hz:g} pulses/s were assumed")
     notes.append(
-        "both copies of the header are lost: participant, limits, segments and devices are not known, and neither is "
-        "when the test was, if its start is lost, too"
+        "both copies of the header are lost: participant, limits, segments and devices are unknown; so is the time of "
+        "the test, if its start is lost, too"
     )
     plan = {
         "test_id": contents.path.stem,
@@ -163,12 +163,12 @@ def _header_of_blocks(contents: JournalContents, notes: list[str]) -> dict[str, 
 
 
 def _plan_of_intents(contents: JournalContents, notes: list[str]) -> NDArray[np.float64]:
-    """The widths that were sent, where both copies of the plan are damaged."""
+    """The widths that were sent, if both copies of the plan are damaged."""
     known = [journal.SKIPPED.unpack(p)[0] for k, p in contents.blocks if k in (Kind.WRITTEN, Kind.SKIPPED)]
     known += [journal.ACKED.unpack_from(p)[0] for k, p in contents.blocks if k == Kind.ACKED]
     intents = _intents(contents)
     known += [intent[0] for intent in intents]
-    notes.append("both copies of the plan are lost: planned widths are those that were sent")
+    notes.append("both copies of the plan are lost: the widths that were sent are used as planned widths")
     planned = np.zeros(max(known, default=-1) + 1)
     for index, _, _, width_us, _ in intents:
         planned[index] = width_us
@@ -176,12 +176,12 @@ def _plan_of_intents(contents: JournalContents, notes: list[str]) -> NDArray[np.
 
 
 def _intents(contents: JournalContents) -> list[tuple[int, float, float, float, float]]:
-    """Index, time, due time, width and current of each pulse that was about to be sent."""
+    """Index, time, due time, width and current of each pulse that was to be sent."""
     return [journal.INTENT.unpack(payload) for kind, payload in contents.blocks if kind == Kind.INTENT]
 
 
 def _start(contents: JournalContents, header: dict[str, Any], rate_hz: float) -> tuple[bool, float, float]:
-    """Had it begun; zero of the test's clock on the rig's, s; the same moment by the wall clock."""
+    """Whether the test began; start of the test's clock on the rig's clock, s; the same time as UTC."""
     started = contents.first_json(Kind.START)
     if started is not None:
         return True, float(started["t0_s"]), float(started["unix_s"])
@@ -193,7 +193,7 @@ def _start(contents: JournalContents, header: dict[str, Any], rate_hz: float) ->
 
 
 def _sample_rate(contents: JournalContents) -> float:
-    """Torque samples a second, as they came."""
+    """Torque samples per second, measured."""
     blocks = [np.frombuffer(p, SAMPLE) for k, p in contents.blocks if k == Kind.TORQUE and len(p)]
     if len(blocks) < 2:
         return 1.0
@@ -209,7 +209,7 @@ def _first_time(contents: JournalContents) -> float:
 
 
 def _last_time(contents: JournalContents) -> float:
-    """The newest time in a journal without an end."""
+    """The latest time in a journal without an end."""
     newest = -np.inf
     for kind, payload in contents.blocks:
         if kind == Kind.TORQUE and len(payload) >= SAMPLE.itemsize:
@@ -231,17 +231,17 @@ class _Pulses:
         self._sent_us, self._current = np.full(n, np.nan), np.zeros(n)
         self._written_s, self._acked_s = np.full(n, np.nan), np.full(n, np.nan)
         self._status = np.where(planned == 0, PulseStatus.REST, PulseStatus.DROPPED).astype(np.uint8)
-        self._intended, self._told = np.zeros(n, bool), np.zeros(n, bool)
+        self._intended, self._mentioned = np.zeros(n, bool), np.zeros(n, bool)
 
     def take(self, contents: JournalContents) -> None:
-        """Every block, in order."""
+        """Read all blocks, in order."""
         for kind, payload in contents.blocks:
             if kind not in (Kind.INTENT, Kind.WRITTEN, Kind.SKIPPED, Kind.ACKED):
                 continue
             i = struct.unpack_from("<i", payload)[0]
             if not (0 <= i < len(self._planned)):
                 continue
-            self._told[i] = True
+            self._mentioned[i] = True
             if kind == Kind.INTENT:
                 _, _, _, self._sent_us[i], self._current[i] = journal.INTENT.unpack(payload)
                 self._intended[i], self._status[i] = True, PulseStatus.UNACKNOWLEDGED
@@ -257,7 +257,7 @@ class _Pulses:
     def columns(
         self, rate_hz: float, played_s: float, blocks_missing: bool, notes: list[str]
     ) -> dict[str, NDArray[Any]]:
-        """The datasets of `/pulses`, as far as the test went."""
+        """The datasets of `/pulses`, up to the end of the test."""
         n = len(self._planned)
         reached = int(np.clip(np.ceil(played_s * rate_hz - 1e-6), 0, n))
         self._without_intent(notes)
@@ -265,7 +265,7 @@ class _Pulses:
             self._without_trace(reached, notes)
         tried = np.flatnonzero((self._current > 0) | np.isfinite(self._written_s))
         reached = max(reached, int(tried[-1]) + 1 if len(tried) else 0)
-        # the sender may lose the processor between its write and its look at the clock; the ack came after the write
+        # the sender may be interrupted between its write and its reading of the clock; the ack came after the write
         acked_s = np.where(np.isfinite(self._written_s), self._acked_s, np.nan)
         self._sent_us[self._status == PulseStatus.REST] = 0.0
         found: dict[str, NDArray[Any]] = {
@@ -280,27 +280,27 @@ class _Pulses:
         return {path: column[:reached] for path, column in found.items()}
 
     def _without_intent(self, notes: list[str]) -> None:
-        """Written or acknowledged, so it was sent: as planned, where its intent is lost."""
+        """Pulses that were sent but have no intent: use their planned values."""
         sent = ~self._intended & (np.isfinite(self._written_s) | np.isfinite(self._acked_s))
         if not sent.any():
             return
         silent = sent & ~np.isfinite(self._acked_s)
         self._status[silent] = PulseStatus.UNACKNOWLEDGED
         self._as_planned(sent)
-        notes.append(f"{int(sent.sum())} pulses were sent whose intents are lost: they stand as they were planned")
+        notes.append(f"{int(sent.sum())} pulses were sent whose intents are lost: their planned values are used")
         if unknown := int(np.sum(sent & (self._planned == 0))):
-            notes.append(f"of {unknown} of them the width is not known")
+            notes.append(f"the width of {unknown} of them is unknown")
 
     def _without_trace(self, reached: int, notes: list[str]) -> None:
-        """Planned, and no block tells what became of it: it may have been felt, so it counts as unacknowledged."""
-        lost = ~self._told & (self._planned > 0)
+        """Planned pulses without any block: they may have been felt, so they count as unacknowledged."""
+        lost = ~self._mentioned & (self._planned > 0)
         lost[reached:] = False
         if not lost.any():
             return
         self._status[lost] = PulseStatus.UNACKNOWLEDGED
         self._as_planned(lost)
         notes.append(
-            f"{int(lost.sum())} planned pulses left no trace: they may have been felt and stand as unacknowledged"
+            f"{int(lost.sum())} planned pulses have no block: they may have been felt and count as unacknowledged"
         )
 
     def _as_planned(self, which: NDArray[np.bool_]) -> None:

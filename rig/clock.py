@@ -1,7 +1,7 @@
-"""Time is injected: monotonic for decisions, UTC as a label only.
+"""Clocks are passed in: monotonic time for decisions, UTC as a label only.
 
-`MonotonicClock` is what the rig runs on. Its `speed` is 1 on hardware; against an emulator that runs n times
-faster than the world the same rig runs with `speed=n`. `VirtualClock` jumps from event to event, for tests.
+The rig runs on `MonotonicClock`. Its `speed` is 1 on hardware. With an emulator that runs n times faster than real
+time, the same rig runs with `speed=n`. `VirtualClock` jumps from event to event, for tests.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ class Clock(Protocol):
 
     @property
     def speed(self) -> float:
-        """Rig seconds a real second; allowances for the operating system are multiplied by it."""
+        """Rig seconds per real second. Time allowances for the operating system are multiplied by it."""
         ...
 
     def now_s(self) -> float:
@@ -41,7 +41,7 @@ class MonotonicClock:
 
     def __init__(self, speed: float = 1.0) -> None:
         if not (0 < speed < 1000):
-            raise ValueError(f"clock speed {speed}: give a number above 0 and below 1000")
+            raise ValueError(f"clock speed {speed}: must be above 0 and below 1000")
         self.speed = speed
 
     def now_s(self) -> float:
@@ -60,7 +60,7 @@ class MonotonicClock:
 
 
 class VirtualClock:
-    """A clock that stands still until somebody waits; `call_at` schedules what the fakes do meanwhile.
+    """A clock that moves only when somebody waits; `call_at` schedules what the fakes do meanwhile.
 
     For one thread: waiting runs the scheduled events up to the deadline in order, then returns.
     """

@@ -1,6 +1,6 @@
-"""The rig file (TOML): which devices, on which ports, which tighter limits. `docs/rig-file.md` lists every key.
+"""The rig file (TOML): devices, ports and tighter limits. `docs/rig-file.md` lists every key.
 
-A mistake is one line: file, key, what is wrong, what would be right.
+An error is one line: file, key, what is wrong, how to correct it.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ class _Table(BaseModel):
 
 
 class _Numbers(_Table):
-    """Strict: `true` is no number of mA."""
+    """Types are strict: `true` is not a number."""
 
     model_config = ConfigDict(strict=True)
 
 
 class LimitSettings(_Numbers):
-    """Tightens the hard limits for this rig; a value above the hard limit changes nothing."""
+    """Tighter limits for this rig; a value beyond the hard limit has no effect."""
 
     pulse_width_us: float | None = Field(None, ge=0)
     current_ma: float | None = Field(None, ge=0)
@@ -59,7 +59,7 @@ class LimitSettings(_Numbers):
 
 
 class WatchSettings(_Numbers):
-    """When silence counts as a fault, real seconds; tighter or a little looser than the defaults."""
+    """When silence counts as a fault, real seconds; may be tighter or slightly looser than the defaults."""
 
     stale_torque_s: float = Field(0.1, gt=0, le=0.5)
     missing_ack_s: float = Field(0.1, gt=0, le=0.5)
@@ -74,10 +74,10 @@ class WatchSettings(_Numbers):
 
 
 class RigConfig(_Table):
-    """A whole rig file, checked. `stimulator` and `load_cell` are the settings of the chosen devices.
+    """A complete rig file, checked. `stimulator` and `load_cell` are the settings of the chosen devices.
 
-    `clock_speed` is no key of a rig file: every limit that has a second in it is meant in rig seconds, so a faster
-    clock would widen them all. Only the emulator's own line sets it (`for_emulator`).
+    `clock_speed` is not a key of the rig file: all limits with a time are in rig seconds, so a faster clock would widen
+    them. Only the emulator's JSON line sets it (see `for_emulator`).
     """
 
     data_dir: Path
@@ -90,7 +90,7 @@ class RigConfig(_Table):
     watch: WatchSettings = WatchSettings.model_validate({})
 
     def public(self) -> dict[str, Any]:
-        """The configuration as it is kept in every recording."""
+        """The configuration as stored in every recording."""
         content = self.model_dump(mode="json")
         content["stimulator"] = self.stimulator.model_dump(mode="json")
         content["load_cell"] = self.load_cell.model_dump(mode="json")
@@ -107,14 +107,14 @@ def load(path: Path, **overrides: Any) -> RigConfig:
     Parameters
     ----------
     path
-        The TOML file; a relative DBC path in it is taken from the file's folder.
+        The TOML file; a relative DBC path in it is relative to the file's folder.
     overrides
-        Values that win over the file's: `data_dir`, `socket`.
+        Values that override the file's: `data_dir`, `socket`.
 
     Raises
     ------
     ConfigError
-        One line with file, key and mend.
+        One line with file, key and how to correct it.
     """
     try:
         content = tomllib.loads(path.read_text("utf-8"))
@@ -125,7 +125,7 @@ def load(path: Path, **overrides: Any) -> RigConfig:
     if EMULATOR_ONLY in content or overrides.get(EMULATOR_ONLY) is not None:
         place = f"{path}: {EMULATOR_ONLY}" if EMULATOR_ONLY in content else f"--clock-speed with {path}"
         raise ConfigError(
-            f"{place}: only an emulator's clock may run faster than the world, and its own line says so; take it out"
+            f"{place}: only an emulator's clock may run faster than real time, and its own JSON line sets it; remove it"
         )
     cell = content.get("load_cell")
     if isinstance(cell, dict) and str(cell.get("dbc", "")).endswith(".dbc"):
@@ -142,31 +142,31 @@ EMULATED_CELLS: dict[str, Callable[[int], dict[str, Any]]] = {
     "counts": lambda samples: _packed("counts_be16", samples, ""),
     "canopen": lambda _: {"start_frames": ["000#0101"], "stop_frames": ["000#0201"]},
 }
-"""How a rig file describes the emulator's cells, by their names and samples a frame."""
+"""Rig-file settings for each of the emulator's cells, by name and samples per frame."""
 EMULATOR_WATCH = {"stale_torque_s": 0.5, "missing_ack_s": 0.5, "clipped_torque_s": 10.0}
-"""Nobody sits at an emulator, and it shares its processors with whatever else runs: a laptop's pause of 0.1 s, which
-would stop a rig that drives a person, does not end a demo. A hidden clipped amplifier is there to be diagnosed, and
-stands at its end for up to 6 s of the default ramp."""
+"""No person is connected to an emulator, and it shares its processors with other programs. A pause of 0.1 s would stop
+a real rig, but must not end a demo. A hidden saturated amplifier is there to be diagnosed, and stays saturated for up
+to 6 s of the default ramp."""
 
 
 def for_emulator(ready: str, **overrides: Any) -> RigConfig:
-    """A rig on the emulator's devices, from the JSON line that it prints (or a file holding that line).
+    """A rig for the emulator's devices, from the JSON line that it prints (or from a file with that line).
 
-    The line may set the clock's speed and the watch, and asks for no calibration, so it must not lead to a real
-    stimulator: its port is a pseudo-terminal.
+    The line may set the clock's speed and the watch, and needs no calibration. It must therefore never lead to a real
+    stimulator: its port must be a pseudo-terminal.
 
     Raises
     ------
     ConfigError
-        No such line, or a port that is no pseudo-terminal.
+        The line is not valid, or its port is not a pseudo-terminal.
     """
     try:
         text = ready if ready.lstrip().startswith("{") else Path(ready).read_text("utf-8")
         line = json.loads(text)
-        # the link, like udev's names by id, outlives a replugging
+        # the link stays valid after replugging, like udev's names by id
         stimulator, can = line.get("stimulator_link", line["stimulator"]), line["can"]
         cell = EMULATED_CELLS[line.get("cell", "plain")](int(line.get("samples_per_frame", 1)))
-        # a link is gone while the emulator's stimulator is unplugged: then its port is what the line says
+        # the link is missing while the emulated stimulator is unplugged: then use the port itself
         linked = Path(str(stimulator)).is_symlink() or Path(str(stimulator)).exists()
         place = Path(str(stimulator if linked else line["stimulator"])).resolve()
     except OSError as error:
@@ -175,12 +175,12 @@ def for_emulator(ready: str, **overrides: Any) -> RigConfig:
         raise ConfigError(f"--emulator-json: not the line that `stimrig emulate` prints ({error})") from None
     if place.parent != PSEUDO_TERMINALS:
         raise ConfigError(
-            f"--emulator-json: stimulator {stimulator} is no pseudo-terminal of an emulator; real "
+            f"--emulator-json: stimulator {stimulator} is not a pseudo-terminal of an emulator; real "
             "devices need a rig file"
         )
     content: dict[str, Any] = {
         "clock_speed": line.get("speed", 1.0),
-        "require_calibration": False,  # nobody sits at an emulator
+        "require_calibration": False,  # no person is connected to an emulator
         "watch": line.get("watch", EMULATOR_WATCH),
         "stimulator": {"device": line.get("stimulator_device", "p24"), "port": stimulator},
         "load_cell": {

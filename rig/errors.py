@@ -1,10 +1,10 @@
-"""The rig's tree of exceptions: mapped once, at the socket (`rig.control`) and the command line (`rig.__main__`)."""
+"""The rig's exceptions. The socket (`rig.control`) and the command line (`rig.__main__`) turn them into messages."""
 
 from __future__ import annotations
 
 
 class RigError(Exception):
-    """Anything the rig can name: the text is one line with the place and the mend.
+    """Base of all: the text is one line that names the place and says how to correct it.
 
     `code` is stable and goes to clients as `messages.Problem.code`.
     """
@@ -21,14 +21,14 @@ class ConfigError(RigError):
 
 
 class PlanError(RigError):
-    """A test plan that cannot be built: names the segment and the setting."""
+    """A test plan cannot be built: names the segment and the setting."""
 
     code = "bad-plan"
     title = "The test plan is wrong"
 
 
 class RefusedError(RigError):
-    """A pulse or plan outside a limit: names the limit, the value and the bound."""
+    """A pulse or plan is outside a limit: names the limit, the value and the bound."""
 
     code = "refused"
     title = "Refused by a limit"
@@ -49,14 +49,14 @@ class LatchedError(RigError):
 
 
 class UncertainError(RigError):
-    """Started after a crash in mid-test, and no person has re-armed yet."""
+    """Started after a crash during a test, and no person has re-armed yet."""
 
     code = "uncertain"
     title = "The rig died in a test and waits for a person"
 
 
 class DeviceError(RigError):
-    """A device that cannot be reached, fell silent or answered with an error."""
+    """A device cannot be reached, does not answer, or answered with an error."""
 
     code = "disconnected"
     title = "A device does not answer"
@@ -70,14 +70,14 @@ class JournalError(RigError):
 
 
 class RecordingError(RigError):
-    """A recording that could not be sealed or read back; the journal is kept."""
+    """A recording could not be sealed or read back; the journal is kept."""
 
     code = "recording"
     title = "The recording could not be sealed"
 
 
 class WireError(RigError):
-    """Bytes that are no frame of the protocol: names the rule that they break."""
+    """Bytes that are not a valid frame of the protocol: names the rule that is broken."""
 
     code = "wire"
-    title = "The device sent bytes that make no sense"
+    title = "The device sent invalid data"

@@ -1,10 +1,11 @@
 """The only way to a stimulator: open only during a test, limits first, intent on disk before the command.
 
-At most one pulse is on its way: until the device has acknowledged it, each pulse that comes due is dropped and
-recorded. A line that stalls can therefore hold one pulse, never a row of them. When that pulse is felt is not known
-before its ack is read, so intervals, rates and charge per second are counted from the ack: they hold at the electrode.
+At most one pulse is unacknowledged at any time. Each pulse that comes due before the acknowledgement (ack) is dropped,
+and the drop is recorded. So a stalled line can hold one pulse, never several. The moment at which that pulse is felt is
+unknown until its ack is read. Intervals, rates and charge per second are therefore counted from the ack, so that they
+hold at the electrode.
 
-Once `shut` has returned no pulse is handed to the line any more, whatever other threads still try.
+After `shut` has returned, no pulse is written to the line, whatever other threads do.
 """
 
 from __future__ import annotations
@@ -24,13 +25,13 @@ from rig.limits import Limit, Refusal, admit, check
 from rig.signals import Ack, LateError, Pulse, PulseStatus
 
 LATE_ACK_S = 0.015
-"""Real seconds: an ack that took longer is told in the recording: the pulse may have been felt as late, and at 40
-pulses/s the next one is too close to it."""
+"""Real seconds. A slower ack is noted in the recording: the pulse may have been felt that late, and at 40 pulses/s the
+next one then follows too closely."""
 
 
 @dataclass(frozen=True, slots=True)
 class OnItsWay:
-    """A pulse that was handed to the line and that the device has not acknowledged."""
+    """A pulse that was written to the line and that the device has not acknowledged."""
 
     index: int
     number: int
@@ -38,16 +39,16 @@ class OnItsWay:
 
 
 class Gate:
-    """Holds the stimulator and lets admitted pulses through.
+    """Owns the stimulator and sends admitted pulses.
 
     Parameters
     ----------
     stimulator
-        The device; nothing else keeps a reference to it.
+        The device. Nothing else keeps a reference to it.
     clock
         The rig's clock.
     on_fault, on_lost
-        Called with the reason when the device reports an error, and when its line is gone; from any thread.
+        Called with the reason when the device reports an error, or when its line is gone. From any thread.
     """
 
     def __init__(
@@ -67,7 +68,7 @@ class Gate:
         self.on_its_way: OnItsWay | None = None
         self._recent: deque[tuple[float, float]] = deque()
         self.last_pulse_s: float | None = None
-        """The latest moment at which the last pulse can have been felt, as far as is known."""
+        """Latest time at which the last pulse can have been felt, s; None before the first pulse."""
         self.lateness_s: list[float] = []
         self.ack_delay_s: list[float] = []
         self.charge_uc = 0.0
@@ -76,11 +77,11 @@ class Gate:
 
     @property
     def is_open(self) -> bool:
-        """A test may send pulses now."""
+        """Whether a test may send pulses now."""
         return self._passing
 
     def identify(self) -> dict[str, object]:
-        """Open the line to the device and ask who it is. Raises DeviceError."""
+        """Open the line and ask the device for its identity. Raises DeviceError."""
         return self._stimulator.open()
 
     def state(self) -> tuple[bool, str]:
@@ -88,7 +89,7 @@ class Gate:
         return self._stimulator.state()
 
     def reset(self) -> None:
-        """Forget the counts of the test before."""
+        """Clear the counts of the previous test."""
         with self._lock:
             self.last_pulse_s, self.lateness_s, self.ack_delay_s = None, [], []
             self.charge_uc, self.dropped = 0.0, 0
@@ -100,13 +101,13 @@ class Gate:
         Raises
         ------
         DeviceError, JournalError
-            The gate then stays shut.
+            The gate stays shut.
         """
         journal.append_json(Kind.EVENT, {"event": "arm", "time_s": self._clock.now_s()})
         self._stimulator.arm()
         with self._lock:
             self._table = table
-            self.on_its_way = None  # the device has answered since: whatever lay in the line is through
+            self.on_its_way = None  # the device has answered since, so the line is empty
             self._journal = journal
             self._passing = True
 
@@ -118,12 +119,12 @@ class Gate:
         index
             Its number in the test.
         due_s, latest_s
-            When it was due, and after when it is dropped rather than sent.
+            When it is due, and the time after which it is dropped instead of sent.
 
         Raises
         ------
         DeviceError, JournalError
-            Nothing may follow; the caller stops the test.
+            No pulse may follow. The caller must stop the test.
         """
         with self._lock:
             journal = self._journal
@@ -148,7 +149,7 @@ class Gate:
             intent = jn.INTENT.pack(index, now_s, due_s, verdict.pulse_width_us, verdict.current_ma)
             journal.append(Kind.INTENT, intent)
             try:
-                number = self._stimulator.send(verdict, latest_s)  # looks at the clock last of all
+                number = self._stimulator.send(verdict, latest_s)  # checks the clock as its last step before the write
             except LateError:  # the disk or the line was slow
                 return self._skip(journal, index, PulseStatus.DROPPED)
             written_s = self._clock.now_s()
@@ -161,26 +162,27 @@ class Gate:
         return PulseStatus.UNACKNOWLEDGED
 
     def feed(self) -> None:
-        """Health has just been proven; does nothing unless a test is on. Raises DeviceError."""
+        """Feed the device's watchdog after a health check; does nothing unless a test runs. Raises DeviceError."""
         with self._lock:
             if self._passing:
                 self._stimulator.feed()
 
     def shut(self) -> None:
-        """From here on nothing is handed to the line; what it holds already is `on_its_way`."""
+        """Write nothing more to the line. A pulse that it already holds stays in `on_its_way`."""
         with self._lock:
             self._passing = False
 
     def release(self) -> None:
-        """Shut, and let the test's journal go: late acks are no longer written."""
+        """Shut, and release the test's journal: later acks are not recorded."""
         with self._lock:
             self._passing = False
             self._journal = None
 
     def stop(self) -> None:
-        """Shut, and tell the device to stop; what has not left this computer is discarded. Raises DeviceError.
+        """Shut, discard what has not left this computer, and tell the device to stop. Raises DeviceError.
 
-        The line keeps its order: a device that has answered has taken, or lost, the pulse that was on its way before.
+        The line keeps the order of bytes. A device that answers the stop has already received, or lost, the pulse
+        that was sent before it.
         """
         self.shut()
         self._stimulator.stop()
@@ -189,7 +191,7 @@ class Gate:
                 self.on_its_way, self.last_pulse_s = None, self._clock.now_s()
 
     def still_possible(self) -> str:
-        """In words: may a pulse that was sent still be felt? Empty: no."""
+        """A sentence if a pulse that was sent may still be felt; empty if not."""
         pulse = self.on_its_way
         if pulse is None:
             return ""
@@ -197,7 +199,7 @@ class Gate:
         return f"pulse {pulse.index + 1} was sent {age_ms:.0f} ms ago and not acknowledged: it may still be felt"
 
     def disconnect(self) -> None:
-        """Stop if it still can be, and give the line back; never raises."""
+        """Try to stop, then close the line; never raises."""
         with contextlib.suppress(DeviceError):
             self.stop()
         self._stimulator.close()
@@ -213,7 +215,7 @@ class Gate:
         return status
 
     def _too_close(self, now_s: float) -> str:
-        """Why the pulse before is not known to be past for long enough; empty: it is."""
+        """Why too little time has certainly passed since the previous pulse; empty if enough has."""
         if self.on_its_way is not None:
             return f"pulse {self.on_its_way.index + 1} is not acknowledged yet"
         if not self._recent:
@@ -225,7 +227,7 @@ class Gate:
         while self._recent and self._recent[0][0] <= now_s - 1.0:
             self._recent.popleft()
         if self._recent:
-            # those of the last second; the window that ends on a pulse may begin on one, too
+            # pulses of the last second: a window that ends with a pulse may also begin with one
             refusal = check(self._table["pulse_rate_hz"], len(self._recent))
             if refusal is not None:
                 return refusal
@@ -246,10 +248,10 @@ class Gate:
             "stimulator: it acknowledged a pulse that it was not sent; is the line disturbed?" if unasked else "",
         ):
             if reason:
-                self._on_fault(reason)  # outside the lock: a fault shuts the gate
+                self._on_fault(reason)  # without the lock: a fault shuts the gate
 
     def _settle(self, pulse: OnItsWay, ack: Ack) -> None:
-        """The pulse has been felt, between its write and its ack."""
+        """The ack came: the pulse was felt at some time between its write and its ack."""
         self.on_its_way = None
         self.last_pulse_s = max(ack.time_s, pulse.written_s)
         self.ack_delay_s.append(self.last_pulse_s - pulse.written_s)

@@ -1,10 +1,10 @@
-"""The journal: what happened, in append-only blocks with length and CRC-32, while it happens.
+"""The journal: an append-only log of the test in blocks with length and CRC-32, written while it happens.
 
-A process that is killed, or a disk that fills up, costs the last block at most. Blocks reach the kernel before
-`append` returns (so they outlive this process) and the disk at the start, once a second and at the end.
+If the process is killed or the disk is full, at most the last block is lost. Blocks reach the kernel before `append`
+returns (so they survive this process); they are synced to the disk at the start, twice a second and at the end.
 
-Header and plan, without which the rest is hard to read, stand in it twice, further apart than a sector of a disk is
-long. While it is open it is locked, so that nobody seals what is still being written.
+Header and plan are needed to read the rest, so they are stored twice, further apart than one disk sector. The journal
+is locked while it is open, so that nobody seals it while it is still being written.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ MAX_PAYLOAD = 64 * 1024 * 1024
 INTENT = struct.Struct("<idddd")
 """Pulse index, time_s, due_s, width µs, current mA: written before the command goes out."""
 WRITTEN = struct.Struct("<iBd")
-"""Pulse index, packet number, time_s when the last byte was handed to the line."""
+"""Pulse index, packet number, time_s when the last byte was written to the line."""
 SKIPPED = struct.Struct("<iBd")
 """Pulse index, `PulseStatus`, time_s."""
 ACKED = struct.Struct("<id")
@@ -62,7 +62,7 @@ class Kind(IntEnum):
 class Journal:
     """One test's journal, open for appending from several threads.
 
-    After the first failure every further `append` raises: a journal with a hole must not look whole.
+    After the first failure every further `append` raises: a journal with a gap must not look complete.
     """
 
     def __init__(self, path: Path) -> None:
@@ -77,7 +77,7 @@ class Journal:
             self.sync()
             _sync_directory(path.parent)
         except OSError as error:
-            raise JournalError(f"journal {path}: {error.strerror}; free the disk or correct data_dir") from None
+            raise JournalError(f"journal {path}: {error.strerror}; free some disk space or correct data_dir") from None
 
     def append(self, kind: Kind, payload: bytes) -> None:
         """Write one block through to the kernel.
@@ -85,7 +85,7 @@ class Journal:
         Raises
         ------
         JournalError
-            The disk refused it, now or before.
+            The disk gave an error, now or before.
         """
         with self._lock:
             if self._failure:
@@ -95,12 +95,12 @@ class Journal:
             try:
                 self._put(head + struct.pack("<I", crc) + payload)
             except OSError as error:
-                self._failure = f"journal {self.path}: {error.strerror}; the test stops, what was written is kept"
+                self._failure = f"journal {self.path}: {error.strerror}; the test stops; what was written is kept"
                 raise JournalError(self._failure) from None
             self._number += 1
 
     def begin(self, header: dict[str, Any], plan: bytes) -> None:
-        """Header and plan, twice, and on the disk. Raises JournalError."""
+        """Write header and plan, twice, and sync them to the disk. Raises JournalError."""
         for spacer in (bytes(APART_BYTES), b""):
             self.append_json(Kind.HEADER, header)
             self.append(Kind.PLAN, plan)
@@ -118,14 +118,14 @@ class Journal:
             raise OSError(28, "disk full: block cut short")
 
     def sync(self) -> None:
-        """Bring everything written so far to the disk. A failure shows in the next `append`."""
+        """Sync everything written so far to the disk. After a failure the next `append` raises."""
         try:
             os.fdatasync(self._fd)
         except OSError as error:
-            self._failure = f"journal {self.path}: {error.strerror}; the test stops, what was written is kept"
+            self._failure = f"journal {self.path}: {error.strerror}; the test stops; what was written is kept"
 
     def close(self) -> None:
-        """Bring everything to the disk and close."""
+        """Sync everything to the disk and close."""
         self.sync()
         os.close(self._fd)
 
@@ -140,7 +140,7 @@ def _sync_directory(path: Path) -> None:
 
 @dataclass(frozen=True, slots=True)
 class JournalContents:
-    """Every whole block in order; `damaged_bytes` were skipped, `blocks_missing` by the sequence numbers."""
+    """Every complete block in order; `damaged_bytes` were skipped; `blocks_missing` are counted by sequence number."""
 
     path: Path
     blocks: list[tuple[Kind, bytes]]
@@ -149,12 +149,12 @@ class JournalContents:
 
     @property
     def damaged(self) -> bool:
-        """Something cannot be read, or is missing."""
+        """Whether something cannot be read, or is missing."""
         return self.damaged_bytes > 0 or self.blocks_missing > 0
 
     @property
     def ended(self) -> bool:
-        """The test's end was written: nothing is missing at the tail."""
+        """Whether the test's end was written: nothing is missing at the end."""
         return any(kind == Kind.END for kind, _ in self.blocks)
 
     def first_json(self, kind: Kind) -> dict[str, Any] | None:
@@ -163,12 +163,12 @@ class JournalContents:
 
 
 def read(path: Path) -> JournalContents:
-    """Read a journal, whole or half-written: damage costs the damaged blocks only.
+    """Read a journal, complete or partial: only damaged blocks are lost.
 
     Raises
     ------
     RecordingError
-        Not there, or not a journal at all.
+        Missing, or not a journal.
     """
     try:
         data = path.read_bytes()
@@ -190,7 +190,7 @@ def read(path: Path) -> JournalContents:
         expected = number + 1
         blocks.append((kind, payload))
     if not blocks and not data.startswith(MAGIC):
-        raise RecordingError(f"journal {path}: does not start like a journal; it is another file or was overwritten")
+        raise RecordingError(f"journal {path}: is not a journal, or its start was overwritten")
     return JournalContents(path, blocks, damaged, missing)
 
 

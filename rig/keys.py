@@ -1,7 +1,7 @@
-"""A key in the terminal stops stimulation: any key, at any time, where a person started the rig in one.
+"""Any key in the terminal stops stimulation, at any time, if a person started the rig in a terminal.
 
-Nothing is read where the rig has no terminal of its own (a service, a child of `stimrig serve`), or stands in the
-background, where reading would stop the whole process.
+Nothing is read if the rig has no terminal of its own (a service, a child of `stimrig serve`), or runs in the
+background, where reading would suspend the whole process.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any
 
 
 def in_front(fd: int) -> bool:
-    """Is `fd` the terminal whose keys are meant for this process?"""
+    """Whether `fd` is a terminal and this process is in its foreground."""
     try:
         return os.isatty(fd) and os.tcgetpgrp(fd) == os.getpgrp()
     except OSError:
@@ -33,7 +33,7 @@ class StopKey:
     fd
         The terminal.
     ours
-        Whether its keys are meant for this process, asked before each touch of it.
+        Whether its keys are meant for this process; asked before each access.
     """
 
     def __init__(
@@ -48,14 +48,14 @@ class StopKey:
 
     @property
     def watched(self) -> bool:
-        """Is there a terminal whose keys stop?"""
+        """Whether a terminal is being watched for keys."""
         return self._before is not None
 
     def __enter__(self) -> StopKey:
         if self._ours(self._fd):
             with contextlib.suppress(OSError, termios.error):
                 self._before = termios.tcgetattr(self._fd)
-                tty.setcbreak(self._fd, termios.TCSANOW)  # Ctrl-C and Ctrl-Z stay what they are
+                tty.setcbreak(self._fd, termios.TCSANOW)  # Ctrl-C and Ctrl-Z keep their meaning
                 self._loop.add_reader(self._fd, self._read)
         return self
 
@@ -70,7 +70,7 @@ class StopKey:
 
     def _read(self) -> None:
         if not self._ours(self._fd):
-            self._loop.remove_reader(self._fd)  # moved to the background: its keys are somebody else's now
+            self._loop.remove_reader(self._fd)  # moved to the background: the keys are for another process now
             return
         try:
             keys = os.read(self._fd, 1024)

@@ -1,13 +1,13 @@
-"""What may reach a person: ONE table, and the function that admits a pulse or says why not.
+"""Safety limits: ONE table, and the function that admits a pulse or says why not.
 
-Every bound is checked as `if not (lo <= x <= hi)`, so a NaN is refused; rounding to the device's steps is toward
-zero. The tighter of the table, the rig file and the participant's profile wins, and the refusal names which.
+Every bound is checked as `if not (lo <= x <= hi)`, so NaN is refused. Values are rounded toward zero to the device's
+steps. The tightest of table, rig file, participant's profile and request applies, and a refusal names its owner.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from rig.errors import RefusedError
 from rig.messages import Bound, Profile, TestPlan
@@ -19,7 +19,7 @@ STEP_CURRENT_MA = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Limit:
-    """One row: the closed range that is allowed, why, and where the number comes from."""
+    """One row: the closed range that is allowed, the reason, and the source of the numbers."""
 
     name: str
     lo: float
@@ -40,75 +40,75 @@ HARD_LIMITS: dict[str, Limit] = {
         ),
         Limit(
             "current_ma", 0.0, 100.0, "mA",
-            "with 500 µs at 40 Hz it is 20 mA rms, below 2 mA/cm² on electrodes of 10 cm² or more",
+            "at 500 µs and 40 Hz this is 20 mA rms, below 2 mA/cm² on electrodes of 10 cm² or more",
             "IEC 60601-2-10 (attention above 2 mA/cm²); the P24 could send 130 mA",
         ),
         Limit(
             "charge_per_phase_uc", 0.0, 40.0, "µC",
             "twice what arm muscles need (300 µs × 60 mA = 18 µC); the protocol could encode 614 µC",
-            "house rule, tighter than IEC 60601-2-10's 300 mJ a pulse into 500 Ω (40 µC at 100 mA: 4 mJ)",
+            "own rule, tighter than IEC 60601-2-10's 300 mJ a pulse into 500 Ω (40 µC at 100 mA: 4 mJ)",
         ),
         Limit(
             "charge_per_second_uc", 0.0, 1600.0, "µC/s",
             "40 pulses/s at the highest charge: a higher rate must use smaller pulses",
-            "house rule: charge_per_phase_uc × 40 Hz",
+            "own rule: charge_per_phase_uc × 40 Hz",
         ),
         Limit(
             "pulse_rate_hz", 1.0, 60.0, "Hz",
-            "40 Hz is a fused contraction; faster only tires the muscle",
+            "at 40 Hz the contraction is fused; a higher rate only tires the muscle",
             "paper, section II (40 Hz); clinical FES 20-50 Hz",
         ),
         Limit(
             "pulse_interval_s", 0.008, math.inf, "s",
-            "two pulses closer than this sum in the nerve: a late pulse is dropped, never sent in a burst",
+            "two pulses closer than this add up in the nerve; a late pulse is dropped, never sent in a burst",
             "shortest interpulse interval of the RehaStim 2 (8 ms)",
         ),
         Limit(
             "torque_nm", -60.0, 60.0, "N·m",
-            "an elbow under maximal voluntary effort gives about 60 N·m: beyond it something is wrong",
-            "house rule; the profile's max_torque_nm is normally far below",
+            "an elbow under maximal voluntary effort gives about 60 N·m: above that something is wrong",
+            "own rule; the profile's max_torque_nm is normally far below",
         ),
         Limit(
             "torque_jump_nm", 0.0, 5.0, "N·m",
-            "no elbow changes its torque so much from one sample to the next: a knock, a loose cable, a turned sign",
-            "house rule: 1000 N·m/s, twice a strong arm's rate of rise, is 0.6 N·m a sample at 1600/s",
+            "an elbow's torque cannot change so much within a sample: a knock, a loose cable, a reversed sign",
+            "own rule: 1000 N·m/s, twice a strong arm's rate of rise, is 0.6 N·m a sample at 1600/s",
         ),
         Limit(
             "duration_s", 0.0, 300.0, "s",
-            "a pre-session test must not tire the muscle that the session trains",
-            "house rule: a default test takes 40 s",
+            "a pre-session test must not tire the muscle before its training session",
+            "own rule: a default test takes 40 s",
         ),
         Limit(
             "charge_per_test_uc", 0.0, 50_000.0, "µC",
             "ten default tests' dose (300 µs, 20 mA: about 4 mC)",
-            "house rule",
+            "own rule",
         ),
         Limit(
             "width_rise_us", -math.inf, 50.0, "µs/pulse",
-            "a width that rises faster than 0 to 300 µs in 150 ms startles; falling is always allowed. Sequences that "
-            "jump between levels by design (PRBS and its like) say so and are exempt",
-            "house rule; the paper's ramp rises by 1.5 µs a pulse",
+            "a pulse width that rises faster than 0 to 300 µs in 150 ms startles; a fall is always allowed. Sequences "
+            "that jump between levels by design (such as PRBS) declare it and are exempt",
+            "own rule; the paper's ramp rises by 1.5 µs a pulse",
         ),
         Limit(
             "rest_between_tests_s", 1.0, math.inf, "s",
-            "from a test's last pulse to the next one's first: the torque must have fallen to its rest, or the next "
-            "baseline lies; against fatigue the rig file and the profile ask for more",
+            "from a test's last pulse to the next test's first: the torque must return to rest, or the next baseline "
+            "is wrong; to avoid fatigue the rig file and the profile may ask for more",
             "paper: slowest muscle about 1 s",
         ),
         Limit(
             "rest_between_trains_s", 0.5, math.inf, "s",
             "between two trains of a calibration: a person must be able to tell them apart",
-            "house rule",
+            "own rule",
         ),
         Limit(
             "calibration_step_us", 1.0, 25.0, "µs",
-            "small steps: from the sensory threshold to discomfort are often 100 µs",
-            "house rule",
+            "small steps: discomfort often begins only 100 µs above the sensory threshold",
+            "own rule",
         ),
         Limit(
             "calibration_train_s", 0.1, 2.0, "s",
-            "long enough to be felt, short enough to be borne once too much",
-            "house rule",
+            "long enough to be felt, short enough to be bearable if one step is too strong",
+            "own rule",
         ),
     )
 }  # fmt: skip
@@ -116,19 +116,19 @@ HARD_LIMITS: dict[str, Limit] = {
 
 @dataclass(frozen=True, slots=True)
 class Steps:
-    """What a stimulator can tell apart: pulses are rounded toward zero to it, shorter ones are no pulse."""
+    """A stimulator's resolution: pulses are rounded toward zero to it; below `shortest_us` nothing is sent."""
 
     pulse_width_us: float = STEP_PULSE_WIDTH_US
     current_ma: float = STEP_CURRENT_MA
     shortest_us: float = STEP_PULSE_WIDTH_US
 
     def width_us(self, asked_us: float) -> int:
-        """The width that is sent for it; 0: none."""
+        """Width that is sent for the width asked for, µs; 0: no pulse."""
         width_us = int(int(asked_us / self.pulse_width_us) * self.pulse_width_us)
         return width_us if width_us >= self.shortest_us else 0
 
     def current(self, asked_ma: float) -> float:
-        """The current that is sent for it, mA; 0: none."""
+        """Current that is sent for the current asked for, mA; 0: no pulse."""
         return int(asked_ma / self.current_ma) * self.current_ma
 
 
@@ -137,7 +137,7 @@ FINEST = Steps()
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """Why a pulse was not admitted: which limit, the value, the bound, whose bound it is."""
+    """Why a pulse was not admitted: the limit, the value, the bounds, and who set them."""
 
     limit: str
     value: float
@@ -177,7 +177,7 @@ class Admitted:
 
 
 def bounds(table: dict[str, Limit]) -> dict[str, Bound]:
-    """The table as clients see it, so that a form can say what the rig would refuse."""
+    """The table for clients, so that a form can show what the rig would refuse."""
     return {
         row.name: Bound(
             lo=row.lo if math.isfinite(row.lo) else None,
@@ -202,7 +202,7 @@ def tightened(table: dict[str, Limit], name: str, hi: float, owner: str, lo: flo
     Raises
     ------
     RefusedError
-        The bound is no number, or leaves nothing: an open door is no limit.
+        The bound is not a number, or no value would be left.
     """
     row = table[name]
     lo = row.lo if lo is None else max(row.lo, lo)
@@ -210,18 +210,17 @@ def tightened(table: dict[str, Limit], name: str, hi: float, owner: str, lo: flo
         raise RefusedError(f"{owner}: {name} {hi:g} {row.unit} must be at least {lo:g} {row.unit}")
     if hi >= row.hi and lo <= row.lo:
         return table
-    bounds = Limit(name, lo, min(hi, row.hi), row.unit, row.reason, row.source, owner)
-    return {**table, name: bounds}
+    return {**table, name: replace(row, lo=lo, hi=min(hi, row.hi), owner=owner)}
 
 
 def at_least(table: dict[str, Limit], name: str, lo: float, owner: str) -> dict[str, Limit]:
-    """The table with one row's lower bound raised, never lowered. Raises RefusedError for no number."""
+    """The table with one row's lower bound raised, never lowered. Raises RefusedError if it is not a number."""
     row = table[name]
     if not (lo <= row.hi):
         raise RefusedError(f"{owner}: {name} {lo:g} {row.unit} must be at most {row.hi:g} {row.unit}")
     if lo <= row.lo:
         return table
-    return {**table, name: Limit(name, lo, row.hi, row.unit, row.reason, row.source, owner)}
+    return {**table, name: replace(row, lo=lo, owner=owner)}
 
 
 def for_profile(table: dict[str, Limit], profile: Profile, owner: str = "participant's profile") -> dict[str, Limit]:

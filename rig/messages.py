@@ -1,11 +1,10 @@
-"""What passes over the rig's Unix socket: one JSON object a line, in both directions.
+"""Messages on the rig's Unix socket: one JSON object per line, in both directions.
 
-A client sends a `Request` and gets one reply, a `Reply` with the same `id`. After `subscribe` the
-connection also carries `Event` lines until either side closes it. `api` imports this module and
-nothing else that reaches a device.
+A client sends a `Request` and gets one `Reply` with the same `id`. After `subscribe` the connection also carries
+`Event` lines until either side closes it. This is the only module of `rig` that `api` imports.
 
-A second socket beside the first, `stop_socket`, takes `stop` alone: nothing that happens on the first one can
-keep it from being heard. A request over 64 kB begins with its `kind` and `id`, as these models write it.
+A second socket, `stop_socket`, accepts only `stop`, so that nothing on the first socket can delay a stop. A request
+over 64 kB must begin with its `kind` and `id`, as these models write it.
 """
 
 from __future__ import annotations
@@ -18,9 +17,9 @@ from pydantic import BaseModel, ConfigDict, Field
 RigState = Literal[
     "disconnected", "uncertain", "ready", "calibrating", "arming", "running", "sealing", "stopping", "latched"
 ]
-"""`uncertain`: started after a crash, the device has been asked but no person has re-armed.
-`calibrating`: a guided calibration is open and nothing is being sent; its trains pass through arming, running, sealing.
-`latched`: stopped after a fault or a stop; stays so until a person re-arms."""
+"""`uncertain`: started after a crash during a test; the device was asked, but no person has re-armed yet.
+`calibrating`: a guided calibration is open and nothing is sent; each train passes through arming, running, sealing.
+`latched`: stopped after a fault or a stop, until a person re-arms."""
 
 Threshold = Literal["sensory", "motor", "comfort"]
 
@@ -30,18 +29,18 @@ TestOutcome = Literal["completed", "stopped", "fault"]
 
 
 LONGEST_LINE = 1_900_000
-"""Bytes of a request: the rig hears out none that is longer."""
+"""Bytes of a request. The rig refuses longer ones."""
 
 
 def stop_socket(path: Path) -> Path:
-    """Where a rig that listens at `path` takes stops."""
+    """Path of the stop socket of a rig that listens at `path`."""
     return path.with_name(f"{path.name}.stop")
 
 
 class Message(BaseModel):
-    """Base of everything on the socket: unknown fields are refused, so a typing slip is seen.
+    """Base of all messages: unknown fields are refused, so that a typing error is noticed.
 
-    Strict: `true` is no current and `"20"` no width.
+    Types are strict: `true` is not a current, and `"20"` is not a width.
     """
 
     model_config = ConfigDict(extra="forbid", strict=True)
@@ -56,10 +55,10 @@ class SegmentPlan(Message):
 
 
 class Profile(Message):
-    """A participant's limits for the day; the tighter of these and the hard limits wins.
+    """A participant's limits for the day. The tighter of these and the hard limits applies.
 
-    What a guided calibration adds (both thresholds and both times, or none of them) is checked at every start:
-    0 < sensory <= motor <= comfort, set not in the future, not expired, valid for a day at most.
+    A guided calibration adds both thresholds and both times. They are checked at every start: all or none are given,
+    0 < sensory <= motor <= comfort, set not in the future, not expired, valid for at most one day.
     """
 
     current_ma: float = Field(20.0, description="fixed current of every pulse, mA")
@@ -68,14 +67,14 @@ class Profile(Message):
     sensory_pulse_width_us: float | None = Field(default=None, description="width at which it is first felt, µs")
     motor_pulse_width_us: float | None = Field(default=None, description="width at which the muscle first moves, µs")
     set_at_utc: str | None = Field(default=None, description="when the calibration was finished, ISO 8601")
-    expires_at_utc: str | None = Field(default=None, description="end of that day where the rig stands, ISO 8601")
-    rest_between_tests_s: float | None = Field(default=None, description="least rest from the last pulse of a test, s")
+    expires_at_utc: str | None = Field(default=None, description="end of that day in the rig's time zone, ISO 8601")
+    rest_between_tests_s: float | None = Field(default=None, description="shortest rest after a test's last pulse, s")
 
 
 class TestPlan(Message):
     """A whole pre-session test."""
 
-    __test__ = False  # not a test class, whatever pytest thinks of its name
+    __test__ = False  # keeps pytest from collecting it
 
     test_id: str
     participant: str
@@ -83,12 +82,12 @@ class TestPlan(Message):
     profile: Profile
     segments: list[SegmentPlan] | None = Field(None, description="None: the default pre-session test")
     pulse_rate_hz: float = 40.0
-    max_pulse_width_us: float | None = Field(default=None, description="for this test alone, if tighter, µs")
-    max_torque_nm: float | None = Field(default=None, description="for this test alone, if tighter, N·m")
+    max_pulse_width_us: float | None = Field(default=None, description="for this test only, if tighter, µs")
+    max_torque_nm: float | None = Field(default=None, description="for this test only, if tighter, N·m")
 
 
 class RecruitmentTable(Message):
-    """A recruitment curve as the participant's last model gives it: linear between the points."""
+    """Recruitment curve of the participant's last model: linear between the points."""
 
     pulse_width_us: list[float]
     torque_nm: list[float]
@@ -105,12 +104,12 @@ class SubscribeRequest(Message):
 
 
 class PreviewRequest(Message):
-    """Ask for a plan's duration, dose and pulse widths without playing it."""
+    """Ask for a plan's duration, dose and pulse widths; nothing is sent."""
 
     kind: Literal["preview"] = "preview"
     id: int = 0
     plan: TestPlan
-    recruitment: RecruitmentTable | None = Field(None, description="to estimate the torque-time with")
+    recruitment: RecruitmentTable | None = Field(None, description="to estimate the torque-time")
 
 
 class StartRequest(Message):
@@ -140,18 +139,18 @@ class CalibrateStartRequest(Message):
     calibration_id: str
     participant: str
     by: str
-    current_ma: float = Field(20.0, description="the fixed current of all pulses, mA")
-    step_us: float = Field(10.0, description="how much wider one step up is, µs")
-    train_s: float = Field(1.0, description="length of the pulse train at each step, s")
+    current_ma: float = Field(20.0, description="fixed current of all pulses, mA")
+    step_us: float = Field(10.0, description="increase of the pulse width per step, µs")
+    train_s: float = Field(1.0, description="length of each pulse train, s")
     pulse_rate_hz: float = 40.0
-    max_pulse_width_us: float | None = Field(None, description="never wider than this, µs; None: the hard limits alone")
+    max_pulse_width_us: float | None = Field(None, description="widest pulse allowed, µs; None: the hard limits")
     max_torque_nm: float = Field(30.0, description="torque at which a train stops, N·m")
 
 
 class CalibrateStepRequest(Message):
-    """Play one train: a step wider, a step narrower, or the same again. Reply: `Status`, at once (state arming).
+    """Play one train: one step wider, one step narrower, or the same again. Reply: `Status`, at once (state arming).
 
-    The train is over when the state is `calibrating` again; a fault or a stop latches and ends the calibration.
+    The train has ended when the state is `calibrating` again. A fault or a stop latches and ends the calibration.
     """
 
     kind: Literal["calibrate-step"] = "calibrate-step"
@@ -160,7 +159,7 @@ class CalibrateStepRequest(Message):
 
 
 class CalibrateMarkRequest(Message):
-    """Mark the width of the last train as a threshold; marking again replaces it. Reply: `Status`."""
+    """Mark the width of the last train as a threshold; a new mark replaces the old one. Reply: `Status`."""
 
     kind: Literal["calibrate-mark"] = "calibrate-mark"
     id: int = 0
@@ -192,7 +191,7 @@ Request = Annotated[
 
 
 class Problem(Message):
-    """Why a request was refused; `code` is stable, the words are for people and name the mend."""
+    """Why a request was refused. `code` is stable; the text is for people and says how to correct it."""
 
     code: str = Field(description="busy, latched, uncertain, refused, bad-plan, disconnected, internal, …")
     title: str
@@ -213,12 +212,12 @@ class CalibrationTrain(Message):
 
     number: int
     pulse_width_us: float
-    pulses: int = Field(description="how many were sent")
-    torque_rise_nm: float | None = Field(None, description="highest torque above rest, either way, N·m")
+    pulses: int = Field(description="pulses that were sent")
+    torque_rise_nm: float | None = Field(None, description="largest change of torque from rest, N·m")
 
 
 class CalibrationStatus(Message):
-    """Where a guided calibration stands."""
+    """Progress of a guided calibration."""
 
     calibration_id: str
     participant: str
@@ -228,28 +227,28 @@ class CalibrationStatus(Message):
     train_s: float
     max_torque_nm: float
     pulse_width_us: float = Field(description="width of the last train, µs; 0 before the first")
-    ceiling_us: float = Field(description="the widest that limits and a marked comfort maximum allow, µs")
-    ceiling_owner: str = Field(description="whose bound that is")
+    ceiling_us: float = Field(description="widest pulse that the limits and a marked comfort maximum allow, µs")
+    ceiling_owner: str = Field(description="who set that bound")
     next_us: dict[Direction, float] = Field(
-        default_factory=dict, description="width that each step would send, µs; one that is missing would be refused"
+        default_factory=dict, description="width that each step would send, µs; a missing step would be refused"
     )
     marks_us: dict[Threshold, float] = Field(default_factory=dict, description="marked widths, µs")
-    missing: list[Threshold] = Field(default_factory=list, description="what has to be marked before finishing")
+    missing: list[Threshold] = Field(default_factory=list, description="thresholds still to be marked")
     trains: list[CalibrationTrain] = Field(default_factory=list)
 
 
 class CalibrationResult(Message):
     profile: Profile | None = Field(None, description="valid until the end of the day; None: discarded")
-    recordings: list[str] = Field(default_factory=list, description="a sealed recording for each train")
+    recordings: list[str] = Field(default_factory=list, description="one sealed recording per train")
 
 
 class Bound(Message):
-    """What this rig admits of one quantity: the hard limit, narrowed by the rig file."""
+    """Range that this rig allows for one quantity: the hard limit, narrowed by the rig file."""
 
     lo: float | None = Field(None, description="None: no lower bound")
     hi: float | None = Field(None, description="None: no upper bound")
     unit: str
-    owner: str = Field(description="whose bound it is: hard limit or rig file")
+    owner: str = Field(description="who set it: hard limit or rig file")
 
 
 class Status(Message):
@@ -261,36 +260,35 @@ class Status(Message):
     elapsed_s: float = 0.0
     duration_s: float = 0.0
     stimulator: dict[str, Any] = Field(default_factory=dict, description="device, id, firmware, port")
-    load_cell: dict[str, Any] = Field(default_factory=dict, description="device, rate measured, bus")
-    torque_age_s: float | None = Field(None, description="age of the newest torque sample; None: never seen")
+    load_cell: dict[str, Any] = Field(default_factory=dict, description="device, measured sample rate, bus")
+    torque_age_s: float | None = Field(None, description="age of the newest torque sample; None: there was none")
     torque_nm: float | None = None
     calibration: CalibrationStatus | None = Field(None, description="while a guided calibration is open")
-    limits: dict[str, Bound] = Field(default_factory=dict, description="this rig's limits by name")
-    require_calibration: bool | None = Field(None, description="None: not told")
+    limits: dict[str, Bound] = Field(default_factory=dict, description="limits of this rig by name")
+    require_calibration: bool | None = Field(None, description="None: unknown")
     finished: FinishedEvent | None = Field(
-        None, description="the newest FinishedEvent since the rig started, a recovered one included: for who came late"
+        None,
+        description="newest one since the rig started, recovered tests included; for clients that connect later",
     )
 
 
 class Preview(Message):
     duration_s: float
     charge_uc: float = Field(description="sum over pulses of width × current, one phase, µC")
-    torque_time_nms: float | None = Field(
-        None, description="estimated torque-time, N·m·s; None: no model to estimate with"
-    )
+    torque_time_nms: float | None = Field(None, description="estimated torque-time, N·m·s; None: there is no model")
     pulse_width_us: list[float]
-    segments: list[dict[str, Any]] = Field(description="name, start_s, end_s each")
+    segments: list[dict[str, Any]] = Field(description="each with name, start_s, end_s")
 
 
 class StopEvidence(Message):
-    """A stop is confirmed by its effect: what the device and the torque said after it."""
+    """Whether a stop took effect: what the device answered, and what the torque did."""
 
     confirmed: bool
     detail: str
     last_pulse_age_s: float | None = None
     device_state: str | None = None
     pulse_may_follow: bool = Field(
-        default=False, description="one pulse was sent before the stop and not acknowledged: it may still be felt"
+        default=False, description="a pulse sent before the stop was not acknowledged and may still be felt"
     )
 
 
@@ -300,7 +298,7 @@ class StateEvent(Message):
 
 
 class LiveEvent(Message):
-    """About 20 a second while the load cell speaks: what a page needs to draw, no more."""
+    """Data for a page's chart, about 20 times per second while torque arrives."""
 
     event: Literal["live"] = "live"
     test_id: str | None
@@ -331,7 +329,7 @@ class FinishedEvent(Message):
         description="duration_s, samples, lost_samples, pulses, dropped_pulses, lateness_ms {median, p99, max}, "
         "ack_delay_ms {median, p99, max}, "
         "charge_uc, alignment {method, error_ms}, sample_rate_hz, torque_peak_nm, cpu_percent, warnings (sentences "
-        "about what is in doubt, for people)",
+        "for people about possible errors)",
     )
 
 

@@ -1,6 +1,6 @@
-"""What the rig tells systemd: that it is ready, that it lives, that it ends (sd_notify's protocol, a datagram a word).
+"""Messages to systemd: ready, alive, stopping (the sd_notify protocol, one datagram for each message).
 
-Without systemd (no NOTIFY_SOCKET) nothing is told. Source: systemd, sd_notify(3).
+Without systemd (no NOTIFY_SOCKET) nothing is sent. Source: systemd, sd_notify(3).
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections.abc import Mapping
 
 
 class Notifier:
-    """Speaks to the service manager that started this process; never blocks, never raises.
+    """Sends messages to the service manager that started this process; never blocks, never raises.
 
     Parameters
     ----------
@@ -32,12 +32,12 @@ class Notifier:
         self._tell("READY=1")
 
     def alive(self, trouble: str | None) -> None:
-        """Feed the watchdog if there is proof of health; else say what is wrong, and let it bark.
+        """Feed the watchdog if all is well; else report what is wrong, and let the watchdog expire.
 
         Parameters
         ----------
         trouble
-            What `Rig.trouble` found; None: all that must live does.
+            What `Rig.trouble` found; None: nothing.
         """
         if trouble is None:
             if self._complained:
@@ -50,7 +50,7 @@ class Notifier:
             self._tell(f"STATUS=not fed: {trouble}")
 
     def stopping(self) -> None:
-        """Stimulation is being stopped, the recording sealed."""
+        """The rig stops stimulation and seals the recording."""
         self._tell("STOPPING=1")
 
     def _tell(self, words: str) -> None:

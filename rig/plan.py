@@ -1,4 +1,4 @@
-"""From a `TestPlan` to every pulse of the test: built and checked whole before anything is sent."""
+"""From a `TestPlan` to every pulse of the test. The whole test is built and checked before anything is sent."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from rig.limits import Limit, Refusal, Steps, admit, check
 from rig.messages import Preview, RecruitmentTable, SegmentPlan, TestPlan
 from rig.signals import Pulse
 
-MOST_SEGMENTS = 200
+MAX_SEGMENTS = 200
 MAX_WIDTH_SETTING = "max_pulse_width_us"
-"""Where a sequence has this setting and the plan does not give it: the comfort maximum, or the request's if less."""
+"""If the plan does not give this setting of a sequence, it is the comfort maximum, or the request's limit if lower."""
 
 
 def default_segments() -> list[SegmentPlan]:
     """The pre-session test: PRBS (12.7 s), triangular ramp (10 s), held-out levels (7 s), rests around them; 38.7 s.
 
-    PRBS: 7 bits, chips of 4 pulses (0.1 s): a whole period of 12.7 s excites 0.08 to 4.4 Hz, which covers muscles
-    with time constants of 0.1 to 0.6 s, and doses half of the pulses at c. The rest after it is long enough
-    for the slowest muscle to fall to a few percent before the ramp.
+    PRBS: 7 bits, each chip lasts 4 pulses (0.1 s). One period of 12.7 s excites 0.08 to 4.4 Hz, which covers muscles
+    with time constants of 0.1 to 0.6 s. About half of its pulses are at the full width. During the rest after it the
+    torque of the slowest muscle falls to a few percent before the ramp begins.
     """
     return [
         SegmentPlan(name="rest", sequence="rest", settings={"duration_s": 2.0}),
@@ -40,7 +40,7 @@ def default_segments() -> list[SegmentPlan]:
 
 @dataclass(frozen=True, slots=True)
 class PlannedSegment:
-    """A segment as indices of pulses, end exclusive."""
+    """A segment as indices of its pulses, end exclusive."""
 
     name: str
     start: int
@@ -90,9 +90,9 @@ def build(plan: TestPlan, table: dict[str, Limit]) -> PlannedTest:
     Raises
     ------
     PlanError
-        Unknown sequence, wrong setting, no segment, one without a pulse: names the segment.
+        Unknown sequence, wrong setting, no segment, or a segment without a pulse: names the segment.
     RefusedError
-        A limit that the plan would break, which pulse breaks it and by how much.
+        The plan would break a limit: names the limit, the pulse and the excess.
     """
     _refuse(check(table["pulse_rate_hz"], plan.pulse_rate_hz), "plan")
     chosen = default_segments() if plan.segments is None else plan.segments
@@ -109,28 +109,28 @@ def build(plan: TestPlan, table: dict[str, Limit]) -> PlannedTest:
 
 
 def check_steps(test: PlannedTest, steps: Steps) -> None:
-    """A plan that asks for pulses must not come to none by this stimulator's rounding. Raises PlanError."""
+    """Refuse a plan whose pulses this stimulator would all round to zero. Raises PlanError."""
     widest_us, current_ma = float(test.pulse_width_us.max()), test.plan.profile.current_ma
     if widest_us > 0 and (steps.width_us(widest_us) == 0 or steps.current(current_ma) == 0):
         raise PlanError(
-            f"plan: {widest_us:g} µs at {current_ma:g} mA stimulates nothing: this stimulator begins at "
+            f"plan: {widest_us:g} µs at {current_ma:g} mA would stimulate nothing: this stimulator's smallest pulse is "
             f"{steps.shortest_us:g} µs and {steps.current_ma:g} mA"
         )
 
 
 def _laid_out(chosen: list[SegmentPlan], plan: TestPlan, table: dict[str, Limit]) -> tuple[PlannedSegment, ...]:
-    """Where each segment begins and ends, by arithmetic alone: what is too long is refused before it is built."""
+    """Start and end of each segment, computed without building it: too long a plan is refused before that."""
     if not chosen:
         raise PlanError("plan.segments is empty; leave it out for the default test, or give at least one segment")
-    if len(chosen) > MOST_SEGMENTS:
-        raise PlanError(f"plan.segments: {len(chosen)} segments, at most {MOST_SEGMENTS}; put several into one")
+    if len(chosen) > MAX_SEGMENTS:
+        raise PlanError(f"plan.segments: {len(chosen)} segments, at most {MAX_SEGMENTS}; combine some of them")
     segments: list[PlannedSegment] = []
     start = 0
     for number, segment in enumerate(chosen, start=1):
         with _named(number, segment):
             count = sequences.pulse_count(segment.sequence, _settings(segment, plan), plan.pulse_rate_hz)
             if count < 1:
-                raise PlanError(f"it is too short for one pulse at {plan.pulse_rate_hz:g} pulses/s; lengthen it")
+                raise PlanError(f"too short for one pulse at {plan.pulse_rate_hz:g} pulses/s; lengthen it")
         segments.append(PlannedSegment(segment.name, start, start + count))
         start += count
         _refuse(check(table["duration_s"], start / plan.pulse_rate_hz), f"plan, up to segment {number}")
@@ -139,7 +139,7 @@ def _laid_out(chosen: list[SegmentPlan], plan: TestPlan, table: dict[str, Limit]
 
 @contextlib.contextmanager
 def _named(number: int, segment: SegmentPlan) -> Iterator[None]:
-    """A mistake within names the segment."""
+    """Add the segment's number and name to a PlanError."""
     try:
         yield
     except PlanError as error:
@@ -173,7 +173,7 @@ def _check(test: PlannedTest, table: dict[str, Limit]) -> None:
 def _check_rise(
     widths_us: NDArray[np.float64], segment: PlannedSegment, of: SegmentPlan, table: dict[str, Limit]
 ) -> None:
-    """No rise of the width from one pulse to the next beyond the limit, unless the sequence jumps by design."""
+    """The width must not rise faster than the limit, unless the sequence jumps by design."""
     if sequences.jumps(of.sequence, of.settings):
         return
     before_us = widths_us[segment.start - 1] if segment.start else 0.0
@@ -189,19 +189,19 @@ def _refuse(refusal: Refusal | None, place: str) -> None:
 
 
 def preview(test: PlannedTest, recruitment: RecruitmentTable | None = None) -> Preview:
-    """What a person should know before the test is played.
+    """Duration, dose and pulses, to be shown before the test is played.
 
     Raises
     ------
     PlanError
-        A recruitment table that is no curve.
+        The recruitment table is not a curve.
     """
     rate_hz = test.plan.pulse_rate_hz
     torque_time_nms = None
     if recruitment is not None:
         widths, torques = recruitment.pulse_width_us, recruitment.torque_nm
         if len(widths) != len(torques) or len(widths) < 2 or not np.all(np.diff(widths) > 0):
-            raise PlanError("recruitment: give as many torques as pulse widths, at least two, the widths rising")
+            raise PlanError("recruitment: give as many torques as pulse widths, at least two; the widths must increase")
         torque_time_nms = sequences.torque_time_nms(test.pulse_width_us, rate_hz, widths, torques)
     return Preview(
         duration_s=test.duration_s,

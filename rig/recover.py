@@ -1,7 +1,7 @@
 """`python -m rig.recover JOURNAL`: seal a journal by hand, whole, half-written or damaged.
 
-The journal is only read and stays where it is. What could not be read, and what had to be inferred, is said in words
-and in the recording's attribute `journal_note`. Exit 2: there is nothing to seal, or a living rig still writes it.
+The journal is only read and stays where it is. The output and the recording's attribute `journal_note` say what could
+not be read and what had to be inferred. Exit 2: there is nothing to seal, or a running rig still writes the journal.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 from rig import archive, assembly, journal
 from rig.errors import BusyError, RecordingError, RigError
 
-UNKNOWN_END = "recovered by hand; how the test ended is not written in its journal"
+UNKNOWN_END = "recovered by hand; the journal does not say how the test ended"
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -41,12 +41,12 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def recover(path: Path, folder: Path) -> dict[str, Any]:
-    """Seal what the journal holds into the folder, and say what that is.
+    """Seal what the journal holds into the folder, and return a summary.
 
     Raises
     ------
     RecordingError
-        Not a journal, nothing to seal, the disk refuses, or another recording has its place.
+        Not a journal, nothing to seal, a disk error, or another recording of that name exists.
     """
     if not folder.is_dir():
         raise RecordingError(f"{folder}: no such folder; make it, or give another with -o")
@@ -54,7 +54,7 @@ def recover(path: Path, folder: Path) -> dict[str, Any]:
     target = archive.place(recording, folder)
     known = target.exists() and archive.verify(target) == archive.content_sha256(recording.columns)
     if target.exists() and not known:
-        raise RecordingError(f"{target}: another recording of this test is there; give another folder with -o")
+        raise RecordingError(f"{target}: another recording of this test exists; give another folder with -o")
     if not known:
         archive.seal(recording, folder)
     columns, attributes = recording.columns, recording.attributes
@@ -74,7 +74,7 @@ def recover(path: Path, folder: Path) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def _nobody_writes(path: Path) -> Iterator[None]:
-    """Hold the journal, and its data folder where the rig would seal it at its next start. Raises BusyError."""
+    """Lock the journal, and its data folder if it lies in one. Raises BusyError if a rig uses them."""
     locks = [path]
     if path.suffix == ".journal" and path.parent.name == "journals":
         locks.append(path.parent.parent / "rig.lock")
@@ -87,7 +87,7 @@ def _nobody_writes(path: Path) -> Iterator[None]:
                 fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
             except BlockingIOError:
                 raise BusyError(
-                    f"journal {path}: a rig that is alive has it and seals it itself; stop that rig first"
+                    f"journal {path}: a running rig uses it and will seal it; stop that rig first"
                 ) from None
             except OSError as error:
                 raise RecordingError(f"{lock}: {error.strerror}") from None
@@ -101,7 +101,7 @@ def _folder_of(path: Path) -> Path:
 
 def _words(found: dict[str, Any]) -> str:
     lines = [
-        f"{'was sealed already' if found['was_there'] else 'sealed'}: {found['recording']}",
+        f"{'already sealed' if found['was_there'] else 'sealed'}: {found['recording']}",
         f"test {found['test_id']} of participant {found['participant']}, {found['outcome']}: {found['reason'] or '-'}",
         f"{found['pulses']} pulses ({found['unacknowledged']} not acknowledged), {found['samples']} torque samples",
     ]

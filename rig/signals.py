@@ -1,4 +1,4 @@
-"""The values that flow through the rig: a pulse outwards, its ack and blocks of torque inwards."""
+"""Values that pass through the rig: pulses to the stimulator; acks and blocks of torque from the devices."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Pulse:
 
 
 class LateError(Exception):
-    """A pulse's time had passed right before it would have been written; nothing was."""
+    """A pulse's latest time had passed right before the write, so nothing was written."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +61,7 @@ cell's counter (raw from a device, unwrapped after the receiver; −1: none), sy
 
 @dataclass(frozen=True, slots=True)
 class TorqueBlock:
-    """Torque samples in the order in which they came, dtype `SAMPLE`, shape (n,); n may be 0."""
+    """Torque samples in the order of arrival, dtype `SAMPLE`, shape (n,); n may be 0."""
 
     samples: NDArray[np.void]
     malformed: int = 0

@@ -1,11 +1,11 @@
-"""The life of the rig from one test to the next: a pure state machine.
+"""The rig's states from one test to the next: a pure state machine.
 
     disconnected -> ready -> arming -> running -> sealing -> ready
                               |          |
                               +-> stopping -> sealing -> latched -> (a person) -> ready
     ready -> calibrating -> arming … sealing -> calibrating -> … -> ready
 
-Every method gives a new `Trial` or raises the reason why not. Nothing but a person's `rearm` leads out of
+Every method returns a new `Trial` or raises the reason why it cannot. Only `rearm`, called by a person, leads out of
 `latched` and `uncertain`.
 """
 
@@ -20,12 +20,12 @@ BUSY: tuple[RigState, ...] = ("arming", "running", "sealing", "stopping")
 
 
 class TransitionError(RigError):
-    """A step that the state machine does not know: a fault in this program."""
+    """A step that is not allowed in this state: a bug in this program."""
 
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """State, why, and whose test; `latch` and `lost` say what follows when the test is over."""
+    """State, its reason, and the test. `latch` and `lost` say which state follows the test."""
 
     state: RigState = "disconnected"
     reason: str = "not connected yet"
@@ -37,11 +37,11 @@ class Trial:
 
     @property
     def busy(self) -> bool:
-        """A test is on its way; its devices and files are in use."""
+        """Whether a test is in progress: its devices and files are in use."""
         return self.state in BUSY
 
     def connected(self, before: RigState | None = None, reason: str = "") -> Trial:
-        """Both devices answer. `before`: what the rig was when it died, from its latch file."""
+        """Both devices answer. `before`: the rig's state when its last process ended, from the latch file."""
         self._only("disconnected")
         if before == "latched":
             return Trial("latched", reason)
@@ -50,7 +50,7 @@ class Trial:
         return Trial("ready", "")
 
     def disconnected(self, reason: str) -> Trial:
-        """A device is gone: at once when idle, after the test's end when one runs; a latch stays a latch."""
+        """A device is gone: takes effect at once when idle, else after the test; a latch stays."""
         if self.busy or self.state in ("latched", "uncertain"):
             return replace(self, lost=reason)
         return Trial("disconnected", reason)
@@ -87,15 +87,15 @@ class Trial:
         if self.state == "uncertain":
             raise UncertainError(f"{self.reason}; look at the participant and the rig, then re-arm")
         if self.state == "disconnected":
-            raise DeviceError(f"{self.reason}; mend it, then re-arm")
+            raise DeviceError(f"{self.reason}; correct that, then re-arm")
 
     def armed(self) -> Trial:
-        """The device is ready and the first pulse is due."""
+        """The device is ready for the first pulse."""
         self._only("arming")
         return replace(self, state="running")
 
     def halted(self, reason: str) -> Trial:
-        """A stop or a fault, at any time: idle, it latches; in a test, the test is ending."""
+        """A stop or a fault, at any time: an idle rig latches at once, a test is ended first."""
         if self.state in ("arming", "running"):
             return replace(self, state="stopping", reason=reason, latch=True)
         if self.busy:
@@ -110,7 +110,7 @@ class Trial:
         return replace(self, state="sealing")
 
     def sealed(self) -> Trial:
-        """The recording is safe (or its journal kept)."""
+        """The recording is sealed (or its journal is kept)."""
         self._only("sealing")
         if self.latch:
             return Trial("latched", self.reason, lost=self.lost)
@@ -126,12 +126,12 @@ class Trial:
         return Trial("ready", "")
 
     def rearm(self) -> Trial:
-        """A person has looked; both devices have just answered.
+        """A person has checked participant and rig, and both devices have just answered.
 
         Raises
         ------
         BusyError
-            A test is on its way.
+            A test is in progress, or a calibration is open.
         """
         if self.busy:
             raise BusyError(f"test {self.test_id} is {self.state}; nothing to re-arm")

@@ -14,7 +14,7 @@ from sqlalchemy.engine import URL, make_url
 from sqlalchemy.exc import ArgumentError, DatabaseError, OperationalError
 from sqlalchemy.orm import Session, sessionmaker
 
-from api import private
+from api import owner_only
 from api.errors import ApiError
 from api.store import migrations
 
@@ -95,10 +95,10 @@ def sqlite_file(url: URL) -> Path | None:
 
 def close_to_others(path: Path) -> None:
     """The database is for its owner only: SQLite gives what it makes beside it the same rights."""
-    private.folder(path.parent)
-    private.file(path)
+    owner_only.folder(path.parent)
+    owner_only.file(path)
     for beside in ("-wal", "-shm", "-journal"):
-        private.close(path.with_name(path.name + beside), 0o600)
+        owner_only.close(path.with_name(path.name + beside), 0o600)
 
 
 def _durable_sqlite(connection: Any, _record: Any) -> None:

@@ -1,1 +1,1 @@
-"""Load cells: `cells` lays samples out in CAN frames, `transports` carries frames, `sampler` makes samples."""
+"""Load cells: `sampler` makes samples, `cells` packs them into CAN frames, `transports` carries the frames."""

@@ -1,4 +1,4 @@
-"""What passes between sampler, cell and transport, and what the two kinds answer to."""
+"""Samples and frames, and the protocols of cells and transports."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ LARGEST_STANDARD_ID = 0x7FF
 
 
 class Sample(NamedTuple):
-    """One reading of the cell; `time_us` is on the cell's own clock; `counter` never wraps, a cell's layout does."""
+    """One reading; `time_us` is on the cell's own clock; `counter` never wraps here, only in a cell's frames."""
 
     torque_nm: float
     counter: int
@@ -27,13 +27,13 @@ class Frame(NamedTuple):
 
 
 FrameHandler = Callable[[int, bytes], None]
-"""Takes a frame that the host sent: id and data."""
+"""Called with the id and data of each frame from the host."""
 
 
 class CellProtocol(Protocol):
     """A load cell's electronics: how samples become frames, and what starts and stops them.
 
-    Its constructor takes the samples a frame, one of `layouts`. A frame's time is that of its last sample.
+    Its constructor takes the number of samples per frame, one of `layouts`. A frame's time is that of its last sample.
     """
 
     layouts: tuple[int, ...]
@@ -55,10 +55,10 @@ class CellProtocol(Protocol):
 
 
 class TransportProtocol(Protocol):
-    """What stands between the CAN bus and the host; its constructor takes the reactor and a `FrameHandler`."""
+    """What connects the CAN bus to the host; its constructor takes the reactor and a `FrameHandler`."""
 
     can: dict[str, Any]
-    """For `can.Bus(**can)` as it is."""
+    """Arguments of `can.Bus`."""
     overruns: int
     """Frames dropped because the host did not read."""
 

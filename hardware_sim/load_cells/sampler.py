@@ -1,4 +1,4 @@
-"""Samples of the muscle's torque at multiples of the cell's own period, and the frames they travel in."""
+"""Samples of the muscle's torque at multiples of the cell's own period, and their frames."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ TorqueHook = Callable[[float], float]
 FrameHook = Callable[[Frame], Iterable[Frame]]
 NOISE_BLOCK = 4096
 LARGEST_JITTER_PERIODS = 0.45
-"""A sample never comes before the one in front of it."""
+"""Below one half, so that samples stay in order."""
 JITTER_SEED = 0x7177E2
 
 
 class Noise:
-    """White noise, the same for the same seed, drawn in blocks to be cheap."""
+    """White noise, the same for the same seed, drawn in blocks to save time."""
 
     def __init__(self, sd_nm: float, seed: int) -> None:
         self._sd_nm = sd_nm
@@ -33,14 +33,14 @@ class Noise:
 
 
 class LoadCell:
-    """Takes the muscle along as time goes by, and turns its torque into frames.
+    """Advances the muscle and turns its torque into frames.
 
-    `torque_hooks` and `frame_hooks` are where faults enter: a torque hook changes a reading, a frame hook gives
-    the frames that are sent in place of one. A muscle may bring the last stage of its cell along, a method
-    `converted_nm(reading_nm, time_s)` that comes after noise and offset (a converter that clips).
+    Faults act on `torque_hooks` and `frame_hooks`. A torque hook changes a reading; a frame hook takes a frame and
+    returns those that are sent instead. A muscle may have a method `converted_nm(reading_nm, time_s)`: the last stage
+    of its cell, which comes after noise and offset (a converter that clips).
 
-    With `jitter_s` each sample is taken, and its frame stamped, off its time by that standard deviation. Samples
-    come at exact multiples of the period without it.
+    Samples come at exact multiples of the period. With `jitter_s` each sample is taken, and its frame stamped, off that
+    time by this standard deviation.
     """
 
     def __init__(
@@ -88,7 +88,7 @@ class LoadCell:
         self._jitter = Noise(sd_s, JITTER_SEED) if sd_s else None
 
     def produce(self, until_s: float) -> None:
-        """All samples that are due before `until_s`, in emulated seconds."""
+        """Take all samples that are due before `until_s`, in emulated seconds."""
         time_s = self._next_s()
         while time_s < until_s:
             self._sample(time_s)
@@ -100,7 +100,7 @@ class LoadCell:
         return frames
 
     def add_frame(self, frame: Frame) -> None:
-        """A frame of no sample: a bus error, or one that a fault had kept back."""
+        """Send a frame that holds no new sample: a bus error, or one that a fault has delayed."""
         self._frames.append(frame)
 
     def time_us(self, time_s: float) -> int:
@@ -142,7 +142,7 @@ class LoadCell:
 
 
 def deliver(load_cell: LoadCell, transport: TransportProtocol) -> None:
-    """Hand the frames made since the last call to the transport."""
+    """Send the frames made since the last call."""
     frames = load_cell.take_frames()
     if frames:
         transport.send(frames)

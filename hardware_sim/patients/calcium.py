@@ -56,7 +56,7 @@ class CalciumMuscle:
     def pulse(self, time_s: float, width_us: float, current_ma: float) -> None:
         """A pulse of `width_us` a phase and `current_ma` reaches the electrodes at `time_s`.
 
-        A pulse below the threshold reaches no fibre and so changes nothing.
+        A pulse below the threshold excites no fibre and changes nothing.
         """
         self._advance(time_s)
         gain = self.gain_n_per_s(width_us, current_ma)

@@ -1,4 +1,4 @@
-"""What every emulated muscle answers to: pulses in, elbow torque out."""
+"""The protocol of every emulated muscle: pulses in, elbow torque out."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Protocol
 
 
 class Muscle(Protocol):
-    """A muscle with its joint held still, driven by single pulses.
+    """A muscle with its joint held still, stimulated by single pulses.
 
     Time is the emulator's own, in seconds, and never runs backwards.
     """

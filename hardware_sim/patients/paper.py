@@ -2,12 +2,11 @@
 
 f(u) = a1 (exp(a2 u) - 1) / (exp(a2 u) + a3), eq. (35), and G: T² y'' + 2 ζ T y' + y = f, unit gain at DC.
 
-The paper's input is a pulse width that is always there; a muscle gets pulses. A pulse's recruitment is
-therefore held for one pulse period. Jitter of the pulses must leave no gap and a missing pulse must leave
-one, which no causal rule can do at once. So when a hold has run out, the state there is kept and the torque
-goes on with the hold ended; if a pulse comes within `late_periods` of the one before, the piece since is
-integrated again with the hold prolonged to it. What was read meanwhile is off by w dt² / (2 T²): 1e-5 N·m
-for a pulse 1 ms late.
+The paper's input is a continuous pulse width, but a muscle gets pulses. A pulse's recruitment is therefore held for one
+pulse period. Jitter of the pulses must leave no gap, and a missing pulse must leave one; no causal rule does both. So
+when a hold ends, the state there is saved and the torque goes on without input. If a pulse comes within `late_periods`
+of the one before, the time since is integrated again with the hold extended to it. Readings taken in between are off by
+w dt² / (2 T²): 1e-5 N·m for a pulse 1 ms late.
 
 The paper gives f at one current. At another the width is scaled by charge: width × current / nominal current.
 """
@@ -20,7 +19,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Parameters:
-    """Numbers of section V; T in seconds (the paper's T_omega), torque in N·m, widths in µs."""
+    """Parameters of section V; T in seconds (the paper's T_omega), torque in N·m, widths in µs."""
 
     a1: float = 6.8994
     a2: float = 0.0410

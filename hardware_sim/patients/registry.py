@@ -1,6 +1,6 @@
-"""Patients are found by scanning this folder: a patient is one file with `Parameters` and `make`.
+"""Patients by name. A patient is one file of this folder with `Parameters` and `make`.
 
-`Parameters` is a frozen dataclass of numbers with defaults; `make(parameters)` gives a `Muscle` at rest.
+`Parameters` is a frozen dataclass of numbers with defaults; `make(parameters)` returns a `Muscle` at rest.
 A file in TOML or JSON names one of them and overrides its parameters::
 
     patient = "paper"
@@ -11,24 +11,22 @@ A file in TOML or JSON names one of them and overrides its parameters::
 from __future__ import annotations
 
 import dataclasses
-import importlib
 import json
 import math
-import pkgutil
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 from hardware_sim import patients
 from hardware_sim.errors import PatientError
 from hardware_sim.patients.muscle import Muscle
+from hardware_sim.scan import modules_with
 
 
 def names() -> list[str]:
-    """Names of the patients there are, in alphabetical order."""
-    return sorted(_modules())
+    """Names of all patients, in alphabetical order."""
+    return list(modules_with(patients, "Parameters"))
 
 
 def make(name: str, parameters: Mapping[str, float] | None = None) -> Muscle:
@@ -37,11 +35,11 @@ def make(name: str, parameters: Mapping[str, float] | None = None) -> Muscle:
     Raises
     ------
     PatientError
-        There is no such patient, or it has no such parameter, or a value is no finite number.
+        There is no such patient, or it has no such parameter, or a value is not a finite number or out of range.
     """
-    modules = _modules()
+    modules = modules_with(patients, "Parameters")
     if name not in modules:
-        raise PatientError(f"patient '{name}' is neither a file nor one of {', '.join(sorted(modules))}")
+        raise PatientError(f"patient '{name}' is neither a file nor one of {', '.join(modules)}")
     module = modules[name]
     known = [field.name for field in dataclasses.fields(module.Parameters)]
     for key, value in (parameters or {}).items():
@@ -86,14 +84,3 @@ def _read(path: Path) -> dict[str, Any]:
     if not isinstance(described, dict):
         raise PatientError(f"{path}: must hold a table with 'patient' and 'parameters'")
     return described
-
-
-def _modules() -> dict[str, ModuleType]:
-    found = {}
-    for entry in pkgutil.iter_modules(patients.__path__):
-        if entry.ispkg or entry.name in {"muscle", "registry"}:
-            continue
-        module = importlib.import_module(f"{patients.__name__}.{entry.name}")
-        if hasattr(module, "Parameters") and hasattr(module, "make"):
-            found[entry.name] = module
-    return found

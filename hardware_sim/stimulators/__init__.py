@@ -1,1 +1,1 @@
-"""Stimulators: a firmware is one file with a class `Firmware`, found by scanning (see `registry`)."""
+"""Stimulators: a firmware is one file with a class `Firmware`, found by scanning this folder."""

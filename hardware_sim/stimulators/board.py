@@ -1,4 +1,4 @@
-"""What a firmware stands on: time, the line to the host, the electrodes."""
+"""The hardware that a firmware runs on: time, the line to the host, the electrodes."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from hardware_sim.electrodes import Electrodes
 from hardware_sim.timeline import Timeline
 
 FrameHook = Callable[[bytes], bytes | None]
-"""A fault on the line: gets a frame, gives what is sent instead; None sends nothing."""
+"""A fault on the line: takes a frame and returns what is sent instead; None sends nothing."""
 
 
 class Board:
-    """The hardware under a firmware; faults hook in here, so that a firmware knows nothing of them.
+    """The hardware under a firmware. Faults act here, so that no firmware needs to know them.
 
-    `unread` counts bytes on the line that the host has not read.
+    `write` sends bytes to the host, `unread` returns how many of them the host has not read.
     """
 
     def __init__(
@@ -45,7 +45,7 @@ class Board:
 
 
 class FirmwareProtocol(Protocol):
-    """What every stimulator answers to; its constructor takes the `Board`."""
+    """What every stimulator's firmware offers; its constructor takes the `Board`."""
 
     def received(self, data: bytes) -> None:
         """Bytes from the host, at the timeline's time."""

@@ -1,4 +1,4 @@
-"""Hasomed RehaMove P24's firmware, ScienceMode 4: general commands and low level; mid level next door.
+"""Hasomed RehaMove P24's firmware, ScienceMode 4: general commands and low level. The mid level is in `p24_mid_level`.
 
 Low level: the host sends one LLChannelConfig per pulse. Silence means no stimulation.
 """
@@ -11,6 +11,7 @@ from typing import Any
 
 from hardware_sim.stimulators import sciencemode4
 from hardware_sim.stimulators.board import Board
+from hardware_sim.stimulators.framing import Packet
 from hardware_sim.stimulators.p24_mid_level import MidLevel
 from hardware_sim.stimulators.p24_points import (
     ELECTRODE,
@@ -24,7 +25,6 @@ from hardware_sim.stimulators.p24_points import (
     parse_points,
     within_limits,
 )
-from hardware_sim.stimulators.sciencemode4 import Packet
 from hardware_sim.timeline import Event
 
 LL_INIT, LL_CHANNEL_CONFIG, LL_STOP = 0, 2, 4
@@ -76,7 +76,7 @@ class Firmware:
 
     @property
     def high_voltage_on(self) -> bool:
-        """Whether the source that drives the pulses is up."""
+        """Whether the source that drives the pulses is on."""
         return self._level != NO_LEVEL and self._source != HIGH_VOLTAGE_OFF and self._board.high_voltage_works
 
     def received(self, data: bytes) -> None:

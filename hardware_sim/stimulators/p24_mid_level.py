@@ -1,7 +1,7 @@
-"""The P24's mid level: the device repeats each channel's pulse by itself until told otherwise.
+"""The P24's mid level: the device repeats each channel's pulse by itself until the host changes or stops it.
 
-The host must send MLGetCurrentData at least every 2 s; silence stops the stimulation. Only that command
-counts as a sign of life here, though a real device may take others too: a driver that passes here passes there.
+The host must send MLGetCurrentData at least every 2 s; silence stops the stimulation. A real device may accept other
+commands as a sign of life. This one does not, so that a driver that works here works there.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Channel:
 
 
 class MidLevel:
-    """Running channels and their keep-alive."""
+    """The running channels and their watchdog."""
 
     def __init__(self, board: Board) -> None:
         self._board = board
@@ -72,7 +72,7 @@ class MidLevel:
             self._silence = None
 
     def update(self, data: bytes) -> int:
-        """MLUpdate: set each channel in the mask, stop those that are not; the result code."""
+        """MLUpdate: set each channel in the mask, stop the others; returns the result code."""
         wanted = _parse_update(data)
         if wanted is None:
             return PARAMETER
@@ -85,14 +85,14 @@ class MidLevel:
                 self._errors.pop(number, None)
                 self._channels[number] = channel
                 self._schedule(number, channel, self._board.timeline.now_s)
-            else:  # the grid of a running channel goes on
+            else:  # a running channel keeps its timing
                 running.period_s, running.points = channel.period_s, channel.points
         if self.running and self._silence is None:
             self._alive()
         return OK
 
     def current_data(self, data: bytes) -> bytes:
-        """MLGetCurrentData's answer, and the sign of life: result, selection, active mask, errors."""
+        """MLGetCurrentData, which is the sign of life; its answer: result, selection, active mask, errors."""
         if data != bytes((ALL_ERRORS,)):
             return bytes((PARAMETER, *data[:1], *([0] * (6 - len(data[:1])))))
         if self.running:

@@ -1,12 +1,13 @@
-"""Hasomed RehaStim 2's firmware, ScienceMode 2: connection, watchdog and single pulses; the channel list next door.
+"""Hasomed RehaStim 2's firmware, ScienceMode 2: connection, watchdog and single pulses. The channel list is in
+`rehastim2_channels`.
 
-The device offers a connection (Init) every 500 ms until the host takes it (InitAck). From then on 1200 ms without
-a valid command end everything: stimulation, modes and the connection. Until then a started channel list goes
-on pulsing by itself, whether or not the host lives.
+The device offers a connection (Init) every 500 ms until the host accepts it (InitAck). From then on, 1200 ms without a
+valid command end everything: stimulation, modes and the connection. Until then a started channel list goes on pulsing
+by itself, even if the host is dead.
 
-Where the facts at hand are silent this firmware is strict, so that a driver that passes here passes there: without
-a connection commands are neither obeyed nor answered, and Init comes again after the watchdog has struck. Odd
-currents are lowered to the 2 mA step below.
+Where its documentation is silent this firmware is strict, so that a driver that works here works on the device: without
+a connection commands are neither obeyed nor answered, and Init comes again after the watchdog has expired. Odd currents
+are rounded down to a multiple of 2 mA.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from typing import Any
 
 from hardware_sim.stimulators import sciencemode2
 from hardware_sim.stimulators.board import Board
+from hardware_sim.stimulators.framing import Packet
 from hardware_sim.stimulators.rehastim2_channels import (
     CHANNELS,
     NO_ERROR,
@@ -29,12 +31,11 @@ from hardware_sim.stimulators.rehastim2_channels import (
     parse_pulse,
     parse_start,
 )
-from hardware_sim.stimulators.sciencemode2 import Packet
 from hardware_sim.timeline import Event
 
 INIT, INIT_ACK, UNKNOWN_COMMAND, WATCHDOG = 1, 2, 3, 4
 GET_MODE, INIT_CHANNEL_LIST, START, STOP, SINGLE_PULSE, STIMULATION_ERROR = 10, 30, 32, 34, 36, 38
-TRANSFER, WRONG_MODE, VERSION_REFUSED, BUSY = -1, -3, -5, -8
+TRANSFER, WRONG_MODE, BUSY = -1, -3, -8
 PROTOCOL_VERSION = 1
 INIT_PERIOD_S = 0.5
 WATCHDOG_S = 1.2
@@ -43,7 +44,7 @@ MODES = {NOT_CONNECTED: "none", START_MODE: "start", INITIALISED: "initialised",
 
 
 class Firmware:
-    """The RehaStim 2's state machine; each command is done when it arrives and acknowledged at once."""
+    """The RehaStim 2's state machine; each command is executed and acknowledged when it arrives."""
 
     def __init__(self, board: Board) -> None:
         self._board = board
@@ -62,7 +63,7 @@ class Firmware:
         self.reset()
 
     def received(self, data: bytes) -> None:
-        """Bytes from the host; a damaged command that can be told is answered with a transfer error."""
+        """Bytes from the host; a damaged command that can still be read is answered with a transfer error."""
         for packet in self._decoder.feed(data, self._board.timeline.now_s):
             self.commands[packet.command] += 1
             if packet.command == INIT_ACK:
@@ -91,7 +92,7 @@ class Firmware:
         }
 
     def _connect(self, packet: Packet) -> None:
-        """An InitAck counts if it answers one of the Inits since the connection was lost."""
+        """Accept an InitAck if it answers an Init that was sent since the connection was lost."""
         if self._mode != NOT_CONNECTED or packet.number not in self._offered or packet.data != bytes((OK,)):
             return
         if self._offer is not None:
@@ -109,9 +110,9 @@ class Firmware:
         self._offer = self._board.timeline.after(INIT_PERIOD_S, self._offer_connection)
 
     def _offer_connection(self) -> None:
-        if self._board.unread() == 0:  # a closed port drops what comes; here it would pile up for the next client
+        if self._board.unread() == 0:  # on hardware a closed port drops it; here it would wait for the next client
             self._offered.add(self._number)
-            self._say(INIT, bytes((PROTOCOL_VERSION,)))
+            self._send(INIT, bytes((PROTOCOL_VERSION,)))
         self._offer = self._board.timeline.after(INIT_PERIOD_S, self._offer_connection)
 
     def _alive(self) -> None:
@@ -131,16 +132,16 @@ class Firmware:
         body = bytes((result & 0xFF,)) + data
         self._board.send(sciencemode2.encode(Packet(packet.number, packet.command + 1, body)))
 
-    def _say(self, command: int, data: bytes) -> None:
-        """A packet of the device's own accord, under its own number."""
+    def _send(self, command: int, data: bytes) -> None:
+        """Send a packet that answers no command, with the device's own packet number."""
         self._board.send(sciencemode2.encode(Packet(self._number, command, data)))
         self._number = (self._number + 1) & 0xFF
 
     def _stimulation_failed(self, error: int) -> None:
-        """The device itself stops, goes back to start mode and says why."""
+        """Stop, go back to start mode and report the error."""
         self._channels.stop()
         self._mode = START_MODE
-        self._say(STIMULATION_ERROR, bytes((error & 0xFF,)))
+        self._send(STIMULATION_ERROR, bytes((error & 0xFF,)))
 
     def _init_channel_list(self, packet: Packet) -> None:
         wanted = parse_init(packet.data)
@@ -154,7 +155,7 @@ class Firmware:
             self._ack(packet, OK)
 
     def _start(self, packet: Packet) -> None:
-        """Start, or Update where it runs: its own grid goes on."""
+        """Start, or Update if the list runs already: the timing of its pulses goes on."""
         if self._mode == START_MODE:
             self._ack(packet, WRONG_MODE)
             return

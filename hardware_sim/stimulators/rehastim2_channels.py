@@ -1,4 +1,4 @@
-"""The RehaStim 2's channel list: set up once, then pulsed by the device on its own grid; and its single pulses."""
+"""The RehaStim 2's channel list, which the device pulses with its own timing, and its single pulses."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ class Pulse(NamedTuple):
 
     @property
     def duration_s(self) -> float:
-        """Of one pulse, both phases and the gap between."""
+        """Duration of one pulse: both phases and the gap between them."""
         return (2 * self.width_us + GAP_US) * 1e-6
 
     def points(self) -> list[Point]:
-        """The shape that flows."""
+        """The pulse's shape."""
         return [(self.width_us, self.current_ma), (GAP_US, 0), (self.width_us, -self.current_ma)]
 
 
 class Setup(NamedTuple):
-    """What InitChannelList says; `period_s` is 0 for one shot a Start."""
+    """The settings of InitChannelList; `period_s` is 0 for one group of pulses per Start."""
 
     channels: tuple[int, ...]
     low_frequency: frozenset[int]
@@ -51,7 +51,7 @@ class Setup(NamedTuple):
 def parse_init(data: bytes) -> Setup | None:
     """InitChannelList: factor, active mask, low-frequency mask, interpulse code, period code u16, execution.
 
-    Execution other than 0 is refused: what it would do is not known here.
+    Execution other than 0 is refused, since its meaning is not known.
     """
     if len(data) != 7 or data[0] > LARGEST_LOW_FREQUENCY_FACTOR or data[6] != 0:
         return None
@@ -65,7 +65,7 @@ def parse_init(data: bytes) -> Setup | None:
 
 
 def parse_pulse(data: bytes) -> Pulse | None:
-    """Width u16 and mA; None beyond the device's limits. Odd currents sink to the step below."""
+    """Width u16 and mA; None outside the device's limits. Odd currents are rounded down."""
     width_us, current_ma = int.from_bytes(data[:2], "big"), data[2]
     if not (SHORTEST_US <= width_us <= LONGEST_US and current_ma <= LARGEST_MA):
         return None
@@ -86,7 +86,7 @@ def parse_start(data: bytes, setup: Setup) -> dict[int, Pulse] | None:
 
 
 def fire(board: Board, time_s: float, channel: int, pulse: Pulse, source: str) -> int:
-    """One pulse at one output; 0, or what StimulationError has to say."""
+    """Fire one pulse at one output; returns 0 or the error for StimulationError."""
     if board.electrodes.cut:
         return EMERGENCY_SWITCH
     if not board.high_voltage_works:
@@ -98,7 +98,7 @@ def fire(board: Board, time_s: float, channel: int, pulse: Pulse, source: str) -
 
 
 class ChannelList:
-    """Running channels; `failed` is told the error of a pulse that did not flow."""
+    """The running channels; `failed` is called with the error of a pulse that did not flow."""
 
     def __init__(self, board: Board, failed: Callable[[int], None]) -> None:
         self.setup = Setup((), frozenset(), 0, SHORTEST_INTERVAL_S, 0.0)
@@ -111,16 +111,16 @@ class ChannelList:
 
     @property
     def one_shot_runs(self) -> bool:
-        """Whether a shot of an earlier Start is still under way."""
+        """Whether the group of an earlier Start still runs."""
         return self.setup.period_s == 0 and self._board.timeline.now_s < self._one_shot_ends_s
 
     def set_up(self, setup: Setup) -> None:
-        """Take the setup; nothing runs."""
+        """Use this setup; nothing runs."""
         self.stop()
         self.setup = setup
 
     def start(self, pulses: dict[int, Pulse]) -> None:
-        """The first group at once; where the grid runs already, the pulses hold from the next group on."""
+        """Fire the first group at once. If the list runs already, the pulses apply from the next group on."""
         self._pulses = pulses
         if self.setup.period_s == 0:
             self._one_shot_ends_s = self._board.timeline.now_s + max(
@@ -152,10 +152,10 @@ class ChannelList:
             channels = [channel for channel in due if self._pulses[channel].pulses > index]
             if channels:
                 self._rest.append(self._board.timeline.at(at_s, lambda c=channels, t=at_s: self._fire(c, t)))
-        self._fire(due, time_s)  # last: if it fails, all that has been planned is cancelled
+        self._fire(due, time_s)  # last, since a failure cancels all that was planned
 
     def _is_due(self, channel: int) -> bool:
-        """A low-frequency channel leaves out as many groups as the factor says, after each that it takes."""
+        """A low-frequency channel skips as many groups as the factor says after each one it fires in."""
         return channel not in self.setup.low_frequency or self._group % (self.setup.low_frequency_factor + 1) == 0
 
     def _fire(self, channels: list[int], time_s: float) -> None:

@@ -1,1 +1,1 @@
-"""What moves while a test runs: the thread that sends, the thread that receives, and what stops them."""
+"""A running test: the sending thread, the receiving thread, and what stops them."""

@@ -1,4 +1,4 @@
-"""The one way to end a test early: the first reason wins and wakes the sender at once."""
+"""The only way to end a test early: the first reason counts, and wakes the sender at once."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Cause = Literal["stopped", "fault"]
 
 
 class Halt:
-    """Set from any thread, once; `event` wakes whoever waits."""
+    """Set once, from any thread; `event` wakes all waiting threads."""
 
     def __init__(self, clock: Clock) -> None:
         self.event = threading.Event()
@@ -28,7 +28,7 @@ class Halt:
         self._heard.append(action)
 
     def set(self, cause: Cause, reason: str) -> bool:
-        """End the test; False if it was ending already."""
+        """End the test; False if it was already ending."""
         with self._lock:
             if self.cause is not None:
                 return False

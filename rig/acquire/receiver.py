@@ -1,7 +1,7 @@
-"""The torque receiver: one thread from connecting to disconnecting, recording while a test runs.
+"""The torque receiver: one thread from connect to disconnect, which records while a test runs.
 
-Unwraps the cell's counter, finds lost, repeated and disordered samples, and tells at once when a torque is over
-its limit or no number.
+It unwraps the cell's counter, finds lost, repeated and disordered samples, and reports at once a torque outside its
+limit or one that is not a number.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.acquire.plausible import Plausible
+from rig.acquire.plausibility import PlausibilityCheck
 from rig.clock import Clock
 from rig.devices import LoadCell
 from rig.errors import DeviceError, JournalError
@@ -27,18 +27,19 @@ log = logging.getLogger("rig.receiver")
 
 READ_TIMEOUT_S = 0.02
 SILENCE_S = 1.0
-"""Real seconds without a sample after which the cell counts as gone and its bus is closed: some buses spin then."""
+"""Real seconds without a sample after which the cell counts as gone. Its bus is closed, since some drivers then use a
+whole processor."""
 LIVE_BLOCKS = 4000
 SETTLING_S = 0.1
 BACKLOG_RATE = 1.6
 JUMP_ALLOWANCE_S = 0.5
-"""A counter that runs further ahead of the host's clock than this has jumped: no time can be given to its samples."""
+"""A counter that is further ahead of the host's clock than this has jumped, so its samples have no reliable time."""
 
 
 class CounterUnwrapper:
-    """Raw counters (modulo the device's) to one that never wraps, across blocks.
+    """Turns the device's wrapping counter into one that never wraps, across blocks.
 
-    A step of zero is a repeated frame, a step backwards a late one: both are left out of the record.
+    A step of zero is a repeated frame, a step backwards is a late frame: both are left out of the recording.
     """
 
     def __init__(self, modulus: int) -> None:
@@ -50,7 +51,7 @@ class CounterUnwrapper:
         self._last = None
 
     def unwrap(self, raw: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_], int, int]:
-        """Unwrapped counters, which samples to keep, how many were repeats, how many came late."""
+        """Unwrapped counters, which samples to keep, number of repeats, number of late samples."""
         if self._last is None:
             self._last = int(raw[0]) - 1
         ahead = (raw - self._last + self._modulus // 2) % self._modulus - self._modulus // 2
@@ -83,7 +84,7 @@ class Receiver:
         self._unwrapper = CounterUnwrapper(cell.counter_modulus) if cell.counter_modulus else None
         self._journal: Journal | None = None
         self._limits_nm = (-np.inf, np.inf)
-        self._plausible: Plausible | None = None
+        self._plausibility: PlausibilityCheck | None = None
         self._on_fault: Callable[[str], None] = lambda _: None
         self._previous: tuple[int, float] | None = None
         self._rate: deque[tuple[float, int]] = deque(maxlen=2000)
@@ -99,21 +100,21 @@ class Receiver:
 
     @property
     def nominal_rate_hz(self) -> float:
-        """Samples a second, as the rig file says."""
+        """Samples per second according to the rig file."""
         return self._cell.sample_rate_hz
 
     def start(self) -> None:
-        """Begin to read."""
+        """Start reading."""
         self._thread = threading.Thread(target=self._run, name="torque-receiver", daemon=True)
         self._thread.start()
 
     @property
     def living(self) -> bool:
-        """Does its thread still read?"""
+        """Whether its thread still runs."""
         return self._thread is not None and self._thread.is_alive()
 
     def close(self) -> None:
-        """End the thread and give the bus back."""
+        """End the thread and close the bus."""
         self._closing.set()
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join(timeout=2.0)
@@ -124,18 +125,18 @@ class Receiver:
         journal: Journal,
         limits_nm: tuple[float, float],
         on_fault: Callable[[str], None],
-        plausible: Plausible | None = None,
+        plausibility: PlausibilityCheck | None = None,
     ) -> None:
-        """From here on every sample goes to the journal and is checked; faults are told at once."""
+        """From now on write every sample to the journal and check it; faults are reported at once."""
         with self._lock:
-            self._plausible = plausible
+            self._plausibility = plausibility
             self._journal, self._limits_nm, self._on_fault = journal, limits_nm, on_fault
             self.counts, self.peak_nm, self.range_nm = Recorded(), 0.0, (np.inf, -np.inf)
 
     def release(self) -> Recorded:
-        """Stop recording; what was counted since `record`."""
+        """Stop recording; returns the counts since `record`."""
         with self._lock:
-            self._journal = self._plausible = None
+            self._journal = self._plausibility = None
             self._limits_nm, self._on_fault = (-np.inf, np.inf), lambda _: None
             return replace(self.counts)
 
@@ -145,9 +146,9 @@ class Receiver:
         return np.inf if last_s is None else now_s - last_s
 
     def settled(self) -> bool:
-        """Do samples come as fast as the cell takes them, and no faster?
+        """Whether samples arrive at the cell's own rate, not faster.
 
-        Faster means that a buffer is being emptied of what is old: an adapter that nobody read, a host that stood.
+        If they arrive faster, old samples from a buffer are being read: after a pause of host or adapter.
         """
         since_s = self._clock.now_s() - SETTLING_S * self._clock.speed
         rate = [entry for entry in tuple(self._rate) if entry[0] >= since_s]
@@ -156,25 +157,25 @@ class Receiver:
         return (rate[-1][1] - rate[0][1]) / (rate[-1][0] - rate[0][0]) <= BACKLOG_RATE * self.nominal_rate_hz
 
     def torque_around(self, duration_s: float) -> float | None:
-        """Median of the torque over the last `duration_s`, N·m; None where there is none."""
+        """Median of the torque over the last `duration_s`, N·m; None if there is none."""
         since_s = self._clock.now_s() - duration_s
         values = [torque for time_s, torque in tuple(self.recent) if time_s >= since_s]
         return float(np.median(values)) if values else None
 
     def changes_lately(self) -> int:
-        """How often the torque changed from block to block over the last second or two."""
+        """How often the torque changed from block to block during the last one or two seconds."""
         means_nm = [torque for _, torque in tuple(self.recent)]
-        return int(np.sum(np.abs(np.diff(means_nm)) > 1e-9))  # of equal samples the mean is not quite the same
+        return int(np.sum(np.abs(np.diff(means_nm)) > 1e-9))  # means of equal samples differ by rounding
 
     def measured_rate_hz(self) -> float | None:
-        """Samples a second over the last seconds, by the host's clock."""
+        """Samples per second over the last seconds, by the host's clock."""
         rate = tuple(self._rate)
         if len(rate) < 2 or rate[-1][0] <= rate[0][0]:
             return None
         return (rate[-1][1] - rate[0][1]) / (rate[-1][0] - rate[0][0])
 
     def take(self, block: TorqueBlock) -> None:
-        """One block from the cell: unwrap, record, check."""
+        """Process one block from the cell: unwrap, record, check."""
         with self._lock:
             self.counts.malformed_frames += block.malformed
             self.counts.error_frames += block.error_frames
@@ -191,11 +192,11 @@ class Receiver:
                 except JournalError as error:
                     self._on_fault(str(error))
             self._check(samples["torque_nm"])
-            if self._plausible is not None and (wrong := self._plausible.wrong(samples)):
-                self._on_fault(wrong)
+            if self._plausibility is not None and (fault := self._plausibility.fault(samples)):
+                self._on_fault(fault)
 
     def _placed(self, samples: NDArray[Any]) -> NDArray[Any]:
-        """The samples with unwrapped counters, without repeats and late ones; losses counted."""
+        """The samples with unwrapped counters, without repeated and late ones; counts the lost ones."""
         if self._unwrapper is None:
             return samples
         counter, keep, repeats, late = self._unwrapper.unwrap(samples["counter"])
@@ -234,19 +235,19 @@ class Receiver:
         if not np.all(within):
             worst = float(torque_nm[np.argmin(within)])
             if np.isnan(worst):
-                self._on_fault("load cell: sent a torque that is no number (NaN); check its amplifier")
+                self._on_fault("load cell: sent a torque that is not a number (NaN); check its amplifier")
             else:
                 self._on_fault(f"torque {worst:.2f} N·m is outside {lo:g} … {hi:g} N·m")
         elif self._journal is not None:
             self.peak_nm = max(self.peak_nm, float(np.max(np.abs(torque_nm))))
-            mean_nm = float(np.mean(torque_nm))  # of a few ms: less of the noise
+            mean_nm = float(np.mean(torque_nm))  # over a few ms, to reduce noise
             self.range_nm = min(self.range_nm[0], mean_nm), max(self.range_nm[1], mean_nm)
 
     def _run(self) -> None:
         try:
             self._read_all()
-        except Exception as error:  # a mistake in a driver or here: told at once, not only by its silence
-            log.exception("the torque receiver broke")
+        except Exception as error:  # a bug in a driver or here: report it at once, not after a timeout
+            log.exception("the torque receiver failed")
             self._lose(f"load cell: internal: {type(error).__name__}: {error}")
 
     def _read_all(self) -> None:

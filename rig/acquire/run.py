@@ -1,7 +1,7 @@
-"""One test, played in its own thread: arm, a pulse at each deadline, stop, and see that it stopped.
+"""One test, played in its own thread: arm, send a pulse at each deadline, stop, confirm the stop.
 
-Deadlines are absolute on the monotonic clock. Before each pulse the proof of health is looked at; a late pulse, or one
-that comes due before the one before is acknowledged, is dropped and recorded, never sent in a burst.
+Deadlines are absolute on the monotonic clock. Health is checked before each pulse. A pulse that is late, or that comes
+due before the previous one is acknowledged, is dropped and recorded, never sent in a burst.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 from rig.acquire.evidence import AROUND_S, evidence, stop_device, watch_decay
 from rig.acquire.halt import Cause, Halt
 from rig.acquire.health import DEFAULT_WATCH, Disk, Health, Watch
-from rig.acquire.plausible import Plausible
+from rig.acquire.plausibility import PlausibilityCheck
 from rig.acquire.receiver import Receiver
 from rig.clock import Clock
 from rig.errors import DeviceError, JournalError
@@ -37,14 +37,14 @@ LEAD_S = 0.1
 """Real seconds between arming and the first deadline."""
 SENDER_PRIORITY = 50
 SETTLE_S = 3.0
-"""Real seconds to wait until what lay in buffers has been read."""
+"""Real seconds to wait until a backlog in buffers has been read."""
 FRESH_S = 0.5
-"""Real seconds to wait for a fresh torque before arming."""
+"""Real seconds to wait for a new torque sample before arming."""
 
 
 @dataclass(slots=True)
 class RunResult:
-    """How a test went; lateness of the written pulses and delay of their acks in s."""
+    """Result of a test; lateness of the written pulses and delay of their acks in s."""
 
     outcome: TestOutcome
     reason: str
@@ -63,14 +63,14 @@ class RunResult:
 
 
 class TestRun:
-    """A test on its way.
+    """A test in progress.
 
     Parameters
     ----------
     test, table
-        What to play, and the limits narrowed by the participant's profile.
+        The pulses to play, and the limits narrowed by the participant's profile.
     journal
-        Already holding header and plan.
+        Already contains header and plan.
     halt
         Ends the test early from any thread.
     """
@@ -111,7 +111,7 @@ class TestRun:
         cpu_s, wall_s = time.process_time(), time.monotonic()
         self._gate.reset()
         torque = self._table["torque_nm"]
-        self._plausible = Plausible(
+        self._plausibility = PlausibilityCheck(
             self._table["torque_jump_nm"].hi,
             self._watch.stuck_torque_s * self._clock.speed,
             self._watch.clipped_torque_s * self._clock.speed,
@@ -119,7 +119,7 @@ class TestRun:
             self._clock.speed,
             self._receiver.changes_lately(),
         )
-        self._receiver.record(self._journal, (torque.lo, torque.hi), self._fault, self._plausible)
+        self._receiver.record(self._journal, (torque.lo, torque.hi), self._fault, self._plausibility)
         disk = Disk(self._journal)
         self._health = Health(self._gate, self._receiver, disk, self._clock, self._watch)
         try:
@@ -128,8 +128,8 @@ class TestRun:
                     self._play()
         except (DeviceError, JournalError) as error:
             self._fault(str(error))
-        except Exception as error:  # a mistake in this program must stop the stimulation, too
-            log.exception("the test broke")
+        except Exception as error:  # a bug in this program must stop stimulation, too
+            log.exception("the test failed")
             self._fault(f"internal: {type(error).__name__}: {error}")
         found = self._stop()
         elapsed_s = max(time.monotonic() - wall_s, 1e-9)
@@ -139,25 +139,25 @@ class TestRun:
 
     @property
     def journal_path(self) -> Path:
-        """Where its journal lies."""
+        """Path of its journal."""
         return self._journal.path
 
     def segment(self) -> str | None:
-        """Name of the segment that is playing, None before the start and after the end."""
+        """Name of the current segment; None before the start and after the end."""
         return None if self.t0_s is None else self.test.segment_at(self.elapsed_s())
 
     @property
     def dropped(self) -> int:
-        """Pulses dropped so far because they were late."""
+        """Number of pulses dropped so far."""
         return self._gate.dropped
 
     def sender_age_s(self) -> float:
-        """Real seconds since the sender last asked for proof of health; 0 while it has nothing to send."""
+        """Real seconds since the sender last asked for a health check; 0 while it has nothing to send."""
         asked_s = self._asked_s
         return 0.0 if asked_s is None else (self._clock.now_s() - asked_s) / self._clock.speed
 
     def elapsed_s(self) -> float:
-        """Time on the test's clock, 0 before its start."""
+        """Time on the test's clock, s; 0 before its start."""
         return 0.0 if self.t0_s is None else max(0.0, self._clock.now_s() - self.t0_s)
 
     def _fault(self, reason: str) -> None:
@@ -172,16 +172,16 @@ class TestRun:
                 break
             waited_s = (self._clock.now_s() - began_s) / speed
             if not fresh and waited_s >= FRESH_S:
-                self._fault("load cell: no fresh torque before the test; check its cable and supply")
+                self._fault("load cell: no torque arrived before the test; check its cable and power supply")
             if waited_s >= SETTLE_S:
-                self._fault("load cell: samples come far faster than the rig file says; check sample_rate_hz and bus")
+                self._fault("load cell: samples arrive much faster than sample_rate_hz; check rig file and bus")
             if self._clock.wait(self._clock.now_s() + 0.005 * speed, self.halt.event):
                 return False
-        self._plausible.begin()
+        self._plausibility.begin()
         self._rest_nm = self._receiver.torque_around(0.1 * speed)
         self._gate.open(self._journal, self._table)
         if self.halt.event.is_set():
-            self._gate.shut()  # halted while arming: the gate was opened after the halt had shut it
+            self._gate.shut()  # halted while arming: the gate was opened after the halt shut it
             return False
         return True
 
@@ -197,11 +197,11 @@ class TestRun:
         for index, width_us in enumerate(self.test.pulse_width_us.tolist()):
             due_s = t0_s + index * period_s
             if index == first:
-                self._rest_nm = self._receiver.torque_around(0.1 * clock.speed)  # at rest, if ever
+                self._rest_nm = self._receiver.torque_around(0.1 * clock.speed)  # before the first pulse: at rest
             if clock.wait(due_s, self.halt.event):
                 return
             self._asked_s = clock.now_s()
-            wrong = self._health.wrong(due_s)
+            wrong = self._health.fault(due_s)
             if wrong is not None:
                 self._fault(wrong)
                 return
@@ -216,14 +216,14 @@ class TestRun:
         at_stop_nm = self._receiver.torque_around(AROUND_S * clock.speed)
         device = stop_device(self._gate)
         self.stimulation_ended.set()
-        if cause is None and not device[0]:  # a test whose end the device does not confirm did not end well
+        if cause is None and not device[0]:  # without the device's confirmation the end is a fault
             self._fault(f"the end of stimulation is not confirmed: {device[2] or device[1]}")
-        elif cause is None and (wrong := self._plausible.wrong_at_end()):
+        elif cause is None and (wrong := self._plausibility.fault_at_end()):
             self._fault(wrong)
         cause = self.halt.cause
         if cause is None:
-            clock.wait(clock.now_s() + AROUND_S * clock.speed)  # samples on their way still belong to the test
-            torque = True, "the test ended by itself"
+            clock.wait(clock.now_s() + AROUND_S * clock.speed)  # samples still in transit belong to the test
+            torque = True, "the test ended as planned"
         else:
             torque = watch_decay(self._gate, self._receiver, clock, self._rest_nm, at_stop_nm)
         now_s, last_s = clock.now_s(), self._gate.last_pulse_s
@@ -245,7 +245,7 @@ class TestRun:
         }
         self._gate.release()
         self._counts = self._receiver.release()
-        # An end that cannot be written leaves a journal without one, which is recovered as such.
+        # If the end cannot be written, the journal is recovered later as one without an end.
         with contextlib.suppress(JournalError):
             if cause is not None:
                 event = {"event": cause, "reason": self.halt.reason, "time_s": self.halt.time_s}
@@ -272,7 +272,7 @@ class TestRun:
         )
 
     def _rise_nm(self) -> float | None:
-        """Furthest that the torque went from where it rested, N·m."""
+        """Largest change of the torque from rest, N·m."""
         lo_nm, hi_nm = self._receiver.range_nm
         if self._rest_nm is None or not (lo_nm <= hi_nm):
             return None
@@ -281,7 +281,7 @@ class TestRun:
 
 @contextlib.contextmanager
 def _undisturbed():
-    """No garbage collection, and real-time priority for this thread where the system allows it."""
+    """No garbage collection, and real-time priority for this thread if the system allows it."""
     gc.collect()
     gc.disable()
     policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
@@ -296,7 +296,7 @@ def _undisturbed():
 
 
 def spread_ms(durations_s: list[float]) -> dict[str, float]:
-    """Median, 99th percentile and maximum, ms; empty without any."""
+    """Median, 99th percentile and maximum, ms; empty for an empty list."""
     if not durations_s:
         return {}
     values = np.asarray(durations_s) * 1e3

@@ -1,4 +1,4 @@
-"""What the builder of previews does, in its own process (see `rig.builder`)."""
+"""Work of the preview builder, in its own process (see `rig.builder`)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from rig import limits, plan
 from rig.control.calibration import check_profile
-from rig.control.replies import id_of, refusal, to_line, unforeseen, wrong
+from rig.control.replies import id_of, internal_error, invalid_request, refusal, to_line
 from rig.errors import RigError
 from rig.limits import Limit
 from rig.messages import Preview, PreviewRequest, Reply
@@ -30,15 +30,15 @@ def answer(line: bytes, table: dict[str, Limit], unix_s: float, speed: float) ->
         body = previewed(request, table, unix_s, speed).model_dump(mode="json")
         return Reply(id=request.id, ok=True, body=body)
     except ValidationError as error:
-        return wrong(id_of(line), error)
+        return invalid_request(id_of(line), error)
     except RigError as error:
         return refusal(id_of(line), error)
     except Exception as error:
-        return unforeseen(id_of(line), error)
+        return internal_error(id_of(line), error)
 
 
 def serve(requests: BinaryIO, replies: BinaryIO) -> None:
-    """The rig's limits in the first line, then a request a line, until there are no more."""
+    """Read the rig's limits from the first line, then answer one request per line until the end of input."""
     first = requests.readline()
     if not first:
         return

@@ -1,4 +1,4 @@
-"""The verbs of a guided calibration, as people ask for them; `rig.control.calibration` decides, `Playing` plays."""
+"""Requests of a guided calibration; `rig.control.calibration` decides what is allowed, `Playing` plays it."""
 
 from __future__ import annotations
 
@@ -24,24 +24,24 @@ class Calibrating(Playing):
         BusyError, LatchedError, UncertainError, DeviceError
             As for a test.
         PlanError, RefusedError
-            A wrong name or id; a step, train, current or rate outside the limits, or one that stimulates nothing.
+            Wrong name or id; step, train, current or rate outside the limits, or too small to stimulate.
         """
         with self._lock:
             following = self._trial.calibrate(request.participant)
             check_names("calibration", calibration_id=request.calibration_id, participant=request.participant)
             calibration = Calibration(request, self._table, self._clock.unix_s(), self._pair.steps)
-            self._shelf.check_room(f"{request.calibration_id}.001")
+            self._store.check_room(f"{request.calibration_id}.001")
             self._calibration = calibration
             self._change(following)
         return self.status()
 
     def calibrate_step(self, direction: str) -> Status:
-        """Play one train: a step up, a step down, or the same again; returns when it has begun.
+        """Play one train: a step up, a step down, or the same again; returns when it has started.
 
         Raises
         ------
         PlanError, BusyError, RefusedError
-            No calibration is open; a train is on its way; above a limit or the marked comfort maximum; its day is over.
+            No calibration is open; a train is playing; above a limit or the marked comfort maximum; its day is over.
         """
         with self._lock:
             calibration = self._open_calibration()
@@ -49,7 +49,7 @@ class Calibrating(Playing):
             request = calibration.train(calibration.next_width_us(direction))
             test = plan.build(request, calibration.table)
             self._rest.check(test, calibration.rest)
-            self._shelf.check_room(request.test_id)
+            self._store.check_room(request.test_id)
             self._launch(test, calibration.table, self._trial.train(request.test_id))
         return self.status()
 
@@ -78,7 +78,7 @@ class Calibrating(Playing):
 
     def _open_calibration(self) -> Calibration:
         if self._calibration is None:
-            raise PlanError("calibration: none is open (a stop or a fault closes it); begin with calibrate-start")
+            raise PlanError("calibration: none is open (a stop or a fault closes it); start a new one")
         if self._trial.state != "calibrating":
             raise BusyError(f"calibration: train {self._trial.test_id} is {self._trial.state}; wait or stop it")
         return self._calibration

@@ -1,11 +1,11 @@
-"""Guided calibration: one short train for each step that a person asks for, thresholds marked, a profile for the day.
+"""Guided calibration: a person asks for short trains step by step and marks thresholds; the result is a day's profile.
 
-Nothing here sends: it decides what the next train may be. The rig plays it as it plays every test.
+This module sends nothing. It decides what the next train may be; the rig plays a train as it plays every test.
 
-What is found holds for the day on which the calibration was begun. After midnight an open one takes no train, no mark
-and gives no profile, and says so: thresholds felt yesterday must not become a profile of today. A test that would end
-after its profile is refused at its start rather than cut short: the person hears the reason before anything is felt,
-and no pulse train ends in its middle by the calendar. Nothing that has begun looks at the wall clock.
+The result is valid for the day on which the calibration began. After midnight an open calibration accepts no train and
+no mark, gives no profile, and says so: yesterday's thresholds must not become today's profile. A test that would end
+after its profile expires is refused at its start, not cut short: the person learns the reason before anything is felt,
+and the calendar never ends a train in its middle. Nothing that has begun uses the wall clock.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ from rig.messages import (
 ORDER: tuple[Threshold, ...] = ("sensory", "motor", "comfort")
 STEPS: tuple[Direction, ...] = ("up", "repeat", "down")
 REST_S = 0.25
-"""Before and after each train: the torque's level at rest, and its fall."""
+"""Rest before and after each train, s: shows the torque at rest, and its fall."""
 CLOCK_SLIP_S = 300.0
-"""How far in the future a profile may have been set: clocks of two computers differ."""
-LONGEST_VALID_S = 25 * 3600.0
-"""A day, and the hour that is added to one in autumn."""
+"""How far in the future a profile may have been set, s: the clocks of two computers differ."""
+MAX_VALID_S = 25 * 3600.0
+"""A day, and the hour that is added when summer time ends."""
 OWNER = "calibration request"
 
 
 class Calibration:
-    """One calibration that is open.
+    """An open calibration.
 
     Parameters
     ----------
@@ -50,14 +50,14 @@ class Calibration:
     table
         The rig's limits, hard ones narrowed by the rig file.
     unix_s
-        Now: its day is that of the calibration.
+        Time now; its day is the day of the calibration.
     steps
-        What the stimulator can tell apart.
+        The stimulator's resolution.
 
     Raises
     ------
     RefusedError
-        A step, train, current or rate outside the limits, or one that stimulates nothing.
+        Step, train, current or rate outside the limits, or too small to stimulate.
     """
 
     def __init__(
@@ -77,13 +77,13 @@ class Calibration:
                 raise RefusedError(f"calibration: {refusal}")
         if steps.current(request.current_ma) == 0:
             raise RefusedError(
-                f"calibration: current_ma {request.current_ma:g} mA stimulates nothing; this stimulator begins at "
+                f"calibration: current_ma {request.current_ma:g} mA would stimulate nothing; the smallest current is "
                 f"{steps.current_ma:g} mA"
             )
         if self._pulses() < 1:
             raise RefusedError(
                 f"calibration: a train of {request.train_s:g} s at {request.pulse_rate_hz:g} pulses/s has no pulse; "
-                "make it longer or the rate higher"
+                "make the train longer or the rate higher"
             )
         most_us = table["pulse_width_us"].hi if request.max_pulse_width_us is None else request.max_pulse_width_us
         wanted = Profile(current_ma=request.current_ma, max_pulse_width_us=most_us, max_torque_nm=request.max_torque_nm)
@@ -100,39 +100,39 @@ class Calibration:
         Raises
         ------
         RefusedError
-            Above what limits, request or the marked comfort maximum allow; says whose bound and by how much.
+            Above the limits, the request's maximum or the marked comfort maximum; names the bound and the excess.
         PlanError
-            A step down from the lowest.
+            There is no lower step.
         """
         change_us = {"up": self.request.step_us, "down": -self.request.step_us}.get(direction, 0.0)
         width_us = self._width_us + change_us
         if self._width_us == 0 and direction == "up":
-            width_us = max(width_us, self._steps.shortest_us)  # below it nothing would be sent, and all be felt as none
+            width_us = max(width_us, self._steps.shortest_us)  # below it nothing would be sent, and nothing felt
         if self._steps.width_us(width_us) == 0:
-            raise PlanError(f"calibration: no train is narrower than {self._width_us:g} µs; the first step goes up")
+            raise PlanError(f"calibration: no step below {self._width_us:g} µs; step up instead")
         refusal = limits.check(self._ceiling(), width_us)
         if refusal is not None:
             raise RefusedError(f"calibration: {refusal}")
         return width_us
 
     def check_day(self, unix_s: float) -> None:
-        """Is it still the day on which it was begun? Raises RefusedError."""
+        """Raise RefusedError if the day of the calibration is over."""
         if not (unix_s < self._ends_s):
             raise RefusedError(
-                f"calibration: it was begun on the day before, which ended at {utc_text(self._ends_s)}; discard it and "
-                "begin anew"
+                f"calibration: it began on an earlier day, which ended at {utc_text(self._ends_s)}; discard it and "
+                "start again"
             )
 
     @property
     def rest(self) -> Limit:
-        """What must lie before the next train: before the first, as much as between two tests."""
+        """Rest that the next train needs: before the first train as much as between two tests."""
         return self.table["rest_between_trains_s" if self._trains else "rest_between_tests_s"]
 
     def _pulses(self) -> int:
         return round(self.request.train_s * self.request.pulse_rate_hz)
 
     def train(self, width_us: float) -> TestPlan:
-        """The plan of one train at that width. Raises RefusedError when the calibration's dose is used up."""
+        """Plan of one train of that width. Raises RefusedError if the calibration's total charge would be too high."""
         request = self.request
         dose_uc = self._charge_uc + self._pulses() * width_us * request.current_ma * 1e-3
         refusal = limits.check(self.table["charge_per_test_uc"], dose_uc)
@@ -152,7 +152,7 @@ class Calibration:
         )
 
     def played(self, width_us: float, torque_rise_nm: float | None, finished: FinishedEvent) -> None:
-        """A train is over."""
+        """Record a train that has ended."""
         self._width_us = width_us
         self._charge_uc += float(finished.summary.get("charge_uc", 0.0))
         pulses = int(finished.summary.get("pulses", 0))
@@ -164,15 +164,15 @@ class Calibration:
             self.recordings.append(finished.recording_path)
 
     def mark(self, threshold: Threshold) -> None:
-        """The last train's width is that threshold.
+        """Mark the last train's width as that threshold.
 
         Raises
         ------
         PlanError
-            Nothing was played yet, or the order sensory <= motor <= comfort would be broken.
+            No train was played yet, or the order sensory <= motor <= comfort would be broken.
         """
         if not self._trains:
-            raise PlanError("calibration: nothing was played yet; step up first, then mark")
+            raise PlanError("calibration: no train was played yet; step up first, then mark")
         marks: dict[Threshold, float] = {**self._marks_us, threshold: self._width_us}
         known = [(name, marks[name]) for name in ORDER if name in marks]
         for (low, low_us), (high, high_us) in itertools.pairwise(known):
@@ -183,10 +183,10 @@ class Calibration:
         self._marks_us = marks
 
     def profile(self, unix_s: float) -> Profile:
-        """What was found, valid until the end of the day. Raises PlanError naming what is not marked, RefusedError."""
+        """The profile, valid until the end of the day. Raises PlanError (a threshold is not marked) or RefusedError."""
         self.check_day(unix_s)
         if missing := self._missing():
-            raise PlanError(f"calibration: not marked yet: {', '.join(missing)}; mark, or finish with discard")
+            raise PlanError(f"calibration: not marked yet: {', '.join(missing)}; mark them, or finish with discard")
         return Profile(
             current_ma=self.request.current_ma,
             max_pulse_width_us=self._marks_us["comfort"],
@@ -198,7 +198,7 @@ class Calibration:
         )
 
     def status(self) -> CalibrationStatus:
-        """As clients see it."""
+        """Its progress, for clients."""
         request, ceiling = self.request, self._ceiling()
         return CalibrationStatus(
             calibration_id=request.calibration_id,
@@ -227,7 +227,7 @@ class Calibration:
         return [name for name in ORDER if name not in self._marks_us]
 
     def _ceiling(self) -> Limit:
-        """The tightest bound of the width, with its owner."""
+        """The tightest upper bound of the width, with its owner."""
         width, phase, second = (
             self.table[n] for n in ("pulse_width_us", "charge_per_phase_uc", "charge_per_second_uc")
         )
@@ -242,54 +242,54 @@ class Calibration:
 
 
 def end_of_day_s(unix_s: float) -> float:
-    """The next midnight where the rig stands, s since 1970."""
+    """Next midnight in the rig's time zone, s since 1970."""
     here = datetime.fromtimestamp(unix_s, UTC).astimezone()
     tomorrow = (here.replace(tzinfo=None) + timedelta(days=1)).replace(hour=0, minute=0, second=0, microsecond=0)
     return tomorrow.astimezone().timestamp()
 
 
 def check_profile(profile: Profile, unix_s: float, required: bool, duration_s: float = 0.0) -> None:
-    """Is what a calibration found consistent and still valid?
+    """Check that a profile is consistent and still valid.
 
     Parameters
     ----------
     unix_s
-        Now. The one decision that rests on UTC: a day ends by the calendar.
+        Time now. This is the only decision that uses UTC, since a day ends by the calendar.
     required
-        Refuse a profile without a calibration.
+        Whether a profile without a calibration is refused.
     duration_s
-        Real seconds of the test that is to be played: it must have ended before the profile does.
+        Real seconds of the test; it must end before the profile expires.
 
     Raises
     ------
     RefusedError
-        Saying what is wrong with it.
+        The message says what is wrong with the profile.
     """
     sensory_us, motor_us = profile.sensory_pulse_width_us, profile.motor_pulse_width_us
     found = (sensory_us, motor_us, profile.set_at_utc, profile.expires_at_utc)
     if all(value is None for value in found):
         if required:
-            raise RefusedError("participant's profile: not calibrated; no test without a calibration of the day")
+            raise RefusedError("participant's profile: not calibrated; a test needs a calibration made on the same day")
         return
     if sensory_us is None or motor_us is None or profile.set_at_utc is None or profile.expires_at_utc is None:
-        raise RefusedError("participant's profile: calibrated in part only; calibrate anew")
+        raise RefusedError("participant's profile: the calibration is incomplete; calibrate again")
     comfort_us = profile.max_pulse_width_us
     if not (0 < sensory_us <= motor_us <= comfort_us):
         raise RefusedError(
             f"participant's profile: sensory {sensory_us:g}, motor {motor_us:g} and comfort {comfort_us:g} µs "
-            "must rise from above 0; calibrate anew"
+            "must be above 0 and in this order; calibrate again"
         )
     set_s, expires_s = _time("set_at_utc", profile.set_at_utc), _time("expires_at_utc", profile.expires_at_utc)
     if not (set_s <= unix_s + CLOCK_SLIP_S):
-        raise RefusedError(f"participant's profile: set at {profile.set_at_utc}, which is in the future; check clocks")
-    if not (0 < expires_s - set_s <= LONGEST_VALID_S):
-        raise RefusedError("participant's profile: must expire after it was set, within a day; calibrate anew")
+        raise RefusedError(f"participant's profile: set in the future, at {profile.set_at_utc}; check the clocks")
+    if not (0 < expires_s - set_s <= MAX_VALID_S):
+        raise RefusedError("participant's profile: must expire within one day after it was set; calibrate again")
     if not (unix_s < expires_s):
-        raise RefusedError(f"participant's profile: expired at {profile.expires_at_utc}; calibrate anew")
+        raise RefusedError(f"participant's profile: expired at {profile.expires_at_utc}; calibrate again")
     if not (unix_s + duration_s < expires_s):
         raise RefusedError(
-            f"participant's profile: expires at {profile.expires_at_utc}, before this test of {duration_s:.0f} s would "
-            "end; calibrate anew once the day is over"
+            f"participant's profile: expires at {profile.expires_at_utc}, before the end of this test of "
+            f"{duration_s:.0f} s; calibrate again after midnight"
         )
 
 
@@ -297,7 +297,7 @@ def _time(name: str, text: str) -> float:
     try:
         parsed = datetime.fromisoformat(text)
     except ValueError:
-        raise RefusedError(f"participant's profile: {name} {text!r} is no time in ISO 8601") from None
+        raise RefusedError(f"participant's profile: {name} {text!r} is not a time in ISO 8601") from None
     if parsed.tzinfo is None:
         raise RefusedError(f"participant's profile: {name} {text!r} lacks its time zone (end it with Z)")
     return parsed.timestamp()

@@ -1,4 +1,4 @@
-"""What all of the rig's deeds stand on: its devices, its state, what is told of it, and how anything ends."""
+"""Base of the rig: its devices, its state, its status, and how a test is ended."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rig.control.latch import Latch, Remembered, lock_folder
 from rig.control.live import live_event
 from rig.control.pair import Pair
 from rig.control.rest import Rest
-from rig.control.sealing import Shelf
+from rig.control.sealing import RecordingStore
 from rig.errors import ConfigError, RigError
 from rig.messages import Event, FinishedEvent, LiveEvent, StateEvent, Status, StopEvidence
 from rig.trial import Trial
@@ -26,16 +26,16 @@ from rig.trial import Trial
 log = logging.getLogger("rig")
 
 HUNG_S = 5.0
-"""Real seconds without a sign of the sender: it asks for proof of health at every pulse's time, 1 s apart at most."""
+"""Real seconds after which a silent sender counts as hung: it asks for a health check at least once per second."""
 LOCK_PATIENCE_S = 0.2
-LONGEST_REQUEST_S = 60.0
-"""Real seconds that a request may take: re-arming opens both devices anew and seals what a full disk had left."""
+MAX_REQUEST_S = 60.0
+"""Real seconds that a request may take: re-arming reopens both devices and seals journals that were left."""
 
 
 class Core:
-    """State and devices of a rig (see `rig.control.rig.Rig`, which is what others use).
+    """State and devices of a rig. Others use its subclass `rig.control.rig.Rig`.
 
-    `_lock` guards the state; a stop of a running test never waits for it.
+    `_lock` guards the state. A stop of a running test never waits for it.
     """
 
     def __init__(self, config: RigConfig, clock: Clock, publish: Callable[[Event], None]) -> None:
@@ -44,9 +44,9 @@ class Core:
         self._publish = publish
         self._table = config.limits.table()
         self._require_calibration = config.require_calibration
-        self._shelf = Shelf(config, clock)
+        self._store = RecordingStore(config, clock)
         try:
-            self._shelf.make_folders()
+            self._store.make_folders()
             self._folder_lock = lock_folder(config.data_dir)
         except OSError as error:
             raise ConfigError(f"data_dir: {error.filename or config.data_dir}: {error.strerror}") from None
@@ -59,7 +59,7 @@ class Core:
         self._run: TestRun | None = None
         self._thread: threading.Thread | None = None
         self._evidence: StopEvidence | None = None
-        self._told = threading.Event()
+        self._evidence_ready = threading.Event()
         self._next_live_pulse = 0
         self._calibration: Calibration | None = None
         self._held_since_s: float | None = None
@@ -73,16 +73,16 @@ class Core:
 
     @property
     def speed(self) -> float:
-        """Of the rig's clock."""
+        """Speed of the rig's clock."""
         return self._clock.speed
 
     @property
     def busy(self) -> bool:
-        """Is a test on its way?"""
+        """Whether a test is in progress."""
         return self._trial.busy
 
     def status(self) -> Status:
-        """How things stand now."""
+        """State, devices and limits now."""
         with self._lock:
             trial, run, receiver = self._trial, self._run, self._pair.receiver
             calibration = self._calibration.status() if self._calibration else None
@@ -111,26 +111,26 @@ class Core:
         )
 
     def trouble(self) -> str | None:
-        """What should live in this process and does not; None: all of it does. For the process's own watchdog."""
+        """Which thread or request of this process hangs or has died; None: none. For the process's watchdog."""
         if self._lock.acquire(timeout=LOCK_PATIENCE_S):
             self._lock.release()
             self._held_since_s = None
         else:
             now_s = time.monotonic()
             since_s = self._held_since_s = self._held_since_s or now_s
-            if now_s - since_s > LONGEST_REQUEST_S:
-                return f"a request has not come to its end for {now_s - since_s:.0f} s"
+            if now_s - since_s > MAX_REQUEST_S:
+                return f"a request has been running for {now_s - since_s:.0f} s"
         trial, run, thread, receiver = self._trial, self._run, self._thread, self._pair.receiver
         if run is not None and run.sender_age_s() > HUNG_S:
-            return f"the sender hangs: it has asked for nothing for {run.sender_age_s():.0f} s"
+            return f"the sender hangs: no health check for {run.sender_age_s():.0f} s"
         if trial.busy and not (thread is not None and (thread.is_alive() or thread.ident is None)):
-            return f"the thread of test {trial.test_id} has ended without an end"
+            return f"the thread of test {trial.test_id} ended, but its test did not"
         if receiver is not None and not receiver.living and trial.state != "disconnected" and not trial.lost:
             return "the torque receiver's thread has ended"
         return None
 
     def live(self) -> LiveEvent | None:
-        """The newest torque and pulses; None where nothing came since the last call."""
+        """Torque and pulses since the last call; None if there is no new torque."""
         with self._lock:
             run, receiver, now_s = self._run, self._pair.receiver, self._clock.now_s()
             if receiver is None:
@@ -142,22 +142,22 @@ class Core:
             return event
 
     def _fault(self, reason: str) -> None:
-        """A device says that something is wrong, from one of its threads."""
+        """A device reports a fault; called from one of its threads."""
         log.error("%s", reason)
         self._end("fault", reason)
 
     def _lost(self, reason: str) -> None:
-        """A device is gone, from one of its threads."""
+        """A device is gone; called from one of its threads."""
         log.error("%s", reason)
         self._end("fault", reason, latch_idle=False)
         with self._lock:
             self._change(self._trial.disconnected(reason))
 
     def _end(self, cause: Cause, reason: str, latch_idle: bool = True) -> bool:
-        """End the test that runs, or latch; True if one runs. Takes the lock only when idle: a stop must not wait."""
+        """End the running test, or latch; True if a test runs. Takes the lock only when idle: a stop never waits."""
         halt = self._halt
         if not (self._trial.busy and halt is not None):
-            with self._lock:  # a start may be on its way, and must then be ended, too
+            with self._lock:  # a test may be starting, and must then be ended, too
                 halt = self._halt if self._trial.busy else None
                 if halt is None and latch_idle:
                     self._halted(reason)
@@ -166,8 +166,8 @@ class Core:
         return halt is not None
 
     def _remember(self, state: Remembered, reason: str) -> None:
-        """Write the latch file; where the disk refuses, the rig stays stopped all the same, and what the file says
-        since the test's start ("running") makes the next start uncertain."""
+        """Write the latch file. If the disk fails, the rig stays stopped, and the file still holds "running" from the
+        test's start, so that the next process starts as uncertain."""
         try:
             self._latch.write(state, reason)
         except RigError as error:

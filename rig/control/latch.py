@@ -1,4 +1,4 @@
-"""What the rig must remember across its own death: that a test ran, or that it is latched and why."""
+"""What the rig must remember across a crash: that a test was running, or that it is latched and why."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ Remembered = Literal["running", "latched"]
 
 
 class Latch:
-    """A small file in the data folder, on the disk before what it speaks of happens."""
+    """A small file in the data folder, synced to the disk before the event that it describes."""
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / "latch.json"
 
     def read(self) -> tuple[Remembered | None, str]:
-        """What was remembered and why; a file that cannot be read counts as a test that ran."""
+        """The stored state and its reason; an unreadable file counts as a running test."""
         try:
             content = json.loads(self._path.read_text("utf-8"))
             return ("latched" if content["state"] == "latched" else "running"), str(content["reason"])
@@ -32,25 +32,25 @@ class Latch:
             return "running", "the latch file could not be read"
 
     def write(self, state: Remembered, reason: str) -> None:
-        """Remember. Raises RigError when the disk refuses: then nothing may start."""
+        """Store a state. Raises RigError if the disk fails: then nothing may start."""
         try:
             archive.write_atomically(self._path, json.dumps({"state": state, "reason": reason}).encode())
         except RecordingError as error:
             raise RigError(f"latch file: {error}") from None
 
     def clear(self) -> None:
-        """Forget: a person has re-armed, or a test has ended well."""
+        """Remove the state: a person has re-armed, or a test has ended well."""
         with contextlib.suppress(FileNotFoundError):
             self._path.unlink()
 
 
 def lock_folder(folder: Path) -> IO[str]:
-    """Make sure that one rig process alone uses the data folder; keep the file open while it does.
+    """Make sure that only one rig process uses the data folder. Keep the returned file open meanwhile.
 
     Raises
     ------
     BusyError
-        Another one runs; the line names its process.
+        Another rig uses it; the message names its process.
     """
     file = (folder / "rig.lock").open("a+")
     try:
@@ -59,7 +59,7 @@ def lock_folder(folder: Path) -> IO[str]:
         file.seek(0)
         holder = file.read().strip() or "unknown"
         file.close()
-        raise BusyError(f"data_dir {folder}: another rig (process {holder}) uses it; stop that first") from None
+        raise BusyError(f"data_dir {folder}: another rig (process {holder}) uses it; stop that rig first") from None
     file.truncate(0)
     file.write(str(os.getpid()))
     file.flush()

@@ -1,4 +1,4 @@
-"""What a page needs to draw: envelopes of the torque and the pulses since the last event."""
+"""Data for a page's chart: envelope of the torque, and the pulses, since the last event."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ BIN_S = 0.01
 def live_event(
     receiver: Receiver, run: TestRun | None, origin_s: float, now_s: float, first_pulse: int
 ) -> LiveEvent | None:
-    """The newest torque as min/max of bins of 10 ms, or None where nothing came.
+    """The newest torque as minimum and maximum of bins of 10 ms, or None if there is none.
 
     Parameters
     ----------
     run
-        The test on its way; None when idle.
+        The test in progress; None when idle.
     origin_s
         Rig time that counts as zero: the test's start, or the rig's when idle.
     first_pulse
-        The first pulse that earlier events have not carried.
+        Index of the first pulse that earlier events did not contain.
     """
     blocks = []
     while receiver.live:
@@ -58,5 +58,5 @@ def live_event(
 
 
 def _finite(values: np.ndarray) -> list[float]:
-    """JSON has no NaN: a bin without a number is drawn at zero, and the fault is told elsewhere."""
+    """JSON has no NaN: a bin without a number is set to zero; the fault is reported elsewhere."""
     return np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0).round(5).tolist()

@@ -1,4 +1,4 @@
-"""The two devices of a rig: connected together, asked together, given back together."""
+"""The two devices of a rig, which are connected, checked and disconnected together."""
 
 from __future__ import annotations
 
@@ -35,15 +35,15 @@ class Pair:
         self.gate: Gate | None = None
         self.receiver: Receiver | None = None
         self.found_state = ""
-        """What the stimulator said of itself when it was connected."""
+        """State that the stimulator reported when it was connected."""
         self.steps = limits.FINEST
-        """What the stimulator can tell apart."""
+        """The stimulator's resolution."""
         self.identity: dict[str, dict[str, Any]] = {"stimulator": {}, "load_cell": {}}
 
     def connect(self) -> None:
-        """Open both; a stimulator that says that it may stimulate, though no test is on, is stopped at once.
+        """Open both. A stimulator that is found able to stimulate is stopped at once, since no test runs.
 
-        Raises DeviceError (neither stays open then) and ConfigError (a DBC without the signal).
+        Raises DeviceError (both are then closed) and ConfigError (the DBC lacks the signal).
         """
         settings = self._config.stimulator, self._config.load_cell
         stimulator = devices.find("stimulator", settings[0].device).create(settings[0], self._clock)
@@ -68,7 +68,7 @@ class Pair:
             gate.stop()
 
     def disconnect(self) -> None:
-        """Stop stimulation and give both back; never raises."""
+        """Stop stimulation and close both; never raises."""
         if self.gate is not None:
             self.gate.disconnect()
         if self.receiver is not None:
@@ -76,14 +76,14 @@ class Pair:
         self.gate = self.receiver = None
 
     def reconnect(self) -> None:
-        """Give both back, open them anew and see that torque comes. Raises DeviceError."""
+        """Close both, open them again and check that torque arrives. Raises DeviceError."""
         self.disconnect()
         self.connect()
         if not self.torque_comes():
-            raise DeviceError("load cell: connected, but no torque comes; check its cable and start frames")
+            raise DeviceError("load cell: connected, but no torque arrives; check its cable and start frames")
 
     def both_answer(self) -> bool:
-        """Stop the stimulator anew and ask its state; does torque come?"""
+        """Stop the stimulator, ask its state, and check that torque arrives; False if one of them fails."""
         if self.gate is None or self.receiver is None:
             return False
         try:
@@ -94,7 +94,7 @@ class Pair:
         return self.torque_comes()
 
     def torque_comes(self) -> bool:
-        """Does a sample arrive from now on, within a short time?"""
+        """Whether a new sample arrives within a short time from now."""
         assert self.receiver is not None
         asked_s = self._clock.now_s()
         end_s = asked_s + FRESH_S * self._clock.speed

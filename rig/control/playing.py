@@ -1,4 +1,4 @@
-"""One test, or one train of a calibration: from its journal's first block to its sealed recording."""
+"""Plays one test, or one train of a calibration: from the first block of its journal to its sealed recording."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ _NAME = re.compile(r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$")
 
 
 class Playing(Core):
-    """Plays what has been planned and admitted."""
+    """Plays planned and admitted tests."""
 
     def _launch(self, test: plan.PlannedTest, table: dict[str, limits.Limit], following: Trial) -> None:
-        """Journal, latch file, thread: what every test and every train of a calibration goes through."""
+        """Create latch file, journal and thread, for every test and every train of a calibration."""
         self._latch.write("running", f"test {following.test_id} of participant {following.participant}")
         try:
             self._begin(test, table)
@@ -37,12 +37,12 @@ class Playing(Core):
         gate, receiver = self._pair.gate, self._pair.receiver
         assert gate is not None
         assert receiver is not None
-        journal = self._shelf.begin(test, self._pair.identity)
+        journal = self._store.begin(test, self._pair.identity)
         halt = Halt(self._clock)
         run = TestRun(test, table, journal, gate, receiver, self._clock, halt, self._watch)
         halt.on_set(lambda: self._halted(halt.reason))
         self._halt, self._run, self._evidence = halt, run, None
-        self._told.clear()
+        self._evidence_ready.clear()
         self._next_live_pulse = 0
         self._thread = threading.Thread(target=self._execute, args=(run,), name="test", daemon=True)
 
@@ -51,13 +51,13 @@ class Playing(Core):
         try:
             result = run.execute()
             self._evidence = result.evidence
-            self._told.set()  # who waits for a stop's evidence does not wait for the disk
+            self._evidence_ready.set()  # a stop's evidence does not wait for the disk
             self._remember_pulse(result)
             with self._lock:
                 self._change(self._trial.ended())
-            finished = self._shelf.finish(run.journal_path, run.test.plan.test_id, result)
-        except Exception as error:  # a mistake in this program: stay stopped, keep the journal for the next start
-            log.exception("the test could not be ended in order")
+            finished = self._store.finish(run.journal_path, run.test.plan.test_id, result)
+        except Exception as error:  # a bug in this program: stay stopped, keep the journal for the next start
+            log.exception("the test could not be ended properly")
             self._broken(f"internal: {type(error).__name__}: {error}")
             return
         with self._lock:
@@ -67,7 +67,7 @@ class Playing(Core):
                 self._calibration.played(run.test.plan.profile.max_pulse_width_us, result.rise_nm, finished)
             if not train:
                 self.finished = finished
-            if finished.recording_path is None and run.t0_s is not None:  # kept as a journal: a person must see to it
+            if finished.recording_path is None and run.t0_s is not None:  # only a journal: needs a person
                 self._change(self._trial.halted(finished.reason))
             following = self._trial.sealed()
             if following.state == "latched":
@@ -79,13 +79,13 @@ class Playing(Core):
             self._publish(finished)
 
     def _remember_pulse(self, result: RunResult) -> None:
-        """Before another test may start; where the end of stimulation is not confirmed, one may still come."""
+        """Store the last pulse's time before another test may start; an unconfirmed end counts as a pulse now."""
         if result.last_pulse_s is not None:
             confirmed = result.evidence.confirmed
             self._rest.pulse_at(result.last_pulse_s if confirmed else self._clock.now_s(), ended=confirmed)
 
     def _broken(self, reason: str) -> None:
-        self._told.set()
+        self._evidence_ready.set()
         with self._lock:
             self._run = None
             self._remember("running", reason)
@@ -103,7 +103,7 @@ class Playing(Core):
 
 
 def check_names(place: str, **names: str) -> None:
-    """Names end up in paths. Raises PlanError."""
+    """Check names that become part of paths. Raises PlanError."""
     for name, value in names.items():
         if not _NAME.match(value):
-            raise PlanError(f"{place}.{name}: {value!r} must be letters, digits, '.', '_' or '-', at most 100")
+            raise PlanError(f"{place}.{name}: {value!r} use letters, digits, '.', '_' and '-', at most 100 characters")

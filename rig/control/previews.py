@@ -1,7 +1,7 @@
-"""Previews are built in another process: `rig.builder`, one at a time, with a bound on its memory and its time.
+"""Previews are built by another process, `rig.builder`, one at a time, with limits on memory and time.
 
-Whatever a plan asks for, it can cost the rig neither memory nor the processor that its sender needs. Those that would
-have to wait for too long are refused at once.
+So no plan can take memory or processor time from the rig's sender. Requests that would have to wait too long are
+refused at once.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from rig.limits import Limit
 
 log = logging.getLogger("rig.previews")
 
-MOST_WAITING = 8
-LONGEST_S = 30.0
-"""Real seconds that one may take: the longest test takes a tenth of a second of a processor that others may have."""
-LONGEST_REPLY = 8_000_000
+MAX_WAITING = 8
+MAX_BUILD_S = 30.0
+"""Real seconds allowed for one preview. The longest test needs 0.1 s of processor time, at the lowest priority."""
+MAX_REPLY_BYTES = 8_000_000
 
 
 class Previews:
-    """Asks the builder, and begins it anew when it has died or taken too long.
+    """Sends requests to the builder, and starts it again if it has died or taken too long.
 
     Parameters
     ----------
@@ -44,32 +44,32 @@ class Previews:
         self._process: asyncio.subprocess.Process | None = None
 
     async def warm(self) -> None:
-        """Begin the builder, so that the first preview need not wait for it."""
+        """Start the builder, so that the first preview does not wait for it."""
         async with self._one:
             await self._begin()
 
     async def reply(self, line: bytes) -> bytes:
-        """The reply to a preview's request, both a line of JSON.
+        """Reply to a preview request; both are one line of JSON.
 
         Raises
         ------
         BusyError
-            Too many wait already.
+            Too many requests are waiting.
         PlanError
-            It took too long, or too much memory.
+            It took too much memory.
         """
-        if self._waiting >= MOST_WAITING:
-            raise BusyError(f"previews: {self._waiting} wait already; ask again in a moment")
+        if self._waiting >= MAX_WAITING:
+            raise BusyError(f"previews: {self._waiting} requests are waiting; try again in a moment")
         self._waiting += 1
         try:
             async with self._one:
-                return await asyncio.wait_for(self._ask(line), LONGEST_S)
+                return await asyncio.wait_for(self._ask(line), MAX_BUILD_S)
         except TimeoutError:
             await self.close()
-            raise BusyError(f"preview: not built within {LONGEST_S:g} s, the computer is too busy; ask again") from None
+            raise BusyError(f"preview: not built within {MAX_BUILD_S:g} s, the computer is busy; try again") from None
         except (OSError, ValueError):
             await self.close()
-            raise PlanError("preview: could not be built; make the plan smaller") from None
+            raise PlanError("preview: it could not be built; make the plan shorter") from None
         finally:
             self._waiting -= 1
 
@@ -85,7 +85,7 @@ class Previews:
         if self._process is None or self._process.returncode is not None:
             self._process = await asyncio.create_subprocess_exec(
                 sys.executable, "-m", "rig.builder",
-                stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, limit=LONGEST_REPLY,
+                stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, limit=MAX_REPLY_BYTES,
                 env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
             )  # fmt: skip
             assert self._process.stdin is not None
@@ -100,5 +100,5 @@ class Previews:
         await process.stdin.drain()
         reply = await process.stdout.readline()
         if not reply.endswith(b"\n"):
-            raise ConnectionError("the builder of previews has died")
+            raise ConnectionError("the preview builder has died")
         return reply

@@ -1,4 +1,4 @@
-"""Requests and replies as lines of JSON: what the sockets and the builder of previews have in common."""
+"""Requests and replies as lines of JSON, for both sockets and the preview builder."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ _HEAD = re.compile(rb'\s*\{\s*"kind"\s*:\s*"([a-z-]{1,40})"\s*,\s*"id"\s*:\s*(\d
 
 
 def head_of(line: bytes) -> tuple[str, int] | None:
-    """Kind and id where a request begins with them, as `rig.messages` writes it; read without parsing the rest."""
+    """Kind and id of a request that begins with them, as `rig.messages` writes it, without parsing the rest."""
     found = _HEAD.match(line[:200])
     return (found[1].decode(), int(found[2])) if found else None
 
 
 def id_of(line: bytes) -> int:
-    """The id of a request that is no valid one; 0 where there is none."""
+    """The id of an invalid request; 0 if it has none."""
     if (head := head_of(line)) is not None:
         return head[1]
     with contextlib.suppress(ValueError, TypeError, AttributeError, RecursionError):
@@ -31,18 +31,18 @@ def id_of(line: bytes) -> int:
 
 
 def refusal(number: int, error: RigError) -> Reply:
-    """An exception as clients see it."""
+    """Reply for an exception of the rig."""
     return Reply(id=number, ok=False, problem=Problem(code=error.code, title=error.title, detail=str(error)))
 
 
-def unforeseen(number: int, error: Exception) -> Reply:
-    """A mistake in this program as clients see it."""
+def internal_error(number: int, error: Exception) -> Reply:
+    """Reply for a bug in this program."""
     detail = f"{type(error).__name__}: {error}"
     return Reply(id=number, ok=False, problem=Problem(code=RigError.code, title=RigError.title, detail=detail))
 
 
-def wrong(number: int, error: ValidationError) -> Reply:
-    """A request that is none: the first place where it is wrong."""
+def invalid_request(number: int, error: ValidationError) -> Reply:
+    """Reply for an invalid request: names the first place that is wrong."""
     first: Any = error.errors(include_input=False, include_url=False)[0]
     place = ".".join(str(part) for part in first["loc"]) or "request"
     detail = f"{place}: {first['msg']}"

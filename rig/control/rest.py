@@ -1,9 +1,9 @@
-"""The rest between tests and trains, counted from the last pulse, and remembered when the process ends.
+"""The rest between tests and trains, counted from the last pulse, and kept when the process ends.
 
-The machine's monotonic clock goes on from process to process until the machine starts anew, so a clean restart of the
-rig shortens no rest. The wall clock decides nothing here: set wrong, it can neither shorten a rest nor lengthen it.
-Whatever is in doubt (another boot, another machine, a file that cannot be read, a death in a test) counts as a pulse
-at this moment: a rest may come out longer than asked for, never shorter.
+The machine's monotonic clock continues across processes until the machine is rebooted, so a clean restart of the rig
+shortens no rest. The wall clock is not used: a wrong time can neither shorten nor lengthen a rest. In case of doubt
+(another boot, another machine, an unreadable file, a crash during a test) the last pulse is assumed to be now: a rest
+may be longer than asked for, never shorter.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 
 
 class Rest:
-    """When the last pulse was, on the rig's clock; None: never in this data folder."""
+    """Time of the last pulse on the rig's clock; None: there was none with this data folder."""
 
     def __init__(self, folder: Path, clock: Clock) -> None:
         self._folder, self._clock = folder, clock
@@ -34,7 +34,7 @@ class Rest:
         self._ended = True
 
     def recall(self, in_doubt: bool) -> None:
-        """What the process before has left. `in_doubt`: it died, so its last pulse may have been at any time since."""
+        """Read what the last process stored. `in_doubt`: it crashed, so the time of its last pulse is unknown."""
         remembered_s = None if in_doubt else self._read()
         if remembered_s is not None:
             self.last_pulse_s = remembered_s
@@ -42,9 +42,9 @@ class Rest:
             self.pulse_at(self._clock.now_s(), ended=False)
 
     def pulse_at(self, time_s: float, ended: bool = True) -> None:
-        """Remember a pulse at that time; where the disk refuses, the next start is in doubt.
+        """Store the time of the last pulse; if the disk fails, the next process is in doubt.
 
-        `ended` is False where the end of stimulation is not confirmed: a line that stalls may still hold a pulse.
+        `ended` is False if the end of stimulation is not confirmed: a stalled line may still hold a pulse.
         """
         self.last_pulse_s, self._ended = time_s, ended
         content = {
@@ -57,16 +57,16 @@ class Rest:
             archive.write_atomically(self._path, json.dumps(content).encode())
         except RecordingError as error:
             log.error("the last pulse's time could not be written: %s", error)
-            with contextlib.suppress(OSError):  # a disk that is read-only now: the latch says that a test ran
+            with contextlib.suppress(OSError):  # the disk is read-only now: the latch file still says that a test ran
                 self._path.unlink(missing_ok=True)
 
     def settle(self) -> None:
-        """The stimulator has answered: what the line held is through, perhaps only now."""
+        """The stimulator has answered, so the line is empty; a held pulse may have been felt just now."""
         if not self._ended:
             self.pulse_at(self._clock.now_s())
 
     def check(self, test: PlannedTest, limit: limits.Limit) -> None:
-        """Time enough between the last pulse that was sent and the first that is planned? Raises RefusedError."""
+        """Raise RefusedError if the first planned pulse follows the last one too soon."""
         planned = test.pulse_width_us > 0
         if self.last_pulse_s is None or not planned.any():
             return
@@ -77,7 +77,7 @@ class Rest:
             raise RefusedError(f"plan: {refusal}; wait {limit.lo - rest_s:.1f} s")
 
     def _read(self) -> float | None:
-        """The time that was left, if it is beyond doubt of this boot."""
+        """The stored time, if it certainly belongs to this boot."""
         try:
             content = json.loads(self._path.read_text("utf-8"))
             here, monotonic_s = boot_id(), float(content["monotonic_s"])
@@ -88,12 +88,12 @@ class Rest:
         return time_s if certain and 0 <= time_s <= self._clock.now_s() else None
 
     def _used(self) -> bool:
-        """Was anything ever played from this folder? One of an older version has no file of the last pulse."""
+        """Whether any test was ever played with this folder; older versions stored no time of the last pulse."""
         return any(any((self._folder / name).glob("*")) for name in ("recordings", "journals"))
 
 
 def boot_id() -> str:
-    """Which start of this machine this is; empty where the system does not say."""
+    """Id of this boot of the machine; empty if the system has none."""
     try:
         return BOOT_ID.read_text("ascii").strip()
     except (OSError, ValueError):

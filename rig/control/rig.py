@@ -1,4 +1,4 @@
-"""The rig: both devices, one test at a time, and what is told about it. Knows no socket."""
+"""The rig: both devices, one test at a time, its status and events. Independent of the sockets."""
 
 from __future__ import annotations
 
@@ -16,32 +16,32 @@ from rig.trial import Trial
 log = logging.getLogger("rig")
 
 STOP_TIMEOUT_S = 6.0
-"""Real seconds to wait for the evidence of a stop, decay of the torque included."""
+"""Real seconds to wait for the evidence of a stop, including the fall of the torque."""
 
 
 class Rig(Calibrating):
-    """Owns the devices. Every method may be called from any thread.
+    """Owns the devices. All methods may be called from any thread.
 
     Parameters
     ----------
     publish
-        Takes every event but the live ones; called from any thread, must not block.
+        Receives all events except live ones; called from any thread, must not block.
 
     Raises
     ------
     ConfigError, BusyError
-        The data folder cannot be used, or another rig uses it.
+        The data folder cannot be used, or another rig is using it.
     """
 
     def open(self) -> None:
-        """Recover what a crash left, then connect; a device that is not there is told, not raised."""
+        """Seal what a crash left, then connect; a missing device is reported in the status, not raised."""
         remembered, reason = self._latch.read()
-        for event in self._shelf.recover("the rig process died during the test"):
+        for event in self._store.recover("the rig process died during the test"):
             remembered = "running"
             self.finished = event
             self._publish(event)
         before = None
-        self._rest.recall(in_doubt=remembered == "running")  # a death is no rest
+        self._rest.recall(in_doubt=remembered == "running")  # after a crash the last pulse's time is unknown
         if remembered == "running":
             before, reason = "uncertain", f"the rig died during a test ({reason or 'its journal was left'})"
         elif remembered == "latched":
@@ -51,14 +51,14 @@ class Rig(Calibrating):
             self._pair.connect()
         except DeviceError as error:
             log.error("%s", error)
-            trial = trial.disconnected(str(error))  # a latch outlives the missing device
+            trial = trial.disconnected(str(error))  # a latch stays although a device is missing
         else:
             if before == "uncertain":
                 trial = replace(trial, reason=f"{reason}; the stimulator, asked now: {self._pair.found_state}")
         self._change(trial)
 
     def close(self) -> None:
-        """Stop what runs, wait until it is sealed, disconnect."""
+        """Stop a running test, wait until it is sealed, disconnect."""
         self.stop("the rig is shutting down", "rig", latch_idle=False)
         thread = self._thread
         if thread is not None:
@@ -67,18 +67,18 @@ class Rig(Calibrating):
         self._folder_lock.close()
 
     def start(self, request: TestPlan) -> Status:
-        """Begin a test in its own thread.
+        """Start a test in its own thread.
 
         Raises
         ------
         BusyError, LatchedError, UncertainError, DeviceError
             See `Trial.start`.
         PlanError, RefusedError
-            The plan is wrong or outside a limit.
+            The plan is wrong, or outside a limit.
         JournalError, RigError
-            The disk refuses the journal or the latch file.
+            The journal or the latch file cannot be written.
         """
-        self._trial.may_start()  # before waiting for the lock: what was asked while stopped isn't played once re-armed
+        self._trial.may_start()  # before the lock: a start that was asked for while stopped must not run later
         with self._lock:
             self._trial.may_start()
             check_names("plan", test_id=request.test_id, participant=request.participant)
@@ -88,19 +88,19 @@ class Rig(Calibrating):
             check_profile(request.profile, now_s, self._require_calibration, duration_s)
             plan.check_steps(test, self._pair.steps)
             self._rest.check(test, table["rest_between_tests_s"])
-            self._shelf.check_room(request.test_id)
+            self._store.check_room(request.test_id)
             self._launch(test, table, self._trial.start(request.test_id, request.participant))
         return self.status()
 
     def stop(self, reason: str, by: str, latch_idle: bool = True) -> StopEvidence:
-        """Stop stimulation now, latch, and say what the device and the torque tell of it."""
+        """Stop stimulation now, latch, and return what device and torque showed afterwards."""
         words = f"{reason} (by {by})" if by else reason
         if self._end("stopped", words, latch_idle):
-            self._told.wait(STOP_TIMEOUT_S)
-            return self._evidence or self._unconfirmed("no pulse leaves; the device did not answer in time")
+            self._evidence_ready.wait(STOP_TIMEOUT_S)
+            return self._evidence or self._unconfirmed("no more pulses are sent; the device did not answer in time")
         gate = self._pair.gate
         if gate is None:
-            return StopEvidence(confirmed=False, detail="the stimulator is not connected; no pulse can leave")
+            return StopEvidence(confirmed=False, detail="the stimulator is not connected; no pulse can be sent")
         try:
             gate.stop()
             safe, state = gate.state()
@@ -110,20 +110,20 @@ class Rig(Calibrating):
         return StopEvidence(confirmed=safe, detail=f"no test was running; device: {state}", device_state=state)
 
     def _unconfirmed(self, detail: str) -> StopEvidence:
-        """The device has not answered: may a pulse still come that was sent before?"""
+        """Evidence if the device did not answer: a pulse that was sent before may still be felt."""
         possible = self._pair.gate.still_possible() if self._pair.gate else ""
         words = "; ".join(part for part in (detail, possible) if part)
         return StopEvidence(confirmed=False, detail=words, pulse_may_follow=bool(possible))
 
     def rearm(self, by: str) -> Status:
-        """A person has looked: ask both devices anew and be ready.
+        """A person has checked participant and rig: ask both devices again, then be ready.
 
         Raises
         ------
         BusyError
-            A test is on its way.
+            A test is in progress.
         DeviceError
-            A device does not answer: the rig stays as it is.
+            A device does not answer: the rig stays stopped.
         """
         with self._lock:
             following = self._trial.rearm()
@@ -133,7 +133,7 @@ class Rig(Calibrating):
                 except DeviceError as error:
                     self._change(self._trial.disconnected(str(error)))
                     raise
-            for event in self._shelf.recover("its recording could not be sealed at its end"):
+            for event in self._store.recover("its recording could not be sealed at its end"):
                 self.finished = event
                 self._publish(event)
             self._rest.settle()

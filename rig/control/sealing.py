@@ -1,4 +1,4 @@
-"""Around one test's journal: beginning it, sealing it, and sealing what a crash left."""
+"""Creates the journal of a test, seals it into a recording, and recovers journals after a crash."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ MIN_FREE_BYTES = 64 * 2**20
 
 DOUBTFUL_ALIGNMENT_MS = 5.0
 DOUBTFUL_RATE = 0.02
-"""Beyond these a recording's times are in doubt, and its finished event says so; a rate further off is a fault."""
+"""Beyond these a recording's times are uncertain, and its finished event says so. A larger rate error is a fault."""
 
 
-class Shelf:
+class RecordingStore:
     """The folders of unfinished journals and sealed recordings in the data folder."""
 
     def __init__(self, config: RigConfig, clock: Clock) -> None:
@@ -46,22 +46,22 @@ class Shelf:
             folder.mkdir(parents=True, exist_ok=True)
 
     def check_room(self, test_id: str) -> None:
-        """Is there place for a test of that id?
+        """Check that a test of that id can be stored.
 
         Raises
         ------
         PlanError
-            The id was used before.
+            The id was already used.
         JournalError
             The disk is nearly full.
         """
         used = (self.journals / f"{test_id}.journal").exists() or any(self.recordings.glob(f"*Z_{test_id}.h5"))
         if used:
-            raise PlanError(f"plan.test_id: {test_id!r} was used before; give each test a new id")
+            raise PlanError(f"plan.test_id: {test_id!r} was already used; give each test a new id")
         free = self._free_bytes()
         if free < MIN_FREE_BYTES:
             raise JournalError(
-                f"data_dir {self._config.data_dir}: {free // 2**20} MB free, a test needs {MIN_FREE_BYTES // 2**20}; "
+                f"data_dir {self._config.data_dir}: {free // 2**20} MB free; a test needs {MIN_FREE_BYTES // 2**20}; "
                 "move old recordings away"
             )
 
@@ -69,7 +69,7 @@ class Shelf:
         return shutil.disk_usage(self._config.data_dir).free
 
     def begin(self, test: PlannedTest, identity: dict[str, Any]) -> Journal:
-        """A journal with its header and plan, on the disk. Raises JournalError."""
+        """Create a journal with its header and plan, synced to the disk. Raises JournalError."""
         book = Journal(self.journals / f"{test.plan.test_id}.journal")
         header = {
             "recording_id": uuid.uuid4().hex,
@@ -107,32 +107,32 @@ class Shelf:
         return self._seal(path, test_id, result.outcome, result.reason, summary, result.last_sample_unix_s)
 
     def recover(self, reason: str) -> Iterator[FinishedEvent]:
-        """Seal the journals that a crash or a full disk left; one with nothing to seal is set aside, never deleted.
+        """Seal the journals that a crash or a full disk left; a journal with nothing to seal is renamed, never deleted.
 
         Parameters
         ----------
         reason
-            Why it was left, for those that do not say themselves how the test ended.
+            Why it was left; used for journals that do not say how the test ended.
         """
         for path in sorted(self.journals.glob("*.journal")):
             log.warning("recovering %s", path.name)
             event = self._seal(path, path.stem, "fault", reason, {"recovered": True}, None)
-            if path.exists() and self._free_bytes() >= MIN_FREE_BYTES:  # else it is the disk's fault: try again later
+            if path.exists() and self._free_bytes() >= MIN_FREE_BYTES:  # else the disk is full: try again later
                 path.rename(path.with_suffix(".unsealed"))
             yield event
 
     def _seal(
         self, path: Path, test_id: str, outcome: str, reason: str, summary: dict[str, Any], unix_s: float | None
     ) -> FinishedEvent:
-        """Seal a journal and remove it; where that fails the journal stays and the event says why.
+        """Seal a journal and remove it; if that fails, the journal stays and the event says why.
 
-        A damaged one is sealed as far as it goes, and kept beside the others as `TEST_ID.damaged`.
+        Of a damaged journal the readable part is sealed, and the file is kept as `TEST_ID.damaged`.
         """
         sealed = None
         try:
             contents = journal.read(path)
             sealed = archive.seal(assembly.assemble(contents, outcome, reason), self.recordings)
-            if contents.damaged:  # what could be read is sealed; the rest may be wanted by whoever looks into it
+            if contents.damaged:  # the readable part is sealed; the file is kept for inspection
                 path.rename(path.with_suffix(".damaged"))
             else:
                 path.unlink()
@@ -170,7 +170,7 @@ def _of_recording(recording: assembly.Recording) -> dict[str, Any]:
 
 
 def warnings(recording: assembly.Recording) -> list[str]:
-    """What a person should know before a model is made of it, a sentence each; empty where nothing is in doubt."""
+    """Warnings before a model is fitted to it, one sentence each; empty if there are none."""
     alignment, attributes = recording.alignment, recording.attributes
     found = _disturbed_line(recording)
     if attributes["journal_note"]:
@@ -180,42 +180,44 @@ def warnings(recording: assembly.Recording) -> list[str]:
         return found
     torque_nm = recording.columns["torque/torque_nm"]
     if np.all(torque_nm == torque_nm[0]):
-        found.append(f"load cell: stood at exactly {torque_nm[0]:.3f} N·m through the whole test: is it stuck?")
-    if not (alignment.error_ms <= DOUBTFUL_ALIGNMENT_MS):
-        error = "not known" if alignment.error_ms != alignment.error_ms else f"{alignment.error_ms:.1f} ms"
         found.append(
-            f"torque and pulses: the alignment's error is {error} (up to {DOUBTFUL_ALIGNMENT_MS:g} ms is usual): the "
-            "computer or the bus stood still; delays of a model of this recording are in doubt"
+            f"load cell: its value stayed at exactly {torque_nm[0]:.3f} N·m in the whole test; it may be stuck"
+        )
+    if not (alignment.error_ms <= DOUBTFUL_ALIGNMENT_MS):
+        error = "unknown" if alignment.error_ms != alignment.error_ms else f"{alignment.error_ms:.1f} ms"
+        found.append(
+            f"torque and pulses: the error of their alignment is {error} (usual: up to {DOUBTFUL_ALIGNMENT_MS:g} ms), "
+            "because the computer or the bus was blocked; delays in a model of this recording may be wrong"
         )
     if nominal_hz > 0 and not (abs(measured_hz / nominal_hz - 1) <= DOUBTFUL_RATE):
         found.append(
-            f"load cell: {measured_hz:.0f} samples/s came, the rig file says {nominal_hz:g}: times of this recording "
-            "are in doubt"
+            f"load cell: {measured_hz:.0f} samples/s arrived, the rig file says {nominal_hz:g}: times in this "
+            "recording may be wrong"
         )
     return found
 
 
 def _disturbed_line(recording: assembly.Recording) -> list[str]:
-    """Pulses that the stimulator acknowledged late, or that nobody sent, and those that were dropped meanwhile."""
+    """Warnings about late acknowledgements, acknowledgements of pulses that were not sent, and dropped pulses."""
     named = [event.get("event") for event in recording.events]
     late_s = [event["delay_s"] for event in recording.events if event.get("event") == "late_ack"]
     found = []
     if unasked := named.count("unasked_ack"):
         found.append(
-            f"stimulator: it acknowledged pulses that were not sent ({unasked}): so many more may have been felt than "
-            "this recording holds"
+            f"stimulator: it acknowledged {unasked} pulses that were not sent; they may have been felt and are not in "
+            "this recording"
         )
     if late_s:
         found.append(
             f"stimulator: {len(late_s)} acknowledgements came late, up to {max(late_s) * 1e3:.0f} ms after the pulse "
-            f"was sent: these pulses may have been felt as late; {named.count('dropped')} that came due meanwhile were "
-            "dropped"
+            f"was sent; these pulses may have been felt that late; {named.count('dropped')} pulses that came due "
+            "meanwhile were dropped"
         )
     return found
 
 
 def software() -> str:
-    """Name and version, as recordings carry it."""
+    """Name and version of this program, for recordings."""
     try:
         return f"stimrig {version('stimrig')}"
     except PackageNotFoundError:

@@ -1,7 +1,7 @@
-"""The Unix socket: requests in, replies and events out, one JSON object a line; beside it the one for stops alone.
+"""The Unix socket: requests in, replies and events out, one JSON object per line. Also starts the stop socket.
 
-What touches a device or the disk runs in worker threads, previews in another process. The number of connections, of
-requests that wait and of bytes in a request is bounded; who is over a bound is refused at once.
+Work with a device or the disk runs in worker threads; previews are built in another process. The numbers of
+connections, of waiting requests and of bytes in a request are limited; requests above a limit are refused at once.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from typing import Any
 
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
-from rig.control.crowd import Crowd
+from rig.control.connections import Connections
 from rig.control.previews import Previews
-from rig.control.replies import head_of, id_of, refusal, to_line, unforeseen, wrong
+from rig.control.replies import head_of, id_of, internal_error, invalid_request, refusal, to_line
 from rig.control.rig import Rig
-from rig.control.stop_door import StopDoor
+from rig.control.stop_server import StopServer
 from rig.errors import BusyError, ConfigError, PlanError, RigError
 from rig.messages import LONGEST_LINE, Event, LiveEvent, Reply, Request, StateEvent, stop_socket
 
@@ -28,13 +28,13 @@ log = logging.getLogger("rig.socket")
 LIVE_PERIOD_S = 0.05
 WORKERS = 32
 SLOW_BYTES = 1_000_000
-"""A subscriber that lets this much wait gets no live events until it has caught up."""
+"""A subscriber with this many unread bytes gets no live events until it has read them."""
 DEAD_BYTES = 8_000_000
 LONG_LINE_BYTES = 64_000
-"""Reading a longer one holds the interpreter for milliseconds, which a test's sender has not to give."""
-MOST_PENDING = 64
-"""Requests of one connection that may wait at the same time."""
-MOST_SILENT, MOST_SPEAKING = 64, 128
+"""Parsing a longer request blocks the interpreter for milliseconds, which would delay a test's sender."""
+MAX_PENDING = 64
+"""Largest number of waiting requests of one connection."""
+MAX_SILENT, MAX_ACTIVE = 64, 128
 
 _REQUEST: TypeAdapter[Any] = TypeAdapter(Request)
 
@@ -47,42 +47,44 @@ class Server:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._subscribers: set[asyncio.StreamWriter] = set()
         self._tasks: set[asyncio.Task[None]] = set()
-        self._crowd = Crowd(MOST_SILENT, MOST_SPEAKING)
+        self._connections = Connections(MAX_SILENT, MAX_ACTIVE)
         self._server: asyncio.Server | None = None
-        self._door: StopDoor | None = None
+        self._stop_server: StopServer | None = None
         self._previews: Previews
 
     def publish(self, event: Event) -> None:
-        """Send an event to every subscriber; from any thread."""
+        """Send an event to all subscribers; may be called from any thread."""
         if self._loop is not None and not self._loop.is_closed():
             self._loop.call_soon_threadsafe(self._send_all, event)
 
     async def start(self, rig: Rig, path: Path) -> None:
-        """Listen on `path`, and for stops beside it; only this user and group may connect."""
+        """Listen on `path` and on the stop socket; only this user and group may connect."""
         self._loop = asyncio.get_running_loop()
         self.rig = rig
         self._previews = Previews(rig.table, rig.speed)
         self._loop.set_default_executor(ThreadPoolExecutor(WORKERS, "request"))
         if await _answers(path):
-            raise ConfigError(f"socket: {path}: another rig listens there; stop it or give another path")
+            raise ConfigError(f"socket: {path}: another rig is listening there; stop it or use another path")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._door = StopDoor(rig.stop)
-            self._door.open(stop_socket(path))  # first: who can ask for anything can stop
+            self._stop_server = StopServer(rig.stop)
+            self._stop_server.open(stop_socket(path))  # first: whoever can send a request can also stop
             path.unlink(missing_ok=True)
             self._server = await asyncio.start_unix_server(self._serve, path, limit=LONGEST_LINE, backlog=512)
             path.chmod(0o660)
         except OSError as error:
-            raise ConfigError(f"socket: {path}: {error.strerror or error}; a short path in a writable folder") from None
+            raise ConfigError(
+                f"socket: {path}: {error.strerror or error}; use a short path in a writable folder"
+            ) from None
         self._keep(self._loop.create_task(self._live()))
         self._keep(self._loop.create_task(self._previews.warm()))
 
     async def close(self) -> None:
-        """Stop listening and let every client go."""
+        """Stop listening and close all connections."""
         if self._server is not None:
             self._server.close()
-        if self._door is not None:
-            await asyncio.to_thread(self._door.close)
+        if self._stop_server is not None:
+            await asyncio.to_thread(self._stop_server.close)
         for task in tuple(self._tasks):
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
@@ -115,23 +117,23 @@ class Server:
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         pending: set[asyncio.Task[None]] = set()
-        self._crowd.enter(writer.transport)
+        self._connections.enter(writer.transport)
         try:
             while line := await reader.readline():
                 if line.strip():
-                    self._crowd.spoke(writer.transport)
+                    self._connections.spoke(writer.transport)
                     # each request is its own task, so that a stop never waits behind another request
-                    task = asyncio.create_task(self._answer(line, writer, len(pending) >= MOST_PENDING))
+                    task = asyncio.create_task(self._answer(line, writer, len(pending) >= MAX_PENDING))
                     pending.add(task)
                     task.add_done_callback(pending.discard)
                     self._keep(task)
         except ValueError:
             _write(writer, to_line(refusal(0, PlanError(f"request: longer than {LONGEST_LINE // 1000} kB"))))
         except ConnectionError as error:
-            log.warning("client let go: %s", error)
+            log.warning("client disconnected: %s", error)
         finally:
             self._subscribers.discard(writer)
-            self._crowd.leave(writer.transport)
+            self._connections.leave(writer.transport)
             await asyncio.gather(*pending, return_exceptions=True)
             writer.close()
             with contextlib.suppress(ConnectionError, OSError):
@@ -140,12 +142,12 @@ class Server:
     async def _answer(self, line: bytes, writer: asyncio.StreamWriter, crowded: bool) -> None:
         head = head_of(line)
         kind = head[0] if head else ""
-        if kind == "stop" and self._door is not None:  # with the threads that are kept for stops
-            _write(writer, to_line(await self._door.answer(line)))
+        if kind == "stop" and self._stop_server is not None:  # uses the threads reserved for stops
+            _write(writer, to_line(await self._stop_server.answer(line)))
             return
         try:
             if crowded:
-                raise BusyError(f"{MOST_PENDING} requests of this connection wait already; take their replies first")
+                raise BusyError(f"{MAX_PENDING} requests of this connection are waiting; read their replies first")
             if kind == "preview":
                 _write(writer, await self._preview(line, writer))
                 return
@@ -155,23 +157,23 @@ class Server:
             _write(writer, to_line(refusal(id_of(line[:200]), error)))
             return
         except ValidationError as error:
-            _write(writer, to_line(wrong(id_of(line), error)))
+            _write(writer, to_line(invalid_request(id_of(line), error)))
             return
         await self._obey(request, writer)
 
     async def _preview(self, line: bytes, writer: asyncio.StreamWriter) -> bytes:
-        """In the order of asking; who has gone meanwhile is not worked for."""
+        """Previews are built in order of request; none for a client that has disconnected."""
         return b"" if writer.transport.is_closing() else await self._previews.reply(line)
 
     def _refuse_long(self, line: bytes, kind: str) -> None:
         assert self.rig is not None
         if len(line) > LONG_LINE_BYTES and kind == "":
-            raise PlanError(f"request: one over {LONG_LINE_BYTES // 1000} kB begins with its kind and its id")
+            raise PlanError(f"request: if over {LONG_LINE_BYTES // 1000} kB, it must begin with its kind and its id")
         if len(line) > LONG_LINE_BYTES and self.rig.busy:
-            raise BusyError("a test is on its way; wait or stop it")
+            raise BusyError("a test is in progress; wait or stop it")
 
     async def _obey(self, request: Any, writer: asyncio.StreamWriter) -> None:
-        if request.kind in ("preview", "stop"):  # one that does not begin with its kind and id
+        if request.kind in ("preview", "stop"):  # it does not begin with its kind and id
             await self._answer(to_line(request), writer, crowded=False)
             return
         try:
@@ -181,7 +183,7 @@ class Server:
             reply = refusal(request.id, error)
         except Exception as error:
             log.exception("request %s failed", request.kind)
-            reply = unforeseen(request.id, error)
+            reply = internal_error(request.id, error)
         _write(writer, to_line(reply))
         if request.kind == "subscribe" and reply.ok and self.rig is not None:
             self._subscribers.add(writer)
@@ -207,7 +209,7 @@ class Server:
 
 
 async def _answers(path: Path) -> bool:
-    """Does a live process listen on that socket?"""
+    """Whether a process is listening on that socket."""
     try:
         _, writer = await asyncio.open_unix_connection(path)
     except OSError:
@@ -218,6 +220,6 @@ async def _answers(path: Path) -> bool:
 
 def _write(writer: asyncio.StreamWriter, line: bytes) -> None:
     if writer.transport.get_write_buffer_size() > DEAD_BYTES:
-        writer.transport.abort()  # asks and does not read
+        writer.transport.abort()  # the client sends requests but reads no replies
     elif line and not writer.transport.is_closing():
         writer.write(line)

@@ -1,7 +1,7 @@
-"""Devices behind two small Protocols; a device is one file here, found by its id (the file's name).
+"""Devices behind two small Protocols; each device is one file here, found by its id (the file's name).
 
 A device module has `KIND` ("stimulator" or "load_cell"), `Settings` (a pydantic model, the device's part of the
-rig file) and `create(settings, clock)`. Adding a device is adding a file.
+rig file) and `create(settings, clock)`. To add a device, add a file.
 """
 
 from __future__ import annotations
@@ -34,19 +34,19 @@ class Stimulator(Protocol):
     """Delivers single pulses. Only `rig.gate` may hold one."""
 
     steps: Steps
-    """What it can tell apart; the gate rounds to it."""
+    """Its resolution; the gate rounds to it."""
     silence_s: float
-    """Device seconds for which it may go on pulsing by itself after the host's last word; 0: a command a pulse."""
+    """Device seconds for which it may continue to pulse after the host's last command; 0: one command per pulse."""
 
     def open(self) -> dict[str, Any]:
-        """Open the line and ask who answers; returns identity for people (device, serial number, firmware, port).
+        """Open the line; returns the identity to display (device, serial number, firmware, port).
 
-        Raises DeviceError naming the port and the mend.
+        Raises DeviceError, which names the port and says how to correct it.
         """
         ...
 
     def listen(self, on_ack: Callable[[Ack], None], on_lost: Callable[[str], None]) -> None:
-        """Say where acks and the loss of the line go; both are called from the device's reader thread."""
+        """Register callbacks for acks and for the loss of the line; called from the device's reader thread."""
         ...
 
     def arm(self) -> None:
@@ -54,22 +54,23 @@ class Stimulator(Protocol):
         ...
 
     def send(self, pulse: Admitted, latest_s: float) -> int:
-        """Hand one pulse to the line and return its number; does not wait for the ack.
+        """Write one pulse to the line and return its number; does not wait for the ack.
 
-        Raises LateError where the clock has passed `latest_s` right before the write, and DeviceError.
+        Raises LateError if the clock has passed `latest_s` right before the write, and DeviceError.
         """
         ...
 
     def feed(self) -> None:
-        """Health has just been proven: a device with a watchdog may be kept alive, by this call alone.
+        """Feed the device's watchdog, if it has one. Nothing else may do so.
 
-        Called before each pulse and through rests while a test runs. Raises DeviceError.
+        Called after each health check, before each pulse and during rests. Raises DeviceError.
         """
         ...
 
     def stop(self) -> None:
-        """Stop stimulation; safe at any time and from any thread. What still waits in this computer to be sent is
-        discarded first. Raises DeviceError.
+        """Stop stimulation; safe at any time and from any thread. Raises DeviceError.
+
+        Bytes that still wait in this computer are discarded first.
         """
         ...
 
@@ -78,30 +79,30 @@ class Stimulator(Protocol):
         ...
 
     def close(self) -> None:
-        """Give the line back; never raises."""
+        """Close the line; never raises."""
         ...
 
 
 class LoadCell(Protocol):
-    """Gives torque samples as they come."""
+    """Gives torque samples as they arrive."""
 
     sample_rate_hz: float
     counter_modulus: int
-    """Where the raw counter wraps, in samples; 0: the cell has no counter."""
+    """Value at which the raw counter wraps, in samples; 0: the cell has no counter."""
 
     def open(self) -> dict[str, Any]:
-        """Open the bus and start the cell; returns identity for people. Raises DeviceError."""
+        """Open the bus and start the cell; returns the identity to display. Raises DeviceError."""
         ...
 
     def read(self, timeout_s: float) -> TorqueBlock:
-        """Samples that came within `timeout_s` real seconds, soon after the first; empty if none came.
+        """Samples that arrive within `timeout_s` real seconds; returns soon after the first one; may be empty.
 
         Raises DeviceError when the bus is gone.
         """
         ...
 
     def close(self) -> None:
-        """Stop the cell and give the bus back; never raises."""
+        """Stop the cell and close the bus; never raises."""
         ...
 
 
@@ -119,7 +120,7 @@ def find(kind: Kind, device_id: object) -> ModuleType:
     Raises
     ------
     ConfigError
-        Unknown id; the line lists those that there are.
+        Unknown id; the message lists the known ones.
     """
     known = library(kind)
     if not isinstance(device_id, str) or device_id not in known:

@@ -1,4 +1,4 @@
-"""A serial line that speaks in numbered packets: a reader thread, one writer at a time, commands that wait for acks."""
+"""A serial line with numbered packets: a reader thread, one writer at a time, commands that wait for acks."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PSEUDO_TERMINALS = "/dev/pts/"
 
 
 class Reader(Protocol):
-    """Bytes to packets."""
+    """Turns bytes into packets."""
 
     def feed(self, data: bytes) -> Iterator[Packet]: ...
 
@@ -38,13 +38,13 @@ class PacketLine:
     port
         Path of the port.
     numbers
-        How many packet numbers there are before they come again.
+        Number of packet numbers before they repeat.
     reader
-        Makes a new `Reader` for each opening.
+        Makes a new `Reader` each time the port is opened.
     on_packet
-        Takes each packet and the time at which it had been read (rig clock); from the reader thread.
+        Called with each packet and the time at which it was read (rig clock); from the reader thread.
     arguments
-        Of `serial.Serial`: rate, parity, stop bits, flow control.
+        For `serial.Serial`: rate, parity, stop bits, flow control.
     """
 
     def __init__(
@@ -74,13 +74,13 @@ class PacketLine:
         self._on_lost: Callable[[str], None] = lambda _: None
 
     def on_lost(self, action: Callable[[str], None]) -> None:
-        """Say who is told, from the reader thread, when the line breaks."""
+        """Register a callback for the loss of the line; called from the reader thread."""
         self._on_lost = action
 
     def open(self) -> None:
-        """Open the port and begin to read. Raises DeviceError naming the port and the mend."""
+        """Open the port and start reading. Raises DeviceError, which names the port and says how to correct it."""
         if not Path(self.port).exists():
-            raise DeviceError(f"stimulator.port: {self.port} is not there; plug the stimulator in or correct the port")
+            raise DeviceError(f"stimulator.port: {self.port} is missing; plug in the stimulator or correct the port")
         try:
             self._serial = serial.Serial(self.port, timeout=READ_TIMEOUT_S, exclusive=True, **self._arguments)
         except (serial.SerialException, OSError, ValueError) as error:
@@ -94,30 +94,30 @@ class PacketLine:
         self._thread.start()
 
     def _refuse_fast_clock(self) -> None:
-        """Limits are in rig seconds: a clock that runs faster than the world may drive an emulator's port only."""
+        """Limits are in rig seconds, so a clock faster than real time may be used with an emulator's port only."""
         assert self._serial is not None
         place = os.ttyname(self._serial.fileno())
         if self._clock.speed != 1.0 and not place.startswith(PSEUDO_TERMINALS):
             self.close()
             raise DeviceError(
                 f"stimulator.port: {self.port} is {place}, a real device, and the rig's clock runs "
-                f"{self._clock.speed:g} times as fast as the world; use a rig file"
+                f"{self._clock.speed:g} times as fast as real time; use a rig file"
             )
 
     def close(self) -> None:
-        """End the thread and give the port back; never raises."""
+        """End the thread and close the port; never raises."""
         self._closing.set()
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join(timeout=1.0)
         if self._serial is not None:
-            with contextlib.suppress(OSError):  # an unplugged line cannot be given back
+            with contextlib.suppress(OSError):  # closing an unplugged port fails
                 self._serial.close()
             self._serial = None
 
     def discard(self) -> None:
-        """Throw away what was written and still waits in this computer: a line that takes nothing holds it there.
+        """Discard bytes that were written but still wait in this computer, as on a stalled line.
 
-        Never raises. A frame that is cut in two by this is damaged, and the device drops it by its checksum.
+        Never raises. A frame that is cut by this is damaged, and the device drops it because of its checksum.
         """
         port = self._serial
         if port is not None:
@@ -125,21 +125,21 @@ class PacketLine:
                 termios.tcflush(port.fileno(), termios.TCOFLUSH)
 
     def tell(self, make: Callable[[int], bytes], latest_s: float | None = None) -> int:
-        """Write the frame that `make` gives for the next number; the number.
+        """Write the frame that `make` returns for the next packet number; returns the number.
 
         Raises
         ------
         LateError
             The clock had passed `latest_s` right before the write: nothing was written.
         DeviceError
-            The line takes no bytes, or the frame cannot be made.
+            The line accepts no bytes, or the frame cannot be encoded.
         """
         with self._write_lock:
             number = self._next_number()
             try:
                 frame = make(number)
             except WireError as error:
-                raise DeviceError(f"stimulator {self.port}: cannot be sent: {error}") from None
+                raise DeviceError(f"stimulator {self.port}: the command cannot be encoded: {error}") from None
             self._write(frame, latest_s)
         return number
 
@@ -149,14 +149,14 @@ class PacketLine:
         Parameters
         ----------
         name, answer
-            What people call the command, and the command number of its ack.
+            Name of the command in messages, and the command number of its ack.
         timeout_s
             Real seconds.
 
         Raises
         ------
         DeviceError
-            No ack in time, or another answer.
+            No ack in time, or an unexpected answer.
         """
         with self._write_lock:
             number = self._next_number()
@@ -173,7 +173,7 @@ class PacketLine:
             packet = self._waiting.pop(number)
         if packet is None:
             why = self._lost or f"no answer in {timeout_s:g} s"
-            raise DeviceError(f"stimulator {self.port}: {name}: {why}; is it switched on?")
+            raise DeviceError(f"stimulator {self.port}: {name}: {why}; check its power")
         if packet.command != answer:
             raise DeviceError(f"stimulator {self.port}: {name}: answered with command {packet.command}")
         return packet
@@ -188,19 +188,19 @@ class PacketLine:
         if latest_s is not None and not (self._clock.now_s() <= latest_s):
             raise LateError
         try:
-            # one system call: pyserial's own write calls a pulse that went out late-scheduled a timeout
+            # one system call: pyserial's write reports a timeout for a pulse that it has sent, if it was interrupted
             written = os.write(self._serial.fileno(), frame)
         except (serial.SerialException, OSError, TypeError) as error:
-            raise DeviceError(f"stimulator {self.port} took no bytes: {error}") from None
+            raise DeviceError(f"stimulator {self.port} accepted no bytes: {error}") from None
         if written != len(frame):
-            raise DeviceError(f"stimulator {self.port} took {written} of {len(frame)} bytes; is it still reading?")
+            raise DeviceError(f"stimulator {self.port} accepted {written} of {len(frame)} bytes; check its power")
         self.last_written_s = self._clock.now_s()
 
     def _read(self) -> None:
         try:
             self._read_all()
-        except Exception as error:  # a mistake in a driver: told at once, not only by acks that do not come
-            log.exception("the reader of %s broke", self.port)
+        except Exception as error:  # a bug in a driver: report it at once, not after a timeout
+            log.exception("the reader of %s failed", self.port)
             self._lose(f"internal: {type(error).__name__}: {error}")
 
     def _read_all(self) -> None:
@@ -213,9 +213,9 @@ class PacketLine:
                 if data:
                     data += port.read(port.in_waiting)
             except (serial.SerialException, OSError, TypeError) as error:
-                # TypeError: pyserial's answer to a port closed under a read
+                # pyserial raises TypeError if the port is closed during a read
                 if not self._closing.is_set():
-                    self._lose(f"the line broke ({error})")
+                    self._lose(f"the connection was lost ({error})")
                 return
             time_s = self._clock.now_s()
             for packet in frames.feed(data):

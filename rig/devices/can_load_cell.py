@@ -1,6 +1,6 @@
-"""A torque cell on a CAN bus, described by a DBC file: which message, signals, scale, rate and start frames.
+"""A torque cell on a CAN bus. A DBC file describes its message and signals.
 
-The bus is whatever python-can reaches: socketcan on hardware, socketcand or slcan elsewhere.
+The bus may be any that python-can supports: socketcan on hardware, socketcand or slcan elsewhere.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from rig.wire import dbc
 KIND = "load_cell"
 
 GATHER_S = 0.005
-"""Samples are handed on at most this long (real time) after the first of a block came."""
+"""Real seconds: a block is returned at most this long after its first sample arrived."""
 
 _FRAME = re.compile(r"^([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#((?:[0-9A-Fa-f]{2}){0,8})$")
 
@@ -34,11 +34,11 @@ _FRAME = re.compile(r"^([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#((?:[0-9A-Fa-f]{2}){0,8})
 class Settings(DeviceSettings):
     bus: dict[str, Any] = Field(description="keyword arguments of can.Bus: interface, channel, bitrate, host, port …")
     dbc: str = Field(dbc.PACKAGED, description="path of a DBC file, or torque_default")
-    message: str | None = Field(None, description="message that carries the torque; default: the first with the signal")
-    signal: str | list[str] = Field("Torque_Nm", description="torque signal; several where a frame has several samples")
-    scale_nm: float = Field(1.0, description="N·m for one unit of the signal; negative turns the sign")
-    counter: str | None = Field("Counter", description="sample counter's signal; '' where the cell has none")
-    sync: str | None = Field("Sync", description="signal of the stimulator's sync line; '' where there is none")
+    message: str | None = Field(None, description="message with the torque; default: the first one that has the signal")
+    signal: str | list[str] = Field("Torque_Nm", description="torque signal; a list if a frame has several samples")
+    scale_nm: float = Field(1.0, description="N·m per unit of the signal; a negative value reverses the sign")
+    counter: str | None = Field("Counter", description="signal of the sample counter; '' if the cell has none")
+    sync: str | None = Field("Sync", description="signal of the stimulator's sync line; '' if there is none")
     sample_rate_hz: float = Field(1600.0, gt=0, le=20_000)
     start_frames: list[str] = Field(default_factory=list, description="sent on opening, as id#data in hex: 000#0100")
     stop_frames: list[str] = Field(default_factory=list, description="sent on closing")
@@ -48,14 +48,14 @@ class Settings(DeviceSettings):
     def _hex_frames(cls, frames: list[str]) -> list[str]:
         for frame in frames:
             if not _FRAME.match(frame):
-                raise ValueError(f"{frame!r} is no frame; write id#data in hex, e.g. 000#0100")
+                raise ValueError(f"{frame!r} is not a frame; write id#data in hex, e.g. 000#0100")
         return frames
 
     @field_validator("scale_nm")
     @classmethod
     def _not_zero(cls, scale: float) -> float:
         if scale == 0:
-            raise ValueError("a scale of 0 would hide every torque; give N·m for one unit of the signal")
+            raise ValueError("a scale of 0 would hide every torque; give N·m per unit of the signal")
         return scale
 
 
@@ -86,7 +86,7 @@ class CanLoadCell:
         self.counter_modulus = self._frame.counter_modulus * self._frame.samples_per_frame
         self._bus: can.BusABC | None = None
         self._stamped = False
-        # python-can warns about every frame that a packet cuts in two; that is its daily bread
+        # python-can warns about every frame that is split between two packets, which is normal
         logging.getLogger("can").setLevel(logging.CRITICAL)
 
     def open(self) -> dict[str, Any]:
@@ -129,7 +129,7 @@ class CanLoadCell:
                 malformed += 1  # slcan: a damaged line
                 continue
             except (can.CanError, OSError) as error:
-                raise DeviceError(f"load cell on {self._place()}: the bus is gone: {_line(error)}") from None
+                raise DeviceError(f"load cell on {self._place()}: the bus was lost: {_line(error)}") from None
             except Exception as error:
                 raise DeviceError(f"load cell on {self._place()}: reading failed: {_line(error)}") from None
             if message is None:
@@ -174,7 +174,7 @@ class CanLoadCell:
         return bus
 
     def _probe(self, bus: dict[str, Any]) -> None:
-        """Python-can tries a dead server for ten busy seconds; one attempt tells a person sooner."""
+        """Fail early if no server answers: python-can itself would retry for ten seconds."""
         if bus.get("interface") != "socketcand":
             return
         host, port = bus.get("host"), bus.get("port")
@@ -182,7 +182,7 @@ class CanLoadCell:
             socket.create_connection((str(host), int(str(port))), timeout=2.0).close()
         except (OSError, ValueError) as error:
             raise DeviceError(
-                f"load_cell.bus: no socketcand at {host}:{port} ({_line(error)}); is it running?"
+                f"load_cell.bus: no socketcand answers at {host}:{port} ({_line(error)}); check that it is running"
             ) from None
 
     def _send(self, frames: list[str]) -> None:
@@ -211,6 +211,6 @@ def create(settings: Settings, clock: Clock) -> CanLoadCell:
     Raises
     ------
     ConfigError
-        The DBC has no such message or signal.
+        The DBC lacks the message or signal.
     """
     return CanLoadCell(settings, clock)

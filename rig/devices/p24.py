@@ -1,6 +1,6 @@
-"""Hasomed RehaMove P24 in ScienceMode 4's low level: one command a pulse, so silence is no stimulation.
+"""Hasomed RehaMove P24 in ScienceMode 4's low level: one command per pulse, so without commands nothing is sent.
 
-Takes only width and current and draws the symmetric biphasic pulse itself: an unbalanced pulse cannot be asked for.
+The driver takes only width and current and makes the symmetric biphasic pulse itself, so a pulse is always balanced.
 """
 
 from __future__ import annotations
@@ -85,11 +85,11 @@ class P24:
         )
 
     def feed(self) -> None:
-        pass  # in low level nothing goes on by itself, so there is nothing to keep alive
+        pass  # the low level has no watchdog: the device does nothing by itself
 
     def stop(self) -> None:
         self._line.discard()
-        self._ask(Command.LL_STOP, fine=(0, NOT_INITIALISED))  # one that is not initialised has stopped already
+        self._ask(Command.LL_STOP, fine=(0, NOT_INITIALISED))  # a device that is not initialised has already stopped
 
     def state(self) -> tuple[bool, str]:
         result, level, _ = wire.parse_status(self._ask(Command.STIM_STATUS).data)

@@ -1,8 +1,8 @@
-"""Hasomed RehaStim 2 in ScienceMode 2, single pulses: one command a pulse, so silence is no stimulation.
+"""Hasomed RehaStim 2 in ScienceMode 2, single pulses: one command per pulse, so without commands nothing is sent.
 
-The channel list, which the device goes on playing by itself for up to 1200 ms after the host's last word, is never
-used. The device's own watchdog still counts: after 1200 ms without a command it drops the connection and offers a new
-one. It is kept alive by `feed` alone, which the rig calls only upon proof of health: there is no keep-alive thread.
+The channel list is never used, since the device would continue to play it for up to 1200 ms after the host's last
+command. The device's own watchdog is still active: after 1200 ms without a command it closes the connection and offers
+a new one. Only `feed` keeps it alive, which the rig calls after a health check: there is no keep-alive thread.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ class RehaStim2:
         }
 
     def arm(self) -> None:
-        self.stop()  # back to the start mode, whatever was
+        self.stop()  # back to the start mode, whatever the mode was
         safe, state = self.state()
         if not safe:
             raise DeviceError(f"stimulator {self._settings.port}: cannot be armed, it is in {state}")
@@ -120,7 +120,7 @@ class RehaStim2:
         self._line.close()
 
     def _ask(self, command: Command) -> Packet:
-        """Ask; where the device has dropped the connection meanwhile, take its next offer and ask once more."""
+        """Ask; if the device has closed the connection, accept its next offer and ask once more."""
         try:
             return self._ask_once(command)
         except DeviceError:
@@ -134,7 +134,7 @@ class RehaStim2:
         return self._line.ask(lambda number: wire.encode(Packet(number, command)), name, command + 1, timeout_s)
 
     def _take_offer(self) -> bool:
-        """Accept a connection that the device offers; False where it offers none."""
+        """Accept a connection that the device offers; False if it offers none."""
         with self._offers:
             if not self._offers.wait_for(lambda: self._offer is not None, OFFER_S):
                 return False
@@ -144,7 +144,7 @@ class RehaStim2:
         result = 0 if accepted else -5
         self._line.tell(lambda _: wire.encode(Packet(offer.number, Command.INIT_ACK, bytes((result & 0xFF,)))))
         if not accepted:
-            raise DeviceError(f"stimulator {self._settings.port}: speaks protocol {offer.data.hex()}, this driver 1")
+            raise DeviceError(f"stimulator {self._settings.port}: it uses protocol {offer.data.hex()}, this driver 1")
         return True
 
     def _take(self, packet: Packet, time_s: float) -> None:
@@ -164,7 +164,7 @@ class RehaStim2:
             self._offer = packet
             self._offers.notify_all()
         if self._armed:
-            self._on_ack(Ack(-1, time_s, "it started anew in a test (reset, power, or its watchdog)"))
+            self._on_ack(Ack(-1, time_s, "it restarted during a test (reset, power failure, or its watchdog)"))
 
 
 def create(settings: Settings, clock: Clock) -> RehaStim2:

@@ -1,10 +1,14 @@
 """The library of stimulation sequences: one file each, found by looking into this folder.
 
-A sequence is a module with `Settings` (a pydantic model, units in the names), `pulse_count(settings, pulse_rate_hz)`,
-how many pulses it has (0 µs ones included) by arithmetic alone, so that a length is refused before anything is built,
-and `pulse_widths(settings, pulse_rate_hz) -> ndarray`, a pure function giving one width in µs for each pulse.
-The module's name is the sequence's id. Adding one is adding a file. A sequence that jumps between levels by design
-says so: `JUMPS = True` in the module, or a setting `jumps` where the caller decides.
+A sequence is a module with three parts:
+
+- `Settings`: a pydantic model, units in the names.
+- `pulse_count(settings, pulse_rate_hz)`: the number of pulses (those of 0 µs included), computed without building them,
+  so that too long a sequence is refused before it is built.
+- `pulse_widths(settings, pulse_rate_hz) -> ndarray`: a pure function that returns one width in µs for each pulse.
+
+The module's name is the sequence's id. To add a sequence, add a file. A sequence that jumps between levels by design
+declares `JUMPS = True`, or has a setting `jumps` if the caller decides.
 """
 
 from __future__ import annotations
@@ -24,16 +28,16 @@ Floats = NDArray[np.float64] | list[float]
 
 
 class SequenceSettings(BaseModel):
-    """Base of every sequence's settings: unknown names are refused, and so are NaN, infinities, and what is no number.
+    """Base of every sequence's settings: unknown names, NaN and infinities are refused.
 
-    Strict: `true` is no duration and `"5"` no width.
+    Types are strict: `true` is not a duration, and `"5"` is not a width.
     """
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False, strict=True)
 
 
 class Sequence(Protocol):
-    """What a module in this folder offers."""
+    """Interface of a module in this folder."""
 
     Settings: type[SequenceSettings]
 
@@ -57,7 +61,7 @@ def find(sequence_id: str) -> Sequence:
     Raises
     ------
     PlanError
-        No file in this folder has the name; the message lists those that there are.
+        There is no sequence of that id; the message lists the known ones.
     """
     try:
         return library()[sequence_id]
@@ -71,7 +75,7 @@ def settings_of(sequence_id: str, settings: dict[str, Any]) -> SequenceSettings:
     Raises
     ------
     PlanError
-        Naming the first wrong setting and what is expected there.
+        Names the first wrong setting and what is expected.
     """
     model = find(sequence_id).Settings
     try:
@@ -93,13 +97,13 @@ def build(sequence_id: str, settings: dict[str, Any], pulse_rate_hz: float) -> N
 
 
 def jumps(sequence_id: str, settings: dict[str, Any]) -> bool:
-    """May the width rise in one pulse to any level that is allowed?"""
+    """Whether the width may rise to any allowed level within one pulse."""
     checked = settings_of(sequence_id, settings)
     return bool(getattr(find(sequence_id), "JUMPS", False) or getattr(checked, "jumps", False))
 
 
 def pulse_count(sequence_id: str, settings: dict[str, Any], pulse_rate_hz: float) -> int:
-    """How many pulses `build` would give, without building them."""
+    """Number of pulses that `build` would return, without building them."""
     return find(sequence_id).pulse_count(settings_of(sequence_id, settings), pulse_rate_hz)
 
 

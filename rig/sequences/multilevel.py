@@ -1,7 +1,7 @@
-"""Random levels held for random times: unlike PRBS and ramp, so a model is tested on what it was not fitted to.
+"""Random levels, held for random times: tests a model on an input unlike PRBS and ramp.
 
-The levels are stratified (one from each of n equal bands, in random order), so that a short sequence still
-visits the whole range; some are zero, so that the muscle also relaxes.
+The levels are stratified (one from each of n equal bands, in random order), so that a short sequence covers the whole
+range. Some are zero, so that the muscle also relaxes.
 """
 
 from __future__ import annotations

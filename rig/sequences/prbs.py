@@ -1,7 +1,7 @@
 """Pseudo-random binary sequence between 0 and c, from a maximum-length shift register.
 
-Two levels hide the recruitment curve's shape, so the response to them is linear in the input whatever that
-shape is: the linear dynamics are identified from it alone (paper, section III-A, after Godfrey 1993).
+With only two levels the response is linear in the input, whatever the shape of the recruitment curve. So the linear
+dynamics can be identified from it alone (paper, section III-A, after Godfrey 1993).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ FEEDBACK_TAPS = {
     11: (11, 9),
     12: (12, 11, 10, 4),
 }
-"""Primitive feedback polynomials over GF(2): the register runs through all 2^bits − 1 states but zero."""
+"""Primitive feedback polynomials over GF(2): the register passes through all 2^bits − 1 non-zero states."""
 
 
 class Settings(SequenceSettings):

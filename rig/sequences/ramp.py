@@ -1,4 +1,4 @@
-"""Triangular ramp 0 → c → 0: passes slowly through the whole recruitment curve, both ways (paper, section III-B)."""
+"""Triangular ramp 0 → c → 0: covers the whole recruitment curve slowly, up and down (paper, section III-B)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rest: no pulses. Shows the torque's offset and noise, and lets the muscle relax."""
+"""Rest: no pulses. Shows the offset and noise of the torque, and lets the muscle relax."""
 
 from __future__ import annotations
 

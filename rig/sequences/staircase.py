@@ -1,4 +1,4 @@
-"""Staircase 0 → c → 0 in equal steps: the steady torque at each level, and whether it differs on the way down."""
+"""Staircase 0 → c → 0 in equal steps: shows the steady torque at each level, up and down."""
 
 from __future__ import annotations
 

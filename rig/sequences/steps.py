@@ -1,4 +1,4 @@
-"""On-off steps at one level, repeated: rise and fall times, and what repetition does to the torque (fatigue)."""
+"""Repeated on-off steps at one level: show rise time, fall time and fatigue."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Any list of pulse widths, one for each pulse: sequences made elsewhere."""
+"""A list of pulse widths, one for each pulse, for sequences made by other tools."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from pydantic import Field
 
 from rig.sequences import SequenceSettings
 
-LONGEST = 18_000
-"""Pulses of the longest test (300 s) at the highest rate (60 Hz): `rig.limits` admits no more."""
+MAX_PULSES = 18_000
+"""Pulses of the longest test (300 s) at the highest rate (60 Hz): `rig.limits` allows no more."""
 
 
 class Settings(SequenceSettings):
-    pulse_width_us: list[float] = Field(min_length=1, max_length=LONGEST, description="µs, one for each pulse")
-    jumps: bool = Field(False, description="the list jumps between levels on purpose, as a PRBS does")
+    pulse_width_us: list[float] = Field(min_length=1, max_length=MAX_PULSES, description="µs, one for each pulse")
+    jumps: bool = Field(False, description="whether the list jumps between levels on purpose, as a PRBS does")
 
 
 def pulse_count(settings: Settings, pulse_rate_hz: float) -> int:

@@ -1,1 +1,1 @@
-"""Bytes on the line to values and back, pure: no port is opened here."""
+"""Encoders and decoders of the wire protocols. Pure: no port is opened here."""

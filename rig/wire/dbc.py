@@ -1,4 +1,4 @@
-"""Torque samples out of CAN frames, as a DBC file describes them: any cell is a description, not a driver."""
+"""Decodes torque samples from CAN frames by a DBC file, so that a new cell needs a description, not a driver."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from cantools.database.can import Message
 from rig.errors import ConfigError, WireError
 
 PACKAGED = "torque_default"
-"""Name of the description that is used when none is given: frame 0x181, float32 N·m, counter, sync bit."""
+"""The default description: frame 0x181, float32 in N·m, counter, sync bit."""
 
 
 def load(dbc: str) -> Database:
@@ -25,7 +25,7 @@ def load(dbc: str) -> Database:
     Raises
     ------
     ConfigError
-        Not there, or no DBC.
+        Missing, or not a DBC file.
     """
     try:
         if "/" not in dbc and not dbc.endswith(".dbc"):
@@ -34,7 +34,7 @@ def load(dbc: str) -> Database:
             text = Path(dbc).read_text("cp1252")
         database = cantools.database.load_string(text, "dbc")
     except OSError:
-        raise ConfigError(f"dbc: no file {dbc!r}; give the path of a .dbc file or {PACKAGED!r}") from None
+        raise ConfigError(f"dbc: there is no file {dbc!r}; give the path of a .dbc file or {PACKAGED!r}") from None
     except Exception as error:
         line = " ".join(str(error).split())
         raise ConfigError(f"dbc: {dbc} is not a DBC file that can be read: {line}") from None
@@ -53,7 +53,7 @@ def _choose(kind: str, name: str, known: Sequence[str], place: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class FrameSamples:
-    """What one frame carries: one or more torque values in the signal's unit, counter or −1, sync or 255."""
+    """Content of one frame: torque values in the signal's unit, counter (−1: none), sync (255: none)."""
 
     values: tuple[float, ...]
     counter: int
@@ -61,23 +61,23 @@ class FrameSamples:
 
 
 class TorqueFrame:
-    """Decoder of the one message that carries torque.
+    """Decoder of the message that contains the torque.
 
     Parameters
     ----------
     dbc
         Path of a DBC file or the name of a packaged one.
     message
-        Name of the message; None: the first that has the signal.
+        Name of the message; None: the first one with the signal.
     signals
-        Names of the signals that carry torque, in the order of time (several: a multi-sample frame).
+        Names of the torque signals, in order of time (several if a frame contains several samples).
     counter, sync
-        Names of the counter's and the sync line's signals, None where there is none.
+        Names of the signals of counter and sync line; None if there is none.
 
     Raises
     ------
     ConfigError
-        A message or signal that the file does not have; the line names those that it has.
+        The file lacks the message or signal; the message lists those that it has.
     """
 
     def __init__(
@@ -109,7 +109,7 @@ class TorqueFrame:
 
     @property
     def samples_per_frame(self) -> int:
-        """How many torque samples each frame carries."""
+        """Number of torque samples per frame."""
         return len(self._signals)
 
     def decode(self, data: bytes) -> FrameSamples:
@@ -123,7 +123,7 @@ class TorqueFrame:
         try:
             values = cast(
                 "dict[str, float]",
-                # a shorter frame may carry fewer samples; what this rig needs must be there all the same
+                # a frame may be shorter than described, but the signals needed here must be in it
                 self.message.decode(data, decode_choices=False, scaling=True, allow_truncated=True),
             )
             return FrameSamples(

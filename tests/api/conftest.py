@@ -16,9 +16,9 @@ import httpx
 import pytest
 import uvicorn
 
-from api import visitors
-from api.app import create_app
 from api.settings import Settings
+from api.web import connections
+from api.web.app import create_app
 from tests.api.fake_rig import FakeRig, RigThread
 
 TOKEN = "administrator-token-of-the-tests"
@@ -54,7 +54,7 @@ class Server:
     """uvicorn in a thread."""
 
     def __init__(self, app: Any, http: Any = None) -> None:
-        http = http or visitors.protocol()
+        http = http or connections.protocol()
         self.server = uvicorn.Server(uvicorn.Config(app, port=0, log_level="warning", ws_ping_interval=None, http=http))
 
     def __enter__(self) -> str:

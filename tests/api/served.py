@@ -1,11 +1,11 @@
-"""`api.server` as a process, with the stub worker in identify's place: starts quickly, to be killed and begun anew."""
+"""`api.web.server` as a process, with a stub worker instead of identify: it starts quickly and can be killed."""
 
 from __future__ import annotations
 
 import sys
 from functools import partial
 
-from api import server
+from api.web import server
 from tests.api.conftest import STUB
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""A worker that speaks the protocol of `api.worker` but fits nothing: quick, and slow when asked to be."""
+"""A worker that speaks the protocol of `api.workers.child` but fits nothing: quick, and slow when asked to be."""
 
 from __future__ import annotations
 
@@ -136,11 +136,11 @@ def answer(verb: str, arguments: dict[str, Any], say: Any) -> dict[str, Any]:
         Path(arguments["out"]).write_text("time_s,pulse_width_us,torque_nm,segment\n0.0,0.0,0.0,rest\n")
         return {"result": {"rows": 1}}
     if verb == "find_recording":
-        from api.jobs import find_recording
+        from api.workers.verbs import find_recording
 
         return {"result": find_recording(lambda *_: None, **arguments)}
     if verb == "recorded":
-        from api.recorded import recorded
+        from api.workers.recorded_signals import recorded
 
         return {"result": recorded(progress=lambda *_: None, **arguments)}
     return {"result": {}}
@@ -150,6 +150,6 @@ for line in sys.stdin:
     request = json.loads(line)
 
     def say(**fields: Any) -> None:
-        print(json.dumps({"job": request["job"], **fields}), flush=True)  # noqa: B023
+        print(json.dumps({"call": request["call"], **fields}), flush=True)  # noqa: B023
 
     say(**answer(request["verb"], request["arguments"], say))

@@ -11,9 +11,9 @@ from typing import Any
 import httpx
 import pytest
 
-from api.auth import Principal
 from api.clock import Clock
-from api.questions import LIFE_S, MOST, Question, Questions
+from api.people.auth import Principal
+from api.sessions.questions import LIFE_S, MOST, Question, Questions
 from rig import messages as m
 from tests.api.conftest import Service, run_test, wait_done
 from tests.api.test_access import csrf, signed_in
@@ -73,7 +73,7 @@ def test_start_shows_who_and_how_much_and_plays_nothing(tab: httpx.Client, servi
     assert re.fullmatch(r"\d+ pulses, \d\.\d\d mC", told["Dose"]) and "FAKE P24" in told["Rig"]
     assert told["Calibration"] == "not calibrated"
     assert re.search(r'class="stimulate big" data-needs-ready[^>]*>Start now: 20 mA, 300 µs<', page)
-    assert service.rig.starts == 0 and service.app.state.context.trials.current is None
+    assert service.rig.starts == 0 and service.app.state.context.runner.current is None
 
 
 def test_who_calibrated_and_until_when_is_told(tab: httpx.Client, client: httpx.Client) -> None:
@@ -128,7 +128,7 @@ def test_limits_changed_meanwhile_are_not_played(tab: httpx.Client, client: http
     client.put("/v1/participants/P017/profile", json={"current_ma": 10})
     refused = yes(tab, question)
     assert refused.status_code == 409 and "limits of P017 were changed meanwhile" in refused.text
-    assert service.rig.starts == 0 and service.app.state.context.trials.current is None
+    assert service.rig.starts == 0 and service.app.state.context.runner.current is None
 
 
 def test_a_rig_set_up_anew_meanwhile_is_asked_about_again(
@@ -139,7 +139,7 @@ def test_a_rig_set_up_anew_meanwhile_is_asked_about_again(
     monkeypatch.setattr(service.rig, "_widths", lambda _plan: ([*widths, 300.0], segments))
     refused = yes(tab, question)
     assert refused.status_code == 409 and "would now play something else" in refused.text
-    assert service.rig.starts == 0 and service.app.state.context.trials.current is None
+    assert service.rig.starts == 0 and service.app.state.context.runner.current is None
 
 
 def test_a_rig_that_asks_for_a_calibration_offers_that_first(
@@ -203,11 +203,11 @@ def test_many_questions_of_one_drop_no_one_elses() -> None:
     questions = Questions(SetClock())
     ada, ben = (Principal(name, frozenset(), csrf=name) for name in ("Ada", "Ben"))
 
-    async def deed() -> str:
+    async def action() -> str:
         return "/done"
 
     def of(who: Principal) -> str:
-        address = questions.ask(Question("P1", "Yes?", "Yes", deed), who)
+        address = questions.ask(Question("P1", "Yes?", "Yes", action), who)
         return address.split("/")[-1]
 
     first, own = of(ben), [of(ada) for _ in range(3 * MOST)]
@@ -221,12 +221,12 @@ def test_a_deed_that_failed_is_not_done_again() -> None:
     questions, done = Questions(SetClock()), []
     who = Principal("Ada", frozenset(), csrf="x")
 
-    async def deed() -> str:
+    async def action() -> str:
         done.append(1)
         raise RuntimeError("no")
 
     async def twice() -> list[Any]:
-        number = questions.ask(Question("P1", "Yes?", "Yes", deed), who).split("/")[-1]
+        number = questions.ask(Question("P1", "Yes?", "Yes", action), who).split("/")[-1]
         question = questions.find("P1", number, who)
         return await asyncio.gather(questions.yes(question), questions.yes(question), return_exceptions=True)
 

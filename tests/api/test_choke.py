@@ -16,10 +16,10 @@ from urllib.parse import urlsplit
 import httpx
 import pytest
 
-from api import body_limit, visitors
 from api.errors import ApiError
-from api.rig_client import LONGEST_LINE, line_of
+from api.sessions.rig_client import LONGEST_LINE, line_of
 from api.store.tables import AuditEntry
+from api.web import body_limit, connections
 from rig.messages import PreviewRequest, Profile, SegmentPlan, TestPlan
 from tests.api.conftest import Server, Service
 
@@ -76,7 +76,7 @@ def stops_noted(store: Any) -> list[str]:
 @pytest.fixture
 def patient_door(monkeypatch: pytest.MonkeyPatch) -> None:
     """Who says nothing is let go for the crowd alone: on a busy machine its time would be over in the test."""
-    monkeypatch.setattr(visitors, "protocol", partial(visitors.protocol, request_s=600.0))
+    monkeypatch.setattr(connections, "protocol", partial(connections.protocol, request_s=600.0))
 
 
 @pytest.mark.usefixtures("patient_door")
@@ -94,7 +94,7 @@ def test_a_stop_gets_in_past_a_crowd_that_says_nothing(service: Service, client:
 
 
 def test_who_says_nothing_is_let_go_after_a_while(service: Service):
-    with Server(service.app, http=visitors.protocol(request_s=2.0)) as url:
+    with Server(service.app, http=connections.protocol(request_s=2.0)) as url:
         first, second = connect(url), connect(url, b"GET /health HTTP/1.1\r\nHost: x\r\n\r\n")
         assert second.recv(12) == b"HTTP/1.1 200"
         with contextlib.suppress(ConnectionError):  # no TimeoutError: that would be a door kept open
@@ -110,7 +110,7 @@ def test_a_pipelined_request_that_is_being_served_is_not_cut_off():
             await send({"type": "http.response.start", "status": 200, "headers": [(b"content-length", b"0")]})
             await send({"type": "http.response.body"})
 
-    with Server(app, http=visitors.protocol(request_s=0.2)) as url:
+    with Server(app, http=connections.protocol(request_s=0.2)) as url:
         two = connect(url, b"".join(b"GET %s HTTP/1.1\r\nHost: x\r\n\r\n" % path for path in (b"/quick", b"/slow")))
         said = b""
         with contextlib.suppress(ConnectionResetError):
@@ -137,7 +137,7 @@ def test_too_many_previews_at_once_are_refused_before_they_are_read(
         await asyncio.to_thread(go_on.wait, 120)
         return {"duration_s": 1.0}
 
-    monkeypatch.setattr(service.app.state.context.trials, "preview", slow)
+    monkeypatch.setattr(service.app.state.context.runner, "preview", slow)
     with ThreadPoolExecutor(1) as pool:
         first = pool.submit(client.post, "/v1/preview", json={"participant": participant})
         assert asked.wait(60)

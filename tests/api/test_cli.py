@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from api import cli, terminal
+from api.cli import main, terminal
 from tests.api.test_worker import made_up_csv
 
 GOOD = ["time_s,pulse_width_us,torque_nm,segment"] + [
@@ -31,13 +31,13 @@ def record(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def model(record: Path) -> Path:
     path = record.parent / "MODEL.json"
-    assert cli.run(["fit", str(record), "-o", str(path)]) == 0
+    assert main.run(["fit", str(record), "-o", str(path)]) == 0
     return path
 
 
 def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
     capsys.readouterr()
-    code = cli.run(list(arguments))
+    code = main.run(list(arguments))
     out, err = capsys.readouterr()
     return code, out, err
 
@@ -155,7 +155,7 @@ def test_a_model_that_cannot_be_criticised_on_this_record_is_refused(
     other.write_text(json.dumps({**json.loads(model.read_text()), "pulse_rate_hz": 25.0}))
     words = refused(capsys, verb, str(record), "--model", str(other))
     assert "other.json" in words and "25 pulses a second" in words
-    assert cli.run(["fit", str(record), "--method", "narx", "-o", str(boxes)]) == 0
+    assert main.run(["fit", str(record), "--method", "narx", "-o", str(boxes)]) == 0
     assert "effects do not stand on a model of narx" in refused(capsys, verb, str(record), "--model", str(boxes))
 
 
@@ -163,7 +163,7 @@ def test_progress_tells_share_and_time_left_after_a_second(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now_s = [0.0]
-    monkeypatch.setattr("api.terminal.time.monotonic", lambda: now_s[0])
+    monkeypatch.setattr("api.cli.terminal.time.monotonic", lambda: now_s[0])
     monkeypatch.setattr("sys.stderr.isatty", lambda: True)
     progress = terminal.progress_line()
     for now_s[0], share in ((0.9, 0.1), (10.0, 0.25), (20.0, 0.02), (100.0, 0.5), (110.0, 1.0)):
@@ -217,12 +217,12 @@ def test_emulate_hands_everything_on() -> None:
 
 @pytest.mark.parametrize("given", [[], ["audit"]])
 def test_without_a_verb_the_help_is_told_line_by_line(given, capsys):
-    assert cli.run(given) == 2
+    assert main.run(given) == 2
     told = capsys.readouterr().err
     assert told.startswith("Usage:") and len(told.splitlines()) > 6
 
 
 def test_a_verb_does_not_wait_for_the_libraries_of_others():
-    code = "import sys; from api.cli import build; build('diagnose'); print('sqlalchemy' in sys.modules)"
+    code = "import sys; from api.cli.main import build; build('diagnose'); print('sqlalchemy' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"

@@ -132,8 +132,8 @@ def test_a_reader_sees_no_deeds_and_may_stop(blank: Any, service: Service) -> No
     assert blank.get_by_text("Nothing to see here").is_visible() and blank.get_by_text("C4").count() == 0
     blank.goto(f"{service.url}/models/{model}")
     blank.get_by_text("A clinician approves or rejects it.").wait_for()
-    for deed in ("Approve", "Reject", "Improve", "Add this effect", "Run it now", "Undo"):
-        assert blank.get_by_role("button", name=deed).count() == 0, deed
+    for action in ("Approve", "Reject", "Improve", "Add this effect", "Run it now", "Undo"):
+        assert blank.get_by_role("button", name=action).count() == 0, action
     blank.goto(f"{service.url}/administration")
     blank.get_by_role("heading", name="Not allowed").wait_for()
     blank.get_by_role("button", name="Stop stimulation").click()
@@ -158,9 +158,9 @@ def test_an_administrator_adds_a_clinician_and_a_key_by_clicking(blank: Any, ser
     assert blank.get_by_text("The chain of hashes is whole").is_visible()
     with blank.expect_download() as caught:
         blank.get_by_role("link", name="Export all").click()
-    from api import cli
+    from api.cli import main
 
-    assert cli.run(["audit", "verify", "--file", str(caught.value.path())]) == 0
+    assert main.run(["audit", "verify", "--file", str(caught.value.path())]) == 0
     blank.get_by_role("button", name=re.compile("Revoke the token of ilc")).first.click()
     blank.get_by_text("revoked").first.wait_for()
     with service.client(key) as controller:

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 import identify
-from api import reading
-from api.commands.diagnose import effect_lines
-from api.pages import why
-from api.pages.environment import environment
+from api.cli.commands.diagnose import effect_lines
+from api.models import explanation, summary
+from api.web.pages.environment import environment
 from tests.identify import hidden_muscles
 
 PULLS = "as the muscle pulls"
@@ -46,17 +45,17 @@ def test_the_diagnosis_tells_it_too_in_a_terminal_and_on_the_page() -> None:
     entry = next(entry for entry in missing if entry["effect"] == "baseline_drift")
     assert any(line.endswith(PULLS) for line in effect_lines(entry))
     effect = environment.get_template("why.html").make_module().effect  # type: ignore[attr-defined]
-    assert PULLS in effect(why.card(entry, {}), 1, {})
+    assert PULLS in effect(explanation.card(entry, {}), 1, {})
     upright = identify.diagnose(drifting(1)).missing[0]
-    assert PULLS not in effect(why.card(upright, {}), 1, {})
+    assert PULLS not in effect(explanation.card(upright, {}), 1, {})
 
 
 def test_threshold_plateau_and_validity_are_those_of_the_same_cell_mounted_upright() -> None:
     record = hidden_muscles.record("fatigue", seed=5)
     upright, inverted = (identify.fit(record.with_torque(12 + sign * record.torque_nm)).to_dict() for sign in (1, -1))
-    one, other = reading.recruitment(upright), reading.recruitment(inverted)
+    one, other = summary.recruitment(upright), summary.recruitment(inverted)
     assert one["threshold_us"] == pytest.approx(other["threshold_us"], abs=1)
     assert one["saturation_us"] == pytest.approx(other["saturation_us"], abs=1)
     assert one["plateau_nm"] is not None and one["plateau_nm"] > 1
     assert other["plateau_nm"] == pytest.approx(-one["plateau_nm"], rel=0.01)
-    assert "torques up to" in str(reading.validity(upright)) and "torques down to -" in str(reading.validity(inverted))
+    assert "torques up to" in str(summary.validity(upright)) and "torques down to -" in str(summary.validity(inverted))

@@ -12,8 +12,8 @@ from pathlib import Path
 import httpx
 import pytest
 
-from api import cli, doctor
-from api.doctor import Finding, examine
+from api.cli import doctor, main
+from api.cli.doctor import Finding, examine
 from api.logs import JsonLines
 from api.settings import Settings
 from tests.api.conftest import Service, run_test
@@ -40,7 +40,7 @@ def finding(name: str, **settings: object) -> Finding:
 
 
 def test_sound_machine_exits_0_and_one_json_object(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.run(["doctor", "--data", str(tmp_path), "--rig", str(rig_file(tmp_path)), "--json"]) == 0
+    assert main.run(["doctor", "--data", str(tmp_path), "--rig", str(rig_file(tmp_path)), "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     verdicts = {found["check"]: found["verdict"] for found in report["findings"]}
     assert verdicts["rig file"] == verdicts["stimulator"] == verdicts["load cell"] == "ok"
@@ -60,7 +60,7 @@ def test_sound_machine_exits_0_and_one_json_object(tmp_path: Path, capsys: pytes
 
 def test_missing_devices_exit_1_with_the_mend(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = rig_file(tmp_path, port=str(tmp_path / "not-there"), interface="socketcan", channel="can77")
-    assert cli.run(["doctor", "--data", str(tmp_path), "--rig", str(path)]) == 1
+    assert main.run(["doctor", "--data", str(tmp_path), "--rig", str(path)]) == 1
     out = capsys.readouterr().out
     assert "not-there is not there" in out and "plug it in" in out
     assert "there is no interface can77" in out and "stimrig-can@can77" in out

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 import identify
-from api.fitting import WORKER
-from api.jobs import curves
-from api.pages import charts, directions
-from api.pages.drawing import svg, ticks
+from api.charts import model_charts, ramp_directions
+from api.charts.svg import svg, ticks
+from api.workers.pool import WORKER
+from api.workers.verbs import curves
 from tests.api.conftest import run_service, run_test
 from tests.api.fake_rig import default_widths, muscle
 
@@ -88,9 +88,9 @@ def distance(found: dict[str, Any]) -> float:
 
 def test_both_directions_of_the_ramp_lie_on_the_curve_of_a_muscle_without_hysteresis() -> None:
     document, drawn = measured()
-    found = directions.seen(document, drawn)
+    found = ramp_directions.seen(document, drawn)
     for points in found.values():
-        curve = [directions.on(document["recruitment"], width) for width in points["pulse_width_us"]]
+        curve = [ramp_directions.on(document["recruitment"], width) for width in points["pulse_width_us"]]
         assert np.abs(np.array(points["torque_nm"]) - curve).max() < 0.12
     assert abs(distance(found)) < 0.06
 
@@ -104,22 +104,22 @@ def test_a_muscle_with_hysteresis_shows_two_curves() -> None:
         return np.where(ramp & (falls > 0), 0.8, 0.0)
 
     document, drawn = measured(lag)
-    found = directions.seen(document, drawn)
+    found = ramp_directions.seen(document, drawn)
     assert distance(found) > 0.2, "less than the 0.8 N·m put in: the fitted lag takes a part of it upon itself"
-    figure = charts.recruitment(document, drawn)
+    figure = model_charts.recruitment(document, drawn)
     assert {"ramp up", "ramp down"} <= {trace["name"] for trace in figure["data"]}
 
 
 def test_a_recording_without_a_ramp_has_no_directions() -> None:
     document, drawn = measured()
     still = {**drawn, "pulse_width_us": [0.0, 200.0] * (len(drawn["time_s"]) // 2), "time_s": drawn["time_s"]}
-    assert directions.seen(document, still) == {}
-    assert directions.seen(document, {**drawn, "time_s": [0.0]}) == {}
+    assert ramp_directions.seen(document, still) == {}
+    assert ramp_directions.seen(document, {**drawn, "time_s": [0.0]}) == {}
 
 
 def test_still_pictures_are_whole_svg_with_the_values_in_their_place() -> None:
     document, drawn = measured()
-    for name, figure in charts.of_model(document, drawn).items():
+    for name, figure in model_charts.of_model(document, drawn).items():
         picture = ElementTree.fromstring(str(svg(figure, 600.0, label=f"<{name}> & more")))
         texts = {text.text for text in picture.iter("{http://www.w3.org/2000/svg}text")}
         assert figure["layout"]["xaxis"]["title"]["text"] in texts

@@ -12,13 +12,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from api.pages import typed
+from api.web.pages import typed
 from tests.api.conftest import Service
 from tests.api.test_access import csrf, signed_in
 from tests.api.test_profiles import calibrate, limits
 
 PAGE = "/participants/P017"
-PAGES = Path(__file__).parents[2] / "api" / "pages"
+PAGES = Path(__file__).parents[2] / "api" / "web" / "pages"
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from api.fitting import WORKER
+from api.workers.pool import WORKER
 from tests.api.browser import PASSWORD, participant
 from tests.api.conftest import Service, run_service
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import httpx
 
-from api.launcher import Child
+from api.cli.launcher import Child
 from tests.api.conftest import TOKEN, wait_done
 
 ROOT = Path(__file__).parents[2]
@@ -63,12 +63,12 @@ def busy_clinic(url: str, seed: int, kept: Acknowledged, ended: threading.Event)
     with httpx.Client(base_url=url, headers=AUTHORIZED, timeout=60) as http:
         while not ended.is_set():
             try:
-                deed(http, rng, kept)
+                action(http, rng, kept)
             except httpx.HTTPError:
                 return
 
 
-def deed(http: httpx.Client, rng: random.Random, kept: Acknowledged) -> None:
+def action(http: httpx.Client, rng: random.Random, kept: Acknowledged) -> None:
     code = f"P{rng.randrange(10**9)}"
     if http.post("/v1/participants", json={"code": code}).status_code == 201:
         kept.participants.add(code)

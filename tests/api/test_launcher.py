@@ -13,8 +13,9 @@ from pathlib import Path
 import httpx
 import pytest
 
-from api.launcher import LaunchError, Services
-from api.session import run_test
+from api.cli.errors import LaunchError
+from api.cli.launcher import Services
+from api.cli.rest_session import run_test
 from api.settings import Settings
 from tests.api.conftest import TOKEN
 
@@ -168,7 +169,7 @@ def test_taken_port_is_one_line(tmp_path: Path) -> None:
         second.port = taken.getsockname()[1]
         with pytest.raises(LaunchError, match="another port") as caught, Services(second, [], TOKEN):
             pass
-    assert caught.value.code == 2
+    assert caught.value.exit_code == 2
 
 
 def test_ending_the_service_in_a_test_stops_it_and_keeps_its_record(tmp_path: Path) -> None:

@@ -27,13 +27,13 @@ def test_an_end_that_was_never_told_is_found_by_asking(
 
 
 def test_a_failure_in_the_link_does_not_end_it(client: httpx.Client, service: Service, participant: str) -> None:
-    """Events are taken by listeners; an unforeseen error in one of them must cost one connection at most."""
+    """Events are taken by listeners; an unexpected error in one of them must cost one connection at most."""
     failures = []
 
     def once(_event: Any) -> None:
         if not failures:
             failures.append("first event")
-            raise RuntimeError("unforeseen")
+            raise RuntimeError("unexpected")
 
     service.app.state.context.rig.listeners.insert(0, once)
     assert run_test(client, participant)["state"] == "completed"
@@ -45,7 +45,7 @@ def test_a_failure_in_a_poll_does_not_end_the_polling(client: httpx.Client, serv
 
     def always(_status: Any) -> None:
         calls.append(time.monotonic())
-        raise RuntimeError("unforeseen")
+        raise RuntimeError("unexpected")
 
     rig.poll_listeners.insert(0, always)
     end = time.monotonic() + 20

@@ -79,7 +79,7 @@ def test_the_service_says_so_in_one_line_and_ends(tmp_path: Path) -> None:
     Store(f"sqlite:///{path}").close()
     change(path, f"INSERT INTO schema_version VALUES ({migrations.VERSION + 1})")
     environment = {**os.environ, "STIMRIG_DATA_DIR": str(tmp_path), "STIMRIG_PORT": "0"}
-    command = [sys.executable, "-m", "api.server"]
+    command = [sys.executable, "-m", "api.web.server"]
     done = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True, timeout=60)
     lines = [line for line in done.stderr.splitlines() if not line.startswith("{")]
     assert done.returncode == 2 and len(lines) == 1 and f"version {migrations.VERSION + 1}" in lines[0], done.stderr

@@ -9,8 +9,8 @@ import httpx
 import pytest
 
 from api.errors import ApiError
-from api.narrowing import limits_of
-from api.schemas import ProfileIn, TestIn
+from api.sessions.limits import limits_of
+from api.sessions.requests import ProfileIn, TestIn
 from tests.api.conftest import Service, wait_done
 from tests.api.test_problems import problem
 

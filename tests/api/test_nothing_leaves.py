@@ -11,10 +11,10 @@ from urllib.parse import urlsplit
 import pytest
 
 import identify
-from api import notebook
-from api.jobs import curves, thinned
-from api.pages.chart_config import CHART_CONFIG
-from api.report import comparison_html, improvement_html
+from api.charts import notebook
+from api.charts.config import CHART_CONFIG
+from api.web.pages.report_file import comparison_html, improvement_html
+from api.workers.verbs import curves, thinned
 from tests.api.browser import open_tab
 from tests.api.conftest import STUB, Service, run_service, run_test
 from tests.api.test_worker import made_up_csv

@@ -17,11 +17,12 @@ from typing import Any
 import httpx
 import pytest
 
-from api import cli, lock
-from api.launcher import LaunchError, Services
-from api.lock import HeldError, ServiceLock
+from api.cli import main
+from api.cli.errors import LaunchError
+from api.cli.launcher import Services
 from api.settings import Settings
-from api.store import Store
+from api.store import Store, lock
+from api.store.lock import HeldError, ServiceLock
 from tests.api.conftest import PATIENCE_S, TOKEN, Service, run_test
 
 ROOT = Path(__file__).parents[2]
@@ -54,7 +55,7 @@ def test_a_second_service_is_told_who_holds_the_data_and_a_kill_lets_go(tmp_path
             (line,) = [line for line in done.stderr.splitlines() if not line.startswith("{")]
             assert done.returncode == 2 and done.stdout == ""
             assert f"process {first.pid} on {socket.gethostname()}, since 20" in line and f"at {url}; stop it" in line
-        assert cli.run(["audit", "verify", "--data", str(data)]) == 0, "who only reads is let in"
+        assert main.run(["audit", "verify", "--data", str(data)]) == 0, "who only reads is let in"
         http = httpx.Client(base_url=url, headers={"Authorization": f"Bearer {TOKEN}"}, timeout=PATIENCE_S)
         assert http.post("/v1/participants", json={"code": "P1"}).status_code == 201, "the first works on"
         first.send_signal(signal.SIGKILL)
@@ -118,8 +119,8 @@ def test_serve_says_so_before_it_starts_a_rig(tmp_path: Path) -> None:
 
 
 def test_a_service_that_does_not_come_up_lets_go(tmp_path: Path) -> None:
-    from api.context import build
     from api.errors import ApiError
+    from api.web.dependencies import build
 
     (tmp_path / "stimrig.db").write_bytes(b"not a database at all" * 100)
     with pytest.raises(ApiError, match="does not open"):

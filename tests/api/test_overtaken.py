@@ -10,7 +10,7 @@ from typing import Any
 import httpx
 import pytest
 
-from api import trials
+from api.sessions import runner
 from tests.api.conftest import Service
 
 
@@ -19,7 +19,7 @@ class Held:
 
     def __init__(self, service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
         self.reached, self.free = threading.Event(), threading.Event()
-        target = service.app.state.context.trials
+        target = service.app.state.context.runner
         write = target._write_intent
 
         def slowly(*arguments: Any) -> Any:
@@ -72,7 +72,7 @@ def test_limits_lowered_while_a_start_is_on_its_way_are_not_passed_by(
 def test_a_start_that_took_too_long_is_not_played_any_more(
     client: httpx.Client, service: Service, participant: str, held: Held, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(trials, "START_S", 0.0)
+    monkeypatch.setattr(runner, "START_S", 0.0)
     with ThreadPoolExecutor(1) as pool:
         asked = held.start(pool, client, participant)
         held.free.set()

@@ -13,8 +13,8 @@ import pytest
 
 from api.clock import Clock
 from api.errors import ApiError
-from api.pace import FORGOTTEN_S, FREE_FOR_A_NAME, FREE_TRIES, LONGEST_WAIT_S, Guesses, Pace, place_of
-from api.passwords import MOST_STRANGERS, Passwords
+from api.people.pace import FORGOTTEN_S, FREE_FOR_A_NAME, FREE_TRIES, LONGEST_WAIT_S, Guesses, Pace, place_of
+from api.people.passwords import MOST_STRANGERS, Passwords
 from tests.api.conftest import TOKEN, Service, run_test
 from tests.api.test_people import PASSWORD, SetClock, standing_still
 

@@ -11,7 +11,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from api import pages
+from api.web import pages
 from tests.api.browser import NARROW, PASSWORD, PHONE, WIDE, open_tab, painted_soon, participant, say_yes, start
 from tests.api.conftest import STUB, Service, run_service, run_test
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from fastapi.routing import APIRoute
 
-from api import pages
+from api.web import pages
 from tests.api.conftest import STUB, TOKEN, Service, run_service, run_test
 
 HTML = {"Accept": "text/html"}

@@ -13,12 +13,13 @@ import httpx
 import pytest
 from fastapi.routing import APIRoute
 
-from api import cli, pages, routes
-from api.auth import Scope
+from api.cli import main
 from api.clock import Clock
-from api.pace import Pace
-from api.server import configuration, loopback, refuse_open_door
+from api.people.auth import Scope
+from api.people.pace import Pace
 from api.settings import Settings
+from api.web import pages, routes
+from api.web.server import configuration, loopback, refuse_open_door
 from tests.api.conftest import PATIENCE_S, Service, run_test
 
 PASSWORD = "correct horse battery"
@@ -255,11 +256,11 @@ def test_audit_is_verified_and_exported_by_a_command(
     data, out = str(service.data), tmp_path / "trail.jsonl"
     for number in range(3):
         service.token(f"more {number}", "read-live")
-    assert cli.run(["audit", "verify", "--data", data, "--json"]) == 0
+    assert main.run(["audit", "verify", "--data", data, "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["whole"] and found["entries"] >= 2
-    assert cli.run(["audit", "export", "--data", data, "-o", str(out)]) == 0
-    assert cli.run(["audit", "verify", "--file", str(out), "--head", found["head"]]) == 0
+    assert main.run(["audit", "export", "--data", data, "-o", str(out)]) == 0
+    assert main.run(["audit", "verify", "--file", str(out), "--head", found["head"]]) == 0
     lines = out.read_text().splitlines()
     for tampered in (
         lines[:1] + lines[2:],
@@ -267,12 +268,12 @@ def test_audit_is_verified_and_exported_by_a_command(
         [lines[1], lines[0]],
     ):
         out.write_text("\n".join(tampered) + "\n")
-        assert cli.run(["audit", "verify", "--file", str(out)]) == 1
+        assert main.run(["audit", "verify", "--file", str(out)]) == 1
     out.write_text(lines[0] + "\n")
-    assert cli.run(["audit", "verify", "--file", str(out), "--head", found["head"]]) == 1, "a cut end is found"
+    assert main.run(["audit", "verify", "--file", str(out), "--head", found["head"]]) == 1, "a cut end is found"
     with sqlite3.connect(service.data / "stimrig.db") as database:
         database.execute("UPDATE audit SET who = 'somebody else' WHERE seq = 2")
     capsys.readouterr()
-    assert cli.run(["audit", "verify", "--data", data]) == 1
+    assert main.run(["audit", "verify", "--data", data]) == 1
     assert "broken at entry 2" in capsys.readouterr().out
-    assert cli.run(["audit", "verify", "--data", str(tmp_path / "nowhere")]) == 2
+    assert main.run(["audit", "verify", "--data", str(tmp_path / "nowhere")]) == 2

@@ -9,7 +9,7 @@ import httpx
 import numpy as np
 import pytest
 
-from api.fitting import WORKER
+from api.workers.pool import WORKER
 from tests.api.conftest import run_service
 from tests.api.fake_rig import muscle
 from tests.api.test_worker import made_up_csv

@@ -9,7 +9,7 @@ from typing import Any
 import httpx
 import pytest
 
-from api import profiles
+from api.sessions import profiles
 from tests.api.conftest import Service
 from tests.api.test_problems import problem
 

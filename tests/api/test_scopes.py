@@ -10,8 +10,8 @@ import httpx
 import pytest
 from fastapi.routing import APIRoute
 
-from api import pages, routes
-from api.auth import Scope
+from api.people.auth import Scope
+from api.web import pages, routes
 from tests.api.conftest import STUB, TOKEN, Service, run_service, run_test
 
 SCOPES = ("read-live", "run-test", "rearm", "approve-model", "read-model", "administer")
@@ -230,7 +230,7 @@ def test_what_goes_wrong_has_the_same_head(
     service: Service, client: httpx.Client, participant: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def broken() -> None:
-        raise RuntimeError("unforeseen")
+        raise RuntimeError("unexpected")
 
     monkeypatch.setattr(service.app.state.context.people, "public", broken)
     model = run_test(client, participant)

@@ -144,10 +144,10 @@ def test_comparison_and_diagnosis_are_made_once_and_kept(
     diagnosis = client.get(f"{model}/diagnosis").json()  # begun with the test's end: nothing else is made after it
     assert diagnosis["verdict"] == "effect_missing"
     comparison = client.get(f"{model}/comparison").json()
-    done = service.app.state.context.fitting.done_count
+    done = service.app.state.context.pool.done_count
     assert client.get(f"{model}/comparison").json() == comparison
     assert client.get(f"{model}/diagnosis").json() == diagnosis
-    assert service.app.state.context.fitting.done_count == done
+    assert service.app.state.context.pool.done_count == done
 
 
 def test_refused_plan_says_why_and_is_kept(client: httpx.Client, participant: str) -> None:

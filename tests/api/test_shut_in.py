@@ -17,15 +17,15 @@ from typing import Any
 import httpx
 import pytest
 
-from api import confinement
 from api.errors import ApiError
-from api.fitting import WORKER, Fitting
-from api.jobs import find_recording
-from api.worker_process import Places
+from api.workers import confinement
+from api.workers.pool import WORKER, Pool
+from api.workers.process import Places
+from api.workers.verbs import find_recording
 from bench import hostile_files, hostile_shapes
 from tests.api.conftest import STUB, Service, run_service
 from tests.api.test_problems import problem
-from tests.api.test_worker import made_up_csv, with_fitting
+from tests.api.test_worker import made_up_csv, with_pool
 
 SECRET = "the-administrators-token"
 ROOT = Path(__file__).parents[2]
@@ -65,14 +65,14 @@ def test_a_worker_has_no_secret_in_its_environment_and_is_bounded(monkeypatch: p
     for name in ("STIMRIG_ADMIN_TOKEN", "STIMRIG_DATABASE_URL", "SOME_PASSWORD"):
         monkeypatch.setenv(name, SECRET)
 
-    async def work(fitting: Fitting) -> tuple[str, str]:
-        await fitting.submit("effects").result
-        process = fitting.workers[0].process
+    async def work(pool: Pool) -> tuple[str, str]:
+        await pool.submit("effects").result
+        process = pool.workers[0].process
         assert process is not None
         folder = Path(f"/proc/{process.pid}")
         return (folder / "environ").read_bytes().decode(), (folder / "limits").read_text()
 
-    environment, limits = with_fitting(work, command=WORKER)
+    environment, limits = with_pool(work, command=WORKER)
     assert SECRET not in environment and "STIMRIG_ADMIN" not in environment
     bounds = {line[:26].strip(): line[26:].split()[0] for line in limits.splitlines()}
     assert int(bounds["Max address space"]) == confinement.MEMORY_BYTES
@@ -109,7 +109,9 @@ attempt('memory', lambda: bytearray({confinement.MEMORY_BYTES}))
 
 
 def test_what_cannot_be_shut_is_said() -> None:
-    program = "import json, api.confinement as c\nc.LIBC = None\nc.FORBIDDEN = {}\nprint(json.dumps(c.confine()))"
+    program = (
+        "import json, api.workers.confinement as c\nc.LIBC = None\nc.FORBIDDEN = {}\nprint(json.dumps(c.confine()))"
+    )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, cwd=ROOT, timeout=120)
     assert set(json.loads(done.stdout)) == {"files", "network"}, done.stderr
 
@@ -119,12 +121,12 @@ def test_a_job_without_an_end_is_ended_by_its_processor_time() -> None:
     assert shut_in(code).returncode == -signal.SIGXCPU
     ends = (sys.executable, "-c", f"import os, sys; sys.stdin.readline(); os.kill(os.getpid(), {signal.SIGXCPU:d})")
 
-    async def work(fitting: Fitting) -> None:
+    async def work(pool: Pool) -> None:
         with pytest.raises(ApiError, match="was ended after 300 s") as caught:
-            await fitting.submit("fit", data="x").result
+            await pool.submit("fit", data="x").result
         assert caught.value.status == 422
 
-    with_fitting(work, command=ends)
+    with_pool(work, command=ends)
 
 
 def test_a_recording_in_a_folder_not_known_yet_is_read_by_a_fresh_worker(tmp_path: Path) -> None:
@@ -134,15 +136,15 @@ def test_a_recording_in_a_folder_not_known_yet_is_read_by_a_fresh_worker(tmp_pat
         made_up_csv(folder / "good.csv")
 
     async def run() -> list[int]:
-        fitting, pids = Fitting(1, places=Places([first])), []
+        pool, pids = Pool(1, places=Places([first])), []
         try:
             for folder in (first, second, first):
-                await fitting.submit("fit", data=str(folder / "good.csv")).result
-                process = fitting.workers[0].process
+                await pool.submit("fit", data=str(folder / "good.csv")).result
+                process = pool.workers[0].process
                 assert process is not None
                 pids.append(process.pid)
         finally:
-            await fitting.close()
+            await pool.close()
         return pids
 
     pids = asyncio.run(run())
@@ -246,7 +248,7 @@ def test_a_row_that_is_not_written_leaves_no_file(
             def full(*_: object, **__: object) -> None:
                 raise OSError("disk full")
 
-            monkeypatch.setattr("api.routes.recordings.audit.write", full)
+            monkeypatch.setattr("api.web.routes.recordings.audit.write", full)
             assert client.post("/v1/participants/P017/recordings", content=b"a,b\n").status_code == 500
             monkeypatch.undo()
         assert not list((tmp_path / "recordings").rglob("upload-*"))

@@ -17,9 +17,9 @@ from typing import Any
 import httpx
 import pytest
 
-from api import cli, stop_key
-from api.commands import test as test_verb
-from api.stop_key import StopKey, at_rig, at_service
+from api.cli import main, stop_key
+from api.cli.commands import test as test_verb
+from api.cli.stop_key import StopKey, at_rig, at_service
 from tests.api.conftest import TOKEN, Service, wait_done
 from tests.api.fake_rig import RigThread
 
@@ -138,7 +138,7 @@ def test_stimrig_test_stops_on_a_key(
 
     pressed: list[int] = []
     monkeypatch.setattr(test_verb, "run_test", watched)
-    assert cli.run(["test", "--url", service.url, "--participant", "K1"]) == 1
+    assert main.run(["test", "--url", service.url, "--participant", "K1"]) == 1
     said = capsys.readouterr().err
     assert "any key stops the test" in said and "ended as stopped" in said and "any key" not in said.splitlines()[-1]
 
@@ -150,7 +150,7 @@ def test_stimrig_test_stops_on_a_key(
 def test_attaching_and_starting_a_rig_exclude_each_other(
     other: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert cli.run(["serve", "--rig-socket", "rig.sock", "--data", str(tmp_path / "data"), *other]) == 2
+    assert main.run(["serve", "--rig-socket", "rig.sock", "--data", str(tmp_path / "data"), *other]) == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and "--rig-socket rig.sock" in said and other[0] in said
     assert not (tmp_path / "data").exists()
@@ -158,7 +158,7 @@ def test_attaching_and_starting_a_rig_exclude_each_other(
 
 def test_no_rig_at_the_socket_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "none.sock"
-    assert cli.run(["serve", "--rig-socket", str(path), "--data", str(tmp_path / "data")]) == 2
+    assert main.run(["serve", "--rig-socket", str(path), "--data", str(tmp_path / "data")]) == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and str(path) in said and "python -m rig" in said
 

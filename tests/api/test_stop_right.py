@@ -13,10 +13,10 @@ import httpx
 import pytest
 from sqlalchemy.exc import OperationalError
 
-from api import private
-from api.auth import Scope
+from api import owner_only
 from api.clock import Clock
-from api.stop_right import RIGHT_S, StopRights
+from api.people.auth import Scope
+from api.sessions.stop_right import RIGHT_S, StopRights
 from tests.api.conftest import TOKEN, Service
 from tests.api.test_people import standing_still
 
@@ -190,7 +190,7 @@ def test_a_restart_of_the_service_keeps_the_rights_of_open_pages(service: Servic
     right = service.app.state.context.stop_rights.give("Ada", None)
     assert path.stat().st_mode & 0o777 == 0o600
     path.chmod(0o644)
-    assert StopRights(private.key(path), Clock()).holder(right) == "Ada"
+    assert StopRights(owner_only.key(path), Clock()).holder(right) == "Ada"
     assert path.stat().st_mode & 0o777 == 0o600
 
 
@@ -216,8 +216,8 @@ def test_a_right_token_stops_whatever_was_guessed_at_its_address(service: Servic
 
 
 def test_a_right_in_a_form_that_comes_slowly_is_waited_for(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("api.stop_right.PATIENCE_S", 0.01)
-    monkeypatch.setattr("api.stop_right.LONGEST_PATIENCE_S", 60.0, raising=False)
+    monkeypatch.setattr("api.web.stop_guard.PATIENCE_S", 0.01)
+    monkeypatch.setattr("api.web.stop_guard.LONGEST_PATIENCE_S", 60.0, raising=False)
     right = service.app.state.context.stop_rights.give("Ada", None)
     with slow_form(service, f"right={right}", "Cookie: stimrig_session=ended\r\n") as connection:
         connection.sendall(right[-1:].encode())
@@ -226,7 +226,7 @@ def test_a_right_in_a_form_that_comes_slowly_is_waited_for(service: Service, mon
 
 
 def test_a_stop_that_is_allowed_anyway_waits_for_no_form(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("api.stop_right.LONGEST_PATIENCE_S", 60.0)
+    monkeypatch.setattr("api.web.stop_guard.LONGEST_PATIENCE_S", 60.0)
     with slow_form(service, "reason=x", f"Authorization: Bearer {TOKEN}\r\n") as connection:
         assert connection.recv(12) == b"HTTP/1.1 200"
 

@@ -12,8 +12,8 @@ import h5py
 import numpy as np
 import pytest
 
-from api.pages import charts
-from api.recorded import recorded
+from api.charts import model_charts
+from api.workers.recorded_signals import recorded
 from tests.api.browser import participant, start
 from tests.api.conftest import STUB, Service, run_service
 
@@ -94,8 +94,8 @@ def test_no_peak_is_lost_and_a_dropped_pulse_is_a_gap(tmp_path: Path) -> None:
 def test_what_was_not_played_begins_where_the_pulses_end(tmp_path: Path, sent_us: list[float]) -> None:
     found = recorded(str(made_up(tmp_path / "r.h5", sent_us, 1.2 if sent_us else 0.0)), lambda *_: None)
     plan_us = [100.0] * 400
-    figure = charts.recorded(found, plan_us, 40.0, "stopped")
+    figure = model_charts.recorded(found, plan_us, 40.0, "stopped")
     (faint,) = [trace for trace in figure["data"] if trace["name"] == "planned, not played"]
-    assert faint["x"][0] == pytest.approx(len(sent_us) / 40) and faint["line"]["color"] == charts.FAINT
-    whole = charts.recorded(found, plan_us[: len(sent_us)], 40.0, "completed")
+    assert faint["x"][0] == pytest.approx(len(sent_us) / 40) and faint["line"]["color"] == model_charts.FAINT
+    whole = model_charts.recorded(found, plan_us[: len(sent_us)], 40.0, "completed")
     assert not [trace for trace in whole["data"] if trace["name"] == "planned, not played"]

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from api import cli
+from api.cli import main
 from api.settings import Settings
 from tests.api.conftest import STUB, Service, run_service, run_test
 from tests.api.test_access import csrf, signed_in
@@ -93,6 +93,6 @@ def test_unknown_effect_is_one_line_before_the_service_starts(
     assert done.returncode == 2 and done.stdout == ""
     assert line.startswith("stimrig: STIMRIG_STRUCTURE: no effect is called phlogiston. Take some of ")
     monkeypatch.setenv("STIMRIG_STRUCTURE", "Fatigue!")
-    assert cli.run(["serve", "--data", str(tmp_path)]) == 2
+    assert main.run(["serve", "--data", str(tmp_path)]) == 2
     err = capsys.readouterr().err
     assert err.count("\n") == 1 and "STIMRIG_STRUCTURE: Fatigue! is no effect's id" in err

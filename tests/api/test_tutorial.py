@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from api import notebook
+from api.charts import notebook
 
 ROOT = Path(__file__).parents[2]
 TEXT = (ROOT / "docs" / "tutorial.md").read_text("utf-8")

@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from api import cli, reading
-from api.versions import Versions
-from api.worker_process import WORKER
+from api.cli import main
+from api.models import summary
+from api.models.registry import Versions
+from api.workers.process import WORKER
 from tests.api.conftest import run_service
 from tests.harness.patients import Patient, make_record
 
@@ -36,7 +37,7 @@ def record_csv(path: Path, *, follows: bool, level: bool = False) -> Path:
 
 def said(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
     capsys.readouterr()
-    assert cli.run([str(argument) for argument in arguments]) == 0
+    assert main.run([str(argument) for argument in arguments]) == 0
     return capsys.readouterr().out
 
 
@@ -76,12 +77,12 @@ def test_level_held_out_torque_has_no_percent(
 ) -> None:
     data = record_csv(tmp_path / "level.csv", follows=True, level=True)
     printed, report = said(capsys, "fit", data, "-o", tmp_path / "MODEL.json"), tmp_path / "report.html"
-    assert f"held out       {reading.UNDEFINED}, rms" in printed
+    assert f"held out       {summary.UNDEFINED}, rms" in printed
     fit = json.loads((tmp_path / "MODEL.json").read_text())["fit"]
     assert fit["held_out_fit_percent"] is None and fit["held_out_ceiling_percent"] is None
     assert fit["held_out_rms_nm"] > 0
-    assert reading.UNDEFINED in said(capsys, "compare", tmp_path / "MODEL.json", data, "--html", report)
-    assert reading.UNDEFINED in report.read_text("utf-8")
+    assert summary.UNDEFINED in said(capsys, "compare", tmp_path / "MODEL.json", data, "--html", report)
+    assert summary.UNDEFINED in report.read_text("utf-8")
     for service in run_service(tmp_path / "service", short_dir, WORKER):
         with service.client() as client:
             client.post("/v1/participants", json={"code": "P1"})
@@ -92,7 +93,7 @@ def test_level_held_out_torque_has_no_percent(
             assert found["held_out_fit_percent"] is None and found["held_out_rms_nm"] > 0
             assert client.get(f"/v1/models/{found['id']}/comparison").status_code == 200
             for path in (f"/models/{found['id']}?diagnose=0", f"/models/{found['id']}/report"):
-                assert reading.UNDEFINED in client.get(path).text
+                assert summary.UNDEFINED in client.get(path).text
             assert client.get("/participants/P1").status_code == client.get("/").status_code == 200
 
 
@@ -112,7 +113,7 @@ def test_level_held_out_torque_has_no_percent(
 )
 def test_older_models_are_read(stored: dict[str, Any] | None, verdict: str, words: str) -> None:
     document = {"fit": {}} | ({} if stored is None else {"quality": stored})
-    found = reading.quality(document)
+    found = summary.quality(document)
     assert found["verdict"] == verdict and found["words"].startswith(words)
     row: Any = SimpleNamespace(fit={}, etag="1", document=json.dumps(document).encode())
     versions = Versions(None, None)  # pyright: ignore[reportArgumentType]

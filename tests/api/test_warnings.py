@@ -6,8 +6,8 @@ import json
 
 import httpx
 
-from api.report import comparison_html
-from api.session import report_lines
+from api.cli.rest_session import report_lines
+from api.web.pages.report_file import comparison_html
 from tests.api.conftest import Service, run_test
 
 WORDS = [

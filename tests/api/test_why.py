@@ -13,8 +13,7 @@ import h5py
 import httpx
 import pytest
 
-from api import evidence
-from api.pages import why
+from api.models import effect_evidence, explanation
 from tests.api.conftest import Service, run_test, wait_done
 from tests.api.test_access import HTML, csrf, signed_in
 
@@ -189,7 +188,7 @@ def test_diagnosis_kept_before_structures_were_told_is_read(client: httpx.Client
 
 def refusal(missing: list[dict[str, Any]], gains: list[list[tuple[str, float]]], effect: str) -> str | None:
     rounds = [[{"effect": name, "log_evidence_gain": gain} for name, gain in found] for found in gains]
-    return evidence.refusal({"missing": missing, "candidates": rounds}, [], effect)
+    return effect_evidence.refusal({"missing": missing, "candidates": rounds}, [], effect)
 
 
 def test_reasons_against_an_effect() -> None:
@@ -229,7 +228,7 @@ def test_experiment_joins_only_the_participants_own_model(client: httpx.Client, 
 
 def test_worker_joins_by_begin_and_leaves_a_file_with_the_parts(tmp_path: Path) -> None:
     import identify
-    from api import jobs, missing
+    from api.workers import diagnosis_verbs, verbs
     from tests.api.fake_rig import write_recording
 
     widths = [200.0 if index >= 40 and index // 20 % 2 else 0.0 for index in range(240)]
@@ -243,7 +242,7 @@ def test_worker_joins_by_begin_and_leaves_a_file_with_the_parts(tmp_path: Path) 
             file.attrs["created_utc"] = f"2026-01-01T00:{minute:02d}:00.250Z"
         paths.append(str(path))
     out, exported = tmp_path / "joined.csv", tmp_path / "exported.csv"
-    found = missing.joined(paths, str(out), lambda *_: None)
+    found = diagnosis_verbs.joined(paths, str(out), lambda *_: None)
     assert found["file_sha256"] == hashlib.sha256(out.read_bytes()).hexdigest()
     joined = identify.read(out)
     assert [source.recording_id for source in joined.source.parts] == ["R-early", "R-late"]
@@ -252,9 +251,9 @@ def test_worker_joins_by_begin_and_leaves_a_file_with_the_parts(tmp_path: Path) 
     assert joined.parts[0].begun_s == pytest.approx(1767225600.25)
     # Torque that follows at once is no second order: its zero is found to a fiftieth of its 5 N·m.
     assert identify.fit(joined).baseline_nm == pytest.approx(0.0, abs=0.1)
-    missing.joined(paths[::-1], str(exported), lambda *_: None)
+    diagnosis_verbs.joined(paths[::-1], str(exported), lambda *_: None)
     assert exported.read_bytes() == out.read_bytes()
-    jobs.export_csv(str(out), lambda *_: None, str(exported))
+    verbs.export_csv(str(out), lambda *_: None, str(exported))
     assert identify.read(exported).parts == joined.parts
 
 
@@ -270,7 +269,7 @@ FATIGUE = {"effect": "fatigue", "name": "Fatigue", "probability": 0.97, "rms_bef
 
 def shown(verdict: str, missing: list[dict[str, Any]], effects: list[str], times: float) -> dict[str, Any]:
     diagnosis = {"verdict": verdict, "missing": missing, "where": [PLACE], "noise_sd_nm": 0.04}
-    return why.view(diagnosis, {"noise_sd_nm": 0.04, "rms_nm": 0.04 * times}, effects)
+    return explanation.view(diagnosis, {"noise_sd_nm": 0.04, "rms_nm": 0.04 * times}, effects)
 
 
 def test_verdict_on_this_model_in_words() -> None:
@@ -284,7 +283,7 @@ def test_verdict_on_this_model_in_words() -> None:
 
 
 def test_place_is_named_without_repeating_its_share() -> None:
-    found = why.place(PLACE, 3)
+    found = explanation.place(PLACE, 3)
     assert found["words"] == WORDS and found["percent"] == 31
 
 
@@ -358,14 +357,14 @@ def test_browser_asks_for_html(service: Service) -> None:
 
 def test_real_worker_finds_what_is_missing_and_the_test_that_decides(tmp_path: Path) -> None:
     """identify's own answers carry what page and routes build on."""
-    from api import missing
-    from api.documents import ComparisonOut, DiagnosisOut
-    from api.jobs import comparison, fit
+    from api.web.responses import ComparisonOut, DiagnosisOut
+    from api.workers import diagnosis_verbs
+    from api.workers.verbs import comparison, fit
     from tests.api.test_worker import made_up_csv
 
     path = str(made_up_csv(tmp_path / "record.csv"))
     told: list[float] = []
-    found = missing.diagnosis(path, lambda share, _text="": told.append(share))
+    found = diagnosis_verbs.diagnosis(path, lambda share, _text="": told.append(share))
     DiagnosisOut.model_validate(found)
     assert told == sorted(told) and told[-1] <= 1 and len(told) > 5
     assert found["structure"] == []
@@ -373,5 +372,5 @@ def test_real_worker_finds_what_is_missing_and_the_test_that_decides(tmp_path: P
     compared = comparison(path, lambda *_: None, model["json"])
     ComparisonOut.model_validate(compared)
     assert len(compared["series"]["time_s"]) <= 2400
-    view = why.view(found, compared, [])
-    assert view["title"] and {split["title"] for split in view["splits"]} == set(why.SPLITS.values())
+    view = explanation.view(found, compared, [])
+    assert view["title"] and {split["title"] for split in view["splits"]} == set(explanation.SPLITS.values())

@@ -11,75 +11,75 @@ from typing import Any
 import pytest
 
 from api.errors import ApiError
-from api.fitting import Fitting
+from api.workers.pool import Pool
 from tests.api.conftest import STUB
 from tests.api.fake_rig import default_widths, muscle
 
 
-def with_fitting(work: Any, workers: int = 1, command: tuple[str, ...] = STUB) -> Any:
+def with_pool(work: Any, workers: int = 1, command: tuple[str, ...] = STUB) -> Any:
     async def run() -> Any:
-        fitting = Fitting(workers, command)
+        pool = Pool(workers, command)
         try:
             async with asyncio.timeout(120):
-                return await work(fitting)
+                return await work(pool)
         finally:
-            await fitting.close()
+            await pool.close()
 
     return asyncio.run(run())
 
 
 def test_cancelled_job_frees_its_worker() -> None:
-    async def work(fitting: Fitting) -> None:
-        slow = fitting.submit("fit", data="x", effects=["slow"])
+    async def work(pool: Pool) -> None:
+        slow = pool.submit("fit", data="x", effects=["slow"])
         while slow.progress < 0.5:
             await asyncio.sleep(0.01)
-        fitting.cancel(slow)
+        pool.cancel(slow)
         with pytest.raises(ApiError, match="cancelled"):
             await slow.result
         assert slow.state == "cancelled"
-        assert (await fitting.submit("fit", data="x").result)["model"]["method"] == "maximum-likelihood"
+        assert (await pool.submit("fit", data="x").result)["model"]["method"] == "maximum-likelihood"
 
-    with_fitting(work)
+    with_pool(work)
 
 
 def test_queued_job_can_be_cancelled() -> None:
-    async def work(fitting: Fitting) -> None:
-        slow, queued = fitting.submit("fit", data="x", effects=["slow"]), fitting.submit("fit", data="x")
+    async def work(pool: Pool) -> None:
+        slow, queued = pool.submit("fit", data="x", effects=["slow"]), pool.submit("fit", data="x")
         await asyncio.sleep(0.05)
-        fitting.cancel(queued)
+        pool.cancel(queued)
         with pytest.raises(ApiError, match="cancelled"):
             await queued.result
         assert slow.state == "running"
 
-    with_fitting(work)
+    with_pool(work)
 
 
 def test_dead_worker_is_a_problem_and_the_next_job_gets_a_new_one() -> None:
-    async def work(fitting: Fitting) -> None:
+    async def work(pool: Pool) -> None:
         with pytest.raises(ApiError, match="died"):
-            await fitting.submit("fit", data="x", effects=["die"]).result
-        await fitting.submit("fit", data="x").result
+            await pool.submit("fit", data="x", effects=["die"]).result
+        await pool.submit("fit", data="x").result
 
-    with_fitting(work)
+    with_pool(work)
 
 
 def test_fit_after_a_test_goes_first_and_has_a_worker_kept_free() -> None:
-    async def work(fitting: Fitting) -> None:
-        blocking = [fitting.submit("fit", data="x", effects=["slow"]) for _ in range(3)]
-        urgent = await asyncio.wait_for(fitting.submit("fit", urgent=True, data="x").result, 20)
+    async def work(pool: Pool) -> None:
+        blocking = [pool.submit("fit", data="x", effects=["slow"]) for _ in range(3)]
+        urgent = await asyncio.wait_for(pool.submit("fit", urgent=True, data="x").result, 20)
         assert urgent["model"]
-        assert sum(job.state == "running" for job in blocking) == 1
+        assert sum(call.state == "running" for call in blocking) == 1
 
-    with_fitting(work, workers=2)
+    with_pool(work, workers=2)
 
 
 def test_expected_error_names_the_place() -> None:
-    async def work(fitting: Fitting) -> None:
+    async def work(pool: Pool) -> None:
         with pytest.raises(ApiError) as caught:
-            await fitting.submit("fit", data="x", effects=["bad"]).result
+            await pool.submit("fit", data="x", effects=["bad"]).result
         assert caught.value.status == 422 and caught.value.extra["place"] == "effects"
 
-    with_fitting(work)
+    with_pool(work)
 
 
 def made_up_csv(path: Path) -> Path:
@@ -93,19 +93,19 @@ def made_up_csv(path: Path) -> Path:
 
 
 def test_real_worker_fits_draws_and_tells_bad_data(tmp_path: Path) -> None:
-    from api.fitting import WORKER
+    from api.workers.pool import WORKER
 
     good, bad = made_up_csv(tmp_path / "good.csv"), tmp_path / "bad.csv"
     bad.write_text("time_s,pulse_width_us,segment\n0,0,prbs\n")
 
-    async def work(fitting: Fitting) -> dict[str, Any]:
-        found = await fitting.submit("fit", data=str(good)).result
-        curves = await fitting.submit("curves", data=str(good), model_json=found["json"]).result
+    async def work(pool: Pool) -> dict[str, Any]:
+        found = await pool.submit("fit", data=str(good)).result
+        curves = await pool.submit("curves", data=str(good), model_json=found["json"]).result
         with pytest.raises(ApiError, match="torque_nm"):
-            await fitting.submit("fit", data=str(bad)).result
+            await pool.submit("fit", data=str(bad)).result
         return {**found, "curves": curves}
 
-    found = with_fitting(work, command=WORKER)
+    found = with_pool(work, command=WORKER)
     assert json.loads(found["json"])["model_id"] == found["model"]["model_id"]
     assert found["model"]["fit"]["fit_percent"] > 95
     assert abs(found["model"]["linear"]["time_constant_s"] - 0.5284) < 0.05

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from api.launcher import SEAL_S
+from api.cli.launcher import SEAL_S
 from rig.__main__ import BEAT_PERIOD_S, PROCESS_PRIORITY
 from rig.acquire.run import SENDER_PRIORITY
 

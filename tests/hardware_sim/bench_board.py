@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from hardware_sim.electrodes import Electrodes, Point
 from hardware_sim.stimulators.board import Board
+from hardware_sim.stimulators.framing import Packet
 from hardware_sim.stimulators.p24 import Firmware
-from hardware_sim.stimulators.sciencemode4 import Decoder, Packet, encode
+from hardware_sim.stimulators.sciencemode4 import Decoder, encode
 from hardware_sim.timeline import Timeline
 
 LL_INIT, LL_CONFIG, LL_STOP = 0, 2, 4

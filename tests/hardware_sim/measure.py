@@ -14,7 +14,8 @@ import can
 import numpy as np
 import serial
 
-from hardware_sim.stimulators.sciencemode4 import Packet, encode
+from hardware_sim.stimulators.framing import Packet
+from hardware_sim.stimulators.sciencemode4 import encode
 from tests.hardware_sim.bench_board import LL_CONFIG, LL_INIT, biphasic, config
 from tests.hardware_sim.emulated import Emulated, emulated
 

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 import serial
 
+from hardware_sim.offline import simulate
 from hardware_sim.patients import registry
-from hardware_sim.records import simulate
-from hardware_sim.stimulators.sciencemode4 import Packet, encode
+from hardware_sim.stimulators.framing import Packet
+from hardware_sim.stimulators.sciencemode4 import encode
 from tests.hardware_sim.bench_board import LL_CONFIG, LL_INIT, biphasic, config
 from tests.hardware_sim.emulated import emulated
 

@@ -16,7 +16,8 @@ import pytest
 import serial
 
 from hardware_sim.faults.registry import library
-from hardware_sim.stimulators.sciencemode4 import Decoder, Packet, encode
+from hardware_sim.stimulators.framing import Packet
+from hardware_sim.stimulators.sciencemode4 import Decoder, encode
 from tests.hardware_sim.bench_board import LL_CONFIG, LL_INIT, biphasic, config
 from tests.hardware_sim.emulated import Emulated, emulated, wait_for
 

@@ -9,6 +9,7 @@ import pytest
 
 from hardware_sim.patients.hidden.base import Base, draw_base
 from hardware_sim.patients.hidden.chain import Chain
+from hardware_sim.patients.hidden.design import make_design
 from hardware_sim.patients.hidden.draw import (
     draw_scenario,
     effect_ids,
@@ -17,10 +18,9 @@ from hardware_sim.patients.hidden.draw import (
     outside_kept_ids,
     rng_of,
 )
+from hardware_sim.patients.hidden.effect_free_fit import EffectFreeFit
 from hardware_sim.patients.hidden.kernels import Formulation, NotSuited
-from hardware_sim.patients.hidden.protocol import make_design
 from hardware_sim.patients.hidden.scenario import BANDS, combine, excess_nm, simulate
-from hardware_sim.patients.hidden.yardstick import Yardstick
 
 CONTRACT = {
     "fatigue",
@@ -81,7 +81,7 @@ def test_magnitude_zero_is_the_base_muscle(effect: str, index: int) -> None:
     plain = simulate(base, base.stages(), design, STEP_S)
     neutral = simulate(base, combine(base, [(formulation, 0.0)]), design, STEP_S)
     assert np.abs(neutral - plain).max() < 1e-4
-    full = simulate(base, combine(base, [(formulation, formulation.top)]), design, STEP_S)
+    full = simulate(base, combine(base, [(formulation, formulation.largest_magnitude)]), design, STEP_S)
     assert np.abs(full - plain).max() > 0.05
 
 
@@ -91,7 +91,7 @@ def test_a_finer_step_gives_the_same_torque(effect: str, index: int) -> None:
     design = make_design("full", rng_of(2), float(base.largest_width_us), moving=True, validate_s=4.0)
     if any(word in formulation.name for word in ("random drive", "grid's frequency wanders")):
         return  # random by the step
-    stages = combine(base, [(formulation, 0.4 * formulation.top)])
+    stages = combine(base, [(formulation, 0.4 * formulation.largest_magnitude)])
     coarse = simulate(base, stages, design, STEP_S)
     fine = simulate(base, stages, design, STEP_S / 4.0)[::4]
     assert np.sqrt(np.mean((coarse - fine) ** 2)) < 0.004 * base.largest_nm
@@ -113,7 +113,7 @@ def test_the_excess_is_that_of_a_fit_made_anew() -> None:
     scenario = draw_scenario(("fatigue",), "strong", 210, noise_sd_nm=NOISE_SD_NM)
     torque = simulate(scenario.base, scenario.stages(), scenario.design, STEP_S)[::40]
     held_out = scenario.design.held_out
-    residual = Yardstick(scenario.base, scenario.design.width_us, held_out).fit(torque)
+    residual = EffectFreeFit(scenario.base, scenario.design.width_us, held_out).fit(torque)
     again = excess_nm("fatigue", residual, held_out)
     assert again["held_out_nm"] == pytest.approx(scenario.hidden[0].excess["held_out_nm"], rel=0.05)
 
@@ -126,7 +126,9 @@ def test_a_base_muscle_leaves_the_yardstick_almost_nothing(steep: bool) -> None:
         torque = simulate(scenario.base, scenario.stages(), scenario.design, STEP_S)[::40]
         held_out = scenario.design.held_out
         left.append(
-            np.sqrt(np.mean(Yardstick(scenario.base, scenario.design.width_us, held_out).fit(torque)[held_out] ** 2))
+            np.sqrt(
+                np.mean(EffectFreeFit(scenario.base, scenario.design.width_us, held_out).fit(torque)[held_out] ** 2)
+            )
         )
     assert np.median(left) < 0.5 * NOISE_SD_NM
     # within a steep rise the ramp leaves one pulse every 1.5 µs: nobody could know the curve better

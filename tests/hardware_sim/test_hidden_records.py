@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hardware_sim.hidden_records import draw_noise, generate, main, write_csv
+from hardware_sim.hidden_records import generate, main, write_csv
+from hardware_sim.patients.hidden.sensor_noise import draw_noise
 
 
 def read_csv(path: Path) -> dict[str, list[str]]:

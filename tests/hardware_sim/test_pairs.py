@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import serial
 
+from hardware_sim.offline import simulate
 from hardware_sim.patients import registry
-from hardware_sim.records import simulate
 from hardware_sim.stimulators import sciencemode2, sciencemode4
 from tests.hardware_sim.bench_board import LL_CONFIG, LL_INIT, biphasic, config
 from tests.hardware_sim.emulated import emulated

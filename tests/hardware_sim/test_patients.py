@@ -13,11 +13,11 @@ from scipy.integrate import solve_ivp
 from scipy.signal import lsim
 
 from hardware_sim.errors import PatientError
+from hardware_sim.offline import simulate
 from hardware_sim.patients import registry
 from hardware_sim.patients.calcium import CalciumMuscle
 from hardware_sim.patients.paper import PaperMuscle
 from hardware_sim.patients.paper import Parameters as PaperParameters
-from hardware_sim.records import simulate
 from tests.harness.patients import Patient
 
 PERIOD_S = 0.025

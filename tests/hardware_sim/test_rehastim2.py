@@ -8,8 +8,9 @@ import pytest
 
 from hardware_sim.electrodes import Electrodes
 from hardware_sim.stimulators.board import Board
+from hardware_sim.stimulators.framing import Packet
 from hardware_sim.stimulators.rehastim2 import Firmware
-from hardware_sim.stimulators.sciencemode2 import Decoder, Packet, encode
+from hardware_sim.stimulators.sciencemode2 import Decoder, encode
 from hardware_sim.timeline import Timeline
 from tests.hardware_sim.bench_board import NotingMuscle
 

@@ -13,7 +13,8 @@ from itertools import pairwise
 import pytest
 import serial
 
-from hardware_sim.stimulators.sciencemode2 import Decoder, Packet, encode
+from hardware_sim.stimulators.framing import Packet
+from hardware_sim.stimulators.sciencemode2 import Decoder, encode
 from tests.hardware_sim.emulated import Emulated, emulated, wait_for
 
 pytestmark = pytest.mark.wire

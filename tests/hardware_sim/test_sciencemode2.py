@@ -6,7 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hardware_sim.stimulators.sciencemode2 import Decoder, Packet, crc8, encode
+from hardware_sim.stimulators.framing import Packet
+from hardware_sim.stimulators.sciencemode2 import Decoder, crc8, encode
 
 FRAMES = {
     "InitAck": ("f0 81 7f 81 56 00 02 00 0f", Packet(0, 2, b"\x00")),

@@ -6,7 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hardware_sim.stimulators.sciencemode4 import Decoder, Packet, encode, stuff, unstuff
+from hardware_sim.stimulators.framing import Packet, stuff, unstuff
+from hardware_sim.stimulators.sciencemode4 import Decoder, encode
 
 FRAMES = {
     "GetStimStatus": ("f0 81 55 81 59 81 4e 81 0c 04 3e 0f", Packet(1, 62, b"")),

@@ -299,7 +299,7 @@ def test_bad_csv_columns_are_one_line(tmp_path, cells, says):
 
 
 def test_exported_records_keep_both(tmp_path):
-    from api.jobs import export_csv
+    from api.workers.verbs import export_csv
 
     seal(tmp_path / "r.h5", sync=True)
     sealed = read(tmp_path / "r.h5")

@@ -107,7 +107,7 @@ def test_the_dose_of_all_trains_together_is_limited():
         ({"step_us": math.nan}, "calibration_step_us nan"),
         ({"train_s": 3.0}, "calibration_train_s 3"),
         ({"current_ma": 101.0}, "current_ma 101"),
-        ({"current_ma": 0.4}, "stimulates nothing"),
+        ({"current_ma": 0.4}, "would stimulate nothing"),
         ({"current_ma": -1.0}, "current_ma -1"),
         ({"pulse_rate_hz": 61.0}, "pulse_rate_hz 61"),
         ({"max_pulse_width_us": math.nan}, "pulse_width_us nan"),
@@ -128,14 +128,14 @@ def test_what_a_coarse_stimulator_would_not_send_is_no_train():
     """A RehaStim 2 takes currents in steps of 2 mA and sends nothing below 20 µs."""
     coarse = Steps(1.0, 2.0, 20.0)
     request = CalibrateStartRequest(calibration_id="c1", participant="P01", by="t", current_ma=1.5)
-    with pytest.raises(RefusedError, match=r"current_ma 1.5 mA stimulates nothing; this stimulator begins at 2 mA"):
+    with pytest.raises(RefusedError, match=r"current_ma 1.5 mA would stimulate nothing; the smallest current is 2 mA"):
         Calibration(request, HARD_LIMITS, NOON_S, coarse)
     calibration = Calibration(request.model_copy(update={"current_ma": 10.0}), HARD_LIMITS, NOON_S, coarse)
-    with pytest.raises(PlanError, match="first step goes up"):
+    with pytest.raises(PlanError, match="step up instead"):
         calibration.next_width_us("repeat")
     assert play(calibration, "up", "up") == 30.0
     assert play(calibration, "down") == 20.0
-    with pytest.raises(PlanError, match="narrower than 20"):
+    with pytest.raises(PlanError, match="no step below 20"):
         calibration.next_width_us("down")
 
 
@@ -164,22 +164,22 @@ def test_midnight_ends_an_open_calibration_and_says_so():
     calibration.check_day(midnight_s - 1)
     assert calibration.profile(midnight_s - 1).expires_at_utc == utc_text(midnight_s)
     for late in (calibration.check_day, calibration.profile):
-        with pytest.raises(RefusedError, match="begun on the day before"):
+        with pytest.raises(RefusedError, match="began on an earlier day"):
             late(midnight_s)
 
 
 def test_a_test_that_would_outlast_its_profile_is_refused_at_its_start():
     calibrated = profile(expires_at_utc=utc_text(NOON_S + 30.0))
     check_profile(calibrated, NOON_S, required=True, duration_s=29.0)
-    with pytest.raises(RefusedError, match="before this test of 39 s would end"):
+    with pytest.raises(RefusedError, match="before the end of this test of 39 s"):
         check_profile(calibrated, NOON_S, required=True, duration_s=38.7)
 
 
 def test_marks_keep_their_order():
     calibration = opened()
-    with pytest.raises(PlanError, match="nothing was played"):
+    with pytest.raises(PlanError, match="no train was played"):
         calibration.mark("sensory")
-    with pytest.raises(PlanError, match="first step goes up"):
+    with pytest.raises(PlanError, match="step up instead"):
         calibration.next_width_us("down")
     play(calibration, *["up"] * 5)
     calibration.mark("motor")
@@ -198,15 +198,15 @@ def test_marks_keep_their_order():
     [
         ({"expires_at_utc": utc_text(NOON_S - 1)}, "expired"),
         ({"set_at_utc": utc_text(NOON_S + 3000)}, "in the future"),
-        ({"expires_at_utc": utc_text(NOON_S + 30 * 3600)}, "within a day"),
-        ({"expires_at_utc": utc_text(NOON_S - 7200)}, "within a day"),
-        ({"motor_pulse_width_us": 181.0}, "must rise"),
-        ({"sensory_pulse_width_us": 120.0}, "must rise"),
-        ({"sensory_pulse_width_us": 0.0}, "must rise"),
-        ({"motor_pulse_width_us": math.nan}, "must rise"),
-        ({"motor_pulse_width_us": None}, "in part only"),
-        ({"set_at_utc": None}, "in part only"),
-        ({"set_at_utc": "yesterday"}, "no time in ISO 8601"),
+        ({"expires_at_utc": utc_text(NOON_S + 30 * 3600)}, "within one day"),
+        ({"expires_at_utc": utc_text(NOON_S - 7200)}, "within one day"),
+        ({"motor_pulse_width_us": 181.0}, "must be above 0"),
+        ({"sensory_pulse_width_us": 120.0}, "must be above 0"),
+        ({"sensory_pulse_width_us": 0.0}, "must be above 0"),
+        ({"motor_pulse_width_us": math.nan}, "must be above 0"),
+        ({"motor_pulse_width_us": None}, "incomplete"),
+        ({"set_at_utc": None}, "incomplete"),
+        ({"set_at_utc": "yesterday"}, "not a time in ISO 8601"),
         ({"set_at_utc": "2026-03-04T11:00:00"}, "time zone"),
     ],
 )

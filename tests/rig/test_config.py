@@ -145,7 +145,7 @@ def test_the_emulators_line_never_leads_to_a_real_stimulator(tmp_path: Path):
     absent = ("/dev/ttyACM9", "/dev/pts/../ttyACM9", str(tmp_path / "dangling"))  # there is one when it is opened
     for port in (str(real), "/dev/null", str(tmp_path / "link"), *absent):
         line = json.dumps({"stimulator": port, "can": {"interface": "virtual"}, "speed": 20})
-        with pytest.raises(ConfigError, match="is no pseudo-terminal of an emulator"):
+        with pytest.raises(ConfigError, match="is not a pseudo-terminal of an emulator"):
             config.for_emulator(line, data_dir=tmp_path, socket=tmp_path / "s")
 
 

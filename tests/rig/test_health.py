@@ -16,7 +16,7 @@ WORDS = {
     "ack": "acknowledged",
     "disk slow": "too slow",
     "disk full": "MB free",
-    "sender": "stood still",
+    "sender": "blocked",
 }
 REST = [SegmentPlan(name="rest", sequence="rest", settings={"duration_s": 3.0})]
 

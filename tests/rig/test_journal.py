@@ -79,7 +79,7 @@ def test_mistakes_are_named(tmp_path: Path):
     with pytest.raises(RecordingError, match="No such file"):
         journal.read(tmp_path / "none")
     (tmp_path / "other").write_bytes(b"hello")
-    with pytest.raises(RecordingError, match="does not start like a journal"):
+    with pytest.raises(RecordingError, match="is not a journal"):
         journal.read(tmp_path / "other")
     Journal(tmp_path / "j").close()
     with pytest.raises(JournalError, match="File exists"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import FrozenInstanceError, replace
 
 import pytest
 from hypothesis import given, settings
@@ -85,6 +86,113 @@ def test_a_profile_of_nonsense_is_refused(field: str, value: float):
         limits.for_profile(HARD_LIMITS, Profile(**{field: value}))
 
 
+def test_the_hard_limits_are_those_that_were_agreed_on():
+    """Written down a second time on purpose: nobody changes a limit without changing it here, too."""
+    inf = math.inf
+    assert {name: (row.lo, row.hi, row.unit, row.owner) for name, row in HARD_LIMITS.items()} == {
+        name: (lo, hi, unit, "hard limit")
+        for name, lo, hi, unit in (
+            ("pulse_width_us", 0, 500, "µs"),
+            ("current_ma", 0, 100, "mA"),
+            ("charge_per_phase_uc", 0, 40, "µC"),
+            ("charge_per_second_uc", 0, 1600, "µC/s"),
+            ("pulse_rate_hz", 1, 60, "Hz"),
+            ("pulse_interval_s", 0.008, inf, "s"),
+            ("torque_nm", -60, 60, "N·m"),
+            ("torque_jump_nm", 0, 5, "N·m"),
+            ("duration_s", 0, 300, "s"),
+            ("charge_per_test_uc", 0, 50_000, "µC"),
+            ("width_rise_us", -inf, 50, "µs/pulse"),
+            ("rest_between_tests_s", 1, inf, "s"),
+            ("rest_between_trains_s", 0.5, inf, "s"),
+            ("calibration_step_us", 1, 25, "µs"),
+            ("calibration_train_s", 0.1, 2, "s"),
+        )
+    }
+
+
+def test_a_limit_cannot_be_changed_in_place():
+    for thing, name in (
+        (HARD_LIMITS["current_ma"], "hi"),
+        (limits.FINEST, "shortest_us"),
+        (Admitted(100, 20.0), "current_ma"),
+        (limits.check(HARD_LIMITS["current_ma"], 101), "hi"),
+    ):
+        with pytest.raises(FrozenInstanceError):
+            setattr(thing, name, 1e9)
+
+
+def test_a_narrowed_row_differs_in_its_bounds_and_its_owner_alone():
+    for name, narrow, changed in (
+        ("current_ma", lambda: limits.tightened(HARD_LIMITS, "current_ma", 60.0, "rig file"), {"hi": 60.0}),
+        ("current_ma", lambda: limits.tightened(HARD_LIMITS, "current_ma", 0.0, "rig file"), {"hi": 0.0}),
+        (
+            "torque_nm",
+            lambda: limits.tightened(HARD_LIMITS, "torque_nm", 99.0, "rig file", lo=-7.0),
+            {"lo": -7.0, "hi": 60.0},
+        ),
+        (
+            "rest_between_tests_s",
+            lambda: limits.at_least(HARD_LIMITS, "rest_between_tests_s", 9, "rig file"),
+            {"lo": 9},
+        ),
+        ("pulse_rate_hz", lambda: limits.at_least(HARD_LIMITS, "pulse_rate_hz", 60.0, "rig file"), {"lo": 60.0}),
+    ):
+        row = replace(HARD_LIMITS[name], owner="rig file", **changed)
+        assert narrow() == {**HARD_LIMITS, name: row}
+
+
+def test_a_bound_no_tighter_than_what_holds_changes_nothing_not_even_the_owner():
+    for hi, lo in ((60.0, None), (60.0, -60.0), (99.0, -99.0)):
+        assert limits.tightened(HARD_LIMITS, "torque_nm", hi, "rig file", lo) == HARD_LIMITS
+    for lo in (1.0, 0.5, -math.inf):
+        assert limits.at_least(HARD_LIMITS, "rest_between_tests_s", lo, "rig file") == HARD_LIMITS
+
+
+def test_a_bound_that_leaves_nothing_is_refused_and_says_what_would_do():
+    for narrow, words in (
+        (
+            lambda: limits.tightened(HARD_LIMITS, "pulse_rate_hz", 0.5, "rig file"),
+            "rig file: pulse_rate_hz 0.5 Hz must be at least 1 Hz",
+        ),
+        (
+            lambda: limits.at_least(HARD_LIMITS, "pulse_rate_hz", 61, "rig file"),
+            "rig file: pulse_rate_hz 61 Hz must be at most 60 Hz",
+        ),
+        (
+            lambda: limits.for_profile(HARD_LIMITS, Profile(max_torque_nm=0.0)),
+            "participant's profile: max_torque_nm 0 N·m must be above 0",
+        ),
+        (
+            lambda: limits.for_plan(HARD_LIMITS, request(Profile(), max_torque_nm=0.0)),
+            "request: max_torque_nm 0 N·m must be above 0",
+        ),
+    ):
+        with pytest.raises(RefusedError) as raised:
+            narrow()
+        assert str(raised.value) == words
+    gentle = limits.for_plan(HARD_LIMITS, request(Profile(max_torque_nm=0.9), max_torque_nm=0.8))
+    assert (gentle["torque_nm"].lo, gentle["torque_nm"].hi) == (-0.8, 0.8)
+
+
+def test_a_refusal_in_words():
+    row = replace(HARD_LIMITS["current_ma"], lo=2.0, reason="because")
+    assert str(limits.check(row, 130.5)) == "current_ma 130.5 mA is outside 2 … 100 (hard limit, over by 30.5): because"
+    assert str(limits.check(row, 0.5)) == "current_ma 0.5 mA is outside 2 … 100 (hard limit, under by 1.5): because"
+    assert str(limits.check(row, math.nan)) == "current_ma nan mA is outside 2 … 100 (hard limit): because"
+    assert str(limits.check(row, math.inf)) == "current_ma inf mA is outside 2 … 100 (hard limit): because"
+
+
+def test_a_stimulator_s_steps_round_toward_zero_and_what_is_too_short_is_no_pulse():
+    coarse = limits.Steps(pulse_width_us=4.0, current_ma=2.0, shortest_us=20.0)
+    assert [coarse.width_us(us) for us in (0.0, 19.9, 20.0, 23.9, 24.0)] == [0, 0, 20, 20, 24]
+    assert [coarse.current(ma) for ma in (0.0, 1.9, 2.0, 3.9)] == [0.0, 0.0, 2.0, 2.0]
+    assert limits.Steps() == limits.FINEST == limits.Steps(1.0, 0.5, 1.0)
+    assert admit(Pulse(23.9, 3.9), HARD_LIMITS, coarse) == Admitted(20, 2.0)
+    assert Admitted(300, 20.0).charge_uc == pytest.approx(6.0)
+    assert Pulse(300.0, 20.0).charge_uc == pytest.approx(6.0)
+
+
 def test_every_limit_has_its_reason_and_source():
     for name, row in HARD_LIMITS.items():
         assert row.name == name
@@ -160,5 +268,6 @@ def test_clients_are_told_the_bounds_of_this_rig():
     assert (told["current_ma"].hi, told["current_ma"].owner) == (60.0, "rig file")
     assert (told["pulse_width_us"].hi, told["pulse_width_us"].owner) == (500.0, "hard limit")
     assert told["width_rise_us"].lo is None and told["rest_between_tests_s"].hi is None
+    assert (told["torque_nm"].lo, told["torque_nm"].unit) == (-60.0, "N·m")
     status = Status(state="ready", limits=told)
     assert Status.model_validate_json(status.model_dump_json()) == status

@@ -142,7 +142,7 @@ NONE = {
 def test_a_segment_without_a_pulse_is_a_mistake_in_the_plan(sequence: str):
     short = SegmentPlan(name="x", sequence=sequence, settings=NONE[sequence])
     for segments in ([short], [*plan.default_segments(), short], [short, *plan.default_segments()]):
-        with pytest.raises(PlanError, match=r"segment \d \(x\): it is too short for one pulse at 40 pulses/s"):
+        with pytest.raises(PlanError, match=r"segment \d \(x\): too short for one pulse at 40 pulses/s"):
             built(segments)
 
 

@@ -32,12 +32,12 @@ def test_one_that_takes_too_long_is_ended_and_the_next_is_built(monkeypatch: pyt
         asked = Previews(HARD_LIMITS, 1.0)
         await asked.warm()
         first = asked._process
-        monkeypatch.setattr(previews, "LONGEST_S", 0.0)
+        monkeypatch.setattr(previews, "MAX_BUILD_S", 0.0)
         with pytest.raises(BusyError, match="not built within"):
             await asked.reply(REQUEST)
         assert first is not None
         assert first.returncode is not None
-        monkeypatch.setattr(previews, "LONGEST_S", 60.0)
+        monkeypatch.setattr(previews, "MAX_BUILD_S", 60.0)
         reply = json.loads(await asked.reply(REQUEST))
         assert (reply["id"], reply["ok"], reply["body"]["duration_s"]) == (3, True, pytest.approx(38.7))
         await asked.close()
@@ -46,13 +46,13 @@ def test_one_that_takes_too_long_is_ended_and_the_next_is_built(monkeypatch: pyt
 
 
 def test_who_would_wait_for_too_long_is_refused_at_once(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(previews, "LONGEST_S", 60.0)
+    monkeypatch.setattr(previews, "MAX_BUILD_S", 60.0)
 
     async def run() -> None:
         asked = Previews(HARD_LIMITS, 1.0)
         found = await asyncio.gather(*(asked.reply(REQUEST) for _ in range(40)), return_exceptions=True)
-        assert [isinstance(one, bytes) for one in found[: previews.MOST_WAITING]] == [True] * previews.MOST_WAITING
-        assert all(isinstance(one, BusyError) for one in found[previews.MOST_WAITING :])
+        assert [isinstance(one, bytes) for one in found[: previews.MAX_WAITING]] == [True] * previews.MAX_WAITING
+        assert all(isinstance(one, BusyError) for one in found[previews.MAX_WAITING :])
         assert json.loads(await asked.reply(REQUEST))["ok"]
         await asked.close()
 
@@ -63,7 +63,7 @@ def test_memory_is_bounded():
     code = "import rig.builder as b; b._modest(); bytearray(2 << 30)"
     ended = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert "MemoryError" in ended.stderr
-    assert resource.getrlimit(resource.RLIMIT_AS)[0] != builder.MOST_MEMORY_BYTES  # the child's alone
+    assert resource.getrlimit(resource.RLIMIT_AS)[0] != builder.MAX_MEMORY_BYTES  # the child's alone
 
 
 def test_what_is_wrong_is_told_and_the_builder_lives_on():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rig import archive, assembly, journal
-from rig.acquire.plausible import Plausible
+from rig.acquire.plausibility import PlausibilityCheck
 from rig.acquire.receiver import Receiver
 from rig.control.sealing import warnings
 from rig.messages import SegmentPlan
@@ -57,7 +57,7 @@ def test_a_restless_host_hides_no_rate_and_is_not_taken_for_one(tmp_path: Path, 
     restless(rig)
     result = rig.execute()
     assert result.outcome == outcome, result.reason
-    assert ("samples/s come" in result.reason) == (outcome == "fault")
+    assert ("samples/s arrive" in result.reason) == (outcome == "fault")
 
 
 def test_a_rig_that_runs_faster_than_the_world_still_sees_half_a_rate(tmp_path: Path):
@@ -67,18 +67,18 @@ def test_a_rig_that_runs_faster_than_the_world_still_sees_half_a_rate(tmp_path: 
     rig.cell.rate = 0.5
     result = rig.execute()
     assert result.outcome == "fault"
-    assert "800 samples/s come" in result.reason
+    assert "800 samples/s arrive" in result.reason
 
 
 def heard(arrival_s: list[float], size: int = 16) -> list[str | None]:
     """What is said after each block of so many samples, given when each of them came, and at the end."""
-    judge = Plausible(5.0, 1e9, 1e9, 1600.0, 1.0)
+    judge = PlausibilityCheck(5.0, 1e9, 1e9, 1600.0, 1.0)
     found = []
     for i, now_s in enumerate(arrival_s):
         block = np.zeros(size, SAMPLE)
         block["counter"], block["host_time_s"], block["torque_nm"] = -1, now_s, i % 2
-        found.append(judge.wrong(block))
-    return [*found, judge.wrong_at_end()]
+        found.append(judge.fault(block))
+    return [*found, judge.fault_at_end()]
 
 
 @pytest.mark.parametrize("rate", [1.0, 1.05])
@@ -164,15 +164,15 @@ def test_a_backlog_that_is_read_slowly_is_no_rate(holes_s: list[tuple[float, flo
 
 
 def test_a_backlog_read_before_the_test_is_no_rate():
-    judge, found = Plausible(5.0, 1e9, 1e9, 1600.0, 1.0), []
+    judge, found = PlausibilityCheck(5.0, 1e9, 1e9, 1600.0, 1.0), []
     for i in range(1000):
         block = np.zeros(16, SAMPLE)
         now_s = i * 0.005 if i < 300 else 1.5 + (i - 300) * 0.01  # 1.5 s read at twice the rate
         block["counter"], block["host_time_s"], block["torque_nm"] = -1, now_s, i % 2
         if i == 300:
             judge.begin()
-        found.append(judge.wrong(block))
-    assert not any([*found, judge.wrong_at_end()])
+        found.append(judge.fault(block))
+    assert not any([*found, judge.fault_at_end()])
 
 
 def test_a_backlog_read_while_arming_does_not_end_the_test(tmp_path: Path):
@@ -192,11 +192,11 @@ def test_a_backlog_read_while_arming_does_not_end_the_test(tmp_path: Path):
 
 
 def test_what_came_too_little_is_not_judged():
-    judge = Plausible(5.0, 1e9, 1e9, 1600.0, 1.0)
-    assert judge.wrong_at_end() is None
+    judge = PlausibilityCheck(5.0, 1e9, 1e9, 1600.0, 1.0)
+    assert judge.fault_at_end() is None
     block = np.zeros(16, SAMPLE)
-    judge.wrong(block)
-    assert judge.wrong_at_end() is None
+    judge.fault(block)
+    assert judge.fault_at_end() is None
 
 
 def test_times_in_doubt_are_told_with_the_finished_test(tmp_path: Path):
@@ -204,7 +204,7 @@ def test_times_in_doubt_are_told_with_the_finished_test(tmp_path: Path):
     rig.execute()
     recording = assembly.assemble(journal.read(rig.path))
     assert warnings(recording) == []
-    for error_ms, words in ((60.0, "60.0 ms"), (float("nan"), "not known")):
+    for error_ms, words in ((60.0, "60.0 ms"), (float("nan"), "unknown")):
         doubtful = archive.Recording(
             recording.columns,
             recording.names,
@@ -213,10 +213,10 @@ def test_times_in_doubt_are_told_with_the_finished_test(tmp_path: Path):
         )
         assert words in warnings(doubtful)[0]
     recording.columns["torque/torque_nm"][:] = 1.25
-    assert "stood at exactly 1.250" in warnings(recording)[0]
+    assert "stayed at exactly 1.250" in warnings(recording)[0]
     recording.columns["torque/torque_nm"][3] = 1.5
     recording.attributes["sample_rate_measured_hz"] = 1560.0
-    assert "1560 samples/s came, the rig file says 1600" in warnings(recording)[0]
+    assert "1560 samples/s arrived, the rig file says 1600" in warnings(recording)[0]
     (tmp_path / "2").mkdir()
     nothing = VirtualRig(tmp_path / "2")
     nothing.cell.silent = True

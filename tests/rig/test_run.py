@@ -75,13 +75,13 @@ def test_a_long_stall_sends_nothing_afterwards(tmp_path: Path):
     rig.at(1.0, lambda: rig.clock.advance(2.0))  # SIGSTOP
     result = rig.execute()
     assert result.outcome == "fault"
-    assert "stood still for 2.0 s" in result.reason
+    assert "blocked for 2.0 s" in result.reason
     assert rig.clock.now_s() - rig.stimulator.sent[-1][0] > 2.0
 
 
 FAULTS: dict[str, tuple[Callable[[VirtualRig], object], str]] = {
     "silent cell": (lambda r: setattr(r.cell, "silent", True), "torque is stale"),
-    "NaN": (lambda r: setattr(r.cell, "nan", True), "no number"),
+    "NaN": (lambda r: setattr(r.cell, "nan", True), "not a number"),
     "torque over its limit": (lambda r: setattr(r.cell, "add_nm", 35.0), "outside -30 … 30"),
     "torque under its limit": (lambda r: setattr(r.cell, "add_nm", -35.0), "outside -30 … 30"),
     "counter jump": (lambda r: setattr(r.cell, "skip", 5000), "jumped"),
@@ -128,7 +128,7 @@ def test_a_stop_among_the_first_pulses_says_no_more_than_the_torque_does(tmp_pat
     rig.at(0.003, lambda: rig.halt.set("stopped", "enough"))
     result = rig.execute()
     assert result.evidence.confirmed
-    assert "too small to tell more" in result.evidence.detail
+    assert "too small to show a fall" in result.evidence.detail
     assert "fell" not in result.evidence.detail
 
 
@@ -151,7 +151,7 @@ def test_no_torque_no_test(tmp_path: Path):
     rig.cell.silent = True
     result = rig.execute()
     assert result.outcome == "fault"
-    assert "no fresh torque" in result.reason
+    assert "no torque arrived" in result.reason
     assert rig.stimulator.sent == []
     recording = assembly.assemble(journal.read(rig.path))
     assert recording.names == []
@@ -261,7 +261,10 @@ def test_a_torque_far_from_its_rest_on_either_side_confirms_no_stop(
 
 def test_what_a_buffer_gives_up_confirms_no_stop(tmp_path: Path):
     """Its oldest samples are of the rest before the first pulse."""
-    assert watched(tmp_path, Heard(0.0, settles_s=np.inf), 8.0) == (False, "no torque to confirm the stop by")
+    assert watched(tmp_path, Heard(0.0, settles_s=np.inf), 8.0) == (
+        False,
+        "there is no torque signal to confirm the stop",
+    )
 
 
 def test_a_stop_waits_while_a_backlog_is_read_and_not_where_nothing_comes(tmp_path: Path):

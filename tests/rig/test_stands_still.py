@@ -31,7 +31,7 @@ def test_a_cell_that_stays_at_its_ceiling_ends_the_test_within_3_s(tmp_path: Pat
     rig = rig_with_noise(tmp_path, on_s=8.0)
     result = rig.execute()
     assert result.outcome == "fault"
-    assert "5.000 N·m" in result.reason and "more would not be seen" in result.reason
+    assert "5.000 N·m" in result.reason and "higher torque is not seen" in result.reason
     assert 3.0 < rig.stimulator.sent[-1][0] - rig.stimulator.sent[0][0] < 4.0  # it takes 0.2 s to get there
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from rig.errors import BusyError, DeviceError, LatchedError, RigError, UncertainError
-from rig.trial import Trial
+from rig.trial import TransitionError, Trial
 
 STEPS = {
     "start": lambda t: t.start("id", "P"),
@@ -86,3 +88,110 @@ def test_a_stop_while_sealing_latches_afterwards():
     trial = Trial().connected().start("a", "P").armed().ended().halted("stop")
     assert trial.state == "sealing"
     assert trial.sealed().state == "latched"
+
+
+ARMING = Trial("arming", "", "a", "P")
+STOPPING = Trial("stopping", "why", "a", "P", latch=True)
+SEALING = replace(STOPPING, state="sealing")
+CALIBRATING = Trial("calibrating", "", None, "P", calibrating=True)
+TRAIN = replace(CALIBRATING, state="arming", test_id="c.001")
+READY = Trial("ready", "")
+LATCHED = Trial("latched", "why")
+UNCERTAIN = Trial("uncertain", "died")
+
+EVERY_STATE = (
+    Trial("disconnected", "gone"), READY, CALIBRATING, ARMING, TRAIN, replace(ARMING, state="running"),
+    replace(TRAIN, state="running"), STOPPING, replace(ARMING, state="sealing"), replace(TRAIN, state="sealing"),
+    SEALING, LATCHED, UNCERTAIN,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("trial", EVERY_STATE, ids=lambda t: f"{t.state}-{t.test_id}")
+def test_each_step_is_taken_from_its_own_states_alone(trial: Trial):
+    """A step from any other state is a fault in the program: it raises, and names both."""
+    for step, states in {
+        "connected": ("disconnected",),
+        "armed": ("arming",),
+        "ended": ("running", "stopping", "arming"),
+        "sealed": ("sealing",),
+        "calibrated": ("calibrating",),
+    }.items():
+        if trial.state in states:
+            getattr(trial, step)()
+            continue
+        with pytest.raises(TransitionError) as raised:
+            getattr(trial, step)()
+        assert str(raised.value) == f"the rig is {trial.state}, this step needs {' or '.join(states)}"
+    if trial.state != "calibrating":
+        with pytest.raises(TransitionError, match="needs calibrating"):
+            trial.train("c.001")
+
+
+def test_what_each_step_gives():
+    assert Trial().connected() == READY
+    assert Trial().connected("latched", "why") == LATCHED
+    assert Trial().connected("running", "died") == UNCERTAIN
+    assert READY.start("a", "P") == ARMING
+    assert READY.calibrate("P") == CALIBRATING
+    assert CALIBRATING.train("c.001") == TRAIN
+    assert CALIBRATING.calibrated() == READY
+    for begun in (ARMING, TRAIN):
+        assert begun.armed() == replace(begun, state="running")
+        assert begun.ended() == begun.armed().ended() == replace(begun, state="sealing")
+    assert STOPPING.ended() == SEALING
+
+
+def test_where_the_sealing_leads():
+    assert replace(ARMING, state="sealing").sealed() == READY
+    assert replace(TRAIN, state="sealing").sealed() == CALIBRATING
+    assert SEALING.sealed() == LATCHED
+    assert replace(SEALING, lost="gone").sealed() == replace(LATCHED, lost="gone")
+    assert replace(TRAIN, state="sealing", lost="gone").sealed() == Trial("disconnected", "gone")
+
+
+def test_a_stop_leads_to_the_latch_from_everywhere_and_its_first_reason_stays():
+    for begun in (ARMING, TRAIN, replace(ARMING, state="running"), replace(TRAIN, state="running")):
+        assert begun.halted("why") == replace(begun, state="stopping", reason="why", latch=True)
+    for ending in (STOPPING, SEALING):
+        assert ending.halted("another") == ending
+    assert replace(ARMING, state="sealing").halted("why") == SEALING
+    assert READY.halted("why") == CALIBRATING.halted("why") == LATCHED
+    for stopped in (LATCHED, UNCERTAIN, Trial()):
+        assert stopped.halted("another") == stopped
+
+
+def test_a_lost_device_is_remembered_until_the_end_of_a_test_and_while_a_person_is_awaited():
+    for trial in EVERY_STATE:
+        waits = trial.busy or trial.state in ("latched", "uncertain")
+        assert trial.disconnected("unplugged") == (
+            replace(trial, lost="unplugged") if waits else Trial("disconnected", "unplugged")
+        )
+
+
+@pytest.mark.parametrize("trial", EVERY_STATE, ids=lambda t: f"{t.state}-{t.test_id}")
+def test_a_start_is_refused_in_every_state_but_ready(trial: Trial):
+    look = "look at the participant and the rig, then re-arm"
+    expected = {
+        "calibrating": (BusyError, "a calibration of participant P is open; finish or discard it"),
+        "latched": (LatchedError, f"why; {look}"),
+        "uncertain": (UncertainError, f"died; {look}"),
+        "disconnected": (DeviceError, "gone; correct that, then re-arm"),
+    }.get(trial.state, (BusyError, f"test {trial.test_id} of participant P is {trial.state}; wait or stop it"))
+    if trial.state == "ready":
+        trial.may_start()
+        return
+    for begin in (trial.may_start, lambda: trial.start("b", "Q"), lambda: trial.calibrate("Q")):
+        with pytest.raises(RigError) as raised:
+            begin()
+        assert (type(raised.value), str(raised.value)) == expected
+
+
+@pytest.mark.parametrize("trial", EVERY_STATE, ids=lambda t: f"{t.state}-{t.test_id}")
+def test_rearming_ends_no_test_and_no_calibration(trial: Trial):
+    if not trial.busy and trial.state != "calibrating":
+        assert trial.rearm() == READY
+        return
+    what = f"test {trial.test_id} is {trial.state}" if trial.busy else "a calibration of participant P is open"
+    with pytest.raises(BusyError) as raised:
+        trial.rearm()
+    assert str(raised.value) == f"{what}; nothing to re-arm"

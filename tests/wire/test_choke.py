@@ -127,7 +127,7 @@ def test_what_is_too_much_at_once_is_refused_in_words(shared: tuple[Bench, RigCl
     raw = bench.client()
     raw._replies[0] = client.events.__class__()
     raw.send_raw(json.dumps({"id": 7, "kind": "start", "plan": default_plan("x", kind="x" * 70_000)}))
-    assert "begins with its kind and its id" in raw._replies[0].get(timeout=60)["problem"]["detail"]
+    assert "begin with its kind and its id" in raw._replies[0].get(timeout=60)["problem"]["detail"]
     with contextlib.suppress(OSError):  # let go before all of it was sent
         raw.send_raw("x" * 2_500_000)
     assert raw.closed.wait(60)

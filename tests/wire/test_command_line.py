@@ -89,7 +89,7 @@ def test_a_port_that_is_not_there_is_told_until_it_is(make_bench: Callable[..., 
     try:
         assert rig.ready["state"] == "disconnected"
         client = RigClient(tmp_path / "rig.sock")
-        assert "no-such-port is not there" in client.status()["reason"]
+        assert "no-such-port is missing" in client.status()["reason"]
         assert client.ask("rearm", by="nurse")["problem"]["code"] == "disconnected"
         link.symlink_to(bench.emulator.ready["stimulator"])
         assert client.ask("rearm", by="nurse")["body"]["state"] == "ready"

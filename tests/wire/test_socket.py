@@ -59,7 +59,7 @@ def test_what_comes_to_no_pulse_is_a_mistake_and_not_an_internal_one(shared: tup
     for kind in ("preview", "start"):
         problem = client.ask(kind, plan=default_plan("none", segments=none))["problem"]
         assert problem["code"] == "bad-plan"
-        assert "segment 1 (x): it is too short for one pulse" in problem["detail"]
+        assert "segment 1 (x): too short for one pulse" in problem["detail"]
     train = {"calibration_id": "none", "participant": "P01", "by": "t", "train_s": 0.1, "pulse_rate_hz": 1.0}
     assert "has no pulse" in client.ask("calibrate-start", **train)["problem"]["detail"]
     for wrong in (True, "20"):

@@ -134,4 +134,4 @@ def test_two_tests_one_after_the_other(shared: tuple[Bench, RigClient]):
     assert second["outcome"] == "completed"
     again = client.ask("start", plan=short_plan("two"))
     assert again["problem"]["code"] == "bad-plan"
-    assert "used before" in again["problem"]["detail"]
+    assert "already used" in again["problem"]["detail"]

@@ -1,1 +1,1 @@
-"""A cell is one file with a class `Cell`, found by scanning."""
+"""A cell is one file with a class `Cell`, found by scanning this folder."""

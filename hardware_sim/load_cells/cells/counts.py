@@ -1,6 +1,6 @@
 """A cell like ME's GSV-4: id 610, 16-bit counts, big endian, no counter and no sync line. Always on.
 
-Counts are offset binary: 32768 is zero, full scale 50 N·m. Several samples a frame stand one after another.
+Counts are offset binary: 32768 is zero, full scale 50 N·m. Several samples of a frame follow one another.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Cell:
         return True
 
     def encode(self, samples: Sequence[Sample]) -> Frame:
-        """The frame of its samples; a value beyond full scale, or none, sits at the stop."""
+        """The frame of its samples; values are limited to full scale, NaN is the lowest count."""
         data = b"".join(_counts(sample.torque_nm).to_bytes(2, "big") for sample in samples)
         return Frame(CAN_ID, data, samples[-1].time_us)
 

@@ -1,6 +1,6 @@
 """The default cell: id 0x181, torque in N·m as float32, 16-bit counter, status with the sync line. Always on.
 
-With three samples a frame: three int16 counts of 2 mN·m and a 16-bit counter of frames; no room for the sync line.
+With three samples per frame: three int16 counts of 2 mN·m and a 16-bit counter of frames, without the sync line.
 """
 
 from __future__ import annotations
@@ -48,6 +48,6 @@ class Cell:
 
 
 def _counts(torque_nm: float) -> int:
-    """Counts between the stops; a value that is none sits at the lower."""
+    """Counts, limited to full scale; NaN is the lowest count."""
     counts = round(torque_nm * COUNTS_PER_NM) if math.isfinite(torque_nm) else -LARGEST_COUNTS
     return min(max(counts, -LARGEST_COUNTS), LARGEST_COUNTS)

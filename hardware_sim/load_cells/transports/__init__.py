@@ -1,1 +1,1 @@
-"""A transport is one file with a class `Transport`, found by scanning."""
+"""A transport is one file with a class `Transport`, found by scanning this folder."""

@@ -16,7 +16,7 @@ LONGEST_LINE = 64
 
 
 class Transport:
-    """One adapter on one port; it does not notice whether anybody has the port open."""
+    """One adapter on one port; it does not know whether a client has the port open."""
 
     def __init__(self, reactor: Reactor, on_frame: FrameHandler) -> None:
         self._reactor, self._on_frame = reactor, on_frame
@@ -32,7 +32,7 @@ class Transport:
         return self._port.dropped_messages
 
     def send(self, frames: Sequence[Frame]) -> None:
-        """Frames to the port while the channel is open; the protocol has no word for bus errors."""
+        """Frames to the port while the channel is open; the protocol cannot report bus errors."""
         if self._open:
             for frame in frames:
                 if not frame.error:

@@ -1,7 +1,7 @@
 """A socketcand server on 127.0.0.1 with one bus, `can0`, in raw mode.
 
-Frames begin `QUIET_S` after `< rawmode >` has been answered: a client takes the answer and the first frame
-in one packet for a failed handshake, and nothing on the wire shows that it has read the answer.
+Frames begin `QUIET_S` after the answer to `< rawmode >`. A client that reads the answer and the first frame in one
+packet takes the handshake as failed, and nothing on the wire shows when it has read the answer.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Transport:
     def _accept(self) -> None:
         try:
             connection, _ = self._listener.accept()
-        except OSError:  # the client has gone already
+        except OSError:  # the client has already disconnected
             return
         connection.setblocking(False)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -126,7 +126,7 @@ class Transport:
 
 
 class _Client:
-    """One connection: what it has said so far, and what it has yet to take."""
+    """One connection: text received and not yet parsed, bytes not yet sent."""
 
     def __init__(self, connection: socket.socket) -> None:
         self.connection = connection

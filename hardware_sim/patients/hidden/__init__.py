@@ -1,6 +1,6 @@
-"""Muscles with something hidden in them, drawn by a seed: physics written apart from the library that is to find it.
+"""Muscles with hidden effects, drawn by a seed. Their physics shares no code with the library that must find them.
 
-`make(seed)` gives the muscle and keeps its secret, `reveal(seed)` tells it.
+`make(seed)` gives the muscle without saying what is hidden, `reveal(seed)` says it.
 """
 
 from __future__ import annotations
@@ -25,17 +25,16 @@ def _scenario(seed: int) -> Scenario:
     kind = str(rng.choice(["one", "nothing", "two", "outside"], p=[0.64, 0.12, 0.1, 0.14]))
     strength = str(rng.choice(["weak", "middle", "strong"], p=[0.2, 0.45, 0.35]))
     for attempt in range(20):
-        still = [name for name in draw.effect_ids() if name not in draw.MOVING]
         names: tuple[str, ...] = ()
         if kind == "one":
-            names = (str(rng.choice(still)),)
+            names = (str(rng.choice(draw.still_effect_ids())),)
         elif kind == "two":
             names = draw.draw_pair(rng)
         elif kind == "outside":
             names = (str(rng.choice(draw.outside_ids())),)
         try:
             return draw.draw_scenario(names, strength, seed + attempt, noise_sd_nm=NOISE_SD_NM)
-        except ValueError:  # no muscle shows this as strongly: draw something else
+        except ValueError:  # no muscle shows this effect so strongly: draw another
             continue
     raise ValueError(f"seed {seed}: no patient found; take another seed")
 

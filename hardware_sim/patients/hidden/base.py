@@ -1,5 +1,4 @@
-# ruff: noqa: ARG001 (every kernel takes the same four arguments)
-"""The muscle before anything is hidden in it: recruitment drawn from many shapes, linear second-order dynamics."""
+"""The muscle without effects: recruitment drawn from many shapes, linear second-order dynamics."""
 
 from __future__ import annotations
 
@@ -19,6 +18,7 @@ from hardware_sim.patients.hidden.kernels import (
     SPEED,
     STEP_S,
     Floats,
+    NotSuited,
     Stage,
     helper,
     kernel,
@@ -26,7 +26,7 @@ from hardware_sim.patients.hidden.kernels import (
 
 PERIOD_S = 0.025
 TABLE_SIZE = 512
-"""Recruitment is a table with one entry a µs."""
+"""Recruitment is a table with one entry per µs."""
 
 
 @helper
@@ -84,7 +84,7 @@ def second_order(x, p, s, c):
 def as_pulses(x, p, s, c):
     """p: length of a pulse's drive s, latency s, period s. s[0]: place in a ring, then drives to come.
 
-    The recruited torque of a period comes in one short burst per pulse, its middle where that of a held width is.
+    The recruited torque of a period comes in one short burst per pulse, centred in the period.
     """
     size = 256
     i = int(s[0])
@@ -102,7 +102,7 @@ def as_pulses(x, p, s, c):
 
 @dataclass(frozen=True)
 class Base:
-    """A muscle with nothing hidden in it.
+    """A muscle without effects.
 
     `lags_s` are the two time constants where the dynamics are two first-order lags in a row, else None. Where
     `burst_s` is not 0, each pulse drives the muscle in a burst of that length, so that torque ripples at 40 Hz.
@@ -128,6 +128,18 @@ class Base:
         share = np.maximum.accumulate(self.table_nm) / self.largest_nm
         return float(np.argmax(share >= 0.1)), float(np.argmax(share >= 0.9))
 
+    def two_lags_s(self) -> tuple[float, float]:
+        """The two time constants, the shorter first.
+
+        Raises
+        ------
+        NotSuited
+            The dynamics are not two first-order lags.
+        """
+        if self.lags_s is None:
+            raise NotSuited("needs two real time constants")
+        return min(self.lags_s), max(self.lags_s)
+
     def stages(self) -> list[Stage]:
         """Recruitment and dynamics."""
         stages = [
@@ -139,7 +151,7 @@ class Base:
         return stages
 
     def describe(self) -> dict[str, Any]:
-        """What `reveal` tells of it."""
+        """What `reveal` says of it."""
         return {
             "recruitment": self.shape,
             "dynamics": self.dynamics,

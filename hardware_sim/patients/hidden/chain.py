@@ -1,4 +1,4 @@
-"""Stages in a row: one compiled loop, for a whole record at once or a step at a time."""
+"""Stages in series, run by one compiled loop: a whole record at once or one step at a time."""
 
 from __future__ import annotations
 
@@ -58,14 +58,14 @@ def _run(
 
 
 class Chain:
-    """Stages ordered by their slot, with their state.
+    """Stages in the order of their slots, with their state.
 
     Parameters
     ----------
     stages
-        Any number; within a slot they keep the order given.
+        Any number. Within a slot they keep the given order.
     largest_nm
-        The base's largest torque, by which activation and force are counted, N·m.
+        The base's largest torque; activation and force are shares of it, N·m.
     step_s
         Step of the simulation, s.
     """
@@ -84,7 +84,7 @@ class Chain:
         self._one = np.zeros((5, 1))
 
     def run(self, x: Floats, pulse: Floats, angle_rad: Floats, velocity_rad_s: Floats) -> Floats:
-        """Advance by as many steps as `x` has entries; what leaves the last stage at the end of each."""
+        """Advance by as many steps as `x` has entries; the last stage's output after each step."""
         out = np.empty(x.size)
         _run(self._addresses, self._p, self._s, self._c, x, pulse, angle_rad, velocity_rad_s, self._steps, out)
         self._steps += x.size

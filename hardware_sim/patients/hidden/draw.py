@@ -1,13 +1,13 @@
-"""Drawing a muscle with something hidden in it, by a seed."""
+"""Drawing a muscle with hidden effects by a seed."""
 
 from __future__ import annotations
 
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache
 from importlib import import_module
 from pkgutil import iter_modules
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -15,80 +15,86 @@ from numpy.random import Generator
 
 from hardware_sim.patients.hidden import effects, kept_back, outside, outside_kept
 from hardware_sim.patients.hidden.base import Base, draw_base
+from hardware_sim.patients.hidden.design import Design, make_design
 from hardware_sim.patients.hidden.kernels import Formulation, NotSuited, Stage
-from hardware_sim.patients.hidden.protocol import Protocol40, make_design
-from hardware_sim.patients.hidden.scenario import BANDS, Hidden, combine, jsonable, set_size
+from hardware_sim.patients.hidden.scenario import BANDS, HiddenEffect, combine, find_magnitude, jsonable
 
 ATTEMPTS = 40
 CALIBRATION_STEP_S = 1.0 / 1600.0
 
 KEPT_BACK_FROM = 1000
-"""Seeds from here on may draw formulations that no lower seed draws."""
+"""Seeds from here on may also draw the formulations in `kept_back`."""
 
 MOVING = frozenset({"torque_angle", "torque_velocity", "passive_torque"})
-"""Show only where the joint moves."""
+"""These effects show only where the joint moves."""
 
 Writer = Callable[[Generator, Base], Formulation]
 
 
-@cache
+def _files_of(package: ModuleType) -> tuple[str, ...]:
+    return tuple(sorted(module.name for module in iter_modules(package.__path__)))
+
+
 def effect_ids() -> tuple[str, ...]:
-    """Effects the library names, one file each."""
-    return tuple(sorted(module.name for module in iter_modules(effects.__path__)))
+    """Effects that the library has, one file each."""
+    return _files_of(effects)
 
 
-@cache
 def outside_ids() -> tuple[str, ...]:
-    """Effects no library names."""
-    return tuple(sorted(module.name for module in iter_modules(outside.__path__)))
+    """Effects that no library has."""
+    return _files_of(outside)
 
 
-@cache
 def outside_kept_ids() -> tuple[str, ...]:
-    """More of them, which nobody who tunes a diagnosis looks at."""
-    return tuple(sorted(module.name for module in iter_modules(outside_kept.__path__)))
+    """More of them, which nobody who tunes a diagnosis may look at."""
+    return _files_of(outside_kept)
+
+
+def still_effect_ids() -> list[str]:
+    """Effects of the library that show while the joint is held still."""
+    return [name for name in effect_ids() if name not in MOVING]
 
 
 def formulations(effect: str, seed: int = KEPT_BACK_FROM) -> tuple[Writer, ...]:
-    """The ways an effect is written here; under seed 1000 without those kept back from development.
+    """The formulations of an effect; under seed 1000 without those kept back from development.
 
     Raises
     ------
     ValueError
         No effect of that name.
     """
-    for foreign, known in ((outside, outside_ids()), (outside_kept, outside_kept_ids())):
-        if effect in known:
-            return import_module(f"{foreign.__name__}.{effect}").FORMULATIONS
+    for package in (outside, outside_kept):
+        if effect in _files_of(package):
+            return import_module(f"{package.__name__}.{effect}").FORMULATIONS
     if effect not in effect_ids():
         raise ValueError(f"effect {effect!r}: one of {', '.join((*effect_ids(), *outside_ids()))}")
-    written = import_module(f"{effects.__name__}.{effect}").FORMULATIONS
-    if seed < KEPT_BACK_FROM or effect not in {module.name for module in iter_modules(kept_back.__path__)}:
-        return written
-    return (*written, *import_module(f"{kept_back.__name__}.{effect}").FORMULATIONS)
+    known = import_module(f"{effects.__name__}.{effect}").FORMULATIONS
+    if seed < KEPT_BACK_FROM or effect not in _files_of(kept_back):
+        return known
+    return (*known, *import_module(f"{kept_back.__name__}.{effect}").FORMULATIONS)
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """A base muscle, what is hidden in it, and the design the sizes were set on."""
+    """A base muscle, its hidden effects, and the design on which their magnitudes were found."""
 
     base: Base
-    hidden: tuple[Hidden, ...]
-    design: Protocol40
+    hidden: tuple[HiddenEffect, ...]
+    design: Design
 
     def stages(self) -> list[Stage]:
         """All stages of the muscle."""
         return combine(self.base, [(one.formulation, one.magnitude) for one in self.hidden])
 
     def truth(self, noise_sd_nm: float) -> dict[str, Any]:
-        """What is hidden, plainly."""
+        """What is hidden, as plain values."""
         return {
             "effects": [one.effect for one in self.hidden],
             "formulation": [one.formulation.name for one in self.hidden],
             "source": [one.formulation.source for one in self.hidden],
             "strength": self.hidden[0].strength if self.hidden else "none",
             "parameters": {
-                one.effect: jsonable({one.formulation.magnitude: one.magnitude, **one.formulation.parameters})
+                one.effect: jsonable({one.formulation.magnitude_name: one.magnitude, **one.formulation.parameters})
                 for one in self.hidden
             },
             "outside_library": any(one.effect not in effect_ids() for one in self.hidden),
@@ -99,7 +105,7 @@ class Scenario:
 
 
 def rng_of(seed: int, *labels: str) -> Generator:
-    """A generator of its own for a seed and labels."""
+    """The random generator of this seed and these labels."""
     return np.random.default_rng([seed, *(zlib.crc32(label.encode()) for label in labels)])
 
 
@@ -118,7 +124,7 @@ def draw_scenario(
 ) -> Scenario:
     """A scenario with the effects `names`, each of the given strength on its own.
 
-    Bases, formulations and sizes are drawn until the strength's band can be reached.
+    Bases, formulations and magnitudes are drawn until the strength's band is reached.
 
     Raises
     ------
@@ -128,32 +134,45 @@ def draw_scenario(
     if strength not in BANDS:
         raise ValueError(f"strength {strength!r}: one of {', '.join(BANDS)}")
     moving = moving or bool(MOVING & set(names))
-    low, high = BANDS[strength]
     for attempt in range(ATTEMPTS):
         rng = rng_of(seed, *names, strength, str(attempt))
         base = draw_base(rng, steep)
         if pulsed:
             base = replace(base, burst_s=float(rng.uniform(0.003, 0.012)))
         sequence = make_design(design, rng, float(base.largest_width_us), moving=moving, **design_settings)
-        hidden: list[Hidden] = []
         try:
-            for name in names:
-                writers = formulations(name, seed)
-                choice = int(rng.integers(len(writers))) if formulation is None else formulation
-                written = writers[choice](rng, base)
-                target = noise_sd_nm * float(np.exp(rng.uniform(np.log(low * 1.08), np.log(min(high, 20.0) * 0.92))))
-                band = noise_sd_nm * low, noise_sd_nm * high
-                size, excess = set_size(name, written, base, sequence, target, band, CALIBRATION_STEP_S)
-                hidden.append(Hidden(name, written, size, strength, excess))
+            hidden = tuple(
+                _draw_effect(rng, name, strength, noise_sd_nm, base, sequence, formulations(name, seed), formulation)
+                for name in names
+            )
             combine(base, [(one.formulation, one.magnitude) for one in hidden])
         except NotSuited:
             continue
-        return Scenario(base, tuple(hidden), sequence)
+        return Scenario(base, hidden, sequence)
     raise ValueError(f"{' and '.join(names)}, {strength}: no muscle found that shows it this strongly")
+
+
+def _draw_effect(
+    rng: Generator,
+    effect: str,
+    strength: str,
+    noise_sd_nm: float,
+    base: Base,
+    design: Design,
+    writers: tuple[Writer, ...],
+    choice: int | None,
+) -> HiddenEffect:
+    """One effect of this strength on this base; `choice` is its formulation, drawn if None."""
+    low, high = BANDS[strength]
+    formulation = writers[int(rng.integers(len(writers))) if choice is None else choice](rng, base)
+    target_nm = noise_sd_nm * float(np.exp(rng.uniform(np.log(low * 1.08), np.log(min(high, 20.0) * 0.92))))
+    band_nm = noise_sd_nm * low, noise_sd_nm * high
+    magnitude, excess = find_magnitude(effect, formulation, base, design, target_nm, band_nm, CALIBRATION_STEP_S)
+    return HiddenEffect(effect, formulation, magnitude, strength, excess)
 
 
 def draw_pair(rng: Generator) -> tuple[str, str]:
     """Two different effects of the library that need no movement."""
-    still = [name for name in effect_ids() if name not in MOVING]
+    still = still_effect_ids()
     first, second = rng.choice(len(still), 2, replace=False)
     return still[int(first)], still[int(second)]

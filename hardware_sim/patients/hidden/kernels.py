@@ -1,8 +1,8 @@
-"""How a stage of the hidden muscle is written: a small compiled function with its numbers and its state.
+"""How a stage of a hidden muscle is written: a small compiled function with its parameters and its state.
 
-Every kernel takes `(x, p, s, c)`: the signal that reaches it, its parameters, its state and the context all stages
-share, and gives the signal that leaves. Kernels are C functions, called by address, so that any set of them runs in
-one compiled loop without compiling anew, and one step of a live muscle costs about a microsecond.
+Every kernel takes `(x, p, s, c)`: its input signal, its parameters, its state and the context that all stages share.
+It returns its output signal. Kernels are C functions called by address, so that any set of them runs in one compiled
+loop without another compilation, and one step of a live muscle costs about a microsecond.
 """
 
 from __future__ import annotations
@@ -17,12 +17,13 @@ import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
+from numpy.random import Generator
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
 ROW = 1024
-"""Parameters and states a stage may have."""
+"""Most parameters, and most states, of a stage."""
 
 # The context: one array that all stages of a muscle read, and some write.
 TIME_S = 0
@@ -30,18 +31,18 @@ STEP_S = 1
 WIDTH_US = 2  # what the stimulator sends, before any electrode effect
 PULSE = 3  # 1 in the step a pulse with some width arrives in
 SINCE_S = 4  # since the last such pulse
-COUNT = 5  # pulses of the present train
-PAUSE_S = 6  # the pause before the present train
+COUNT = 5  # pulses of this train
+PAUSE_S = 6  # the pause before this train
 ANGLE_RAD = 7
 VELOCITY_RAD_S = 8
 ACTIVATION = 9  # recruited share, 0 to 1, before any gain
-FORCE = 10  # what the dynamics gave in the step before, as a share of the largest torque
-SPEED = 11  # factor on the rates of the dynamics; 1 unless a stage before them changes it
+FORCE = 10  # output of the dynamics one step before, as a share of the largest torque
+SPEED = 11  # factor on the rates of the dynamics; 1 unless an earlier stage changes it
 LARGEST_NM = 12
 CONTEXT_SIZE = 16
 
 SLOTS = (
-    "electrode",  # pulse width -> pulse width the nerve feels
+    "electrode",  # pulse width -> pulse width at the nerve
     "recruitment",  # -> recruited torque
     "gain",
     "delay",
@@ -64,7 +65,7 @@ def kernel(function: Callable[..., float]) -> Any:
 
 
 helper: Any = nb.njit(cache=True)
-"""Decorator of what several kernels share."""
+"""Decorator of functions that several kernels call."""
 
 
 @intrinsic
@@ -111,9 +112,14 @@ def smooth_table(p: Any, first: int, count: int, position: float) -> float:
     return b + 0.5 * r * (d - a + r * (2 * a - 5 * b + 4 * d - e + r * (3 * (b - d) + e - a)))
 
 
+def random_sign(rng: Generator, positive_share: float) -> float:
+    """1 with this probability, otherwise -1."""
+    return 1.0 if rng.random() < positive_share else -1.0
+
+
 @dataclass(frozen=True)
 class Stage:
-    """A kernel with its numbers, in one slot of the muscle."""
+    """A kernel with its parameters, in one slot of the muscle."""
 
     slot: str
     kernel: Any
@@ -132,18 +138,17 @@ class Stage:
 class Formulation:
     """One way of writing an effect down.
 
-    `build(magnitude)` gives its stages; at magnitude 0 they leave the base muscle as it is. A stage in the slot
-    `recruitment` or `dynamics` takes the place of the base's own.
+    `build(magnitude)` gives its stages. At magnitude 0 they leave the base muscle as it is. A stage in the slot
+    `recruitment` or `dynamics` replaces the base's own. `magnitude_name` says what the magnitude is, with its unit.
     """
 
     name: str
     source: str
     build: Callable[[float], list[Stage]]
-    top: float
-    magnitude: str
+    largest_magnitude: float
+    magnitude_name: str
     parameters: dict[str, Any] = field(default_factory=dict)
-    needs_movement: bool = False
 
 
 class NotSuited(Exception):
-    """This formulation cannot be written on this base muscle; draw another."""
+    """This formulation does not suit this base muscle; draw another."""

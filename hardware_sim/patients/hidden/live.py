@@ -18,15 +18,15 @@ _Saved = tuple[Floats, Floats, float]
 
 
 class HiddenMuscle:
-    """A muscle with something hidden in it; answers to the `Muscle` protocol, joint held still.
+    """A muscle with hidden effects and its joint held still; it implements the `Muscle` protocol.
 
-    A pulse's width is held for 25 ms; what jitter leaves open between two holds, up to 5 ms, is closed by going
-    back to the end of the first. Another current than 20 mA scales the width by charge.
+    A pulse's width is held for 25 ms. Jitter leaves gaps between two holds; a gap of up to 5 ms is closed by going back
+    to its beginning. Another current than 20 mA scales the width by charge.
 
     Parameters
     ----------
     scenario
-        The base muscle and what is hidden in it.
+        The base muscle and its hidden effects.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -34,9 +34,9 @@ class HiddenMuscle:
         largest_nm = scenario.base.largest_nm
         self._muscle = Chain(before, largest_nm, 1.0 / STEPS_PER_S)
         self._converter = Chain(after, largest_nm, 1.0 / STEPS_PER_S) if after else None
-        self._done = 0  # steps made; the state is that at `_done` / STEPS_PER_S
-        self._values = (0.0, 0.0)  # at the last two steps
-        self._edges: list[tuple[float, float]] = []  # times in steps from which a width holds, not yet passed
+        self._done = 0  # steps simulated; the state is that at `_done` / STEPS_PER_S
+        self._values = (0.0, 0.0)  # torque at the last two steps
+        self._edges: list[tuple[float, float]] = []  # coming changes of the width: time in steps, new width
         self._width_us = 0.0
         self._arrivals: list[float] = []
         self._hold_end = -math.inf
@@ -58,19 +58,19 @@ class HiddenMuscle:
         self._hold_end = at + PULSE_PERIOD_S * STEPS_PER_S
 
     def torque_nm(self, time_s: float) -> float:
-        """Advance to `time_s` and give the torque on the load cell there, N·m: neither noise nor converter."""
+        """Advance to `time_s` and return the torque on the load cell, N·m, without noise and converter."""
         at = time_s * STEPS_PER_S
         self._run_to(math.floor(at + 1e-6))
         before, last = self._values
         return last + (last - before) * (at - self._done) if at > self._done + 1e-6 else last
 
     def converted_nm(self, reading_nm: float, time_s: float) -> float:
-        """What the converter makes of a reading that has its noise already: rails and steps come after noise."""
+        """The reading, noise included, after the converter; clipping and steps come after the noise."""
         return self._converter.step(reading_nm, 0.0, time_s * STEPS_PER_S) if self._converter else reading_nm
 
     def _close_gap(self, at: float) -> None:
-        """Hold the last width up to `at`, though its hold had run out."""
-        if self._at_hold_end is None:  # the step in which it ends has not been made
+        """Hold the last width up to `at`, although its hold had ended."""
+        if self._at_hold_end is None:  # the step in which the hold ends was not simulated yet
             self._edges = [edge for edge in self._edges if edge[0] != self._hold_end]
             return
         saved, done, values, width = self._at_hold_end
@@ -88,7 +88,7 @@ class HiddenMuscle:
             self._done += 1
 
     def _input(self) -> tuple[float, float]:
-        """Mean width over the step about to be made, and whether a pulse arrives in it."""
+        """Mean width over the next step, and whether a pulse arrives in it."""
         start, end = float(self._done), self._done + 1.0
         pulse = 0.0
         if self._arrivals and self._arrivals[0] < end:

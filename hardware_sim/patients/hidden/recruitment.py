@@ -1,4 +1,4 @@
-"""Shapes of the isometric recruitment curve, each drawn with its own threshold and steepness.
+"""Shapes of the isometric recruitment curve, each with a drawn threshold and steepness.
 
 Sources: the paper's sigmoid, eq. 35; Ding, Chou, Kesar et al. 2007 (exponential above a threshold); Hill and
 Gompertz curves as used for dose and response; Durfee and MacLean 1989 (dead band, rise, plateau); a pool of motor
@@ -88,7 +88,7 @@ SHAPES = {
 
 
 def draw(rng: Generator, steep: bool, size: int) -> tuple[str, Floats, dict[str, float], int]:
-    """A shape's name, its values at 0 … size - 1 µs, its numbers, and the largest pulse width to send."""
+    """A shape's name, its values at 0 … size - 1 µs, its parameters, and the largest pulse width to send."""
     name = str(rng.choice(list(SHAPES)))
     largest = int(rng.choice([250, 300, 300, 300, 350, 400]))
     bounds = (5.0, 25.0) if steep else (26.0, 150.0)

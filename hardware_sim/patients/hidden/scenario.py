@@ -1,4 +1,4 @@
-"""A base muscle with what is hidden in it; simulated over a design; the size of an effect set by what it leaves."""
+"""Simulating a base muscle with hidden effects, and finding the magnitude at which an effect shows as asked."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import numpy as np
 
 from hardware_sim.patients.hidden.base import Base
 from hardware_sim.patients.hidden.chain import Chain
+from hardware_sim.patients.hidden.design import Design
+from hardware_sim.patients.hidden.effect_free_fit import PULSE_RATE_HZ, EffectFreeFit
 from hardware_sim.patients.hidden.kernels import SLOTS, Floats, Formulation, NotSuited, Stage
-from hardware_sim.patients.hidden.protocol import Protocol40
-from hardware_sim.patients.hidden.yardstick import PULSE_RATE_HZ, Yardstick
 
 BANDS = {"weak": (2.0, 5.0), "middle": (5.0, 10.0), "strong": (10.0, 25.0)}
-"""Excess error over the noise's sd."""
+"""Excess error over the noise's standard deviation."""
 
 EVERYWHERE = frozenset(
     {
@@ -27,23 +27,23 @@ EVERYWHERE = frozenset(
         "sensor_gain_swing",
     }
 )
-"""Not predictable in held-out rows: their excess is the residual over the whole record."""
+"""Not predictable in held-out rows: the residual over the whole record counts."""
 
 ADDED = frozenset({"mains_hum"})
-"""Aliases at the pulse rate: the excess is the rms of what is added, at the full rate."""
+"""Aliases at the pulse rate: the rms of the added torque at the full rate counts."""
 
 EITHER = frozenset({"threshold_drift", "fatigue", "potentiation"})
-"""Can hide from the held-out rows: the larger of training and held-out residual counts."""
+"""May not show in the held-out rows: the larger of training and held-out residual counts."""
 
 IN_TRAINING = frozenset({"slipped_electrode"})
-"""Happens while training: what it leaves there counts, since only there it can be seen to happen."""
+"""Happens in the training rows only: the training residual counts."""
 
 _REPLACED = ("recruitment", "dynamics")
 
 
 @dataclass(frozen=True)
-class Hidden:
-    """One effect: how it is written, how large it is, and how much it leaves."""
+class HiddenEffect:
+    """One effect: its formulation, its magnitude, and the error that a fit without it leaves."""
 
     effect: str
     formulation: Formulation
@@ -53,12 +53,12 @@ class Hidden:
 
 
 def combine(base: Base, hidden: list[tuple[Formulation, float]]) -> list[Stage]:
-    """The base's stages with those of the effects put in.
+    """The base's stages together with those of the effects.
 
     Raises
     ------
     NotSuited
-        Two effects want the place of the same stage.
+        Two effects replace the same stage.
     """
     stages = [stage for formulation, magnitude in hidden for stage in formulation.build(magnitude)]
     taken = [stage.slot for stage in stages if stage.slot in _REPLACED]
@@ -73,10 +73,8 @@ def split(stages: list[Stage]) -> tuple[list[Stage], list[Stage]]:
     return [s for s in stages if SLOTS.index(s.slot) < cut], [s for s in stages if SLOTS.index(s.slot) >= cut]
 
 
-def simulate(
-    base: Base, stages: list[Stage], design: Protocol40, step_s: float, noise_nm: Floats | None = None
-) -> Floats:
-    """Torque at every step of the design, N·m; the noise enters before the converter."""
+def simulate(base: Base, stages: list[Stage], design: Design, step_s: float, noise_nm: Floats | None = None) -> Floats:
+    """Torque at every step of the design, N·m; the noise is added before the converter."""
     width, pulse, angle, velocity = design.fine(step_s)
     before, after = split(stages)
     torque = Chain(before, base.largest_nm, step_s).run(width, pulse, angle, velocity)
@@ -88,7 +86,7 @@ def simulate(
 
 
 def excess_nm(effect: str, residual_nm: Floats, held_out: np.ndarray) -> dict[str, float]:
-    """Root mean square of what the effect-free fit leaves: trained, held out, whole, and the one that counts."""
+    """Root mean squares of the residual: training rows, held-out rows, all rows, and the one that counts."""
     rms = lambda rows: float(np.sqrt(np.mean(rows**2))) if rows.size else float("nan")  # noqa: E731
     out = {
         "training_nm": rms(residual_nm[~held_out]),
@@ -107,29 +105,29 @@ def excess_nm(effect: str, residual_nm: Floats, held_out: np.ndarray) -> dict[st
 
 
 @dataclass
-class _Sizing:
-    """What an effect of a given magnitude leaves on one base and one design."""
+class _Excess:
+    """The error that the effect-free fit leaves, by the effect's magnitude, on one base and one design."""
 
     effect: str
     formulation: Formulation
     base: Base
-    design: Protocol40
+    design: Design
     step_s: float
 
     def __post_init__(self) -> None:
-        self._yardstick = Yardstick(self.base, self.design.width_us, self.design.held_out)
+        self._effect_free_fit = EffectFreeFit(self.base, self.design.width_us, self.design.held_out)
         self._without, found = self._residual(self.base.stages())
-        self.own_nm = found["counted_nm"]  # what the spline cannot follow of the base itself
+        self.own_nm = found["counted_nm"]  # what the fit leaves without any effect
 
     def _residual(self, stages: list[Stage]) -> tuple[Floats, dict[str, float]]:
         torque = simulate(self.base, stages, self.design, self.step_s)
         if not np.all(np.isfinite(torque)):
             raise NotSuited("the simulation diverged")
         every = round(1.0 / PULSE_RATE_HZ / self.step_s)
-        return torque, excess_nm(self.effect, self._yardstick.fit(torque[::every]), self.design.held_out)
+        return torque, excess_nm(self.effect, self._effect_free_fit.fit(torque[::every]), self.design.held_out)
 
-    def leaves(self, magnitude: float) -> dict[str, float]:
-        """Excess in N·m; `counted_nm` is freed of the base's own."""
+    def at(self, magnitude: float) -> dict[str, float]:
+        """Excess in N·m; the error without the effect is taken out of `counted_nm`."""
         torque, found = self._residual(combine(self.base, [(self.formulation, magnitude)]))
         counted = float(np.sqrt(max(found["counted_nm"] ** 2 - self.own_nm**2, 1e-18)))
         if self.effect in ADDED:
@@ -137,35 +135,35 @@ class _Sizing:
         return found | {"counted_nm": counted}
 
 
-def set_size(
+def find_magnitude(
     effect: str,
     formulation: Formulation,
     base: Base,
-    design: Protocol40,
+    design: Design,
     target_nm: float,
     band_nm: tuple[float, float],
     step_s: float,
 ) -> tuple[float, dict[str, float]]:
-    """Magnitude at which the effect leaves about `target_nm`, and what it leaves, surely within the band.
+    """Magnitude at which the excess is about `target_nm` and within the band, and that excess.
 
-    Secant steps in the logarithm, kept within a bracket.
+    By secant steps in the logarithm, kept within a bracket.
 
     Raises
     ------
     NotSuited
-        The largest magnitude leaves less, or the base itself too much.
+        The excess of the largest magnitude is too small, or the fit without the effect too poor.
     """
-    sizing = _Sizing(effect, formulation, base, design, step_s)
-    if sizing.own_nm > 0.5 * target_nm:
-        raise NotSuited("the yardstick cannot follow this base closely enough")
-    high = formulation.top
-    at_high = sizing.leaves(high)["counted_nm"]
+    excess = _Excess(effect, formulation, base, design, step_s)
+    if excess.own_nm > 0.5 * target_nm:
+        raise NotSuited("the effect-free fit follows this base too poorly")
+    high = formulation.largest_magnitude
+    at_high = excess.at(high)["counted_nm"]
     if at_high < target_nm:
-        raise NotSuited("too small even at its top")
+        raise NotSuited("too small even at its largest magnitude")
     low, at_low = high * 1e-3, target_nm * 1e-3
     magnitude = high * target_nm / at_high
     for tries in range(12):
-        found = sizing.leaves(magnitude)
+        found = excess.at(magnitude)
         counted = found["counted_nm"]
         close = abs(np.log(counted / target_nm)) < (0.1 if tries < 6 else 1.0)
         if close and band_nm[0] * 1.03 < counted < band_nm[1] * 0.97:
@@ -181,16 +179,8 @@ def set_size(
     raise NotSuited("the effect's size does not grow smoothly")
 
 
-def band_of(excess_over_noise: float) -> str:
-    """Name of the band an excess falls in."""
-    for name, (low, high) in BANDS.items():
-        if low <= excess_over_noise < high:
-            return name
-    return "below" if excess_over_noise < BANDS["weak"][0] else "above"
-
-
 def jsonable(value: Any) -> Any:
-    """Plain numbers for `reveal`."""
+    """The value as plain numbers, lists and dictionaries."""
     if isinstance(value, dict):
         return {str(k): jsonable(v) for k, v in value.items()}
     if isinstance(value, list | tuple | np.ndarray):

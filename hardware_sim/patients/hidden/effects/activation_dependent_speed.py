@@ -7,7 +7,7 @@ import math
 from numpy.random import Generator
 
 from hardware_sim.patients.hidden.base import Base, lag_after
-from hardware_sim.patients.hidden.kernels import FORCE, LARGEST_NM, SPEED, STEP_S, Formulation, NotSuited, Stage, kernel
+from hardware_sim.patients.hidden.kernels import FORCE, LARGEST_NM, SPEED, STEP_S, Formulation, Stage, kernel
 
 
 @kernel
@@ -63,12 +63,6 @@ def _cooperative(x, p, s, c):
     return s[1]
 
 
-def _lags(base: Base) -> tuple[float, float]:
-    if base.lags_s is None:
-        raise NotSuited("needs two real time constants")
-    return min(base.lags_s), max(base.lags_s)
-
-
 def by_level(rng: Generator, _base: Base) -> Formulation:
     sign, lag = float(rng.choice([-1.0, 1.0])), float(rng.uniform(0.01, 0.1))
     return Formulation(
@@ -82,7 +76,7 @@ def by_level(rng: Generator, _base: Base) -> Formulation:
 
 
 def calcium_pump(_rng: Generator, base: Base) -> Formulation:
-    fast, slow = _lags(base)
+    fast, slow = base.two_lags_s()
     return Formulation(
         "calcium pump saturates",
         "Michaelis-Menten uptake, Westerblad and Allen 1994; Stein, Bobet, Oğuztöreli and Fryer 1988",
@@ -93,7 +87,7 @@ def calcium_pump(_rng: Generator, base: Base) -> Formulation:
 
 
 def bound_calcium(_rng: Generator, base: Base) -> Formulation:
-    fast, slow = _lags(base)
+    fast, slow = base.two_lags_s()
     return Formulation(
         "force decays more slowly with bound calcium",
         "Ding, Wexler and Binder-Macleod 2000: τ1 + τ2 CN / (Km + CN)",
@@ -104,7 +98,7 @@ def bound_calcium(_rng: Generator, base: Base) -> Formulation:
 
 
 def cooperative(_rng: Generator, base: Base) -> Formulation:
-    fast, slow = _lags(base)
+    fast, slow = base.two_lags_s()
     return Formulation(
         "cooperative attachment, faster when strong",
         "Campbell 1997",

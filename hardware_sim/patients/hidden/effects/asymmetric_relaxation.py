@@ -7,7 +7,7 @@ import math
 from numpy.random import Generator
 
 from hardware_sim.patients.hidden.base import Base, lag_after, second_order_step
-from hardware_sim.patients.hidden.kernels import FORCE, LARGEST_NM, STEP_S, Formulation, NotSuited, Stage, kernel
+from hardware_sim.patients.hidden.kernels import FORCE, LARGEST_NM, STEP_S, Formulation, Stage, kernel, random_sign
 
 
 @kernel
@@ -50,15 +50,19 @@ def _cross_bridges(x, p, s, c):
 
 
 def _lags(base: Base, rng: Generator) -> tuple[float, float]:
-    if base.lags_s is None:
-        raise NotSuited("needs two real time constants")
-    slow, fast = max(base.lags_s), min(base.lags_s)
+    """The time constant that becomes asymmetric, and the other."""
+    fast, slow = base.two_lags_s()
     return (slow, fast) if rng.random() < 0.7 else (fast, slow)
+
+
+def _sign(rng: Generator) -> float:
+    """1 where relaxation is slower, in three of four; -1 where development is."""
+    return random_sign(rng, 0.75)
 
 
 def thelen(rng: Generator, base: Base) -> Formulation:
     asymmetric, other = _lags(base, rng)
-    sign = 1.0 if rng.random() < 0.75 else -1.0  # relaxation is slower in three of four
+    sign = _sign(rng)
     exponent = float(rng.uniform(0.0, 1.0))
     return Formulation(
         "activation and deactivation time constants with 0.5 + 1.5 a",
@@ -72,7 +76,7 @@ def thelen(rng: Generator, base: Base) -> Formulation:
 
 def de_groote(rng: Generator, base: Base) -> Formulation:
     asymmetric, other = _lags(base, rng)
-    sign = 1.0 if rng.random() < 0.75 else -1.0
+    sign = _sign(rng)
     steepness, share = float(rng.uniform(5.0, 30.0)), float(rng.uniform(0.0, 0.5))
     return Formulation(
         "tanh-smoothed activation dynamics",
@@ -85,7 +89,7 @@ def de_groote(rng: Generator, base: Base) -> Formulation:
 
 
 def cross_bridges(rng: Generator, base: Base) -> Formulation:
-    sign = 1.0 if rng.random() < 0.75 else -1.0
+    sign = _sign(rng)
     smooth = float(rng.uniform(0.02, 0.15))
     return Formulation(
         "attachment faster than detachment, smoothed, second order",

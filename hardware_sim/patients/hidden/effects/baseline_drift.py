@@ -1,4 +1,3 @@
-# ruff: noqa: ARG001 (every kernel takes the same four arguments)
 """Baseline drift: the torque read at rest wanders (temperature, settling limb)."""
 
 from __future__ import annotations

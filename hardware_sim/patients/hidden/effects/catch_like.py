@@ -1,4 +1,3 @@
-# ruff: noqa: ARG001 (every kernel takes the same four arguments)
 """Catch-like property: the onset of a train yields more torque than its later pulses."""
 
 from __future__ import annotations

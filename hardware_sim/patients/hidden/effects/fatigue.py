@@ -1,4 +1,3 @@
-# ruff: noqa: ARG001 (every kernel takes the same four arguments)
 """Fatigue: the torque a given recruitment yields falls with use and comes back with rest."""
 
 from __future__ import annotations

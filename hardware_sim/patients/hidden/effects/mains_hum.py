@@ -1,4 +1,3 @@
-# ruff: noqa: ARG001 (every kernel takes the same four arguments)
 """Mains hum: 50 or 60 Hz and harmonics on the load cell's line."""
 
 from __future__ import annotations

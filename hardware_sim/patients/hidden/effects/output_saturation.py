@@ -1,4 +1,3 @@
-# ruff: noqa: ARG001 (every kernel takes the same four arguments)
 """Output saturation: large torques are rounded off after the dynamics, by tendon or fixture."""
 
 from __future__ import annotations

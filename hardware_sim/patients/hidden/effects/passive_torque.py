@@ -1,4 +1,3 @@
-# ruff: noqa: ARG001 (every kernel takes the same four arguments)
 """Passive torque: tissue resists movement without any stimulation."""
 
 from __future__ import annotations
@@ -55,7 +54,6 @@ def exponential(rng: Generator, _base: Base) -> Formulation:
         8.0,
         "size_nm",
         {"lengths_per_rad": per_rad, "slack_rad": slack, "viscous_share_s": viscous},
-        True,
     )
 
 
@@ -76,7 +74,6 @@ def two_ends(rng: Generator, _base: Base) -> Formulation:
         dict(
             zip(("flexed_per_rad", "flexed_rad", "extended_per_rad", "extended_rad", "viscous_s"), numbers, strict=True)
         ),
-        True,
     )
 
 
@@ -89,7 +86,6 @@ def friction(rng: Generator, _base: Base) -> Formulation:
         5.0,
         "size_nm",
         dict(zip(("stiffness", "viscosity_s", "dry"), shares, strict=True)),
-        True,
     )
 
 
@@ -102,7 +98,6 @@ def relaxing(rng: Generator, _base: Base) -> Formulation:
         6.0,
         "stiffness_nm_per_rad",
         {"lasting_share": lasting, "relaxation_s": tau},
-        True,
     )
 
 

@@ -1,4 +1,3 @@
-# ruff: noqa: ARG001 (every kernel takes the same four arguments)
 """Recruitment hysteresis: the same pulse width recruits less on the way up than on the way down."""
 
 from __future__ import annotations

@@ -1,4 +1,3 @@
-# ruff: noqa: ARG001 (every kernel takes the same four arguments)
 """Sensor clipping: the load cell's amplifier or converter reaches its rail."""
 
 from __future__ import annotations

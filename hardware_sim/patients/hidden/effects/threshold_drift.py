@@ -1,4 +1,3 @@
-# ruff: noqa: ARG001 (every kernel takes the same four arguments)
 """Threshold drift: over minutes, the same pulse width reaches fewer or more nerve fibres."""
 
 from __future__ import annotations
@@ -9,7 +8,7 @@ import numpy as np
 from numpy.random import Generator
 
 from hardware_sim.patients.hidden.base import Base
-from hardware_sim.patients.hidden.kernels import TIME_S, Formulation, Stage, kernel, smooth_table
+from hardware_sim.patients.hidden.kernels import TIME_S, Formulation, Stage, kernel, random_sign, smooth_table
 
 
 @kernel
@@ -44,7 +43,7 @@ def _linear(x, p, s, c):
 
 
 def _sign(rng: Generator) -> float:
-    return 1.0 if rng.random() < 0.65 else -1.0
+    return random_sign(rng, 0.65)
 
 
 def impedance(rng: Generator, _base: Base) -> Formulation:

@@ -1,4 +1,3 @@
-# ruff: noqa: ARG001 (every kernel takes the same four arguments)
 """Torque-angle: active torque depends on the elbow's angle."""
 
 from __future__ import annotations
@@ -40,7 +39,6 @@ def parabola(_rng: Generator, _base: Base) -> Formulation:
         lambda m: [Stage("joint", _parabola, (m, 0.0344, 4.49e-4))],
         1.3,
         "exponent",
-        needs_movement=True,
     )
 
 
@@ -54,7 +52,6 @@ def force_length(rng: Generator, _base: Base) -> Formulation:
         8.0,
         "exponent",
         {"lengths_per_rad": per_rad, "best_angle_rad": best, "width": width},
-        True,
     )
 
 
@@ -67,7 +64,6 @@ def moment_arm(rng: Generator, _base: Base) -> Formulation:
         5.0,
         "exponent",
         {"best_angle_rad": at},
-        True,
     )
 
 

@@ -1,4 +1,3 @@
-# ruff: noqa: ARG001 (every kernel takes the same four arguments)
 """Torque-velocity: active torque falls as the muscle shortens and rises as it is stretched."""
 
 from __future__ import annotations
@@ -8,7 +7,7 @@ import math
 from numpy.random import Generator
 
 from hardware_sim.patients.hidden.base import Base
-from hardware_sim.patients.hidden.kernels import ANGLE_RAD, VELOCITY_RAD_S, Formulation, Stage, kernel
+from hardware_sim.patients.hidden.kernels import ANGLE_RAD, VELOCITY_RAD_S, Formulation, Stage, kernel, random_sign
 
 
 @kernel
@@ -39,7 +38,7 @@ def _angle_times_velocity(x, p, s, c):
 
 
 def _sign(rng: Generator) -> float:
-    return 1.0 if rng.random() < 0.7 else -1.0
+    return random_sign(rng, 0.7)
 
 
 def hill(rng: Generator, _base: Base) -> Formulation:
@@ -51,7 +50,6 @@ def hill(rng: Generator, _base: Base) -> Formulation:
         1.0,
         "inverse_largest_velocity_s",
         {"shortening": "extension" if sign > 0 else "flexion", "shape": shape, "eccentric_plateau": plateau},
-        True,
     )
 
 
@@ -64,7 +62,6 @@ def logarithmic(rng: Generator, _base: Base) -> Formulation:
         1.0,
         "inverse_largest_velocity_s",
         {"shortening": "extension" if sign > 0 else "flexion"},
-        True,
     )
 
 
@@ -77,7 +74,6 @@ def angle_times_velocity(rng: Generator, _base: Base) -> Formulation:
         1.5,
         "share_lost_per_rad_s",
         {"V2_per_degree": v2, "sign": sign},
-        True,
     )
 
 

@@ -1,4 +1,3 @@
-# ruff: noqa: ARG001 (every kernel takes the same four arguments)
 """Voluntary effort and spasm: torque that has nothing to do with the stimulation."""
 
 from __future__ import annotations

@@ -1,4 +1,3 @@
-# ruff: noqa: ARG001 (every kernel takes the same four arguments)
 """Speed by recruitment."""
 
 from __future__ import annotations

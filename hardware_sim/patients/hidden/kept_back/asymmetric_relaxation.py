@@ -1,4 +1,3 @@
-# ruff: noqa: ARG001 (every kernel takes the same four arguments)
 """Relaxation with a linear phase."""
 
 from __future__ import annotations
@@ -8,7 +7,7 @@ import math
 from numpy.random import Generator
 
 from hardware_sim.patients.hidden.base import Base, lag_after
-from hardware_sim.patients.hidden.kernels import FORCE, LARGEST_NM, STEP_S, Formulation, NotSuited, Stage, kernel
+from hardware_sim.patients.hidden.kernels import FORCE, LARGEST_NM, STEP_S, Formulation, Stage, kernel
 
 
 @kernel
@@ -27,9 +26,7 @@ def _limited_fall(x, p, s, c):
 
 
 def limited_fall(rng: Generator, base: Base) -> Formulation:
-    if base.lags_s is None:
-        raise NotSuited("needs two real time constants")
-    fast, slow = min(base.lags_s), max(base.lags_s)
+    fast, slow = base.two_lags_s()
     return Formulation(
         "torque falls no faster than the bridges let go",
         "linear phase of relaxation, Tesi, Piroddi, Colomo and Poggesi 2002",

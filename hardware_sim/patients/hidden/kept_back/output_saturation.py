@@ -1,4 +1,3 @@
-# ruff: noqa: ARG001 (every kernel takes the same four arguments)
 """Output saturation by a hyperbola."""
 
 from __future__ import annotations

@@ -1,4 +1,3 @@
-# ruff: noqa: ARG001 (every kernel takes the same four arguments)
 """Passive torque by a tangent."""
 
 from __future__ import annotations
@@ -28,7 +27,6 @@ def tangent(rng: Generator, _base: Base) -> Formulation:
         4.0,
         "size_nm",
         dict(zip(("range_rad", "viscous_share", "velocity_exponent"), numbers, strict=True)),
-        True,
     )
 
 

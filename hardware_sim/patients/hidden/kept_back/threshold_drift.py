@@ -1,4 +1,3 @@
-# ruff: noqa: ARG001 (every kernel takes the same four arguments)
 """Threshold drift with use."""
 
 from __future__ import annotations

@@ -1,4 +1,3 @@
-# ruff: noqa: ARG001 (every kernel takes the same four arguments)
 """Torque-angle by a cubic."""
 
 from __future__ import annotations
@@ -31,7 +30,6 @@ def cubic(rng: Generator, _base: Base) -> Formulation:
         4.0,
         "exponent",
         {"coefficients": list(numbers)},
-        True,
     )
 
 

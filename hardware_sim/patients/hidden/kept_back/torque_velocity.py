@@ -1,4 +1,3 @@
-# ruff: noqa: ARG001 (every kernel takes the same four arguments)
 """Torque-velocity by a logistic curve."""
 
 from __future__ import annotations
@@ -8,7 +7,7 @@ import math
 from numpy.random import Generator
 
 from hardware_sim.patients.hidden.base import Base
-from hardware_sim.patients.hidden.kernels import VELOCITY_RAD_S, Formulation, Stage, kernel
+from hardware_sim.patients.hidden.kernels import VELOCITY_RAD_S, Formulation, Stage, kernel, random_sign
 
 
 @kernel
@@ -19,7 +18,7 @@ def _logistic(x, p, s, c):
 
 
 def logistic(rng: Generator, _base: Base) -> Formulation:
-    sign, plateau = (1.0 if rng.random() < 0.7 else -1.0), float(rng.uniform(1.4, 1.9))
+    sign, plateau = random_sign(rng, 0.7), float(rng.uniform(1.4, 1.9))
     return Formulation(
         "logistic curve",
         "smooth stand-in for Hill's hyperbola",
@@ -27,7 +26,6 @@ def logistic(rng: Generator, _base: Base) -> Formulation:
         0.8,
         "steepness_s",
         {"sign": sign, "plateau": plateau},
-        True,
     )
 
 

@@ -1,4 +1,3 @@
-# ruff: noqa: ARG001 (every kernel takes the same four arguments)
 """Tremor as beats."""
 
 from __future__ import annotations

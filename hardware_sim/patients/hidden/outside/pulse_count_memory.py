@@ -1,4 +1,3 @@
-# ruff: noqa: ARG001 (every kernel takes the same four arguments)
 """Memory of the number of pulses: the gain goes up and down with how many pulses there have been."""
 
 from __future__ import annotations

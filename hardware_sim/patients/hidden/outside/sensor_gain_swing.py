@@ -1,4 +1,3 @@
-# ruff: noqa: ARG001 (every kernel takes the same four arguments)
 """Sensor gain that swings: warmth from a heating cycle changes the load cell's sensitivity, not its zero."""
 
 from __future__ import annotations

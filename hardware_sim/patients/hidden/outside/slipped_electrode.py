@@ -1,4 +1,3 @@
-# ruff: noqa: ARG001 (every kernel takes the same four arguments)
 """A slipped electrode: at one moment it comes away from its place, and from then on everything is weaker or later."""
 
 from __future__ import annotations

@@ -1,4 +1,3 @@
-# ruff: noqa: ARG001 (every kernel takes the same four arguments)
 """A slow converter: the sensor holds each reading for a while, or rounds it coarsely."""
 
 from __future__ import annotations

@@ -1,0 +1,1 @@
+"""Charts of models, diagnoses and recordings: for pages, reports and notebooks alike."""

@@ -1,0 +1,111 @@
+"""`stimrig audit`: verify the chain of the audit trail, and export it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from api.cli.errors import InputError
+from api.cli.terminal import Json, say, say_json, write
+from api.errors import ApiError
+from api.settings import Settings
+from api.store import Store, audit
+from api.store.tables import AuditEntry
+
+DataDir = Annotated[Path | None, typer.Option("--data", help="data folder; default ./var, or STIMRIG_DATA_DIR")]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the verb and what it can do."""
+    verbs = typer.Typer(no_args_is_help=True, help="Who did what, when, why: verify the chain of hashes, or export it.")
+    verbs.command("verify")(verify)
+    verbs.command("export")(export)
+    app.add_typer(verbs, name="audit")
+
+
+def verify(
+    data: DataDir = None,
+    file: Annotated[Path | None, typer.Option(help="an exported file instead of the database")] = None,
+    head: Annotated[str, typer.Option(help="hash that was noted elsewhere: it must stand in the chain")] = "",
+    as_json: Json = False,
+) -> None:
+    """Exit 0 if the chain holds; 1 if an entry was changed, taken out or put in."""
+    entries = read_export(file) if file is not None else stored(data)
+    broken = audit.first_broken(entries)
+    missing = bool(head) and head not in {entry.hash for entry in entries}
+    last = entries[-1].hash if entries else audit.GENESIS
+    found = {"whole": broken is None and not missing, "first_broken": broken, "head_found": not missing,
+             "entries": len(entries), "head": last}  # fmt: skip
+    if as_json:
+        say_json(found)
+    elif broken is not None:
+        say(f"broken at entry {broken}: it, or one before it, was changed, taken out or put in")
+    elif missing:
+        say(f"{head}: no entry has this hash; the trail was cut short or written anew")
+    else:
+        say(f"whole: {len(entries)} entries; head {last}")
+        say("note the head elsewhere: --head finds out later whether the trail's end was cut off")
+    if not found["whole"]:
+        raise typer.Exit(1)
+
+
+def export(
+    output: Annotated[Path, typer.Option("-o", "--output", help="file to write: one JSON object a line")],
+    data: DataDir = None,
+) -> None:
+    """Write the trail, one entry a line; `verify --file` checks it without the database."""
+    entries = stored(data)
+    write(output, "".join(json.dumps(entry.as_dict(), sort_keys=True) + "\n" for entry in entries))
+    say(f"{len(entries)} entries written to {output}; head {entries[-1].hash if entries else audit.GENESIS}")
+
+
+def stored(data: Path | None) -> list[AuditEntry]:
+    """The trail in the database, read only.
+
+    Raises
+    ------
+    InputError
+        There is no database.
+    """
+    given: dict[str, Any] = {} if data is None else {"data_dir": data}
+    settings = Settings(**given)
+    if settings.database_url is None and not (settings.data_dir / "stimrig.db").is_file():
+        raise InputError(f"{settings.data_dir / 'stimrig.db'}: there is no database. Give the data folder with --data.")
+    try:
+        store = Store(settings.database)
+    except ApiError as error:
+        raise InputError(str(error)) from error
+    try:
+        return store.all(AuditEntry, order=AuditEntry.seq)
+    finally:
+        store.close()
+
+
+def read_export(path: Path) -> list[AuditEntry]:
+    """An exported trail.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, or a line is no entry.
+    """
+    try:
+        lines = path.read_text("utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: {error}. Give a file written by `stimrig audit export`.") from error
+    columns = {column.name for column in AuditEntry.__table__.columns}
+    entries = []
+    for number, line in enumerate(lines, start=1):
+        try:
+            fields = json.loads(line)
+        except ValueError as error:
+            raise InputError(
+                f"{path}, line {number}: no JSON. Give a file written by `stimrig audit export`."
+            ) from error
+        if not isinstance(fields, dict) or set(fields) != columns:
+            raise InputError(f"{path}, line {number}: no entry of an audit trail.")
+        entries.append(AuditEntry(**fields))
+    return entries

@@ -1,0 +1,63 @@
+"""`stimrig compare`: measurement against model."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from api.cli.terminal import Data, Json, ModelFile, load_model, model_report, say, say_json, write
+
+
+def register(app: typer.Typer) -> None:
+    """Add the verb."""
+    app.command("compare")(compare)
+
+
+def compare(
+    model_json: ModelFile,
+    data: Data,
+    html: Annotated[Path | None, typer.Option(help="write a report with charts here")] = None,
+    as_json: Json = False,
+) -> None:
+    """Measurement against model: where it fails, and by how much.
+
+    The model runs free: it is given the pulse widths alone, never the measured torque.
+    """
+    import identify
+    from api.web.pages.report_file import comparison_html
+    from api.workers.verbs import clean, curves, thinned
+
+    model = load_model(model_json)
+    record = identify.read(data)
+    found = identify.compare(model, record).to_dict()
+    if html is not None:
+        drawn = clean(curves(model, record))
+        write(html, comparison_html(model.to_dict(), drawn, data.name, comparison=thinned(found)))
+    if as_json:
+        say_json(found)
+        return
+    about = f"{model_json}, its figures on what it was fitted to"
+    say(about, *model_report(model.to_dict()), "", f"{data} against it, all rows", *comparison_lines(found))
+    if html is not None:
+        say("", f"report         {html}")
+
+
+def comparison_lines(found: dict[str, Any]) -> list[str]:
+    """The comparison in words, the worst places, and where the error above the noise sits."""
+    places = [place["text"] for place in found.get("where") or []]
+    named_below = {f"{text}." for text in places}
+    lines = [line for line in found.get("plain") or [] if line not in named_below]
+    if places:
+        lines += ["", "worst places", *[f"  {text}" for text in places]]
+    for kind in ("segment", "level", "direction", "frequency"):
+        rows = (found.get("by") or {}).get(kind) or []
+        shares = [
+            f"{row['label']} {100 * row['share_of_excess']:.0f} %" for row in rows if row["share_of_excess"] > 0.005
+        ]
+        if shares:
+            lines.append(f"by {kind:12}{', '.join(shares)}")
+    if any(line.startswith("by ") for line in lines):
+        lines.append("               in % of the error above the noise")
+    return lines

@@ -1,0 +1,111 @@
+"""`stimrig diagnose`: what is missing."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import typer
+
+from api.cli.terminal import Data, HeldModel, Json, load_held, number, percent, progress_line, say, say_json
+from api.structure import in_words, worded
+
+VERDICTS = {
+    "effect_missing": "An effect is missing in the model.",
+    "nothing_missing": "Nothing is missing: what is left looks like noise.",
+    "unexplained_structure": "Structure is left that no effect of the library explains.",
+}
+
+
+def register(app: typer.Typer) -> None:
+    """Add the verb."""
+    app.command("diagnose")(diagnose)
+
+
+def diagnose(
+    data: Data,
+    model_json: HeldModel = None,
+    as_json: Json = False,
+) -> None:
+    """What is missing in a model's structure, ranked; or that nothing is; or that what is left has no name here.
+
+    Takes 5 to 30 s. DATA decides: a model given with --model lends its structure, not its numbers.
+    """
+    import identify
+
+    record, model, structure = load_held(model_json, data)
+    progress = progress_line()
+    found = {"structure": structure, **identify.diagnose(record, model, progress).to_dict()}
+    progress(1.0, "done")
+    if as_json:
+        say_json(found)
+        return
+    say(*diagnosis_lines(found))
+
+
+def diagnosis_lines(found: dict[str, Any]) -> list[str]:
+    """A diagnosis for people."""
+    from identify.caution import caution
+    from identify.shown import held_out_label, probability, sure
+
+    base, verdict, doubt = found["base"], found["verdict"], caution(found)
+    said = str(VERDICTS.get(verdict, verdict)).rstrip(".")
+    if verdict == "effect_missing":
+        said = said.replace(" is ", f" is {sure(found['probability'])} ", 1)
+    lines = [
+        f"{said} (probability {probability(found['probability'])}).",
+        *([doubt] if doubt else []),
+        "",
+        f"structure      {in_words(found['structure'])}",
+        f"noise          {number(found['noise_sd_nm'], 4)} N·m",
+        f"the model      fit {percent(base.get('fit_percent'))}, rms {number(base.get('rms_nm'), 4)} N·m; "
+        f"{held_out_label(base)} {percent(base.get('held_out_fit_percent'))}, "
+        f"rms {number(base.get('held_out_rms_nm'), 4)} N·m",
+    ]
+    if verdict == "unexplained_structure" and found.get("missing"):
+        lines += ["", "Nearest in the library, but not near enough: adding it leaves the structure."]
+    for effect in found.get("missing") or []:
+        lines += ["", *effect_lines(effect)]
+    # Where nothing is missing the worst of the noise is no place to look at.
+    places = [] if verdict == "nothing_missing" else found.get("where") or []
+    if places:
+        lines += ["", "worst places, of the fitted rows"]
+        lines += [f"  {place['start_s']:.1f}-{place['end_s']:.1f} s, {place['text']}" for place in places]
+    lines += ["", *found["notes"]] if found.get("notes") else []
+    return [*lines, "", f"next           {next_step(found, doubt)}"]
+
+
+def next_step(found: dict[str, Any], doubt: str) -> str:
+    """What to do with a diagnosis."""
+    if found["verdict"] == "unexplained_structure":
+        return (
+            "look at the worst places and at electrodes, cell and fixture, and record again; an effect of your own: "
+            "docs/add-an-effect.md"
+        )
+    if found["verdict"] == "effect_missing":
+        rivals = any(effect.get("confused_with") for effect in found["missing"])
+        add = "`stimrig improve DATA -o MODEL.json` adds what is missing, as long as the evidence lasts"
+        return f"the next experiment above decides between the rivals; {add}" if rivals else add
+    return "record a longer test" if doubt else "nothing to add: use the model of `stimrig fit DATA -o MODEL.json`"
+
+
+def effect_lines(effect: dict[str, Any]) -> list[str]:
+    """One candidate."""
+    from identify.shown import probability, sure
+
+    p = float(effect.get("probability") or 0.0)
+    lines = [
+        f"{effect['effect']}: {sure(p)} missing (probability {probability(p)})",
+        *([f"  {effect['plain']}"] if effect.get("plain") else []),
+        f"  rms {number(effect.get('rms_before_nm'), 4)} -> {number(effect.get('rms_after_nm'), 4)} N·m, held out "
+        f"{number(effect.get('held_out_rms_before_nm'), 4)} -> {number(effect.get('held_out_rms_after_nm'), 4)} N·m",
+    ]
+    for name, parameter in (effect.get("parameters") or {}).items():
+        value, sd = parameter.get("value"), parameter.get("sd")
+        unit = "" if parameter.get("unit") == "1" else parameter.get("unit") or ""
+        unit = f"{unit} {parameter.get('direction') or ''}".strip()
+        lines.append(f"  {name} {number(value, 4)} ± {number(sd, 4)} {unit}".rstrip())
+    if effect.get("confused_with"):
+        lines.append(f"  this record cannot tell it from: {', '.join(effect['confused_with'])}")
+    if effect.get("next_experiment"):
+        lines.append(f"  next experiment: {worded(effect['next_experiment'])}")
+    return lines

@@ -1,0 +1,41 @@
+"""`stimrig doctor`: what on this machine keeps a rig from working, and what mends it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from api.cli import doctor as checks
+from api.cli.terminal import Json, say, say_json
+from api.settings import Settings
+
+MARKS = {"ok": "ok   ", "care": "care ", "fails": "FAILS"}
+
+
+def register(app: typer.Typer) -> None:
+    """Add the verb."""
+    app.command("doctor")(doctor)
+
+
+def doctor(
+    rig: Annotated[Path | None, typer.Option(help="rig file (TOML); default: STIMRIG_RIG_FILE")] = None,
+    data: Annotated[Path | None, typer.Option(help="data folder; default ./var, or STIMRIG_DATA_DIR")] = None,
+    socket: Annotated[Path | None, typer.Option(help="a running rig's socket, or STIMRIG_RIG_SOCKET")] = None,
+    as_json: Json = False,
+) -> None:
+    """Look at devices, permissions, clock, disk, priority; say what to mend. Sends nothing. Exit 1 if one fails."""
+    given: dict[str, Any] = {"rig_file": rig, "data_dir": data, "rig_socket": socket}
+    settings = Settings(**{key: value for key, value in given.items() if value is not None})
+    found = checks.examine(settings)
+    report = checks.as_dict(found)
+    if as_json:
+        say_json(report)
+    else:
+        for finding in found:
+            say(f"{MARKS[finding.verdict]}  {finding.check:14} {finding.says}")
+            if finding.verdict != "ok" and finding.mend:
+                say(f"{'':23}-> {finding.mend}")
+    if report["verdict"] == "fails":
+        raise typer.Exit(1)

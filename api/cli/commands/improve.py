@@ -1,0 +1,90 @@
+"""`stimrig improve`: effects added one by one while the evidence lasts."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from api.cli.commands.diagnose import VERDICTS
+from api.cli.terminal import Data, HeldModel, Json, load_held, number, progress_line, say, say_json, table, write
+from api.structure import in_words
+
+FEW = 3
+"""Refused effects that are named."""
+
+
+def register(app: typer.Typer) -> None:
+    """Add the verb."""
+    app.command("improve")(improve)
+
+
+def improve(
+    data: Data,
+    model_json: HeldModel = None,
+    html: Annotated[Path | None, typer.Option(help="write a report with charts here")] = None,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="write the last MODEL.json here")] = None,
+    as_json: Json = False,
+) -> None:
+    """Add effects one by one to a model's structure while the evidence lasts; each step is a model.
+
+    Takes 5 to 40 s. Without -o nothing is kept.
+    """
+    import identify
+
+    record, model, structure = load_held(model_json, data)
+    progress = progress_line()
+    improved = identify.improve(record, progress=progress, model=model)
+    progress(1.0, "done")
+    found, models = {"structure": structure, **improved.to_dict()}, improved.models
+    del found["models"]
+    if output is not None:
+        write(output, json.dumps(models[-1].to_dict(), indent=1))
+    if html is not None:
+        write(html, report(record, found, models, data, model))
+    if as_json:
+        say_json(found)
+        return
+    say(*improvement_lines(found))
+    say(*[f"written to     {path}" for path in (output, html) if path is not None])
+
+
+def report(record: Any, found: dict[str, Any], models: Sequence[Any], data: Path, held: Any | None = None) -> str:
+    """The report: what was found, what each effect is, what is left before and after."""
+    import numpy as np
+
+    import identify
+    from api.web.pages.report_file import improvement_html
+    from api.workers.diagnosis_verbs import diagnosis
+    from api.workers.verbs import runs, thinned
+
+    before, after = (thinned(identify.compare(model, record).to_dict()) for model in (models[0], models[-1]))
+    labels = [str(record.segment_names[index]) for index in record.segment]
+    segments = runs(labels, np.asarray(record.time_s))
+    missing = diagnosis(str(data), progress_line(), None if held is None else held.to_json())
+    return improvement_html(found, data.name, missing, before, after, segments)
+
+
+def improvement_lines(found: dict[str, Any]) -> list[str]:
+    """The steps for people."""
+    rows = [
+        (
+            step["added"] or "base model",
+            number(step.get("fit_percent")),
+            number(step.get("rms_nm"), 4),
+            number(step.get("held_out_fit_percent")),
+            number(step.get("held_out_rms_nm"), 4),
+        )
+        for step in found["steps"]
+    ]
+    header = ("added", "fit %", "rms N·m", "held-out %", "held-out rms N·m")
+    lines = [f"structure      {in_words(found['structure'])}", "", *table(header, rows), ""]
+    lines.append(f"noise          {number(found['noise_sd_nm'], 4)} N·m: what no model can explain")
+    lines.append(f"at first       {VERDICTS.get(found['verdict'], found['verdict'])}")
+    refused = [f"{row['effect']}: {row['reason']}" for row in found.get("refused") or []]
+    if len(refused) > FEW:
+        refused[FEW:] = [f"and {len(refused) - FEW} effects more (--json says which)"]
+    return [*lines, *[f"{'not added' if not number else '':15}{text}" for number, text in enumerate(refused)]]

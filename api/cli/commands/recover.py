@@ -1,0 +1,33 @@
+"""`stimrig recover`: seal a damaged or forgotten journal of the rig by hand."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from api.cli.errors import InputError, LaunchError
+from api.cli.terminal import Json
+
+
+def register(app: typer.Typer) -> None:
+    """Add the verb."""
+    app.command("recover")(recover)
+
+
+def recover(
+    journal: Annotated[Path, typer.Argument(help="a rig's journal, also a damaged one", metavar="JOURNAL")],
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="folder for the recording")] = None,
+    as_json: Json = False,
+) -> None:
+    """Seal what a journal holds, and say what is missing; the journal stays. In a process of the rig's own code."""
+    options = [*(["-o", str(output)] if output else []), *(["--json"] if as_json else [])]
+    command = [sys.executable, "-m", "rig.recover", *options, "--", str(journal)]
+    ended = subprocess.run(command, capture_output=True, text=True)
+    if ended.returncode:
+        words = (ended.stderr.strip().splitlines() or ["it ended without a word"])[-1].removeprefix("recover: ")
+        raise InputError(words) if ended.returncode == 2 else LaunchError(words, ended.returncode)
+    print(ended.stdout, end="")

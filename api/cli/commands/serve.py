@@ -1,0 +1,107 @@
+"""`stimrig serve`: the service and the page, with the rig, and the emulator where no rig file is given."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from api.cli.errors import InputError
+from api.cli.launcher import Services
+from api.cli.stop_key import StopKey, at_rig
+from api.cli.terminal import say
+from api.settings import Settings
+from rig.messages import Status
+
+
+def register(app: typer.Typer) -> None:
+    """Add the verb."""
+    app.command("serve")(serve)
+
+
+def serve(
+    port: Annotated[int | None, typer.Option(min=0, max=65535, help="default 8000, or STIMRIG_PORT")] = None,
+    host: Annotated[str | None, typer.Option(help="default 127.0.0.1, or STIMRIG_HOST")] = None,
+    rig: Annotated[Path | None, typer.Option(help="rig file (TOML); default: the emulated rig")] = None,
+    rig_socket: Annotated[
+        Path | None, typer.Option(help="attach to the rig that listens here and start none; or STIMRIG_RIG_SOCKET")
+    ] = None,
+    data: Annotated[Path | None, typer.Option(help="data folder; default ./var, or STIMRIG_DATA_DIR")] = None,
+    emulate: Annotated[str, typer.Option(help='options for the emulator, e.g. "--hidden 7"')] = "",
+) -> None:
+    """The service and the page, until Ctrl-C or SIGTERM."""
+    given = {"port": port, "host": host, "rig_file": rig, "rig_socket": rig_socket, "data_dir": data}
+    settings = Settings(**{key: value for key, value in given.items() if value is not None})
+    found = attachable(settings, emulate) if settings.rig_socket else None
+    ended: list[int] = []
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda caught, _frame: ended.append(caught))
+    with Services(settings, emulate.split(), attach=settings.rig_socket) as services:
+        say(*welcome(services, settings), *rig_state(services, found))
+        with StopKey(at_rig(services.socket), say) as key:
+            if key.listens:
+                say("any key stops a running test; Ctrl-C ends the service" + ("" if found else " and the rig"))
+            while not ended:
+                time.sleep(0.2)
+                if not ended:
+                    for event in services.watch():
+                        say(event)
+        say("stopping" + ("; the rig goes on by itself" if found else ""))
+
+
+def attachable(settings: Settings, emulate: str) -> Status:
+    """The state of the rig that runs already.
+
+    Raises
+    ------
+    InputError
+        A rig to be started was named, too, or none listens at the socket.
+    """
+    from api.clock import Clock
+    from api.errors import ApiError
+    from api.sessions.rig_client import RigClient
+
+    place = settings.rig_socket
+    if settings.rig_file is not None or emulate.strip():
+        other = f"--rig {settings.rig_file}" if settings.rig_file is not None else "--emulate"
+        raise InputError(
+            f"--rig-socket {place} attaches to a rig that runs, {other} starts one: give one of them "
+            "(STIMRIG_RIG_SOCKET and STIMRIG_RIG_FILE count, too)."
+        )
+    try:
+        return asyncio.run(RigClient(place, Clock()).fresh_status())
+    except ApiError as error:
+        raise InputError(
+            f"--rig-socket {place}: no rig answers there ({error.detail}) Start it first: "
+            f"python -m rig --config RIG.toml --data DIR --socket {place}"
+        ) from error
+
+
+def rig_state(services: Services, found: Status | None = None) -> list[str]:
+    """What keeps the rig from working, if anything does."""
+    if found is not None:
+        return [] if found.state == "ready" else [f"the rig is {found.state}: {found.reason or 'it is busy'}"]
+    state = services.rig.ready.get("state", "ready")
+    return [] if state == "ready" else [f"the rig is {state}: {services.rig.last_words()}"]
+
+
+def welcome(services: Services, settings: Settings) -> list[str]:
+    """Where it is, and how to get in."""
+    devices = f"rig file {settings.rig_file}" if settings.rig_file else "the emulated rig"
+    if services.attached:
+        devices = f"the rig at {settings.rig_socket}"
+    lines = [f"stimrig serves {services.url}/ with {devices}; data and logs in {settings.data_dir.absolute()}"]
+    if services.drawn_token:
+        lines += [
+            f"first administrator's token, shown this once: {services.drawn_token}",
+            f"sign in: {services.url}/sign-in#token={services.drawn_token}",
+        ]
+    elif settings.admin_token:
+        lines.append("the administrator's token is the one in STIMRIG_ADMIN_TOKEN")
+    else:
+        lines.append("sign in with a token issued before (set STIMRIG_ADMIN_TOKEN to replace a lost one)")
+    return lines

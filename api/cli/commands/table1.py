@@ -1,0 +1,39 @@
+"""`stimrig table1`: the paper's Table I, ours beside theirs."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import typer
+
+from api.cli.terminal import Json, number, progress_line, say, say_json, table
+
+
+def register(app: typer.Typer) -> None:
+    """Add the verb."""
+    app.command("table1")(table1)
+
+
+def table1(
+    trials: Annotated[int, typer.Option(min=1, max=10000, help="records for each noise level")] = 100,
+    as_json: Json = False,
+) -> None:
+    """Best-fit rates at each noise level, ours beside the paper's."""
+    from identify.paper import table1 as table_one
+
+    found = table_one.run(trials, progress_line())
+    if as_json:
+        say_json(found)
+        return
+    say(*lines(found))
+
+
+def lines(found: dict[str, Any]) -> list[str]:
+    """The table for people."""
+    rows = found.get("rows")
+    if not isinstance(rows, list) or not rows:
+        return [f"{key}: {value}" for key, value in found.items()]
+    header = list(rows[0])
+    body = [[str(row[key]) if isinstance(row[key], str) else number(row[key]) for key in header] for row in rows]
+    rest = [f"{key}: {value}" for key, value in found.items() if key != "rows"]
+    return [*table(header, body), "", *rest]

@@ -1,0 +1,291 @@
+"""What must hold on a machine before a rig runs on it; each check says what it saw and what mends it.
+
+Reads and measures only: no device is opened, nothing is sent. A check is a generator function of this module whose name
+begins with `check_`.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import socket
+import stat
+import subprocess
+import sys
+import tempfile
+import time
+import tomllib
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from api.settings import Settings
+
+Verdict = Literal["ok", "care", "fails"]
+LEAST_FREE_GB, GOOD_FREE_GB = 0.5, 5.0
+SENDER_PRIORITY = 50
+LATE_MS, SLOW_DISK_MS = 5.0, 200.0
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing looked at.
+
+    Attributes
+    ----------
+    verdict : {'ok', 'care', 'fails'}
+        `fails`: a test would be refused or lost. `care`: it works, but not as it should.
+    """
+
+    check: str
+    verdict: Verdict
+    says: str
+    mend: str = ""
+
+
+def examine(settings: Settings) -> list[Finding]:
+    """All checks; one that breaks is a finding, too."""
+    found: list[Finding] = []
+    for name, check in checks().items():
+        try:
+            found += check(settings)
+        except Exception as error:
+            found.append(Finding(name, "care", f"could not be looked at: {type(error).__name__}: {error}"))
+    return found
+
+
+def checks() -> dict[str, Callable[[Settings], Iterator[Finding]]]:
+    """The checks of this module, in the order they are written."""
+    return {name.removeprefix("check_"): check for name, check in globals().items() if name.startswith("check_")}
+
+
+def as_dict(found: list[Finding]) -> dict[str, Any]:
+    """The findings as one object."""
+    worst: Verdict = "ok"
+    for verdict in ("care", "fails"):
+        if any(finding.verdict == verdict for finding in found):
+            worst = verdict
+    return {"verdict": worst, "findings": [asdict(finding) for finding in found]}
+
+
+def check_rig_file(settings: Settings) -> Iterator[Finding]:
+    """The rig file, read by the rig's own reader, in a process of its own."""
+    if settings.rig_file is None:
+        yield Finding("rig file", "ok", "none given: the emulated rig would be used")
+        return
+    code = "import sys, pathlib; from rig import config; config.load(pathlib.Path(sys.argv[1]))"
+    command = [sys.executable, "-c", code, str(settings.rig_file)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    if done.returncode == 0:
+        yield Finding("rig file", "ok", f"{settings.rig_file}: every key holds")
+    else:
+        last = (done.stderr.strip().splitlines() or ["it cannot be read"])[-1].partition("Error: ")
+        yield Finding("rig file", "fails", last[2] or last[0], "docs/rig-file.md lists every key")
+
+
+def check_devices(settings: Settings) -> Iterator[Finding]:
+    """Are the stimulator's port and the load cell's bus there, and may this user use them?"""
+    if settings.rig_file is None or not settings.rig_file.is_file():
+        return
+    content = tomllib.loads(settings.rig_file.read_text("utf-8"))
+    port = (content.get("stimulator") or {}).get("port")
+    if port:
+        yield port_finding("stimulator", Path(port))
+    bus = (content.get("load_cell") or {}).get("bus") or {}
+    if bus:
+        yield bus_finding(bus)
+
+
+def port_finding(what: str, port: Path) -> Finding:
+    """A serial port: there, a device, and ours to use."""
+    if not port.exists():
+        mend = "plug it in and switch it on; `ls -l /dev/serial/by-id /dev/stimrig` shows what is there"
+        return Finding(what, "fails", f"{port} is not there", mend)
+    mode = port.stat().st_mode
+    if not stat.S_ISCHR(mode):
+        return Finding(what, "fails", f"{port} is no serial port", "give its name under /dev in the rig file")
+    if not os.access(port, os.R_OK | os.W_OK):
+        mend = "add this user to the port's group (dialout), or install deploy/udev/70-stimrig.rules; sign in again"
+        return Finding(what, "fails", f"{port} may not be read and written by this user", mend)
+    return Finding(what, "ok", f"{port} is there and may be used")
+
+
+def bus_finding(bus: dict[str, Any]) -> Finding:
+    """A CAN bus by its kind."""
+    kind, channel = str(bus.get("interface", "")), str(bus.get("channel", ""))
+    if kind == "slcan":
+        return port_finding("load cell", Path(channel.partition("@")[0]))
+    if kind == "socketcan":
+        link = Path("/sys/class/net") / channel
+        if not link.exists():
+            mend = f"plug the adapter in; systemctl start stimrig-can@{channel} brings it up"
+            return Finding("load cell", "fails", f"there is no interface {channel}", mend)
+        if not int((link / "flags").read_text(), 16) & 1:
+            mend = f"ip link set {channel} up type can bitrate …, or systemctl start stimrig-can@{channel}"
+            return Finding("load cell", "fails", f"{channel} is down", mend)
+        return Finding("load cell", "ok", f"{channel} is up")
+    if kind == "socketcand":
+        host, port = str(bus.get("host", "127.0.0.1")), int(bus.get("port", 29536))
+        try:
+            socket.create_connection((host, port), timeout=2).close()
+        except OSError as error:
+            says = f"socketcand at {host}:{port}: {error.strerror or error}"
+            return Finding("load cell", "fails", says, "start socketcand on that machine")
+        return Finding("load cell", "ok", f"socketcand answers at {host}:{port}")
+    return Finding("load cell", "care", f"a {kind} bus cannot be looked at without opening it")
+
+
+def check_rig(settings: Settings) -> Iterator[Finding]:
+    """Does the rig's process answer, and does it stand still?"""
+    if settings.rig_socket is None:
+        return
+    try:
+        with socket.socket(socket.AF_UNIX) as line:
+            line.settimeout(3)
+            line.connect(str(settings.rig_socket))
+            line.sendall(b'{"kind": "status", "id": 1}\n')
+            body = json.loads(line.makefile().readline())["body"]
+    except (OSError, ValueError, KeyError) as error:
+        mend = "systemctl status stimrig-rig; its journal says why"
+        yield Finding("rig", "fails", f"{settings.rig_socket}: no answer ({error})", mend)
+        return
+    if body["state"] in ("latched", "uncertain", "disconnected"):
+        mend = "look at the participant and the rig, then re-arm it on the page"
+        yield Finding("rig", "fails", f"{body['state']}: {body['reason']}", mend)
+    else:
+        yield Finding("rig", "ok", body["state"])
+
+
+def check_data(settings: Settings) -> Iterator[Finding]:
+    """The data folder: ours to write, closed to others, with room, on a disk that keeps pace."""
+    folder = settings.data_dir.absolute()
+    nearest = next(place for place in (folder, *folder.parents) if place.exists())
+    if not os.access(nearest, os.W_OK | os.X_OK):
+        mend = f"chown it to this user, or set STIMRIG_DATA_DIR; deploy/install.sh makes {folder} as it should be"
+        yield Finding("data folder", "fails", f"{nearest} may not be written by this user", mend)
+        return
+    if folder.exists() and folder.stat().st_mode & stat.S_IROTH:
+        yield Finding("data folder", "care", f"{folder} may be read by every user", f"chmod o-rwx {folder}")
+    else:
+        yield Finding("data folder", "ok", f"{folder} may be written, by this user and its group")
+    free_gb = shutil.disk_usage(nearest).free / 1e9
+    says, mend = f"{free_gb:.1f} GB free; a test takes 5 MB", "make room, or move old recordings to the backup"
+    yield Finding(
+        "disk", "fails" if free_gb < LEAST_FREE_GB else "care" if free_gb < GOOD_FREE_GB else "ok", says, mend
+    )
+    slowest_ms = max(synced_ms(nearest) for _ in range(5))
+    says = f"slowest of five writes brought to the disk: {slowest_ms:.0f} ms"
+    yield Finding(
+        "disk speed", "care" if slowest_ms > SLOW_DISK_MS else "ok", says, "use a local disk, not a network's"
+    )
+
+
+def synced_ms(folder: Path) -> float:
+    """A journal's second of data, brought to the disk, ms."""
+    with tempfile.TemporaryFile(dir=folder) as file:
+        began = time.perf_counter()
+        file.write(b"\0" * 65536)
+        file.flush()
+        os.fsync(file.fileno())
+        return 1000 * (time.perf_counter() - began)
+
+
+def check_database(settings: Settings) -> Iterator[Finding]:
+    """Does the database open, and does its audit trail hold?"""
+    if settings.database_url is None and not (settings.data_dir / "stimrig.db").exists():
+        yield Finding("database", "ok", "not there yet; the first start makes it")
+        return
+    from api.errors import ApiError
+    from api.store import Store, audit
+    from api.store.tables import AuditEntry
+
+    try:
+        store = Store(settings.database)
+    except ApiError as error:
+        yield Finding("database", "fails", str(error), "restore it from the backup (docs/install.md)")
+        return
+    entries = store.all(AuditEntry, order=AuditEntry.seq)
+    broken = audit.first_broken(entries)
+    store.close()
+    if broken is None:
+        yield Finding("database", "ok", f"opens; the audit trail's {len(entries)} entries hold together")
+    else:
+        mend = "compare with the backup's; somebody wrote to the database by other ways than the service"
+        yield Finding("database", "fails", f"the audit trail is broken at entry {broken}", mend)
+
+
+def check_clock(_settings: Settings) -> Iterator[Finding]:
+    """Is UTC a label to be trusted, and does this machine wake up in time?"""
+    tool = shutil.which("timedatectl")
+    answer = ""
+    if tool:
+        command = [tool, "show", "--property=NTPSynchronized", "--value"]
+        answer = subprocess.run(command, capture_output=True, text=True, timeout=10).stdout.strip()
+    if answer == "yes":
+        yield Finding("clock", "ok", "set by NTP")
+    else:
+        says = "not set by NTP" if answer == "no" else "whether NTP sets it cannot be told here"
+        mend = "timedatectl set-ntp true; without a network set it by hand: recordings and approvals carry its date"
+        yield Finding("clock", "care", says, mend)
+    late_ms = []
+    for _ in range(200):
+        began = time.perf_counter()
+        time.sleep(0.002)
+        late_ms.append(1000 * (time.perf_counter() - began) - 2)
+    worst_ms = sorted(late_ms)[-3]
+    mend = "end what else runs here; give the rig real-time priority"
+    says = f"wakes up {worst_ms:.2f} ms late at the 99th percentile (a pulse is dropped at 10 ms)"
+    yield Finding("wake-up", "ok" if worst_ms < LATE_MS else "care", says, mend)
+
+
+def check_priority(_settings: Settings) -> Iterator[Finding]:
+    """May the rig's sender run before everything else?"""
+    code = f"import os; os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param({SENDER_PRIORITY}))"
+    allowed = subprocess.run([sys.executable, "-c", code], capture_output=True, timeout=30).returncode == 0
+    says = "real-time priority is granted" if allowed else "no real-time priority for this user"
+    mend = "LimitRTPRIO=60 as in deploy/systemd/stimrig-rig.service, or `rtprio 60` in /etc/security/limits.d"
+    yield Finding("priority", "ok" if allowed else "care", says, "" if allowed else mend)
+
+
+def check_compiled(_settings: Settings) -> Iterator[Finding]:
+    """Can what numba compiles be kept, so that the first fit is not a slow one?"""
+    import identify
+
+    place = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(str(identify.__file__)).parent)
+    nearest = next(folder for folder in (place, *place.parents) if folder.exists())
+    kept = os.access(nearest, os.W_OK | os.X_OK)
+    says = f"{place} {'may' if kept else 'may not'} be written"
+    mend = "set NUMBA_CACHE_DIR to a folder of this user; else each start compiles anew, for some ten seconds"
+    yield Finding("compiled code", "ok" if kept else "care", says, "" if kept else mend)
+
+
+def check_door(settings: Settings) -> Iterator[Finding]:
+    """Is the service closed to the network unless TLS stands in front?"""
+    from api.web.server import refuse_open_door
+
+    try:
+        refuse_open_door(settings)
+    except OSError as error:
+        yield Finding("address", "fails", str(error))
+        return
+    with socket.socket(socket.AF_INET6 if ":" in settings.host else socket.AF_INET) as line:
+        line.settimeout(1)
+        taken = line.connect_ex((settings.host, settings.port)) == 0
+    says = f"{settings.host}:{settings.port} {'answers: the service, or another one' if taken else 'is free'}"
+    yield Finding("address", "ok", says)
+
+
+def check_workers(_settings: Settings) -> Iterator[Finding]:
+    """Can the processes that read other people's files be shut in?"""
+    command = [sys.executable, "-m", "api.workers.confinement"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=30)
+    left_open = json.loads(done.stdout)
+    if not left_open:
+        says = "shut in: no network, no file but recordings, bounds on memory and time"
+        yield Finding("workers", "ok", says)
+    for what, why in left_open.items():
+        mend = "a kernel from 5.13 on with Landlock" if what == "files" else "Linux on x86_64 or aarch64 with seccomp"
+        says = f"{what}: workers that read uploads cannot be shut off from them here ({why})"
+        yield Finding("workers", "care", says, f"{mend}; until then take in files of people you trust only")

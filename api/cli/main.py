@@ -1,0 +1,94 @@
+"""`stimrig`: one verb a file in `api/cli/commands`; errors become one line and an exit code here, nowhere else.
+
+0 done; 1 something failed; 2 bad input, one line on standard error; never a traceback.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import pkgutil
+import sys
+import tempfile
+import traceback
+from pathlib import Path
+
+import typer
+from typer.exceptions import TyperException
+
+from api.cli import commands
+from api.cli.errors import CommandError
+from api.cli.terminal import clear_progress
+from api.errors import ApiError, SettingsError
+from identify.errors import IdentifyError
+
+
+def build(verb: str = "") -> typer.Typer:
+    """The command line with the verb's file in `api/cli/commands`; with every file where none bears its name.
+
+    No verb waits until the libraries of all others are loaded.
+    """
+    app = typer.Typer(
+        name="stimrig",
+        help="Identify electrically stimulated muscle, see where the model fails, learn what is missing.",
+        no_args_is_help=True,
+        add_completion=False,
+        pretty_exceptions_enable=False,
+        rich_markup_mode=None,
+        context_settings={"help_option_names": ["-h", "--help"]},
+    )
+    app.callback()(lambda: None)  # one verb alone stays a verb
+    names = sorted(info.name for info in pkgutil.iter_modules(commands.__path__))
+    for name in [verb] if verb in names else names:
+        importlib.import_module(f"{commands.__name__}.{name}").register(app)
+    return app
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run a verb and leave with its exit code."""
+    sys.exit(run(arguments))
+
+
+def run(arguments: list[str] | None = None) -> int:
+    """Run a verb; its exit code."""
+    # Matrices of a fit are small: a second BLAS thread only waits for the first, and on a busy machine for long.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    verb = next((word for word in (arguments if arguments is not None else sys.argv[1:]) if word[:1] != "-"), "")
+    try:
+        code = build(verb)(arguments, standalone_mode=False)
+        sys.stdout.flush()
+        return code if isinstance(code, int) else 0
+    except (KeyboardInterrupt, typer.Abort):
+        clear_progress()
+        print("stimrig: interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # the reader has gone; nothing to say to nobody
+        return 0
+    except Exception as error:
+        return _one_line(verb, error)
+
+
+def _one_line(verb: str, error: Exception) -> int:
+    """The error's line, and the exit code it stands for."""
+    name = f"stimrig {verb}".strip()
+    clear_progress()
+    if isinstance(error, TyperException):
+        message = error.format_message().strip()
+        if not message or message.startswith("Usage:"):  # no verb was given: the help itself, not in one line
+            print(message, file=sys.stderr)
+            return 2
+        print(f"{name}: {flat(message)} (see {name} --help)", file=sys.stderr)
+        return 2
+    if isinstance(error, CommandError | IdentifyError | ApiError | SettingsError):
+        print(f"{name}: {flat(str(error))}", file=sys.stderr)
+        return error.exit_code if isinstance(error, CommandError) else 2
+    log = Path(tempfile.gettempdir()) / f"stimrig-error-{os.getpid()}.log"
+    log.write_text("".join(traceback.format_exception(error)))
+    print(f"{name}: unexpected: {type(error).__name__}: {flat(str(error))} (log: {log})", file=sys.stderr)
+    return 1
+
+
+def flat(text: str) -> str:
+    """Text on one line."""
+    return " ".join(text.split())

@@ -1,0 +1,151 @@
+"""Any key stops: while a test runs and a person sits at the terminal, a key sends the stop straight to the rig."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import select
+import sys
+import termios
+import threading
+import tty
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import httpx
+
+from rig.messages import StatusRequest, StopEvidence, StopRequest
+
+if TYPE_CHECKING:
+    from api.sessions.rig_client import RigClient
+
+REASON, BY = "a key was pressed", "terminal"
+IDLE = ("ready", "latched", "uncertain", "disconnected")
+"""Nothing is played and no calibration is open: a stray key must not latch the rig."""
+STATUS_S, STOP_S = 0.5, 8.0
+CONFIRMED, NOTHING = "stopped: the rig confirms that stimulation is off", "no test runs, nothing to stop"
+DOUBT = "THE STOP IS NOT CONFIRMED. Use the stimulator's own emergency switch now."
+
+
+class StopKey:
+    """Listens for a key as long as it is open; does nothing where standard input is no terminal.
+
+    Keys are read in a thread of its own: nothing that the program waits for delays a stop. Ctrl-C stays what it is.
+
+    Parameters
+    ----------
+    stop : callable
+        Stops, and says in words what came of it.
+    tell : callable
+        Gets the words.
+    descriptor : int, optional
+        Another file descriptor than standard input's.
+    """
+
+    def __init__(self, stop: Callable[[], str], tell: Callable[[str], object], descriptor: int | None = None) -> None:
+        self.stop, self.tell = stop, tell
+        self.descriptor = standard_input() if descriptor is None else descriptor
+        self.listens = False
+        self._before: list[object] = []
+        self._thread: threading.Thread | None = None
+
+    def __enter__(self) -> StopKey:
+        if self.descriptor < 0 or not os.isatty(self.descriptor) or not in_foreground(self.descriptor):
+            return self
+        self._before = termios.tcgetattr(self.descriptor)
+        tty.setcbreak(self.descriptor, termios.TCSANOW)  # a key at once, unechoed; Ctrl-C still interrupts
+        self._ending, self._end = os.pipe()
+        self._thread = threading.Thread(target=self._listen, name="stop key", daemon=True)
+        self.listens = True
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._thread is None:
+            return
+        os.write(self._end, b"x")
+        self._thread.join(STATUS_S + STOP_S)
+        if in_foreground(self.descriptor):
+            with contextlib.suppress(termios.error):  # the terminal was closed
+                termios.tcsetattr(self.descriptor, termios.TCSANOW, self._before)  # pyright: ignore[reportArgumentType]
+        os.close(self._end)
+        if not self._thread.is_alive():
+            os.close(self._ending)
+
+    def _listen(self) -> None:
+        while True:
+            ready, _, _ = select.select([self.descriptor, self._ending], [], [])
+            if self._ending in ready:
+                return
+            if not in_foreground(self.descriptor):  # put in the background: the keys are another program's
+                if select.select([self._ending], [], [], STATUS_S)[0]:
+                    return
+                continue
+            try:
+                pressed = os.read(self.descriptor, 4096)
+            except OSError:
+                return
+            if not pressed:  # the terminal was closed
+                return
+            try:
+                self.tell(self.stop())
+            except Exception as error:
+                self.tell(f"{DOUBT} ({type(error).__name__}: {error})")
+
+
+def standard_input() -> int:
+    """Its descriptor, or -1 where it has none."""
+    try:
+        return sys.stdin.fileno()
+    except (AttributeError, OSError, ValueError):
+        return -1
+
+
+def in_foreground(descriptor: int) -> bool:
+    """Whether the terminal's keys are for this program."""
+    try:
+        return os.tcgetpgrp(descriptor) == os.getpgrp()
+    except OSError:  # not the controlling terminal: nobody takes turns on it
+        return True
+
+
+def at_rig(path: Path) -> Callable[[], str]:
+    """What stops the rig at a socket, past the service: it need not be alive."""
+    from api.clock import Clock
+    from api.sessions.rig_client import RigClient
+
+    rig = RigClient(path, Clock())
+    return lambda: asyncio.run(_stop(rig))
+
+
+async def _stop(rig: RigClient) -> str:
+    from api.errors import ApiError
+
+    with contextlib.suppress(ApiError):  # who does not say what it does is stopped
+        if (await rig.ask(StatusRequest(), STATUS_S)).get("state") in IDLE:
+            return NOTHING
+    try:
+        evidence = StopEvidence.model_validate(await rig.ask(StopRequest(reason=REASON, by=BY), STOP_S))
+    except ApiError as error:
+        return f"{DOUBT} {error.title}: {error.detail}"
+    return CONFIRMED if evidence.confirmed else f"{DOUBT} The rig says: {evidence.detail}"
+
+
+def at_service(url: str, token: str) -> Callable[[], str]:
+    """What stops the rig of a service elsewhere."""
+    return lambda: _stop_through(url, token)
+
+
+def _stop_through(url: str, token: str) -> str:
+    with httpx.Client(base_url=url, headers={"Authorization": f"Bearer {token}"}) as client:
+        with contextlib.suppress(httpx.HTTPError, ValueError):
+            state = client.get("/v1/rig", timeout=STATUS_S)
+            if state.is_success and state.json()["state"] in IDLE:
+                return NOTHING
+        try:
+            answer = client.post("/v1/stop", json={"reason": REASON}, timeout=STOP_S + 1.0)
+        except httpx.HTTPError as error:
+            return f"{DOUBT} {url}: {error}"
+    return CONFIRMED if answer.is_success else f"{DOUBT} {url}: {answer.text[:300]}"

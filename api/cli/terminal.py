@@ -1,0 +1,196 @@
+"""What the verbs of the command line share: reading what is asked for, and saying what was found."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from api.cli.errors import InputError
+
+LARGEST_MODEL_BYTES = 32 * 2**20
+PATIENCE_S = 1.0
+"""What takes no longer shows no progress."""
+LEAST_PACE = 0.05
+"""Share from which the time that passed says how long it takes."""
+CLEARED = "\r\x1b[K"
+
+
+DATA_HELP = "sealed recording (HDF5), or CSV file with the columns time_s,pulse_width_us,torque_nm,segment"
+Json = Annotated[bool, typer.Option("--json", help="one JSON object on standard output, nothing else there")]
+Data = Annotated[Path, typer.Argument(help=DATA_HELP, metavar="DATA", show_default=False)]
+ModelFile = Annotated[
+    Path, typer.Argument(help="MODEL.json of `stimrig fit -o`", metavar="MODEL.json", show_default=False)
+]
+HeldModel = Annotated[
+    Path | None,
+    typer.Option(
+        "--model",
+        help="begin with this model's structure: its effects, their numbers fitted anew to DATA; default: the plain "
+        "structure, a recruitment curve f(u) and then second-order dynamics G, without effects",
+        metavar="MODEL.json",
+        show_default=False,
+    ),
+]
+
+
+def names(text: str | None) -> tuple[str, ...]:
+    """A comma-separated list."""
+    return tuple(part.strip() for part in (text or "").split(",") if part.strip())
+
+
+def load_model(path: Path) -> Any:
+    """A model from its file.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, or holds no model.
+    """
+    import identify
+
+    try:
+        with path.open("rb") as file:
+            return identify.Model.from_json(file.read(LARGEST_MODEL_BYTES))
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror}. Give a file written by `stimrig fit -o`.") from error
+    except identify.IdentifyError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def load_held(path: Path | None, data: Path) -> tuple[Any, Any, list[str]]:
+    """A record, the model whose structure is meant on it (none: the plain one), and the effects that this holds.
+
+    Raises
+    ------
+    InputError
+        As `load_model`; the model is one of another pulse rate, or one that effects do not stand on.
+    """
+    import identify
+    from api.structure import held_by
+
+    model = None if path is None else load_model(path)
+    record = identify.read(data)
+    try:
+        return record, model, held_by(model, record)
+    except identify.IdentifyError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def write(path: Path, text: str) -> None:
+    """Write a file.
+
+    Raises
+    ------
+    InputError
+        It cannot be written.
+    """
+    try:
+        path.write_text(text, "utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror}. Give a file in a folder that can be written.") from error
+
+
+def say_json(found: dict[str, Any]) -> None:
+    """One JSON object, nothing else."""
+    from api.workers.verbs import clean
+
+    print(json.dumps(clean(found), ensure_ascii=False, allow_nan=False))
+
+
+def say(*lines: str) -> None:
+    """Lines for people."""
+    print("\n".join(lines))
+
+
+def number(value: float | None, digits: int = 2, unit: str = "") -> str:
+    """A number for people; a dash where there is none."""
+    text = "–" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
+    return f"{text} {unit}".rstrip()
+
+
+def percent(value: float | None, digits: int = 2) -> str:
+    """A best-fit % for people; why there is none."""
+    from api.models.summary import UNDEFINED
+
+    return UNDEFINED if value is None or not math.isfinite(value) else f"{value:.{digits}f} %"
+
+
+def table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
+    """Columns, aligned."""
+    cells = [list(header), *[list(row) for row in rows]]
+    widths = [max(len(row[index]) for row in cells) for index in range(len(cells[0]))]
+    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in cells]
+    return [lines[0], "  ".join("-" * width for width in widths), *lines[1:]]
+
+
+def progress_line() -> Callable[[float, str], None]:
+    """A line on standard error where a person looks at it: how far, how long yet; gone once all is done.
+
+    What ends within a second shows none.
+    """
+    shown, begun_s = sys.stderr.isatty(), time.monotonic()
+
+    def progress(fraction: float, text: str = "") -> None:
+        passed_s = time.monotonic() - begun_s
+        if not shown or passed_s < PATIENCE_S:
+            return
+        line = "" if fraction >= 1 else progress_words(fraction, passed_s, text)
+        print(f"{CLEARED}{line}", end="", file=sys.stderr, flush=True)
+
+    return progress
+
+
+def progress_words(fraction: float, passed_s: float, text: str) -> str:
+    """The share that is done, the time that its pace leaves, and what is being done."""
+    left = ""
+    if fraction >= LEAST_PACE:
+        left_s = round(passed_s * (1.0 - fraction) / fraction)
+        left = f"about {left_s // 60} min {left_s % 60} s left" if left_s >= 60 else f"about {left_s} s left"
+    return f"{100 * fraction:3.0f} %  {left:22}  {text[:60]}".rstrip()
+
+
+def clear_progress() -> None:
+    """Take a progress line away before something else is said on standard error."""
+    if sys.stderr.isatty():
+        print(CLEARED, end="", file=sys.stderr, flush=True)
+
+
+def model_report(document: dict[str, Any]) -> list[str]:
+    """What a person reads off a model."""
+    from api.models import summary
+
+    fit, judged = summary.figures(document), summary.quality(document)
+    dynamics, curve = summary.dynamics(document), summary.recruitment(document)
+    effects = ", ".join(effect["id"] for effect in document.get("effects") or []) or "none"
+    in_turn = "in turn, cross-validated: " if fit["held_out_by"] == "cross-validation" else ""
+    lines = [
+        f"model          {document['model_id']}  ({document['method']}, effects: {effects})",
+        f"fit            {percent(fit['fit_percent'])}  (the noise allows {number(fit['ceiling_percent'])} %), "
+        f"rms {number(fit['rms_nm'], 4)} N·m, noise {number(fit['noise_sd_nm'], 4)} N·m",
+        "held out       nothing"
+        if fit["held_out_rms_nm"] is None
+        else f"held out       {in_turn}{percent(fit['held_out_fit_percent'])}, "
+        f"rms {number(fit['held_out_rms_nm'], 4)} N·m",
+    ]
+    if dynamics["time_constant_s"] is not None:
+        lines.append(
+            f"dynamics       Tω {number(dynamics['time_constant_s'], 4)} s, ζ {number(dynamics['damping'], 4)}, "
+            f"delay {number(1000 * (dynamics['delay_s'] or 0), 1)} ms"
+        )
+    elif dynamics["poles_per_s"]:
+        lines.append(
+            "dynamics       poles " + ", ".join(f"{re:+.3f}{im:+.3f}j" for re, im in dynamics["poles_per_s"]) + " 1/s"
+        )
+    lines.append(
+        f"recruitment    threshold {number(curve['threshold_us'], 0)} µs (5 % of the rise), "
+        f"plateau {number(curve['plateau_nm'])} N·m (95 % at {number(curve['saturation_us'], 0)} µs)"
+    )
+    lines.append(f"quality        {judged['verdict']}: {judged['words']}")
+    return [*lines, *(f"               also: {reason}" for reason in judged["reasons"][1:])]

@@ -1,0 +1,1 @@
+"""Model versions, what is known about each, and their approval."""

@@ -1,0 +1,274 @@
+"""What workers find out about a model, kept with it: comparison, curves, diagnosis; and effects added to it."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import json
+import logging
+import secrets
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from api.clock import Clock
+from api.errors import ApiError, NotFoundError
+from api.models import effect_evidence
+from api.models.registry import Versions
+from api.models.starting_effects import StartingEffects
+from api.settings import Settings
+from api.store import Store, audit, uploads
+from api.store.tables import Analysis, Model, Recording
+from api.workers.pool import Call, Pool
+
+log = logging.getLogger("stimrig.analyses")
+OnCall = Callable[[Call], None]
+OWN_DIAGNOSIS = "diagnosis of its structure"
+"""The name under which that of a version is kept whose structure is not the plain one."""
+HALF_DONE = 0.5
+"""From here on a diagnosis of low priority is left to finish when somebody begins to wait for it."""
+
+
+def is_plain(model: Model) -> bool:
+    """Whether a version's structure is the plain one: no effects around f(u) and a G of second order."""
+    return not model.effects and "time_constant_s" in json.loads(model.document)["linear"]
+
+
+def structure_of(model: Model) -> list[str]:
+    """The effects of a version, each `id:form` or, where no form is named, `id`."""
+    held = json.loads(model.document).get("effects") or []
+    return [f"{effect['id']}:{effect.get('form') or ''}".removesuffix(":") for effect in held]
+
+
+class Analyses:
+    """Asks the workers once for each finding; a second asker shares the first one's call."""
+
+    def __init__(self, store: Store, clock: Clock, pool: Pool, versions: Versions, settings: Settings) -> None:
+        self.store, self.clock, self.pool, self.versions = store, clock, pool, versions
+        self.settings = settings
+        self.starting_effects = StartingEffects(store, pool, settings)
+        self.running: dict[tuple[str, str], Call] = {}
+        self._ids: list[str] | None = None
+
+    def path(self, recording_id: str) -> str:
+        """Where a recording lies."""
+        recording: Recording | None = self.store.get(Recording, recording_id)
+        if recording is None:
+            raise NotFoundError("recording", recording_id, "A model's document names its recording.")
+        return recording.path
+
+    async def comparison(self, model: Model, recording_id: str | None = None) -> dict[str, Any]:
+        """Measurement against model; with another recording's id, the model against that one."""
+        given = {"model_json": model.document.decode()}
+        if recording_id in (None, model.recording_id):
+            return await self._kept(model, "comparison", given)
+        digest = hashlib.sha256(str(recording_id).encode()).hexdigest()[:16]
+        return await self._kept(model, f"comparison {digest}", given, verb="comparison", recording_id=recording_id)
+
+    async def curves(self, model: Model) -> dict[str, Any]:
+        """Measured, predicted and commanded curves, thinned to what a screen shows."""
+        return await self._kept(model, "curves", {"model_json": model.document.decode()})
+
+    async def diagnosis(self, model: Model, on_call: OnCall | None = None) -> dict[str, Any]:
+        """What is missing in the model's own structure; that of the plain one is shared by all that have it."""
+        place, kind, given = await asyncio.to_thread(self._criticised, model)
+        return await self._kept(place, kind, given, verb="diagnosis", on_call=on_call)
+
+    def _criticised(self, model: Model) -> tuple[Model, str, dict[str, Any]]:
+        """With which version a diagnosis is kept, under which name, and what the worker is given for it."""
+        if is_plain(model):
+            return self.first_version(model), "diagnosis", {}
+        return model, OWN_DIAGNOSIS, {"model_json": model.document.decode()}
+
+    def first_version(self, model: Model) -> Model:
+        """The first version made from the model's recording: what is found of its plain structure is kept with it."""
+        rows = self.store.all(Model, Model.recording_id == model.recording_id, order=Model.created_utc, limit=1)
+        return rows[0]
+
+    def _plain_eldest(self, model: Model) -> Model:
+        """The recording's first version where that is plain like the model, else the model."""
+        first_version = self.first_version(model)
+        return first_version if is_plain(first_version) else model
+
+    def known_diagnosis(self, model: Model) -> dict[str, Any] | None:
+        """The diagnosis if it has been made."""
+        place, kind, _ = self._criticised(model)
+        return self.known(place.id, kind)
+
+    async def diagnose_ahead(self, model: Model) -> None:
+        """Diagnose before anybody asks, with low priority; a new test ends it, and nobody is told."""
+        place, kind, given = await asyncio.to_thread(self._criticised, model)
+        try:
+            await self._kept(place, kind, given, verb="diagnosis", background=True)
+        except ApiError as error:
+            log.info("diagnosis of %s in the background: %s", model.id, error.title)
+
+    def known(self, model_id: str, kind: str) -> dict[str, Any] | None:
+        """A finding if it has been made."""
+        row = self.store.get(Analysis, (model_id, kind))
+        return row.document if row else None
+
+    async def _kept(
+        self,
+        model: Model,
+        kind: str,
+        given: dict[str, Any],
+        *,
+        verb: str | None = None,
+        recording_id: str | None = None,
+        background: bool = False,
+        on_call: OnCall | None = None,
+    ) -> dict[str, Any]:
+        known = await asyncio.to_thread(self.known, model.id, kind)
+        if known is not None:
+            return known
+        path = await asyncio.to_thread(self.path, recording_id or model.recording_id)
+        key = (model.id, kind)
+        call = self.running.get(key)
+        if call is not None and call.background and not background and call.progress < HALF_DONE:
+            self.pool.cancel(call)  # somebody waits now: on a busy machine low priority could take minutes
+            call = None
+        if call is None:
+            call = self._begin(key, verb or kind, background, {"data": path, **given})
+        if on_call is not None:
+            on_call(call)
+        found = await asyncio.shield(call.result)
+        await asyncio.to_thread(self._keep, model.id, kind, found)
+        return found
+
+    def _begin(self, key: tuple[str, str], verb: str, background: bool, arguments: dict[str, Any]) -> Call:
+        call = self.running[key] = self.pool.submit(verb, background=background, **arguments)
+
+        def done(_future: object) -> None:
+            if self.running.get(key) is call:
+                del self.running[key]
+
+        call.result.add_done_callback(done)
+        return call
+
+    def _keep(self, model_id: str, kind: str, found: dict[str, Any]) -> None:
+        with self.store.write() as session:
+            session.merge(Analysis(model_id=model_id, kind=kind, document=found, created_utc=self.clock.utc()))
+
+    # ---- versions -------------------------------------------------------------------------------------------
+
+    async def add_effects(
+        self,
+        model: Model,
+        added: list[str],
+        by: str,
+        *,
+        force: bool = False,
+        reason: str = "",
+        on_call: OnCall | None = None,
+    ) -> Model:
+        """A new version: the model's effects and these, fitted together anew.
+
+        Raises
+        ------
+        ApiError
+            409: an effect is in it already, or the recording does not ask for it and nobody forces it; 422: no such
+            effect, or the data do not allow the fit.
+        """
+        twice = [effect for effect in added if effect in model.effects]
+        if twice:
+            detail = f"{', '.join(twice)} is in {model.id} already. Name effects it does not hold."
+            raise ApiError(409, "effect-present", "The effect is in the model", detail)
+        await self.check_known(added)
+        effects = list(dict.fromkeys([*model.effects, *added]))
+        same = await asyncio.to_thread(self.versions.child_with, model, effects)
+        if same is not None:
+            return same
+        if force and not reason.strip():
+            detail = "Forcing an effect goes against the evidence; say why, it is kept in the audit trail."
+            raise ApiError(422, "reason-missing", "A forced effect wants a reason", detail)
+        if not force:
+            effect_evidence.require(await self.diagnosis(model, on_call), model.effects, added)
+        path = await asyncio.to_thread(self.path, model.recording_id)
+        held = {effect.partition(":")[0]: effect for effect in structure_of(model)}
+        asked = [held.get(effect, effect) for effect in effects]
+        call = self.pool.submit("fit", data=path, method=model.method, effects=asked)
+        if on_call is not None:
+            on_call(call)
+        found = await asyncio.shield(call.result)
+        return await asyncio.to_thread(self._store_added, found["json"], model, added, by, force, reason)
+
+    async def check_known(self, effects: list[str]) -> None:
+        """Refuse effects that are not in the library."""
+        if self._ids is None:
+            found = await asyncio.shield(self.pool.submit("effects").result)
+            self._ids = sorted(entry["id"] for entry in found["effects"])
+        unknown = [effect for effect in effects if effect not in self._ids]
+        if unknown:
+            detail = f"There is no effect {', '.join(unknown)}. Take one of {', '.join(self._ids)}."
+            raise ApiError(422, "unknown-effect", "No such effect", detail)
+
+    def _store_added(self, model_json: str, model: Model, added: list[str], by: str, force: bool, reason: str) -> Model:
+        row = self.versions.add(
+            model_json, model.participant, model.recording_id, by, parent_id=model.id, added_effect=",".join(added)
+        )
+        if force or reason:
+            with self.store.write() as session:
+                action = "force effect" if force else "add effect"
+                audit.write(session, self.clock.utc(), by, action, row.id, effects=added, reason=reason)
+        return row
+
+    async def improve(self, model: Model, by: str, on_call: OnCall | None = None) -> tuple[dict[str, Any], list[Model]]:
+        """Effects added to the model's structure one by one while the evidence lasts, each step a version.
+
+        They descend from the model; of the plain structure, from the recording's first version if that has it, too.
+        """
+        path = await asyncio.to_thread(self.path, model.recording_id)
+        plain = await asyncio.to_thread(is_plain, model)
+        given: dict[str, Any] = {} if plain else {"model_json": model.document.decode()}
+        call = self.pool.submit("improve", data=path, **given)
+        if on_call is not None:
+            on_call(call)
+        found = await asyncio.shield(call.result)
+        first = await asyncio.to_thread(self._plain_eldest, model) if plain else model
+        rows = await asyncio.to_thread(self._store_steps, found, first, by)
+        return {key: value for key, value in found.items() if key != "models"}, rows
+
+    def _store_steps(self, found: dict[str, Any], first: Model, by: str) -> list[Model]:
+        """Each step that adds something as a version; what they begin with is there already."""
+        rows = [first]
+        for step, document in zip(found["steps"], found["models"], strict=True):
+            if step["added"] is None:
+                continue
+            parent = rows[-1]
+            row = self.versions.child_with(parent, [*parent.effects, step["added"]])
+            if row is None:
+                document["extra"] = {**(document.get("extra") or {}), "parent": parent.id}
+                row = self.versions.add(
+                    json.dumps(document), parent.participant, parent.recording_id, by, parent.id, step["added"]
+                )
+            rows.append(row)
+        return rows
+
+    # ---- several recordings ---------------------------------------------------------------------------------
+
+    async def join(self, older: str, newer: str, participant: str) -> Recording:
+        """Two recordings as one, itself a recording (`origin` joined), to which all else applies."""
+        paths = [await asyncio.to_thread(self.path, part) for part in (older, newer)]
+        identity = f"{uploads.JOINED}{secrets.token_hex(8)}"
+        made = self.settings.exports_dir / f"{identity}.csv"  # all that a worker may write to
+        kept = self.settings.recordings_dir / made.name
+        try:
+            call = self.pool.submit("join", urgent=True, parts=paths, out=str(made))
+            digest = (await asyncio.shield(call.result))["file_sha256"]
+            await asyncio.to_thread(made.replace, uploads.part_of(kept))
+        except BaseException:
+            made.unlink(missing_ok=True)
+            raise
+        stored = asyncio.to_thread(self._store_joined, kept, digest, participant, older, newer)
+        return await asyncio.shield(stored)
+
+    def _store_joined(self, kept: Path, digest: str, participant: str, older: str, newer: str) -> Recording:
+        now, identity = self.clock.utc(), kept.stem
+        row = Recording(id=identity, participant=participant, path=str(kept), file_sha256=digest, origin="joined")
+        row.test_id, row.created_utc = None, now
+        with uploads.taken_in(kept), self.store.write() as session:
+            session.add(row)
+            session.flush()
+            audit.write(session, now, "service", "join recordings", identity, parts=[older, newer], sha256=digest)
+        return row

@@ -1,0 +1,44 @@
+"""Whether a recording asks for an effect: what a person is told who wants to add one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from api.errors import ApiError
+
+
+def require(diagnosis: dict[str, Any], present: Sequence[str], added: Sequence[str]) -> None:
+    """Refuse effects that the recording does not ask for.
+
+    Raises
+    ------
+    ApiError
+        409, with the reason for each effect.
+    """
+    reasons = {effect: refusal(diagnosis, present, effect) for effect in added}
+    found = {effect: reason for effect, reason in reasons.items() if reason}
+    if found:
+        detail = " ".join(f"{effect}: {reason}" for effect, reason in found.items())
+        detail += " A person can add it all the same and say why (`force`); the held-out error then shows what it does."
+        raise ApiError(409, "effect-not-there", "The recording does not ask for this effect", detail, reasons=found)
+
+
+def refusal(diagnosis: dict[str, Any], present: Sequence[str], effect: str) -> str | None:
+    """Why the recording does not ask for an effect; None where it does, or cannot tell it from one it asks for."""
+    for entry in diagnosis.get("missing") or []:
+        if entry["effect"] == effect:
+            return None
+        if effect in (entry.get("confused_with") or []) and entry["effect"] not in present:
+            return None
+    rows = [row for rows in diagnosis.get("candidates") or [] for row in rows if row["effect"] == effect]
+    if not rows:
+        return "it was not considered on this recording: it needs columns that are not in it, or was seen otherwise."
+    gain = rows[-1]["log_evidence_gain"]
+    if gain <= 0:
+        return f"the recording speaks against it (log evidence {gain:+.1f})."
+    better = [entry for entry in diagnosis.get("missing") or [] if entry["effect"] != effect]
+    if better and rows[0]["log_evidence_gain"] > 6:
+        names = " and ".join((entry.get("name") or entry["effect"]).lower() for entry in better)
+        return f"{names} explains the same better; beside it, {effect} gains too little (log evidence {gain:+.1f})."
+    return f"too little speaks for it (log evidence {gain:+.1f}): what it would explain looks like noise."

@@ -1,0 +1,205 @@
+"""Model versions: immutable, with lineage; approval; and the one the controller gets."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import select
+
+from api.clock import Clock
+from api.errors import ApiError, NotFoundError
+from api.models import summary
+from api.store import Store, audit
+from api.store.tables import Approval, Model
+
+LATEST = "9999"
+"""Sorts after every label of time: an approval from before approvals expired."""
+
+
+@dataclass(frozen=True)
+class Served:
+    """What the controller fetches: the bytes and their tag."""
+
+    body: bytes
+    etag: str
+    expires_utc: str
+
+
+class Versions:
+    """The models of all participants.
+
+    The approved model's bytes are kept in memory, so that a controller's fetch touches no disk.
+    """
+
+    def __init__(self, store: Store, clock: Clock) -> None:
+        self.store, self.clock = store, clock
+        self._served: dict[str, Served] = {}
+        self._read: dict[str, dict[str, Any]] = {}
+
+    def add(
+        self,
+        model_json: str,
+        participant: str,
+        recording_id: str,
+        by: str,
+        parent_id: str | None = None,
+        added_effect: str | None = None,
+    ) -> Model:
+        """Store a new version."""
+        document = json.loads(model_json)
+        body = model_json.encode()
+        now = self.clock.utc()
+        row = Model(
+            id=str(document["model_id"]),
+            participant=participant,
+            recording_id=recording_id,
+            parent_id=parent_id,
+            added_effect=added_effect,
+            method=str(document.get("method", "")),
+            effects=[str(effect["id"]) for effect in document.get("effects") or []],
+            fit={**summary.figures(document), **summary.quality(document)},
+            document=body,
+            etag=hashlib.sha256(body).hexdigest(),
+            created_utc=now,
+            created_by=by,
+        )
+        with self.store.write() as session:
+            same = session.get(Model, row.id)
+            if same is not None:
+                if same.etag == row.etag:
+                    return same
+                detail = f"{row.id} is stored with other contents; nothing was overwritten."
+                raise ApiError(409, "model-exists", "A model version cannot be changed", detail)
+            session.add(row)
+            audit.write(session, now, by, "store model", row.id, recording=recording_id, effects=row.effects)
+        return row
+
+    def get(self, model_id: str) -> Model:
+        """A version by its id."""
+        row = self.store.get(Model, model_id)
+        if row is None:
+            raise NotFoundError("model", model_id, "GET /v1/participants/{code}/models lists a participant's.")
+        return row
+
+    def of(self, participant: str) -> list[Model]:
+        """A participant's versions, newest first."""
+        return self.store.all(Model, Model.participant == participant, order=Model.created_utc.desc())
+
+    def child_with(self, parent: Model, effects: list[str]) -> Model | None:
+        """A version of the same recording, made from `parent`, that holds exactly these effects."""
+        rows = self.store.all(Model, Model.parent_id == parent.id, Model.recording_id == parent.recording_id)
+        return next((row for row in rows if sorted(row.effects) == sorted(effects)), None)
+
+    def lineage(self, model: Model) -> list[Model]:
+        """The versions from the first one of the recording to this one, then its newest descendants."""
+        rows = {row.id: row for row in self.store.all(Model, Model.recording_id == model.recording_id)}
+        path = [model]
+        while path[0].parent_id in rows:
+            path.insert(0, rows[str(path[0].parent_id)])
+        children = sorted(rows.values(), key=lambda row: row.created_utc)
+        while below := [row for row in children if row.parent_id == path[-1].id]:
+            path.append(below[-1])
+        return path
+
+    def undo(self, model_id: str, by: str, reason: str) -> Model:
+        """Go back to the version this one was made from: this one is rejected, and where it was in use, that one is.
+
+        Raises
+        ------
+        ApiError
+            409: there is nothing before it.
+        """
+        row = self.get(model_id)
+        if row.parent_id is None:
+            detail = f"{model_id} is the first version. Reject it instead."
+            raise ApiError(409, "nothing-to-undo", "There is no version before this one", detail)
+        holding = self.approved(row.participant)
+        words = f"undone: {reason}" if reason else "undone"
+        self.decide(row.id, False, by, words)
+        if holding is not None and holding.model_id == row.id:
+            self.decide(row.parent_id, True, by, words)
+        return self.get(row.parent_id)
+
+    def decide(self, model_id: str, approved: bool, by: str, reason: str) -> Approval:
+        """Approve or reject a version; only a person does this."""
+        row = self.get(model_id)
+        now = self.clock.utc()
+        decision = Approval(model_id=row.id, participant=row.participant, approved=approved, reason=reason)
+        decision.by, decision.at_utc = by, now
+        decision.expires_utc = self.clock.end_of_day_utc() if approved else None
+        with self.store.write() as session:
+            session.add(decision)
+            audit.write(session, now, by, "approve" if approved else "reject", row.id, reason=reason)
+            self._served.pop(row.participant, None)
+        return decision
+
+    def decision(self, model_id: str) -> Approval | None:
+        """The newest decision on a version."""
+        found = self.store.all(Approval, Approval.model_id == model_id, order=Approval.id.desc(), limit=1)
+        return found[0] if found else None
+
+    def approved(self, participant: str) -> Approval | None:
+        """The approval that holds for a participant today: the newest on a version not rejected since."""
+        now = self.clock.utc()
+        query = select(Approval).where(Approval.participant == participant).order_by(Approval.id.desc())
+        rejected: set[str] = set()
+        with self.store.read() as session:
+            for decision in session.scalars(query):
+                if not decision.approved:
+                    rejected.add(decision.model_id)
+                elif decision.model_id not in rejected:
+                    return decision if decision.expires_utc is None or decision.expires_utc > now else None
+        return None
+
+    def served(self, participant: str) -> Served | None:
+        """What the controller gets, or None where nothing is approved."""
+        found = self._served.get(participant)
+        if found is not None and found.expires_utc <= self.clock.utc():
+            del self._served[participant]
+            return None
+        if found is None:
+            with self.store.write_lock:  # no approval may slip in between reading and keeping
+                approval = self.approved(participant)
+                if approval is None:
+                    return None
+                row = self.get(approval.model_id)
+                found = self._served[participant] = Served(
+                    row.document, f'"{row.etag}"', approval.expires_utc or LATEST
+                )
+        return found
+
+    def quality(self, row: Model) -> dict[str, Any]:
+        """The verdict stored in the model; kept beside its figures, but for those stored before it was."""
+        if "verdict" in row.fit:
+            return {key: row.fit[key] for key in ("verdict", "words", "reasons")}
+        if row.etag not in self._read:
+            self._read[row.etag] = summary.quality(json.loads(row.document))
+        return self._read[row.etag]
+
+    def document(self, row: Model) -> dict[str, Any]:
+        """A version as clients see it, without the model itself."""
+        decision = self.decision(row.id)
+        holding = self.approved(row.participant)
+        return {
+            "id": row.id,
+            "model_id": row.id,
+            "participant": row.participant,
+            "recording_id": row.recording_id,
+            "parent_id": row.parent_id,
+            "added_effect": row.added_effect,
+            "method": row.method,
+            "effects": row.effects,
+            **row.fit,
+            **self.quality(row),
+            "decision": None if decision is None else ("approved" if decision.approved else "rejected"),
+            "decided_by": decision.by if decision else None,
+            "decided_utc": decision.at_utc if decision else None,
+            "decision_reason": decision.reason if decision else None,
+            "expires_utc": decision.expires_utc if decision else None,
+            "served": holding is not None and holding.model_id == row.id,
+            "created_utc": row.created_utc,
+            "created_by": row.created_by,
+        }

@@ -1,0 +1,243 @@
+"""Who may do what: bearer tokens with scopes, and a cookie session for the page's plain forms."""
+
+from __future__ import annotations
+
+import hashlib
+import secrets
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+from sqlalchemy import delete, select
+from sqlalchemy.orm import Session
+from starlette.requests import HTTPConnection
+
+from api.clock import Clock
+from api.errors import ApiError
+from api.people.pace import Guesses, place_of
+from api.store import Store, audit
+from api.store.tables import Confirmation, PageSession, Token
+
+COOKIE = "stimrig_session"
+
+
+class Scope(StrEnum):
+    """What a token may be used for.
+
+    ``rearm`` is in no role and no controller's key: after a stop a person looks first. Who signed in with a password
+    and may run tests holds it for the session; a program holds it only if it was asked for by name.
+    """
+
+    READ_LIVE = "read-live"
+    RUN_TEST = "run-test"
+    REARM = "rearm"
+    APPROVE_MODEL = "approve-model"
+    READ_MODEL = "read-model"
+    ADMINISTER = "administer"
+
+
+@dataclass(frozen=True)
+class Principal:
+    """Who is asking.
+
+    Parameters
+    ----------
+    name : str
+        The token's name; goes into the audit trail.
+    scopes : frozenset of str
+        What the token may do; ``administer`` includes everything.
+    csrf : str or None
+        The session's CSRF token; None for a bearer token.
+    session_hash : str or None
+        The session of a person with a password; None for tokens, which have none to ask for again.
+    """
+
+    name: str
+    scopes: frozenset[str]
+    csrf: str | None = None
+    session_hash: str | None = None
+
+    def may(self, scope: Scope) -> bool:
+        """Whether the scope is held."""
+        return scope in self.scopes or Scope.ADMINISTER in self.scopes
+
+    @property
+    def role(self) -> str:
+        """What a person calls these scopes."""
+        if self.may(Scope.ADMINISTER):
+            return "administrator"
+        if self.may(Scope.APPROVE_MODEL):
+            return "clinician"
+        return "operator" if self.may(Scope.RUN_TEST) else "reader"
+
+
+class Auth:
+    """Issues and checks tokens and sessions; keeps only hashes."""
+
+    def __init__(self, store: Store, clock: Clock, guesses: Guesses, session_hours: float = 12.0) -> None:
+        self.store, self.clock, self.guesses, self.session_s = store, clock, guesses, session_hours * 3600
+        self._known: dict[str, Token] = {}
+
+    def issue(self, name: str, scopes: list[Scope], by: str, *, text: str | None = None, origin: str = "issued",
+              expires_utc: str | None = None) -> str:  # fmt: skip
+        """Make a token and return its text, which is shown this once."""
+        text = text or f"stimrig_{secrets.token_urlsafe(32)}"
+        now = self.clock.utc()
+        with self.store.write() as session:
+            row = Token(hash=digest(text), prefix=text[:12] if origin == "issued" else "(set)", name=name)
+            row.scopes, row.created_utc, row.origin = [str(scope) for scope in scopes], now, origin
+            row.expires_utc, row.revoked = expires_utc, False
+            session.merge(row)
+            audit.write(session, now, by, "issue token", name, scopes=row.scopes)
+        self._known.clear()
+        return text
+
+    def revoke(self, token_id: str, by: str) -> bool:
+        """Revoke a token by its public id; False where there is none."""
+        with self.store.write() as session:
+            found = [row for row in session.scalars(select(Token)) if row.hash[:16] == token_id]
+            for row in found:
+                row.revoked = True
+                audit.write(session, self.clock.utc(), by, "revoke token", row.name)
+        self._known.clear()
+        return bool(found)
+
+    def first_administrator(self, configured: str | None) -> str | None:
+        """See that an administrator exists; return the new token's text if one was drawn.
+
+        A token set from outside (``STIMRIG_ADMIN_TOKEN``) replaces the one set before it.
+        """
+        if configured:
+            self._revoke_set_tokens(keep=digest(configured))
+            self.issue("administrator", [Scope.ADMINISTER], "settings", text=configured, origin="settings")
+            return None
+        tokens = self.store.all(Token, Token.revoked.is_(False))
+        if any(Scope.ADMINISTER in token.scopes and token.origin == "issued" for token in tokens):
+            return None
+        return self.issue("administrator", [Scope.ADMINISTER], "first start")
+
+    def _revoke_set_tokens(self, keep: str) -> None:
+        with self.store.write() as session:
+            for token in session.scalars(select(Token).where(Token.origin == "settings", Token.hash != keep)):
+                token.revoked = True
+        self._known.clear()
+
+    def bearer(self, text: str, address: str = "", *, forgive_age: bool = False) -> Principal:
+        """The holder of a bearer token; `forgive_age` lets one that ran out still press stop.
+
+        Guesses are held to a pace by the place they come from. A token that was drawn opens all the same: nobody
+        guesses its 256 bits, and others' guesses must not keep a controller out. A right token always presses stop.
+
+        Raises
+        ------
+        ApiError
+            401: unknown, revoked or expired; 429: too many that were none.
+        """
+        token, place = self._token(digest(text)), place_of(address)
+        if token is None:
+            self.guesses.unknown_token(place)
+        elif token.origin == "settings" and not forgive_age:  # a stop waits for no pace
+            self.guesses.chosen_token(token.hash, place)
+        return self._principal(token, forgive_age=forgive_age)
+
+    def _token(self, token_hash: str) -> Token | None:
+        """A token's row; kept in memory, since a controller asks often, and forgotten at every change."""
+        found = self._known.get(token_hash)
+        if found is None:
+            found = self.store.get(Token, token_hash)
+            if found is not None:
+                self._known[token_hash] = found
+        return found
+
+    def _principal(self, token: Token | None, csrf: str | None = None, *, forgive_age: bool = False) -> Principal:
+        if token is None or token.revoked:
+            raise unauthorized("The token is unknown or has been revoked. Ask an administrator for a new one.")
+        if token.expires_utc is not None and token.expires_utc <= self.clock.utc() and not forgive_age:
+            raise unauthorized("The token has expired. Ask an administrator for a new one.")
+        return Principal(token.name, frozenset(token.scopes), csrf)
+
+    def sign_in(self, token_text: str, address: str) -> str:
+        """Open a page session for a token's holder; its cookie. Raises as `bearer` does."""
+        return self.open_session(digest(token_text), self.bearer(token_text, address).name)
+
+    def open_session(self, token_hash: str, name: str) -> str:
+        """Open a page session for the holder of a token; its cookie."""
+        cookie, now = secrets.token_urlsafe(32), self.clock.unix_s()
+        with self.store.write() as session:
+            session.add(
+                PageSession(
+                    hash=digest(cookie),
+                    token_hash=token_hash,
+                    csrf=secrets.token_urlsafe(24),
+                    created_unix_s=now,
+                    expires_unix_s=now + self.session_s,
+                )
+            )
+            audit.write(session, self.clock.utc(), name, "sign in", "page")
+        return cookie
+
+    def token_of_person(self, session: Session, name: str, scopes: list[Scope]) -> Token:
+        """The token that says what a person may do; nobody holds its text."""
+        token = Token(hash=secrets.token_hex(32), prefix="(user)", name=name, origin="user", revoked=False)
+        token.scopes, token.created_utc = [str(scope) for scope in scopes], self.clock.utc()
+        session.add(token)
+        session.flush()
+        return token
+
+    def end_sessions(self, session: Session, token_hash: str, but: str | None = None) -> str | None:
+        """End the sessions of a token's holder; the one of the hash `but` goes on under a new cookie, which is given.
+
+        Its forms stay good: they are worth nothing without the new cookie.
+        """
+        cookie = None
+        for row in session.scalars(select(PageSession).where(PageSession.token_hash == token_hash)).all():
+            if row.hash == but:
+                cookie = secrets.token_urlsafe(32)
+                session.add(PageSession(**{**row.as_dict(), "hash": digest(cookie)}))
+            session.execute(delete(Confirmation).where(Confirmation.session_hash == row.hash))
+            session.delete(row)
+        return cookie
+
+    def sign_out(self, cookie: str) -> None:
+        """Forget a page session."""
+        with self.store.write() as session:
+            row = session.get(PageSession, digest(cookie))
+            if row is not None:
+                session.delete(row)
+
+    def cookie(self, cookie: str, *, forgive_age: bool = False) -> Principal:
+        """The holder of a page session; `forgive_age` lets a session that ran out still press stop."""
+        row = self.store.get(PageSession, digest(cookie))
+        if row is None or (row.expires_unix_s <= self.clock.unix_s() and not forgive_age):
+            raise unauthorized("The session has ended. Sign in again.")
+        token = self._token(row.token_hash)
+        principal = self._principal(token, row.csrf, forgive_age=forgive_age)
+        if token is None or token.origin != "user":
+            return principal
+        more = {Scope.REARM} if principal.may(Scope.RUN_TEST) else set()
+        return replace(principal, session_hash=row.hash, scopes=principal.scopes | more)
+
+    def identify(self, connection: HTTPConnection, *, forgive_age: bool = False) -> Principal:
+        """Who stands behind a request or a WebSocket."""
+        header = connection.headers.get("authorization", "")
+        if header:
+            kind, _, text = header.partition(" ")
+            if kind.lower() != "bearer" or not text.strip():
+                raise unauthorized("Send `Authorization: Bearer <token>`.")
+            address = connection.client.host if connection.client else ""
+            return self.bearer(text.strip(), address, forgive_age=forgive_age)
+        cookie = connection.cookies.get(COOKIE)
+        if cookie:
+            return self.cookie(cookie, forgive_age=forgive_age)
+        raise unauthorized("Send `Authorization: Bearer <token>`, or sign in on the page.")
+
+
+def digest(text: str) -> str:
+    """SHA-256 in hex; the tokens are drawn from 256 random bits, so no slow hash is needed."""
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def unauthorized(detail: str, code: str = "unauthorized", title: str = "Not signed in") -> ApiError:
+    """A 401 with the challenge that RFC 9110 asks for."""
+    problem = ApiError(401, code, title, detail)
+    problem.headers["WWW-Authenticate"] = 'Bearer realm="stimrig"'
+    return problem

@@ -1,0 +1,1 @@
+"""A test from the request to its recording, and the service's end of the rig's socket."""

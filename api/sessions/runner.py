@@ -1,0 +1,443 @@
+"""A test from the request to the model: intent in the database, command to the rig, recording, identification."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import math
+import secrets
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy.exc import SQLAlchemyError
+
+from api.clock import Clock, asked_s
+from api.errors import ApiError, NotFoundError
+from api.logs import current_test
+from api.models.analyses import Analyses
+from api.models.registry import Versions
+from api.sessions import profiles
+from api.sessions.lifecycle import OPEN_STATES, Lifecycle
+from api.sessions.limits import limits_of
+from api.sessions.live import Hub
+from api.sessions.requests import TestIn
+from api.sessions.rig_client import AnyEvent, RigClient
+from api.store import Store, audit
+from api.store.tables import Participant, Test
+from api.workers.pool import Pool
+from rig.messages import (
+    FinishedEvent,
+    LiveEvent,
+    PreviewRequest,
+    RecruitmentTable,
+    SegmentPlan,
+    StartRequest,
+    Status,
+    StopEvidence,
+    StopRequest,
+    TestPlan,
+)
+
+log = logging.getLogger("stimrig.trials")
+NOT_CONFIRMED = "The stop is not confirmed"
+HALTED = ("latched", "uncertain", "disconnected")
+START_S = 10.0
+"""From the request to the command to the rig: nobody waits with a hand on the button for longer."""
+PREVIEW_S = 35.0
+"""More than the rig takes for one before it says that the computer is too busy."""
+MISSED_POLLS = 3
+"""After so many states that don't name the test, its end was lost: it comes within milliseconds of the state."""
+NOTE_S = 0.3
+"""So long the answer to a stop waits for its entry in the audit trail; the entry is made all the same."""
+EMERGENCY = "Use the stimulator's own emergency switch now."
+
+
+@dataclass
+class Current:
+    """The test the rig is busy with, or that is being identified."""
+
+    test_id: str
+    participant: str
+    by: str
+    finished: asyncio.Event = field(default_factory=asyncio.Event)
+    started: bool = False
+    """The rig has said that it plays."""
+    ending: bool = False
+    """Its end has been heard."""
+    missed: int = 0
+    """How often in a row the rig, asked for its state, did not name it."""
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What a person was shown before saying yes; a test that would be another one is not started."""
+
+    profile_version: str
+    preview: dict[str, Any]
+
+    def same(self, preview: dict[str, Any]) -> bool:
+        """Whether the rig would play what was shown; the torque it is estimated to give may be known better by now."""
+        return {**preview, "torque_time_nms": None} == {**self.preview, "torque_time_nms": None}
+
+
+class Runner:
+    """Starts tests, one at a time, and follows each to its model."""
+
+    def __init__(
+        self, store: Store, clock: Clock, rig: RigClient, pool: Pool, versions: Versions, analyses: Analyses,
+        recordings_dir: Path,
+    ) -> None:  # fmt: skip
+        self.store, self.clock, self.rig, self.versions, self.pool = store, clock, rig, versions, pool
+        self.hub = Hub(clock)
+        self.current: Current | None = None
+        self.lifecycle = Lifecycle(store, clock, rig, pool, versions, analyses, recordings_dir, self.announce)
+        self._lock = asyncio.Lock()
+        self._halted_s = -math.inf
+        self._notes = ThreadPoolExecutor(2, "notes-of-stops")
+        self._tasks: set[asyncio.Task[Any]] = set()
+        rig.listeners.append(self._on_event)
+        rig.link_listeners.append(self._on_link)
+        rig.poll_listeners.append(self._on_poll)
+
+    # ---- start and stop -------------------------------------------------------------------------------------
+
+    async def start(self, body: TestIn, by: str, seen: Seen | None = None) -> Test:
+        """Begin a test.
+
+        Parameters
+        ----------
+        body : TestIn
+            The test.
+        by : str
+            Who answers for it.
+        seen : Seen, optional
+            What a person has confirmed; None: a program's request, which nobody was shown.
+
+        Raises
+        ------
+        ApiError
+            404 no such participant; 409 another test runs, the holder named; 409 it would not be what was seen, or a
+            stop came since it was asked for; 503 that was too long ago; what the rig refuses.
+        """
+        self.refuse_second()
+        async with self._lock:
+            self.refuse_second()
+            return await self._start(body, await self._participant(body), by, seen)
+
+    def refuse_second(self) -> None:
+        """409 while a test runs, its holder named."""
+        if self.current is not None:
+            raise busy(self.current)
+
+    async def _participant(self, body: TestIn) -> Participant:
+        participant = await asyncio.to_thread(self.store.get, Participant, body.participant)
+        if participant is None:
+            raise NotFoundError("participant", body.participant, "POST /v1/participants makes one.")
+        return participant
+
+    async def _start(self, body: TestIn, participant: Participant, by: str, seen: Seen | None) -> Test:
+        if seen is not None and seen.profile_version != profiles.version(participant.profile):
+            raise not_what_was_seen(f"The limits of {participant.code} were changed meanwhile.")
+        plan = self._plan(body, participant)
+        if body.joins is not None:
+            await asyncio.to_thread(self._check_joins, body)
+        current = self.current = Current(plan.test_id, plan.participant, by)
+        current_test.set(plan.test_id)
+        self.pool.cancel_background()
+        try:
+            preview = await self._previewed(plan)
+            if seen is not None and not seen.same(preview):
+                raise not_what_was_seen("The rig would now play something else: it was set up anew.")
+            row = await asyncio.to_thread(self._write_intent, plan, preview, by, body.joins)
+            self.hub.begin(plan.test_id)
+            await self._command(plan, body, profiles.version(participant.profile))
+            current.started = True
+        except BaseException:
+            self.current = None
+            raise
+        return await asyncio.to_thread(self.lifecycle.update, row.id, state="running")
+
+    async def _command(self, plan: TestPlan, body: TestIn, version: str) -> None:
+        try:
+            if profiles.version((await self._participant(body)).profile) != version:
+                raise not_what_was_seen(f"The limits of {plan.participant} were changed meanwhile.")
+            self._refuse_overtaken(
+                asked_s.get(self.clock.monotonic_s())
+            )  # nothing is waited for between this and the command
+            await self.rig.ask(StartRequest(plan=plan), timeout_s=15.0)
+        except ApiError as error:
+            await asyncio.to_thread(
+                self.lifecycle.update, plan.test_id, state="refused", reason=error.detail or error.title
+            )
+            if error.code == "rig-unreachable":  # it may have heard us all the same
+                await self._stop_quietly(f"start of {plan.test_id} was not answered")
+            status = self.rig.status
+            if error.code == "rig-busy" and status is not None:
+                error.extra["holder"] = {"test_id": status.test_id, "participant": status.participant}
+            raise
+
+    def _refuse_overtaken(self, since_s: float) -> None:
+        """A start that a stop has overtaken, or whose asker has long given up, is not played."""
+        if self._halted_s >= since_s:
+            detail = "Nothing was played. Look at the participant and the rig, re-arm it, and start again."
+            raise ApiError(409, "stopped-meanwhile", "A stop came after this start was asked for", detail)
+        if not (self.clock.monotonic_s() - since_s <= START_S):
+            detail = f"It could not begin within {START_S:g} s. Nothing was played. Start again."
+            raise ApiError(503, "too-late", "The start took too long", detail)
+
+    async def _stop_quietly(self, reason: str) -> None:
+        try:
+            await self.rig.request(StopRequest(reason=reason, by="service"))
+        except ApiError as error:
+            log.warning("stop after a failed start: %s", error)
+
+    def _plan(self, body: TestIn, participant: Participant) -> TestPlan:
+        segments = None
+        if body.segments is not None:
+            segments = [SegmentPlan(**segment.model_dump()) for segment in body.segments]
+        return TestPlan(
+            test_id=self._new_id(),
+            participant=participant.code,
+            kind=body.kind,
+            segments=segments,
+            pulse_rate_hz=body.pulse_rate_hz,
+            **limits_of(body, participant.profile),
+        )
+
+    def _check_joins(self, body: TestIn) -> None:
+        """The model whose recording the new one is to be joined to is the participant's own."""
+        model = self.versions.get(str(body.joins))
+        if model.participant != body.participant:
+            detail = f"{model.id} is a model of {model.participant}, the test is for {body.participant}."
+            raise ApiError(422, "other-participant", "The model is another participant's", detail)
+
+    def _new_id(self) -> str:
+        stamp = self.clock.utc()[:19].replace("-", "").replace(":", "")
+        return f"T{stamp}-{secrets.token_hex(3)}"
+
+    def _write_intent(self, plan: TestPlan, preview: dict[str, Any], by: str, joins: str | None) -> Test:
+        now = self.clock.utc()
+        row = Test(id=plan.test_id, participant=plan.participant, kind=plan.kind, state="requested")
+        row.plan, row.summary, row.reason = {**plan.model_dump(), "preview": preview, "joins": joins}, {}, ""
+        row.requested_by, row.requested_utc = by, now
+        with self.store.write() as session:
+            session.add(row)
+            audit.write(session, now, by, "start test", plan.test_id, participant=plan.participant, kind=plan.kind)
+        log.info("test requested, kind %s", plan.kind, extra={"test_id": plan.test_id})
+        return row
+
+    async def preview(self, body: TestIn) -> dict[str, Any]:
+        """A test's duration, dose and pulse widths; nothing is played."""
+        return await self._previewed(self._plan(body, await self._participant(body)))
+
+    async def _previewed(self, plan: TestPlan) -> dict[str, Any]:
+        curve = await asyncio.to_thread(self._recruitment, plan.participant)
+        return await self.rig.ask(PreviewRequest(plan=plan, recruitment=curve), timeout_s=PREVIEW_S)
+
+    def _recruitment(self, participant: str) -> RecruitmentTable | None:
+        """The approved model's recruitment curve, to estimate the torque-time of a plan with."""
+        served = self.versions.served(participant)
+        if served is None:
+            return None
+        curve = json.loads(served.body)["recruitment"]
+        return RecruitmentTable(pulse_width_us=curve["pulse_width_us"], torque_nm=curve["torque_nm"])
+
+    async def stop(self, reason: str, by: str) -> StopEvidence:
+        """Stop the rig; the audit entry comes after, so that nothing delays the command.
+
+        Raises
+        ------
+        ApiError
+            503: the rig cannot be reached, or it could not confirm that stimulation has stopped.
+        """
+        self._halted_s = self.clock.monotonic_s()
+        subject = self.current.test_id if self.current else "rig"
+        try:
+            evidence = StopEvidence.model_validate(
+                await self.rig.ask(StopRequest(reason=reason or "stop pressed", by=by), timeout_s=8.0)
+            )
+        except ApiError as error:
+            await self._note(by, "stop failed", subject, detail=error.detail)
+            error.title, error.detail = NOT_CONFIRMED, f"{EMERGENCY} {error.title}: {error.detail}"
+            raise
+        await self._note(by, "stop", subject, reason=reason, confirmed=evidence.confirmed)
+        if not evidence.confirmed:
+            detail = f"{EMERGENCY} The rig says: {evidence.detail}"
+            raise ApiError(503, "stop-not-confirmed", NOT_CONFIRMED, detail, evidence=evidence.model_dump())
+        return evidence
+
+    async def _note(self, by: str, action: str, subject: str, **detail: Any) -> None:
+        """Write a stop down; a database that is slow or gone does not keep its answer back."""
+
+        def write() -> None:
+            try:
+                with self.store.write() as session:
+                    audit.write(session, self.clock.utc(), by, action, subject, **detail)
+            except SQLAlchemyError:
+                log.exception("%s by %s could not be written into the audit trail", action, by)
+
+        noted = asyncio.get_running_loop().run_in_executor(self._notes, write)  # threads that nothing else can fill
+        await asyncio.wait({noted}, timeout=NOTE_S)
+
+    # ---- what the rig says ----------------------------------------------------------------------------------
+
+    def _on_event(self, event: AnyEvent) -> None:
+        if isinstance(event, LiveEvent):
+            self.hub.live(event)
+        elif isinstance(event, FinishedEvent):
+            self._spawn(self._finish(event))
+        else:
+            if event.status.state in HALTED:
+                self._halted_s = self.clock.monotonic_s()
+            self.hub.send({"type": "state", "rig": event.status.model_dump(exclude={"finished"})})
+
+    def _on_link(self, connected: bool) -> None:
+        self.hub.send({"type": "link", "connected": connected})
+        current, status = self.current, self.rig.status
+        if not connected or status is None or current is None or not current.started:
+            return  # a start under way learns by itself what became of it
+        if not current.ending and status.test_id != current.test_id:
+            current.ending = True
+            self._spawn(self._recover(current.test_id, "the rig's process ended during the test"))
+
+    def _on_poll(self, status: Status) -> None:
+        """A test whose end was lost on the way must not hold the rig for ever."""
+        current = self.current
+        if current is None or not current.started or current.ending:
+            return
+        current.missed = 0 if status.test_id == current.test_id else current.missed + 1
+        if current.missed >= MISSED_POLLS:
+            current.ending = True
+            self._spawn(self._recover(current.test_id, f"the rig is {status.state} and no longer plays this test"))
+
+    def _spawn(self, work: Any) -> asyncio.Task[Any]:
+        task = asyncio.create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+        return task
+
+    async def _finish(self, event: FinishedEvent) -> None:
+        """Take over a finished test: store the recording, identify, store the model."""
+        current_test.set(event.test_id)
+        if self.current is not None and self.current.test_id == event.test_id:
+            self.current.ending = True
+        try:
+            row = await asyncio.to_thread(self.lifecycle.take_recording, event)
+            if row is None:
+                return
+            self.announce(row.id)
+            if row.state == "identifying":
+                self._release(event.test_id)
+                await self.lifecycle.identify(row.id, event.last_sample_unix_s)
+        except Exception as error:
+            log.exception("the test could not be taken over", extra={"test_id": event.test_id})
+            await asyncio.to_thread(
+                self.lifecycle.update, event.test_id, state="failed", reason=" ".join(str(error).split())
+            )
+        finally:
+            self._release(event.test_id)
+            self.announce(event.test_id)
+
+    def _release(self, test_id: str) -> None:
+        """The rig is free again; the identification goes on beside it."""
+        if self.current is not None and self.current.test_id == test_id:
+            self.current.finished.set()
+            self.current = None
+
+    # ---- after a restart ------------------------------------------------------------------------------------
+
+    async def resume(self) -> None:
+        """Take up what a restart of the service left open."""
+        for row in await asyncio.to_thread(self.store.all, Test, Test.state.in_(OPEN_STATES)):
+            status = self.rig.status
+            if (
+                status is not None
+                and status.test_id == row.id
+                and status.state not in ("ready", "latched", "uncertain")
+            ):
+                self.current = Current(row.id, row.participant, row.requested_by, started=True)
+                self.hub.begin(row.id)
+            else:
+                self._spawn(self._recover(row.id, "the service was restarted during the test"))
+
+    async def _recover(self, test_id: str, why: str) -> None:
+        """A test whose end was not heard: its recording, if the rig sealed one, is adopted."""
+        current_test.set(test_id)
+        row: Test = await asyncio.to_thread(self.store.get, Test, test_id)
+        if row.recording_id is not None:
+            await self.lifecycle.identify(test_id)
+        else:
+            await self._finish(await self.lifecycle.missed_end(test_id, why))
+        self._release(test_id)
+        self.announce(test_id)
+
+    # ---- what clients see -----------------------------------------------------------------------------------
+
+    def announce(self, test_id: str) -> None:
+        """Tell the listeners of the live channel how the test stands."""
+        row = self.store.get(Test, test_id)
+        if row is not None:
+            self.hub.send({"type": "test", "test": self.document(row)})
+
+    def document(self, row: Test) -> dict[str, Any]:
+        """A test as clients see it."""
+        planned = {key: value for key, value in row.plan.get("preview", {}).items() if key != "pulse_width_us"}
+        running = row.state in ("requested", "running")
+        start = (0.0, planned.get("duration_s", 0.0), None)
+        end = (row.summary.get("duration_s", 0.0), row.summary.get("duration_s", 0.0), None)
+        elapsed_s, duration_s, segment = (self.hub.position(row.id) or start) if running else end
+        call, rig = self.lifecycle.calls.get(row.id), self.rig.status
+        sealing = running and rig is not None and rig.test_id == row.id and rig.state == "sealing"
+        model = self.versions.get(row.model_id) if row.model_id else None
+        return {
+            "id": row.id,
+            "participant": row.participant,
+            "kind": row.kind,
+            "state": "sealing" if sealing else row.state,
+            "done": row.state not in OPEN_STATES,
+            "reason": row.reason,
+            "segment": segment,
+            "elapsed_s": elapsed_s,
+            "duration_s": duration_s,
+            "time_left_s": max(0.0, duration_s - elapsed_s),
+            "progress": min(1.0, elapsed_s / duration_s) if duration_s else 0.0,
+            "identification": call.document() if call else None,
+            "requested_by": row.requested_by,
+            "requested_utc": row.requested_utc,
+            "finished_utc": row.finished_utc,
+            "planned": planned,
+            "recording_id": row.recording_id,
+            "recording_url": f"/v1/recordings/{row.recording_id}" if row.recording_id else None,
+            "joins": row.plan.get("joins"),
+            "model_id": row.model_id,
+            "model_url": f"/v1/models/{row.model_id}" if row.model_id else None,
+            "summary": row.summary,
+            "fit": self.versions.document(model) if model else None,
+        }
+
+    async def close(self) -> None:
+        """Leave what runs to the next start of the service."""
+        for task in list(self._tasks):
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await asyncio.to_thread(self._notes.shutdown)
+
+
+def not_what_was_seen(why: str) -> ApiError:
+    """409: a person said yes to something else."""
+    return ApiError(
+        409, "not-what-was-seen", "This is no longer what you saw", f"{why} Nothing was started; look again."
+    )
+
+
+def busy(current: Current) -> ApiError:
+    """409, naming the holder."""
+    detail = (
+        f"{current.test_id} for participant {current.participant}, started by {current.by}, holds the rig. "
+        "Wait for its end, or stop it."
+    )
+    holder = {"test_id": current.test_id, "participant": current.participant, "by": current.by}
+    return ApiError(409, "rig-busy", "Another test is running", detail, holder=holder)

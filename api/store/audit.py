@@ -1,0 +1,53 @@
+"""The audit trail: append-only, each entry holding the hash of the one before."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from typing import Any
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from api.store.tables import AuditEntry
+
+GENESIS = "0" * 64
+
+
+def entry_hash(entry: dict[str, Any]) -> str:
+    """SHA-256 of an entry's canonical JSON, its own hash left out."""
+    held = {key: value for key, value in entry.items() if key != "hash"}
+    return hashlib.sha256(json.dumps(held, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def write(session: Session, at_utc: str, who: str, action: str, subject: str, **detail: Any) -> None:
+    """Append an entry in the caller's transaction, so that action and entry stand or fall together."""
+    last = session.scalars(select(AuditEntry).order_by(AuditEntry.seq.desc()).limit(1)).first()
+    fields = {
+        "seq": last.seq + 1 if last else 1,
+        "at_utc": at_utc,
+        "who": who,
+        "action": action,
+        "subject": subject,
+        "detail": detail,
+        "previous_hash": last.hash if last else GENESIS,
+    }
+    session.add(AuditEntry(**fields, hash=entry_hash(fields)))
+    session.flush()
+
+
+def first_broken(entries: list[AuditEntry]) -> int | None:
+    """The sequence number of the first entry that does not hold, or None if the chain is whole."""
+    previous = GENESIS
+    for number, entry in enumerate(entries, start=1):
+        fields = entry.as_dict()
+        if entry.seq != number or entry.previous_hash != previous or entry.hash != entry_hash(fields):
+            return entry.seq
+        previous = entry.hash
+    return None
+
+
+def newest(session: Session, subject: str, *actions: str) -> AuditEntry | None:
+    """The last entry about a subject among some actions: who did that, and when."""
+    of = select(AuditEntry).where(AuditEntry.subject == subject, AuditEntry.action.in_(actions))
+    return session.scalars(of.order_by(AuditEntry.seq.desc()).limit(1)).first()

@@ -1,0 +1,69 @@
+"""Files that were taken in: in a folder of their own until the database names them, and never deleted after that.
+
+A service that is ended in between leaves a file in that folder. The next start takes it away, or moves it to its place
+where the database names it already. A whole file stays, whatever the database says: it may be the wrong database.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from api.store import Store
+
+PREFIX, JOINED = "upload-", "joined-"
+PARTS = "parts"
+MOST_TOLD = 10
+log = logging.getLogger("stimrig.uploads")
+
+
+def part_of(whole: Path) -> Path:
+    """Where a file is until the database names it; its name is the same: models and messages tell it."""
+    return whole.parent / PARTS / whole.name
+
+
+@contextlib.contextmanager
+def taken_in(whole: Path) -> Iterator[None]:
+    """Around the writing of its row: a file comes to its place once that is committed, and goes where it fails."""
+    part = part_of(whole)
+    try:
+        yield
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise
+    part.replace(whole)
+
+
+def settle(folder: Path, store: Store) -> None:
+    """At the start: end what an ended service had begun, and say which whole files the database does not name.
+
+    Only files that this service itself writes are looked at, by their names.
+    """
+    from api.store.tables import Recording
+
+    named = {Path(row.path).name for row in store.all(Recording)}
+    for part in _ours(folder / PARTS):
+        whole = folder / part.name
+        if part.name in named and not whole.exists():
+            part.replace(whole)
+            log.warning("moved to its place what the database names already: %s", part.name)
+        else:
+            part.unlink(missing_ok=True)
+            log.warning("removed what had not been taken in: %s", part.name)
+    if unnamed := [path.name for path in _ours(folder) if path.name not in named]:
+        more = f" and {len(unnamed) - MOST_TOLD} more" if len(unnamed) > MOST_TOLD else ""
+        told = ", ".join(unnamed[:MOST_TOLD]) + more
+        log.warning("the database does not name %s; nothing of it was deleted. Is it the right database?", told)
+
+
+def _ours(folder: Path) -> list[Path]:
+    return [
+        path
+        for path in sorted(folder.iterdir())
+        if path.name.startswith((PREFIX, JOINED)) and path.suffix in (".csv", ".h5")
+        if path.is_file() and not path.is_symlink()
+    ]

@@ -1,0 +1,1 @@
+"""The web service: REST routes, pages, and what guards both."""

@@ -1,0 +1,91 @@
+"""The service: its parts, its routes, its page."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from importlib.metadata import PackageNotFoundError, version
+
+from fastapi import FastAPI
+from starlette.types import ASGIApp
+
+from api.clock import Clock
+from api.settings import Settings
+from api.store.lock import ServiceLock
+from api.web import pages, problems, routes, strict_body
+from api.web.body_limit import BodyLimit
+from api.web.dependencies import Context, build
+from api.web.headers import Headers
+from api.workers.pool import WORKER
+
+
+def software_version() -> str:
+    """The installed distribution's version."""
+    try:
+        return version("stimrig")
+    except PackageNotFoundError:
+        return "0"
+
+
+class Service(FastAPI):
+    """The application, with its headers outermost: an unexpected error's answer has them, too."""
+
+    def build_middleware_stack(self) -> ASGIApp:
+        """Starlette's, within the headers."""
+        return Headers(super().build_middleware_stack())
+
+
+def create_app(
+    settings: Settings | None = None, *, clock: Clock | None = None, worker: tuple[str, ...] = WORKER,
+    lock: ServiceLock | None = None,
+) -> FastAPI:  # fmt: skip
+    """The application.
+
+    Parameters
+    ----------
+    settings : Settings, optional
+        Default: from the environment.
+    clock : Clock, optional
+        Another clock, for tests.
+    worker : tuple of str
+        How to start a worker process.
+    lock : ServiceLock, optional
+        Held already; default: taken now.
+
+    Raises
+    ------
+    ApiError
+        The database cannot be opened.
+    HeldError
+        Another service holds the data folder or the database.
+    """
+    context = build(settings or Settings(), clock, worker, lock)
+    app = Service(
+        title="stimrig",
+        version=software_version(),
+        summary="Pre-session tests, models of stimulated muscle, and the approved one for the controller.",
+        lifespan=_lifespan(context),
+        docs_url=None,
+        redoc_url=None,
+        openapi_url="/openapi.json",
+    )
+    app.state.context = context
+    app.add_middleware(strict_body.StrictBody)
+    app.add_middleware(BodyLimit, context=context)  # the last one added stands outside
+    problems.install(app)
+    for router in [*routes.routers(), *pages.routers()]:
+        app.include_router(router)
+    strict_body.describe(app)
+    return app
+
+
+def _lifespan(context: Context):
+    @asynccontextmanager
+    async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
+        await context.open()
+        try:
+            yield
+        finally:
+            await context.close()
+
+    return lifespan

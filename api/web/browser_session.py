@@ -1,0 +1,36 @@
+"""A browser's session: its cookie, where it may be opened from, where it leads back to."""
+
+from __future__ import annotations
+
+from urllib.parse import urlsplit
+
+from fastapi import Request
+from fastapi.responses import Response
+
+from api.errors import ApiError
+from api.people.auth import COOKIE
+from api.web.dependencies import Context
+
+
+def same_origin(request: Request) -> None:
+    """Refuse a sign-in that another site's page sends: there is no session yet whose CSRF token could be asked for."""
+    origin = request.headers.get("origin")
+    if origin and urlsplit(origin).netloc != request.headers.get("host"):
+        raise ApiError(403, "forbidden", "Not allowed", "The page of another site asked.")
+
+
+def set_cookie(context: Context, answer: Response, cookie: str) -> None:
+    """The session's cookie: not for scripts, not for other sites."""
+    age_s, secure = int(context.auth.session_s), context.settings.secure_cookies
+    answer.set_cookie(COOKIE, cookie, max_age=age_s, httponly=True, samesite="strict", secure=secure)
+
+
+def local(target: str) -> str:
+    """An address on this host, or the first page."""
+    plain = target.startswith("/") and not target.startswith(("//", "/\\"))
+    return target if plain else "/"
+
+
+def wants_html(request: Request) -> bool:
+    """Whether a browser's navigation or form asked, not a program."""
+    return "text/html" in request.headers.get("accept", "")

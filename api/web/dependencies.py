@@ -1,0 +1,169 @@
+"""The service's parts, made once and handed to the routes."""
+
+from __future__ import annotations
+
+import asyncio
+import shutil
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+from fastapi import Depends, Request
+from starlette.requests import HTTPConnection
+
+from api import owner_only
+from api.clock import Clock
+from api.models.analyses import Analyses
+from api.models.registry import Versions
+from api.people.accounts import People
+from api.people.auth import Auth, Principal, Scope
+from api.people.pace import Guesses
+from api.sessions.questions import Questions
+from api.sessions.rig_client import RigClient
+from api.sessions.runner import Runner
+from api.sessions.stop_log import StopLog
+from api.sessions.stop_right import StopRights
+from api.settings import Settings
+from api.store import Store, uploads
+from api.store.lock import ServiceLock
+from api.store.tables import Recording
+from api.web.guards import anyone_signed_in, require
+from api.web.stop_guard import Press, anyone_who_may_stop
+from api.workers.pool import WORKER, Pool
+from api.workers.process import Places
+from api.workers.tracker import Jobs
+
+
+@dataclass
+class Context:
+    """Everything a route may need."""
+
+    settings: Settings
+    clock: Clock
+    store: Store
+    auth: Auth
+    people: People
+    stop_rights: StopRights
+    rig: RigClient
+    pool: Pool
+    versions: Versions
+    runner: Runner
+    analyses: Analyses
+    jobs: Jobs
+    lock: ServiceLock
+    questions: Questions
+    drawn_token: str | None = None
+    limits_turn: asyncio.Lock = field(default_factory=asyncio.Lock)
+    """Who changes a participant's limits, and who lets a calibration send by them, take turns: once a change is
+    answered nothing begins with what was before."""
+    stops: StopLog = field(default_factory=StopLog)
+    started_s: float = field(default_factory=time.monotonic)
+
+    async def open(self) -> None:
+        """Connect, warm the workers, take up what a restart left open."""
+        uploads.settle(self.settings.recordings_dir, self.store)
+        self.rig.start()
+        self.pool.warm()
+        for _ in range(20):  # a rig that is there answers within milliseconds
+            if self.rig.connected or self.rig.path is None:
+                break
+            await asyncio.sleep(0.05)
+        await self.runner.resume()
+
+    async def close(self) -> None:
+        """Let everything go."""
+        await self.runner.close()
+        await self.jobs.close()
+        await self.pool.close()
+        await self.rig.close()
+        self.people.close()
+        self.store.close()
+        self.lock.release()
+
+
+def build(
+    settings: Settings, clock: Clock | None = None, worker: tuple[str, ...] = WORKER, lock: ServiceLock | None = None
+) -> Context:
+    """Make the parts; `lock` is held already, or taken now.
+
+    Raises
+    ------
+    ApiError
+        The database cannot be opened.
+    HeldError
+        Another service holds the data folder or the database.
+    """
+    lock = lock or ServiceLock(settings)
+    try:
+        return _build(settings, clock or Clock(), worker, lock)
+    except BaseException:
+        lock.release()
+        raise
+
+
+def _build(settings: Settings, clock: Clock, worker: tuple[str, ...], lock: ServiceLock) -> Context:
+    make_folders(settings)
+    store = Store(settings.database)
+    guesses = Guesses(clock)
+    auth = Auth(store, clock, guesses, settings.session_hours)
+    configured = settings.admin_token.get_secret_value() if settings.admin_token else None
+    drawn = auth.first_administrator(configured)
+    rig = RigClient(settings.rig_socket, clock)
+    pool = Pool(settings.workers, worker, places(settings, store))
+    versions = Versions(store, clock)
+    analyses = Analyses(store, clock, pool, versions, settings)
+    runner = Runner(store, clock, rig, pool, versions, analyses, settings.recordings_dir)
+    jobs = Jobs(pool)
+    people = People(store, clock, auth, guesses)
+    rights = StopRights(owner_only.key(settings.data_dir / "stop-right.key"), clock)
+    questions = Questions(clock)
+    return Context(
+        settings, clock, store, auth, people, rights, rig, pool, versions, runner, analyses, jobs, lock,
+        questions, drawn
+    )  # fmt: skip
+
+
+def make_folders(settings: Settings) -> None:
+    """Folders for their owner only; the rig may share that of recordings with a group."""
+    owner_only.close(owner_only.folder(settings.recordings_dir), 0o770)
+    owner_only.close(owner_only.folder(settings.recordings_dir / uploads.PARTS), 0o700)
+    owner_only.close(settings.logs_dir, 0o700)
+    shutil.rmtree(settings.exports_dir, ignore_errors=True)
+    owner_only.folder(settings.exports_dir)
+
+
+def places(settings: Settings, store: Store) -> Places:
+    """The folders that workers may reach: those of recordings, known ones of a rig that runs by itself included."""
+    reads = {settings.recordings_dir, *(Path(row.path).parent for row in store.all(Recording))}
+    reads |= {settings.effects_dir} if settings.effects_dir else set()
+    return Places(reads, [settings.exports_dir])
+
+
+def of(connection: HTTPConnection) -> Context:
+    """The application's context."""
+    return connection.app.state.context
+
+
+async def from_request(request: Request) -> Context:
+    """The application's context, as a dependency; not in a worker thread: a stop waits for none of them."""
+    return of(request)
+
+
+Ctx = Annotated[Context, Depends(from_request)]
+Anyone = Annotated[Principal, Depends(anyone_signed_in)]
+MayStop = Annotated[Press, Depends(anyone_who_may_stop)]
+LiveReader = Annotated[Principal, Depends(require(Scope.READ_LIVE))]
+Tester = Annotated[Principal, Depends(require(Scope.RUN_TEST))]
+Rearmer = Annotated[Principal, Depends(require(Scope.REARM))]
+Approver = Annotated[Principal, Depends(require(Scope.APPROVE_MODEL))]
+ModelReader = Annotated[Principal, Depends(require(Scope.READ_MODEL))]
+Administrator = Annotated[Principal, Depends(require(Scope.ADMINISTER))]
+
+PROBLEM: dict[int | str, dict[str, Any]] = {
+    code: {"description": text, "content": {"application/problem+json": {}}}
+    for code, text in {
+        401: "not signed in", 403: "not allowed", 404: "not there", 409: "in conflict with what is",
+        422: "does not hold", 429: "too many wrong tries: `Retry-After`", 503: "the rig cannot be reached",
+    }.items()
+}  # fmt: skip

@@ -1,0 +1,49 @@
+"""What a route asks of whoever comes: a scope, and of a session's form its CSRF token."""
+
+from __future__ import annotations
+
+import hmac
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+from fastapi import Request
+
+from api.errors import ApiError
+from api.people.auth import Principal, Scope
+
+SAFE_METHODS = {"GET", "HEAD", "OPTIONS"}
+
+
+def require(scope: Scope) -> Callable[[Request], Awaitable[Principal]]:
+    """A dependency: the principal, if the scope is held and a session's form carries its CSRF token."""
+
+    async def check(request: Request) -> Principal:
+        principal = request.app.state.context.auth.identify(request)
+        if not principal.may(scope):
+            detail = f"This needs the scope {scope}; {principal.name} holds {', '.join(sorted(principal.scopes))}."
+            raise ApiError(403, "forbidden", "Not allowed", detail)
+        await check_csrf(request, principal)
+        if scope is Scope.APPROVE_MODEL and request.method not in SAFE_METHODS:
+            await request.app.state.context.people.confirmed(request, principal)
+        return principal
+
+    check.__name__ = f"require_{scope.name.lower()}"
+    return check
+
+
+async def anyone_signed_in(request: Request) -> Principal:
+    """A dependency: anyone with a valid token or session."""
+    principal = request.app.state.context.auth.identify(request)
+    await check_csrf(request, principal)
+    return principal
+
+
+async def check_csrf(request: Request, principal: Principal) -> None:
+    """Refuse a session's write whose form or header does not carry the session's CSRF token."""
+    if principal.csrf is None or request.method in SAFE_METHODS:
+        return
+    sent: Any = request.headers.get("x-csrf-token")
+    if sent is None and "form" in request.headers.get("content-type", ""):
+        sent = (await request.form()).get("csrf")
+    if not isinstance(sent, str) or not hmac.compare_digest(sent.encode(), principal.csrf.encode()):
+        raise ApiError(403, "csrf", "The form is out of date", "Load the page again and repeat what you did.")

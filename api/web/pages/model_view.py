@@ -1,0 +1,205 @@
+"""A model: beside its measurement, why it fails, and what can be done about it."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Form, Request
+from fastapi.responses import RedirectResponse, Response
+
+from api.charts import diagnosis_charts, model_charts
+from api.errors import ApiError
+from api.models import explanation, summary
+from api.people.auth import Scope
+from api.sessions.requests import TestIn
+from api.store.tables import Model
+from api.web.dependencies import Approver, Context, Ctx, ModelReader, Tester
+from api.web.pages import starting
+from api.web.pages.checked import checked
+from api.web.pages.render import page
+from api.web.requests import EffectsIn
+from api.web.routes import criticism
+from api.workers.tracker import Job
+
+router = APIRouter(include_in_schema=False)
+TITLES = {"diagnosis": "Diagnosing", "add-effects": "Adding the effect", "improve": "Improving the model"}
+
+
+@router.get("/models/{model_id}")
+async def model(request: Request, context: Ctx, who: ModelReader, model_id: str, diagnose: int = -1) -> Response:
+    """A model beside its measurement, and why it fails. `diagnose`: 1 begins a diagnosis anew, 0 begins none."""
+    row = await asyncio.to_thread(context.versions.get, model_id)
+    document = json.loads(row.document)
+    measured = await measurement(context, row)
+    diagnosis = await looked_at(context, row, who.name, diagnose)
+    shown = await asyncio.to_thread(gather, context, row, measured, diagnosis)
+    version = await asyncio.to_thread(context.versions.document, row)
+    return page(
+        request,
+        "model.html",
+        model=version,
+        document=document,
+        recruitment=summary.recruitment(document),
+        dynamics=summary.dynamics(document),
+        validity=summary.validity(document),
+        problem=measured["problem"],
+        reasons=[
+            *version["reasons"][1:],
+            *await asyncio.to_thread(context.runner.lifecycle.warnings, row.recording_id),
+        ],
+        hdf5=not (await asyncio.to_thread(context.analyses.path, row.recording_id)).endswith(".csv"),
+        now_utc=context.clock.utc(),
+        may_test=who.may(Scope.RUN_TEST),
+        may_approve=who.may(Scope.APPROVE_MODEL),
+        **{key: value for key, value in shown.items() if key != "figures"},
+        figures={**model_charts.of_model(document, measured["curves"], measured["comparison"]), **shown["figures"]},
+    )
+
+
+async def measurement(context: Context, row: Model) -> dict[str, Any]:
+    """Curves and comparison, or the problem that keeps them from being drawn."""
+    found: dict[str, Any] = {"curves": None, "comparison": None, "problem": None}
+    try:
+        found["curves"], found["comparison"] = await asyncio.gather(
+            context.analyses.curves(row), context.analyses.comparison(row)
+        )
+    except ApiError as error:
+        found["problem"] = error
+    return found
+
+
+async def looked_at(context: Context, row: Model, by: str, diagnose: int) -> dict[str, Any]:
+    """The diagnosis if it is there; else the job that makes it, begun if nobody has."""
+    known = await asyncio.to_thread(context.analyses.known_diagnosis, row)
+    if known is not None:
+        return {"found": known, "job": None}
+    jobs = [job for job in context.jobs.all.values() if (job.kind, job.subject) == ("diagnosis", row.id)]
+    newest = jobs[-1] if jobs else None
+    if diagnose == 1 or (newest is None and diagnose != 0):
+        newest = criticism.begin_diagnosis(context, row, by)
+        await asyncio.sleep(0.05)
+    if newest is not None and newest.state == "completed":  # it was done between the two looks
+        known = await asyncio.to_thread(context.analyses.known_diagnosis, row)
+    return {"found": known, "job": newest}
+
+
+def gather(context: Context, row: Model, measured: dict[str, Any], diagnosis: dict[str, Any]) -> dict[str, Any]:
+    """What the section "Why does it fail?" shows."""
+    found, comparison, job = diagnosis["found"], measured["comparison"], diagnosis["job"]
+    view = explanation.view(found, comparison, row.effects) if found else None
+    rows = explanation.versions(
+        [context.versions.document(version) for version in context.versions.lineage(row)], row.id
+    )
+    segments = (measured["curves"] or {}).get("segments") or []
+    signatures = (found or {}).get("signatures") or {}
+    # Where all is noise the worst of it is no place to look at.
+    quiet = view is not None and view["kind"] in ("nothing", "unsure") and not explanation.noisy(comparison or {})
+    if view is not None and quiet:
+        view["places"] = []
+    places = view["places"] if view else diagnosis_charts.places_of(comparison or {})
+    return {
+        "quiet": quiet,
+        "why": view,
+        # One that has just ended is shown as running once more: the page asks after it, and then shows what it found.
+        "job": job.document() if job and not found and job.state in ("running", "completed") else None,
+        "why_problem": job.problem if job and job.state == "failed" else None,
+        "places": places,
+        "splits": explanation.splits(comparison),
+        "tests": view["tests"] if view else [],
+        "versions": rows,
+        "figures": diagnosis_charts.of_why(comparison, segments, view, signatures, rows),
+    }
+
+
+@router.post("/models/{model_id}/diagnosis/cancel")
+async def cancel_diagnosis(context: Ctx, _who: Tester, model_id: str) -> Response:
+    """Stop diagnosing; the page then offers to begin anew."""
+    for job in list(context.jobs.all.values()):
+        if (job.kind, job.subject) == ("diagnosis", model_id):
+            context.jobs.cancel(job)
+    return RedirectResponse(f"/models/{model_id}?diagnose=0#why", 303)
+
+
+@router.post("/models/{model_id}/effects")
+async def add_effect(
+    context: Ctx,
+    who: Tester,
+    model_id: str,
+    effect: Annotated[str, Form()] = "",
+    force: Annotated[str, Form()] = "",
+    reason: Annotated[str, Form()] = "",
+) -> Response:
+    """Add one effect."""
+    row = await asyncio.to_thread(context.versions.get, model_id)
+    body = checked(EffectsIn, effects=[effect], reason=reason[:500], force=bool(force))
+    return await to_job(criticism.begin_adding(context, row, body, who.name))
+
+
+@router.post("/models/{model_id}/improve")
+async def improve(context: Ctx, who: Tester, model_id: str) -> Response:
+    """Add what is missing, one by one."""
+    row = await asyncio.to_thread(context.versions.get, model_id)
+    return await to_job(criticism.begin_improving(context, row, who.name))
+
+
+@router.post("/models/{model_id}/undo")
+async def undo(context: Ctx, who: Approver, model_id: str) -> Response:
+    """Back to the version before."""
+    parent = await asyncio.to_thread(context.versions.undo, model_id, who.name, "")
+    return RedirectResponse(f"/models/{parent.id}#why", 303)
+
+
+@router.post("/models/{model_id}/experiment")
+async def run_experiment(context: Ctx, who: Tester, model_id: str) -> Response:
+    """To the question before the diagnosis' next experiment; its recording is joined to this model's."""
+    row = await asyncio.to_thread(context.versions.get, model_id)
+    found = await asyncio.to_thread(context.analyses.known_diagnosis, row)
+    experiment = (found or {}).get("experiment")
+    if not experiment:
+        detail = "The diagnosis of this recording names none: nothing is left to be told apart."
+        raise ApiError(409, "no-experiment", "There is no next experiment", detail)
+    body = TestIn.model_validate(
+        {"participant": row.participant, "kind": "next-experiment", "segments": experiment["segments"], "joins": row.id}
+    )
+    return RedirectResponse(await starting.ask(context, who, body, back=f"/models/{model_id}#experiment"), 303)
+
+
+# ---- long work ----------------------------------------------------------------------------------------------
+
+
+async def to_job(job: Job) -> Response:
+    """To the result where it is there at once, else to the page that waits for it."""
+    try:
+        await asyncio.wait_for(job.done.wait(), 0.3)
+    except TimeoutError:
+        return RedirectResponse(f"/jobs/{job.id}", 303)
+    return RedirectResponse(result_page(job) or f"/jobs/{job.id}", 303)
+
+
+def result_page(job: Job) -> str | None:
+    """The page on which the result is seen."""
+    if job.result_url is None:
+        return None
+    return job.result_url.removeprefix("/v1").removesuffix("/diagnosis") + "#why"
+
+
+@router.get("/jobs/{job_id}")
+async def job(request: Request, context: Ctx, _who: ModelReader, job_id: str) -> Response:
+    """Long work: how far it is; on to its result once it is done."""
+    job = context.jobs.get(job_id)
+    target = result_page(job)
+    if target:
+        return RedirectResponse(target, 303)
+    title = job.problem.title if job.state == "failed" and job.problem else TITLES[job.kind]
+    status = job.problem.status if job.problem and job.state == "failed" else 200
+    return page(request, "job.html", status, job=job.document(), problem=job.problem, title=title)
+
+
+@router.post("/jobs/{job_id}/cancel")
+async def cancel(context: Ctx, _who: Tester, job_id: str) -> Response:
+    """Cancel it."""
+    job = context.jobs.get(job_id)
+    context.jobs.cancel(job)
+    return RedirectResponse(f"/models/{job.subject}#why", 303)

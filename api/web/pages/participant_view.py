@@ -1,0 +1,125 @@
+"""A participant: limits for today and the way to a test in one form, models and tests below."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+from fastapi import APIRouter, Request
+from fastapi.responses import RedirectResponse, Response
+
+from api.people.auth import Principal
+from api.sessions import profiles
+from api.sessions.questions import Question, Row
+from api.sessions.requests import TestIn
+from api.store import audit
+from api.store.tables import Participant, Test
+from api.web.dependencies import Context, Ctx, Tester
+from api.web.pages import limits_form, starting
+from api.web.pages.environment import when
+from api.web.pages.limits_form import LimitsForm
+from api.web.pages.render import page
+from api.web.routes import participants
+from api.web.routes.participants import Change
+
+router = APIRouter(include_in_schema=False, prefix="/participants/{code}")
+
+
+@router.get("")
+async def participant(request: Request, context: Ctx, _who: Tester, code: str) -> Response:
+    """A participant: limits, start, history of tests and models."""
+    return await shown(request, context, code)
+
+
+async def shown(
+    request: Request, context: Context, code: str, form: LimitsForm | None = None, status: int = 200
+) -> Response:
+    """The page, with the form as it was sent where something was wrong with it."""
+
+    def gather() -> dict[str, Any]:
+        row = participants.find(context, code)
+        history = context.store.all(Test, Test.participant == code, order=Test.requested_utc.desc(), limit=200)
+        return {
+            "participant": row,
+            "calibrated": starting.calibrated(context, row),
+            "form": form or limits_form.fresh(row.profile),
+            "meanwhile": participants.meanwhile(context, code),
+            "fields": limits_form.fields(context.rig.status),
+            "tests": [context.runner.document(test) for test in history],
+            "models": [context.versions.document(model) for model in context.versions.of(code)],
+        }
+
+    return page(request, "participant.html", status, **await asyncio.to_thread(gather))
+
+
+@router.post("/profile")
+async def set_limits(request: Request, context: Ctx, who: Tester, code: str) -> Response:
+    """The limits for the day."""
+    return await taken(request, context, who, code, start=False)
+
+
+@router.post("/tests")
+async def start_test(request: Request, context: Ctx, who: Tester, code: str) -> Response:
+    """To the question before the pre-session test; limits that were typed are set on the way, or asked about."""
+    return await taken(request, context, who, code, start=True)
+
+
+async def taken(request: Request, context: Context, who: Principal, code: str, start: bool) -> Response:
+    """Take the form: refuse it, ask about it, or do what it says."""
+    row = await asyncio.to_thread(participants.find, context, code)
+    status = context.rig.status
+    form = limits_form.read(await request.form(), row.profile, status.limits if status else {})
+    if form.notice and not form.errors:
+        form.notice += await asyncio.to_thread(_by_whom, context, code)
+        return await shown(request, context, code, form, 409)
+    if form.errors:
+        return await shown(request, context, code, form, 422)
+
+    async def on() -> str:
+        if not start:
+            return f"/participants/{code}"
+        return await starting.ask(context, who, TestIn.model_validate({"participant": code}))
+
+    if not form.asked:
+        return RedirectResponse(await on(), 303)
+    new, voids = profiles.changed(row.profile, form.asked)
+    change = Change(form.asked, [profiles.version(row.profile)], bool(voids))
+
+    async def save() -> str:
+        await participants.change_profile(context, code, change, who.name)
+        return await on()
+
+    doubts = [*profiles.jumps(row.profile, new), *_lost(context, voids)]
+    if not doubts:
+        return RedirectResponse(await save(), 303)
+    return RedirectResponse(context.questions.ask(_question(row, new, doubts, save), who), 303)
+
+
+def _question(row: Participant, new: dict[str, Any], doubts: list[str], save: Any) -> Question:
+    lines, values = [], []
+    for name, limit in profiles.LIMITS.items():
+        value, before = f"{new[name]:g} {limit.unit}", f"{row.profile[name]:g} {limit.unit}"
+        lines.append(Row(limit.words.capitalize(), value, before if before != value else ""))
+        values.append(value)
+    return Question(
+        participant=row.code,
+        title=f"Set these limits for {row.code}?",
+        button=f"Yes, set {', '.join(values)}",
+        action=save,
+        rows=lines,
+        warnings=doubts,
+    )
+
+
+def _lost(context: Context, voids: str) -> list[str]:
+    if not voids:
+        return []
+    required = context.rig.status is None or context.rig.status.require_calibration is not False
+    then = " Until the participant is calibrated anew, no test starts." if required else ""
+    return [f"The calibration is lost with it: {voids}.{then}"]
+
+
+def _by_whom(context: Context, code: str) -> str:
+    with context.store.read() as session:
+        entry = audit.newest(session, code, "set profile", "finish calibration")
+    return f" by {entry.who}, {when(entry.at_utc)}." if entry else "."

@@ -1,0 +1,90 @@
+"""Templates to responses; what every page shows; problems as pages."""
+
+from __future__ import annotations
+
+from typing import Any
+from urllib.parse import quote
+
+from fastapi import Request
+from fastapi.responses import HTMLResponse, RedirectResponse, Response
+from sqlalchemy.exc import SQLAlchemyError
+
+from api.errors import ApiError
+from api.people.auth import Principal, Scope
+from api.web.dependencies import Context
+from api.web.pages import rig_state
+from api.web.pages.environment import environment
+
+environment.filters["mend"] = rig_state.mend
+
+BACK = {"models": "Back to the model", "participants": "Back to the participant", "tests": "Back to the test"}
+
+
+def page(request: Request, template: str, status: int = 200, **values: Any) -> HTMLResponse:
+    """A page, with the bar that every page has."""
+    context = request.app.state.context
+    principal = known(request)
+    right = stop_right(request, principal)
+    bar = {**bar_of(context, principal), "right": right, "version": request.app.version}
+    shown = {"bar": bar, "principal": principal, "here": here(request)}
+    html = environment.get_template(template).render(request=request, **shown, **values)
+    return HTMLResponse(html, status_code=status)
+
+
+def known(request: Request) -> Principal | None:
+    """Who looks at the page; nobody where the database does not answer: what a stop did is said all the same."""
+    try:
+        return request.app.state.context.auth.identify(request, forgive_age=True)
+    except (ApiError, SQLAlchemyError):
+        return None
+
+
+def stop_right(request: Request, principal: Principal | None) -> str | None:
+    """What the page's stop button is good for; the answer to a stop keeps the right that was used, and no longer."""
+    context = request.app.state.context
+    if principal is None:
+        return getattr(request.state, "stop_right", None)
+    current = context.runner.current
+    return context.stop_rights.give(principal.name, current.test_id if current else None)
+
+
+def fragment(context: Context, template: str, principal: Principal, place: str) -> str:
+    """A part of a page by itself, for a script that renews it; `place`: the page it is on."""
+    bar = bar_of(context, principal)
+    return environment.get_template(template).render(bar=bar, principal=principal, here=place)
+
+
+def bar_of(context: Context, principal: Principal | None) -> dict[str, Any]:
+    """What every page has at its top."""
+    return {
+        "rig": context.rig.status,
+        "connected": context.rig.connected,
+        "current": context.runner.current,
+        "now": rig_state.now(context, principal),
+        "may_rearm": principal is not None and principal.may(Scope.REARM),
+    }
+
+
+def here(request: Request) -> str:
+    """The address of the page that is shown; of the one with the form where a form was refused."""
+    if request.method == "GET":
+        return request.url.path + (f"?{request.url.query}" if request.url.query else "")
+    back = back_from(request.url.path)
+    return back[0] if back else "/"
+
+
+def problem_page(request: Request, problem: ApiError) -> Response:
+    """A problem as a page that says what to do; the way to the door where nobody is signed in."""
+    if problem.status == 401 and request.method == "GET":
+        return RedirectResponse(f"/sign-in?next={quote(request.url.path)}", 303)
+    response = page(request, "problem.html", problem.status, problem=problem, back=back_from(request.url.path))
+    response.headers.update(problem.headers)
+    return response
+
+
+def back_from(path: str) -> tuple[str, str] | None:
+    """Address and words of the page that a form was on."""
+    parts = path.strip("/").split("/")
+    if len(parts) < 3 or parts[0] not in BACK:
+        return None
+    return f"/{parts[0]}/{quote(parts[1])}", BACK[parts[0]]

@@ -1,0 +1,31 @@
+"""What scripts on every page ask for: the rig's state, and the notice about it."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter, Request
+from fastapi.responses import HTMLResponse, JSONResponse, Response
+from sqlalchemy.exc import SQLAlchemyError
+
+from api.errors import ApiError
+from api.web.browser_session import local
+from api.web.dependencies import Anyone, Ctx
+from api.web.pages import rig_state
+from api.web.pages.render import fragment
+
+router = APIRouter(include_in_schema=False, prefix="/rig")
+
+
+@router.get("/now")
+async def rig_now(request: Request, context: Ctx) -> Response:
+    """The state for the bar of every page, also of one whose session has ended."""
+    try:
+        principal = context.auth.identify(request)
+    except (ApiError, SQLAlchemyError):  # the state is told all the same
+        principal = None
+    return JSONResponse(rig_state.now(context, principal))
+
+
+@router.get("/notice")
+async def rig_notice(context: Ctx, who: Anyone, back: str = "/") -> Response:
+    """The notice alone, for a page on which it has changed."""
+    return HTMLResponse(fragment(context, "notice.html", who, local(back)))

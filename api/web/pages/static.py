@@ -1,0 +1,65 @@
+"""Style, scripts and plotly, from this machine only; compressed once, kept by browsers for long."""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+from functools import lru_cache
+from importlib.util import find_spec
+from pathlib import Path
+
+from fastapi import APIRouter, Request
+from fastapi.responses import Response
+
+from api.errors import NotFoundError
+from api.web.pages.environment import HERE, environment
+
+router = APIRouter(include_in_schema=False)
+
+KINDS = {".js": "text/javascript; charset=utf-8", ".css": "text/css; charset=utf-8", ".svg": "image/svg+xml"}
+
+
+def plotly_path() -> Path:
+    """plotly.min.js of the PyPI package, found without importing it."""
+    spec = find_spec("plotly")
+    assert spec is not None and spec.submodule_search_locations is not None
+    return Path(spec.submodule_search_locations[0]) / "package_data" / "plotly.min.js"
+
+
+def locate(name: str) -> Path:
+    """A file by its public name; nothing outside the folder."""
+    if name == "plotly.min.js":
+        return plotly_path()
+    path = HERE / "static" / name
+    if path.suffix not in KINDS or path.parent != HERE / "static" or not path.is_file():
+        raise NotFoundError("file", name)
+    return path
+
+
+@lru_cache(maxsize=32)
+def contents(path: Path, _changed: float) -> tuple[bytes, bytes, str]:
+    """A file, the same compressed, and its tag."""
+    body = path.read_bytes()
+    return body, gzip.compress(body, 6, mtime=0), hashlib.sha256(body).hexdigest()[:16]
+
+
+def url(name: str) -> str:
+    """A file's address with its tag in it, so that a browser may keep it for long."""
+    path = locate(name)
+    return f"/static/{name}?v={contents(path, path.stat().st_mtime)[2]}"
+
+
+environment.globals["static"] = url
+
+
+@router.get("/static/{name}")
+def static(request: Request, name: str) -> Response:
+    """A file of the page."""
+    path = locate(name)
+    body, packed, tag = contents(path, path.stat().st_mtime)
+    headers = {"Cache-Control": "public, max-age=31536000, immutable", "ETag": f'"{tag}"', "Vary": "Accept-Encoding"}
+    if request.headers.get("if-none-match") == f'"{tag}"':
+        return Response(status_code=304, headers=headers)
+    if "gzip" in request.headers.get("accept-encoding", ""):
+        body, headers["Content-Encoding"] = packed, "gzip"
+    return Response(body, media_type=KINDS[path.suffix], headers=headers)

@@ -1,0 +1,82 @@
+"""Every error that a client can meet, as RFC 9457 ``application/problem+json``: the one mapping place."""
+
+from __future__ import annotations
+
+import logging
+from http import HTTPStatus
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse, Response
+from starlette.exceptions import HTTPException
+
+from api.errors import ApiError
+from api.web.browser_session import wants_html
+from api.web.pages.render import problem_page
+
+log = logging.getLogger("stimrig.api")
+
+
+def from_validation(error: RequestValidationError) -> ApiError:
+    """Fields that do not hold, each named with what would do."""
+    found = []
+    for item in error.errors():
+        place = ".".join(str(part) for part in item.get("loc", ()) if part != "body") or "body"
+        found.append({"field": place, "detail": str(item.get("msg", "")), "got": _short(item.get("input"))})
+    names = "; ".join(f"{item['field']}: {item['detail']}" for item in found)
+    return ApiError(422, "invalid-input", "The request does not hold what the route expects", names, errors=found)
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 80 else text[:77] + "..."
+
+
+def _from_http(error: HTTPException) -> ApiError:
+    phrase = HTTPStatus(error.status_code).phrase
+    problem = ApiError(error.status_code, phrase.lower().replace(" ", "-"), phrase, _http_detail(error))
+    problem.headers = dict(error.headers or {})
+    return problem
+
+
+def _http_detail(error: HTTPException) -> str:
+    if error.status_code == 404:
+        return "There is nothing at this address. /openapi.json lists what there is."
+    if error.status_code == 405:
+        return "The address is right, the method is not. /openapi.json lists what there is."
+    return str(error.detail)
+
+
+def respond(request: Request, problem: ApiError) -> Response:
+    """The problem as JSON, or as a page where a browser's form asked."""
+    if wants_html(request):
+        return problem_page(request, problem)
+    return JSONResponse(
+        problem.body(str(request.url.path)),
+        status_code=problem.status,
+        media_type="application/problem+json",
+        headers=problem.headers,
+    )
+
+
+def install(app: FastAPI) -> None:
+    """Hang the mapping into the application."""
+
+    @app.exception_handler(ApiError)
+    async def known(request: Request, error: ApiError) -> Response:
+        return respond(request, error)
+
+    @app.exception_handler(RequestValidationError)
+    async def invalid(request: Request, error: RequestValidationError) -> Response:
+        return respond(request, from_validation(error))
+
+    @app.exception_handler(HTTPException)
+    async def http(request: Request, error: HTTPException) -> Response:
+        return respond(request, _from_http(error))
+
+    @app.exception_handler(Exception)
+    async def unexpected(request: Request, error: Exception) -> Response:
+        log.exception("unexpected error in %s %s", request.method, request.url.path, exc_info=error)
+        detail = "Nothing was lost. The service's log (logs/api.log in the data folder) says more."
+        return respond(request, ApiError(500, "internal", "Something unexpected went wrong here", detail))

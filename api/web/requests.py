@@ -1,0 +1,38 @@
+"""What clients send to the other routes, each field checked; docs/api.md says what they get."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field, StringConstraints
+
+from api.sessions.requests import FIRST_PROFILE, Body, Code, FirstProfileIn
+
+
+class ParticipantIn(Body):
+    """A new participant."""
+
+    code: Code
+    profile: FirstProfileIn = Field(default=FIRST_PROFILE)
+
+
+class DecisionIn(Body):
+    """Why a model is approved or rejected."""
+
+    reason: Annotated[str, StringConstraints(max_length=500)] = ""
+
+
+class EffectsIn(Body):
+    """Effects to add to a model."""
+
+    effects: Annotated[list[Annotated[str, StringConstraints(pattern=r"^[a-z0-9_]{1,64}$")]], Field(min_length=1)]
+    reason: Annotated[str, StringConstraints(max_length=500)] = ""
+    force: bool = Field(False, description="add it although the evidence is against it")
+
+
+class TokenIn(Body):
+    """A token to be issued."""
+
+    name: Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_. -]{1,80}$")]
+    scopes: Annotated[list[str], Field(min_length=1)]
+    expires_utc: Annotated[str, StringConstraints(pattern=r"^\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d+)?Z$")] | None = None

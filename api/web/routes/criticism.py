@@ -1,0 +1,134 @@
+"""Where a model fails, what it lacks, adding that; long work can be left alone and cancelled."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Query, Response
+from fastapi.responses import JSONResponse
+
+from api.store.tables import Model
+from api.web.dependencies import PROBLEM, Context, Ctx, ModelReader, Tester
+from api.web.requests import EffectsIn
+from api.web.responses import ComparisonOut, DiagnosisOut, ImprovementOut, JobOut, VersionOut
+from api.workers.tracker import Job
+
+router = APIRouter(prefix="/v1", tags=["criticism"], responses=PROBLEM)
+LATER: dict[int | str, dict[str, Any]] = {202: {"model": JobOut, "description": "begun; see `Location`"}}
+Wait = Annotated[bool, Query(description="false: answer 202 at once, with the job's address")]
+
+
+@router.get("/models/{model_id}/comparison", response_model=ComparisonOut)
+async def comparison(
+    context: Ctx,
+    _who: ModelReader,
+    model_id: str,
+    recording: Annotated[str | None, Query(description="another recording than the model's own")] = None,
+) -> dict[str, Any]:
+    """Measurement against the model's free run: the error split up, the worst places, tests of the residual."""
+    row = await asyncio.to_thread(context.versions.get, model_id)
+    return await context.analyses.comparison(row, recording)
+
+
+@router.get("/models/{model_id}/curves")
+async def curves(context: Ctx, _who: ModelReader, model_id: str) -> dict[str, Any]:
+    """The measured, predicted and commanded curves and the step response, thinned to what a screen shows."""
+    row = await asyncio.to_thread(context.versions.get, model_id)
+    return await context.analyses.curves(row)
+
+
+@router.get("/models/{model_id}/diagnosis", response_model=DiagnosisOut, responses=LATER)
+async def diagnosis(context: Ctx, who: ModelReader, model_id: str, wait: Wait = True) -> Any:
+    """What is missing, ranked; or that nothing is; or that what is left has no name in the library."""
+    row = await asyncio.to_thread(context.versions.get, model_id)
+    if wait or await asyncio.to_thread(context.analyses.known_diagnosis, row) is not None:
+        return await context.analyses.diagnosis(row)
+    return later(begin_diagnosis(context, row, who.name))
+
+
+@router.post("/models/{model_id}/effects", status_code=201, response_model=VersionOut, responses=LATER)
+async def add_effects(
+    context: Ctx, who: Tester, model_id: str, body: EffectsIn, response: Response, wait: Wait = True
+) -> Any:
+    """Add effects: a new version, fitted anew; the old one stays as it is.
+
+    409 where the recording does not ask for one of them, with the reason; `force`, with a reason of one's own, adds it
+    all the same.
+    """
+    row = await asyncio.to_thread(context.versions.get, model_id)
+    if not wait:
+        return later(begin_adding(context, row, body, who.name))
+    new = await context.analyses.add_effects(row, body.effects, who.name, force=body.force, reason=body.reason)
+    response.headers["Location"] = f"/v1/models/{new.id}"
+    return await asyncio.to_thread(context.versions.document, new)
+
+
+@router.post("/models/{model_id}/improve", status_code=201, response_model=ImprovementOut, responses=LATER)
+async def improve(context: Ctx, who: Tester, model_id: str, response: Response, wait: Wait = True) -> Any:
+    """Add effects one by one while the evidence lasts; each step is a version."""
+    row = await asyncio.to_thread(context.versions.get, model_id)
+    if not wait:
+        return later(begin_improving(context, row, who.name))
+    found, rows = await context.analyses.improve(row, who.name)
+    response.headers["Location"] = f"/v1/models/{rows[-1].id}"
+    versions = await asyncio.to_thread(lambda: [context.versions.document(new) for new in rows])
+    return {**found, "versions": versions}
+
+
+@router.get("/effects")
+async def effects(context: Ctx, _who: ModelReader) -> dict[str, Any]:
+    """The library of effects."""
+    return await context.pool.submit("effects").result
+
+
+@router.get("/jobs/{job_id}", response_model=JobOut)
+def job(context: Ctx, _who: ModelReader, job_id: str) -> dict[str, Any]:
+    """Long work: how far, how long yet, and where its result lies."""
+    return context.jobs.get(job_id).document()
+
+
+@router.delete("/jobs/{job_id}", response_model=JobOut)
+async def cancel(context: Ctx, _who: Tester, job_id: str) -> dict[str, Any]:
+    """Cancel it. What is done already stays done."""
+    job = context.jobs.get(job_id)
+    context.jobs.cancel(job)
+    await asyncio.wait_for(job.done.wait(), 10)
+    return job.document()
+
+
+def later(job: Job) -> Response:
+    """202, with the job's address."""
+    return JSONResponse(job.document(), status_code=202, headers={"Location": f"/v1/jobs/{job.id}"})
+
+
+def begin_diagnosis(context: Context, model: Model, by: str) -> Job:
+    """Diagnose while the person looks on."""
+
+    async def work(job: Job) -> str:
+        await context.analyses.diagnosis(model, job.take)
+        return f"/v1/models/{model.id}/diagnosis"
+
+    return context.jobs.start("diagnosis", model.id, by, work)
+
+
+def begin_adding(context: Context, model: Model, body: EffectsIn, by: str) -> Job:
+    """Add effects while the person looks on."""
+
+    async def work(job: Job) -> str:
+        new = await context.analyses.add_effects(
+            model, body.effects, by, force=body.force, reason=body.reason, on_call=job.take
+        )
+        return f"/v1/models/{new.id}"
+
+    return context.jobs.start("add-effects", model.id, by, work)
+
+
+def begin_improving(context: Context, model: Model, by: str) -> Job:
+    """Improve while the person looks on."""
+
+    async def work(job: Job) -> str:
+        _, rows = await context.analyses.improve(model, by, job.take)
+        return f"/v1/models/{rows[-1].id}"
+
+    return context.jobs.start("improve", model.id, by, work)

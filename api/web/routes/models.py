@@ -1,0 +1,86 @@
+"""Models: versions, approval, what the controller gets."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Header, Response
+
+from api.errors import ApiError
+from api.web.dependencies import PROBLEM, Approver, Ctx, ModelReader
+from api.web.headers import entity_tags
+from api.web.requests import DecisionIn
+from api.web.responses import VersionOut
+from api.web.routes import participants
+
+router = APIRouter(prefix="/v1", tags=["models"], responses=PROBLEM)
+
+
+@router.get("/participants/{code}/model", response_class=Response, responses={304: {"description": "unchanged"}})
+async def approved_model(
+    context: Ctx, _who: ModelReader, code: str, if_none_match: Annotated[str | None, Header()] = None
+) -> Response:
+    """The approved model, for the ILC controller: MODEL.json with its `ETag`; 304 where it is known already."""
+    served = context.versions.served(code)
+    if served is None:
+        await asyncio.to_thread(participants.find, context, code)
+        detail = (
+            f"Participant {code!r} has no model approved today; an approval ends with its day. "
+            "POST /v1/models/{id}/approve approves one."
+        )
+        raise ApiError(404, "no-approved-model", "No approved model", detail)
+    headers = {"ETag": served.etag, "Cache-Control": "private, no-cache"}
+    if if_none_match and matches(if_none_match, served.etag):
+        return Response(status_code=304, headers=headers)
+    return Response(served.body, media_type="application/json", headers=headers)
+
+
+def matches(if_none_match: str, etag: str) -> bool:
+    """RFC 9110, section 13.1.2: weak comparison against a list, or `*`."""
+    tags = entity_tags(if_none_match)
+    return "*" in tags or etag in tags
+
+
+@router.get("/participants/{code}/models", response_model=list[VersionOut])
+def versions(context: Ctx, _who: ModelReader, code: str) -> list[dict[str, Any]]:
+    """A participant's model versions, newest first, with their errors and what each added."""
+    participants.find(context, code)
+    return [context.versions.document(row) for row in context.versions.of(code)]
+
+
+@router.get("/models/{model_id}", response_model=VersionOut)
+def one_model(context: Ctx, _who: ModelReader, model_id: str) -> dict[str, Any]:
+    """A version: its errors, its verdict, its lineage, and the model."""
+    row = context.versions.get(model_id)
+    return {**context.versions.document(row), "model": json.loads(row.document)}
+
+
+@router.get("/models/{model_id}/file", response_class=Response)
+def model_file(context: Ctx, _who: ModelReader, model_id: str) -> Response:
+    """MODEL.json, as it was stored."""
+    row = context.versions.get(model_id)
+    headers = {"Content-Disposition": f'attachment; filename="{row.id}.json"', "ETag": f'"{row.etag}"'}
+    return Response(row.document, media_type="application/json", headers=headers)
+
+
+@router.post("/models/{model_id}/approve", response_model=VersionOut)
+def approve(context: Ctx, who: Approver, model_id: str, body: DecisionIn | None = None) -> dict[str, Any]:
+    """Let the controller have this version."""
+    context.versions.decide(model_id, True, who.name, body.reason if body else "")
+    return context.versions.document(context.versions.get(model_id))
+
+
+@router.post("/models/{model_id}/reject", response_model=VersionOut)
+def reject(context: Ctx, who: Approver, model_id: str, body: DecisionIn | None = None) -> dict[str, Any]:
+    """Keep this version from the controller."""
+    context.versions.decide(model_id, False, who.name, body.reason if body else "")
+    return context.versions.document(context.versions.get(model_id))
+
+
+@router.post("/models/{model_id}/undo", response_model=VersionOut)
+def undo(context: Ctx, who: Approver, model_id: str, body: DecisionIn | None = None) -> dict[str, Any]:
+    """Go back to the version this one was made from; nothing is deleted."""
+    parent = context.versions.undo(model_id, who.name, body.reason if body else "")
+    return context.versions.document(parent)

@@ -1,0 +1,184 @@
+"""Participants: codes and a profile of limits, no names."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Header, Query, Response
+
+from api.errors import ApiError, NotFoundError
+from api.sessions import profiles
+from api.sessions.requests import ProfileIn
+from api.store import audit
+from api.store.tables import Participant, Test
+from api.web.dependencies import PROBLEM, Context, Ctx, Tester
+from api.web.headers import entity_tags
+from api.web.requests import ParticipantIn
+
+router = APIRouter(prefix="/v1/participants", tags=["participants"], responses=PROBLEM)
+
+
+def create(context: Context, body: ParticipantIn, by: str) -> Participant:
+    """A new participant; 409 where the code is taken, 422 where this rig would refuse its limits."""
+    now = context.clock.utc()
+    profile = body.profile.model_dump()
+    if "profile" in body.model_fields_set:
+        check_asked(context, profile, profile)
+    with context.store.write() as session:
+        if session.get(Participant, body.code) is not None:
+            raise ApiError(409, "exists", "The code is taken", f"Participant {body.code!r} exists. Take another code.")
+        row = Participant(code=body.code, profile=profile, created_utc=now, created_by=by)
+        session.add(row)
+        session.flush()
+        audit.write(session, now, by, "create participant", body.code, profile=row.profile)
+    return row
+
+
+def find(context: Context, code: str) -> Participant:
+    """A participant by its code; 404 where there is none."""
+    row = context.store.get(Participant, code)
+    if row is None:
+        raise NotFoundError("participant", code, "POST /v1/participants makes one.")
+    return row
+
+
+@dataclass(frozen=True)
+class Change:
+    """A change of some of a participant's limits.
+
+    Parameters
+    ----------
+    asked : dict
+        The limits to be changed; the others keep their value.
+    seen : collection of str or None
+        The versions that the one who asks has seen; None: whatever there is.
+    voids : bool
+        Whether a calibration may be lost by it.
+    """
+
+    asked: dict[str, float]
+    seen: Collection[str] | None = None
+    voids: bool = False
+
+
+async def change_profile(context: Context, code: str, change: Change, by: str) -> Participant:
+    """New limits for a participant: those that are asked for, the rest stays.
+
+    Raises
+    ------
+    ApiError
+        404 no such participant; 412 the limits were changed meanwhile; 422 beyond what the rig takes, or the first ones
+        are not whole; 409 the calibration would be lost, and that was not allowed.
+    """
+    async with context.limits_turn:
+        return await asyncio.to_thread(_change, context, code, change, by)
+
+
+def _change(context: Context, code: str, change: Change, by: str) -> Participant:
+    with context.store.write() as session:
+        row = session.get(Participant, code)
+        if row is None:
+            raise NotFoundError("participant", code)
+        if change.seen is not None and profiles.version(row.profile) not in change.seen:
+            raise stale(row)
+        check_asked(context, row.profile, change.asked)
+        profile, voids = profiles.changed(row.profile, change.asked)
+        if voids and not change.voids:
+            detail = f"{voids[0].upper()}{voids[1:]}. To lose the calibration and set it: ?void_calibration=true."
+            raise ApiError(409, "voids-calibration", "This would void the calibration", detail)
+        row.profile = profile
+        audit.write(session, context.clock.utc(), by, "set profile", code, profile=profile, voids=voids)
+    return row
+
+
+def check_asked(context: Context, profile: dict[str, Any], asked: dict[str, float]) -> None:
+    """Refuse first limits that are not whole, and what this rig would refuse."""
+    if lacking := [name for name in profiles.LIMITS if {**profile, **asked}.get(name) is None]:
+        raise ApiError(422, "invalid-input", "These limits are not whole", f"Send {', '.join(lacking)}, too.")
+    status = context.rig.status
+    if found := profiles.outside(asked, profile, status.limits if status else {}):
+        errors = [{"field": name, "detail": words} for name, words in found.items()]
+        detail = "; ".join(f"{name}: {words}" for name, words in found.items()) + ". Nothing was changed."
+        raise ApiError(422, "invalid-input", "These limits cannot be used", detail, errors=errors)
+
+
+def stale(row: Participant) -> ApiError:
+    """412: somebody changed the limits since they were looked at."""
+    now = ", ".join(f"{name} {row.profile[name]:g}" for name in profiles.LIMITS)
+    detail = f"The limits of {row.code} were changed meanwhile; they are {now}. Look at them, then change them again."
+    return ApiError(412, "changed-meanwhile", "The limits were changed meanwhile", detail, profile=row.profile)
+
+
+def meanwhile(context: Context, code: str) -> str:
+    """What a change of this participant's limits means for what goes on; empty where nothing does."""
+    current, status = context.runner.current, context.rig.status
+    if current is not None and current.participant == code:
+        return (
+            "The test that runs keeps the limits that it was begun with; changed ones hold from the next test on. "
+            "Less current now: press stop."
+        )
+    if status is not None and status.calibration is not None and status.calibration.participant == code:
+        return (
+            "A calibration is open. Once limits are changed it sends no further train and gives no profile: discard it "
+            "and begin anew."
+        )
+    return ""
+
+
+def etag(row: Participant) -> str:
+    """The limits' version as HTTP has it."""
+    return f'"{profiles.version(row.profile)}"'
+
+
+@router.post("", status_code=201)
+def make_participant(context: Ctx, who: Tester, body: ParticipantIn, response: Response) -> dict[str, Any]:
+    """Make a participant: a code, never a name."""
+    row = create(context, body, who.name)
+    response.headers["Location"] = f"/v1/participants/{row.code}"
+    return row.as_dict()
+
+
+@router.get("")
+def list_participants(context: Ctx, _who: Tester) -> list[dict[str, Any]]:
+    """All participants, by code."""
+    return [row.as_dict() for row in context.store.all(Participant, order=Participant.code)]
+
+
+@router.get("/{code}")
+def one_participant(context: Ctx, _who: Tester, code: str, response: Response) -> dict[str, Any]:
+    """One participant with its profile; `ETag` is the version of its limits."""
+    row = find(context, code)
+    response.headers["ETag"] = etag(row)
+    return row.as_dict()
+
+
+@router.put("/{code}/profile", responses={412: {**PROBLEM[409], "description": "changed since it was looked at"}})
+async def set_profile(
+    context: Ctx,
+    who: Tester,
+    code: str,
+    body: ProfileIn,
+    response: Response,
+    if_match: Annotated[str | None, Header(description="the `ETag` of the limits that were looked at")] = None,
+    void_calibration: Annotated[bool, Query(description="the change may void the calibration of the day")] = False,
+) -> dict[str, Any]:
+    """Change limits: those that are sent; the others keep their values, and so does what a calibration found.
+
+    A limit wider than at the calibration voids it: 409, unless `void_calibration`. `meanwhile` says what it means for a
+    test that runs, or a calibration that is open.
+    """
+    seen = None if if_match in (None, "*") else [tag.strip('"') for tag in entity_tags(if_match)]
+    row = await change_profile(context, code, Change(body.sent(), seen, void_calibration), who.name)
+    response.headers["ETag"] = etag(row)
+    return {**row.as_dict(), "meanwhile": meanwhile(context, code)}
+
+
+@router.get("/{code}/tests")
+def tests_of(context: Ctx, _who: Tester, code: str) -> list[dict[str, Any]]:
+    """A participant's tests, newest first."""
+    find(context, code)
+    rows = context.store.all(Test, Test.participant == code, order=Test.requested_utc.desc())
+    return [context.runner.document(row) for row in rows]

@@ -1,0 +1,153 @@
+"""Users, their sessions, and keys for controllers."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Request
+from fastapi.responses import JSONResponse, RedirectResponse, Response
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
+
+from api.clock import utc_label
+from api.errors import NotFoundError
+from api.people.auth import COOKIE, Principal, Scope, unauthorized
+from api.web.browser_session import local, same_origin, set_cookie
+from api.web.dependencies import PROBLEM, Administrator, Anyone, Context, Ctx
+
+router = APIRouter(prefix="/v1", tags=["people"], responses=PROBLEM)
+
+TOO_MANY: dict[int | str, dict[str, Any]] = {
+    429: {"description": "too many wrong passwords: `Retry-After`", "content": {"application/problem+json": {}}}
+}
+Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_.@-]{1,80}$")]
+Password = Annotated[str, StringConstraints(min_length=10, max_length=200)]
+
+
+class _Body(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+class UserIn(_Body):
+    """A person who may sign in on the page."""
+
+    name: Name
+    password: Password
+    scopes: Annotated[list[Scope], Field(min_length=1)] = [
+        Scope.READ_LIVE, Scope.RUN_TEST, Scope.READ_MODEL, Scope.APPROVE_MODEL,
+    ]  # fmt: skip
+
+
+class SignIn(_Body):
+    """Name and password."""
+
+    name: Annotated[str, StringConstraints(min_length=1, max_length=80)]
+    password: Annotated[str, StringConstraints(min_length=1, max_length=200)]
+
+
+class PasswordIn(_Body):
+    """A password."""
+
+    password: Password
+
+
+class ConfirmIn(_Body):
+    """The password, once more."""
+
+    password: Annotated[str, StringConstraints(min_length=1, max_length=200)]
+
+
+class KeyIn(_Body):
+    """A key for a controller."""
+
+    name: Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_. -]{1,80}$")]
+    days: Annotated[int, Field(strict=True, ge=1, le=366, description="it expires after these")] = 30
+
+
+@router.post("/users", status_code=201)
+async def add_user(context: Ctx, who: Administrator, body: UserIn) -> dict[str, Any]:
+    """Add a person; the default scopes are a clinician's."""
+    row = await context.people.add(body.name, body.password, body.scopes, who.name)
+    return {"name": row.name, "scopes": body.scopes, "created_utc": row.created_utc}
+
+
+@router.get("/users")
+def list_users(context: Ctx, _who: Administrator) -> list[dict[str, Any]]:
+    """All users."""
+    return context.people.documents()
+
+
+@router.put("/users/{name}/password", status_code=204)
+async def set_password(context: Ctx, who: Administrator, name: str, body: PasswordIn) -> Response:
+    """A new password; the person's sessions end. One that changes its own goes on under the cookie of the answer."""
+    return await with_new_password(context, who, name, body.password, Response(status_code=204))
+
+
+async def with_new_password(context: Context, who: Principal, name: str, password: str, answer: Response) -> Response:
+    """Change it; the answer carries the cookie of the session that made the change, where it is the person's own."""
+    cookie = await context.people.change_password(name, password, who)
+    if cookie is not None:
+        set_cookie(context, answer, cookie)
+    return answer
+
+
+@router.delete("/users/{name}", status_code=204)
+def remove_user(context: Ctx, who: Administrator, name: str) -> None:
+    """Nobody signs in under this name any more."""
+    context.people.remove(name, who.name)
+
+
+@router.post(
+    "/sessions",
+    status_code=201,
+    responses=TOO_MANY,
+    openapi_extra={"requestBody": {"content": {"application/json": {"schema": SignIn.model_json_schema()}}}},
+)
+async def sign_in(context: Ctx, request: Request) -> Response:
+    """Sign in with name and password (JSON or a form); the session is a cookie. 429 after too many wrong tries."""
+    same_origin(request)
+    form = "form" in request.headers.get("content-type", "")
+    given = await _given(request, form)
+    address = request.client.host if request.client else ""
+    cookie = await context.people.sign_in(given.name, given.password, address)
+    principal = context.auth.cookie(cookie)
+    answer: Response
+    if form:
+        answer = RedirectResponse(local(str((await request.form()).get("next") or "/")), 303)
+    else:
+        scopes = sorted(principal.scopes)
+        answer = JSONResponse({"name": principal.name, "scopes": scopes, "csrf": principal.csrf}, 201)
+    set_cookie(context, answer, cookie)
+    return answer
+
+
+async def _given(request: Request, form: bool) -> SignIn:
+    try:
+        if not form:
+            return SignIn.model_validate_json(await request.body())
+        fields = await request.form()
+        return SignIn(name=str(fields.get("name") or ""), password=str(fields.get("password") or ""))
+    except (ValidationError, ValueError):
+        raise unauthorized("Send `name` and `password`.") from None
+
+
+@router.post("/sessions/confirm", status_code=204, responses=TOO_MANY)
+async def confirm(context: Ctx, who: Anyone, body: ConfirmIn) -> None:
+    """The password once more, before a model is approved."""
+    await context.people.confirm(who, body.password)
+
+
+@router.delete("/sessions/current", status_code=204)
+def sign_out(context: Ctx, request: Request, _who: Anyone) -> None:
+    """Sign out."""
+    cookie = request.cookies.get(COOKIE)
+    if cookie is None:
+        raise NotFoundError("session", "current", "A token has none; DELETE /v1/tokens/{id} revokes it.")
+    context.auth.sign_out(cookie)
+
+
+@router.post("/controller-keys", status_code=201)
+def controller_key(context: Ctx, who: Administrator, body: KeyIn) -> dict[str, Any]:
+    """A key for an ILC controller: reads models, nothing else, and expires. Its text is shown this once."""
+    expires_utc = utc_label(context.clock.unix_s() + 86400.0 * body.days)
+    text = context.auth.issue(body.name, [Scope.READ_MODEL], who.name, expires_utc=expires_utc)
+    return {"key": text, "prefix": text[:12], "scopes": [Scope.READ_MODEL], "expires_utc": expires_utc}

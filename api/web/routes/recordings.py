@@ -1,0 +1,141 @@
+"""Recordings: the raw HDF5 as it was sealed, and recordings of other tools taken in."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import secrets
+from pathlib import Path
+from typing import Any
+
+from fastapi import APIRouter, Request, Response
+from fastapi.responses import FileResponse
+from starlette.background import BackgroundTask
+
+from api.errors import ApiError, NotFoundError
+from api.store import audit, uploads
+from api.store.tables import Model, Recording
+from api.web.dependencies import PROBLEM, Context, Ctx, ModelReader, Tester
+from api.web.routes import participants
+
+router = APIRouter(prefix="/v1", tags=["recordings"], responses=PROBLEM)
+
+UPLOAD = {"requestBody": {"required": True, "content": {"application/octet-stream": {"schema": {"type": "string"}}}}}
+HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
+
+
+@router.get("/recordings/{recording_id}", response_class=FileResponse)
+def recording(context: Ctx, _who: ModelReader, recording_id: str) -> FileResponse:
+    """The raw recording."""
+    row, path = held(context, recording_id)
+    kind = "text/csv" if path.suffix == ".csv" else "application/x-hdf5"
+    return FileResponse(path, media_type=kind, filename=path.name, headers={"X-Content-SHA256": row.file_sha256})
+
+
+@router.get("/recordings/{recording_id}/csv", response_class=FileResponse)
+async def recording_csv(context: Ctx, _who: ModelReader, recording_id: str) -> FileResponse:
+    """The recording as CSV, one row a sample: what other tools read, and what can be uploaded again."""
+    _row, source = await asyncio.to_thread(held, context, recording_id)
+    name = f"{recording_id}.csv"
+    if source.suffix == ".csv":
+        return FileResponse(source, media_type="text/csv", filename=name)
+    out = context.settings.exports_dir / f"{secrets.token_hex(8)}.csv"
+    gone = BackgroundTask(out.unlink, missing_ok=True)
+    try:
+        await context.pool.submit("export_csv", data=str(source), out=str(out)).result
+    except ApiError:
+        out.unlink(missing_ok=True)
+        raise
+    return FileResponse(out, media_type="text/csv", filename=name, background=gone)
+
+
+def held(context: Context, recording_id: str) -> tuple[Recording, Path]:
+    """A recording and its file.
+
+    Raises
+    ------
+    ApiError
+        404 no such recording; 410 its file is gone.
+    """
+    row = context.store.get(Recording, recording_id)
+    if row is None:
+        raise NotFoundError("recording", recording_id, "A test's document names its recording.")
+    path = Path(row.path)
+    if not path.is_file():
+        detail = f"The file of recording {recording_id!r} is not in its place ({path.name}). Restore it from a backup."
+        raise ApiError(410, "recording-gone", "The recording's file is missing", detail)
+    return row, path
+
+
+@router.post("/participants/{code}/recordings", status_code=201, openapi_extra=UPLOAD)
+async def upload(context: Ctx, who: Tester, code: str, request: Request, response: Response) -> dict[str, Any]:
+    """Take in a recording of another tool (CSV or HDF5 as the request's body) and identify a model from it."""
+    await asyncio.to_thread(participants.find, context, code)
+    data = await bounded_body(request, context.settings.max_upload_mb)
+    row, model, warning = await take_in(context, code, data, who.name)
+    response.headers["Location"] = f"/v1/recordings/{row.id}"
+    return {"recording_id": row.id, "model": context.versions.document(model), "warnings": [warning] if warning else []}
+
+
+async def take_in(context: Context, code: str, data: bytes, by: str) -> tuple[Recording, Model, str]:
+    """Keep a recording of another tool and identify a model from it; and what was left out of its structure.
+
+    Raises
+    ------
+    ApiError
+        422: it cannot be read or fitted; nothing is kept of it.
+    """
+    whole = await asyncio.to_thread(_write, context, data)
+    part = uploads.part_of(whole)
+    try:
+        found, warning = await _identified(context, code, part)
+    except BaseException:  # refused, or nobody waits for it any more
+        part.unlink(missing_ok=True)
+        raise
+    row = await asyncio.shield(asyncio.to_thread(_store, context, code, whole, data, by, warning))
+    return row, await asyncio.to_thread(context.versions.add, found["json"], code, row.id, by), warning
+
+
+async def _identified(context: Context, code: str, path: Path) -> tuple[dict[str, Any], str]:
+    """The model of an upload; every reason why there is none is about the upload, and tells nothing of this machine."""
+    try:
+        return await context.analyses.starting_effects.fit(code, str(path))
+    except ApiError as error:
+        if error.code == "worker-died":
+            detail = f"{error.detail.partition('. ')[0]}. Is the file damaged? Nothing of it was kept."
+            raise ApiError(422, "data", "The upload cannot be read", detail) from error
+        error.detail = error.detail.replace(str(path), "the upload").replace(path.name, "the upload")
+        if "place" in error.extra:
+            error.extra["place"] = error.extra["place"].replace(str(path), "the upload")
+        raise
+
+
+async def bounded_body(request: Request, limit_mb: float) -> bytes:
+    """The request's body; 413 as soon as it is too long."""
+    data = bytearray()
+    async for chunk in request.stream():
+        data += chunk
+        if len(data) > limit_mb * 1e6:
+            raise ApiError(413, "too-large", "The upload is too large", f"At most {limit_mb:g} MB are taken.")
+    if not data:
+        raise ApiError(422, "empty", "The upload is empty", "Send a CSV file or a sealed recording as the body.")
+    return bytes(data)
+
+
+def _write(context: Context, data: bytes) -> Path:
+    suffix = ".h5" if data.startswith(HDF5_MAGIC) else ".csv"
+    path = context.settings.recordings_dir / f"{uploads.PREFIX}{secrets.token_hex(8)}{suffix}"
+    uploads.part_of(path).write_bytes(data)
+    return path
+
+
+def _store(context: Context, code: str, path: Path, data: bytes, by: str, warning: str) -> Recording:
+    now = context.clock.utc()
+    row = Recording(id=path.stem, participant=code, test_id=None, path=str(path), origin="upload", created_utc=now)
+    row.file_sha256 = hashlib.sha256(data).hexdigest()
+    row.warnings = [warning] if warning else []
+    with uploads.taken_in(path), context.store.write() as session:
+        session.add(row)
+        session.flush()
+        audit.write(session, now, by, "upload recording", row.id, participant=code, sha256=row.file_sha256)
+    return row

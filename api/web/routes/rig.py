@@ -1,0 +1,97 @@
+"""The rig: its state, stop at any time, and re-arming by a person."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+from fastapi import APIRouter, Request
+from fastapi.responses import JSONResponse, RedirectResponse, Response
+
+from api.errors import ApiError
+from api.sessions.requests import TestIn
+from api.sessions.stop_log import StopResult
+from api.store import audit
+from api.web.browser_session import wants_html
+from api.web.dependencies import PROBLEM, Context, Ctx, LiveReader, MayStop, Rearmer, Tester
+from api.web.stop_guard import Press
+from rig.messages import RearmRequest, StopEvidence
+
+router = APIRouter(prefix="/v1", tags=["rig"], responses=PROBLEM)
+
+
+def rig_state(context: Context) -> dict[str, Any]:
+    """What is known of the rig, and how old it is."""
+    status = context.rig.status
+    current = context.runner.current
+    return {
+        "connected": context.rig.connected,
+        "age_s": context.rig.age_s,
+        **(
+            status.model_dump(exclude={"finished"})
+            if status
+            else {"state": "disconnected", "reason": "the rig has not spoken yet"}
+        ),
+        "holder": {"test_id": current.test_id, "participant": current.participant, "by": current.by}
+        if current
+        else None,
+    }
+
+
+@router.get("/rig")
+def rig(context: Ctx, _who: LiveReader) -> dict[str, Any]:
+    """State, devices, newest torque and its age."""
+    return rig_state(context)
+
+
+@router.post("/stop")
+async def stop(request: Request, context: Ctx, press: MayStop) -> Response:
+    """Stop stimulation: anyone signed in, and any page that shows the button; JSON, a plain form, or no body at all.
+
+    200 only on the rig's evidence that stimulation has stopped; otherwise a problem that says so.
+    """
+    if wants_html(request):
+        return await stop_on_page(request, context, press)
+    evidence = await context.runner.stop(press.reason, press.by)
+    return JSONResponse({"stopped": evidence.confirmed, "evidence": evidence.model_dump(), "rig": rig_state(context)})
+
+
+async def stop_on_page(request: Request, context: Context, press: Press) -> Response:
+    """Stop, and lead to the page that tells what came of it: that one can be loaded again and stops nothing."""
+    current = context.runner.current
+    answer: StopEvidence | ApiError
+    try:
+        answer = await context.runner.stop(press.reason, press.by)
+    except ApiError as error:
+        answer = error
+    right, test_id = getattr(request.state, "stop_right", None), current.test_id if current else None
+    told = StopResult(press.by, press.reason, context.clock.utc(), test_id, right, answer)
+    return RedirectResponse(f"/stopped/{context.stops.keep(told)}", 303)
+
+
+async def rearm_rig(context: Context, by: str) -> dict[str, Any]:
+    """A person has looked and lets the rig work again."""
+
+    def note() -> None:
+        with context.store.write() as session:
+            audit.write(session, context.clock.utc(), by, "re-arm", "rig")
+
+    await asyncio.to_thread(note)
+    await context.rig.ask(RearmRequest(by=by))
+    await context.rig.fresh_status()
+    return rig_state(context)
+
+
+@router.post("/rearm")
+async def rearm(context: Ctx, who: Rearmer) -> dict[str, Any]:
+    """After a stop, a fault or a restart the rig stays still until a person re-arms it: who signed in with a password.
+
+    A program needs the scope `rearm`, which `run-test` does not imply and no controller's key holds.
+    """
+    return await rearm_rig(context, who.name)
+
+
+@router.post("/preview", response_model=dict[str, Any])
+async def preview(context: Ctx, _who: Tester, body: TestIn) -> Response:
+    """A test's duration, dose and pulse widths, without playing it. 503 where too many are asked for at once."""
+    return JSONResponse(await context.runner.preview(body))

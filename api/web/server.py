@@ -1,0 +1,119 @@
+"""`python -m api.web.server`: the web process. Prints one JSON line when it answers; ends at SIGTERM.
+
+Exit 2: a setting does not hold, another service holds the data, the port is taken, or the database does not open.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import ipaddress
+import json
+import os
+import socket
+import sys
+
+import uvicorn
+from starlette.types import ASGIApp
+
+from api import logs
+from api.errors import ApiError, SettingsError
+from api.models import starting_effects
+from api.settings import Settings
+from api.store.lock import ServiceLock
+from api.web.app import create_app
+from api.web.connections import protocol, raise_file_limit
+
+
+def main() -> int:
+    """Run the service; the exit code."""
+    logs.configure()
+    raise_file_limit()
+    os.umask(os.umask(0o077) | 0o077)  # what the service and its workers write is for their user only
+    try:
+        settings = Settings()
+        refuse_open_door(settings)
+        lock = ServiceLock(settings)  # before the port: who runs already says more than a port that is taken
+        listener = bind(settings.host, settings.port)
+        url = address_of(listener)
+        lock.tell(url)
+        asyncio.run(starting_effects.refuse_unknown(settings))  # before a first token is drawn: it is told only once
+        app = create_app(settings, lock=lock)
+    except (ApiError, SettingsError, OSError) as error:
+        print(f"stimrig: {error}", file=sys.stderr)
+        return 2
+    ready = {"url": url, "port": listener.getsockname()[1], "drawn_token": app.state.context.drawn_token}
+    with contextlib.suppress(KeyboardInterrupt):
+        asyncio.run(serve(uvicorn.Server(configuration(app)), listener, ready))
+    return 0
+
+
+def configuration(app: ASGIApp) -> uvicorn.Config:
+    """How uvicorn runs the service.
+
+    `X-Forwarded-For` is believed of a proxy on this machine only: who signs in too often is told apart by address, and
+    anybody could write another one into the header.
+    """
+    return uvicorn.Config(
+        app, log_config=None, access_log=False, timeout_graceful_shutdown=2, ws_max_size=2**20, server_header=False,
+        http=protocol(), proxy_headers=True, forwarded_allow_ips=["127.0.0.1", "::1"],
+    )  # fmt: skip
+
+
+def refuse_open_door(settings: Settings) -> None:
+    """Passwords and tokens don't travel in the clear: another address than loopback only behind a TLS proxy.
+
+    Raises
+    ------
+    OSError
+        The host is not loopback, and TLS in front has not been vouched for.
+    """
+    if loopback(settings.host) or (settings.tls_proxy and settings.secure_cookies):
+        return
+    mend = (
+        "listen on 127.0.0.1 and put the TLS proxy of deploy/nginx in front; if one stands in front on another "
+        "machine, set STIMRIG_TLS_PROXY=true and STIMRIG_SECURE_COOKIES=true"
+    )
+    raise OSError(f"{settings.host}: refused, it is not this machine's loopback; {mend}")
+
+
+def loopback(host: str) -> bool:
+    """Whether an address can be reached from this machine only."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def bind(host: str, port: int) -> socket.socket:
+    """A listening address, or the reason why it cannot be had."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    listener = socket.socket(family, socket.SOCK_STREAM)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind((host, port))
+    except OSError as error:
+        listener.close()
+        detail = f"{host}:{port}: {error.strerror or error}; take another port with --port"
+        raise OSError(detail) from error
+    return listener
+
+
+def address_of(listener: socket.socket) -> str:
+    """Where the service answers."""
+    host, port = listener.getsockname()[:2]
+    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
+
+
+async def serve(server: uvicorn.Server, listener: socket.socket, ready: dict[str, object]) -> None:
+    """Serve; say so once the first request would be answered."""
+    running = asyncio.create_task(server.serve(sockets=[listener]))
+    while not server.started and not running.done():
+        await asyncio.sleep(0.01)
+    if server.started:
+        print(json.dumps(ready), flush=True)
+    await running
+
+
+if __name__ == "__main__":
+    sys.exit(main())

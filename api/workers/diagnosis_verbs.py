@@ -1,0 +1,133 @@
+"""What a worker does to find what a model lacks: diagnosis, signatures, the next experiment, improving, joining.
+
+Imported by the worker and the command line only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from api.structure import held_by
+from api.workers.json_values import clean
+
+Progress = Callable[[float, str], None]
+POINTS = 900
+"""Points of a signature's curve: it is drawn small."""
+
+
+def diagnosis(data: str, progress: Progress, model_json: str | None = None) -> dict[str, Any]:
+    """What is missing in a model's structure, what each effect would explain, and the test that decides.
+
+    Without a model it is the plain structure. The first four fifths of the progress are identify's diagnosis.
+    """
+    import identify
+
+    record = identify.read(Path(data))
+    model = None if model_json is None else identify.Model.from_json(model_json)
+    structure = held_by(model, record)
+    found = identify.diagnose(record, model, lambda share, text="": progress(0.8 * share, text)).to_dict()
+    found["structure"] = structure
+    found["library"] = {entry["id"]: entry for entry in library() if entry["id"] in mentioned(found)}
+    progress(0.82, "what each effect would explain")
+    found["signatures"] = signatures(record, [entry["effect"] for entry in found["missing"]], structure)
+    found["experiment"] = experiment(found["missing"])
+    return clean(found)
+
+
+def library() -> list[dict[str, Any]]:
+    """The library of effects as plain data."""
+    from identify import effects
+
+    return effects.library()
+
+
+def mentioned(found: dict[str, Any]) -> set[str]:
+    """Ids of all effects that a diagnosis speaks of."""
+    named = {entry["effect"] for entry in found["missing"]}
+    named |= {rival for entry in found["missing"] for rival in entry.get("confused_with") or []}
+    return named | {row["effect"] for rows in found.get("candidates") or [] for row in rows}
+
+
+def signatures(record: Any, effects: Sequence[str], structure: Sequence[str] = ()) -> dict[str, Any]:
+    """What each effect explains of what the model before it leaves: seen beside expected.
+
+    ``seen_nm`` is measurement minus the model before, ``expected_nm`` the model with the effect minus the model before.
+    The first model is the structure criticised. An effect whose model cannot be fitted alone has none.
+    """
+    import numpy as np
+
+    import identify
+
+    pick = slice(None, None, max(1, -(-record.time_s.size // POINTS)))
+    found: dict[str, Any] = {"time_s": record.time_s[pick].round(4)}
+    held = list(structure)
+    before = np.asarray(identify.predict(identify.fit(record, effects=held), record))
+    for effect in effects:
+        held.append(effect)
+        try:
+            after = np.asarray(identify.predict(identify.fit(record, effects=held), record))
+        except identify.IdentifyError:
+            held.pop()
+            continue
+        seen = record.torque_nm - before
+        found[effect] = {"seen_nm": smooth(record, seen)[pick].round(4), "expected_nm": (after - before)[pick].round(4)}
+        before = after
+    return found
+
+
+def smooth(record: Any, values: Any) -> Any:
+    """Running mean over a tenth of a second, so that a slow signature is seen through the noise."""
+    import numpy as np
+
+    width = max(1, round(0.1 * record.sample_rate_hz))
+    padded = np.pad(values, (width // 2, width - 1 - width // 2), mode="edge")
+    return np.convolve(padded, np.ones(width) / width, "valid")
+
+
+def experiment(missing: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
+    """The test that separates the first effect with rivals from them; None where no effect has any."""
+    for entry in missing:
+        if entry.get("confused_with") and entry.get("next_experiment_plan"):
+            rivals = [entry["effect"], entry["confused_with"][0]]
+            return {"rivals": rivals, **entry["next_experiment_plan"], "effect": entry["effect"]}
+    return None
+
+
+def improve(data: str, progress: Progress, force: Sequence[str] = (), model_json: str | None = None) -> dict[str, Any]:
+    """Effects added to a model's structure one by one while the evidence lasts, each step with its model."""
+    import identify
+
+    record = identify.read(Path(data))
+    model = None if model_json is None else identify.Model.from_json(model_json)
+    structure = held_by(model, record)
+    return {**identify.improve(record, progress, force=tuple(force), model=model).to_dict(), "structure": structure}
+
+
+def joined(parts: Sequence[str], out: str, progress: Progress) -> dict[str, Any]:
+    """Recordings as the parts of one, written to `out` as CSV that `identify.read` reads; its SHA-256."""
+    import hashlib
+
+    import identify
+    from identify.records import parts_csv
+    from identify.records.join import join
+
+    progress(0.1, "joining the recordings")
+    records = [identify.read(Path(part)) for part in parts]
+    parts_csv.write(join(records, [begun(Path(part)) for part in parts]), Path(out))
+    with Path(out).open("rb") as file:
+        return {"file_sha256": hashlib.file_digest(file, "sha256").hexdigest()}
+
+
+def begun(path: Path) -> float | None:
+    """When a sealed recording's clock was 0, as Unix time; None for CSV: a joined one says it of its parts."""
+    from datetime import datetime
+
+    import identify
+    from identify.records.recording import attributes
+
+    try:
+        return datetime.fromisoformat(attributes(path, ["created_utc"])["created_utc"]).timestamp()
+    except (identify.IdentifyError, ValueError, OverflowError):
+        return None

@@ -1,0 +1,145 @@
+"""identify at work in processes of its own: never in the web process, cancellable, kept warm."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import logging
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+from api.errors import ApiError
+from api.logs import current_test
+from api.workers.process import WORKER, Call, Places, Worker
+
+log = logging.getLogger("stimrig.fitting")
+
+
+class Pool:
+    """A few workers and a queue; the fit after a test goes before everything else.
+
+    One worker more, of low priority, does what nobody waits for yet; a new test ends what it does.
+
+    Parameters
+    ----------
+    workers : int
+        How many processes.
+    command : tuple of str
+        How to start one; tests put another in its place.
+    places : Places
+        The folders that they may reach.
+    """
+
+    def __init__(self, workers: int = 2, command: tuple[str, ...] = WORKER, places: Places | None = None) -> None:
+        places = places or Places()
+        self.workers = [Worker(command, places) for _ in range(workers)]
+        self.workers.append(Worker(command, places, background=True))
+        self.queue: deque[Call] = deque()
+        self.done_count = 0
+        self.failed_count = 0
+        self.busy_s = 0.0
+        self._numbers = itertools.count(1)
+        self._tasks: set[asyncio.Task[None]] = set()
+
+    def submit(
+        self,
+        verb: str,
+        *,
+        urgent: bool = False,
+        background: bool = False,
+        on_progress: Callable[[Call], None] | None = None,
+        **arguments: Any,
+    ) -> Call:
+        """Queue a call; await ``call.result``."""
+        call = Call(next(self._numbers), verb, arguments, urgent, background, on_progress=on_progress)
+        call.result.add_done_callback(_retrieve)
+        if urgent:
+            self.queue.appendleft(call)
+        else:
+            self.queue.append(call)
+        self._dispatch()
+        return call
+
+    def warm(self) -> None:
+        """Have every worker load identify before it is needed."""
+        for worker in self.workers:
+            if not worker.background:
+                self.submit("warm")
+
+    def cancel_background(self) -> int:
+        """End what nobody waits for, so that a test has the machine to itself; how many calls that were."""
+        open_calls = [call for call in self.queue if call.background]
+        open_calls += [worker.call for worker in self.workers if worker.call is not None and worker.call.background]
+        for call in open_calls:
+            self.cancel(call)
+        return len(open_calls)
+
+    def cancel(self, call: Call) -> None:
+        """Take a call off the queue, or end the process that does it."""
+        if call.state == "queued":
+            self.queue.remove(call)
+        for worker in self.workers:
+            if worker.call is call:
+                call.state = "cancelled"
+                worker.kill()
+                return
+        if not call.result.done():
+            call.state = "cancelled"
+            call.result.set_exception(ApiError(409, "cancelled", "The job was cancelled", "Start it again if wanted."))
+
+    def _dispatch(self) -> None:
+        for worker in self.workers:
+            call = self._next_for(worker) if worker.call is None else None
+            if call is not None:
+                self.queue.remove(call)
+                worker.call = call
+                task = asyncio.create_task(self._work(worker, call))
+                self._tasks.add(task)
+                task.add_done_callback(self._tasks.discard)
+
+    def _next_for(self, worker: Worker) -> Call | None:
+        """The next call for a worker; the first of several is kept free for the fit after a test."""
+        reserved = worker is self.workers[0] and len(self.workers) > 2
+        for call in self.queue:
+            fits = call.background == worker.background
+            if fits and (not reserved or call.urgent or call.verb == "warm"):
+                return call
+        return None
+
+    async def _work(self, worker: Worker, call: Call) -> None:
+        call.state, call.started_s = "running", time.monotonic()
+        current_test.set(call.test_id)  # a task of its own; whoever happened to dispatch it may have had another test
+        try:
+            result = await worker.run(call)
+            call.state, call.progress = "done", 1.0
+            self.done_count += 1
+            log.info("%s done in %.1f s", call.verb, call.elapsed_s)
+            if not call.result.done():
+                call.result.set_result(result)
+        except (ApiError, OSError, ValueError) as error:
+            if call.state != "cancelled":
+                call.state = "failed"
+            self.failed_count += 1
+            log.warning("%s: %s", call.verb, error)
+            if not call.result.done():
+                call.result.set_exception(error)
+        finally:
+            self.busy_s += time.monotonic() - call.started_s
+            worker.call = None
+            self._dispatch()
+
+    async def close(self) -> None:
+        """End all workers; what is queued is left."""
+        self.queue.clear()
+        for task in list(self._tasks):
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await asyncio.gather(*(worker.close() for worker in self.workers))
+
+
+def _retrieve(future: asyncio.Future[dict[str, Any]]) -> None:
+    """A failed call nobody waits for is in the log already."""
+    if not future.cancelled():
+        future.exception()

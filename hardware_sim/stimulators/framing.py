@@ -1,0 +1,126 @@
+"""The line layer that ScienceMode 2 and 4 share: byte stuffing, and finding frames in a stream of bytes.
+
+A frame is F0, a header of a fixed length, the stuffed body, 0F. Each byte of the header goes as `81, byte ^ 55`.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import ClassVar, NamedTuple
+
+START, STOP, ESCAPE, KEY = 0xF0, 0x0F, 0x81, 0x55
+
+
+class Packet(NamedTuple):
+    """One command or ack: its number, command and data."""
+
+    number: int
+    command: int
+    data: bytes
+
+
+def stuff(data: bytes) -> bytes:
+    """Escape each byte that could be mistaken for a frame's border."""
+    stuffed = bytearray()
+    for byte in data:
+        if byte in (START, STOP, ESCAPE):
+            stuffed += bytes((ESCAPE, byte ^ KEY))
+        else:
+            stuffed.append(byte)
+    return bytes(stuffed)
+
+
+def unstuff(data: bytes) -> bytes | None:
+    """The reverse of `stuff`; None if an escape is the last byte."""
+    plain = bytearray()
+    pending = iter(data)
+    for byte in pending:
+        if byte == ESCAPE:
+            escaped = next(pending, None)
+            if escaped is None:
+                return None
+            plain.append(escaped ^ KEY)
+        else:
+            plain.append(byte)
+    return bytes(plain)
+
+
+def frame(header: bytes, body: bytes) -> bytes:
+    """The frame of a plain header and a stuffed body."""
+    escaped = b"".join(bytes((ESCAPE, byte ^ KEY)) for byte in header)
+    return bytes((START,)) + escaped + body + bytes((STOP,))
+
+
+class FrameDecoder(ABC):
+    """Bytes in, packets out; bytes that form no frame are skipped and counted in `corrupt_frames`.
+
+    A piece of a frame after which nothing comes for `patience_s` is dropped. A client that dies in the middle of a
+    frame therefore does not cost the next client its first command.
+    """
+
+    HEADER_BYTES: ClassVar[int]
+    """Length of the header before its bytes are escaped."""
+
+    def __init__(self, patience_s: float = 0.1) -> None:
+        self.corrupt_frames = 0
+        self._patience_s = patience_s
+        self._buffer = bytearray()
+        self._last_byte_s = 0.0
+
+    @abstractmethod
+    def body_bytes(self, header: bytes) -> int | None:
+        """Length of the stuffed body that this header announces, or None if it is impossible."""
+
+    @abstractmethod
+    def parse(self, header: bytes, stuffed: bytes) -> Packet | None:
+        """The packet of a whole frame, or None if the frame is damaged."""
+
+    def feed(self, data: bytes, time_s: float) -> list[Packet]:
+        """All packets that are complete with `data`, which came at `time_s`."""
+        if self._buffer and time_s - self._last_byte_s > self._patience_s:
+            self._reject()
+        self._last_byte_s = time_s
+        self._buffer += data
+        packets = []
+        while (packet := self._next()) is not None:
+            packets.append(packet)
+        return packets
+
+    def _next(self) -> Packet | None:
+        body_at = 1 + 2 * self.HEADER_BYTES
+        while self._find_start() and len(self._buffer) >= body_at:
+            header = self._header()
+            length = None if header is None else self.body_bytes(header)
+            if header is None or length is None:
+                self._reject()
+                continue
+            stop_at = body_at + length
+            if len(self._buffer) <= stop_at:
+                return None
+            packet = self.parse(header, bytes(self._buffer[body_at:stop_at])) if self._buffer[stop_at] == STOP else None
+            if packet is not None:
+                del self._buffer[: stop_at + 1]
+                return packet
+            self._reject()
+        return None
+
+    def _find_start(self) -> bool:
+        """Drop what lies before the next frame's start; whether there is one."""
+        start = self._buffer.find(bytes((START, ESCAPE)))
+        if start < 0:
+            start = len(self._buffer) - (self._buffer[-1:] == bytes((START,)))
+            del self._buffer[:start]
+            return False
+        del self._buffer[:start]
+        return True
+
+    def _header(self) -> bytes | None:
+        escaped = self._buffer[1 : 1 + 2 * self.HEADER_BYTES]
+        if any(byte != ESCAPE for byte in escaped[::2]):
+            return None
+        return bytes(byte ^ KEY for byte in escaped[1::2])
+
+    def _reject(self) -> None:
+        """Skip this start byte: another frame may begin inside what looked like one."""
+        self.corrupt_frames += 1
+        del self._buffer[:1]

@@ -1,0 +1,111 @@
+"""A second socket (`SOCKET.stop`) that accepts only stops, so that other requests cannot delay one.
+
+It has its own event loop in its own thread, and its own worker threads. It shares nothing with the requests, previews,
+subscribers and half-open connections of the first socket.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from rig.control.connections import Connections
+from rig.control.replies import id_of, internal_error, invalid_request, refusal, to_line
+from rig.errors import ConfigError, RigError
+from rig.messages import Reply, StopEvidence, StopRequest
+
+log = logging.getLogger("rig.stop")
+
+Stop = Callable[[str, str], StopEvidence]
+WORKERS = 32
+"""Stops that may wait for their evidence at the same time; the first one has already stopped the rig."""
+MAX_LINE_BYTES = 16_384
+MAX_SILENT, MAX_ACTIVE = 32, 64
+
+
+class StopServer:
+    """Serves the stop socket.
+
+    Parameters
+    ----------
+    stop
+        Stops the rig (reason, by) and waits for the evidence.
+    """
+
+    def __init__(self, stop: Stop) -> None:
+        self._stop = stop
+        self._connections = Connections(MAX_SILENT, MAX_ACTIVE)
+        self._pool = ThreadPoolExecutor(WORKERS, "stop")
+        self._loop = asyncio.new_event_loop()
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._thread = threading.Thread(target=self._loop.run_forever, name="stop-door", daemon=True)
+
+    def open(self, path: Path) -> None:
+        """Start listening. Raises ConfigError."""
+        self._thread.start()
+        try:
+            path.unlink(missing_ok=True)
+            asyncio.run_coroutine_threadsafe(self._listen(path), self._loop).result()
+            path.chmod(0o660)
+        except OSError as error:
+            raise ConfigError(
+                f"socket: {path}: {error.strerror or error}; use a short path in a writable folder"
+            ) from None
+
+    def close(self) -> None:
+        """Stop listening; waits for stops that are being answered."""
+        self._pool.shutdown()
+        if self._thread.is_alive():
+            asyncio.run_coroutine_threadsafe(self._end(), self._loop).result()
+            self._loop.call_soon_threadsafe(self._loop.stop)
+            self._thread.join()
+        self._loop.close()
+
+    async def answer(self, line: bytes) -> Reply:
+        """Stop the rig; the reply contains the evidence."""
+        try:
+            request = StopRequest.model_validate_json(line)
+        except ValidationError as error:
+            return invalid_request(id_of(line), error)
+        try:
+            loop = asyncio.get_running_loop()
+            evidence = await loop.run_in_executor(self._pool, self._stop, request.reason, request.by)
+            return Reply(id=request.id, ok=True, body=evidence.model_dump(mode="json"))
+        except RigError as error:
+            return refusal(request.id, error)
+        except Exception as error:
+            log.exception("a stop failed")
+            return internal_error(request.id, error)
+
+    async def _listen(self, path: Path) -> None:
+        self._server = await asyncio.start_unix_server(self._serve, path, limit=MAX_LINE_BYTES, backlog=512)
+
+    async def _end(self) -> None:
+        self._server.close()
+        for task in tuple(self._tasks):
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        task = asyncio.current_task()
+        assert task is not None
+        self._tasks.add(task)
+        self._connections.enter(writer.transport)
+        try:
+            while line := await reader.readline():
+                self._connections.spoke(writer.transport)
+                writer.write(to_line(await self.answer(line)))
+        except (OSError, ValueError) as error:
+            log.warning("client disconnected: %s", error)
+        finally:
+            self._tasks.discard(task)
+            self._connections.leave(writer.transport)
+            with contextlib.suppress(OSError):
+                writer.close()
