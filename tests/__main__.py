@@ -20,11 +20,10 @@ LANES = {
 }
 
 CAMPAIGNS = {
-    "make grids": "every combination of the grids of which the tests take one of each kind",
-    "make soak": "an hour of recording with a fit beside it; the tests take 30 s",
-    "make faults": "every fault in every phase of a test; the tests take seven",
-    "make patients": "hidden patients on the wire, from the test to the model with the effect",
-    "make bench": "the figures in docs/",
+    "make campaigns": "whole grids, of which one of each kind is run here; a hidden patient on the wire",
+    "make soak": "an hour of recording with fits beside it, of which 30 s are run here",
+    "make faults": "every fault in every phase of a test, of which seven are run here",
+    "make bench": "the figures in docs/, against other programs",
 }
 """What is not run here, by the command that runs it."""
 

@@ -1,4 +1,4 @@
-"""What holds for every test: how many threads a process takes, how property tests run, and what `--grids` adds.
+"""What holds for every test: how many threads a process takes, how property tests run, and what is left to campaigns.
 
 Here, above all tests: both settings have to be made before the first of them is imported.
 """
@@ -19,14 +19,12 @@ settings.load_profile("shared-machine")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--grids", action="store_true", help="run the tests marked `grid`, too (`make grids`)")
+    parser.addoption("--campaigns", action="store_true", help="run the tests marked `campaign`, too")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out the rest of each grid, and count it as deselected."""
-    if config.getoption("--grids"):
-        return
-    left_out = [item for item in items if item.get_closest_marker("grid")]
-    if left_out:
+    """Leave out what only a campaign runs, and count it as deselected."""
+    left_out = [item for item in items if item.get_closest_marker("campaign")]
+    if left_out and not config.getoption("--campaigns"):
         config.hook.pytest_deselected(items=left_out)
-        items[:] = [item for item in items if not item.get_closest_marker("grid")]
+        items[:] = [item for item in items if not item.get_closest_marker("campaign")]

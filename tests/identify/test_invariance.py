@@ -169,9 +169,9 @@ def test_fit_with_the_effect_hardly_depends_on_the_samples(hidden, relation):
 
 
 def whole_grid(cases: list[tuple[str, ...]], always: set[tuple[str, ...]]) -> list:
-    """All cases: those of `always` in every run of the tests, the others with `--grids`."""
+    """All cases: those of `always` in every run of the tests, the others with `--campaigns`."""
     assert always <= set(cases)
-    return [pytest.param(*case, marks=[] if case in always else [pytest.mark.grid]) for case in cases]
+    return [pytest.param(*case, marks=[] if case in always else [pytest.mark.campaign]) for case in cases]
 
 
 @pytest.mark.slow
