@@ -36,13 +36,13 @@ types: setup-test ## types
 bench: $(VENV)-bench/.bench ## the figures in docs/, measured on this machine
 	@$(VENV)-bench/bin/python -m bench
 
-soak: setup-test ## an hour of recording with fits beside it (docs/soak.md)
+soak: setup-test ## an hour of recording with fits beside it (docs/results/soak.md)
 	@$(BIN)/python -m bench.soak --minutes 60
 
 campaigns: setup-test ## the tests that are too long for `make test`: whole grids, a hidden patient on the wire
 	@$(BIN)/python -m pytest --campaigns -m campaign tests
 
-faults: setup-test ## the fault campaign on the emulated rig (docs/faults.md)
+faults: setup-test ## the fault campaign on the emulated rig (docs/results/faults.md)
 	@$(BIN)/python -m bench.faults
 
 setup: $(VENV)/.run ## the virtual environment from the hash-locked list

@@ -1,4 +1,4 @@
-"""The fault campaign: each fault, in each phase of a test, on several seeds; the table goes to docs/faults.md.
+"""The fault campaign: each fault, in each phase of a test, on several seeds; the table goes to docs/results/faults.md.
 
     python -m bench.faults [--resume] [--injections N] [--minutes M] [--workers N] [--seed N] [--speed N] [--out FILE]
     python -m bench.faults --table-only      writes the table of what --out holds

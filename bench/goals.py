@@ -1,4 +1,4 @@
-"""The figures that identification is held to, on seeds that nothing was developed on; writes docs/identification.md.
+"""Figures of identification on seeds that nothing was developed on; writes docs/results/identification.md.
 
 python -m bench goals
 """
@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 import identify
+from bench.stamp import RESULTS, written_by
 from identify.dynamics.linear import SecondOrder
 from identify.estimation.figures import best_fit_percent
 from identify.estimation.uncertainty import prediction_band
@@ -27,7 +28,7 @@ from identify.paper.table1 import simulate
 from identify.records.record import Record
 from tests.harness.patients import Patient, make_record
 
-TARGET = Path(__file__).parent.parent / "docs" / "identification.md"
+TARGET = RESULTS / "identification.md"
 ACCURACY_SEEDS = range(710_000, 710_040)
 PATIENT_SEEDS = range(720_000, 720_300)
 CALIBRATION_SEEDS = range(730_000, 730_300)
@@ -64,7 +65,8 @@ def run() -> None:
     lines = [
         "# Identification: figures",
         "",
-        "Written by `python -m bench goals`; don't edit. Seeds here were not used in development.",
+        written_by("python -m bench goals"),
+        "Seeds here were not used in development.",
         "",
     ]
     for part in (accuracy, patients, calibration, speed):

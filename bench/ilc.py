@@ -1,7 +1,7 @@
 """`python -m bench.ilc [--speed N] [--trials N]`: the controller of `examples/ilc_controller.py` on the emulated rig.
 
 Starts the whole rig for each muscle, runs the pre-session test, approves, and lets the controller learn. Writes
-docs/ilc.md and docs/img/ilc.svg.
+docs/results/ilc.md and docs/img/ilc.svg.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ import numpy as np
 
 from api.cli.launcher import Services
 from api.settings import Settings
+from bench.stamp import written_by
 from examples import ilc_controller as ilc
 
 ROOT = Path(__file__).parents[1]
@@ -159,7 +160,7 @@ def main() -> None:
     cases = play_all(wanted, options)
     draw(options.out / "img" / "ilc.svg", cases)
     words = page(cases, options.speed, time.time() - began)
-    (options.out / "ilc.md").write_text(words, "utf-8")
+    (options.out / "results" / "ilc.md").write_text(words, "utf-8")
     print(words)
 
 
@@ -197,7 +198,7 @@ def page(cases: dict[str, dict[str, Any]], speed: float, seconds: float) -> str:
     lines = [
         "# Learning with the model",
         "",
-        "Written by `python -m bench.ilc`; don't edit. `examples/ilc_controller.py` speaks HTTP only; the rig is "
+        f"{written_by('python -m bench.ilc')} `examples/ilc_controller.py` speaks HTTP only; the rig is "
         f"emulated, at {speed:g} times the speed of the world; "
         f"{seconds:.0f} s in all, load average {load}.",
         "",
@@ -205,7 +206,7 @@ def page(cases: dict[str, dict[str, Any]], speed: float, seconds: float) -> str:
         "reference is ten seconds of minimum-jerk moves up to 60 % of the largest torque. *Static start*: the first "
         "trial inverts f alone, as if there were no G, so that there is something to learn.",
         "",
-        "![Tracking error over trials](img/ilc.svg)",
+        "![Tracking error over trials](../img/ilc.svg)",
     ]
     for name, found in cases.items():
         lines += ["", f"## {name[0].upper()}{name[1:]}", ""]

@@ -1,15 +1,15 @@
-"""Side by side: ours, peers and the oracle on the same records, same machine, same run; writes docs/bench.md."""
+"""Ours, peers and the oracle on the same records, same machine, same run; writes docs/results/bench.md."""
 
 from __future__ import annotations
 
 import platform
 import time
 import warnings
-from pathlib import Path
 
 import numpy as np
 
 from bench.contenders import CONTENDERS, Contender, Task
+from bench.stamp import RESULTS, written_by
 from identify.estimation.figures import best_fit_percent
 from identify.paper import muscle
 from identify.records.record import Record
@@ -17,7 +17,7 @@ from identify.records.record import Record
 NOISE_NM = (0.0, 0.02, 0.10)
 SEEDS = {40.0: (90_001, 90_002, 90_003, 90_004, 90_005), 1600.0: (90_001, 90_002)}
 """Seeds that nothing was developed on."""
-TARGET = Path(__file__).parent.parent / "docs" / "bench.md"
+TARGET = RESULTS / "bench.md"
 
 
 def make_task(rate_hz: float, noise_nm: float, seed: int) -> tuple[Task, np.ndarray]:
@@ -57,7 +57,7 @@ def measure(contender: Contender, rate_hz: float, noise_nm: float) -> dict[str, 
 
 
 def run() -> None:
-    """Measure all and write docs/bench.md."""
+    """Measure all and write docs/results/bench.md."""
     warnings.filterwarnings("ignore")
     results: dict[tuple[str, float, float], dict[str, float] | str] = {}
     for rate in SEEDS:
@@ -82,11 +82,12 @@ def cell(found: dict[str, float] | str) -> str:
 
 
 def document(results: dict[tuple[str, float, float], dict[str, float] | str]) -> str:
-    """docs/bench.md."""
+    """docs/results/bench.md."""
     lines = [
         "# Identification beside its peers",
         "",
-        "Written by `make bench` (`python -m bench peers`); don't edit. One run, one core, the same records: the",
+        written_by("python -m bench peers"),
+        "One run, one core, the same records: the",
         "paper's muscle, PRBS of 15.9 s and ramp of 10 s with rests, output noise; fitted on what comes before the",
         "unseen part.",
         "Best fit in free run against the torque without noise, %: on the ramp / on an unseen multi-level input; time",

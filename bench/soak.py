@@ -1,4 +1,4 @@
-"""A long session in real time on the emulated rig, with fits in another process; docs/soak.md has the figures of one.
+"""A long session in real time on the emulated rig, with fits in another process; figures: docs/results/soak.md.
 
     python -m bench.soak [--minutes 60] [--every-minutes 5] [--no-fit]
 

@@ -1,18 +1,17 @@
-"""Table I, ours beside the paper's, and the experiments that explain the differences; writes docs/table1.md."""
+"""Table I, ours beside the paper's, and experiments that explain the differences; writes docs/results/table1.md."""
 
 from __future__ import annotations
-
-from pathlib import Path
 
 import numpy as np
 
 import identify
+from bench.stamp import RESULTS, written_by
 from identify.dynamics.linear import Discrete, SecondOrder
 from identify.estimation.figures import best_fit_percent
 from identify.paper import muscle, table1
 from identify.records.record import Record
 
-TARGET = Path(__file__).parent.parent / "docs" / "table1.md"
+TARGET = RESULTS / "table1.md"
 TRIALS = 100
 FEW = 20
 SEED = 30_000
@@ -51,7 +50,8 @@ def main_table() -> list[str]:
     lines = [
         "# Table I, ours beside the paper's",
         "",
-        f"Written by `python -m bench table1`; don't edit. `stimrig table1 --trials {TRIALS}` prints the same numbers.",
+        written_by("python -m bench table1"),
+        f"`stimrig table1 --trials {TRIALS}` prints the same numbers.",
         "",
         "The paper's muscle (section V), 40 pulses and 40 samples a second, white noise on the output. One record:",
         "rest, PRBS (127 levels of 5 pulses, 0 or 300 µs), rest, triangular ramp (5 s up, 5 s down), rest, unseen",

@@ -141,7 +141,7 @@ def _open(rules: int, path: Path, rights: int) -> None:
 
 def code_roots() -> list[Path]:
     """Folders from which this software is imported: a data folder may lie in one, so only packages in it are open."""
-    return [Path(__file__).resolve().parents[1]]
+    return [Path(__file__).resolve().parents[2]]
 
 
 def code_folders() -> list[Path]:

@@ -39,7 +39,7 @@ WALL_FACTOR = 3.0
 def environment() -> dict[str, str]:
     """The environment of a worker; it imports what this process imports, and nothing from the working folder."""
     kept = {name: os.environ[name] for name in PASSED_ON if name in os.environ}
-    ours = str(Path(__file__).resolve().parents[1])
+    ours = str(Path(__file__).resolve().parents[2])
     path = os.pathsep.join(dict.fromkeys([ours, *kept.get("PYTHONPATH", "").split(os.pathsep)])).rstrip(os.pathsep)
     return {**kept, "PYTHONPATH": path, "PYTHONSAFEPATH": "1", "HDF5_PLUGIN_PRELOAD": "::"}
 

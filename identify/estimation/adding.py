@@ -82,8 +82,7 @@ def try_effect(
         gain = found.log_evidence - base.log_evidence + effect.prior
         idle, top = (0, gain) if gain > max(top, 0.0) else (idle + 1, top)
         gains[form.name] = gain
-        if form.propose is not None:
-            previous, residual = found.parameters_of(effect.id), found.residual_nm
+        previous, residual = found.parameters_of(effect.id), found.residual_nm
         if best is None or found.log_evidence > best.log_evidence:
             best, best_form = found, form
     if best is None or best_form is None:

@@ -2,7 +2,7 @@
 
 Where the text works it is followed: the PRBS's two levels make w proportional to u (15); the linear part found there
 serves to find the spline on the ramp (stage one); with the spline known the linear part is found again (stage two);
-one iteration. Three deviations, each since the text fails under output noise (docs/table1.md shows it):
+one iteration. Three deviations, each since the text fails under output noise (docs/results/table1.md shows it):
 
 - the linear part minimises the output error (12) instead of the equation error (25), which puts poles 4 times too slow;
 - the spline is fitted through G forward instead of inverting G (26), whose zero near -1 makes the inverse unstable;

@@ -95,7 +95,7 @@ def run(
         "sample_rate_hz": sample_rate_hz,
         "unit": "best fit, % (mean over trials); noise in N·m",
         "scored_on": "ours and ceiling: the noisy ramp; clean: the ramp without noise; unseen: multi-level, no noise",
-        "explained_in": "docs/table1.md",
+        "explained_in": "docs/results/table1.md",
     }
 
 

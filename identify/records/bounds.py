@@ -25,6 +25,8 @@ LARGEST = {
     "doubted": 1.0,
     "part": 1e3,
 }
+LARGEST_CALENDAR_S = 1e11
+"""Times as they are read may be counted from 1970, or from 1904."""
 LONGEST_NAME = 100
 MOST_SEGMENTS = 1000
 MOST_PARTS = 1000
@@ -58,6 +60,11 @@ def content_of(path: Path) -> bytes:
         mend = "Cut the record, or give the sealed recording."
         raise BadRecord(f"more than {LARGEST_FILE_BYTES // 2**20} MB", place=str(path), mend=mend)
     return b"".join(pieces)
+
+
+def largest(column: str) -> float:
+    """What a number may be at most as it is read, in the column's own unit."""
+    return LARGEST_CALENDAR_S if column == "time_s" else LARGEST[column]
 
 
 def check_rate(pulse_rate_hz: float, place: str) -> None:

@@ -21,12 +21,16 @@ FORGOTTEN_S = 1.5
 
 @dataclass(frozen=True)
 class Source:
-    """Where a record came from, so that a model can say what it was fitted on; `parts` of a joined one, in order."""
+    """Where a record came from, so that a model can say what it was fitted on; `parts` of a joined one, in order.
+
+    `notes` are sentences on what was assumed when it was read: each changes what the numbers mean.
+    """
 
     name: str = ""
     recording_id: str = ""
     sha256: str = ""
     parts: tuple[Source, ...] = ()
+    notes: tuple[str, ...] = ()
 
 
 def joined_source(parts: Sequence[Source], name: str = "joined", sha256: str = "") -> Source:
@@ -201,6 +205,7 @@ class Record(Shown):
         ]
         if self.columns():
             rows.append(("more", ", ".join(self.columns())))
+        rows += [("note", note) for note in self.notes]
         rates = f"{quantity(self.sample_rate_hz, 'samples/s')}, {quantity(self.pulse_rate_hz, 'pulses/s')}"
         long = quantity(self.time_s.size / self.sample_rate_hz, "s")
         return Sheet(f"Record {self.source.name or 'without a name'}: {long}, {rates}", tuple(rows))
@@ -259,6 +264,12 @@ class Record(Shown):
         """int, shape (N,): index into `parts` for each sample."""
         first = [part.first for part in self.parts]
         return np.searchsorted(first, np.arange(self.time_s.size), side="right") - 1
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was assumed when it was read, in sentences; with the part's name where it is one of several."""
+        of_parts = (f"{part.name}: {note}" for part in self.source.parts for note in part.notes)
+        return tuple(dict.fromkeys((*self.source.notes, *of_parts)))
 
     @property
     def has_held_out(self) -> bool:

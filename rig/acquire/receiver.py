@@ -46,10 +46,6 @@ class CounterUnwrapper:
         self._modulus = modulus
         self._last: int | None = None
 
-    def forget(self) -> None:
-        """Start anew with the next sample."""
-        self._last = None
-
     def unwrap(self, raw: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_], int, int]:
         """Unwrapped counters, which samples to keep, number of repeats, number of late samples."""
         if self._last is None:

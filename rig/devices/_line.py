@@ -7,27 +7,21 @@ import logging
 import os
 import termios
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import serial
 
 from rig.clock import Clock
 from rig.errors import DeviceError, WireError
 from rig.signals import LateError
-from rig.wire.sciencemode4 import Packet
+from rig.wire.framing import FrameReader, Packet
 
 log = logging.getLogger("rig.line")
 
 READ_TIMEOUT_S = 0.05
 PSEUDO_TERMINALS = "/dev/pts/"
-
-
-class Reader(Protocol):
-    """Turns bytes into packets."""
-
-    def feed(self, data: bytes) -> Iterator[Packet]: ...
 
 
 class PacketLine:
@@ -40,7 +34,7 @@ class PacketLine:
     numbers
         Number of packet numbers before they repeat.
     reader
-        Makes a new `Reader` each time the port is opened.
+        Makes a new reader of frames each time the port is opened.
     on_packet
         Called with each packet and the time at which it was read (rig clock); from the reader thread.
     arguments
@@ -52,7 +46,7 @@ class PacketLine:
         port: str,
         clock: Clock,
         numbers: int,
-        reader: Callable[[], Reader],
+        reader: Callable[[], FrameReader],
         on_packet: Callable[[Packet, float], None],
         **arguments: Any,
     ) -> None:

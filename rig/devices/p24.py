@@ -18,7 +18,8 @@ from rig.errors import DeviceError
 from rig.limits import Admitted, Steps
 from rig.signals import Ack
 from rig.wire import sciencemode4 as wire
-from rig.wire.sciencemode4 import Command, Packet
+from rig.wire.framing import Packet
+from rig.wire.sciencemode4 import Command
 
 KIND = "stimulator"
 
@@ -45,7 +46,7 @@ class P24:
             settings.port,
             clock,
             wire.NUMBERS,
-            wire.FrameReader,
+            wire.FRAMING.reader,
             self._take,
             baudrate=BAUD_RATE,
             stopbits=serial.STOPBITS_TWO,
@@ -104,7 +105,7 @@ class P24:
         data = bytes((0,)) if command == Command.LL_INIT else b""
         name = command.name.lower().replace("_", " ")
         packet = self._line.ask(
-            lambda number: wire.encode(Packet(number, command, data)),
+            lambda number: wire.FRAMING.encode(Packet(number, command, data)),
             name,
             command + 1,
             self._settings.reply_timeout_s,

@@ -21,8 +21,8 @@ from rig.errors import DeviceError
 from rig.limits import Admitted, Steps
 from rig.signals import Ack
 from rig.wire import sciencemode2 as wire
+from rig.wire.framing import Packet
 from rig.wire.sciencemode2 import Command
-from rig.wire.sciencemode4 import Packet
 
 KIND = "stimulator"
 
@@ -53,7 +53,7 @@ class RehaStim2:
             settings.port,
             clock,
             wire.NUMBERS,
-            wire.FrameReader,
+            wire.FRAMING.reader,
             self._take,
             baudrate=BAUD_RATE,
             parity=serial.PARITY_EVEN,
@@ -99,7 +99,7 @@ class RehaStim2:
 
     def feed(self) -> None:
         if self._armed and self._clock.now_s() - self._line.last_written_s >= FEED_S:
-            self._line.tell(lambda number: wire.encode(Packet(number, Command.WATCHDOG)))
+            self._line.tell(lambda number: wire.FRAMING.encode(Packet(number, Command.WATCHDOG)))
 
     def stop(self) -> None:
         self._armed = False
@@ -131,7 +131,7 @@ class RehaStim2:
     def _ask_once(self, command: Command) -> Packet:
         name = command.name.lower().replace("_", " ")
         timeout_s = self._settings.reply_timeout_s
-        return self._line.ask(lambda number: wire.encode(Packet(number, command)), name, command + 1, timeout_s)
+        return self._line.ask(lambda number: wire.FRAMING.encode(Packet(number, command)), name, command + 1, timeout_s)
 
     def _take_offer(self) -> bool:
         """Accept a connection that the device offers; False if it offers none."""
@@ -142,7 +142,7 @@ class RehaStim2:
         assert offer is not None
         accepted = offer.data[:1] == bytes((wire.VERSION,))
         result = 0 if accepted else -5
-        self._line.tell(lambda _: wire.encode(Packet(offer.number, Command.INIT_ACK, bytes((result & 0xFF,)))))
+        self._line.tell(lambda _: wire.FRAMING.encode(Packet(offer.number, Command.INIT_ACK, bytes((result & 0xFF,)))))
         if not accepted:
             raise DeviceError(f"stimulator {self._settings.port}: it uses protocol {offer.data.hex()}, this driver 1")
         return True

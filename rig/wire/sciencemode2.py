@@ -7,31 +7,25 @@ An ack is the command + 1 with the same number; its first byte is a signed resul
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from enum import IntEnum
 
 from rig.errors import WireError
-from rig.wire.sciencemode4 import ESCAPE, KEY, START, STOP, Packet, stuff, unstuff
+from rig.wire.framing import Framing, Packet
 
-HEADER_BYTES = 5
 OVERHEAD_BYTES = 6
-SHORTEST_BODY_BYTES = 2
-LONGEST_BODY_BYTES = 0xFF
+MAX_BODY_BYTES = 0xFF
 NUMBERS = 256
-BUSY = -8
 VERSION = 1
 
 
 class Command(IntEnum):
-    """Commands of host and device; INIT, UNKNOWN and STIMULATION_ERROR come from the device of its own accord."""
+    """Commands used here; the device sends INIT, UNKNOWN and STIMULATION_ERROR without being asked."""
 
     INIT = 1
     INIT_ACK = 2
     UNKNOWN = 3
     WATCHDOG = 4
     GET_MODE = 10
-    INIT_CHANNEL_LIST = 30
-    START = 32
     STOP = 34
     SINGLE_PULSE = 36
     STIMULATION_ERROR = 38
@@ -59,7 +53,7 @@ def result_of(data: bytes) -> int:
 
 
 def result_text(result: int) -> str:
-    """Words for a result, with the number where it is unknown."""
+    """Words for a result, with the number if it is unknown."""
     return RESULTS.get(result, f"error {result}")
 
 
@@ -83,72 +77,20 @@ def crc8(data: bytes) -> int:
     return crc
 
 
-def encode(packet: Packet) -> bytes:
-    """The frame of a packet, as written to the line."""
-    body = stuff(bytes((packet.number, packet.command)) + packet.data)
-    return bytes((START, ESCAPE, crc8(body) ^ KEY, ESCAPE, len(body) ^ KEY)) + body + bytes((STOP,))
+def _header(body: bytes) -> bytes:
+    if len(body) > MAX_BODY_BYTES:
+        raise WireError(f"body of {len(body)} bytes, at most {MAX_BODY_BYTES}")
+    return bytes((crc8(body), len(body)))
 
 
-def decode(frame: bytes) -> Packet:
-    """The packet of one whole frame.
-
-    Raises
-    ------
-    WireError
-        Start, escapes, length, CRC or stop byte wrong, or no room for a command.
-    """
-    if len(frame) < OVERHEAD_BYTES + SHORTEST_BODY_BYTES or frame[0] != START or frame[-1] != STOP:
-        raise WireError(f"no frame: {frame.hex(' ')}")
-    crc, length = _header(frame)
-    stuffed = frame[HEADER_BYTES:-1]
-    if length != len(stuffed) or crc8(stuffed) != crc:
-        raise WireError(f"length or CRC wrong: {frame.hex(' ')}")
-    body = unstuff(stuffed)
-    if len(body) < SHORTEST_BODY_BYTES:
-        raise WireError(f"no command in frame: {frame.hex(' ')}")
-    return Packet(body[0], body[1], body[2:])
-
-
-def _header(frame: bytes | bytearray) -> tuple[int, int]:
-    if frame[1] != ESCAPE or frame[3] != ESCAPE:
-        raise WireError(f"header's escapes missing: {bytes(frame[:HEADER_BYTES]).hex(' ')}")
-    return frame[2] ^ KEY, frame[4] ^ KEY
-
-
-class FrameReader:
-    """Cuts a stream of bytes into packets; damaged bytes are skipped and counted in `damaged`."""
-
-    def __init__(self) -> None:
-        self._buffer = bytearray()
-        self.damaged = 0
-
-    def feed(self, data: bytes) -> Iterator[Packet]:
-        """Take what was read from the line and give each whole packet."""
-        self._buffer += data
-        while self._to_start() and len(self._buffer) >= HEADER_BYTES:
-            try:
-                _, length = _header(self._buffer)
-                if not (SHORTEST_BODY_BYTES <= length <= LONGEST_BODY_BYTES):
-                    raise WireError(f"frame length {length}")
-                if len(self._buffer) < length + OVERHEAD_BYTES:
-                    return
-                packet = decode(bytes(self._buffer[: length + OVERHEAD_BYTES]))
-            except WireError:
-                self.damaged += 1
-                del self._buffer[:1]
-                continue
-            del self._buffer[: length + OVERHEAD_BYTES]
-            yield packet
-
-    def _to_start(self) -> bool:
-        """Drop everything before the next `F0 81`; True if the buffer now starts with (a part of) it."""
-        start = self._buffer.find(bytes((START, ESCAPE)))
-        if start < 0:
-            start = len(self._buffer) - (1 if self._buffer.endswith(bytes((START,))) else 0)
-        if start:
-            self.damaged += 1
-            del self._buffer[:start]
-        return bool(self._buffer)
+FRAMING = Framing(
+    header_fields=2,
+    header=_header,
+    frame_length=lambda header: header[1] + OVERHEAD_BYTES,
+    max_frame_bytes=MAX_BODY_BYTES + OVERHEAD_BYTES,
+    pack=lambda packet: bytes((packet.number, packet.command)) + packet.data,
+    unpack=lambda payload: Packet(payload[0], payload[1], payload[2:]),
+)
 
 
 def single_pulse(number: int, channel: int, pulse_width_us: int, current_ma: float) -> bytes:
@@ -177,4 +119,4 @@ def single_pulse(number: int, channel: int, pulse_width_us: int, current_ma: flo
     if not (0 <= channel <= 7):
         raise WireError(f"channel {channel}: 0 to 7")
     data = bytes((channel,)) + pulse_width_us.to_bytes(2, "big") + bytes((int(current_ma),))
-    return encode(Packet(number, Command.SINGLE_PULSE, data))
+    return FRAMING.encode(Packet(number, Command.SINGLE_PULSE, data))

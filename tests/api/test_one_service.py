@@ -114,7 +114,7 @@ def test_serve_says_so_before_it_starts_a_rig(tmp_path: Path) -> None:
     services = Services(Settings(data_dir=tmp_path, port=0))  # pyright: ignore[reportCallIssue]
     with pytest.raises(LaunchError, match="another service runs on it") as caught, services:
         pass
-    assert caught.value.code == 2 and services.emulator is not None and services.emulator.process is None
+    assert caught.value.exit_code == 2 and services.emulator is not None and services.emulator.process is None
     first.release()
 
 

@@ -22,10 +22,11 @@ from api.workers import confinement
 from api.workers.pool import WORKER, Pool
 from api.workers.process import Places
 from api.workers.verbs import find_recording
-from bench import hostile_files, hostile_shapes
+from bench import hostile_files
 from tests.api.conftest import STUB, Service, run_service
 from tests.api.test_problems import problem
 from tests.api.test_worker import made_up_csv, with_pool
+from tests.harness import hostile_shapes
 
 SECRET = "the-administrators-token"
 ROOT = Path(__file__).parents[2]
@@ -41,7 +42,7 @@ def kernel_shuts() -> set[str]:
 def shut_in(code: str, *folders: Path, writes: tuple[Path, ...] = ()) -> subprocess.CompletedProcess[str]:
     """A process that shuts itself in, does what `code` says and tells `left` and what `code` put into `found`."""
     program = (
-        "import json, os, sys\nfrom pathlib import Path\nfrom api.confinement import confine, limit_time\n"
+        "import json, os, sys\nfrom pathlib import Path\nfrom api.workers.confinement import confine, limit_time\n"
         f"reads, writes = {[str(each) for each in folders]!r}, {[str(each) for each in writes]!r}\n"
         "left, found = confine(map(Path, reads), map(Path, writes)), {}\n"
         "def attempt(name, work):\n"

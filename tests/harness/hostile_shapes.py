@@ -274,10 +274,21 @@ def csv_shapes() -> Iterator[Hostile]:
         "time twice": HEADER + sound + sound,
         "cut": HEADER + sound[:-9],
         "a formula": HEADER + sound.replace(b"6.000", b"=1+1"),
+        "decimal signs of both kinds": (HEADER + sound).replace(b",", b";").replace(b"6.000", b"6,000"),
+        "numbers with commas between commas": HEADER + sound.replace(b"6.000", b'"6,000"'),
+        "an eighth of the rows without a number": HEADER + sound.replace(b"6.000", b""),
+        "comments without an end": HEADER + b"# 1\n" * 1_000_000,
+        "a header that never comes": b"Channel 1;Channel 2;Channel 3\n" * 1_000_000,
+        "names in every line": (b"Time,Torque,PW," * 600 + b"\n") * 500,
+        "names in every bracket": (b"T[" * 4900 + b"\n") * 500,
+        "samples that come and go": HEADER
+        + b"".join(b"%.4f,%d,0,r\n" % (k / 40 + 0.2 * (k // 2), k % 3) for k in range(40_000)),
+        "a time unit that is none": b"time [fortnights],pulse_width_us,torque_nm,segment\n" + sound,
+        "UTF-16 cut": (HEADER + sound).decode().encode("utf-16")[:-1],
         "binary": random.Random(1).randbytes(1_000_000),
     }
     for name, content in shapes.items():
-        yield Hostile(name, ".csv", content)
+        yield Hostile(name, ".csv", content, refused=name not in ("semicolons", "UTF-16"))
 
 
 def model_shapes() -> Iterator[Hostile]:

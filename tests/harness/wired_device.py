@@ -16,7 +16,7 @@ from rig.clock import VirtualClock
 from rig.devices import p24, rehastim2
 from rig.signals import LateError
 from rig.wire import sciencemode2, sciencemode4
-from rig.wire.sciencemode4 import Packet
+from rig.wire.framing import Packet
 
 QUICK_S, STALL_S, STALLS = 0.0008, 0.3, 0.02
 """A byte's usual way, the longest stall, and how often one begins."""
@@ -50,12 +50,12 @@ class WiredDevice:
         self._answered: dict[tuple[int, int], Packet] = {}
         if name == "p24":
             self._firmware = p24_device.Firmware(board)
-            self._reader: sciencemode4.FrameReader | sciencemode2.FrameReader = sciencemode4.FrameReader()
+            self._reader = sciencemode4.FRAMING.reader()
             self._numbers = sciencemode4.NUMBERS
             driver = p24.create(p24.Settings(device="p24", port="none"), clock)
         else:
             self._firmware = rehastim2_device.Firmware(board)
-            self._reader, self._numbers = sciencemode2.FrameReader(), sciencemode2.NUMBERS
+            self._reader, self._numbers = sciencemode2.FRAMING.reader(), sciencemode2.NUMBERS
             driver = rehastim2.create(rehastim2.Settings(device="rehastim2", port="none"), clock)
             self._clock.wait(self._began_s + 0.6)
             self._timeline.run_until(0.6)  # it offers a connection

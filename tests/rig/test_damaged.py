@@ -122,7 +122,8 @@ def test_with_whole_kinds_of_blocks_lost_the_others_tell(
     assert words in recording.attributes["journal_note"]
     found, found_uc = felt(recording)
     assert found == pulses
-    assert found_uc == pytest.approx(charge_uc) or "unknown" in recording.attributes["journal_note"]
+    if kinds != (Kind.INTENT, Kind.PLAN):  # which alone leave the widths unknown
+        assert found_uc == pytest.approx(charge_uc)
     assert recording.attributes["pulse_rate_hz"] == pytest.approx(40.0)
     assert len(recording.columns["torque/time_s"]) > 1000
     assert recording.attributes["test_id"] == "t"

@@ -131,6 +131,7 @@ def test_wherever_the_line_stalls_no_interval_at_the_electrode_is_below_the_limi
         setup.fire(100)
         setup.wait(pause_s)
     sent_s = [time_s for time_s, _ in setup.stimulator.sent]
+    assert bool(sent_s) == bool(steps), "the first pulse is sent in any case"
     for acked, following in zip(setup.stimulator.acked_s, sent_s[1:], strict=False):
         assert following - acked >= 0.008 - 1e-9
     setup.journal.close()
@@ -169,6 +170,7 @@ def test_charge_per_second_holds_whatever_the_plan(tmp_path: Path):
         setup.fire(400, 100.0)
         setup.wait(0.016)
     times = [t for t, _ in setup.stimulator.sent]
+    assert len(times) > 120, "40 a second go through"
     for time_s in times:
         assert sum(p.charge_uc for t, p in setup.stimulator.sent if time_s <= t < time_s + 1.0) <= 1600.0
 
@@ -180,6 +182,8 @@ def test_whatever_is_asked_nothing_outside_reaches_the_device(tmp_path: Path, as
     for width_us, current_ma, pause_s in asked:
         setup.fire(width_us, current_ma)
         setup.wait(pause_s)
+    setup.wait(1.1)
+    assert setup.fire(250.0) == PulseStatus.UNACKNOWLEDGED, "what is allowed still goes through"
     for _, pulse in setup.stimulator.sent:
         assert 0 < pulse.pulse_width_us <= 250
         assert 0 < pulse.current_ma <= 20

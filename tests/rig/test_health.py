@@ -26,9 +26,8 @@ def test_through_a_rest_the_device_is_fed_at_every_pulses_time(tmp_path: Path):
     assert rig.execute().outcome == "completed"
     assert rig.stimulator.sent == []
     assert len(rig.stimulator.fed_s) == 120
-    fed = rig.stimulator.fed_s[-1]
     rig.gate.feed()  # after the test nothing feeds any more
-    assert rig.stimulator.fed_s[-1] == fed
+    assert len(rig.stimulator.fed_s) == 120
 
 
 @pytest.mark.parametrize("fault", WORDS)
@@ -59,8 +58,9 @@ def test_without_a_proof_nothing_is_fed(tmp_path: Path, fault: str):
     assert result.outcome == "fault"
     assert WORDS[fault] in result.reason
     bound_s = 0.13 if fault in ("torque", "ack") else 0.03
-    assert all(fed_s - at[0] < bound_s for fed_s in rig.stimulator.fed_s)
-    assert all(sent_s - at[0] < bound_s for sent_s, _ in rig.stimulator.sent)
+    assert rig.stimulator.fed_s[-1] - rig.stimulator.fed_s[0] > 0.9, "before the fault it was fed"
+    assert max(rig.stimulator.fed_s) - at[0] < bound_s
+    assert max(sent_s for sent_s, _ in rig.stimulator.sent) - at[0] < bound_s
 
 
 def test_a_pulse_whose_time_passes_while_its_intent_is_written_is_not_sent(tmp_path: Path):

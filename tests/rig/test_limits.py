@@ -29,6 +29,8 @@ def test_no_pulse_outside_passes(width_us: float, current_ma: float, most_us: fl
     profile = Profile(current_ma=most_ma, max_pulse_width_us=most_us)
     table = limits.for_profile(HARD_LIMITS, profile)
     verdict = admit(Pulse(width_us, current_ma), table)
+    inside = 0 <= width_us <= most_us and 0 <= current_ma <= most_ma and width_us * current_ma * 1e-3 <= 40.0
+    assert isinstance(verdict, Admitted) == inside
     if isinstance(verdict, Admitted):
         assert 0 <= verdict.pulse_width_us <= min(most_us, 500)
         assert 0 <= verdict.current_ma <= min(most_ma, 100)
@@ -171,6 +173,11 @@ def test_a_bound_that_leaves_nothing_is_refused_and_says_what_would_do():
         with pytest.raises(RefusedError) as raised:
             narrow()
         assert str(raised.value) == words
+    whole = Profile(max_pulse_width_us=250, current_ma=15, max_torque_nm=9, rest_between_tests_s=30)
+    narrowed = limits.for_profile(HARD_LIMITS, whole)
+    assert {name: row.owner for name, row in narrowed.items() if row != HARD_LIMITS[name]} == dict.fromkeys(
+        ("pulse_width_us", "current_ma", "torque_nm", "rest_between_tests_s"), "participant's profile"
+    )
     gentle = limits.for_plan(HARD_LIMITS, request(Profile(max_torque_nm=0.9), max_torque_nm=0.8))
     assert (gentle["torque_nm"].lo, gentle["torque_nm"].hi) == (-0.8, 0.8)
 

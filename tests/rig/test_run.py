@@ -155,7 +155,7 @@ def test_no_torque_no_test(tmp_path: Path):
     assert rig.stimulator.sent == []
     recording = assembly.assemble(journal.read(rig.path))
     assert recording.names == []
-    assert all(len(column) == 0 for column in recording.columns.values())
+    assert {path: len(column) for path, column in recording.columns.items()} == {p: 0 for p, _, _ in archive.COLUMNS}
 
 
 def test_a_journal_cut_anywhere_seals_what_it_holds(tmp_path: Path):

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from rig.errors import WireError
 from rig.wire import sciencemode2 as wire
-from rig.wire.sciencemode4 import Packet
+from rig.wire.framing import Packet
 
 VECTORS = {
     "InitAck pn0": ("f0 81 7f 81 56 00 02 00 0f", Packet(0, 2, b"\x00")),
@@ -33,9 +33,9 @@ VECTORS = {
 @pytest.mark.parametrize("name", VECTORS)
 def test_vectors_both_ways(name: str):
     frame, packet = bytes.fromhex(VECTORS[name][0]), VECTORS[name][1]
-    assert wire.encode(packet) == frame
-    assert wire.decode(frame) == packet
-    assert list(wire.FrameReader().feed(frame)) == [packet]
+    assert wire.FRAMING.encode(packet) == frame
+    assert wire.FRAMING.decode(frame) == packet
+    assert list(wire.FRAMING.reader().feed(frame)) == [packet]
 
 
 def test_results_are_signed():
@@ -46,7 +46,7 @@ def test_results_are_signed():
 
 
 def test_a_single_pulse_and_what_cannot_be_one():
-    assert wire.single_pulse(9, 0, 300, 24.0) == wire.encode(Packet(9, 36, bytes((0, 1, 44, 24))))
+    assert wire.single_pulse(9, 0, 300, 24.0) == wire.FRAMING.encode(Packet(9, 36, bytes((0, 1, 44, 24))))
     for wrong in ((0, 19, 20), (0, 501, 20), (0, 300, 25), (0, 300, 128), (0, 300, -2), (8, 300, 20), (-1, 300, 20)):
         with pytest.raises(WireError):
             wire.single_pulse(1, *wrong)
@@ -59,8 +59,8 @@ def test_a_single_pulse_and_what_cannot_be_one():
 @given(st.lists(st.tuples(st.integers(0, 255), st.integers(0, 255), st.binary(max_size=40)), max_size=8), st.data())
 def test_any_packets_cut_anywhere_come_back(packets: list[tuple[int, int, bytes]], data: st.DataObject):
     sent = [Packet(*packet) for packet in packets]
-    stream = b"".join(wire.encode(packet) for packet in sent)
-    reader, got = wire.FrameReader(), []
+    stream = b"".join(wire.FRAMING.encode(packet) for packet in sent)
+    reader, got = wire.FRAMING.reader(), []
     while stream:
         n = data.draw(st.integers(1, len(stream)))
         got += list(reader.feed(stream[:n]))
@@ -71,12 +71,19 @@ def test_any_packets_cut_anywhere_come_back(packets: list[tuple[int, int, bytes]
 
 @given(st.binary(max_size=40), st.integers(0, 10), st.integers(1, 255))
 def test_after_damage_the_next_frames_are_found(junk: bytes, at: int, change: int):
-    good = wire.encode(Packet(9, 37, b"\x00"))
-    broken = bytearray(wire.encode(Packet(8, 37, b"\x00\x01\x02")))
+    good = wire.FRAMING.encode(Packet(9, 37, b"\x00"))
+    broken = bytearray(wire.FRAMING.encode(Packet(8, 37, b"\x00\x01\x02")))
     broken[at % len(broken)] ^= change
-    reader = wire.FrameReader()
+    reader = wire.FRAMING.reader()
     got = list(reader.feed(junk + bytes(broken) + good * 30))
     assert got.count(Packet(9, 37, b"\x00")) >= 5
+
+
+def test_a_body_longer_than_its_length_field_is_refused():
+    longest = Packet(1, 36, bytes(253))
+    assert list(wire.FRAMING.reader().feed(wire.FRAMING.encode(longest))) == [longest]
+    with pytest.raises(WireError):
+        wire.FRAMING.encode(Packet(1, 36, bytes(254)))
 
 
 @pytest.mark.parametrize(
@@ -84,4 +91,4 @@ def test_after_damage_the_next_frames_are_found(junk: bytes, at: int, change: in
 )
 def test_what_is_no_frame_is_told(text: str):
     with pytest.raises(WireError):
-        wire.decode(bytes.fromhex(text))
+        wire.FRAMING.decode(bytes.fromhex(text))

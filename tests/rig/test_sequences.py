@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -13,7 +15,9 @@ from rig.sequences import prbs
 
 
 def test_library_is_the_folder():
-    assert set(sequences.library()) == {"multilevel", "prbs", "ramp", "rest", "staircase", "steps", "widths"}
+    files = {path.stem for path in Path(sequences.__file__).parent.glob("*.py")} - {"__init__"}
+    assert set(sequences.library()) == files
+    assert files >= {"multilevel", "prbs", "ramp", "rest", "staircase", "steps", "widths"}
 
 
 @pytest.mark.parametrize("bits", sorted(prbs.FEEDBACK_TAPS))
@@ -79,17 +83,15 @@ def test_widths_are_taken_as_they_are():
     assert list(sequences.build("widths", {"pulse_width_us": [1.5, 0, 200]}, 40.0)) == [1.5, 0.0, 200.0]
 
 
-@given(
-    st.sampled_from(["prbs", "ramp", "multilevel", "staircase", "steps", "rest"]),
-    st.floats(20, 60),
-    st.floats(1, 500),
-)
+@given(st.sampled_from(sorted(set(sequences.library()) - {"widths"})), st.floats(20, 60), st.floats(1, 500))
 def test_every_sequence_stays_between_zero_and_c(name: str, rate_hz: float, c_us: float):
-    settings = {} if name == "rest" else {"max_pulse_width_us": c_us}
+    scaled = "max_pulse_width_us" in sequences.find(name).Settings.model_fields
+    settings = {"max_pulse_width_us": c_us} if scaled else {}
     widths = sequences.build(name, settings, rate_hz)
     assert len(widths) == sequences.pulse_count(name, settings, rate_hz)
     assert widths.dtype == np.float64
     assert np.all((widths >= 0) & (widths <= c_us * (1 + 1e-12)))
+    assert widths.max() > 0.8 * c_us if scaled else widths.max() == 0, "only a rest has no width to scale"
     assert np.array_equal(widths, sequences.build(name, settings, rate_hz))  # pure
 
 

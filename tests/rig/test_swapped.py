@@ -70,7 +70,7 @@ def test_a_p24_that_is_none(what: str):
         device.listen(lambda _: None, lambda _: None)
         with pytest.raises(DeviceError, match=line.port):
             device.open()
-        commands = {packet.command for packet in sciencemode4.FrameReader().feed(line.heard)}
+        commands = {packet.command for packet in sciencemode4.FRAMING.reader().feed(line.heard)}
     asking = {
         sciencemode4.Command.DEVICE_ID, sciencemode4.Command.EXTENDED_VERSION, sciencemode4.Command.STIM_STATUS,
     }  # fmt: skip
@@ -87,7 +87,7 @@ def test_a_rehastim2_that_is_none(what: str, monkeypatch: pytest.MonkeyPatch):
         device.listen(lambda _: None, lambda _: None)
         with pytest.raises(DeviceError, match=line.port):
             device.open()
-        commands = {packet.command for packet in sciencemode2.FrameReader().feed(line.heard)}
+        commands = {packet.command for packet in sciencemode2.FRAMING.reader().feed(line.heard)}
     assert commands == {sciencemode2.Command.GET_MODE}
 
 

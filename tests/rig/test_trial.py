@@ -130,6 +130,8 @@ def test_each_step_is_taken_from_its_own_states_alone(trial: Trial):
 def test_what_each_step_gives():
     assert Trial().connected() == READY
     assert Trial().connected("latched", "why") == LATCHED
+    assert Trial().connected("latched") == Trial("latched", "")
+    assert Trial() == Trial("disconnected", "not connected yet", None, None, latch=False, lost="", calibrating=False)
     assert Trial().connected("running", "died") == UNCERTAIN
     assert READY.start("a", "P") == ARMING
     assert READY.calibrate("P") == CALIBRATING

@@ -1,4 +1,4 @@
-"""A short fault campaign; the whole one is `python -m bench.faults`, its table docs/faults.md."""
+"""A short fault campaign; the whole one is `python -m bench.faults`, its table docs/results/faults.md."""
 
 from __future__ import annotations
 

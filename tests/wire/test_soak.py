@@ -1,4 +1,4 @@
-"""A small part of the soak: `python -m bench.soak --minutes 60` is the whole, docs/soak.md has its figures."""
+"""A small part of the soak: `python -m bench.soak --minutes 60` is the whole, docs/results/soak.md has its figures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The fault campaign: each fault, in each phase of a test, on several seeds; the table goes to docs/faults.md."""
+"""The fault campaign: each fault in each phase of a test, on several seeds; docs/results/faults.md holds its table."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.harness.campaign.table import table
 from tests.harness.campaign.worker import Worker
 
 ROOT = Path(__file__).parents[3]
-DOCUMENT = ROOT / "docs" / "faults.md"
+DOCUMENT = ROOT / "docs" / "results" / "faults.md"
 OUT = ROOT / "var" / "faults.jsonl"
 BEGIN, END = "<!-- campaign: begin, written by python -m bench.faults -->", "<!-- campaign: end -->"
 SHORT = 24

@@ -1,4 +1,4 @@
-"""The table of a fault campaign, for docs/faults.md."""
+"""The table of a fault campaign, for docs/results/faults.md."""
 
 from __future__ import annotations
 

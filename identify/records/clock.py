@@ -1,0 +1,213 @@
+"""Times of samples as a uniform rate: freed of rounding and jitter, resampled where they are truly uneven.
+
+Lost samples and pauses stay gaps: a record has no rows there. What was done is said in notes, unless nothing but the
+rounding of the written times was taken away.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from identify.errors import BadRecord
+from identify.records import bounds
+from identify.records.pulse_slots import width_in_slots
+
+PAUSE_S = 1.0
+"""A jump of the clock as long as this, at zero pulse width, is a pause between two tests."""
+MOST_PAUSES = 1000
+LEAST_SAMPLES = 8
+MOST_GAPS = 0.1
+"""Share of the samples before which samples are missing, at most."""
+NEAR = 0.75
+"""Share of a step by which an even sample's time stamp may be off."""
+SILENT = 0.1
+"""Share of a step up to which jitter is not worth a word."""
+GAP_STEPS = 3.0
+"""Longer than so many usual steps is a gap where time stamps are uneven."""
+BETTER = 0.98
+"""The time stamps are taken as they are where torque is smoother over them by so much (mean square)."""
+SAME_RATE = 0.002
+INTERPOLATED = ("torque_nm", "angle_rad", "velocity_rad_s")
+Columns = dict[str, np.ndarray]
+At = Callable[[int], str]
+
+
+@dataclass(frozen=True)
+class _Part:
+    """One stretch between two pauses: its even times, or None where it is to be resampled; and its step, s."""
+
+    even_s: np.ndarray | None
+    step_s: float
+    lost: np.ndarray
+    """Rows before which samples are missing."""
+    jitter_s: float = 0.0
+
+
+def regular(columns: Columns, at: At, pulse_rate_hz: float) -> tuple[Columns, list[str]]:
+    """Columns with uniform times, and what of it was assumed.
+
+    Parameters
+    ----------
+    columns : dict of ndarray, shape (N,)
+        `time_s`, `pulse_width_us`, `torque_nm`, and any others, by row.
+    at : callable
+        How messages call a row.
+    pulse_rate_hz : float
+        Pulses a second: when a record is resampled its pulses stay where they were.
+
+    Raises
+    ------
+    BadRecord
+        Time does not rise, too few samples, or a rate that can't be used.
+    """
+    time_s, notes = _finer(columns["time_s"])
+    columns = columns | {"time_s": time_s}
+    _check_rising(time_s, at)
+    edges = _pauses(time_s, columns["pulse_width_us"], at)
+    parts = [_part(time_s[a:b], columns["torque_nm"][a:b], a, at) for a, b in pairwise(edges)]
+    step_s = parts[0].step_s
+    for part, edge in zip(parts, edges, strict=False):
+        bounds.check_sampling(1 / part.step_s, at(edge))
+        if abs(part.step_s - step_s) > SAME_RATE * step_s:
+            raise BadRecord(
+                f"sampled at {1 / part.step_s:.4g} Hz after a pause, {1 / step_s:.4g} Hz before it",
+                place=at(edge),
+                mend="Resample to one rate.",
+            )
+    even = [part.even_s for part in parts if part.even_s is not None]
+    if len(even) < len(parts):
+        return _resampled(columns, step_s, at, pulse_rate_hz)
+    notes += _jitter_note(parts) + _lost_note(np.concatenate([part.lost for part in parts]), time_s, at)
+    return columns | {"time_s": np.concatenate(even)}, notes
+
+
+def _check_rising(time_s: np.ndarray, at: At) -> None:
+    if time_s.size < LEAST_SAMPLES:
+        raise BadRecord(f"only {time_s.size} samples", place=at(0), mend="Give a few seconds of data.")
+    gaps = np.diff(time_s)
+    backwards = np.flatnonzero(~(gaps > 0))
+    if backwards.size:
+        index = int(backwards[0]) + 1
+        verb = "stands still" if gaps[index - 1] == 0 else "runs backwards"
+        mend = "Sort the rows by time, once each."
+        raise BadRecord(f"time {verb} at {time_s[index]:g} s", place=at(index), mend=mend)
+
+
+def _finer(time_s: np.ndarray) -> tuple[np.ndarray, list[str]]:
+    """Even times where the stamps are only too coarsely rounded for the samples, so that some are equal."""
+    if not np.any(np.diff(time_s) == 0):
+        return time_s, []
+    line_s = np.linspace(time_s[0], time_s[-1], time_s.size)
+    line_s += 0.5 * (np.max(time_s - line_s) + np.min(time_s - line_s))
+    coarse_s = _resolution_s(time_s)
+    if not 0.0 < np.max(np.abs(time_s - line_s)) <= NEAR * coarse_s or time_s[-1] <= time_s[0]:
+        return time_s, []
+    rate_hz = (time_s.size - 1) / (line_s[-1] - line_s[0])
+    return line_s, [f"times are written to {1e3 * coarse_s:g} ms only: samples are taken as even, at {rate_hz:.5g} Hz"]
+
+
+def _pauses(time_s: np.ndarray, width_us: np.ndarray, at: At) -> list[int]:
+    """Rows at which a part begins, and the number of rows: tests of one session may follow after a pause at rest."""
+    steps = np.diff(time_s)
+    least_s = max(PAUSE_S, 20 * float(np.median(steps)))
+    jumps = np.flatnonzero((steps >= least_s) & (width_us[:-1] == 0) & (width_us[1:] == 0)) + 1
+    if jumps.size > MOST_PAUSES:
+        mend = "Give a record without holes."
+        raise BadRecord(f"more than {MOST_PAUSES} pauses", place=at(int(jumps[MOST_PAUSES])), mend=mend)
+    return [0, *jumps.tolist(), time_s.size]
+
+
+def _part(time_s: np.ndarray, torque_nm: np.ndarray, first: int, at: At) -> _Part:
+    if time_s.size < LEAST_SAMPLES:
+        raise BadRecord(f"only {time_s.size} samples", place=at(first), mend="Give a few seconds of data.")
+    gaps = np.diff(time_s)
+    typical_s = float(np.median(gaps))
+    near = np.abs(gaps - typical_s) <= NEAR * typical_s
+    mean_s = float(np.mean(gaps[near])) if near.any() else typical_s
+    counts = np.where(near, 1.0, np.maximum(np.rint(gaps / mean_s), 1.0))
+    index = np.concatenate([[0.0], np.cumsum(counts)])
+    slope_s = float(time_s[-1] - time_s[0]) / index[-1]
+    line_s = time_s[0] + slope_s * index
+    # Rounding shifts all times alike: centre the line on the times that were written.
+    line_s += float(np.median(time_s - line_s))
+    jitter_s = float(np.max(np.abs(time_s - line_s)))
+    lost = first + np.flatnonzero(counts > 1.5) + 1
+    if jitter_s <= NEAR * slope_s:
+        if jitter_s <= max(SILENT * slope_s, 0.6 * _resolution_s(time_s)):
+            return _Part(line_s, slope_s, lost)
+        slope_s, start_s = np.polyfit(index, time_s, 1)
+        line_s, slope_s = start_s + slope_s * index, float(slope_s)
+        if _roughness(time_s, torque_nm) > BETTER * _roughness(line_s, torque_nm):
+            return _Part(line_s, slope_s, lost, jitter_s)
+    return _Part(None, _usual_step_s(gaps, typical_s), lost)
+
+
+def _usual_step_s(gaps: np.ndarray, typical_s: float) -> float:
+    return float(np.mean(gaps[gaps <= GAP_STEPS * typical_s]))
+
+
+def _resolution_s(time_s: np.ndarray) -> float:
+    """What the last decimal place of the written times is worth, s."""
+    some = time_s[:: max(time_s.size // 1000, 1)]
+    for places in range(7):
+        if np.all(np.abs(some * 10**places - np.rint(some * 10**places)) < 1e-4):
+            return 10.0**-places
+    return 0.0
+
+
+def _roughness(time_s: np.ndarray, torque_nm: np.ndarray) -> float:
+    """Mean square by which a sample's torque is off the line between its neighbours, as a share of the noise in it."""
+    ahead = (time_s[1:-1] - time_s[:-2]) / (time_s[2:] - time_s[:-2])
+    error = torque_nm[1:-1] - (1.0 - ahead) * torque_nm[:-2] - ahead * torque_nm[2:]
+    return float(np.mean(error**2 / (1.0 + ahead**2 + (1.0 - ahead) ** 2)))
+
+
+def _jitter_note(parts: list[_Part]) -> list[str]:
+    worst = max(parts, key=lambda part: part.jitter_s)
+    if not worst.jitter_s:
+        return []
+    return [
+        f"time stamps jitter by up to {1e3 * worst.jitter_s:.3g} ms: samples are taken as even, at "
+        f"{1 / worst.step_s:.5g} Hz, which suits the torque better"
+    ]
+
+
+def _lost_note(rows: np.ndarray, time_s: np.ndarray, at: At) -> list[str]:
+    if not rows.size:
+        return []
+    if rows.size > max(MOST_PAUSES, MOST_GAPS * time_s.size):
+        place = at(int(rows[MOST_PAUSES]))
+        raise BadRecord(f"{rows.size} gaps in {time_s.size} samples", place=place, mend="Give a record without holes.")
+    longest_s = float(np.max(time_s[rows] - time_s[rows - 1]))
+    places = "1 place" if rows.size == 1 else f"{rows.size} places"
+    return [f"samples are missing at {places} (first at {at(int(rows[0]))}; longest {longest_s:.3g} s): left as gaps"]
+
+
+def _resampled(columns: Columns, step_s: float, at: At, pulse_rate_hz: float) -> tuple[Columns, list[str]]:
+    """Columns at a uniform rate: torque and movement on straight lines between samples, gaps left open."""
+    time_s = columns["time_s"]
+    steps = np.diff(time_s)
+    gaps = np.flatnonzero(steps > GAP_STEPS * np.median(steps)) + 1
+    starts, ends = np.append(0, gaps), np.append(gaps, time_s.size) - 1
+    first = np.ceil((time_s[starts] - time_s[0]) / step_s - 1e-6).astype(np.int64)
+    count = np.maximum(np.floor((time_s[ends] - time_s[0]) / step_s + 1e-6).astype(np.int64) - first + 1, 0)
+    index = np.repeat(first - np.cumsum(count) + count, count) + np.arange(int(count.sum()))
+    even_s = time_s[0] + step_s * index
+    before = np.clip(np.searchsorted(time_s, even_s + 1e-6 * step_s, side="right") - 1, 0, time_s.size - 2)
+    share = np.clip((even_s - time_s[before]) / steps[before], 0.0, 1.0)
+    found = {
+        name: (1.0 - share) * column[before] + share * column[before + 1] if name in INTERPOLATED else column[before]
+        for name, column in columns.items()
+    }
+    width_us = width_in_slots(time_s, columns["pulse_width_us"], even_s, before, pulse_rate_hz)
+    found |= {"time_s": even_s, "pulse_width_us": width_us}
+    usual = steps[steps <= GAP_STEPS * np.median(steps)]
+    note = (
+        f"uneven time stamps (steps of {1e3 * usual.min():.3g} to {1e3 * usual.max():.3g} ms): resampled to "
+        f"{1 / step_s:.5g} Hz, torque on straight lines between samples"
+    )
+    return found, [note, *_lost_note(gaps, time_s, at)]

@@ -1,0 +1,245 @@
+"""Which column of another tool's file is which: as `--map` says, else by its name and the unit that stands there.
+
+A unit is never guessed: a column whose name is known and whose unit is not is refused with the `--map` that would do.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+from identify.errors import BadRecord
+from identify.records import units
+from identify.records.record import OPTIONAL
+
+NEEDED = ("time_s", "pulse_width_us", "torque_nm")
+MAY_LACK = (*NEEDED, "angle_rad", "velocity_rad_s")
+"""Columns in which a number may be missing: a row without one is left out."""
+TARGETS = (*NEEDED, "segment", *OPTIONAL)
+NAMES = {
+    "time_s": "time t timestamp elapsed_time zeit temps tiempo tempo",
+    "pulse_width_us": "pulse_width pulsewidth pw pulse_duration pulse_length stim_pw pulsbreite impulsbreite pulsdauer",
+    "torque_nm": "torque moment joint_torque elbow_torque drehmoment couple",
+    "angle_rad": "angle joint_angle elbow_angle winkel gelenkwinkel",
+    "velocity_rad_s": "velocity angular_velocity joint_velocity speed winkelgeschwindigkeit",
+    "segment": "segment segments",
+}
+"""Names under which other tools write a column, in lower case."""
+_KNOWN = {name: target for target, names in NAMES.items() for name in names.split()}
+_BRACKETS = re.compile(r"^(.*?)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\)|/\s*([^\s/]+))\s*$")
+MOST_SHOWN = 12
+LONGEST_SHOWN = 40
+LONGEST_NAME = 100
+
+
+@dataclass(frozen=True)
+class Asked:
+    """One `--map`: the column that is meant, and its unit where one was given after the last colon."""
+
+    target: str
+    text: str
+
+    @property
+    def name(self) -> str:
+        """The column's name without the unit."""
+        return self.text.rpartition(":")[0] if self.unit else self.text
+
+    @property
+    def unit(self) -> str:
+        """What stands after the last colon; empty without one."""
+        return self.text.rpartition(":")[2].strip() if ":" in self.text else ""
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column that was found: where it stands, by what its numbers are multiplied, and what of it was assumed."""
+
+    index: int
+    factor: float = 1.0
+    note: str = ""
+
+
+Given = Mapping[str, Asked]
+
+
+def parsed(given: Mapping[str, str] | Iterable[str] | None) -> Given:
+    """What `--map` says, by target: a mapping, or texts `target=name` or `target=name:unit`.
+
+    Raises
+    ------
+    BadRecord
+        No such target, no name, or one target twice.
+    """
+    if given is None:
+        return {}
+    pairs = list(given.items()) if isinstance(given, Mapping) else [_pair(text) for text in _texts(given)]
+    found: dict[str, Asked] = {}
+    for target, text in pairs:
+        if target not in TARGETS:
+            mend = f"Give one of {', '.join(TARGETS)}, for instance --map torque_nm=Moment:Nm."
+            raise BadRecord(f"no column is called {_short(target)!r}", place="--map", mend=mend)
+        if target in found:
+            raise BadRecord(f"{target} is given twice", place="--map", mend="Give each column once.")
+        if not str(text).strip():
+            raise BadRecord(f"no name for {target}", place="--map", mend=f"Give --map {target}=NAME:UNIT.")
+        found[target] = Asked(target, str(text).strip())
+    return found
+
+
+def _texts(given: Iterable[str]) -> list[str]:
+    return [given] if isinstance(given, str) else list(given)
+
+
+def _pair(text: str) -> tuple[str, str]:
+    target, equals, name = text.partition("=")
+    if not equals:
+        mend = "Give TARGET=NAME:UNIT, for instance --map torque_nm=Moment:Nm."
+        raise BadRecord(f"{_short(text)!r} has no '='", place="--map", mend=mend)
+    return target.strip(), name
+
+
+def places(header: Sequence[str], given: Given) -> dict[str, list[int]]:
+    """For each column the cells of a header that may be it: as asked, else of its own name, else of a known name."""
+    plain = [cell.strip() for cell in header]
+    known = [_known_as(cell) for cell in plain]
+    found: dict[str, list[int]] = {}
+    for target in TARGETS:
+        if target in given:
+            found[target] = _asked_for(plain, given[target])
+        elif not (exact := [index for index, cell in enumerate(plain) if cell == target]):
+            named = [index for index, name in enumerate(known) if name == target]
+            with_unit = [index for index in named if _split(plain[index], target)[1]]
+            found[target] = with_unit if len(with_unit) == 1 else named
+        else:
+            found[target] = exact
+    return {target: indices for target, indices in found.items() if indices}
+
+
+def complete(found: Mapping[str, list[int]]) -> bool:
+    """Whether a header has all that a record needs."""
+    return all(target in found for target in NEEDED)
+
+
+def columns(header: Sequence[str], given: Given, units_row: Sequence[str], place: str) -> dict[str, Column]:
+    """The columns of a header with their units; `units_row` is a row of units below it, empty without one.
+
+    Raises
+    ------
+    BadRecord
+        A column is missing, there twice, or of a unit that is unknown; with the `--map` that would do.
+    """
+    plain = [cell.strip() for cell in header]
+    found = places(plain, given)
+    missing = [target for target in (*NEEDED, *given) if target not in found]
+    if missing:
+        raise _missing(plain, missing, given, place)
+    columns: dict[str, Column] = {}
+    for target, indices in found.items():
+        if len(indices) > 1:
+            raise _twice(plain, target, indices, place)
+        index = indices[0]
+        below = units_row[index].strip() if index < len(units_row) else ""
+        if plain[index] == target and target not in given and not below:
+            columns[target] = Column(index)
+        elif (column := _with_unit(plain[index], target, index, below, given.get(target), place)) is not None:
+            columns[target] = column
+    return columns
+
+
+def _with_unit(name: str, target: str, index: int, below: str, asked: Asked | None, place: str) -> Column | None:
+    """A column in its unit; None where nobody asked for it and its unit is not said."""
+    if target == "segment":
+        return Column(index, note="" if asked else f"segment is column {_short(name)!r}")
+    wanted = asked.unit if asked is not None and not _is(name, asked.text) else ""
+    written = below or _split(name, target)[1]
+    unit = wanted or written
+    if not unit and name == target:
+        return Column(index)
+    if not unit and asked is not None:
+        own = units.SHOWN.get(target, ("1",))[0]
+        return Column(index, note=f"{target} is {_short(name)!r}, taken in {own} as no unit is given")
+    if not unit and target not in NEEDED:
+        return None
+    factor = units.factor(target, unit) if unit else None
+    if factor is None or (name == target and not wanted and factor != 1.0):
+        raise _unit(name, target, unit, place)
+    if not wanted:
+        return Column(index, factor, "" if name == target else f"{target} is {_short(name)!r} in {_short(unit)}")
+    if written and units.factor(target, written) not in (None, factor):
+        return Column(index, factor, f"{target} is taken in {unit} as --map says; its name says {_short(written)}")
+    return Column(index, factor)
+
+
+def _split(cell: str, target: str = "") -> tuple[str, str]:
+    """A header's cell as name and unit: 'Torque [mNm]', 'Torque (mNm)', 'Torque / mNm', 'torque_mnm'."""
+    if cell == target:
+        return cell, ""
+    if match := _BRACKETS.match(cell[:LONGEST_NAME]):
+        return match[1].strip(), next(text for text in match.groups()[1:] if text is not None).strip()
+    for known in (target,) if target else units.UNITS:
+        for tail in sorted(units.UNITS[known], key=len, reverse=True):
+            ending = "_" + tail.replace("/", "_")
+            if cell.lower().endswith(ending) and (target or _KNOWN.get(_name(cell[: -len(ending)])) == known):
+                return cell[: -len(ending)], tail
+    return cell, ""
+
+
+def _name(text: str) -> str:
+    return re.sub(r"[\s_\-.]+", "_", text.strip().lower()).strip("_")
+
+
+def _known_as(cell: str) -> str:
+    """The column that a cell names, by the names that other tools use; empty where none."""
+    return _KNOWN.get(_name(_split(cell)[0]), "") if len(cell) <= LONGEST_NAME else ""
+
+
+def _is(cell: str, name: str) -> bool:
+    return cell == name.strip() or _name(cell) == _name(name)
+
+
+def _asked_for(cells: Sequence[str], asked: Asked) -> list[int]:
+    """The cells that `--map` means: by number (#3), by the whole name, else by the name without its unit."""
+    for name in dict.fromkeys((asked.text, asked.name)):
+        if re.fullmatch(r"#\d{1,4}", name) and 0 < int(name[1:]) <= len(cells):
+            return [int(name[1:]) - 1]
+        for same in (cells, [_split(cell, asked.target)[0] for cell in cells]):
+            if found := [index for index, cell in enumerate(same) if cell == name]:
+                return found
+            if found := [index for index, cell in enumerate(same) if _is(cell, name)]:
+                return found
+    return []
+
+
+def _missing(cells: Sequence[str], missing: Sequence[str], given: Given, place: str) -> BadRecord:
+    here = ", ".join(_short(cell) for cell in cells[:MOST_SHOWN] if cell) + (", …" if len(cells) > MOST_SHOWN else "")
+    if asked := next((given[target] for target in missing if target in given), None):
+        return BadRecord(f"no column {_short(asked.text)!r} for {asked.target}", place=place, mend=f"It has: {here}.")
+    target = missing[0]
+    unit = units.SHOWN[target][0]
+    mend = f"Say which it is, for instance --map {target}=NAME:{unit}; it has: {here}."
+    return BadRecord(f"no column {', '.join(missing)}", place=place, mend=mend)
+
+
+def _twice(cells: Sequence[str], target: str, indices: Sequence[int], place: str) -> BadRecord:
+    first, second = (cells[index] for index in indices[:2])
+    if first == second:
+        return BadRecord(f"column {_short(first)} is there twice", place=place, mend="Keep one of them.")
+    mend = f"Say which, for instance --map {target}={_short(first)}."
+    return BadRecord(f"{target} may be {_short(first)!r} or {_short(second)!r}", place=place, mend=mend)
+
+
+def _unit(name: str, target: str, unit: str, place: str) -> BadRecord:
+    known = units.SHOWN.get(target, ("1",))
+    shown = _short(_split(name, target)[0] or name)
+    mend = f"Give --map {target}={shown}:{known[0]}" + (f" (or {', '.join(known[1:])})." if known[1:] else ".")
+    if target == "torque_nm" and units.plain(unit) in ("n", "kg", "kn", "v", "mv"):
+        mend = "Torque is asked for: multiply by the lever arm or the sensor's scale first."
+    said = f"its unit {_short(unit)!r} is not known" if unit else "its unit is not said"
+    if unit and units.factor(target, unit) is not None:
+        said = f"below it stands {_short(unit)!r}"
+    return BadRecord(f"column {_short(name)!r} is taken for {target}, but {said}", place=place, mend=mend)
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]}…"

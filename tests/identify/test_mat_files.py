@@ -1,0 +1,258 @@
+"""MAT files in and out: written and read by scipy, an implementation apart; and files made to break a reader."""
+
+from __future__ import annotations
+
+import io
+import random
+import struct
+import tracemalloc
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.io import loadmat, savemat
+
+import identify
+from identify import plain_mat
+from identify.records.mat_file import BadMat, variables
+from identify.records.record import Record
+from tests.harness.patients import Patient, make_record
+
+
+@pytest.fixture(scope="module")
+def record() -> Record:
+    return make_record(Patient(), np.random.default_rng(3), rate_hz=100, noise_nm=0.05)[0]
+
+
+def columns(record: Record) -> dict[str, Any]:
+    names = np.array(record.segment_names, object)[record.segment]
+    return {
+        "time_s": record.time_s,
+        "pulse_width_us": record.pulse_width_us,
+        "torque_nm": record.torque_nm,
+        "segment": names,
+    }
+
+
+def saved(path: Path, content: dict[str, Any], **how: Any) -> Path:
+    savemat(path, content, **how)
+    return path
+
+
+def ways(record: Record) -> dict[str, tuple[dict[str, Any], dict[str, str] | None, dict[str, Any]]]:
+    plain = columns(record)
+    with_more = plain | {
+        "comment": "a Monday",
+        "raw": np.ones((3, 4, 5)),
+        "z": 1j,
+        "many": np.full((2, 2), 1.0, object),
+    }
+    own = {"t": record.time_s * 1e3, "pw": record.pulse_width_us * 1e-6, "M": record.torque_nm * 1e3}
+    rows = np.array(plain["segment"], "U")
+    return {
+        "variables": (plain, None, {}),
+        "packed, in rows, beside others": (with_more, None, {"do_compression": True, "oned_as": "row"}),
+        "a struct": ({"record": plain, "fs": 100.0}, None, {"do_compression": True}),
+        "a struct, unpacked": ({"x": 3, "record": plain}, None, {}),
+        "names and units of their own": (
+            own | {"part": rows}, {"time_s": "t:ms", "pulse_width_us": "pw:s", "torque_nm": "M:mNm", "segment": "part"},
+            {"do_compression": True},
+        ),
+        "own names in a struct": (
+            {"d": own | {"part": rows}},
+            {"time_s": "d.t:ms", "pulse_width_us": "pw:s", "torque_nm": "d.M:mNm", "segment": "d.part"}, {},
+        ),
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("way", range(6))
+def test_the_same_data_give_the_same_record(tmp_path: Path, record: Record, way: int) -> None:
+    content, given, how = list(ways(record).values())[way]
+    found = identify.read(saved(tmp_path / "data.mat", content, **how), map=given)
+    assert found.segment_names == record.segment_names and np.array_equal(found.segment, record.segment)
+    for name in ("time_s", "pulse_width_us", "torque_nm"):
+        assert getattr(found, name) == pytest.approx(getattr(record, name), rel=1e-12, abs=1e-9), name
+    assert found.notes == () and len(found.source.sha256) == 64
+
+
+def test_numbers_of_every_kind_are_read_as_scipy_reads_them(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    content: dict[str, Any] = {
+        kind: rng.integers(0, 100, 50).astype(kind) for kind in ("i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4")
+    }
+    content |= {"f8": rng.standard_normal(50), "logical": rng.random(50) > 0.5, "one": 3.5, "none": np.zeros((0, 0))}
+    for packed in (False, True):
+        path = saved(tmp_path / "data.mat", content, do_compression=packed)
+        found, theirs = variables(path.read_bytes(), "f"), loadmat(path)
+        for name in content:
+            assert np.array_equal(found[name].numbers(), np.ravel(theirs[name]).astype(float)), name
+
+
+def test_no_segments_a_pulse_rate_and_holes(tmp_path: Path, record: Record) -> None:
+    content = columns(record) | {"pulse_rate_hz": 40.0}
+    del content["segment"]
+    content["torque_nm"] = content["torque_nm"].copy()
+    content["torque_nm"][10] = np.nan
+    path = saved(tmp_path / "data.mat", content)
+    found = identify.read(path)
+    assert found.time_s.size == record.time_s.size - 1
+    assert f"(first at {path}, torque_nm(11))" in found.notes[0]
+    assert "no segment column: found from the pulse widths" in found.notes[-1]
+
+
+def test_a_model_and_its_prediction_open_in_other_tools(tmp_path: Path, record: Record) -> None:
+    model = identify.fit(record)
+    plain_mat.write(tmp_path / "MODEL.mat", model.to_dict())
+    theirs = loadmat(tmp_path / "MODEL.mat", squeeze_me=True, struct_as_record=False)
+    linear, curve = theirs["linear"], theirs["recruitment"]
+    assert np.array_equal(linear.b, model.to_dict()["linear"]["b"])
+    assert np.array_equal(curve.torque_nm, model.to_dict()["recruitment"]["torque_nm"])
+    assert theirs["model_id"] == model.model_id and theirs["fit"].fit_percent == model.fit["fit_percent"]
+    plain_mat.write(tmp_path / "p.mat", columns(record) | {"predicted_torque_nm": identify.predict(model, record)})
+    again = identify.read(tmp_path / "p.mat")
+    assert np.array_equal(again.torque_nm, record.torque_nm) and again.segment_names == record.segment_names
+
+
+# ---- what cannot be taken ------------------------------------------------------------------------------------
+
+
+def told(path: Path) -> str:
+    """The line in which a file is refused; empty where it is taken."""
+    try:
+        identify.read(path)
+    except identify.IdentifyError as error:
+        assert "\n" not in str(error) and str(path) in str(error) and len(str(error)) < 500
+        return str(error)
+    return ""
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"torque_nm": np.ones((40, 40))}, r"torque_nm: 40×40 numbers\. Give one row or column"),
+        ({"torque_nm": np.ones(7)}, r"torque_nm: 7 numbers, and time_s has 1600\. Give one for each sample"),
+        ({"torque_nm": np.ones(1600) * 1j}, r"torque_nm: complex numbers"),
+        ({"torque_nm": "strong"}, r"torque_nm: no numbers\. Turn it into plain numbers"),
+        ({"torque_nm": np.full(1600, np.inf)}, r"torque_nm\(1\): inf is no measurement"),
+        ({"segment": np.array(["a", 3.0], object)}, r"segment: a cell array with something in it\. Give texts only"),
+        ({"segment": np.array(["a", "b"], object)}, r"segment: 2 names for 1600 samples"),
+        ({"segment": ""}, "segment: 0 names for 1600 samples"),
+        ({"pulse_rate_hz": 4e4}, "pulse_rate_hz: 40000 pulses a second"),
+        ({"time_s": np.arange(1600.0) * 10}, "sampled at 0.1 Hz"),
+        ({"torque_nm": None}, r"no column torque_nm\. Say which it is, for instance --map torque_nm=NAME:Nm"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_taken_is_one_line(tmp_path: Path, change: dict[str, Any], says: str) -> None:
+    size = 1600
+    content: dict[str, Any] = {
+        "time_s": np.arange(size) / 100, "pulse_width_us": 100.0 * (np.arange(size) // 50 % 2),
+        "torque_nm": np.zeros(size),
+    }  # fmt: skip
+    content = {name: value for name, value in (content | change).items() if value is not None}
+    with pytest.raises(identify.BadRecord, match=says):
+        identify.read(saved(tmp_path / "data.mat", content))
+    assert told(tmp_path / "data.mat")
+
+
+def test_other_versions_are_refused_with_what_to_do(tmp_path: Path) -> None:
+    old = saved(tmp_path / "old.mat", {"time_s": np.arange(9.0)}, format="4")
+    assert "no MAT file of version 5 to 7. Save plain columns" in told(old)
+    new = tmp_path / "new.mat"
+    new.write_bytes(
+        b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM" + bytes(384) + b"\x89HDF\r\n\x1a\n"
+    )
+    assert "a MAT file of version 7.3. Save plain columns" in told(new) and "'-v7'" in told(new)
+    nothing = tmp_path / "nothing.mat"
+    nothing.write_bytes(b"")
+    assert told(nothing)
+
+
+def matrix(kind: int, dims: tuple[int, ...], name: bytes, rest: bytes = b"") -> bytes:
+    """A variable by hand, as declared and no more."""
+
+    def element(tag: int, data: bytes) -> bytes:
+        return struct.pack("<II", tag, len(data)) + data + bytes(-len(data) % 8)
+
+    head = element(6, struct.pack("<II", kind, 0)) + element(5, struct.pack(f"<{len(dims)}i", *dims)) + element(1, name)
+    return element(14, head + rest)
+
+
+def names_of_fields(length: int, names: bytes) -> bytes:
+    return struct.pack("<IIII", 5, 4, length, 0) + struct.pack("<II", 1, len(names)) + names
+
+
+HEAD = b"MATLAB 5.0 MAT-file".ljust(124) + b"\x00\x01IM"
+
+
+def packed(data: bytes) -> bytes:
+    body = zlib.compress(data)
+    return struct.pack("<II", 15, len(body)) + body
+
+
+def weapons() -> dict[str, bytes]:
+    """Files that declare, unpack to or hold what no record holds, each with a variable where the time should be."""
+    huge = (2_000_000_000, 1)
+    others = b"".join(
+        matrix(6, (1, 1), name, struct.pack("<IId", 9, 8, 1.0)) for name in (b"pulse_width_us", b"torque_nm")
+    )
+    time = {
+        "a terabyte of numbers": matrix(6, huge, b"time_s", struct.pack("<II", 9, 2**31)),
+        "numbers that are not there": matrix(6, (1_000_000, 1), b"time_s", struct.pack("<IId", 9, 8, 1.0)),
+        "a terabyte of cells": matrix(1, huge, b"time_s"),
+        "a bomb": packed(matrix(6, (1_000_000, 1), b"time_s", struct.pack("<II", 9, 8_000_000) + bytes(60_000_000))),
+        "a bomb in a text": packed(matrix(4, (1, 9), b"time_s", bytes(60_000_000))),
+        "a function handle": matrix(16, (1, 1), b"time_s", matrix(2, (1, 1), b"")),
+        "an object": matrix(3, (1, 1), b"time_s", matrix(2, (1, 1), b"")),
+        "a table": matrix(17, (1, 1), b"time_s"),
+        "a sparse matrix": matrix(5, (1000, 1), b"time_s"),
+        "dimensions below zero": matrix(6, (-1, 5), b"time_s"),
+        "no dimensions": matrix(6, (), b"time_s"),
+        "a hundred dimensions": matrix(6, (1,) * 100, b"time_s"),
+        "a name of a megabyte": matrix(6, (1, 1), b"t" * 1_000_000),
+        "a struct of a million fields": matrix(2, (1, 1), b"s", names_of_fields(1, b"t" * 10**6)),
+        "a struct with names of no length": matrix(2, (1, 1), b"s", names_of_fields(0, bytes(8))),
+        "a million variables": matrix(6, (0, 0), b"t") * 20_000,
+        "a packed pack": packed(packed(matrix(6, (1, 1), b"time_s"))),
+        "half a variable": matrix(6, (1, 1), b"time_s")[:-9],
+        "nothing": b"",
+        "zeros": bytes(1_000_000),
+    }  # fmt: skip
+    found = {name: HEAD + others + content for name, content in time.items()}
+    distinct = b"".join(matrix(6, (0, 0), b"t%d" % k) for k in range(20_000))
+    return found | {"many variables": HEAD + distinct}
+
+
+@pytest.mark.parametrize("weapon", weapons())
+def test_files_as_weapons_are_refused_in_one_line_and_little_memory(tmp_path: Path, weapon: str) -> None:
+    path = tmp_path / "data.mat"
+    path.write_bytes(weapons()[weapon])
+    tracemalloc.start()
+    try:
+        assert told(path)
+        assert tracemalloc.get_traced_memory()[1] < 40_000_000
+    finally:
+        tracemalloc.stop()
+
+
+def test_files_with_bytes_changed_or_cut_are_answered(tmp_path: Path, record: Record) -> None:
+    rng, path = random.Random(7), tmp_path / "data.mat"
+    answers = []
+    for packed_too in (False, True):
+        target = io.BytesIO()
+        savemat(target, {"r": columns(record.take(np.arange(300)))}, do_compression=packed_too)
+        good = target.getvalue()
+        for _ in range(150):
+            content = bytearray(good)
+            for _ in range(rng.randrange(1, 4)):
+                content[rng.randrange(128, min(len(content), 2000))] = rng.randrange(256)
+            path.write_bytes(content[: rng.choice([len(content), rng.randrange(len(content))])])
+            answers.append(told(path))
+    assert any(answers) and not all(answers)
+
+
+def test_what_is_declared_is_not_believed() -> None:
+    content = HEAD + matrix(6, (3, 1), b"x", struct.pack("<II", 9, 16) + bytes(16))
+    with pytest.raises(BadMat, match="declared and not there"):
+        variables(content, "f")["x"].numbers()

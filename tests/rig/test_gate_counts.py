@@ -1,0 +1,291 @@
+"""The gate's books: what it counts, what it writes into the journal, and what it says when asked."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from rig import journal as jn
+from rig import limits
+from rig.clock import VirtualClock
+from rig.errors import DeviceError
+from rig.gate import Gate
+from rig.journal import Journal, Kind
+from rig.messages import Profile
+from rig.signals import Ack, Pulse, PulseStatus
+from tests.rig.fakes import FakeStimulator
+from tests.rig.test_gate import Setup
+
+T0_S = 1000.0
+"""Where the virtual clock begins."""
+
+
+def blocks(setup: Setup, kind: Kind) -> list[bytes]:
+    return [payload for found, payload in jn.read(setup.path).blocks if found == kind]
+
+
+def test_a_new_gate_is_shut_and_empty():
+    clock = VirtualClock()
+    stimulator = FakeStimulator(clock)
+    lost: list[str] = []
+    gate = Gate(stimulator, clock, lambda _: None, lost.append)
+    assert gate.is_open is False
+    assert (gate.on_its_way, gate.last_pulse_s) == (None, None)
+    assert (gate.lateness_s, gate.ack_delay_s, gate.charge_uc, gate.dropped) == ([], [], 0.0, 0)
+    assert gate.still_possible() == ""
+    assert gate.fire(0, Pulse(100, 20), clock.now_s(), clock.now_s()) == PulseStatus.REFUSED
+    stimulator.on_ack(Ack(1, clock.now_s()))  # of whoever used the device before
+    stimulator.on_lost("unplugged")
+    assert lost == ["unplugged"]
+
+
+def test_a_reset_forgets_the_test_before(tmp_path: Path):
+    setup = Setup(tmp_path)
+    setup.fire(100)
+    setup.wait(0.001)
+    setup.fire(100)
+    assert (setup.gate.charge_uc, setup.gate.dropped) == (2.0, 1)
+    assert setup.gate.last_pulse_s == pytest.approx(T0_S + 0.001)
+    setup.gate.reset()
+    gate = setup.gate
+    assert (gate.last_pulse_s, gate.lateness_s, gate.ack_delay_s) == (None, [], [])
+    assert (gate.charge_uc, gate.dropped) == (0.0, 0)
+    assert setup.fire(100) == PulseStatus.UNACKNOWLEDGED, "the interval of the test before counts no more"
+
+
+def test_lateness_charge_and_delay_are_those_of_the_pulses_sent(tmp_path: Path):
+    setup = Setup(tmp_path)
+    setup.stimulator.ack_delay_s = 0.004
+    now_s = setup.clock.now_s()
+    setup.gate.fire(3, Pulse(100.7, 20.0), now_s - 0.002, now_s)
+    pulse = setup.gate.on_its_way
+    assert pulse is not None
+    assert (pulse.index, pulse.number, pulse.written_s) == (3, 1, now_s)
+    assert setup.gate.last_pulse_s == now_s
+    setup.wait(0.01)
+    assert setup.gate.lateness_s == [pytest.approx(0.002)]
+    assert setup.gate.ack_delay_s == [pytest.approx(0.004)]
+    assert setup.gate.last_pulse_s == pytest.approx(now_s + 0.004), "it may have been felt as late as its ack"
+    assert setup.gate.charge_uc == pytest.approx(2.0), "what was sent, after rounding"
+    assert [jn.INTENT.unpack(p) for p in blocks(setup, Kind.INTENT)] == [(3, now_s, now_s - 0.002, 100.0, 20.0)]
+    assert [jn.WRITTEN.unpack(p) for p in blocks(setup, Kind.WRITTEN)] == [(3, 1, now_s)]
+    assert [jn.ACKED.unpack(p) for p in blocks(setup, Kind.ACKED)] == [(3, pytest.approx(now_s + 0.004))]
+
+
+@pytest.mark.parametrize(
+    ("width_us", "current_ma", "status"),
+    [
+        (0.0, 20.0, PulseStatus.REST),
+        (0.9, 20.0, PulseStatus.REST),
+        (100.0, 0.4, PulseStatus.REST),
+        (1.0, 0.5, PulseStatus.UNACKNOWLEDGED),
+        (301.0, 20.0, PulseStatus.REFUSED),
+    ],
+)
+def test_what_comes_to_no_pulse_is_a_rest(tmp_path: Path, width_us: float, current_ma: float, status: PulseStatus):
+    setup = Setup(tmp_path)
+    assert setup.fire(width_us, current_ma) == status
+    assert len(setup.stimulator.sent) == (status == PulseStatus.UNACKNOWLEDGED)
+    assert setup.gate.dropped == 0
+
+
+def test_no_second_holds_more_pulses_than_the_highest_rate(tmp_path: Path):
+    """Small pulses, so that neither their charge nor their interval forbids them: the rate alone does."""
+    setup = Setup(tmp_path)
+    statuses = []
+    for _ in range(250):
+        statuses.append(setup.fire(10, 1.0))
+        setup.wait(0.010)
+    times = [time_s for time_s, _ in setup.stimulator.sent]
+    assert PulseStatus.REFUSED in statuses
+    assert all(sum(start <= t < start + 1.0 for t in times) <= 61 for start in times)
+    assert times[-1] - times[0] > 2.0, "after a second it goes on"
+    refused = [event["reason"] for event in setup.events() if event["event"] == "refused"]
+    assert refused[0].startswith("pulse_rate_hz 61 Hz is outside 1 … 60")
+
+
+def test_the_charge_of_the_last_second_counts_from_the_ack_and_no_longer_than_a_second(tmp_path: Path):
+    setup = Setup(tmp_path, current_ma=100.0, max_pulse_width_us=400.0)
+    for _ in range(40):
+        assert setup.fire(400, 100.0) == PulseStatus.UNACKNOWLEDGED
+        setup.wait(0.020)
+    assert setup.fire(400, 100.0) == PulseStatus.REFUSED
+    setup.wait(0.2 + 0.0005)  # one second after the first write, not yet after its ack
+    assert setup.fire(400, 100.0) == PulseStatus.REFUSED
+    setup.wait(0.001)
+    assert setup.fire(400, 100.0) == PulseStatus.UNACKNOWLEDGED
+    assert setup.gate.charge_uc == pytest.approx(41 * 40.0)
+
+
+def test_the_journal_says_of_each_pulse_that_was_not_sent_why(tmp_path: Path):
+    setup = Setup(tmp_path)
+    setup.gate.fire(0, Pulse(100, 20), T0_S, T0_S)
+    setup.wait(0.005)
+    now_s = setup.clock.now_s()
+    setup.gate.fire(1, Pulse(100, 20), now_s, now_s)
+    setup.gate.fire(2, Pulse(400, 20), now_s, now_s)
+    setup.gate.fire(3, Pulse(100, 20), now_s, now_s - 1)
+    arm, too_close, refused = setup.events()
+    assert arm == {"event": "arm", "time_s": T0_S}
+    row = limits.for_profile(limits.HARD_LIMITS, Profile())
+    assert too_close == {
+        "event": "dropped",
+        "index": 1,
+        "reason": str(limits.check(row["pulse_interval_s"], now_s - setup.stimulator.acked_s[0])),
+        "time_s": now_s,
+    }
+    assert refused == {
+        "event": "refused",
+        "index": 2,
+        "reason": str(limits.check(row["pulse_width_us"], 400)),
+        "time_s": now_s,
+    }
+    assert [jn.SKIPPED.unpack(p) for p in blocks(setup, Kind.SKIPPED)] == [
+        (1, PulseStatus.DROPPED, now_s),
+        (2, PulseStatus.REFUSED, now_s),
+        (3, PulseStatus.DROPPED, now_s),
+    ]
+
+
+@pytest.mark.parametrize("number", [0, 5])
+def test_an_ack_that_nobody_asked_for_is_written_and_told(tmp_path: Path, number: int):
+    setup = Setup(tmp_path)
+    setup.stimulator.on_ack(Ack(number, 1000.5))
+    assert setup.faults == ["stimulator: it acknowledged a pulse that it was not sent; is the line disturbed?"]
+    assert setup.events()[1:] == [{"event": "unasked_ack", "time_s": 1000.5}]
+    assert [jn.ACKED.unpack(p) for p in blocks(setup, Kind.ACKED)] == [(-1, 1000.5)]
+    setup.gate.shut()
+    setup.stimulator.on_ack(Ack(number, 1000.6))  # after the end it is the answer to whatever was sent before
+    assert len(setup.faults) == 1
+
+
+def test_the_error_of_an_ack_stands_in_the_journal_with_its_pulse(tmp_path: Path):
+    setup = Setup(tmp_path)
+    setup.stimulator.ack_delay_s = None
+    setup.fire(100)
+    setup.stimulator.on_ack(Ack(1, T0_S + 0.001, "electrode error"))
+    assert blocks(setup, Kind.ACKED) == [jn.ACKED.pack(0, T0_S + 0.001) + b"electrode error"]
+    assert len(setup.events()) == 1, "neither late nor unasked for"
+
+
+@pytest.mark.parametrize("speed", [1.0, 4.0])
+def test_late_acks_are_noted_by_real_time(tmp_path: Path, speed: float):
+    setup = Setup(tmp_path)
+    setup.clock.speed = speed
+    for number, real_s in ((1, 0.014), (2, 0.016)):
+        setup.stimulator.ack_delay_s = None
+        setup.fire(100)
+        setup.wait(real_s * speed)
+        assert setup.gate.still_possible() == (
+            f"pulse 1 was sent {1e3 * real_s:.0f} ms ago and not acknowledged: it may still be felt"
+        )
+        setup.stimulator.on_ack(Ack(number, setup.clock.now_s()))
+        assert setup.gate.still_possible() == ""
+        setup.wait(1.0)
+    late = [event for event in setup.events() if event["event"] == "late_ack"]
+    assert late == [
+        {"event": "late_ack", "index": 0, "delay_s": pytest.approx(0.016 * speed), "time_s": setup.gate.last_pulse_s}
+    ]
+
+
+def test_an_ack_after_exactly_the_time_allowed_is_not_late(tmp_path: Path):
+    clock = VirtualClock(start_s=0.0)
+    stimulator = FakeStimulator(clock)
+    stimulator.ack_delay_s = None
+    gate = Gate(stimulator, clock, lambda _: None, lambda _: None)
+    gate.open(Journal(tmp_path / "j"), limits.HARD_LIMITS)
+    gate.fire(0, Pulse(100, 20), 0.0, 0.0)
+    stimulator.on_ack(Ack(1, 0.015))
+    assert sum(kind == Kind.EVENT for kind, _ in jn.read(tmp_path / "j").blocks) == 1, "arm alone"
+
+
+def test_how_long_a_pulse_has_been_on_its_way(tmp_path: Path):
+    setup = Setup(tmp_path)
+    setup.stimulator.ack_delay_s = None
+    setup.fire(100)
+    setup.wait(2.0)
+    assert "was sent 2000 ms ago" in setup.gate.still_possible()
+    setup.gate.shut()
+    assert setup.gate.is_open is False
+
+
+def test_a_pulse_that_becomes_late_while_its_intent_is_written_is_dropped(tmp_path: Path):
+    setup = Setup(tmp_path)
+    append = setup.journal.append
+
+    def slow(kind: Kind, payload: bytes) -> None:
+        append(kind, payload)
+        setup.clock.advance(0.5)
+
+    setup.journal.append = slow
+    assert setup.gate.fire(7, Pulse(100, 20), T0_S, T0_S + 0.01) == PulseStatus.DROPPED
+    assert setup.stimulator.sent == []
+    assert (setup.gate.dropped, setup.gate.charge_uc, setup.gate.on_its_way) == (1, 0.0, None)
+    assert [jn.SKIPPED.unpack(p) for p in blocks(setup, Kind.SKIPPED)] == [(7, PulseStatus.DROPPED, T0_S + 0.5)]
+
+
+def test_pulses_are_rounded_to_the_steps_of_the_device_behind_the_gate(tmp_path: Path):
+    setup = Setup(tmp_path)
+    setup.stimulator.steps = limits.Steps(pulse_width_us=4.0, current_ma=2.0, shortest_us=20.0)
+    assert setup.fire(19.0) == PulseStatus.REST
+    assert setup.fire(103.0, 19.9) == PulseStatus.UNACKNOWLEDGED
+    assert [pulse for _, pulse in setup.stimulator.sent] == [limits.Admitted(100, 18.0)]
+
+
+def test_a_pulse_exactly_a_second_old_no_longer_counts(tmp_path: Path):
+    setup = Setup(tmp_path, current_ma=100.0, max_pulse_width_us=400.0)
+    setup.stimulator.ack_delay_s = 0.0
+    for _ in range(40):
+        assert setup.fire(400, 100.0) == PulseStatus.UNACKNOWLEDGED
+        setup.wait(1 / 64)
+    setup.wait(T0_S + 1.0 - setup.clock.now_s())
+    assert setup.fire(400, 100.0) == PulseStatus.UNACKNOWLEDGED
+    setup.wait(1 / 128)
+    assert setup.fire(400, 100.0) != PulseStatus.UNACKNOWLEDGED
+
+
+def test_after_its_release_a_journal_gets_nothing_more(tmp_path: Path):
+    setup = Setup(tmp_path)
+    setup.stimulator.ack_delay_s = None
+    setup.fire(100)
+    before = setup.path.read_bytes()
+    setup.gate.release()
+    assert setup.gate.is_open is False
+    setup.stimulator.on_ack(Ack(1, setup.clock.now_s()))
+    assert setup.fire(100) == PulseStatus.REFUSED
+    assert setup.path.read_bytes() == before
+    assert setup.gate.on_its_way is None, "the ack still settles what was on its way"
+
+
+def test_an_ack_that_cannot_be_written_is_a_fault(tmp_path: Path):
+    setup = Setup(tmp_path)
+    setup.fire(100)
+    setup.journal._failure = "disk full"
+    setup.wait(0.01)
+    assert setup.faults == ["disk full"]
+
+
+def test_a_watchdog_is_fed_while_the_gate_is_open_alone(tmp_path: Path):
+    setup = Setup(tmp_path)
+    setup.gate.feed()
+    setup.gate.shut()
+    setup.gate.feed()
+    assert setup.stimulator.fed_s == [T0_S]
+
+
+def test_a_gate_whose_device_or_journal_fails_stays_shut(tmp_path: Path):
+    clock = VirtualClock()
+    stimulator = FakeStimulator(clock)
+    gate = Gate(stimulator, clock, lambda _: None, lambda _: None)
+    stimulator.silent = True
+    journal = Journal(tmp_path / "j")
+    with pytest.raises(DeviceError):
+        gate.open(journal, limits.HARD_LIMITS)
+    assert not gate.is_open
+    stimulator.silent = False
+    assert gate.identify() == {"device": "fake"}
+    assert gate.state() == (True, "not initialised")
+    gate.open(journal, limits.HARD_LIMITS)
+    assert gate.is_open
+    assert gate.state() == (False, "armed")
