@@ -12,6 +12,7 @@ from tests.__main__ import CAMPAIGNS, LANES, SIDE_BY_SIDE, not_run, run
 ROOT = Path(__file__).parents[1]
 
 
+@pytest.mark.slow
 def test_each_lane_counts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "test_good.py").write_text("def test_it(): pass")
     (tmp_path / "test_bad.py").write_text("def test_it(): assert 1 == 2")
@@ -28,6 +29,7 @@ def test_each_lane_counts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     assert "[good] " in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_test_process_that_dies_is_a_failure(tmp_path: Path) -> None:
     lines = ["import os", "def test_before(): pass", "def test_dies(): os._exit(0)", "def test_after(): pass"]
     (tmp_path / "test_dies.py").write_text("\n".join(lines))
@@ -39,7 +41,7 @@ def test_a_test_process_that_dies_is_a_failure(tmp_path: Path) -> None:
 
 def test_each_test_is_in_one_lane_and_campaigns_are_told_with_their_commands() -> None:
     chosen = {arguments[arguments.index("-m") + 1] for arguments in LANES.values()}
-    assert chosen == {"wire", "not wire"}
+    assert chosen == {"not wire", "wire and not realtime", "realtime"}
     assert all("tests" in arguments for arguments in LANES.values())
     targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.M))
     assert {command.removeprefix("make ") for command in CAMPAIGNS} <= targets

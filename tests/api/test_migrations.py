@@ -74,6 +74,7 @@ def test_what_does_not_fit_is_refused(tmp_path: Path, statements: tuple[str, ...
     assert path.read_bytes() == before, "nothing was changed in it"
 
 
+@pytest.mark.slow
 def test_the_service_says_so_in_one_line_and_ends(tmp_path: Path) -> None:
     path = tmp_path / "stimrig.db"
     Store(f"sqlite:///{path}").close()

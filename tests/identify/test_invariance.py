@@ -174,8 +174,11 @@ def whole_grid(cases: list[tuple[str, ...]], always: set[tuple[str, ...]]) -> li
     return [pytest.param(*case, marks=[] if case in always else [pytest.mark.campaign]) for case in cases]
 
 
+EACH = [(hidden,) for hidden in HIDDEN]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("hidden", whole_grid([(name,) for name in HIDDEN], {("",), ("fatigue",), ("output_saturation",)}))
+@pytest.mark.parametrize("hidden", whole_grid(EACH, {("",), ("fatigue",), ("output_saturation",)}))
 def test_diagnosis_does_not_depend_on_how_torque_and_time_are_counted(hidden):
     """All at once: turned, ten times as large, 50 N·m lower, 1e4 s later."""
     record = record_of(hidden)
@@ -184,7 +187,7 @@ def test_diagnosis_does_not_depend_on_how_torque_and_time_are_counted(hidden):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("hidden", whole_grid([(name,) for name in HIDDEN], {("threshold_drift",)}))
+@pytest.mark.parametrize("hidden", whole_grid(EACH, {("threshold_drift",)}))
 def test_diagnosis_does_not_depend_on_it_the_other_way_either(hidden):
     """A tenth, 50 N·m higher; then counted in 5 mN·m."""
     record = record_of(hidden)
