@@ -16,13 +16,6 @@ class Table(DeclarativeBase):
         return {column.name: getattr(self, column.name) for column in self.__table__.columns}
 
 
-class SchemaVersion(Table):
-    """Versions this database has been brought to; the largest holds (`api.store.migrations`)."""
-
-    __tablename__ = "schema_version"
-    version: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=False)
-
-
 class Participant(Table):
     __tablename__ = "participants"
     code: Mapped[str] = mapped_column(String(32), primary_key=True)

@@ -197,8 +197,8 @@ def test_the_whole_way_by_keyboard_alone(blank: Any, service: Service) -> None:
     blank.get_by_text("The rig confirms that stimulation is off.").wait_for()
     tab_to(blank, "To the participants")
     keys.press("Enter")
-    blank.get_by_role("button", name="I have looked: re-arm").wait_for()
-    tab_to(blank, "I have looked: re-arm")
+    blank.get_by_role("button", name="I have checked: re-arm").wait_for()
+    tab_to(blank, "I have checked: re-arm")
     keys.press("Enter")
     blank.get_by_role("heading", name="Participants").wait_for()
     assert blank.get_by_text("stays stopped").count() == 0

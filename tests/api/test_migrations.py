@@ -1,4 +1,7 @@
-"""A database of an older version is upgraded, one of a newer version or of something else is refused in one line."""
+"""A database of an older version is upgraded, one of a newer version or of something else is refused in one line.
+
+`databases` holds dumps of what older versions really made, with a row or two in each.
+"""
 
 from __future__ import annotations
 
@@ -11,13 +14,17 @@ from pathlib import Path
 
 import httpx
 import pytest
+from alembic.autogenerate import compare_metadata
+from alembic.runtime.migration import MigrationContext
 
 from api.errors import ApiError
-from api.store import Store, migrations
-from api.store.tables import Approval, Participant
+from api.store import Store, audit, migrations
+from api.store.tables import Approval, AuditEntry, Participant, Recording, Table
 from tests.api.conftest import STUB, run_service, run_test
 
 ROOT = Path(__file__).parents[2]
+OLD = Path(__file__).parent / "databases"
+NEWER = "UPDATE alembic_version SET version_num = '0900'"
 
 
 def change(path: Path, *statements: str) -> None:
@@ -26,30 +33,80 @@ def change(path: Path, *statements: str) -> None:
             database.execute(statement)
 
 
-def test_new_database_says_its_version(tmp_path: Path) -> None:
-    Store(f"sqlite:///{tmp_path}/stimrig.db").close()
+def old(path: Path, name: str) -> Path:
+    """A database as an older version left it."""
+    with closing(sqlite3.connect(path)) as database:
+        database.executescript((OLD / f"{name}.sql").read_text())
+    return path
+
+
+def differences(store: Store) -> list[object]:
+    with store.engine.connect() as connection:
+        return [
+            found
+            for found in compare_metadata(MigrationContext.configure(connection), Table.metadata)
+            if found[0] != "remove_table" or found[1].name != "schema_version"
+        ]
+
+
+def test_a_new_database_is_at_the_newest_revision_and_holds_the_tables_of_today(tmp_path: Path) -> None:
+    store = Store(f"sqlite:///{tmp_path}/stimrig.db")
+    assert differences(store) == []
+    store.close()
     with closing(sqlite3.connect(tmp_path / "stimrig.db")) as database:
-        assert database.execute("SELECT MAX(version) FROM schema_version").fetchone() == (migrations.VERSION,)
+        assert database.execute("SELECT version_num FROM alembic_version").fetchone() == (migrations.NEWEST,)
 
 
-def test_older_database_is_upgraded_and_keeps_its_rows(tmp_path: Path, short_dir: Path) -> None:
-    """As it was before versions were kept, before approvals ended with their day, and before there were passwords."""
+@pytest.mark.parametrize("name", ["unversioned", "2", "3", "4"])
+def test_a_database_of_each_older_version_is_upgraded_and_keeps_its_rows(tmp_path: Path, name: str) -> None:
+    path = old(tmp_path / "stimrig.db", name)
+    for _ in range(2):  # the second time there is nothing to do
+        store = Store(f"sqlite:///{path}")
+        assert differences(store) == []
+        assert [row.code for row in store.all(Participant)] == ["P1"]
+        assert [(row.model_id, row.expires_utc) for row in store.all(Approval)] == [("m1", None)]
+        assert [(row.id, row.warnings) for row in store.all(Recording)] == [("upload-1", None)]
+        entries = store.all(AuditEntry)
+        assert len(entries) == 1 and audit.first_broken(entries) is None
+        store.close()
+
+
+def test_what_an_unversioned_database_lacks_or_has_already_makes_no_difference(tmp_path: Path) -> None:
+    """As before approvals ended with their day; and with people, but no version yet."""
+    before = old(tmp_path / "before.db", "unversioned")
+    change(before, "ALTER TABLE approvals DROP COLUMN expires_utc")
+    people = old(tmp_path / "people.db", "2")
+    change(people, "DROP TABLE schema_version")
+    for path in (before, people):
+        store = Store(f"sqlite:///{path}")
+        assert differences(store) == []
+        store.close()
+
+
+def test_an_upgrade_that_fails_leaves_the_database_as_it_was(tmp_path: Path) -> None:
+    path = old(tmp_path / "stimrig.db", "2")
+    change(path, "ALTER TABLE models DROP COLUMN etag")
+    with closing(sqlite3.connect(path)) as database:
+        before = list(database.iterdump())
+    with pytest.raises(ApiError, match="table models lacks etag"):
+        Store(f"sqlite:///{path}")
+    with closing(sqlite3.connect(path)) as database:
+        assert list(database.iterdump()) == before
+
+
+def test_a_service_goes_on_with_an_older_database(tmp_path: Path, short_dir: Path) -> None:
     for service in run_service(tmp_path, short_dir, STUB):
         with service.client() as http:
             http.post("/v1/participants", json={"code": "P1"})
             model = run_test(http, "P1")["model_id"]
             http.post(f"/v1/models/{model}/approve", json={"reason": "good"})
-    path = tmp_path / "stimrig.db"
     change(
-        path, "DROP TABLE schema_version", "ALTER TABLE approvals DROP COLUMN expires_utc", "DROP TABLE confirmations",
-        "DROP TABLE users",
+        tmp_path / "stimrig.db", "DROP TABLE alembic_version", "DROP TABLE schema_version", "DROP TABLE confirmations",
+        "DROP TABLE known_places", "DROP TABLE users", "ALTER TABLE approvals DROP COLUMN expires_utc",
+        "ALTER TABLE recordings DROP COLUMN warnings",
     )  # fmt: skip
-    store = Store(f"sqlite:///{path}")
-    assert [row.code for row in store.all(Participant)] == ["P1"]
-    (approval,) = store.all(Approval)
-    assert approval.model_id == model and approval.expires_utc is None
-    store.close()
     for service in run_service(tmp_path, short_dir, STUB):
+        assert httpx.get(f"{service.url}/health", timeout=60).json()["database"] == "ok"
         with service.client() as http:
             assert http.get("/v1/participants/P1/model").json()["model_id"] == model
             assert http.get("/v1/audit").json()["whole"]
@@ -59,10 +116,12 @@ def test_older_database_is_upgraded_and_keeps_its_rows(tmp_path: Path, short_dir
 @pytest.mark.parametrize(
     ("statements", "words"),
     [
-        ((f"INSERT INTO schema_version VALUES ({migrations.VERSION + 5})",), "install the stimrig that wrote it"),
-        (("DROP TABLE schema_version", "ALTER TABLE models DROP COLUMN etag"), "table models lacks etag"),
+        ((NEWER,), "it is of version 0900, .* install the stimrig that wrote it"),
+        (("DROP TABLE alembic_version", "UPDATE schema_version SET version = 9"), "version 9, .* install the stimrig"),
+        (("ALTER TABLE models DROP COLUMN etag",), "table models lacks etag"),
+        (("DROP TABLE confirmations",), "no table confirmations"),
     ],
-    ids=["newer", "not-to-be-made-up"],
+    ids=["newer", "numbered-newer", "not-to-be-made-up", "table-gone"],
 )
 def test_what_does_not_fit_is_refused(tmp_path: Path, statements: tuple[str, ...], words: str) -> None:
     path = tmp_path / "stimrig.db"
@@ -74,24 +133,24 @@ def test_what_does_not_fit_is_refused(tmp_path: Path, statements: tuple[str, ...
     assert path.read_bytes() == before, "nothing was changed in it"
 
 
+def test_an_older_stimrig_refuses_a_database_of_today(tmp_path: Path) -> None:
+    """It read `schema_version` and knew numbers up to 4."""
+    Store(f"sqlite:///{tmp_path}/stimrig.db").close()
+    with closing(sqlite3.connect(tmp_path / "stimrig.db")) as database:
+        assert database.execute("SELECT MAX(version) FROM schema_version").fetchone()[0] > 4
+
+
 @pytest.mark.slow
 def test_the_service_says_so_in_one_line_and_ends(tmp_path: Path) -> None:
     path = tmp_path / "stimrig.db"
     Store(f"sqlite:///{path}").close()
-    change(path, f"INSERT INTO schema_version VALUES ({migrations.VERSION + 1})")
+    change(path, NEWER)
     environment = {**os.environ, "STIMRIG_DATA_DIR": str(tmp_path), "STIMRIG_PORT": "0"}
     command = [sys.executable, "-m", "api.web.server"]
     done = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True, timeout=60)
     lines = [line for line in done.stderr.splitlines() if not line.startswith("{")]
-    assert done.returncode == 2 and len(lines) == 1 and f"version {migrations.VERSION + 1}" in lines[0], done.stderr
+    assert done.returncode == 2 and len(lines) == 1 and "version 0900" in lines[0], done.stderr
     path.write_bytes(b"not a database at all" * 100)
     done = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True, timeout=60)
     lines = [line for line in done.stderr.splitlines() if not line.startswith("{")]
     assert done.returncode == 2 and len(lines) == 1 and "restore the database from a backup" in lines[0], done.stderr
-
-
-def test_health_answers_after_an_upgrade(tmp_path: Path, short_dir: Path) -> None:
-    Store(f"sqlite:///{tmp_path}/stimrig.db").close()
-    change(tmp_path / "stimrig.db", "DROP TABLE schema_version")
-    for service in run_service(tmp_path, short_dir, STUB):
-        assert httpx.get(f"{service.url}/health", timeout=60).json()["database"] == "ok"

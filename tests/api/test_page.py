@@ -83,7 +83,7 @@ def test_stop_is_confirmed_and_the_rig_waits_for_a_person(tab: Any, service: Ser
     tab.get_by_text("The rig confirms that stimulation is off.").wait_for()
     tab.get_by_role("link", name="To the participants").click()
     assert tab.get_by_text("stays stopped").is_visible()
-    tab.get_by_role("button", name="I have looked: re-arm").click()
+    tab.get_by_role("button", name="I have checked: re-arm").click()
     tab.get_by_role("heading", name="Participants").wait_for()
     assert not tab.get_by_text("stays stopped").is_visible()
 

@@ -14,6 +14,7 @@ import httpx
 import pytest
 
 from api.models import effect_evidence, explanation
+from hardware_sim import hidden_records
 from tests.api.conftest import Service, run_test, wait_done
 from tests.api.test_access import HTML, csrf, signed_in
 
@@ -355,22 +356,27 @@ def test_browser_asks_for_html(service: Service) -> None:
         assert stranger.get("/compare").status_code == 303
 
 
-def test_real_worker_finds_what_is_missing_and_the_test_that_decides(tmp_path: Path) -> None:
+def test_real_worker_finds_what_is_missing_and_the_page_shows_it(tmp_path: Path) -> None:
     """identify's own answers carry what page and routes build on."""
     from api.web.responses import ComparisonOut, DiagnosisOut
     from api.workers import diagnosis_verbs
     from api.workers.verbs import comparison, fit
-    from tests.api.test_worker import made_up_csv
 
-    path = str(made_up_csv(tmp_path / "record.csv"))
+    path = str(tmp_path / "record.csv")
+    hidden_records.write_csv(hidden_records.generate("asymmetric_relaxation", "middle", 8, rate_hz=200), path)
     told: list[float] = []
     found = diagnosis_verbs.diagnosis(path, lambda share, _text="": told.append(share))
     DiagnosisOut.model_validate(found)
     assert told == sorted(told) and told[-1] <= 1 and len(told) > 5
     assert found["structure"] == []
+    assert (found["verdict"], [entry["effect"] for entry in found["missing"]]) == (
+        "effect_missing",
+        ["asymmetric_relaxation"],
+    )
     model = fit(path, lambda *_: None)
     compared = comparison(path, lambda *_: None, model["json"])
     ComparisonOut.model_validate(compared)
-    assert len(compared["series"]["time_s"]) <= 2400
+    assert 1000 < len(compared["series"]["time_s"]) <= 2400
     view = explanation.view(found, compared, [])
-    assert view["title"] and {split["title"] for split in view["splits"]} == set(explanation.SPLITS.values())
+    assert [entry["effect"] for entry in view["missing"]] == ["asymmetric_relaxation"]
+    assert {split["title"] for split in view["splits"]} == set(explanation.SPLITS.values())

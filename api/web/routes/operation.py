@@ -5,10 +5,15 @@ from __future__ import annotations
 import shutil
 import time
 from collections import Counter
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 from fastapi import APIRouter
-from fastapi.responses import PlainTextResponse
+from fastapi.responses import PlainTextResponse, Response
+from prometheus_client import CollectorRegistry, generate_latest
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4
+from prometheus_client.registry import Collector
 from sqlalchemy import func, select, text
 
 from api.store.tables import AuditEntry, Model, Participant, Test
@@ -38,37 +43,50 @@ def health(context: Ctx) -> dict[str, Any]:
 
 
 @router.get("/metrics", response_class=PlainTextResponse)
-def metrics(context: Ctx) -> PlainTextResponse:
+def metrics(context: Ctx) -> Response:
     """Figures in Prometheus' text format."""
-    lines = [line for name, kind, text_, values in _figures(context) for line in _family(name, kind, text_, values)]
-    return PlainTextResponse("\n".join(lines) + "\n", media_type="text/plain; version=0.0.4")
+    registry = CollectorRegistry()
+    registry.register(_Figures(context))
+    return Response(generate_latest(registry), media_type=CONTENT_TYPE_PLAIN_0_0_4)
 
 
-def _figures(context: Context) -> list[tuple[str, str, str, dict[str, float]]]:
-    states = Counter(row.state for row in context.store.all(Test))
-    newest, rig = context.runner.hub.newest, context.rig
-    return [
-        ("stimrig_up_seconds", "gauge", "Time since start", {"": time.monotonic() - context.started_s}),
-        ("stimrig_rig_connected", "gauge", "1 where the rig's socket is open", {"": float(rig.connected)}),
-        (
-            "stimrig_rig_age_seconds",
-            "gauge",
-            "Time since the rig spoke",
-            {"": -1.0 if rig.age_s is None else rig.age_s},
-        ),
-        ("stimrig_tests", "gauge", "Tests by state", {f'{{state="{name}"}}': float(n) for name, n in states.items()}),
-        ("stimrig_models", "gauge", "Model versions", {"": float(len(context.store.all(Model.id)))}),
-        ("stimrig_approved_models", "gauge", "Participants with one approved today", {"": float(_approved(context))}),
-        ("stimrig_audit_entries", "gauge", "Entries of the audit trail", {"": float(_audit_entries(context))}),
-        ("stimrig_free_disk_bytes", "gauge", "Free where the data lie", {"": float(_free_bytes(context))}),
-        ("stimrig_live_listeners", "gauge", "Open live channels", {"": float(context.runner.hub.listeners)}),
-        ("stimrig_lost_samples", "gauge", "Lost in the newest test", {"": float(newest.lost_samples if newest else 0)}),
-        ("stimrig_dropped_pulses", "gauge", "Dropped in it", {"": float(newest.dropped_pulses if newest else 0)}),
-        ("stimrig_jobs_done_total", "counter", "Analyses done", {"": float(context.pool.done_count)}),
-        ("stimrig_jobs_failed_total", "counter", "Analyses failed", {"": float(context.pool.failed_count)}),
-        ("stimrig_jobs_busy_seconds_total", "counter", "Time in analyses", {"": context.pool.busy_s}),
-        ("stimrig_jobs_queued", "gauge", "Analyses waiting", {"": float(len(context.pool.queue))}),
-    ]
+class _Figures(Collector):
+    """The service's figures, read when they are asked for."""
+
+    def __init__(self, context: Context) -> None:
+        self.context = context
+
+    def describe(self) -> Iterable[Metric]:
+        """Nothing: else each figure would be read once more when it is registered."""
+        return ()
+
+    def collect(self) -> Iterator[Metric]:
+        """One family after the other."""
+        context, rig, newest = self.context, self.context.rig, self.context.runner.hub.newest
+        tests = GaugeMetricFamily("stimrig_tests", "Tests by state", labels=["state"])
+        for state, count in sorted(Counter(row.state for row in context.store.all(Test)).items()):
+            tests.add_metric([state], count)
+        yield tests
+        for name, words, value in (
+            ("stimrig_up_seconds", "Time since start", time.monotonic() - context.started_s),
+            ("stimrig_rig_connected", "1 where the rig's socket is open", float(rig.connected)),
+            ("stimrig_rig_age_seconds", "Time since the rig spoke", -1.0 if rig.age_s is None else rig.age_s),
+            ("stimrig_models", "Model versions", len(context.store.all(Model.id))),
+            ("stimrig_approved_models", "Participants with one approved today", _approved(context)),
+            ("stimrig_audit_entries", "Entries of the audit trail", _audit_entries(context)),
+            ("stimrig_free_disk_bytes", "Free where the data lie", _free_bytes(context)),
+            ("stimrig_live_listeners", "Open live channels", context.runner.hub.listeners),
+            ("stimrig_lost_samples", "Lost in the newest test", newest.lost_samples if newest else 0),
+            ("stimrig_dropped_pulses", "Dropped in it", newest.dropped_pulses if newest else 0),
+            ("stimrig_jobs_queued", "Analyses waiting", len(context.pool.queue)),
+        ):
+            yield GaugeMetricFamily(name, words, value)
+        for name, words, value in (
+            ("stimrig_jobs_done_total", "Analyses done", context.pool.done_count),
+            ("stimrig_jobs_failed_total", "Analyses failed", context.pool.failed_count),
+            ("stimrig_jobs_busy_seconds_total", "Time in analyses", context.pool.busy_s),
+        ):
+            yield CounterMetricFamily(name, words, value)
 
 
 def _approved(context: Context) -> int:
@@ -82,8 +100,3 @@ def _audit_entries(context: Context) -> int:
 
 def _free_bytes(context: Context) -> int:
     return shutil.disk_usage(context.settings.data_dir).free
-
-
-def _family(name: str, kind: str, words: str, values: dict[str, float]) -> list[str]:
-    rows = [f"{name}{labels} {value:.10g}" for labels, value in sorted(values.items())]
-    return [f"# HELP {name} {words}", f"# TYPE {name} {kind}", *rows]

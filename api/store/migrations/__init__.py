@@ -1,0 +1,87 @@
+"""From an older database to today's by Alembic's revisions, in one transaction. A newer database is left alone.
+
+Each change of a table is one file in `versions`; docs/decisions/0009-alembic.md says how to add one. Databases from
+before Alembic kept a number in the table `schema_version`: they are taken over at the revision of that number.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from alembic import command
+from alembic.autogenerate import compare_metadata
+from alembic.config import Config
+from alembic.runtime.migration import MigrationContext
+from alembic.script import ScriptDirectory
+from sqlalchemy import Connection, Engine, inspect, text
+
+from api.store.tables import Table
+
+FOLDER = Path(__file__).parent
+NUMBERED = {0: "0001", 1: "0001", 2: "0002", 3: "0003", 4: "0004"}
+"""The revision of each number in `schema_version`; 0: tables, but no number yet."""
+SCRIPTS = ScriptDirectory(str(FOLDER))
+NEWEST = SCRIPTS.get_current_head()
+
+
+class SchemaError(Exception):
+    """The database is not one that this version can use."""
+
+
+def bring_up(engine: Engine) -> None:
+    """Make or upgrade the tables; all of it is done, or nothing.
+
+    Raises
+    ------
+    SchemaError
+        The database is newer than the software, or lacks a column that no revision adds.
+    """
+    with engine.connect() as connection:
+        if MigrationContext.configure(connection).get_current_revision() != NEWEST:
+            connection.exec_driver_sql("BEGIN IMMEDIATE")  # sqlite3 itself begins no transaction before it makes tables
+            _upgrade(connection)
+        _refuse_lacking(connection)
+        connection.commit()
+
+
+def _upgrade(connection: Connection) -> None:
+    context = MigrationContext.configure(connection)
+    kept = context.get_current_revision()
+    if kept is None and (kept := _numbered(connection)) is not None:
+        context.stamp(SCRIPTS, kept)
+    elif kept is not None and kept not in {script.revision for script in SCRIPTS.walk_revisions()}:
+        raise _newer(kept)
+    config = Config()
+    config.set_main_option("script_location", str(FOLDER).replace("%", "%%"))
+    config.attributes["connection"] = connection
+    command.upgrade(config, "head")
+
+
+def _numbered(connection: Connection) -> str | None:
+    """The revision at which a database from before Alembic stands; None for a new one."""
+    seen = inspect(connection)
+    if not seen.has_table("participants"):
+        return None
+    number = 0
+    if seen.has_table("schema_version"):
+        number = connection.execute(text("SELECT MAX(version) FROM schema_version")).scalar() or 0
+    if number not in NUMBERED:
+        raise _newer(number)
+    return NUMBERED[number]
+
+
+def _newer(found: object) -> SchemaError:
+    mend = "install the stimrig that wrote it, or set STIMRIG_DATA_DIR to another folder"
+    return SchemaError(f"it is of version {found}, this stimrig knows versions up to {NEWEST}; {mend}")
+
+
+def _refuse_lacking(connection: Connection) -> None:
+    """Compare the database with the tables of `api.store.tables`."""
+    for difference in compare_metadata(MigrationContext.configure(connection), Table.metadata):
+        if difference[0] == "add_column":
+            lacking = f"table {difference[2]} lacks {difference[3].name}"
+        elif difference[0] == "add_table":
+            lacking = f"there is no table {difference[1].name}"
+        else:
+            continue
+        raise SchemaError(f"{lacking}, which cannot be made up; restore the database from a backup")
