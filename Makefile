@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 export PYTHONUNBUFFERED = 1
 FAST := not wire and not browser and not service and not slow
 
-.PHONY: demo test check fast lint types serve bench faults soak campaigns lock clean help setup setup-test
+.PHONY: demo test check fast lint types serve bench faults soak campaigns mutation lock clean help setup setup-test
 
 help:
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -44,6 +44,10 @@ campaigns: setup-test ## the tests that are too long for `make test`: whole grid
 
 faults: setup-test ## the fault campaign on the emulated rig (docs/results/faults.md)
 	@$(BIN)/python -m bench.faults
+
+mutation: setup-test ## which changes of the rig's safety code no test sees (docs/results/mutation.md; needs mutmut)
+	@$(BIN)/python -m mutmut run --max-children 2
+	@$(BIN)/python -m mutmut results
 
 setup: $(VENV)/.run ## the virtual environment from the hash-locked list
 

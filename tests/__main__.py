@@ -25,6 +25,7 @@ CAMPAIGNS = {
     "make campaigns": "whole grids, of which one of each kind is run here; a hidden patient on the wire",
     "make soak": "an hour of recording with fits beside it, of which 30 s are run here",
     "make faults": "every fault in every phase of a test, of which seven are run here",
+    "make mutation": "changes of the rig's safety code, one by one: which of them no test sees",
     "make bench": "the figures in docs/, against other programs",
 }
 """What is not run here, by the command that runs it."""

@@ -1,4 +1,4 @@
-"""The library of physical effects: one file each, found by scanning this package, entry points and a folder.
+"""The library of physical effects: one file each, found in this package, in entry points and in a user's folder.
 
 A user's own effect is a file with `EFFECT = Effect(...)`, found in the folder named by the environment variable
 STIMRIG_EFFECTS_DIR, or through an entry point of the group `stimrig.effects`. See `docs/add-an-effect.md`.
@@ -7,24 +7,22 @@ STIMRIG_EFFECTS_DIR, or through an entry point of the group `stimrig.effects`. S
 from __future__ import annotations
 
 import importlib
-import importlib.util
 import os
 import pkgutil
+from collections.abc import Iterator
 from functools import lru_cache
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
+from identify.effects import own_file
 from identify.effects.base import Effect, Form, Parameter, Scene
-from identify.errors import BadRequest, IdentifyError
+from identify.effects.own_file import BadEffect
+from identify.errors import BadRequest
 
 FOLDER_VARIABLE = "STIMRIG_EFFECTS_DIR"
 GROUP = "stimrig.effects"
-_NOT_EFFECTS = {"base", "kernels", "shapes"}
-
-
-class BadEffect(IdentifyError):
-    """A user's effect that can't be loaded or doesn't keep its promises."""
+_NOT_EFFECTS = {"base", "kernels", "own_file"}
 
 
 def _own() -> list[Effect]:
@@ -32,32 +30,36 @@ def _own() -> list[Effect]:
     return [importlib.import_module(f"{__name__}.{name}").EFFECT for name in names]
 
 
-def _from_file(path: Path) -> Effect:
-    spec = importlib.util.spec_from_file_location(f"stimrig_effect_{path.stem}", path)
-    if spec is None or spec.loader is None:
-        raise BadEffect("not a Python file", place=str(path))
-    module = importlib.util.module_from_spec(spec)
-    try:
-        spec.loader.exec_module(module)
-        effect = module.EFFECT
-    except Exception as error:
-        raise BadEffect(
-            f"{type(error).__name__}: {error}", place=str(path), mend="See docs/add-an-effect.md."
-        ) from error
-    return effect
-
-
 @lru_cache(maxsize=8)
 def _everything(folder: str) -> dict[str, Effect]:
     found = {effect.id: effect for effect in _own()}
-    for point in entry_points(group=GROUP):
-        effect = point.load()
+    added = [*_from_packages(), *(_from_folder(Path(folder)) if folder else ())]
+    places: dict[str, str] = {}
+    for place, effect in added:
+        if effect.id in places:
+            message = f"the effect {effect.id!r} is also in {places[effect.id]}"
+            raise BadEffect(message, place=place, fix="Give one of them another id.")
+        places[effect.id] = place
         found[effect.id] = effect
-    if folder:
-        for path in sorted(Path(folder).glob("*.py")):
-            effect = _from_file(path)
-            found[effect.id] = effect
     return found
+
+
+def _from_packages() -> Iterator[tuple[str, Effect]]:
+    for point in entry_points(group=GROUP):
+        place = f"entry point {point.name} = {point.value}"
+        try:
+            effect = point.load()
+        except Exception as error:
+            raise BadEffect(own_file.in_one_line(error), place=place, fix=own_file.FIX) from error
+        yield place, own_file.checked(effect, place)
+
+
+def _from_folder(folder: Path) -> Iterator[tuple[str, Effect]]:
+    if not folder.is_dir():
+        what = "a file, not a folder" if folder.exists() else "no such folder"
+        raise BadEffect(what, place=f"{FOLDER_VARIABLE}={folder}", fix="Name the folder that holds the effects' files.")
+    for path in sorted(folder.glob("*.py")):
+        yield str(path), own_file.effect_of(path)
 
 
 def registry() -> dict[str, Effect]:
@@ -66,7 +68,7 @@ def registry() -> dict[str, Effect]:
     Raises
     ------
     BadEffect
-        A user's file can't be loaded.
+        A user's folder is not there, or one of the files cannot be loaded or used.
     """
     return dict(_everything(os.environ.get(FOLDER_VARIABLE, "")))
 
@@ -77,16 +79,16 @@ def get(effect_id: str) -> Effect:
     Raises
     ------
     BadRequest
-        There is none of that name.
+        No effect has this id.
     """
     effects = registry()
     if effect_id not in effects:
-        raise BadRequest(f"no effect is called {effect_id!r}", mend=f"Known: {', '.join(sorted(effects))}.")
+        raise BadRequest(f"unknown effect {effect_id!r}", fix=f"Known: {', '.join(sorted(effects))}.")
     return effects[effect_id]
 
 
 def library() -> list[dict[str, Any]]:
-    """The library as plain data, for `stimrig effects` and the page."""
+    """The library as dicts, for `stimrig effects` and the page."""
     return [_describe(effect) for effect in registry().values()]
 
 
@@ -115,7 +117,7 @@ def _describe(effect: Effect) -> dict[str, Any]:
         "separated_by": effect.separated_by,
         "plain": effect.plain,
         "needs": list(effect.needs),
-        "foreseeable": effect.foreseeable,
+        "predictable": effect.predictable,
     }
 
 
