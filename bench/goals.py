@@ -21,7 +21,7 @@ import numpy as np
 import identify
 from bench.stamp import RESULTS, written_by
 from identify.dynamics.linear import SecondOrder
-from identify.estimation.figures import best_fit_percent
+from identify.estimation.fit_statistics import best_fit_percent
 from identify.estimation.uncertainty import prediction_band
 from identify.paper import muscle
 from identify.paper.table1 import simulate
