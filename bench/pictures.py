@@ -27,7 +27,7 @@ WIDTH, MARGIN, COLOURS = 1200, 14, 128
 def prepared(url: str, folder: Path) -> str:
     """A clinician, a participant with a recording, and its diagnosis; the id of the model."""
     record = folder / "record.csv"
-    hidden_records.write_csv(hidden_records.generate("recruitment_hysteresis", "strong", seed=3, rate_hz=400), record)
+    hidden_records.write_csv(hidden_records.generate("recruitment_hysteresis", "strong", seed=4, rate_hz=400), record)
     with httpx.Client(base_url=url, headers={"Authorization": f"Bearer {TOKEN}"}, timeout=180) as http:
         http.post("/v1/users", json={"name": NAME, "password": PASSWORD}).raise_for_status()
         http.post("/v1/participants", json={"code": "P017"}).raise_for_status()
