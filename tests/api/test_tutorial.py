@@ -33,7 +33,7 @@ def test_every_block_runs_in_order(tmp_path: Path) -> None:
     for piece in pieces:
         exec(compile(piece, "tutorial.md", "exec"), scope)
     figure = stimrig.plot(scope["better"])  # pyright: ignore[reportArgumentType]
-    assert [trace.name for trace in figure.data] == ["rows it was fitted on", "rows it has not seen"]
+    assert [trace.name for trace in figure.data] == ["rows used to fit", "rows not used to fit"]
     drawn = stimrig.plot(scope["model"], scope["record"])  # pyright: ignore[reportArgumentType]
     assert {"measured", "model, free run", "measured − model", "pulse width"} <= {trace.name for trace in drawn.data}
 
