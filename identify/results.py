@@ -1,4 +1,4 @@
-"""What comparing, diagnosing and improving find: typed, with the keys of `--json`; docs/schema says each with its unit.
+"""What comparing, diagnosing and improving find: typed, with the keys of `--json`; api/schemas says each with its unit.
 
 Rows of tables are dicts; their keys are those of the schema. `to_dict()` is plain JSON. A result shows itself: `print`
 gives about ten lines, `repr` one, a notebook a table.
