@@ -73,3 +73,10 @@ def test_the_emulator_and_identify_import_nothing_of_one_another_or_the_rig() ->
         )
         for path in (ROOT / package).rglob("*.py"):
             assert not pattern.search(path.read_text(encoding="utf-8")), path
+
+
+def test_tests_import_nothing_from_the_benches() -> None:
+    """What both need is in tests/harness."""
+    pattern = re.compile(r"""^\s*(?:from|import)\s+bench\b|import_module\(["']bench\b""", re.M)
+    found = [path for path in (ROOT / "tests").rglob("*.py") if pattern.search(path.read_text(encoding="utf-8"))]
+    assert found == []

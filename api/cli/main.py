@@ -20,11 +20,14 @@ from typer.exceptions import TyperException
 from api.cli import commands
 from api.cli.errors import CommandError
 from api.cli.terminal import clear_progress
+from api.client.errors import Forbidden, Invalid, NotFound, ServiceError, Unauthorized, Unreachable
 from api.errors import ApiError, SettingsError
 from api.version import software_version
 from identify.errors import IdentifyError
 
 VERBS = sorted(info.name for info in pkgutil.iter_modules(commands.__path__))
+INPUT_AT_FAULT = (Unreachable, Unauthorized, Forbidden, NotFound, Invalid)
+"""Errors of a service that stand for a wrong address, a wrong token or a request that cannot be used."""
 
 
 def build(verb: str = "") -> typer.Typer:
@@ -98,6 +101,9 @@ def _one_line(verb: str, error: Exception) -> int:
     if isinstance(error, CommandError | IdentifyError | ApiError | SettingsError):
         print(f"{name}: {flat(str(error))}", file=sys.stderr)
         return error.exit_code if isinstance(error, CommandError) else 2
+    if isinstance(error, ServiceError):
+        print(f"{name}: {flat(str(error))}", file=sys.stderr)
+        return 2 if isinstance(error, INPUT_AT_FAULT) or error.code == "rig-disconnected" else 1
     log = Path(tempfile.gettempdir()) / f"stimrig-error-{os.getpid()}.log"
     log.write_text("".join(traceback.format_exception(error)))
     print(f"{name}: unexpected: {type(error).__name__}: {flat(str(error))} (log: {log})", file=sys.stderr)

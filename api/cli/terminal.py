@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -22,9 +23,22 @@ LEAST_PACE = 0.05
 CLEARED = "\r\x1b[K"
 
 
-DATA_HELP = "sealed recording (HDF5), or CSV file with the columns time_s,pulse_width_us,torque_nm,segment"
+DATA_HELP = (
+    "sealed recording (HDF5); CSV file with the columns time_s,pulse_width_us,torque_nm,segment; or another tool's "
+    "table or MAT file"
+)
 Json = Annotated[bool, typer.Option("--json", help="one JSON object on standard output, nothing else there")]
 Data = Annotated[Path, typer.Argument(help=DATA_HELP, metavar="DATA", show_default=False)]
+ColumnMap = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--map",
+        help="a column of another tool's file and its unit, such as torque_nm=Drehmoment:Nm; once for each column that "
+        "is not called as ours",
+        metavar="COLUMN=NAME:UNIT",
+        show_default=False,
+    ),
+]
 ModelFile = Annotated[
     Path, typer.Argument(help="MODEL.json of `stimrig fit -o`", metavar="MODEL.json", show_default=False)
 ]
@@ -55,6 +69,8 @@ def load_model(path: Path) -> Any:
     """
     import identify
 
+    if path.suffix.lower() == ".mat":
+        raise InputError(f"{path}: a MAT file is for other tools. Give the MODEL.json of the same fit.")
     try:
         with path.open("rb") as file:
             return identify.Model.from_json(file.read(LARGEST_MODEL_BYTES))
@@ -64,7 +80,23 @@ def load_model(path: Path) -> Any:
         raise InputError(f"{path}: {error}") from error
 
 
-def load_held(path: Path | None, data: Path) -> tuple[Any, Any, list[str]]:
+def load_record(data: Path, columns: list[str] | None = None) -> Any:
+    """A record from its file; what was assumed when it was read goes to standard error.
+
+    Raises
+    ------
+    IdentifyError
+        It cannot be read.
+    """
+    import identify
+
+    record = identify.read(data, map=columns)
+    for note in record.notes:
+        print(f"{data}: {note}", file=sys.stderr)
+    return record
+
+
+def load_held(path: Path | None, data: Path, columns: list[str] | None = None) -> tuple[Any, Any, list[str]]:
     """A record, the model whose structure is meant on it (none: the plain one), and the effects that this holds.
 
     Raises
@@ -76,7 +108,7 @@ def load_held(path: Path | None, data: Path) -> tuple[Any, Any, list[str]]:
     from api.structure import held_by
 
     model = None if path is None else load_model(path)
-    record = identify.read(data)
+    record = load_record(data, columns)
     try:
         return record, model, held_by(model, record)
     except identify.IdentifyError as error:
@@ -91,8 +123,49 @@ def write(path: Path, text: str) -> None:
     InputError
         It cannot be written.
     """
-    try:
+    with writing(path):
         path.write_text(text, "utf-8")
+
+
+def write_model(path: Path, model: Any) -> None:
+    """Write a model: as MODEL.json, or where the name ends in .mat as a MAT file for other tools.
+
+    Raises
+    ------
+    InputError
+        It cannot be written.
+    """
+    if path.suffix.lower() != ".mat":
+        write(path, model.to_json())
+        return
+    write_mat(path, model.to_dict())
+
+
+def write_mat(path: Path, variables: dict[str, Any]) -> None:
+    """Write variables as a MAT file.
+
+    Raises
+    ------
+    InputError
+        It cannot be written.
+    """
+    from identify import plain_mat
+
+    with writing(path):
+        plain_mat.write(path, variables)
+
+
+@contextlib.contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Around the writing of a file: one line where it cannot be written.
+
+    Raises
+    ------
+    InputError
+        It cannot.
+    """
+    try:
+        yield
     except OSError as error:
         raise InputError(f"{path}: {error.strerror}. Give a file in a folder that can be written.") from error
 

@@ -60,21 +60,23 @@ class StartingEffects:
 
 
 async def refuse_unknown(settings: Settings, worker: tuple[str, ...] = WORKER) -> None:
-    """Refuse a site's structure that names what is not in the library, which a worker reads.
+    """Refuse effects of the site's own that cannot be used, and a structure that names what is not in the library.
+
+    A worker reads the library.
 
     Raises
     ------
     OSError
         Which, and what there is; or why the library cannot be read.
     """
-    if not settings.structure:
+    if not settings.structure and not settings.effects_dir:
         return
     reads = [settings.effects_dir] if settings.effects_dir else []
     pool = Pool(1, worker, Places(reads))
     try:
         found = await pool.submit("effects").result
     except ApiError as error:
-        raise OSError(f"STIMRIG_STRUCTURE: the library of effects cannot be read: {error}") from error
+        raise OSError(f"the library of effects cannot be read: {error}") from error
     finally:
         await pool.close()
     known = sorted(entry["id"] for entry in found["effects"])

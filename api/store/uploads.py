@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 
 PREFIX, JOINED = "upload-", "joined-"
 PARTS = "parts"
+PLAIN = ".plain"
+"""What a table of another tool is turned into, until it takes its place."""
+SUFFIXES = (".csv", ".h5", ".mat", PLAIN)
 MOST_TOLD = 10
 log = logging.getLogger("stimrig.uploads")
 
@@ -64,6 +67,6 @@ def _ours(folder: Path) -> list[Path]:
     return [
         path
         for path in sorted(folder.iterdir())
-        if path.name.startswith((PREFIX, JOINED)) and path.suffix in (".csv", ".h5")
+        if path.name.startswith((PREFIX, JOINED)) and path.suffix in SUFFIXES
         if path.is_file() and not path.is_symlink()
     ]

@@ -17,14 +17,16 @@ POINTS = 900
 """Points of a signature's curve: it is drawn small."""
 
 
-def diagnosis(data: str, progress: Progress, model_json: str | None = None) -> dict[str, Any]:
+def diagnosis(
+    data: str, progress: Progress, model_json: str | None = None, columns: Sequence[str] | None = None
+) -> dict[str, Any]:
     """What is missing in a model's structure, what each effect would explain, and the test that decides.
 
     Without a model it is the plain structure. The first four fifths of the progress are identify's diagnosis.
     """
     import identify
 
-    record = identify.read(Path(data))
+    record = identify.read(Path(data), map=columns)
     model = None if model_json is None else identify.Model.from_json(model_json)
     structure = held_by(model, record)
     found = identify.diagnose(record, model, lambda share, text="": progress(0.8 * share, text)).to_dict()

@@ -28,7 +28,7 @@ def fit(
     effects: tuple[str, ...] | list[str] = (),
     fit_on: list[str] | None = None,
 ) -> dict[str, Any]:
-    """Read a recording and identify; the model document as JSON text, and as an object."""
+    """Read a recording and identify; the model document as JSON text and as an object, and what was assumed."""
     import identify
 
     progress(0.05, "reading the recording")
@@ -39,7 +39,7 @@ def fit(
         progress(0.2 + 0.8 * share, text)
 
     model = identify.fit(record, method=method, effects=tuple(effects), fit_on=fit_on, progress=further)
-    return {"json": model.to_json(), "model": model.to_dict()}
+    return {"json": model.to_json(), "model": model.to_dict(), "notes": list(record.notes)}
 
 
 def drawn(data: str, progress: Progress, model_json: str) -> dict[str, Any]:
@@ -155,6 +155,18 @@ def _warm_csv() -> str:
     return "\n".join(rows) + "\n"
 
 
+def plain_csv(data: str, progress: Progress, out: str, columns: list[str]) -> dict[str, Any]:
+    """A table or MAT file of another tool as a CSV file in our own layout, by what `--map` says of its columns."""
+    import identify
+    from identify.records import parts_csv
+
+    progress(0.1, "reading the recording")
+    record = identify.read(Path(data), map=columns)
+    progress(0.7, "writing")
+    parts_csv.write(record, Path(out))
+    return {"notes": list(record.notes)}
+
+
 def export_csv(data: str, progress: Progress, out: str) -> dict[str, Any]:
     """A recording as a CSV file in the layout that `identify.read` takes in (docs/recording.md's times and widths)."""
     import identify
@@ -217,6 +229,7 @@ VERBS: dict[str, Callable[..., dict[str, Any]]] = {
     "warm": warm,
     "forecast": forecast,
     "export_csv": export_csv,
+    "plain_csv": plain_csv,
     "find_recording": find_recording,
     "recorded": recorded,
 }

@@ -7,24 +7,22 @@ STIMRIG_EFFECTS_DIR, or through an entry point of the group `stimrig.effects`. S
 from __future__ import annotations
 
 import importlib
-import importlib.util
 import os
 import pkgutil
+from collections.abc import Iterator
 from functools import lru_cache
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
+from identify.effects import own_file
 from identify.effects.base import Effect, Form, Parameter, Scene
-from identify.errors import BadRequest, IdentifyError
+from identify.effects.own_file import BadEffect
+from identify.errors import BadRequest
 
 FOLDER_VARIABLE = "STIMRIG_EFFECTS_DIR"
 GROUP = "stimrig.effects"
-_NOT_EFFECTS = {"base", "kernels", "shapes"}
-
-
-class BadEffect(IdentifyError):
-    """A user's effect that can't be loaded or doesn't keep its promises."""
+_NOT_EFFECTS = {"base", "kernels", "own_file"}
 
 
 def _own() -> list[Effect]:
@@ -32,32 +30,38 @@ def _own() -> list[Effect]:
     return [importlib.import_module(f"{__name__}.{name}").EFFECT for name in names]
 
 
-def _from_file(path: Path) -> Effect:
-    spec = importlib.util.spec_from_file_location(f"stimrig_effect_{path.stem}", path)
-    if spec is None or spec.loader is None:
-        raise BadEffect("not a Python file", place=str(path))
-    module = importlib.util.module_from_spec(spec)
-    try:
-        spec.loader.exec_module(module)
-        effect = module.EFFECT
-    except Exception as error:
-        raise BadEffect(
-            f"{type(error).__name__}: {error}", place=str(path), mend="See docs/add-an-effect.md."
-        ) from error
-    return effect
-
-
 @lru_cache(maxsize=8)
 def _everything(folder: str) -> dict[str, Effect]:
     found = {effect.id: effect for effect in _own()}
-    for point in entry_points(group=GROUP):
-        effect = point.load()
+    added = [*_from_packages(), *(_from_folder(Path(folder)) if folder else ())]
+    places: dict[str, str] = {}
+    for place, effect in added:
+        if effect.id in places:
+            message = f"the effect {effect.id!r} is also in {places[effect.id]}"
+            raise BadEffect(message, place=place, mend="Give one of them another id.")
+        places[effect.id] = place
         found[effect.id] = effect
-    if folder:
-        for path in sorted(Path(folder).glob("*.py")):
-            effect = _from_file(path)
-            found[effect.id] = effect
     return found
+
+
+def _from_packages() -> Iterator[tuple[str, Effect]]:
+    for point in entry_points(group=GROUP):
+        place = f"entry point {point.name} = {point.value}"
+        try:
+            effect = point.load()
+        except Exception as error:
+            raise BadEffect(own_file.in_one_line(error), place=place, mend=own_file.MEND) from error
+        yield place, own_file.checked(effect, place)
+
+
+def _from_folder(folder: Path) -> Iterator[tuple[str, Effect]]:
+    if not folder.is_dir():
+        what = "a file, not a folder" if folder.exists() else "no such folder"
+        raise BadEffect(
+            what, place=f"{FOLDER_VARIABLE}={folder}", mend="Name the folder that holds the effects' files."
+        )
+    for path in sorted(folder.glob("*.py")):
+        yield str(path), own_file.effect_of(path)
 
 
 def registry() -> dict[str, Effect]:
@@ -66,7 +70,7 @@ def registry() -> dict[str, Effect]:
     Raises
     ------
     BadEffect
-        A user's file can't be loaded.
+        A user's folder is not there, or one of their files can't be loaded or used.
     """
     return dict(_everything(os.environ.get(FOLDER_VARIABLE, "")))
 

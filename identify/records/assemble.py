@@ -33,8 +33,10 @@ class Found:
         Index into `names` for each row; None where the file has none.
     names : sequence of str
         Segments.
-    at : callable
-        How messages call a cell, by row and column.
+    name : str
+        How messages call the file.
+    cell : callable
+        How messages call a cell in it, by row and column.
     source : Source
         The file, with notes on how it was read.
     pulse_rate_hz : float
@@ -44,9 +46,14 @@ class Found:
     columns: Columns
     segment: np.ndarray | None
     names: Sequence[str]
-    at: Callable[[int, str], str]
+    name: str
+    cell: Callable[[int, str], str]
     source: Source
     pulse_rate_hz: float = PULSE_RATE_HZ
+
+    def at(self, row: int, column: str) -> str:
+        """How errors call a cell: with the file."""
+        return f"{self.name}, {self.cell(row, column)}"
 
     def noting(self, *notes: str, **changes: object) -> Found:
         """The same with changes, and with more to say."""
@@ -62,12 +69,15 @@ def record_of(found: Found) -> Record:
     BadRecord
         With the place and what to do.
     """
+    check_numbers(found.columns, found.at)
     found = _from_zero(without_holes(found))
     check_widths(found.columns, found.at)
     time_s = found.columns["time_s"]
     bounds.check_span(time_s, found.at(time_s.size - 1, "time_s"))
     rows = found.columns if found.segment is None else {**found.columns, "segment": found.segment}
-    even, notes = clock.regular(rows, lambda row: found.at(row, "time_s"), found.pulse_rate_hz)
+    even, notes = clock.regular(
+        rows, lambda row: found.at(row, "time_s"), lambda row: found.cell(row, "time_s"), found.pulse_rate_hz
+    )
     if found.segment is None:
         even["segment"], names, note = segments.found(even["time_s"], even["pulse_width_us"])
         notes.append(note)
@@ -119,17 +129,19 @@ def without_holes(found: Found) -> Found:
     if not count:
         return found
     first = int(np.argmax(rows))
-    place = found.at(first, next(name for name, hole in holes.items() if hole[first]))
+    column = next(name for name, hole in holes.items() if hole[first])
     if count > MOST_HOLES * rows.size:
         message = f"no number here, nor in {count - 1} of {rows.size} rows" if count > 1 else "no number"
-        raise BadRecord(message, place=place, mend=f"At most {100 * MOST_HOLES:.0f} % of the rows may lack one.")
+        raise BadRecord(
+            message, place=found.at(first, column), mend=f"At most {100 * MOST_HOLES:.0f} % of the rows may lack one."
+        )
     kept = np.flatnonzero(~rows)
     times = "1 row is" if count == 1 else f"{count} rows are"
     return found.noting(
-        f"{times} left out for want of a number (first at {place})",
+        f"{times} left out for want of a number (first at {found.cell(first, column)})",
         columns={name: column[kept] for name, column in found.columns.items()},
         segment=None if found.segment is None else found.segment[kept],
-        at=lambda row, column: found.at(int(kept[row]), column),
+        cell=lambda row, column: found.cell(int(kept[row]), column),
     )
 
 

@@ -47,7 +47,7 @@ class _Part:
     jitter_s: float = 0.0
 
 
-def regular(columns: Columns, at: At, pulse_rate_hz: float) -> tuple[Columns, list[str]]:
+def regular(columns: Columns, at: At, told: At, pulse_rate_hz: float) -> tuple[Columns, list[str]]:
     """Columns with uniform times, and what of it was assumed.
 
     Parameters
@@ -55,7 +55,9 @@ def regular(columns: Columns, at: At, pulse_rate_hz: float) -> tuple[Columns, li
     columns : dict of ndarray, shape (N,)
         `time_s`, `pulse_width_us`, `torque_nm`, and any others, by row.
     at : callable
-        How messages call a row.
+        How errors call a row.
+    told : callable
+        How notes call a row: without the file, which whoever shows them knows.
     pulse_rate_hz : float
         Pulses a second: when a record is resampled its pulses stay where they were.
 
@@ -80,8 +82,8 @@ def regular(columns: Columns, at: At, pulse_rate_hz: float) -> tuple[Columns, li
             )
     even = [part.even_s for part in parts if part.even_s is not None]
     if len(even) < len(parts):
-        return _resampled(columns, step_s, at, pulse_rate_hz)
-    notes += _jitter_note(parts) + _lost_note(np.concatenate([part.lost for part in parts]), time_s, at)
+        return _resampled(columns, step_s, at, told, pulse_rate_hz)
+    notes += _jitter_note(parts) + _lost_note(np.concatenate([part.lost for part in parts]), time_s, at, told)
     return columns | {"time_s": np.concatenate(even)}, notes
 
 
@@ -176,7 +178,7 @@ def _jitter_note(parts: list[_Part]) -> list[str]:
     ]
 
 
-def _lost_note(rows: np.ndarray, time_s: np.ndarray, at: At) -> list[str]:
+def _lost_note(rows: np.ndarray, time_s: np.ndarray, at: At, told: At) -> list[str]:
     if not rows.size:
         return []
     if rows.size > max(MOST_PAUSES, MOST_GAPS * time_s.size):
@@ -184,10 +186,10 @@ def _lost_note(rows: np.ndarray, time_s: np.ndarray, at: At) -> list[str]:
         raise BadRecord(f"{rows.size} gaps in {time_s.size} samples", place=place, mend="Give a record without holes.")
     longest_s = float(np.max(time_s[rows] - time_s[rows - 1]))
     places = "1 place" if rows.size == 1 else f"{rows.size} places"
-    return [f"samples are missing at {places} (first at {at(int(rows[0]))}; longest {longest_s:.3g} s): left as gaps"]
+    return [f"samples are missing at {places} (first at {told(int(rows[0]))}; longest {longest_s:.3g} s): left as gaps"]
 
 
-def _resampled(columns: Columns, step_s: float, at: At, pulse_rate_hz: float) -> tuple[Columns, list[str]]:
+def _resampled(columns: Columns, step_s: float, at: At, told: At, pulse_rate_hz: float) -> tuple[Columns, list[str]]:
     """Columns at a uniform rate: torque and movement on straight lines between samples, gaps left open."""
     time_s = columns["time_s"]
     steps = np.diff(time_s)
@@ -210,4 +212,4 @@ def _resampled(columns: Columns, step_s: float, at: At, pulse_rate_hz: float) ->
         f"uneven time stamps (steps of {1e3 * usual.min():.3g} to {1e3 * usual.max():.3g} ms): resampled to "
         f"{1 / step_s:.5g} Hz, torque on straight lines between samples"
     )
-    return found, [note, *_lost_note(gaps, time_s, at)]
+    return found, [note, *_lost_note(gaps, time_s, at, told)]

@@ -45,7 +45,8 @@ def read_csv(content: bytes, path: Path, pulse_rate_hz: float | None = None, giv
         columns={column: np.array(values) for column, values in table.numbers.items()},
         segment=np.array(table.segment) if "segment" in known else None,
         names=list(table.names),
-        at=lambda row, column: table.at(table.lines[row], column),
+        name=name,
+        cell=lambda row, column: f"line {table.lines[row]}, column {column}",
         source=source,
         pulse_rate_hz=pulse_rate_hz or PULSE_RATE_HZ,
     )

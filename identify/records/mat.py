@@ -11,7 +11,7 @@ import numpy as np
 
 from identify.errors import BadRecord
 from identify.records import bounds, columns
-from identify.records.assemble import PULSE_RATE_HZ, Found, check_numbers, record_of
+from identify.records.assemble import PULSE_RATE_HZ, Found, record_of
 from identify.records.columns import Column, Given
 from identify.records.mat_file import CELL, CHAR, MEND, BadMat, Variable, variables
 from identify.records.record import Record, Source
@@ -37,8 +37,8 @@ def read_mat(content: bytes, path: Path, pulse_rate_hz: float | None = None, giv
         target: f"{scope}.{header[column.index]}" if scope else header[column.index] for target, column in found.items()
     }
 
-    def at(row: int, column: str) -> str:
-        return f"{name}, {of[column]}({row + 1})"
+    def cell(row: int, column: str) -> str:
+        return f"{of[column]}({row + 1})"
 
     numbers = {
         target: _numbers(known[header[column.index]], column, f"{name}, {of[target]}")
@@ -46,7 +46,6 @@ def read_mat(content: bytes, path: Path, pulse_rate_hz: float | None = None, giv
         if target != "segment"
     }
     _check_lengths(numbers, of, name)
-    check_numbers(numbers, at)
     segment, names = None, []
     if "segment" in found:
         variable = known[header[found["segment"].index]]
@@ -56,7 +55,7 @@ def read_mat(content: bytes, path: Path, pulse_rate_hz: float | None = None, giv
         bounds.check_rate(pulse_rate_hz, f"{name}, {RATE}")
     notes = "; ".join(column.note for column in found.values() if column.note)
     source = Source(path.name, sha256=hashlib.sha256(content).hexdigest(), notes=(notes,) if notes else ())
-    return record_of(Found(numbers, segment, names, at, source, pulse_rate_hz or PULSE_RATE_HZ))
+    return record_of(Found(numbers, segment, names, name, cell, source, pulse_rate_hz or PULSE_RATE_HZ))
 
 
 def _scope(top: Mapping[str, Variable], given: Given, name: str) -> tuple[str, Mapping[str, Variable], Given]:

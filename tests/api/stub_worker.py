@@ -109,7 +109,7 @@ def answer(verb: str, arguments: dict[str, Any], say: Any) -> dict[str, Any]:
         while (Path(arguments["data"]).parent / "fitting-slowly").exists():
             time.sleep(0.05)
         document = model([effect.partition(":")[0] for effect in arguments.get("effects", [])])
-        return {"result": {"json": json.dumps(document), "model": document}}
+        return {"result": {"json": json.dumps(document), "model": document, "notes": []}}
     if verb == "comparison":
         return {"result": comparison()}
     if verb == "curves":
@@ -135,6 +135,14 @@ def answer(verb: str, arguments: dict[str, Any], say: Any) -> dict[str, Any]:
     if verb == "export_csv":
         Path(arguments["out"]).write_text("time_s,pulse_width_us,torque_nm,segment\n0.0,0.0,0.0,rest\n")
         return {"result": {"rows": 1}}
+    if verb == "plain_csv":
+        from api.workers.verbs import plain_csv
+        from identify.errors import IdentifyError
+
+        try:
+            return {"result": plain_csv(progress=lambda *_: None, **arguments)}
+        except IdentifyError as error:
+            return {"error": {"expected": True, "detail": str(error), "place": error.place}}
     if verb == "find_recording":
         from api.workers.verbs import find_recording
 

@@ -101,6 +101,53 @@ def test_bad_csv_is_one_line_naming_the_place(
         assert word in err, err
 
 
+def of_another_tool(record: Path, folder: Path) -> Path:
+    """The same record with semicolons, decimal commas, milliseconds, N·cm, and names of its own."""
+    lines = ["Zeit;Breite;Kraftmoment;segment"]
+    for row in record.read_text().splitlines()[1:]:
+        time_s, width_us, torque_nm, segment = row.split(",")
+        lines.append(f"{float(time_s) * 1e3:.4f};{width_us};{float(torque_nm) * 100:.8f};{segment}".replace(".", ","))
+    path = folder / "other.csv"
+    path.write_text("\n".join(lines))
+    return path
+
+
+MAP = ["--map", "time_s=Zeit:ms", "--map", "pulse_width_us=Breite:µs", "--map", "torque_nm=Kraftmoment:N·cm"]
+
+
+@pytest.mark.parametrize("verb", ["fit", "diagnose", "improve", "compare", "predict"])
+def test_a_record_of_another_tool_gives_the_same_and_what_was_assumed_is_said(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, record: Path, model: Path, verb: str
+) -> None:
+    other = of_another_tool(record, tmp_path)
+    before = [str(model)] if verb in ("compare", "predict") else []
+    after = ["-o", str(tmp_path / "out.csv")] if verb == "predict" else []
+    code, out, err = run(capsys, verb, *before, str(other), *MAP, *after, "--json")
+    assert code == 0 and err == f"{other}: semicolons between cells, decimal commas\n"
+    plain = json.loads(run(capsys, verb, *before, str(record), *after, "--json")[1])
+    found = json.loads(out)
+    for key in ("fit", "base"):
+        assert found.get(key, {}).get("fit_percent") == pytest.approx(plain.get(key, {}).get("fit_percent"), abs=1e-3)
+    # A model knows the very record it was fitted on, and runs from the state that it found there.
+    assert found.get("fit_percent") == pytest.approx(plain.get("fit_percent"), abs=0.02)
+    assert found.get("verdict") == plain.get("verdict")
+    assert "Kraftmoment" in refused(capsys, verb, *before, str(other), *after)
+
+
+def test_models_and_predictions_as_mat_files(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, record: Path, model: Path
+) -> None:
+    from scipy.io import loadmat
+
+    assert run(capsys, "fit", str(record), "-o", str(tmp_path / "M.mat"))[0] == 0
+    held = loadmat(tmp_path / "M.mat", squeeze_me=True, struct_as_record=False)
+    assert held["linear"].b == pytest.approx(json.loads(model.read_text())["linear"]["b"])
+    assert run(capsys, "predict", str(model), str(record), "-o", str(tmp_path / "p.mat"))[0] == 0
+    found = loadmat(tmp_path / "p.mat", squeeze_me=True)
+    assert found["predicted_torque_nm"].shape == found["time_s"].shape == (1000,)
+    assert "MODEL.json of the same fit" in refused(capsys, "compare", str(tmp_path / "M.mat"), str(record))
+
+
 def test_half_written_recording(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     from rig.messages import Profile, TestPlan
     from tests.api.fake_rig import write_recording

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from bench.hidden_on_the_wire import reveal, run
+from tests.harness.hidden_on_the_wire import reveal, run
 
 FIRST_SEED = 1000
 TIMELY_MS = 1.5

@@ -15,7 +15,7 @@ import pytest
 
 from api.cli.errors import LaunchError
 from api.cli.launcher import Services
-from api.cli.rest_session import run_test
+from api.client.rest import Client
 from api.settings import Settings
 from tests.api.conftest import TOKEN
 
@@ -32,10 +32,10 @@ def client(services: Services) -> httpx.Client:
 
 
 def test_a_test_on_the_wire_ends_in_a_served_model(tmp_path: Path) -> None:
-    with Services(settings(tmp_path), FAST, TOKEN) as services, client(services) as http:
+    with Services(settings(tmp_path), FAST, TOKEN) as services, Client(services.url, TOKEN) as rest:
+        http = rest.http
         assert http.get("/rig/now").json()["emulated"] is True
-        assert http.post("/v1/participants", json={"code": "P1"}).status_code == 201
-        document = run_test(http, "P1")
+        document = rest.run_test(rest.make_participant("P1")["code"])
         assert document["summary"]["lost_samples"] == 0
         fit = document["fit"]
         # A busy machine's stalls count eight times at this speed; the figure at the speed of the world is the demo's.

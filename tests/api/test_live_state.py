@@ -110,8 +110,8 @@ def without_answers(tab: Any, service: Service) -> None:
 def test_without_an_answer_the_state_is_not_known_within_2_s(tab: Any, service: Service) -> None:
     without_answers(tab, service)
     tab.clock.run_for(2300)  # 2 s, and the page looks every 0.25 s
-    assert "Not known" in tab.locator("#rig-state").inner_text()
-    assert tab.locator("dd [data-now=torque]").inner_text() == "not known"
+    assert "Unknown" in tab.locator("#rig-state").inner_text()
+    assert tab.locator("dd [data-now=torque]").inner_text() == "unknown"
     tab.unroute("**/rig/now")
     tab.clock.run_for(600)
     says(tab, "No stimulation ready")
@@ -120,15 +120,15 @@ def test_without_an_answer_the_state_is_not_known_within_2_s(tab: Any, service: 
 def test_after_a_sleep_nothing_old_is_shown_as_current(tab: Any, service: Service) -> None:
     without_answers(tab, service)  # the line has not come back yet
     tab.clock.fast_forward("01:00:00")
-    assert "Not known" in tab.locator("#rig-state").inner_text()
+    assert "Unknown" in tab.locator("#rig-state").inner_text()
 
 
 def test_a_rig_that_does_not_answer_is_not_called_ready(tab: Any, service: Service) -> None:
     tab.goto(service.url)
     says(tab, "No stimulation ready")
     service.rig.mute = True
-    says(tab, "Not known the rig does not answer")
-    tab.get_by_text("What it does now is not known").wait_for()
+    says(tab, "Unknown the rig does not answer")
+    tab.get_by_text("Its state is unknown").wait_for()
     service.rig.mute = False
     says(tab, "No stimulation ready")
 
@@ -171,7 +171,7 @@ def test_a_latched_or_restarted_rig_is_re_armed_from_the_page_that_shows_it(tab:
     for state in ("latched", "uncertain"):
         tab.goto(service.url + "/participants/E1")
         service.rig_thread.become(state, SILENT_CELL)
-        tab.get_by_role("button", name="I have looked: re-arm").click()
+        tab.get_by_role("button", name="I have checked: re-arm").click()
         says(tab, "No stimulation ready")
         assert tab.url.endswith("/participants/E1")
 

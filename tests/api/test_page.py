@@ -83,7 +83,7 @@ def test_stop_is_confirmed_and_the_rig_waits_for_a_person(tab: Any, service: Ser
     tab.get_by_text("The rig confirms that stimulation is off.").wait_for()
     tab.get_by_role("link", name="To the participants").click()
     assert tab.get_by_text("stays stopped").is_visible()
-    tab.get_by_role("button", name="I have looked: re-arm").click()
+    tab.get_by_role("button", name="I have checked: re-arm").click()
     tab.get_by_role("heading", name="Participants").wait_for()
     assert not tab.get_by_text("stays stopped").is_visible()
 
@@ -199,7 +199,7 @@ def test_hidden_effect_is_found_and_added_by_clicking(tab: Any, service: Service
     tab.set_viewport_size({"width": WIDE[0], "height": WIDE[1]})
     assert tab.locator(".place-share", has_text="31 %").is_visible()
     tab.get_by_role("button", name="Add this effect").click()
-    tab.get_by_role("heading", name="The error over the versions").wait_for()
+    tab.get_by_role("heading", name="Error of each version").wait_for()
     tab.locator("[data-figure=falling] .main-svg").first.wait_for()
     assert tab.locator("tr.current").inner_text().startswith("2. + fatigue")
     tab.locator("[data-job]").wait_for(state="detached")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import time
 from typing import Any
 
@@ -134,6 +135,35 @@ def test_upload_of_another_tools_csv(client: httpx.Client, participant: str) -> 
     assert answer.status_code == 201, answer.text
     assert client.get(answer.headers["location"]).text == GOOD_HEADER + rows
     assert answer.json()["model"]["participant"] == participant
+
+
+def test_upload_of_a_table_whose_columns_are_named(client: httpx.Client, service: Service, participant: str) -> None:
+    """Kept as a table of ours, with the SHA-256 of what was sent; what was assumed is told, and stays told."""
+    rows = "".join(f"{k * 25};{100 * (k // 20 % 2)};{k % 7},5\n" for k in range(400))
+    sent = ("t;Breite;M\n" + rows).encode()
+    columns = ["time_s=t:ms", "pulse_width_us=Breite:µs", "torque_nm=M:Ncm"]
+    answer = client.post(f"/v1/participants/{participant}/recordings", content=sent, params={"map": columns})
+    assert answer.status_code == 201, answer.text
+    told = answer.json()["warnings"]
+    assert told[0] == "semicolons between cells, decimal commas"
+    assert "found from the pulse widths" in told[1] and len(told) == 2
+    kept = client.get(answer.headers["location"]).text
+    header, *cells = kept.splitlines()
+    assert header.startswith("time_s,pulse_width_us,torque_nm,segment,") and len(cells) == 400
+    assert [float(cell) for cell in cells[2].split(",")[:3]] == pytest.approx([0.05, 0.0, 0.025])
+    assert hashlib.sha256(sent).hexdigest() in kept
+    assert [path.suffix for path in (service.data / "recordings").rglob("upload-*")] == [".csv"]
+
+
+def test_upload_of_a_table_with_a_wrong_name_is_one_line(
+    client: httpx.Client, service: Service, participant: str
+) -> None:
+    where = f"/v1/participants/{participant}/recordings"
+    answer = client.post(where, content=GOOD_HEADER + "0,0,0,rest\n" * 9, params={"map": "torque_nm=Kraft:Nm"})
+    detail = problem(answer, 422)["detail"]
+    assert "the upload, line 1: no column 'Kraft:Nm' for torque_nm. It has: time_s, pulse_width_us" in detail
+    assert str(service.data) not in answer.text
+    assert list((service.data / "recordings").rglob("upload-*")) == []
 
 
 def test_upload_too_large_or_empty(client: httpx.Client, service: Service, participant: str) -> None:

@@ -7,6 +7,7 @@ import ctypes
 import json
 import os
 import platform
+import random
 import signal
 import subprocess
 import sys
@@ -22,11 +23,10 @@ from api.workers import confinement
 from api.workers.pool import WORKER, Pool
 from api.workers.process import Places
 from api.workers.verbs import find_recording
-from bench import hostile_files
 from tests.api.conftest import STUB, Service, run_service
 from tests.api.test_problems import problem
 from tests.api.test_worker import made_up_csv, with_pool
-from tests.harness import hostile_shapes
+from tests.harness import hostile_files, hostile_shapes
 
 SECRET = "the-administrators-token"
 ROOT = Path(__file__).parents[2]
@@ -161,15 +161,15 @@ def test_hostile_files_through_a_worker() -> None:
         "a million columns",
         "sound",
     )
-    all_files = hostile_shapes.all_files
 
-    def some(folder: Path, seed: int, count: int) -> Iterator[hostile_shapes.Hostile]:
-        return (each for each in all_files(folder, seed, count) if each.name in picked or each.name.endswith("0"))
+    def some(folder: Path) -> Iterator[hostile_shapes.Hostile]:
+        rng = random.Random(3)
+        yield from (each for each in hostile_shapes.all_files(folder, seed=3, count=0) if each.name in picked)
+        yield from (hostile_shapes.spoiled(rng, number) for number in range(12))
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(hostile_files, "all_files", some)
-        tally = asyncio.run(hostile_files.run(240, seed=3))
-    assert tally.failed == [] and tally.died == 0 and tally.sound >= 1 and tally.refused >= 5
+    tally = asyncio.run(hostile_files.run(some))
+    assert tally.failed == [] and tally.died == 0 and tally.tried == len(picked) + 12
+    assert tally.sound >= 1 and tally.refused >= 5
     assert tally.peak_mb < confinement.MEMORY_BYTES / 2**20
 
 

@@ -261,13 +261,13 @@ def test_after_a_persons_stop_no_program_lets_the_rig_work_again(
         page.post("/sign-in", data={"token": token})
         csrf = re.findall(r'name="csrf" value="([^"]+)"', page.get("/").text)[0]
         assert page.post("/rearm", data={"csrf": csrf}).status_code == 403, "a token that signs in is no person"
-        assert "I have looked" not in page.get("/").text
+        assert "I have checked" not in page.get("/").text
         assert program.post("/v1/tests", json=start).status_code == 409
         assert program.post(calibration).status_code == 409
         assert program.post(f"{calibration}/finish", json={"discard": True}).status_code == 404
         assert program.post(f"{calibration}/step", json={}).status_code == 404
         assert program.get("/v1/rig").json()["state"] == "latched" and service.rig.starts == 0
-        assert "I have looked" in browser.get("/").text
+        assert "I have checked" in browser.get("/").text
         csrf = re.findall(r'name="csrf" value="([^"]+)"', browser.get("/").text)[0]
         assert browser.post("/rearm", data={"csrf": csrf}).status_code == 303
         assert program.post("/v1/tests", json=start).status_code == 202

@@ -6,7 +6,7 @@ import json
 
 import httpx
 
-from api.cli.rest_session import report_lines
+from api.cli.session_report import report_lines
 from api.web.pages.report_file import comparison_html
 from tests.api.conftest import Service, run_test
 

@@ -14,6 +14,7 @@ import httpx
 import pytest
 
 from api.models import effect_evidence, explanation
+from hardware_sim import hidden_records
 from tests.api.conftest import Service, run_test, wait_done
 from tests.api.test_access import HTML, csrf, signed_in
 
@@ -107,7 +108,7 @@ def test_effect_that_is_not_there_is_refused_with_the_reason(client: httpx.Clien
     assert refused.status_code == 409 and refused.json()["type"] == "/problems/effect-not-there"
     assert "log evidence -4.0" in refused.json()["reasons"]["tremor"]
     silent = client.post(f"/v1/models/{model}/effects", json={"effects": ["tremor"], "force": True})
-    assert silent.status_code == 422 and "say why" in silent.json()["detail"]
+    assert silent.status_code == 422 and "Give a reason" in silent.json()["detail"]
     body = {"effects": ["tremor"], "force": True, "reason": "seen with the eye"}
     forced = client.post(f"/v1/models/{model}/effects", json=body)
     assert forced.status_code == 201 and forced.json()["effects"] == ["tremor"]
@@ -160,9 +161,9 @@ def test_version_with_effects_is_criticised_with_them(client: httpx.Client, serv
     assert (own["structure"], [entry["effect"] for entry in own["missing"]]) == (["fatigue"], ["threshold_drift"])
     with signed_in(service) as browser:
         page = browser.get(f"/models/{better}").text
-        assert "Structure criticised: fatigue" in page and 'id="effect-threshold_drift"' in page
+        assert "Structure of the model: fatigue" in page and 'id="effect-threshold_drift"' in page
         assert 'id="effect-fatigue"' not in page
-        assert "Structure criticised: plain" in browser.get(f"/models/{model}").text
+        assert "Structure of the model: plain" in browser.get(f"/models/{model}").text
     added = client.post(f"/v1/models/{better}/effects", json={"effects": ["threshold_drift"]})
     assert added.status_code == 201 and added.json()["effects"] == ["fatigue", "threshold_drift"]
 
@@ -182,7 +183,7 @@ def test_diagnosis_kept_before_structures_were_told_is_read(client: httpx.Client
     context.analyses._keep(model, "diagnosis", old)
     assert client.get(f"/v1/models/{model}/diagnosis").json()["noise_sd_nm"] == 0.123
     with signed_in(service) as browser:
-        assert "Structure criticised: plain" in browser.get(f"/models/{model}").text
+        assert "Structure of the model: plain" in browser.get(f"/models/{model}").text
     assert client.get(f"/v1/models/{with_fatigue(client, model)}/diagnosis").json()["noise_sd_nm"] == 0.04
 
 
@@ -194,10 +195,10 @@ def refusal(missing: list[dict[str, Any]], gains: list[list[tuple[str, float]]],
 def test_reasons_against_an_effect() -> None:
     fatigue = {"effect": "fatigue", "name": "Fatigue", "confused_with": []}
     assert refusal([fatigue], [[("fatigue", 90)]], "fatigue") is None
-    assert "explains the same better" in str(refusal([fatigue], [[("drift", 50)], [("drift", 2)]], "drift"))
+    assert "explains the same error better" in str(refusal([fatigue], [[("drift", 50)], [("drift", 2)]], "drift"))
     assert "speaks against" in str(refusal([], [[("drift", -3)]], "drift"))
-    assert "too little" in str(refusal([], [[("drift", 3)]], "drift"))
-    assert "not considered" in str(refusal([], [], "torque_angle"))
+    assert "too weak" in str(refusal([], [[("drift", 3)]], "drift"))
+    assert "not tested" in str(refusal([], [], "torque_angle"))
 
 
 # ---- the next experiment ------------------------------------------------------------------------------------
@@ -273,7 +274,7 @@ def shown(verdict: str, missing: list[dict[str, Any]], effects: list[str], times
 
 
 def test_verdict_on_this_model_in_words() -> None:
-    assert "ask" in shown("effect_missing", [FATIGUE], [], 6)["words"]
+    assert "evidence" in shown("effect_missing", [FATIGUE], [], 6)["words"]
     after = shown("effect_missing", [FATIGUE], ["fatigue"], 1.1)
     assert after["title"] == "Nothing more is missing: what is left is noise" and after["missing"] == []
     assert shown("nothing_missing", [], [], 1.0)["title"] == "Nothing is missing: what is left is noise"
@@ -295,7 +296,7 @@ def test_page_shows_the_diagnosis_adds_by_a_form_and_shows_the_fall(service: Ser
             "Why does it fail?",
             "Fatigue",
             "93 %",
-            "This record cannot tell it from",
+            "This recording cannot tell it apart from",
             "Run it now",
             "falling prbs",
         ):
@@ -310,7 +311,7 @@ def test_page_shows_the_diagnosis_adds_by_a_form_and_shows_the_fall(service: Ser
             time.sleep(0.1)
             target = browser.get(target).headers.get("location", target)
         after = browser.get(target).text
-        assert "The error over the versions" in after and "Undo: back to the version before" in after
+        assert "Error of each version" in after and "Undo: back to the previous version" in after
         assert "+ fatigue" in after and re.search(r"1\. <a[^>]*>base model", after)
 
 
@@ -319,7 +320,9 @@ def test_forcing_on_the_page_wants_a_reason_and_refusals_are_pages(service: Serv
         led = browser.post(f"/models/{model}/effects", data={"csrf": csrf(browser), "effect": "tremor"})
         page = until(lambda: (found := browser.get(led.headers["location"])).status_code != 200 and found)
         assert (
-            page.status_code == 409 and "does not ask for this effect" in page.text and "Back to the model" in page.text
+            page.status_code == 409
+            and "gives no evidence for this effect" in page.text
+            and "Back to the model" in page.text
         )
 
 
@@ -355,22 +358,27 @@ def test_browser_asks_for_html(service: Service) -> None:
         assert stranger.get("/compare").status_code == 303
 
 
-def test_real_worker_finds_what_is_missing_and_the_test_that_decides(tmp_path: Path) -> None:
+def test_real_worker_finds_what_is_missing_and_the_page_shows_it(tmp_path: Path) -> None:
     """identify's own answers carry what page and routes build on."""
     from api.web.responses import ComparisonOut, DiagnosisOut
     from api.workers import diagnosis_verbs
     from api.workers.verbs import comparison, fit
-    from tests.api.test_worker import made_up_csv
 
-    path = str(made_up_csv(tmp_path / "record.csv"))
+    path = str(tmp_path / "record.csv")
+    hidden_records.write_csv(hidden_records.generate("asymmetric_relaxation", "middle", 8, rate_hz=200), path)
     told: list[float] = []
     found = diagnosis_verbs.diagnosis(path, lambda share, _text="": told.append(share))
     DiagnosisOut.model_validate(found)
     assert told == sorted(told) and told[-1] <= 1 and len(told) > 5
     assert found["structure"] == []
+    assert (found["verdict"], [entry["effect"] for entry in found["missing"]]) == (
+        "effect_missing",
+        ["asymmetric_relaxation"],
+    )
     model = fit(path, lambda *_: None)
     compared = comparison(path, lambda *_: None, model["json"])
     ComparisonOut.model_validate(compared)
-    assert len(compared["series"]["time_s"]) <= 2400
+    assert 1000 < len(compared["series"]["time_s"]) <= 2400
     view = explanation.view(found, compared, [])
-    assert view["title"] and {split["title"] for split in view["splits"]} == set(explanation.SPLITS.values())
+    assert [entry["effect"] for entry in view["missing"]] == ["asymmetric_relaxation"]
+    assert {split["title"] for split in view["splits"]} == set(explanation.SPLITS.values())

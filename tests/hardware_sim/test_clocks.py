@@ -12,7 +12,7 @@ import can
 import numpy as np
 import pytest
 
-from hardware_sim.errors import FaultError, SettingsError
+from hardware_sim.errors import SettingsError
 from hardware_sim.load_cells.cells import canopen, counts, plain
 from hardware_sim.load_cells.frames import Sample
 from hardware_sim.load_cells.sampler import LoadCell, Noise
@@ -162,4 +162,3 @@ class TestOverTheWire:
             assert not answer["ok"]
             assert setting in answer["error"]
         assert rig.ask(cmd="state")["faults"] == []
-        assert issubclass(FaultError, Exception)

@@ -24,6 +24,7 @@ from tests.hardware_sim.emulated import Emulated, emulated, wait_for
 pytestmark = pytest.mark.wire
 LAYOUT = struct.Struct("<fHBB")
 PULSE = config(*biphasic(250, 20))
+GENERAL_ERROR = 66
 
 
 class Host:
@@ -65,7 +66,13 @@ class Host:
         return messages
 
     def samples(self, seconds: float = 0.3) -> list[tuple[float, int, int, int]]:
-        time.sleep(0.02)  # what was on the way when the fault came
+        """At least half of the samples due, so that no check on all of them is made on none."""
+        found = self.samples_or_none(seconds)
+        assert len(found) > 0.5 * 1600 * seconds
+        return found
+
+    def samples_or_none(self, seconds: float = 0.3) -> list[tuple[float, int, int, int]]:
+        time.sleep(0.02)  # frames that were on their way when the fault came
         return [LAYOUT.unpack(m.data) for m in self.listen(seconds) if not m.is_error_frame]
 
     def steps(self, seconds: float = 0.3) -> list[int]:
@@ -144,7 +151,8 @@ def test_corrupt_both_ways(host: Host) -> None:
     host._decoder = Decoder()
     before = host.rig.ask(cmd="state")
     with broken(host, "corrupt_commands"):
-        assert all(packet.command == 66 for packet in host.ask(LL_CONFIG, PULSE))
+        answers = [packet for _ in range(6) for packet in host.ask(LL_CONFIG, PULSE, wait_s=0.15)]
+    assert {packet.command for packet in answers} == {GENERAL_ERROR}
     time.sleep(0.15)
     host.ask(62)
     after = host.rig.ask(cmd="state")
@@ -184,7 +192,7 @@ def test_unplugged_mid_frame_and_back(host: Host) -> None:
 
 def test_silent(host: Host) -> None:
     with broken(host, "cell_silent"):
-        assert host.samples() == []
+        assert host.samples_or_none() == []
     assert set(host.steps()) == {1}
 
 
@@ -231,7 +239,7 @@ def test_bus_errors(host: Host) -> None:
     with broken(host, "bus_off"):
         errors = [m for m in host.tail() if m.is_error_frame]
         assert [m.arbitration_id for m in errors] == [0x40]
-        assert host.samples() == []
+        assert host.samples_or_none() == []
 
 
 def test_counter_jump(host: Host) -> None:
@@ -288,8 +296,8 @@ def test_faults_from_the_start() -> None:
 
 def test_the_library_is_listed_and_every_fault_can_be_switched(host: Host) -> None:
     listed = host.rig.ask(cmd="faults")["faults"]
-    assert set(listed) == set(library())
-    assert all(entry["what"] for entry in listed.values())
+    assert set(listed) == set(library()) >= {"no_ack", "cell_silent"}
+    assert "" not in {entry["what"] for entry in listed.values()}
     for name in set(listed) - {"stimulator_unplugged", "cell_unplugged"}:
         with broken(host, name) as answer:
             assert answer["active"] == [name]

@@ -50,7 +50,9 @@ ALL = [
     for effect in (*effect_ids(), *outside_ids(), *outside_kept_ids())
     for index in range(len(formulations(effect)))
 ]
-# random by the step, or with an instant that falls on a step and sets what follows
+# noise drawn at each step, or a moment that is rounded to a step and changes all that follows
+RANDOM_BY_STEP = {("voluntary_effort", "moods"), ("mains_hum", "wandering")}
+"""Single formulations of the same kind: effect and the formulation's function."""
 BY_STEP = {"tremor", "delay_jitter", "stick_slip", "slow_converter", "clonus", "kind_b"}
 
 
@@ -85,12 +87,20 @@ def test_magnitude_zero_is_the_base_muscle(effect: str, index: int) -> None:
     assert np.abs(full - plain).max() > 0.05
 
 
-@pytest.mark.parametrize(("effect", "index"), [p for p in ALL if p.values[0] not in BY_STEP])
+def depends_on_the_step(effect: str, index: int) -> bool:
+    return effect in BY_STEP or (effect, formulations(effect)[index].__name__) in RANDOM_BY_STEP
+
+
+def test_what_depends_on_the_step_is_there() -> None:
+    known = {(effect, writer.__name__) for effect in effect_ids() for writer in formulations(effect)}
+    assert known >= RANDOM_BY_STEP
+    assert {*effect_ids(), *outside_ids(), *outside_kept_ids()} >= BY_STEP
+
+
+@pytest.mark.parametrize(("effect", "index"), [p for p in ALL if not depends_on_the_step(*p.values)])
 def test_a_finer_step_gives_the_same_torque(effect: str, index: int) -> None:
     base, formulation = written(effect, index)
     design = make_design("full", rng_of(2), float(base.largest_width_us), moving=True, validate_s=4.0)
-    if any(word in formulation.name for word in ("random drive", "grid's frequency wanders")):
-        return  # random by the step
     stages = combine(base, [(formulation, 0.4 * formulation.largest_magnitude)])
     coarse = simulate(base, stages, design, STEP_S)
     fine = simulate(base, stages, design, STEP_S / 4.0)[::4]

@@ -90,10 +90,10 @@ def test_reveal_tells_of_the_muscle_that_make_gives() -> None:
     for seed in range(40, 52):
         told = hidden.reveal(seed)
         json.dumps(told)
+        hidden._scenario.cache_clear()  # or the scenario would be compared with itself
         assert told == hidden.reveal(seed)
         assert len(told["effects"]) == len(told["formulation"]) == len(told["parameters"])
         kinds.add((len(told["effects"]), told["outside_library"]))
-        assert not any(effect in repr(hidden.make(seed)) for effect in told["effects"])
     assert len(kinds) >= 3  # nothing, one, two, foreign
 
     seed = next(seed for seed in range(40, 80) if len(hidden.reveal(seed)["effects"]) == 1)

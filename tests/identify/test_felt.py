@@ -17,7 +17,8 @@ from identify.methods import methods
 from identify.records.read import read
 from identify.records.record import OPTIONAL, Record
 from identify.simulation.predict import predict
-from tests.harness.patients import FINE_HZ, Patient, make_record, protocol, second_order
+from tests.harness.muscle import FINE_HZ, Patient, second_order
+from tests.harness.patients import make_record, protocol
 
 PULSE_S = 0.025
 FINE = round(FINE_HZ * PULSE_S)

@@ -98,7 +98,7 @@ def test_no_segments_a_pulse_rate_and_holes(tmp_path: Path, record: Record) -> N
     path = saved(tmp_path / "data.mat", content)
     found = identify.read(path)
     assert found.time_s.size == record.time_s.size - 1
-    assert f"(first at {path}, torque_nm(11))" in found.notes[0]
+    assert "(first at torque_nm(11))" in found.notes[0]
     assert "no segment column: found from the pulse widths" in found.notes[-1]
 
 

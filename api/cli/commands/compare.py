@@ -7,7 +7,18 @@ from typing import Annotated, Any
 
 import typer
 
-from api.cli.terminal import Data, Json, ModelFile, load_model, model_report, say, say_json, write
+from api.cli.terminal import (
+    ColumnMap,
+    Data,
+    Json,
+    ModelFile,
+    load_model,
+    load_record,
+    model_report,
+    say,
+    say_json,
+    write,
+)
 
 
 def register(app: typer.Typer) -> None:
@@ -19,6 +30,7 @@ def compare(
     model_json: ModelFile,
     data: Data,
     html: Annotated[Path | None, typer.Option(help="write a report with charts here")] = None,
+    columns: ColumnMap = None,
     as_json: Json = False,
 ) -> None:
     """Measurement against model: where it fails, and by how much.
@@ -30,7 +42,7 @@ def compare(
     from api.workers.verbs import clean, curves, thinned
 
     model = load_model(model_json)
-    record = identify.read(data)
+    record = load_record(data, columns)
     found = identify.compare(model, record).to_dict()
     if html is not None:
         drawn = clean(curves(model, record))

@@ -10,13 +10,13 @@ from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any
 
-import httpx
 import typer
 
 from api.cli.errors import ReportedError
 from api.cli.launcher import Services
-from api.cli.rest_session import approve_and_fetch, checked, ensure_participant, report_lines, run_test
+from api.cli.session_report import report_lines, run_test
 from api.cli.terminal import Json, number, say, say_json
+from api.client.rest import Client
 from api.settings import Settings
 
 PARTICIPANT = "DEMO"
@@ -53,23 +53,15 @@ def demo(
 
 def play(services: Services, token: str, tell: Callable[..., None]) -> dict[str, Any]:
     """The whole path, over HTTP only."""
-
-    def watch() -> None:
-        for event in services.watch():
-            raise ReportedError(event)
-
-    with connect(services.url, token) as client:
+    with Client(services.url, token) as client:
         tell(f"service at {services.url}; participant {PARTICIPANT}; the test runs in real time")
-        ensure_participant(client, PARTICIPANT)
         before, start = cpu(services), time.monotonic()
-        test = run_test(client, PARTICIPANT, watch)
+        test = run_test(client, PARTICIPANT, services.watch)
         spent = time.monotonic() - start
         after = cpu(services)
-        issued = checked(client.post("/v1/tokens", json={"name": "controller", "scopes": ["read-model"]})).json()
         tell("approving the model; fetching it as the controller (ETag, then 304)")
-        with connect(services.url, issued["token"]) as controller:
-            model = approve_and_fetch(client, controller, PARTICIPANT, test["model_id"])
-        curves = checked(client.get(f"/v1/models/{test['model_id']}/curves")).json()
+        model = approve_and_fetch(client, test["model_id"])
+        curves = client.curves(test["model_id"])
     shares = {
         name: None if after[name] is None or used is None else round(100 * (after[name] - used) / spent, 1)
         for name, used in before.items()
@@ -77,9 +69,23 @@ def play(services: Services, token: str, tell: Callable[..., None]) -> dict[str,
     return {"test": test, "model": model, "curves": curves, "cpu_percent": shares}
 
 
-def connect(url: str, token: str) -> httpx.Client:
-    """A client with a token."""
-    return httpx.Client(base_url=url, headers={"Authorization": f"Bearer {token}"}, timeout=60)
+def approve_and_fetch(client: Client, model_id: str) -> dict[str, Any]:
+    """A person approves; the controller fetches the model, and a second time hears that nothing changed.
+
+    Raises
+    ------
+    ReportedError
+        The controller did not get the approved model, or no 304.
+    """
+    client.approve(model_id, "demo")
+    with Client(client.url, client.issue_token("controller", ["read-model"])) as controller:
+        first = controller.approved_model(PARTICIPANT)
+        again = controller.approved_model(PARTICIPANT, first)
+    if first.document.get("model_id") != model_id:
+        raise ReportedError("the controller got another model than the approved one")
+    if again.changed:
+        raise ReportedError("the service sent the model a second time, although nothing had changed")
+    return first.document
 
 
 def cpu(services: Services) -> dict[str, Any]:

@@ -6,13 +6,13 @@ from typing import Any
 
 import typer
 
-from api.cli.terminal import Data, HeldModel, Json, load_held, number, percent, progress_line, say, say_json
+from api.cli.terminal import ColumnMap, Data, HeldModel, Json, load_held, number, percent, progress_line, say, say_json
 from api.structure import in_words, worded
 
 VERDICTS = {
     "effect_missing": "An effect is missing in the model.",
     "nothing_missing": "Nothing is missing: what is left looks like noise.",
-    "unexplained_structure": "Structure is left that no effect of the library explains.",
+    "unexplained_structure": "The error has structure that no effect of the library explains.",
 }
 
 
@@ -24,15 +24,16 @@ def register(app: typer.Typer) -> None:
 def diagnose(
     data: Data,
     model_json: HeldModel = None,
+    columns: ColumnMap = None,
     as_json: Json = False,
 ) -> None:
-    """What is missing in a model's structure, ranked; or that nothing is; or that what is left has no name here.
+    """What is missing in a model's structure, most probable first; or nothing; or structure that no effect explains.
 
     Takes 5 to 30 s. DATA decides: a model given with --model lends its structure, not its numbers.
     """
     import identify
 
-    record, model, structure = load_held(model_json, data)
+    record, model, structure = load_held(model_json, data, columns)
     progress = progress_line()
     found = {"structure": structure, **identify.diagnose(record, model, progress).to_dict()}
     progress(1.0, "done")

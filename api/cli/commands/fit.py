@@ -7,7 +7,18 @@ from typing import Annotated
 
 import typer
 
-from api.cli.terminal import Data, Json, model_report, names, progress_line, say, say_json, write
+from api.cli.terminal import (
+    ColumnMap,
+    Data,
+    Json,
+    load_record,
+    model_report,
+    names,
+    progress_line,
+    say,
+    say_json,
+    write_model,
+)
 
 
 def register(app: typer.Typer) -> None:
@@ -24,7 +35,7 @@ def fit(
     effects: Annotated[
         str,
         typer.Option(
-            help="effects that the model is to hold, comma-separated (`stimrig effects` lists them), each `id` or "
+            help="effects of the model, comma-separated (`stimrig effects` lists them), each `id` or "
             "`id:form`; or `auto`: those that the record asks for, as `improve` adds them. Only with maximum-likelihood"
         ),
     ] = "",
@@ -34,18 +45,19 @@ def fit(
             help="segments to fit on, comma-separated, never `validate`; default: all others, or what the method needs"
         ),
     ] = "",
-    output: Annotated[Path | None, typer.Option("-o", "--output", help="write MODEL.json here")] = None,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="write MODEL.json, or MODEL.mat")] = None,
+    columns: ColumnMap = None,
     as_json: Json = False,
 ) -> None:
     """Identify a model: recruitment curve, linear dynamics, effects. Says how well it fits and whether it is usable."""
     import identify
 
-    record = identify.read(data)
+    record = load_record(data, columns)
     model = identify.fit(
         record, method=method, effects=names(effects), fit_on=names(fit_on) or None, progress=progress_line()
     )
     if output is not None:
-        write(output, model.to_json())
+        write_model(output, model)
     if as_json:
         say_json(model.to_dict())
         return

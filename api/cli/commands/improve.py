@@ -1,8 +1,7 @@
-"""`stimrig improve`: effects added one by one while the evidence lasts."""
+"""`stimrig improve`: effects added one by one as long as the evidence supports it."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -10,7 +9,20 @@ from typing import Annotated, Any
 import typer
 
 from api.cli.commands.diagnose import VERDICTS
-from api.cli.terminal import Data, HeldModel, Json, load_held, number, progress_line, say, say_json, table, write
+from api.cli.terminal import (
+    ColumnMap,
+    Data,
+    HeldModel,
+    Json,
+    load_held,
+    number,
+    progress_line,
+    say,
+    say_json,
+    table,
+    write,
+    write_model,
+)
 from api.structure import in_words
 
 FEW = 3
@@ -26,25 +38,28 @@ def improve(
     data: Data,
     model_json: HeldModel = None,
     html: Annotated[Path | None, typer.Option(help="write a report with charts here")] = None,
-    output: Annotated[Path | None, typer.Option("-o", "--output", help="write the last MODEL.json here")] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="write the last MODEL.json, or MODEL.mat")
+    ] = None,
+    columns: ColumnMap = None,
     as_json: Json = False,
 ) -> None:
-    """Add effects one by one to a model's structure while the evidence lasts; each step is a model.
+    """Add effects one by one to a model's structure as long as the evidence supports it; each step is a model.
 
     Takes 5 to 40 s. Without -o nothing is kept.
     """
     import identify
 
-    record, model, structure = load_held(model_json, data)
+    record, model, structure = load_held(model_json, data, columns)
     progress = progress_line()
     improved = identify.improve(record, progress=progress, model=model)
     progress(1.0, "done")
     found, models = {"structure": structure, **improved.to_dict()}, improved.models
     del found["models"]
     if output is not None:
-        write(output, json.dumps(models[-1].to_dict(), indent=1))
+        write_model(output, models[-1])
     if html is not None:
-        write(html, report(record, found, models, data, model))
+        write(html, report(record, found, models, data, model, columns))
     if as_json:
         say_json(found)
         return
@@ -52,7 +67,14 @@ def improve(
     say(*[f"written to     {path}" for path in (output, html) if path is not None])
 
 
-def report(record: Any, found: dict[str, Any], models: Sequence[Any], data: Path, held: Any | None = None) -> str:
+def report(
+    record: Any,
+    found: dict[str, Any],
+    models: Sequence[Any],
+    data: Path,
+    held: Any | None = None,
+    columns: list[str] | None = None,
+) -> str:
     """The report: what was found, what each effect is, what is left before and after."""
     import numpy as np
 
@@ -64,7 +86,7 @@ def report(record: Any, found: dict[str, Any], models: Sequence[Any], data: Path
     before, after = (thinned(identify.compare(model, record).to_dict()) for model in (models[0], models[-1]))
     labels = [str(record.segment_names[index]) for index in record.segment]
     segments = runs(labels, np.asarray(record.time_s))
-    missing = diagnosis(str(data), progress_line(), None if held is None else held.to_json())
+    missing = diagnosis(str(data), progress_line(), None if held is None else held.to_json(), columns)
     return improvement_html(found, data.name, missing, before, after, segments)
 
 

@@ -1,4 +1,4 @@
-"""`stimrig predict`: a model's free run beside the measurement, as CSV."""
+"""`stimrig predict`: a model's free run beside the measurement, as CSV or MAT file."""
 
 from __future__ import annotations
 
@@ -7,8 +7,20 @@ from typing import Annotated
 
 import typer
 
-from api.cli.errors import InputError
-from api.cli.terminal import Data, Json, ModelFile, load_model, number, percent, say, say_json
+from api.cli.terminal import (
+    ColumnMap,
+    Data,
+    Json,
+    ModelFile,
+    load_model,
+    load_record,
+    number,
+    percent,
+    say,
+    say_json,
+    write_mat,
+    writing,
+)
 
 
 def register(app: typer.Typer) -> None:
@@ -19,7 +31,8 @@ def register(app: typer.Typer) -> None:
 def predict(
     model_json: ModelFile,
     data: Data,
-    output: Annotated[Path, typer.Option("-o", "--output", help="CSV file to write", show_default=False)],
+    output: Annotated[Path, typer.Option("-o", "--output", help="CSV or .mat file to write", show_default=False)],
+    columns: ColumnMap = None,
     as_json: Json = False,
 ) -> None:
     """Free-run simulation from the recorded pulse widths: time_s,torque_nm,predicted_torque_nm."""
@@ -29,13 +42,14 @@ def predict(
     from identify.estimation.figures import best_fit_percent
 
     model = load_model(model_json)
-    record = identify.read(data)
+    record = load_record(data, columns)
     predicted = np.asarray(identify.predict(model, record))
-    columns = np.column_stack([record.time_s, record.torque_nm, predicted])
-    try:
-        np.savetxt(output, columns, "%.9g", ",", header="time_s,torque_nm,predicted_torque_nm", comments="")
-    except OSError as error:
-        raise InputError(f"{output}: {error.strerror}. Give a file in a folder that can be written.") from error
+    found = {"time_s": record.time_s, "torque_nm": record.torque_nm, "predicted_torque_nm": predicted}
+    if output.suffix.lower() == ".mat":
+        write_mat(output, found)
+    else:
+        with writing(output):
+            np.savetxt(output, np.column_stack(list(found.values())), "%.9g", ",", header=",".join(found), comments="")
     residual = record.torque_nm - predicted
     reached = best_fit_percent(record.torque_nm, predicted)
     rms_nm = float(np.sqrt(np.mean(residual**2)))

@@ -5,17 +5,18 @@ from __future__ import annotations
 import os
 import secrets
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
-import httpx
 import typer
 
-from api.cli.errors import InputError, ReportedError
+from api.cli.errors import InputError
 from api.cli.launcher import Services
-from api.cli.rest_session import checked, ensure_participant, report_lines, run_test
+from api.cli.session_report import report_lines, run_test
 from api.cli.stop_key import StopKey, at_rig, at_service
 from api.cli.terminal import Json, say, say_json
+from api.client.rest import Client
 from api.settings import Settings
 
 
@@ -33,7 +34,7 @@ def test(
     emulate: Annotated[str, typer.Option(help='options for the emulator, e.g. "--patient calcium"')] = "",
     as_json: Json = False,
 ) -> None:
-    """One pre-session test: PRBS, ramp and held-out levels played, the muscle identified. Approves nothing."""
+    """One pre-session test: PRBS, ramp and held-out levels are sent, and the muscle is identified. Approves nothing."""
     if url:
         token = os.environ.get("STIMRIG_TOKEN") or os.environ.get("STIMRIG_ADMIN_TOKEN")
         if not token:
@@ -91,29 +92,18 @@ def on_own_services(rig: Path | None, data: Path | None, emulate: str, participa
         StopKey(at_rig(services.socket), say_aside) as key,
     ):
         announce(key)
-
-        def watch() -> None:
-            for event in services.watch():
-                raise ReportedError(event)
-
-        return through(services.url, token, participant, watch)
+        return through(services.url, token, participant, services.watch)
 
 
-def through(url: str, token: str, participant: str, watch: Any = lambda: None) -> dict[str, Any]:
+def through(url: str, token: str, participant: str, events: Callable[[], list[str]] = list) -> dict[str, Any]:
     """The test through a service.
 
     Raises
     ------
-    ReportedError
+    ServiceError
         The service cannot be reached, or the test did not end in a model.
     """
-    try:
-        with httpx.Client(base_url=url, headers={"Authorization": f"Bearer {token}"}, timeout=60) as client:
-            ensure_participant(client, participant)
-            document = run_test(client, participant, watch)
-            model = checked(client.get(document["model_url"])).json()["model"]
-            recording = checked(client.get(document["recording_url"])).content
-            return {"test": document, "model": model, "recording": recording}
-    except (httpx.TransportError, httpx.UnsupportedProtocol, httpx.InvalidURL) as error:
-        words = f"{url}: the service cannot be reached ({error}). Is `stimrig serve` running there?"
-        raise ReportedError(words, 2) from error
+    with Client(url, token) as client:
+        document = run_test(client, participant, events)
+        model = client.model_file(document["model_id"])
+        return {"test": document, "model": model, "recording": client.recording(document["recording_id"])}

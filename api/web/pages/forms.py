@@ -33,7 +33,7 @@ async def upload(context: Ctx, who: Tester, code: str, file: Annotated[UploadFil
     data = await file.read()
     if not data:
         raise ApiError(422, "empty", "No file came", "Go back and choose a CSV file or a sealed recording (HDF5).")
-    _row, model, _warning = await recordings.take_in(context, code, data, who.name)
+    _row, model, _warnings = await recordings.take_in(context, code, data, who.name)
     return RedirectResponse(f"/models/{model.id}", 303)
 
 
@@ -59,7 +59,7 @@ async def decide(context: Context, by: str, model_id: str, approved: bool, reaso
     """
     if not reason.strip():
         detail = "Go back and say in a few words why; it is kept in the audit trail. Nothing was decided."
-        raise ApiError(422, "reason-missing", "A decision wants a reason", detail)
+        raise ApiError(422, "reason-missing", "A decision needs a reason", detail)
     await asyncio.to_thread(context.versions.decide, model_id, approved, by, reason.strip()[:500])
     return RedirectResponse(f"/models/{model_id}", 303)
 

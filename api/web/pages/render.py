@@ -15,7 +15,7 @@ from api.web.dependencies import Context
 from api.web.pages import rig_state
 from api.web.pages.environment import environment
 
-environment.filters["mend"] = rig_state.mend
+environment.filters["what_to_check"] = rig_state.what_to_check
 
 BACK = {"models": "Back to the model", "participants": "Back to the participant", "tests": "Back to the test"}
 

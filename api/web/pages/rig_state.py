@@ -1,4 +1,4 @@
-"""What every page says of the rig: one source for the bar, the notice and the rig's card, with scripts and without."""
+"""What every page shows of the rig: one source for the bar, the notice and the rig's card."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from api.web.dependencies import Context
 from api.web.pages.environment import clock
 
 SILENT_S = 1.6
-"""The service asks the rig once a second and hears its torque more often: after such a silence nothing is known."""
+"""The rig answers once a second and sends its torque more often. After such a silence its state is unknown."""
 TORQUE_OLD_S = 1.0
-"""An older torque is not shown as the present one."""
+"""An older torque is not shown as the torque of now."""
 
 WORDS: dict[str, tuple[str, str]] = {
     "ready": ("No stimulation", "ready"),
@@ -21,13 +21,13 @@ WORDS: dict[str, tuple[str, str]] = {
     "running": ("Stimulating", ""),
     "stopping": ("Stopping", "not confirmed yet"),
     "sealing": ("No stimulation", "saving the recording"),
-    "latched": ("Stopped", "waits for a person"),
-    "uncertain": ("Restarted", "waits for a person"),
-    "disconnected": ("Disconnected", "see what to mend"),
-    "unreachable": ("Not known", "the rig cannot be reached"),
-    "silent": ("Not known", "the rig does not answer"),
+    "latched": ("Stopped", "re-arm to go on"),
+    "uncertain": ("Restarted", "re-arm to go on"),
+    "disconnected": ("Disconnected", "see below what to check"),
+    "unreachable": ("Unknown", "the rig cannot be reached"),
+    "silent": ("Unknown", "the rig does not answer"),
 }
-"""What flows, and what else there is to say, for each state of the rig and of the way to it."""
+"""For each state: whether stimulation is on, and one more thing to know."""
 
 
 def state_of(context: Context) -> str:
@@ -49,11 +49,11 @@ def torque_now(context: Context) -> tuple[float | None, float | None]:
 
 
 def now(context: Context, principal: Principal | None) -> dict[str, Any]:
-    """What the rig does now. Who is not signed in learns the state and nothing of any participant."""
+    """What the rig does now. Without a sign-in: the state only, nothing about a participant."""
     state = state_of(context)
     flow, more = WORDS[state]
     torque_nm, age_s = torque_now(context)
-    told: dict[str, Any] = {
+    shown: dict[str, Any] = {
         "state": state,
         "flow": flow,
         "more": more,
@@ -62,10 +62,10 @@ def now(context: Context, principal: Principal | None) -> dict[str, Any]:
         "ready": state == "ready",
     }
     if principal is None:
-        return told
+        return shown
     current = context.runner.current
     return {
-        **told,
+        **shown,
         "torque_nm": torque_nm,
         "torque_age_s": age_s,
         "test": {"id": current.test_id, "participant": current.participant} if current else None,
@@ -74,15 +74,15 @@ def now(context: Context, principal: Principal | None) -> dict[str, Any]:
 
 
 def notice_key(context: Context, state: str) -> str:
-    """Changes whenever the notice has something else to say."""
+    """A key that changes when the notice changes."""
     reason = context.rig.status.reason if context.rig.status else ""
     return hashlib.sha256(f"{state} {reason}".encode()).hexdigest()[:12]
 
 
-def mend(reason: str) -> str:
-    """What a person should look at before pressing *Reconnect*."""
+def what_to_check(reason: str) -> str:
+    """What a person should check before pressing *Reconnect*."""
     if reason.startswith(("load cell", "load_cell")):
-        return "Check the load cell's cable and supply, then press Reconnect."
+        return "Check the cable and the power of the load cell. Then press Reconnect."
     if reason.startswith("stimulator"):
-        return "Check the stimulator's cable, and that it is switched on; then press Reconnect."
-    return "Check the cables and supplies of stimulator and load cell, then press Reconnect."
+        return "Check the cable of the stimulator, and that it is switched on. Then press Reconnect."
+    return "Check cables and power of the stimulator and the load cell. Then press Reconnect."

@@ -1,4 +1,4 @@
-"""Before current flows: who, how much, how long; asked of a person, who sees it and says yes."""
+"""The question before stimulation: a person sees who, how strong, how long, and confirms."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from api.web.dependencies import Context
 from api.web.pages.environment import number, when
 from api.web.routes import participants
 
-NOBODY = "nobody has found out today what is felt, what moves and what is comfortable"
+NOBODY = "today nobody has tested which pulse widths are felt, move the arm and are comfortable"
 KINDS = {"pre-session": "pre-session test", "next-experiment": "next experiment"}
 
 
@@ -57,7 +57,7 @@ async def ask(context: Context, who: Principal, body: TestIn, back: str = "") ->
     context.runner.refuse_second()
     standing = await asyncio.to_thread(calibrated, context, row)
     if not standing.may_start:
-        detail = f"{row.code}'s calibration: {standing.words}. This rig starts no test without one of today."
+        detail = f"{row.code}'s calibration: {standing.words}. This rig needs a calibration of today before a test."
         raise ApiError(409, "calibrate-first", "Calibrate first", detail)
     seen = Seen(profiles.version(row.profile), await context.runner.preview(body))
 
@@ -107,7 +107,7 @@ def rig_words(context: Context) -> str:
     """What the current comes from."""
     status = context.rig.status
     if status is None or not context.rig.connected:
-        return "not reached"
+        return "cannot be reached"
     stimulator = status.stimulator
     parts = [str(stimulator.get("device") or "stimulator unknown").upper(), str(stimulator.get("firmware") or "")]
     emulated = ", emulated: no person is connected" if context.settings.emulated else ""

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import hashlib
 import secrets
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from fastapi import APIRouter, Request, Response
+from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import FileResponse
 from starlette.background import BackgroundTask
 
@@ -28,9 +30,11 @@ BINARY = {"schema": {"type": "string", "format": "binary"}}
 CSV = {"description": "one row a sample", "content": {"text/csv": BINARY}}
 RAW = {
     "description": "the file as it was sealed or sent in; `X-Content-SHA256` is its checksum",
-    "content": {"application/x-hdf5": BINARY, "text/csv": BINARY},
+    "content": {"application/x-hdf5": BINARY, "text/csv": BINARY, "application/x-matlab-data": BINARY},
 }
 GONE = problem("the file is not in its place any more")
+MOST_COLUMNS = 8
+KINDS = {".csv": "text/csv", ".mat": "application/x-matlab-data"}
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 
 
@@ -38,7 +42,7 @@ HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 def recording(context: Ctx, _who: ModelReader, recording_id: str) -> FileResponse:
     """The raw recording."""
     row, path = held(context, recording_id)
-    kind = "text/csv" if path.suffix == ".csv" else "application/x-hdf5"
+    kind = KINDS.get(path.suffix, "application/x-hdf5")
     return FileResponse(path, media_type=kind, filename=path.name, headers={"X-Content-SHA256": row.file_sha256})
 
 
@@ -80,38 +84,78 @@ def held(context: Context, recording_id: str) -> tuple[Recording, Path]:
 @router.post(
     "/participants/{code}/recordings", status_code=201, openapi_extra=UPLOAD, **answers(UploadOut, 201, "taken in")
 )
-async def upload(context: Ctx, who: Tester, code: str, request: Request, response: Response) -> dict[str, Any]:
-    """Take in a recording of another tool (CSV or HDF5 as the request's body) and identify a model from it."""
+async def upload(
+    context: Ctx,
+    who: Tester,
+    code: str,
+    request: Request,
+    response: Response,
+    columns: Annotated[list[str], Query(alias="map", max_length=MOST_COLUMNS)] = [],  # noqa: B006
+) -> dict[str, Any]:
+    """Upload a recording of another tool (CSV, MAT or HDF5 as the request's body) and identify a model from it.
+
+    `map` says what a column is called there and its unit, once for each column: `map=torque_nm=Drehmoment:Nm`.
+    What was assumed is told in `warnings`.
+    """
     await asyncio.to_thread(participants.find, context, code)
     data = await bounded_body(request, context.settings.max_upload_mb)
-    row, model, warning = await take_in(context, code, data, who.name)
+    row, model, warnings = await take_in(context, code, data, who.name, columns)
     response.headers["Location"] = f"/v1/recordings/{row.id}"
-    return {"recording_id": row.id, "model": context.versions.document(model), "warnings": [warning] if warning else []}
+    return {"recording_id": row.id, "model": context.versions.document(model), "warnings": warnings}
 
 
-async def take_in(context: Context, code: str, data: bytes, by: str) -> tuple[Recording, Model, str]:
-    """Keep a recording of another tool and identify a model from it; and what was left out of its structure.
+async def take_in(
+    context: Context, code: str, data: bytes, by: str, columns: Sequence[str] = ()
+) -> tuple[Recording, Model, list[str]]:
+    """Keep a recording of another tool and identify a model from it; what was assumed, and left out of its structure.
+
+    Where `columns` are mapped, what is kept is the record as a CSV file of ours, with the SHA-256 of what was sent.
 
     Raises
     ------
     ApiError
         422: it cannot be read or fitted; nothing is kept of it.
     """
-    whole = await asyncio.to_thread(_write, context, data)
+    whole = await asyncio.to_thread(_write, context, data, ".csv" if columns else _suffix(data))
     part = uploads.part_of(whole)
     try:
+        assumed, data = await _with_our_columns(context, part, columns, data)
         found, warning = await _identified(context, code, part)
     except BaseException:  # refused, or nobody waits for it any more
         part.unlink(missing_ok=True)
         raise
-    row = await asyncio.shield(asyncio.to_thread(_store, context, code, whole, data, by, warning))
-    return row, await asyncio.to_thread(context.versions.add, found["json"], code, row.id, by), warning
+    warnings = [note for note in (*assumed, *found["notes"], warning) if note]
+    row = await asyncio.shield(asyncio.to_thread(_store, context, code, whole, data, by, warnings))
+    return row, await asyncio.to_thread(context.versions.add, found["json"], code, row.id, by), warnings
+
+
+async def _with_our_columns(
+    context: Context, path: Path, columns: Sequence[str], data: bytes
+) -> tuple[list[str], bytes]:
+    """What was assumed, and the bytes that are kept: the upload's own, or the table of ours that was made of it."""
+    if not columns:
+        return [], data
+    out = path.with_suffix(uploads.PLAIN)
+    try:
+        with _about_the_upload(path):
+            found = await context.pool.submit("plain_csv", data=str(path), out=str(out), columns=list(columns)).result
+        await asyncio.to_thread(out.replace, path)
+    finally:
+        out.unlink(missing_ok=True)
+    return found["notes"], await asyncio.to_thread(path.read_bytes)
 
 
 async def _identified(context: Context, code: str, path: Path) -> tuple[dict[str, Any], str]:
-    """The model of an upload; every reason why there is none is about the upload, and tells nothing of this machine."""
-    try:
+    """The model of an upload, and what was left out of its structure."""
+    with _about_the_upload(path):
         return await context.analyses.starting_effects.fit(code, str(path))
+
+
+@contextlib.contextmanager
+def _about_the_upload(path: Path) -> Iterator[None]:
+    """Every reason why there is no model is about the upload, and tells nothing of this machine."""
+    try:
+        yield
     except ApiError as error:
         if error.code == "worker-died":
             detail = f"{error.detail.partition('. ')[0]}. Is the file damaged? Nothing of it was kept."
@@ -130,22 +174,25 @@ async def bounded_body(request: Request, limit_mb: float) -> bytes:
         if len(data) > limit_mb * 1e6:
             raise ApiError(413, "too-large", "The upload is too large", f"At most {limit_mb:g} MB are taken.")
     if not data:
-        raise ApiError(422, "empty", "The upload is empty", "Send a CSV file or a sealed recording as the body.")
+        raise ApiError(422, "empty", "The upload is empty", "Send a CSV or MAT file or a sealed recording as the body.")
     return bytes(data)
 
 
-def _write(context: Context, data: bytes) -> Path:
-    suffix = ".h5" if data.startswith(HDF5_MAGIC) else ".csv"
+def _suffix(data: bytes) -> str:
+    return ".h5" if data.startswith(HDF5_MAGIC) else ".mat" if data.startswith(b"MATLAB ") else ".csv"
+
+
+def _write(context: Context, data: bytes, suffix: str) -> Path:
     path = context.settings.recordings_dir / f"{uploads.PREFIX}{secrets.token_hex(8)}{suffix}"
     uploads.part_of(path).write_bytes(data)
     return path
 
 
-def _store(context: Context, code: str, path: Path, data: bytes, by: str, warning: str) -> Recording:
+def _store(context: Context, code: str, path: Path, data: bytes, by: str, warnings: list[str]) -> Recording:
     now = context.clock.utc()
     row = Recording(id=path.stem, participant=code, test_id=None, path=str(path), origin="upload", created_utc=now)
     row.file_sha256 = hashlib.sha256(data).hexdigest()
-    row.warnings = [warning] if warning else []
+    row.warnings = warnings
     with uploads.taken_in(path), context.store.write() as session:
         session.add(row)
         session.flush()

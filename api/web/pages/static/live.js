@@ -71,8 +71,8 @@ function age() {
   const stale = running && (!state.connected || !open || seconds === null || seconds > STALE_S);
   byId("stale").hidden = !stale;
   byId("live").classList.toggle("is-stale", stale);
-  if (stale) say("stale", !open ? "No connection to the service: what is drawn is old. The stop button still works if the service does; the stimulator's own switch always does."
-    : !state.connected ? "The rig cannot be reached: what is drawn is old." : "The data are old: what is drawn is not what is.");
+  if (stale) say("stale", !open ? "No connection to the service. Display out of date: do not rely on it. If the stop button does not answer, use the emergency switch on the stimulator."
+    : !state.connected ? "The rig cannot be reached. Display out of date: do not rely on it; use the emergency switch on the stimulator if unsure." : "Display out of date. Do not rely on it; press Stop if unsure.");
 }
 
 // ---- drawing -----------------------------------------------------------------------------------

@@ -1,5 +1,5 @@
-// What the rig does now, on every page and in every tab: asked for twice a second, never shown older than 2 s.
-// Asked for, not sent: an answer is always newer than its question, also after a laptop has slept.
+// The rig's state, on every page and in every tab: read twice a second, never shown when older than 2 s.
+// The page asks (the service does not push): an answer is newer than its question, also after a laptop has slept.
 "use strict";
 {
   const EVERY_MS = 500, PATIENCE_MS = 1500, OLD_MS = 2000, TORQUE_OLD_S = 1.0;
@@ -32,7 +32,7 @@
   }
 
   function show() {
-    if (old()) return bar("unknown", "Not known", "no answer from the service", false);
+    if (old()) return bar("unknown", "Unknown", "no answer from the service", false);
     if (!known) return; // what the service wrote into the page stands, with its time
     bar(known.state, known.flow, known.more, known.ready);
     if (known.test !== undefined) test(known.test);
@@ -47,7 +47,7 @@
   }
 
   function torque() {
-    if (old() || !known) return "not known";
+    if (old() || !known) return "unknown";
     if (typeof known.torque_age_s !== "number") return "none yet";
     const age = known.torque_age_s + since(asked) / 1000;
     if (known.torque_nm === null || age > TORQUE_OLD_S) return "no torque for " + age.toFixed(1) + " s";

@@ -1,0 +1,97 @@
+"""A test through the REST client on the command line: its progress, and its report."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from api.cli.errors import ReportedError
+from api.cli.terminal import model_report, number
+from api.client.documents import SessionTest
+from api.client.errors import Unreachable
+from api.client.rest import Client
+
+
+def run_test(client: Client, participant: str, events: Callable[[], list[str]] = list) -> SessionTest:
+    """Run the default pre-session test and show its progress.
+
+    Parameters
+    ----------
+    client : Client
+        Of the service.
+    participant : str
+        Code; made unless it is there.
+    events : callable
+        Says which processes of the service have ended; one is enough to give up.
+
+    Raises
+    ------
+    ReportedError
+        A process has ended.
+    ServiceError
+        The test was refused, or did not complete.
+    """
+    show = Progress()
+
+    def watch(test: SessionTest) -> None:
+        for event in events():
+            raise ReportedError(event)
+        show(test)
+
+    client.ensure_participant(participant)
+    try:
+        return client.run_test(participant, watch)
+    except Unreachable as error:
+        for event in events():
+            raise ReportedError(event) from error
+        raise
+
+
+class Progress:
+    """A progress line: on a terminal in place, elsewhere a line a segment."""
+
+    def __init__(self) -> None:
+        self.terminal = sys.stderr.isatty()
+        self.last = ""
+
+    def __call__(self, document: SessionTest) -> None:
+        """Show where the test stands."""
+        if document["state"] == "identifying":
+            segment = (document.get("identification") or {}).get("text") or "identifying"
+            words = f"identification: {segment}"
+        else:
+            segment = document.get("segment") or document["state"]
+            words = f"{segment:10} {100 * document['progress']:3.0f} %  {document['time_left_s']:4.0f} s left"
+        if self.terminal:
+            words, end = (document["state"], "\n") if document["done"] else (words, "")
+            print(f"\r\x1b[K  {words}", end=end, file=sys.stderr, flush=True)
+        elif segment != self.last and not document["done"]:
+            print(f"  {words}", file=sys.stderr, flush=True)
+        self.last = segment
+
+
+def report_lines(test: Mapping[str, Any], model: dict[str, Any]) -> list[str]:
+    """The report of a test and its model."""
+    summary, planned = test["summary"], test.get("planned") or {}
+    late, aligned = summary.get("lateness_ms") or {}, summary.get("alignment") or {}
+    segments = ", ".join(
+        f"{part['name']} {part['end_s'] - part['start_s']:g} s" for part in planned.get("segments") or []
+    )
+    torque_time = planned.get("torque_time_nms")
+    dose = f"{number(summary.get('charge_uc'), 0)} µC a phase over the test"
+    if torque_time is not None:
+        dose += f", {number(torque_time, 0)} N·m·s planned"
+    return [
+        f"test           {test['id']}  participant {test['participant']}, {number(summary.get('duration_s'), 1)} s",
+        f"segments       {segments}",
+        f"dose           {dose}",
+        f"torque         {summary.get('samples')} samples at {number(summary.get('sample_rate_hz'), 1)} Hz, "
+        f"lost {summary.get('lost_samples')}, peak {number(summary.get('torque_peak_nm'))} N·m",
+        f"pulses         {summary.get('pulses')}, dropped {summary.get('dropped_pulses')}; lateness median "
+        f"{number(late.get('median'), 3)}, p99 {number(late.get('p99'), 3)}, max {number(late.get('max'), 3)} ms",
+        f"clocks         aligned by {aligned.get('method')}, error {number(aligned.get('error_ms'), 4)} ms",
+        *(f"in doubt       {words}" for words in summary.get("warnings") or []),
+        *model_report(model),
+        f"served         {number(summary.get('last_sample_to_model_s'), 2)} s from the last sample to the stored model",
+    ]

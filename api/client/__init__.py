@@ -1,0 +1,1 @@
+"""The REST client: what a program does with a running service."""

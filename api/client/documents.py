@@ -1,0 +1,115 @@
+"""What the service answers. Each document is a dict; a newer service may send more keys than are named here."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, TypedDict
+
+if TYPE_CHECKING:
+    from identify import Model
+
+
+class Participant(TypedDict):
+    """A participant: a code and limits."""
+
+    code: str
+    profile: dict[str, Any]
+    created_utc: str
+    created_by: str
+
+
+class Version(TypedDict):
+    """One model version: its errors, its verdict, and where it comes from."""
+
+    id: str
+    participant: str
+    recording_id: str
+    parent_id: str | None
+    added_effect: str | None
+    method: str
+    effects: list[str]
+    fit_percent: float | None
+    ceiling_percent: float | None
+    held_out_fit_percent: float | None
+    rms_nm: float | None
+    held_out_rms_nm: float | None
+    noise_sd_nm: float | None
+    verdict: Literal["usable", "usable with care", "not usable", "unknown"]
+    words: str
+    reasons: list[str]
+    decision: Literal["approved", "rejected"] | None
+    served: bool
+    created_utc: str
+
+
+class SessionTest(TypedDict):
+    """A test: how far it is; when `done`, its recording, its model and its summary.
+
+    `recording_id` and `recording_url` are text once the recording is sealed, `model_id` and `model_url` once a model is
+    identified; None before.
+    """
+
+    id: str
+    participant: str
+    kind: str
+    state: str
+    done: bool
+    reason: str
+    segment: str | None
+    elapsed_s: float
+    duration_s: float
+    time_left_s: float
+    progress: float
+    identification: dict[str, Any] | None
+    requested_by: str
+    requested_utc: str
+    finished_utc: str | None
+    planned: dict[str, Any]
+    recording_id: Any
+    recording_url: Any
+    joins: str | None
+    model_id: Any
+    model_url: Any
+    summary: dict[str, Any]
+    fit: Version | None
+
+
+class Job(TypedDict):
+    """Long work in the service: how far it is, how long it will take, and the address of its result."""
+
+    id: str
+    kind: str
+    model_id: str
+    state: Literal["running", "completed", "failed", "cancelled"]
+    done: bool
+    progress: float
+    text: str
+    elapsed_s: float
+    time_left_s: float | None
+    result_url: str | None
+    problem: dict[str, Any] | None
+
+
+@dataclass(frozen=True)
+class ApprovedModel:
+    """The approved model of a participant, as a controller fetches it.
+
+    Parameters
+    ----------
+    document : dict
+        MODEL.json.
+    etag : str
+        Its version. With it the service answers 304 while nothing has changed.
+    changed : bool
+        False if this fetch was answered with 304.
+    """
+
+    document: dict[str, Any]
+    etag: str
+    changed: bool = True
+
+    def model(self) -> Model:
+        """The model itself, to predict with."""
+        from identify import Model  # here: a controller that reads the document alone needs no numpy
+
+        return Model.from_dict(self.document)

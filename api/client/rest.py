@@ -1,0 +1,149 @@
+"""The REST client: the rig, participants, tests, recordings, and all that `Models` does."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from api.client.documents import Participant, SessionTest
+from api.client.errors import NotCompleted, NotFound
+from api.client.models import POLL_S, Models
+
+
+class Client(Models):
+    """What a program does with a running service. Each method is one request, or says otherwise; nothing is retried.
+
+    `request`, `get` and `post` reach every other route of docs/api.md.
+
+    Examples
+    --------
+    >>> with Client("http://127.0.0.1:8000", token) as client:  # doctest: +SKIP
+    ...     client.make_participant("P017")
+    ...     test = client.run_test("P017")
+    ...     client.approve(test["model_id"], "good fit")
+
+    Raises
+    ------
+    ServiceError
+        Each method: `Unreachable` without an answer, else a subclass of `Refused` with title, detail and status.
+    """
+
+    # ---- the service and its rig
+
+    def health(self) -> dict[str, Any]:
+        """Whether the service and its rig answer; needs no token."""
+        return self.get("/health")
+
+    def rig(self) -> dict[str, Any]:
+        """State, devices, newest torque and its age."""
+        return self.get("/v1/rig")
+
+    def stop(self, reason: str = "") -> dict[str, Any]:
+        """Stop stimulation. Returns only if the rig confirms that stimulation has stopped."""
+        return self.post("/v1/stop", json={"reason": reason} if reason else {})
+
+    def effects(self) -> list[dict[str, Any]]:
+        """The library of effects of the service."""
+        return self.get("/v1/effects")["effects"]
+
+    def issue_token(self, name: str, scopes: Sequence[str]) -> str:
+        """A new token for a program; only an administrator may do this."""
+        return self.post("/v1/tokens", json={"name": name, "scopes": list(scopes)})["token"]
+
+    # ---- participants
+
+    def participants(self) -> list[Participant]:
+        """All participants."""
+        return self.get("/v1/participants")
+
+    def participant(self, code: str) -> Participant:
+        """One participant with its limits."""
+        return self.get(f"/v1/participants/{code}")
+
+    def make_participant(self, code: str, profile: dict[str, float] | None = None) -> Participant:
+        """Make a participant: a code, never a name. `profile`: current_ma, max_pulse_width_us, max_torque_nm."""
+        return self.post("/v1/participants", json={"code": code} | ({"profile": profile} if profile else {}))
+
+    def ensure_participant(self, code: str) -> Participant:
+        """The participant; makes it if there is none (two requests)."""
+        try:
+            return self.participant(code)
+        except NotFound:
+            return self.make_participant(code)
+
+    def set_limits(self, code: str, **limits: float) -> Participant:
+        """Change the limits that are named; the others stay as they are."""
+        return self.request("PUT", f"/v1/participants/{code}/profile", json=limits).json()
+
+    # ---- tests
+
+    def preview(self, participant: str, **more: Any) -> dict[str, Any]:
+        """Duration, dose and pulse widths of a test. Nothing is played. `more` as in `start_test`."""
+        return self.post("/v1/preview", json={"participant": participant, **more})
+
+    def start_test(self, participant: str, **more: Any) -> SessionTest:
+        """Start a test, the pre-session test by default. `more`: `kind`, `segments`, `joins`, narrower limits."""
+        return self.post("/v1/tests", json={"participant": participant, **more})
+
+    def test(self, test_id: str) -> SessionTest:
+        """A test as it is now."""
+        return self.get(f"/v1/tests/{test_id}")
+
+    def tests(self, participant: str) -> list[SessionTest]:
+        """The tests of a participant, newest first."""
+        return self.get(f"/v1/participants/{participant}/tests")
+
+    def follow(self, test_id: str) -> Iterator[SessionTest]:
+        """A test ten times a second until it is done, whatever its end."""
+        while not (test := self.test(test_id))["done"]:
+            yield test
+            time.sleep(POLL_S)
+        yield test
+
+    def live(self, test_id: str) -> Iterator[dict[str, Any]]:
+        """Live signals of a test until its end: messages of `type` "history", "live", "state" and "test"."""
+        return self.messages(f"/v1/tests/{test_id}/live")
+
+    def run_test(
+        self, participant: str, watch: Callable[[SessionTest], object] = lambda _: None, **more: Any
+    ) -> SessionTest:
+        """Start a test and follow it to its end.
+
+        Parameters
+        ----------
+        participant : str
+            Code.
+        watch : callable
+            Called with the test ten times a second.
+        **more
+            As in `start_test`.
+
+        Raises
+        ------
+        NotCompleted
+            The test was stopped, or failed.
+        """
+        test = self.start_test(participant, **more)
+        for state in self.follow(test["id"]):
+            watch(test := state)
+        if test["state"] != "completed":
+            reason = test["reason"] or "no reason was given"
+            raise NotCompleted("", f"the test ended as {test['state']}", reason, document=test)
+        return test
+
+    # ---- recordings
+
+    def recording(self, recording_id: str) -> bytes:
+        """The raw recording (HDF5), as it was sealed."""
+        return self.request("GET", f"/v1/recordings/{recording_id}").content
+
+    def recording_csv(self, recording_id: str) -> bytes:
+        """The recording as CSV."""
+        return self.request("GET", f"/v1/recordings/{recording_id}/csv").content
+
+    def upload(self, participant: str, data: bytes | Path) -> dict[str, Any]:
+        """Send a recording of another tool (CSV or HDF5). Returns `recording_id`, its new `model`, and `warnings`."""
+        content = data if isinstance(data, bytes) else data.read_bytes()
+        return self.post(f"/v1/participants/{participant}/recordings", content=content)
