@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-from identify.diagnosis import verdict
 from identify.diagnosis.analysis import Analysis
 from identify.diagnosis.unseen import Unseen
+
+from identify.diagnosis import verdict
 from identify.diagnosis.verdict import Verdict, judge, shares
 from identify.effects import get
 
