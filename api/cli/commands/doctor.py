@@ -25,7 +25,7 @@ def doctor(
     socket: Annotated[Path | None, typer.Option(help="a running rig's socket, or STIMRIG_RIG_SOCKET")] = None,
     as_json: Json = False,
 ) -> None:
-    """Check devices, permissions, clock, disk, priority; say how to fix what fails. Sends nothing. Exit 1 on failure."""
+    """Check devices, permissions, clock, disk, priority; say how to fix each. Sends nothing. Exit 1 if one fails."""
     given: dict[str, Any] = {"rig_file": rig, "data_dir": data, "rig_socket": socket}
     settings = Settings(**{key: value for key, value in given.items() if value is not None})
     found = checks.examine(settings)
