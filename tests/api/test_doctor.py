@@ -1,4 +1,4 @@
-"""`stimrig doctor` says what is wrong and what mends it; logs carry the test's id; metrics are Prometheus' text."""
+"""`stimrig doctor` says what is wrong and how to fix it; logs carry the test's id; metrics are Prometheus' text."""
 
 from __future__ import annotations
 

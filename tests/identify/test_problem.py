@@ -7,7 +7,7 @@ import pytest
 
 from identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUNDS_S
 from identify.effects import get
-from identify.estimation.prepare import plain, prepare
+from identify.estimation.prepare import fit_plain, prepare
 from identify.records.join import join
 from identify.simulation.problem import Problem
 from identify.simulation.setup import Setup
@@ -18,7 +18,7 @@ from tests.identify.test_join import record
 def setup() -> Setup:
     """Two parts of six seconds."""
     grid, _ = prepare(join([record(400, name="a"), record(400, name="b", seed=2)], [0.0, 60.0]))
-    return plain(grid, grid.fitted).problem.setup
+    return fit_plain(grid, grid.fitted).problem.setup
 
 
 def test_every_part_has_its_baseline_and_its_initial_state(setup: Setup):

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from identify.diagnosis.analysis import Analysis
-from identify.diagnosis.unseen import Unseen
 
 from identify.diagnosis import verdict
+from identify.diagnosis.held_out_error import HeldOutError
+from identify.diagnosis.search import EffectSearch
 from identify.diagnosis.verdict import Verdict, judge, shares
 from identify.effects import get
 
@@ -47,17 +47,17 @@ class Made:
         self.held_share = 0.0
         self.at_rest = 1.0
         self.rises: set[int] = set()
-        self.unseen: list[Unseen | None] = [None, None]
+        self.unseen: list[HeldOutError | None] = [None, None]
         self.forms: list[float] = []
         base = fitted(0.0)
-        self.work = Analysis(
+        self.work = EffectSearch(
             record=object(), raw=None, plain=base, base=base,  # pyright: ignore[reportArgumentType]
-            rounds=[[candidate(FIRST, 1.0)]], chain=[base], nameless=[0.0], left=[self.left()],
+            rounds=[[candidate(FIRST, 1.0)]], chain=[base], free_gain=[0.0], residuals=[self.left()],
         )  # fmt: skip
         monkeypatch.setattr(verdict, "held_readings", self._held_readings)
         monkeypatch.setattr(verdict, "seen_at_rest", self._seen_at_rest)
-        monkeypatch.setattr(verdict, "rise", self._rise)
-        monkeypatch.setattr(verdict, "unseen", self._unseen)
+        monkeypatch.setattr(verdict, "held_out_rise", self._rise)
+        monkeypatch.setattr(verdict, "held_out_error", self._unseen)
 
     def left(self, ratio: float = 0.0, ideal: float = 80.0, busy_nm: float = 1.0, white_nm: float = 0.0) -> Any:
         return SimpleNamespace(ratio=ratio, ideal=ideal, busy_nm=busy_nm, white_nm=white_nm)
@@ -72,7 +72,7 @@ class Made:
         return self
 
     def leaves(self, **left: float) -> Made:
-        self.work.left = [self.work.left[0], self.left(**left)]
+        self.work.residuals = [self.work.residuals[0], self.left(**left)]
         return self
 
     def judged(self) -> Verdict:
@@ -92,7 +92,7 @@ class Made:
         assert after is self.work.chain[number + 1]
         return (1.0, 2.0) if number in self.rises else None
 
-    def _unseen(self, fit: Any, form: float, beside: Any) -> Unseen | None:
+    def _unseen(self, fit: Any, form: float, beside: Any) -> HeldOutError | None:
         assert beside is self.work.last
         self.forms.append(form)
         return self.unseen[0 if fit is self.work.plain and len(self.forms) == 1 else 1]
@@ -107,7 +107,7 @@ def test_nothing_missing(made: Made):
     found = made.judged()
     assert (found.kind, found.found, found.rivals, found.notes) == ("nothing_missing", {}, {}, [])
     assert (found.explained, found.structure, found.contradicted) == (0.0, 0.0, False)
-    assert found.unseen is None
+    assert found.held_out_error is None
     assert found.probability == pytest.approx(1 / (1 + np.exp(1.0 - 4.5)))
     made.work.rounds = [[candidate(FIRST, 4.5), candidate(SECOND, 3.5)]]
     assert made.judged().probability == pytest.approx(1 / (1 + 1 + np.exp(-1.0)))
@@ -163,7 +163,7 @@ def test_an_effect_that_was_exchanged_counts_as_half(made: Made):
 
 
 def test_effects_seen_in_the_raw_samples_are_almost_certain(made: Made):
-    made.work.given = ["mains_hum"]
+    made.work.detected = ["mains_hum"]
     found = made.judged()
     assert (found.kind, found.found, found.probability) == ("effect_missing", {"mains_hum": 0.99}, 0.99)
     made.work.chain = [fitted(30.0, "mains_hum")]
@@ -173,7 +173,7 @@ def test_effects_seen_in_the_raw_samples_are_almost_certain(made: Made):
 
 @pytest.mark.parametrize(("ratio", "strange"), [(12.0, False), (12.1, True)])
 def test_structure_that_no_effect_explains(made: Made, ratio: float, strange: bool):
-    made.work.left = [made.left(ratio=ratio)]
+    made.work.residuals = [made.left(ratio=ratio)]
     found = made.judged()
     assert (found.kind == "unexplained_structure") is strange
     if strange:
@@ -195,7 +195,7 @@ def test_effects_that_explain_too_little(made: Made, log_likelihood: float, rati
 )
 def test_a_gain_without_a_law_explains_more(made: Made, nameless: float, log_likelihood: float, strange: bool):
     made.add(FIRST, 50.0, log_likelihood)
-    made.work.nameless = [nameless]
+    made.work.free_gain = [nameless]
     assert (made.judged().kind == "unexplained_structure") is strange
 
 
@@ -207,9 +207,7 @@ def test_readings_that_repeat(made: Made, share: float, strange: bool):
     assert bool(found.notes) is strange
     if strange:
         made.held_share = 0.9
-        assert made.judged().notes == [
-            "90 % of the readings repeat the one before exactly: the converter holds or steps."
-        ]
+        assert made.judged().notes == ["90 % of the readings equal the one before: the converter repeats values."]
 
 
 def test_an_effect_against_which_rows_not_seen_speak_is_doubted(made: Made):
@@ -225,33 +223,35 @@ def test_an_effect_against_which_rows_not_seen_speak_is_doubted(made: Made):
 @pytest.mark.parametrize(
     ("before", "after", "contradicted"),
     [
-        (None, Unseen(2.5, 1.0), True),
-        (None, Unseen(2.4, 1.0), False),
-        (Unseen(4.0, 1.0), Unseen(2.5, 1.0), True),
-        (Unseen(9.0, 1.0), Unseen(2.5, 1.0), False),
-        (Unseen(9.0, 1.0), None, False),
+        (None, HeldOutError(2.5, 1.0), True),
+        (None, HeldOutError(2.4, 1.0), False),
+        (HeldOutError(4.0, 1.0), HeldOutError(2.5, 1.0), True),
+        (HeldOutError(9.0, 1.0), HeldOutError(2.5, 1.0), False),
+        (HeldOutError(9.0, 1.0), None, False),
     ],
 )
-def test_rows_not_seen_may_contradict(made: Made, before: Unseen | None, after: Unseen | None, contradicted: bool):
+def test_rows_not_seen_may_contradict(
+    made: Made, before: HeldOutError | None, after: HeldOutError | None, contradicted: bool
+):
     made.unseen = [before, after]
     found = made.judged()
     assert found.contradicted is contradicted
-    assert found.unseen is after
+    assert found.held_out_error is after
     assert (found.kind == "unexplained_structure") is contradicted
     assert len(found.notes) == contradicted
     if contradicted:
         assert found.notes == [
-            "On rows not seen the last model errs by 2.5 times what noise and its own uncertainty allow: "
-            "structure is left."
+            "On held-out rows the error of the last model is 2.5 times what noise and its uncertainty allow: "
+            "something is still missing."
         ]
     assert made.forms[:2] == [0.01, 0.01]
 
 
 def test_half_of_what_the_plain_structure_leaves_is_not_too_much(made: Made):
-    first = Unseen(float(np.sqrt(1 + 4 * 8.0)), 1.0)
-    made.unseen = [first, Unseen(3.0, 1.0)]  # both excesses squared: 32 and 8
+    first = HeldOutError(float(np.sqrt(1 + 4 * 8.0)), 1.0)
+    made.unseen = [first, HeldOutError(3.0, 1.0)]  # both excesses squared: 32 and 8
     assert not made.judged().contradicted
-    made.unseen = [first, Unseen(3.01, 1.0)]
+    made.unseen = [first, HeldOutError(3.01, 1.0)]
     made.forms.clear()
     assert made.judged().contradicted
 
@@ -323,7 +323,7 @@ def test_efforts_that_last_a_third_of_the_test_are_none(made: Made, name: str, w
 )
 def test_a_tremor_takes_most_of_the_power(made: Made, busy_nm: float, ratio: float, strange: bool):
     """Explained is what it took of the power above the white noise, 0.2 N·m here, of 0.3 N·m before."""
-    made.work.left = [made.left(busy_nm=0.3, white_nm=0.2)]
+    made.work.residuals = [made.left(busy_nm=0.3, white_nm=0.2)]
     made.add(TREMOR, 50.0, 90.0)
     made.work.chain[-1].noise.band = 0.5
     found = made.leaves(ratio=ratio, busy_nm=busy_nm, white_nm=0.2).judged()
