@@ -73,9 +73,11 @@ SETTINGS = {
 class SegmentIn(Body):
     """One segment of a test: a sequence of the library by name, with its settings."""
 
-    name: Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_-]{1,40}$")]
+    name: Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_-]{1,40}$"), Field(examples=["prbs"])]
     sequence: Annotated[
-        str, StringConstraints(min_length=1, max_length=40), Field(description="an id of `GET /v1/sequences`")
+        str,
+        StringConstraints(min_length=1, max_length=40),
+        Field(description="an id of `GET /v1/sequences`", examples=["prbs"]),
     ]
     settings: Annotated[dict[str, Any], WithJsonSchema(SETTINGS)] = Field(default_factory=dict)
 

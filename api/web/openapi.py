@@ -58,6 +58,10 @@ def _complete(document: dict[str, Any]) -> None:
     components.update({schemas.component_name(name): schemas.component(name) for name in EMBEDDED})
     for methods in document["paths"].values():
         for operation in methods.values():
+            ways = operation.get("security", [])
+            needed = sorted({scope for way in ways for scopes in way.values() for scope in scopes})
+            if needed:
+                operation["description"] = f"{operation.get('description', '')}\n\nScope: `{'`, `'.join(needed)}`."
             if "HTTPValidationError" in str(operation["responses"].get("422")):
                 del operation["responses"]["422"]
             if "requestBody" in operation:

@@ -85,6 +85,7 @@ def test_every_operation_says_who_may_and_every_error_is_a_problem(document: dic
                 assert schema == {"$ref": "#/components/schemas/Problem"}, (method, path, code)
     approve = document["paths"]["/v1/models/{model_id}/approve"]["post"]
     assert {"token": ["approve-model"]} in approve["security"]
+    assert approve["description"].endswith("Scope: `approve-model`.")
 
 
 def test_real_answers_hold_to_the_document(service: Service, document: dict[str, Any]) -> None:
