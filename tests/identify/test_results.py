@@ -160,7 +160,7 @@ class Tags(HTMLParser):
         self.words.append(data)
 
 
-@pytest.mark.parametrize("name", SCHEMAS)
+@pytest.mark.parametrize("name", RESULTS)
 def test_a_summary_is_about_ten_lines_and_prints_itself(results, name):
     found = results[name]
     lines = found.summary().splitlines()
@@ -187,7 +187,7 @@ def _discrete():
     return Discrete((0.1, 0.1), (1.0, -1.2, 0.4), 1, 0.025)
 
 
-@pytest.mark.parametrize("name", SCHEMAS)
+@pytest.mark.parametrize("name", RESULTS)
 def test_the_notebooks_view_is_the_summary_as_a_table(results, name):
     found = results[name]
     parsed = Tags(found._repr_html_())
