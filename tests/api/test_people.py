@@ -9,12 +9,14 @@ import sqlite3
 from pathlib import Path
 from typing import Any
 
+import argon2
 import httpx
 import pytest
 from fastapi.routing import APIRoute
 
 from api.cli import main
 from api.clock import Clock
+from api.people import passwords
 from api.people.auth import Scope
 from api.people.pace import Pace
 from api.settings import Settings
@@ -91,6 +93,12 @@ def test_every_route_of_the_api_turns_a_stranger_away(service: Service) -> None:
                 answer = stranger.request(method.upper(), re.sub(r"\{\w+\}", "x", path))
                 assert answer.status_code == 401, (method, path, answer.status_code)
                 assert answer.headers["content-type"] == "application/problem+json"
+
+
+def test_a_password_costs_what_rfc_9106_asks_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(passwords, "PasswordHasher", argon2.PasswordHasher)
+    kept = passwords.Passwords().hasher.hash(PASSWORD)
+    assert argon2.extract_parameters(kept) == argon2.profiles.RFC_9106_LOW_MEMORY
 
 
 def test_password_is_kept_as_argon2id_only(service: Service, clinician: httpx.Client) -> None:
