@@ -82,7 +82,7 @@ class FakeRig:
         self.warnings: list[str] = []
         self.torque_age_s = 0.004
         self.cell_speaks = True
-        self.mended = True
+        self.device_back = True
         self._idle: asyncio.Task[None] | None = None
         self.require_calibration = False
         self.limits = {
@@ -260,7 +260,7 @@ class FakeRig:
         ).model_dump()
 
     async def _on_rearm(self, request: Any, writer: Any) -> dict[str, Any]:
-        if not self.mended:
+        if not self.device_back:
             raise m_refusal("disconnected", "A device does not answer", "load cell: no torque comes; check its cable")
         self.become("ready")
         return self.status().model_dump()
