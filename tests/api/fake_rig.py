@@ -180,6 +180,14 @@ class FakeRig:
             segments=segments,
         ).model_dump()  # fmt: skip
 
+    async def _on_sequences(self, request: Any, writer: Any) -> dict[str, Any]:
+        rest = m.SequenceInfo(
+            id="rest", description="No pulses.",
+            settings={"type": "object", "properties": {"duration_s": {"type": "number", "maximum": 600}}},
+        )  # fmt: skip
+        default = [m.SegmentPlan(name="rest", sequence="rest", settings={"duration_s": 1.0})]
+        return m.Sequences(sequences=[rest], default=default).model_dump()
+
     async def _on_start(self, request: Any, writer: Any) -> dict[str, Any]:
         if self.state == "running":
             raise m_refusal("busy", "A test is running", "Wait or stop it.")
