@@ -25,10 +25,10 @@ from api.web.server import configuration, loopback, refuse_open_door
 from tests.api.conftest import PATIENCE_S, Service, run_test
 
 PASSWORD = "correct horse battery"
-OPEN_V1 = {("POST", "/v1/sessions")}
+OPEN_V1 = {("POST", "/v1/sessions"), ("GET", "/v1/schemas"), ("GET", "/v1/schemas/{name}")}
 OPEN_PAGES = {
     ("GET", "/"), ("GET", "/sign-in"), ("POST", "/sign-in"), ("GET", "/static/{name}"), ("GET", "/health"),
-    ("GET", "/metrics"), ("GET", "/rig/now"), ("GET", "/stopped/{key}"),
+    ("GET", "/metrics"), ("GET", "/rig/now"), ("GET", "/stopped/{key}"), ("GET", "/docs"),
 }  # fmt: skip
 """Signing in is for those who are not yet signed in."""
 
