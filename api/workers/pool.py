@@ -12,7 +12,7 @@ from typing import Any
 
 from api.errors import ApiError
 from api.logs import current_test
-from api.workers.process import WORKER, Call, Places, Worker
+from api.workers.process import WORKER, Call, Places, Worker, cancelled
 
 log = logging.getLogger("stimrig.fitting")
 
@@ -87,7 +87,7 @@ class Pool:
                 return
         if not call.result.done():
             call.state = "cancelled"
-            call.result.set_exception(ApiError(409, "cancelled", "The job was cancelled", "Start it again if wanted."))
+            call.result.set_exception(cancelled())
 
     def _dispatch(self) -> None:
         for worker in self.workers:
@@ -95,6 +95,7 @@ class Pool:
             if call is not None:
                 self.queue.remove(call)
                 worker.call = call
+                call.state, call.started_s = "running", time.monotonic()
                 task = asyncio.create_task(self._work(worker, call))
                 self._tasks.add(task)
                 task.add_done_callback(self._tasks.discard)
@@ -109,7 +110,6 @@ class Pool:
         return None
 
     async def _work(self, worker: Worker, call: Call) -> None:
-        call.state, call.started_s = "running", time.monotonic()
         current_test.set(call.test_id)  # a task of its own; whoever happened to dispatch it may have had another test
         try:
             result = await worker.run(call)
@@ -126,7 +126,7 @@ class Pool:
             if not call.result.done():
                 call.result.set_exception(error)
         finally:
-            self.busy_s += time.monotonic() - call.started_s
+            self.busy_s += call.elapsed_s
             worker.call = None
             self._dispatch()
 

@@ -151,6 +151,9 @@ class Worker:
         """Do a call to its end; its result, or its error raised."""
         self.places.learn(call.arguments)
         process = await self.start()
+        if call.state == "cancelled":  # before there was a process to end
+            await self.close()
+            raise cancelled()
         processor_s = PROCESSOR_S.get(call.verb, LONGEST_PROCESSOR_S)
         request = {"call": call.id, "verb": call.verb, "arguments": call.arguments, "processor_s": processor_s}
         try:
@@ -167,7 +170,7 @@ class Worker:
             await self.close()
             raise too_long(call.verb, WALL_FACTOR * processor_s) from None
         if call.state == "cancelled":
-            raise ApiError(409, "cancelled", "The job was cancelled", "Start it again if it is still wanted.")
+            raise cancelled()
         if process.returncode == -signal.SIGXCPU:
             raise too_long(call.verb, processor_s)
         how = f"{ending(process.returncode)} while it did the {call.verb}"
@@ -215,6 +218,11 @@ def call_error(verb: str, error: dict[str, Any]) -> ApiError:
         return ApiError(422, "data", "The data do not allow this", error["detail"], **extra)
     detail = f"{error['detail']}. Your data are safe. See logs/api.log."
     return ApiError(500, "analysis-failed", f"The {verb} failed", detail)
+
+
+def cancelled() -> ApiError:
+    """A call that somebody cancelled."""
+    return ApiError(409, "cancelled", "The job was cancelled", "Start it again if it is still wanted.")
 
 
 def too_long(verb: str, seconds: float) -> ApiError:

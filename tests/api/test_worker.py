@@ -28,6 +28,21 @@ def with_pool(work: Any, workers: int = 1, command: tuple[str, ...] = STUB) -> A
     return asyncio.run(run())
 
 
+def test_a_call_is_cancelled_at_once_after_it_was_handed_to_a_worker() -> None:
+    """Before its process has been started, and while the process of the call before waits for work."""
+
+    async def work(pool: Pool) -> None:
+        for _ in range(2):
+            call = pool.submit("fit", data="x", effects=["slow"])
+            pool.cancel(call)
+            with pytest.raises(ApiError, match="cancelled"):
+                await call.result
+            assert call.state == "cancelled"
+            assert (await pool.submit("effects").result)["effects"], "the worker does the next call"
+
+    with_pool(work)
+
+
 def test_cancelled_job_frees_its_worker() -> None:
     async def work(pool: Pool) -> None:
         slow = pool.submit("fit", data="x", effects=["slow"])

@@ -7,8 +7,10 @@ from typing import Any
 
 import pytest
 
-from api.client.documents import Job, Version
-from api.web.responses import JobOut, VersionOut
+from api.client.documents import Job, Participant, SessionTest, Version
+from api.web.responses.models import JobOut, VersionOut
+from api.web.responses.participants import ParticipantOut
+from api.web.responses.rig import TestOut
 from stimrig import Client, errors
 from tests.api.conftest import PATIENCE_S, TOKEN, Service, service, short_dir  # noqa: F401  fixtures
 
@@ -117,5 +119,6 @@ def test_without_an_answer_the_error_names_the_address(address: str) -> None:
 
 
 def test_documents_have_the_keys_of_the_openapi_document() -> None:
-    for document, model in ((Version, VersionOut), (Job, JobOut)):
+    pairs = {Version: VersionOut, Job: JobOut, SessionTest: TestOut, Participant: ParticipantOut}
+    for document, model in pairs.items():
         assert set(document.__annotations__) == set(model.model_fields)
