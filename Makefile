@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 export PYTHONUNBUFFERED = 1
 
-.PHONY: demo test serve bench faults lint lock clean help setup setup-test
+.PHONY: demo test serve bench faults mutation lint lock clean help setup setup-test
 
 help:
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -29,6 +29,10 @@ bench: $(VENV)-bench/.bench ## the figures in docs/, measured on this machine
 
 faults: setup-test ## the fault campaign on the emulated rig (docs/results/faults.md)
 	@$(BIN)/python -m bench.faults
+
+mutation: setup-test ## which changes of the rig's safety code no test sees (docs/results/mutation.md; needs mutmut)
+	@$(BIN)/python -m mutmut run --max-children 2
+	@$(BIN)/python -m mutmut results
 
 setup: $(VENV)/.run ## the virtual environment from the hash-locked list
 

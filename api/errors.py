@@ -29,7 +29,7 @@ class ApiError(Exception):
     code : str
         Stable id, the last part of the problem's ``type``.
     title, detail : str
-        What is wrong, and where, and the mend.
+        What is wrong, and where, and the fix.
     extra : dict
         More members of the problem, e.g. ``holder`` or ``errors``.
     """
@@ -48,8 +48,8 @@ class ApiError(Exception):
 class NotFoundError(ApiError):
     """What was asked for is not there."""
 
-    def __init__(self, what: str, name: str, mend: str = "") -> None:
-        super().__init__(404, "not-found", f"No such {what}", f"There is no {what} {name!r}. {mend}".strip())
+    def __init__(self, what: str, name: str, fix: str = "") -> None:
+        super().__init__(404, "not-found", f"No such {what}", f"There is no {what} {name!r}. {fix}".strip())
 
 
 class SettingsError(Exception):

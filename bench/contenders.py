@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 
 import identify
 from identify.records.record import Record
-from tests.harness.patients import second_order, sigmoid
+from tests.harness.muscle import second_order, sigmoid
 
 PULSE_RATE_HZ = 40.0
 SPLINES = 8

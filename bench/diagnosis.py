@@ -263,7 +263,7 @@ def _grouped(row: dict[str, Any]) -> bool:
 def _foreseeable(row: dict[str, Any]) -> bool:
     """Efforts and tremor can be seen and not foreseen: no model takes their error away from rows it has not seen."""
     effect = registry()[row["truth"][0]]
-    return effect.foreseeable and not effect.band
+    return effect.predictable and not effect.band
 
 
 def _removed(row: dict[str, Any]) -> float:

@@ -22,28 +22,18 @@ import numpy as np
 
 from api.cli.launcher import Child
 from api.settings import Settings
+from tests.harness.patients import Patient, make_record
 
 TOKEN = "bench-of-the-fetch-is-not-a-secret"
 
 
 def csv_of_a_muscle() -> str:
-    """A record good enough to be identified: a switching input, a ramp, levels held out; first-order torque."""
-    rng, widths, names = np.random.default_rng(3), [], []
-    for name, values in (
-        ("rest", np.zeros(40)),
-        ("prbs", np.repeat(rng.integers(0, 2, 60) * 250.0, 6)),
-        ("ramp", 250.0 * (1 - np.abs(np.linspace(-1, 1, 400)))),
-        ("validate", np.repeat(rng.uniform(0, 250, 10), 24)),
-    ):
-        widths += list(values)
-        names += [name] * len(values)
-    torque = np.zeros(len(widths))
-    for k in range(1, len(widths)):
-        level = 6.0 / (1 + np.exp(-(widths[k] - 140) / 20))
-        torque[k] = torque[k - 1] + (level - torque[k - 1]) / 15
-    torque += 0.03 * rng.standard_normal(torque.size)
-    rows = [f"{k / 40:.4f},{w:.2f},{y:.5f},{n}" for k, (w, y, n) in enumerate(zip(widths, torque, names, strict=True))]
-    return "time_s,pulse_width_us,torque_nm,segment\n" + "\n".join(rows) + "\n"
+    """A record of the paper's muscle."""
+    record, _ = make_record(Patient(), np.random.default_rng(3), rate_hz=40.0)
+    names = np.array(record.segment_names)[record.segment]
+    rows = zip(record.time_s, record.pulse_width_us, record.torque_nm, names, strict=True)
+    lines = [f"{time_s:.4f},{width:.2f},{torque:.5f},{name}" for time_s, width, torque, name in rows]
+    return "time_s,pulse_width_us,torque_nm,segment\n" + "\n".join(lines) + "\n"
 
 
 async def one(

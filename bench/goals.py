@@ -21,7 +21,7 @@ import numpy as np
 import identify
 from bench.stamp import RESULTS, written_by
 from identify.dynamics.linear import SecondOrder
-from identify.estimation.figures import best_fit_percent
+from identify.estimation.fit_statistics import best_fit_percent
 from identify.estimation.uncertainty import prediction_band
 from identify.paper import muscle
 from identify.paper.table1 import simulate
@@ -32,6 +32,7 @@ TARGET = RESULTS / "identification.md"
 ACCURACY_SEEDS = range(710_000, 710_040)
 PATIENT_SEEDS = range(720_000, 720_300)
 CALIBRATION_SEEDS = range(730_000, 730_300)
+OTHER_SEEDS = range(740_000, 740_150)
 NOISE_NM = (0.0, 0.02, 0.04, 0.06, 0.08, 0.10)
 
 
@@ -69,7 +70,7 @@ def run() -> None:
         "Seeds here were not used in development.",
         "",
     ]
-    for part in (accuracy, patients, calibration, speed):
+    for part in (accuracy, patients, calibration, other_curves, speed):
         begin = time.perf_counter()
         found = part()
         print(*found, f"({time.perf_counter() - begin:.0f} s)", "", sep="\n", flush=True)
@@ -218,6 +219,55 @@ def calibration() -> list[str]:
         "",
     ]
     return lines + [f"- {key}: {100 * np.mean([f[key] for f in found]):.1f} %" for key in found[0]]
+
+
+class TwoPools(Patient):
+    """A muscle whose curve has two steps: two groups of fibres with thresholds of their own."""
+
+    def recruitment(self, width_us: np.ndarray) -> np.ndarray:
+        """Steady torque, N·m: 55 % of it as drawn, 45 % with a threshold 90 µs higher."""
+        later = np.maximum(np.asarray(width_us, float) - 90.0, 0.0)
+        return 0.55 * super().recruitment(width_us) + 0.45 * super().recruitment(later)
+
+
+class SharpThreshold(Patient):
+    """A muscle whose curve sets out at its threshold with a corner."""
+
+    def recruitment(self, width_us: np.ndarray) -> np.ndarray:
+        """Steady torque, N·m: nothing up to the threshold, then an exponential approach to the plateau."""
+        threshold_us = np.log(self.a3) / self.a2 - 2.2 / self.a2
+        over_us = np.maximum(np.asarray(width_us, float) - max(threshold_us, 20.0), 0.0)
+        return self.gain * (1 - np.exp(-over_us * self.a2 / 2))
+
+
+def one_other_curve(task: tuple[type[Patient], int]) -> tuple[float, float]:
+    """Share of widths inside the pointwise band, and whether the whole curve is inside the whole band."""
+    kind, seed = task
+    rng = np.random.default_rng(seed)
+    patient = kind(**vars(Patient.draw(rng)))
+    record, _ = record_of(patient, rng, 400.0, 0.05)
+    curve = fitted(record, patient).bands["recruitment"]
+    truth = patient.recruitment(curve["pulse_width_us"])
+    inside = (truth[1:] >= curve["lower"][1:]) & (truth[1:] <= curve["upper"][1:])
+    whole = (truth >= curve["whole_lower"] - 1e-9) & (truth <= curve["whole_upper"] + 1e-9)
+    return float(np.mean(inside)), float(np.all(whole))
+
+
+def other_curves() -> list[str]:
+    """How often the bands of f(u) cover curves that are no sigmoid."""
+    lines = [
+        f"## Bands of f(u) for other curves ({len(OTHER_SEEDS)} records of each, 400 Hz, noise 0.05 N·m)",
+        "",
+        "The patients above have S-shaped curves. Two pools: two groups of fibres with different thresholds. Sharp",
+        "threshold: nothing below the threshold, then an exponential approach to the plateau.",
+        "",
+    ]
+    for kind, name in ((TwoPools, "two pools"), (SharpThreshold, "sharp threshold")):
+        with ProcessPoolExecutor() as pool:
+            found = list(pool.map(one_other_curve, [(kind, seed) for seed in OTHER_SEEDS], chunksize=5))
+        one, whole = 100 * np.mean(found, axis=0)
+        lines.append(f"- {name}: at any one width {one:.1f} %, the whole curve {whole:.1f} %")
+    return lines
 
 
 def speed() -> list[str]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from bench.contenders import CONTENDERS, Contender, Task
 from bench.stamp import RESULTS, written_by
-from identify.estimation.figures import best_fit_percent
+from identify.estimation.fit_statistics import best_fit_percent
 from identify.paper import muscle
 from identify.records.record import Record
 

@@ -14,8 +14,8 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from bench.soak import fitting_one
 from tests.harness.processes import CLINIC_WATCH, Bench, busy_process, default_plan
+from tests.harness.soak import fitting_one
 
 
 def measure(busy: int, tests: int, emulator_options: list[str], fit: bool = False) -> list[dict[str, Any]]:

@@ -16,8 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.soak import fitting_one
 from tests.harness.processes import CLINIC_WATCH, Bench, busy_process, control, default_plan
+from tests.harness.soak import fitting_one
 
 STEPS = [
     {"name": "rest", "sequence": "rest", "settings": {"duration_s": 1.0}},

@@ -7,7 +7,7 @@ import numpy as np
 import identify
 from bench.stamp import RESULTS, written_by
 from identify.dynamics.linear import Discrete, SecondOrder
-from identify.estimation.figures import best_fit_percent
+from identify.estimation.fit_statistics import best_fit_percent
 from identify.paper import muscle, table1
 from identify.records.record import Record
 

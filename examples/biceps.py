@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 import identify
-from identify.estimation.figures import best_fit_percent
+from identify.estimation.fit_statistics import best_fit_percent
 from identify.records.record import Record
 
 WIDTH_US = 300.0

@@ -1,6 +1,6 @@
-"""Identification and criticism of electrically stimulated muscle. Pure: arrays in, model out.
+"""Identification of electrically stimulated muscle, and diagnosis of the models. Pure: arrays in, model out.
 
-Names are loaded when they are first used, so that `import identify` costs nothing.
+Names are loaded when they are first used, so that `import identify` is fast.
 """
 
 from __future__ import annotations

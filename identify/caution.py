@@ -1,4 +1,4 @@
-"""What stands against a diagnosis, read off its own figures; needs nothing but them."""
+"""A warning against the result of a diagnosis, from the values of the result alone."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from collections.abc import Mapping
 from typing import Any
 
 WITHIN_NOISE = 2.5
-"""Error on rows not fitted, over all the noise, up to which nothing stands against it: slow noise alone gives 1.4."""
+"""Error on held-out rows, divided by all noise, up to which there is no warning; slow noise alone gives 1.4."""
 
 
 def caution(found: Mapping[str, Any]) -> str:
-    """What stands against "nothing is missing" in a diagnosis: an error on rows not fitted beyond all noise."""
+    """A warning if the verdict is "nothing is missing" although the error on held-out rows is larger than the noise."""
     if found["verdict"] != "nothing_missing":
         return ""
     error_nm = (found.get("base") or {}).get("held_out_rms_nm")
@@ -19,6 +19,7 @@ def caution(found: Mapping[str, Any]) -> str:
     if error_nm is None or not error_nm > WITHIN_NOISE * noise_nm > 0.0:
         return ""
     return (
-        f"On rows not fitted the error is {error_nm / noise_nm:.1f} times the noise: this record is too short or too "
-        "poor to tell whether something is missing. Record PRBS, ramp and validate."
+        f"On rows that were not fitted the error is {error_nm / noise_nm:.1f} times the noise: this record is too "
+        f"short "
+        "or too poor to show whether something is missing. Record PRBS, ramp and validate."
     )

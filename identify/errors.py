@@ -1,4 +1,4 @@
-"""One exception tree for identification: every message names the place and the mend."""
+"""The exceptions of identification. Every message says what is wrong, where, and what to do."""
 
 from __future__ import annotations
 
@@ -9,28 +9,28 @@ class IdentifyError(Exception):
     Parameters
     ----------
     message : str
-        One line, for a person.
+        What is wrong, in one line.
     place : str
         Where: file, line and column, segment, parameter. May be empty.
-    mend : str
-        What to do about it. May be empty.
+    fix : str
+        What to do. May be empty.
     """
 
-    def __init__(self, message: str, *, place: str = "", mend: str = "") -> None:
-        self.message, self.place, self.mend = message, place, mend
+    def __init__(self, message: str, *, place: str = "", fix: str = "") -> None:
+        self.message, self.place, self.fix = message, place, fix
         super().__init__(str(self))
 
     def __str__(self) -> str:
         head = f"{self.place}: {self.message}" if self.place else self.message
-        return f"{head}. {self.mend}" if self.mend else head
+        return f"{head}. {self.fix}" if self.fix else head
 
 
 class BadRecord(IdentifyError):
-    """The record can't be read, or holds what no measurement holds."""
+    """The record cannot be read, or it has values that no measurement gives."""
 
 
 class BadModel(IdentifyError):
-    """A MODEL.json that can't be read, or that doesn't fit the request."""
+    """A MODEL.json cannot be read, or cannot be used for the request."""
 
 
 class BadRequest(IdentifyError):
@@ -38,7 +38,7 @@ class BadRequest(IdentifyError):
 
 
 class NotIdentifiable(IdentifyError):
-    """The record can't determine what was asked of it."""
+    """The record does not determine what is to be estimated."""
 
 
 class Cancelled(IdentifyError):

@@ -1,4 +1,4 @@
-"""The front door to every method: a record in, a model out."""
+"""`fit`: one function for all methods, from a record to a model."""
 
 from __future__ import annotations
 
@@ -7,23 +7,23 @@ from typing import Any
 
 import numpy as np
 
-from identify.diagnosis.analysis import analyse
 from identify.diagnosis.candidates import Progress
 from identify.diagnosis.improvement import helpful
+from identify.diagnosis.search import search_effects
 from identify.effects import get
 from identify.errors import BadRequest, NotIdentifiable
-from identify.estimation.adding import names, with_effects
+from identify.estimation.effect_fit import effect_names, with_effects
 from identify.estimation.finish import finish
 from identify.estimation.prepare import prepare
 from identify.estimation.rows import fitted_rows
-from identify.methods import known_options, method_of
+from identify.methods import check_options, method_of
 from identify.methods.maximum_likelihood import METHOD as MAXIMUM_LIKELIHOOD
 from identify.model import Model
 from identify.records.record import Record
 
 AUTO = "auto"
 NO_EFFECTS_WITH = {"monotone", "order"}
-"""Options that shape the plain structure alone."""
+"""Options that cannot be combined with effects."""
 
 
 def fit(
@@ -41,74 +41,81 @@ def fit(
     record : Record
         What was measured.
     method : str
-        Id of a method.
+        Id of a method, see `identify.methods.methods()`.
     effects : sequence of str
-        Ids of effects to add around the Hammerstein core, or "id:form" to settle the form; estimated jointly by maximum
-        likelihood. "auto" adds those that the record asks for, as `improve` does.
+        Ids of effects to add to the Hammerstein model, or "id:form" to choose the form; all are estimated jointly by
+        maximum likelihood. "auto" adds those that the evidence asks for, as `improve` does.
     fit_on : sequence of str, optional
-        Names of the segments to fit on; by default all but `validate`, or what the method needs.
+        Names of the segments to fit; by default all but `validate`, or those that the method needs.
     progress : callable, optional
-        Called with a share of 0 to 1 and a line of text while effects are fitted; may raise `Cancelled`.
+        Called with the share done, 0 to 1, and a line of text while effects are fitted. It may raise `Cancelled`.
     **options
-        Of the method; `identify.methods.methods()[id].options` tells.
+        Options of the method: see `identify.methods.methods()[id].options`.
 
     Raises
     ------
-    BadRequest, BadRecord, NotIdentifiable
+    BadRequest
+        An unknown method, effect, segment or option, or a combination that is not possible.
+    BadRecord
+        The record is too short, or sampled more slowly than the pulses.
+    NotIdentifiable
+        The record does not determine the model.
     """
     names = None if fit_on is None else (fit_on,) if isinstance(fit_on, str) else tuple(fit_on)
     if names is not None and not names:
-        raise BadRequest("no segment is named", place="fit_on", mend="Name segments, or leave fit_on out.")
+        raise BadRequest("no segment is named", place="fit_on", fix="Name segments, or leave out fit_on.")
     chosen = method_of(method)
-    known_options(chosen, options)
+    check_options(chosen, options)
     wanted = [effects] if isinstance(effects, str) else list(effects or ())
     twice = {name for name in wanted if wanted.count(name) > 1}
     if twice or not all(isinstance(name, str) for name in wanted):
         given = ", ".join(map(str, sorted(twice, key=str) or wanted))
-        raise BadRequest(f"{given} is no list of different effects", place="effects", mend="Name each effect once.")
+        raise BadRequest(f"not a list of different effects: {given}", place="effects", fix="Name each effect once.")
     try:
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             if not wanted:
                 if len(record.parts) > 1 and chosen is not MAXIMUM_LIKELIHOOD:
-                    message = f"{method} takes one recording; this one is joined of {len(record.parts)}"
-                    raise BadRequest(message, place="method", mend="Use maximum-likelihood, or one of its parts.")
+                    message = f"{method} takes a single recording; this record has {len(record.parts)} parts"
+                    raise BadRequest(message, place="method", fix="Use maximum-likelihood, or give one of the parts.")
                 return chosen.fit(prepare(record)[0], names, **options)
             against = [method] if chosen is not MAXIMUM_LIKELIHOOD else sorted(set(options) & NO_EFFECTS_WITH)
             if against:
-                message = f"effects are not fitted with {' and '.join(against)}"
-                raise BadRequest(message, place="effects", mend="Use maximum-likelihood without it.")
+                message = f"effects cannot be fitted with {' and '.join(against)}"
+                raise BadRequest(message, place="effects", fix="Use maximum-likelihood without this option.")
             return _with_effects(record, wanted, names, options, progress or _quiet)
     except np.linalg.LinAlgError as error:
         raise NotIdentifiable(
-            f"{method} finds no solution on this record ({error})", mend="Check that torque follows the pulses."
+            f"{method} finds no solution on this record ({error})", fix="Check that torque follows the pulses."
         ) from error
     except (TypeError, ValueError) as error:
         if options:
             given = ", ".join(f"{key}={value}" for key, value in options.items())
-            raise BadRequest(f"unusable option ({error})", place=given, mend="See the method's options.") from error
+            raise BadRequest(f"invalid option ({error})", place=given, fix="See the options of the method.") from error
         raise
 
 
 def _with_effects(
     record: Record, wanted: Sequence[str], fit_on: tuple[str, ...] | None, options: dict[str, Any], progress: Progress
 ) -> Model:
-    """Maximum likelihood with the effects named, each in its likeliest form, or in the one named after a colon."""
+    """Maximum likelihood with the named effects, each in its most likely form or in the one given after a colon."""
     grid, raw = prepare(record)
     rows = fitted_rows(grid, fit_on)
     if AUTO in wanted:
         if len(wanted) > 1:
             others = ", ".join(name for name in wanted if name != AUTO)
             raise BadRequest(
-                f"{AUTO} chooses the effects itself, and {others} beside it",
+                f"{AUTO} chooses the effects itself, but {others} is given as well",
                 place="effects",
-                mend="Give one or the other.",
+                fix=f"Give {AUTO}, or a list of effects.",
             )
         if options:
             given = ", ".join(sorted(options))
-            raise BadRequest(f"{AUTO} takes no options, and {given} is given", place="effects", mend="Leave it out.")
-        last = helpful(analyse(record, progress, fitted=rows))[0][-1].fitted
+            raise BadRequest(
+                f"{AUTO} takes no options, but {given} is given", place="effects", fix="Leave out the options."
+            )
+        last = helpful(search_effects(record, progress, fitted=rows))[0][-1].fitted
         progress(1.0, "done")
-        return finish(MAXIMUM_LIKELIHOOD.id, last, [f"effects added: {', '.join(names(last)) or 'none'}"])
+        return finish(MAXIMUM_LIKELIHOOD.id, last, [f"effects added: {', '.join(effect_names(last)) or 'none'}"])
     for name in wanted:
         get(name.partition(":")[0])  # an unknown one is refused before anything is fitted
     base, reasons = MAXIMUM_LIKELIHOOD.start(grid, rows, options)

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from identify import model_shape
+from identify import model_schema
 from identify.dynamics.linear import Discrete, Linear, SecondOrder, linear_from_dict
 from identify.errors import BadModel
-from identify.plain_json import plain
+from identify.json_values import json_value
 from identify.recruitment.curve import Curve, basis_from_dict
-from identify.shown import Sheet, Shown, fit_words, held_out_label, quantity
+from identify.shown import Sheet, Shown, estimate, fit_words, held_out_label, quantity
 from identify.strict_json import BadJson, parse
 
 if TYPE_CHECKING:
@@ -21,22 +21,22 @@ if TYPE_CHECKING:
 
 SCHEMA_VERSION = "1.0"
 LARGEST_TEXT = 16 * 2**20
-"""A thousand knots and all effects together take two million characters."""
+"""Characters. A model with 1000 knots and all effects has two million."""
 SOFTWARE = {"name": "stimrig", "version": "0.1.0"}
 
 
 @dataclass(frozen=True)
 class Noise:
-    """What the residual is taken to be.
+    """The noise that the fit assumes.
 
     Parameters
     ----------
     white_sd_nm : float
-        White measurement noise at the record's own rate, N·m.
+        White measurement noise of a sample, N·m.
     block_sd_nm : float
         Standard deviation of the noise on the grid of pulses, N·m.
     ar1 : float
-        Correlation of neighbours on the grid of pulses; 0 where white is the better account.
+        Correlation of neighbouring pulse intervals; 0 if white noise describes the residual better.
     delta_bic : float
         Evidence for AR(1) over white noise (positive: AR(1)).
     """
@@ -49,16 +49,16 @@ class Noise:
 
 @dataclass(frozen=True)
 class Covariance:
-    """Parameters that were estimated, with their covariance.
+    """The estimated parameters and their covariance.
 
     Parameters
     ----------
     names : tuple of str
-        One a parameter, ending in its unit: time_constant_s, damping, delay_s, baseline_nm, recruitment_0_nm, …
+        One per parameter, ending in its unit: time_constant_s, damping, delay_s, baseline_nm, recruitment_0_nm, …
     values : ndarray, shape (P,)
         Estimates.
     matrix : ndarray, shape (P, P)
-        Covariance, in products of the parameters' units.
+        Covariance; units are products of the parameters' units.
     """
 
     names: tuple[str, ...]
@@ -73,33 +73,33 @@ class Covariance:
 
 @dataclass(frozen=True, repr=False)
 class Model(Shown):
-    """A Hammerstein model, with effects around it or without.
+    """A Hammerstein model, with or without effects.
 
     Parameters
     ----------
     method : str
-        Id of the method that made it.
+        Id of the method that estimated it.
     recruitment : Curve
         f(u), N·m.
     linear : SecondOrder or Discrete
         G, unit gain at DC.
     pulse_rate_hz, sample_rate_hz : float
-        Pulses and samples a second of the record it was fitted on.
+        Pulses and samples per second of the fitted record.
     baseline_nm : float
         Torque at rest, N·m.
     initial : tuple of float
-        Torque above the baseline, N·m, and its rate, N·m/s, at the fitted record's first pulse; zero from rest.
+        Torque above the baseline, N·m, and its rate, N·m/s, at the first pulse of the fitted record.
     noise : Noise
-        The residual's account.
+        The noise.
     effects : tuple of dict
-        Effects, each {"id", "form", "parameters", …} as the fit writes it; empty for the plain structure.
+        Effects, each {"id", "form", "parameters", …} as in MODEL.json; empty for the plain structure.
     covariance : Covariance or None
-        All parameters.
+        Of all parameters; None if the method gives none.
     fit, residual_tests, valid_for, quality, bands, data : dict
         See `docs/` and MODEL.json; `fit` holds fit_percent, held_out_fit_percent, rms_nm, held_out_rms_nm,
         ceiling_percent and noise_sd_nm.
     reasons : tuple of str
-        Why structure, delay, knots and noise model are as they are.
+        Reasons for the structure, the number of knots and the noise model.
     """
 
     method: str
@@ -126,7 +126,7 @@ class Model(Shown):
 
     def predict(self, record: Record) -> np.ndarray:
         """Free-run torque at the record's samples, N·m, shape (N,)."""
-        from identify.simulation.predict import predict  # here, since a service reads models and compiles nothing
+        from identify.simulation.predict import predict  # imported here, so that reading a model does not import numba
 
         return predict(self, record)
 
@@ -134,13 +134,13 @@ class Model(Shown):
         return _words(self)
 
     def to_dict(self) -> dict[str, Any]:
-        """MODEL.json as a dict of plain lists and numbers."""
+        """MODEL.json as a dict of lists, numbers and texts."""
         width, torque = self.recruitment.table()
         level, needed = self.recruitment.inverse()
         rate = self.sample_rate_hz if isinstance(self.linear, SecondOrder) else 1.0 / self.linear.step_s
         b, a, delay = self.linear.discrete(rate)
         covariance = self.covariance
-        return plain(
+        return json_value(
             {
                 "schema_version": SCHEMA_VERSION,
                 "model_id": self.model_id,
@@ -194,26 +194,26 @@ class Model(Shown):
         Raises
         ------
         BadModel
-            A key is missing, or its value is no such thing.
+            A key is missing, or its value is not valid.
         """
         if not isinstance(data, dict):
-            raise BadModel("a model is a JSON object", mend="Give a file written by `stimrig fit -o`.")
+            raise BadModel("not a JSON object", fix="Give a file written by `stimrig fit -o`.")
         version = str(data.get("schema_version", ""))[:20]
         if version.split(".")[0] != SCHEMA_VERSION.split(".")[0]:
             raise BadModel(
                 f"schema version {version or 'missing'}, this software reads {SCHEMA_VERSION}",
                 place="schema_version",
-                mend="Fit the record again with this version.",
+                fix="Fit the record again with this version.",
             )
-        model_shape.MODEL(data, "")
+        model_schema.MODEL(data, "")
         try:
             model = _from_dict(data)
             with np.errstate(all="ignore"):
                 table = model.recruitment.table()[1]
         except (KeyError, TypeError, ValueError, IndexError, AttributeError, ArithmeticError) as error:
-            raise BadModel(f"its parts do not go together ({_line(error)})", mend=model_shape.MEND) from error
+            raise BadModel(f"the parts do not match ({_line(error)})", fix=model_schema.FIX) from error
         if not np.isfinite(table).all():
-            raise BadModel("a curve that is not finite", place="recruitment.basis", mend=model_shape.MEND)
+            raise BadModel("the curve is not finite", place="recruitment.basis", fix=model_schema.FIX)
         for index, entry in enumerate(model.effects):
             _check_effect(entry, f"effects.{index}.parameters", model.recruitment.basis.largest_us)
         return model
@@ -225,17 +225,17 @@ class Model(Shown):
         Raises
         ------
         BadModel
-            No JSON, too long, too deep, a key that stands twice, a number that is none, or not a model.
+            Not JSON, too long, too deep, with a duplicate key or an invalid number, or not a model.
         """
         if len(text) > LARGEST_TEXT:
-            raise BadModel(f"more than {LARGEST_TEXT} characters", mend="Give a file written by `stimrig fit -o`.")
+            raise BadModel(f"more than {LARGEST_TEXT} characters", fix="Give a file written by `stimrig fit -o`.")
         try:
             return cls.from_dict(parse(text))
         except BadJson as error:
-            raise BadModel(str(error), mend=model_shape.MEND) from error
+            raise BadModel(str(error), fix=model_schema.FIX) from error
 
     def with_(self, **changes: Any) -> Model:
-        """The model with some fields changed."""
+        """A copy of the model with some fields changed."""
         return replace(self, **changes)
 
 
@@ -273,8 +273,8 @@ def _from_dict(data: dict[str, Any]) -> Model:
 
 
 def _check_effect(entry: dict[str, Any], place: str, largest_us: float) -> None:
-    """Refuse parameters that no fit gives: some make an equation divide by zero. An effect unknown here is let pass."""
-    from identify.effects import registry  # here, since a service reads models and compiles nothing
+    """Refuse parameters that no fit gives: some would cause a division by zero. Unknown effects are not checked."""
+    from identify.effects import registry  # imported here, so that reading a model does not import numba
     from identify.effects.base import Scene
 
     effect = registry().get(entry["id"])
@@ -283,7 +283,7 @@ def _check_effect(entry: dict[str, Any], place: str, largest_us: float) -> None:
         return
     settings = {"scale_nm": 1.0} | entry.get("settings", {})
     scene = Scene(
-        time_s=np.array([0.0, model_shape.LIKELY]),  # the fitted record's length is not in the file
+        time_s=np.array([0.0, model_schema.PLAUSIBLE]),  # the length of the fitted record is not in the file
         pulse_width_us=np.zeros(2),
         step_s=1.0,
         scale_nm=settings["scale_nm"],
@@ -293,12 +293,12 @@ def _check_effect(entry: dict[str, Any], place: str, largest_us: float) -> None:
     wanted = {}
     for p in (p.on(scene) for p in form.parameters):
         lower, upper = p.lower, p.upper
-        if effect.band or form.settled:  # solved for beside the fit, which knows no bounds
-            lower, upper = 1e-6 if p.scale == "log" else -model_shape.LIKELY, model_shape.LIKELY
-        hair = 1e-6 * (upper - lower) if np.isfinite(upper - lower) else 0.0
-        wanted[p.name] = model_shape.number(lower - hair, upper + hair)
-    given = {name: model_shape.bare(value) for name, value in entry["parameters"].items()}
-    model_shape.fields(wanted)(given, place)
+        if effect.band or form.fixed:  # estimated outside the fit, without bounds
+            lower, upper = 1e-6 if p.scale == "log" else -model_schema.PLAUSIBLE, model_schema.PLAUSIBLE
+        slack = 1e-6 * (upper - lower) if np.isfinite(upper - lower) else 0.0
+        wanted[p.name] = model_schema.number(lower - slack, upper + slack)
+    given = {name: model_schema.parameter_value(value) for name, value in entry["parameters"].items()}
+    model_schema.fields(wanted)(given, place)
 
 
 def _covariance(data: dict[str, Any] | None) -> Covariance | None:
@@ -307,7 +307,7 @@ def _covariance(data: dict[str, Any] | None) -> Covariance | None:
     names, size = tuple(data["names"]), len(data["names"])
     values, matrix = np.asarray(data["values"], float), np.asarray(data["matrix"], float)
     if values.shape != (size,) or matrix.shape != (size, size):
-        raise BadModel("names, values and matrix differ in size", place="uncertainty.covariance", mend=model_shape.MEND)
+        raise BadModel("names, values and matrix differ in size", place="uncertainty.covariance", fix=model_schema.FIX)
     return Covariance(names, values, matrix)
 
 
@@ -320,13 +320,14 @@ def _words(model: Model) -> Sheet:
     named = ", ".join(str(effect["id"]) for effect in model.effects) or "no effects"
     width_us, torque_nm = model.recruitment.table()
     top = int(np.argmax(np.abs(torque_nm)))
+    largest = estimate(float(torque_nm[top]), _curve_sd(model, float(width_us[top])), "N·m")
     rows = [
         ("fit", fit_words(fit)),
         (held_out_label(fit), fit_words(fit, "held_out_")),
         ("noise", f"{quantity(model.noise.white_sd_nm, 'N·m')} white, sd of a sample"),
-        ("dynamics", _dynamics(model.linear)),
-        ("recruitment", f"largest {quantity(float(torque_nm[top]), 'N·m')}, at {quantity(float(width_us[top]), 'µs')}"),
-        ("baseline", quantity(model.baseline_nm, "N·m")),
+        ("dynamics", _dynamics(model)),
+        ("recruitment", f"largest {largest}, at {quantity(float(width_us[top]), 'µs')}"),
+        ("baseline", estimate(model.baseline_nm, _sd(model, "baseline_nm"), "N·m")),
         *[(str(effect["id"]), _parameters(effect.get("parameters", {}))) for effect in model.effects],
     ]
     if "pulse_width_us" in known and "pulse_rate_hz" in known:
@@ -341,11 +342,30 @@ def _words(model: Model) -> Sheet:
     return Sheet(f"Model {model.model_id[:8]}, {model.method}, {named}: {figures}", tuple(rows))
 
 
-def _dynamics(linear: Linear) -> str:
+def _sd(model: Model, name: str, factor: float = 1.0) -> float | None:
+    """Standard deviation of a parameter; None if the model has none."""
+    known = model.covariance
+    return factor * known.sd(name) if known is not None and name in known.names else None
+
+
+def _curve_sd(model: Model, width_us: float) -> float | None:
+    """Standard deviation of the recruitment curve at a pulse width, N·m; None if the model has none."""
+    known, basis = model.covariance, model.recruitment.basis
+    places = [place for place in range(basis.size) if known and f"recruitment_{place}_nm" in known.names]
+    if known is None or len(places) < basis.size:
+        return None
+    rows = [known.names.index(f"recruitment_{place}_nm") for place in places]
+    design = basis.design(np.array([width_us]))[0]
+    return float(np.sqrt(max(design @ known.matrix[np.ix_(rows, rows)] @ design, 0.0)))
+
+
+def _dynamics(model: Model) -> str:
+    linear = model.linear
     if isinstance(linear, SecondOrder):
         return (
-            f"time constant {quantity(linear.time_constant_s, 's')}, damping {quantity(linear.damping, '1')}, "
-            f"delay {quantity(1e3 * linear.delay_s, 'ms')}"
+            f"time constant {estimate(linear.time_constant_s, _sd(model, 'time_constant_s'), 's')}, "
+            f"damping {estimate(linear.damping, _sd(model, 'damping'), '1')}, "
+            f"delay {estimate(1e3 * linear.delay_s, _sd(model, 'delay_s', 1e3), 'ms')}"
         )
     step = quantity(1e3 * linear.step_s, "ms")
     return f"order {len(linear.a) - 1} in steps of {step}, delay {quantity(linear.delay_samples, 'steps')}"
@@ -355,12 +375,10 @@ def _parameters(values: dict[str, Any], most: int = 4) -> str:
     parts = []
     for name, entry in list(values.items())[:most]:
         entry = entry if isinstance(entry, dict) else {"value": entry}
-        spread = "" if entry.get("sd") is None else f" ± {quantity(entry['sd'], '')}"
-        unit, direction = str(entry.get("unit") or "1"), str(entry.get("direction") or "")
-        words = [f"{name} {quantity(entry.get('value'), '')}{spread}", "" if unit == "1" else unit, direction]
-        parts.append(" ".join(word for word in words if word))
+        value = estimate(entry.get("value"), entry.get("sd"), str(entry.get("unit") or "1"))
+        parts.append(f"{name} {value} {entry.get('direction') or ''}".rstrip())
     more = len(values) - most
-    return ", ".join([*parts, *([f"{more} parameters more"] if more > 0 else [])])
+    return ", ".join([*parts, *([f"{more} more parameters"] if more > 0 else [])])
 
 
 def _span(value: Any, unit: str) -> str:

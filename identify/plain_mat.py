@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.io import savemat
 
-from identify.plain_json import plain
+from identify.json_values import json_value
 
 LONGEST_NAME = 63
 
@@ -26,7 +26,7 @@ def write(path: Path, variables: Mapping[str, Any]) -> None:
     OSError
         It cannot be written.
     """
-    values = {_name(name): _value(plain(value)) for name, value in variables.items()}
+    values = {_name(name): _value(json_value(value)) for name, value in variables.items()}
     with path.open("wb") as file:
         savemat(file, values, do_compression=True, long_field_names=True, oned_as="column")
 

@@ -1,7 +1,7 @@
-"""What comparing, diagnosing and improving find: typed, with the keys of `--json`; docs/schema says each with its unit.
+"""The results of `compare`, `diagnose` and `improve`. Their fields are the keys of `--json`; docs/schema defines each.
 
-Rows of tables are dicts; their keys are those of the schema. `to_dict()` is plain JSON. A result shows itself: `print`
-gives about ten lines, `repr` one, a notebook a table.
+Rows of tables are dicts with the keys of the schema. `to_dict()` gives JSON values. `print` shows about ten lines,
+`repr` one line, and a notebook a table.
 """
 
 from __future__ import annotations
@@ -11,23 +11,25 @@ from dataclasses import dataclass, fields
 from typing import Any, TypedDict
 
 from identify.caution import caution
+from identify.json_values import json_value
 from identify.model import Model
-from identify.plain_json import plain
-from identify.shown import Sheet, Shown, both_words, fit_words, probability, quantity, torque
+from identify.shown import Sheet, Shown, both_words, estimate, fit_words, probability, quantity, torque
 
 Row = Mapping[str, Any]
 VERDICTS = {
     "effect_missing": "an effect is missing",
     "nothing_missing": "nothing is missing",
-    "unexplained_structure": "structure is left that no effect of the library explains",
+    "unexplained_structure": "an error is left that no effect in the library explains",
 }
-GOES_WITH = {"residual": "itself", "u": "the pulse width", "u2": "the pulse width's square", "y": "the torque"}
+CORRELATED_WITH = {"residual": "itself", "u": "the pulse width", "u2": "the pulse width's square", "y": "the torque"}
+MOST_PARAMETERS = 3
+"""Parameters of an effect that a summary shows."""
 FEW = 3
-"""Rows of a long table that a summary shows."""
+"""Number of rows of a long table that a summary shows."""
 
 
-class Figures(TypedDict):
-    """How well a model fits some rows; NaN where the torque never changes there."""
+class FitStatistics(TypedDict):
+    """How well a model fits some rows. Per cent are NaN if the torque is constant there."""
 
     fit_percent: float
     ceiling_percent: float
@@ -38,34 +40,34 @@ class Figures(TypedDict):
 
 class _Result(Shown):
     def to_dict(self) -> dict[str, Any]:
-        """All fields as plain lists, numbers and texts; null where a number is none."""
+        """All fields as dicts, lists, numbers and texts; None for a number that is not finite."""
         return {item.name: _document(getattr(self, item.name)) for item in fields(self)}  # pyright: ignore[reportArgumentType]
 
 
 def _document(value: Any) -> Any:
     if isinstance(value, tuple) and any(isinstance(item, Model) for item in value):
         return [item.to_dict() for item in value]
-    return plain(value)
+    return json_value(value)
 
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Comparison(_Result):
-    """A model against a measurement.
+    """A model compared with a measurement.
 
     Parameters
     ----------
     fit_percent, ceiling_percent : float
-        Best fit of all rows, and what the true system would reach on this noise, %.
+        Best fit on all rows, and the best fit that the noise allows, %.
     rms_nm, excess_rms_nm : float
-        Error of all rows, and what of it is above the noise, N·m.
+        Error on all rows, and the part of it above the noise, N·m.
     samples : int
-        Rows.
+        Number of rows.
     noise_sd_nm : float
         White measurement noise of a sample, N·m.
-    fitted : Figures
-        The same figures on rows that may be fitted.
-    held_out : Figures or None
-        And on rows of `validate`; None without any.
+    fitted : FitStatistics
+        The same for rows that may be fitted.
+    held_out : FitStatistics or None
+        The same for rows of `validate`; None if there are none.
     by : dict of list of dict
         The error by "segment", "level" of pulse width, "direction", "time" and "frequency"; each row has `label`,
         `rms_nm` and `share_of_excess`.
@@ -76,10 +78,10 @@ class Comparison(_Result):
         Worst places first: `segment`, `start_s`, `end_s`, `pulse_width_us`, `direction`, `share_of_excess`,
         `mean_error_nm`, `text`.
     series : dict
-        What a plot needs, thinned: `time_s`, `torque_nm`, `predicted_torque_nm`, `lower_nm`, `upper_nm`, `residual_nm`,
-        `pulse_width_us`, `segment`, `noise_band_nm`.
+        Values for plots, at most 4000 points: `time_s`, `torque_nm`, `predicted_torque_nm`, `lower_nm`, `upper_nm`,
+        `residual_nm`, `pulse_width_us`, `segment`, `noise_band_nm`.
     left_out : str
-        How much was not counted, and why; empty where all is known.
+        How much was not counted, and why; empty if everything was counted.
     plain : tuple of str
         Sentences for people.
     """
@@ -90,8 +92,8 @@ class Comparison(_Result):
     excess_rms_nm: float
     samples: int
     noise_sd_nm: float
-    fitted: Figures
-    held_out: Figures | None
+    fitted: FitStatistics
+    held_out: FitStatistics | None
     by: Mapping[str, Sequence[Row]]
     tests: Row
     where: tuple[Row, ...]
@@ -100,20 +102,22 @@ class Comparison(_Result):
     plain: tuple[str, ...]
 
     def _sheet(self) -> Sheet:
-        whole: Figures = {
+        whole: FitStatistics = {
             "fit_percent": self.fit_percent,
             "ceiling_percent": self.ceiling_percent,
             "rms_nm": self.rms_nm,
             "excess_rms_nm": self.excess_rms_nm,
             "samples": self.samples,
         }
-        alarms = [GOES_WITH.get(test["with"], str(test["with"])) for test in self.tests["tests"] if not test["passed"]]
+        alarms = [
+            CORRELATED_WITH.get(test["with"], str(test["with"])) for test in self.tests["tests"] if not test["passed"]
+        ]
         rows = [
             ("all rows", _figures(whole)),
             ("fitted rows", _figures(self.fitted)),
             ("held out", "no rows of `validate`" if self.held_out is None else _figures(self.held_out)),
             ("noise", f"{quantity(self.noise_sd_nm, 'N·m')}, sd of a sample"),
-            ("residual", f"not noise: goes with {', '.join(alarms)}" if alarms else "noise: no correlation stands out"),
+            ("residual", f"not noise: correlated with {', '.join(alarms)}" if alarms else "looks like noise"),
         ]
         rows += [("worst place" if number == 0 else "", row["text"]) for number, row in enumerate(self.where[:FEW])]
         rows += [(f"by {kind}", _shares(self.by[kind])) for kind in ("segment", "direction") if self.by.get(kind)]
@@ -123,7 +127,7 @@ class Comparison(_Result):
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Diagnosis(_Result):
-    """What is missing in the model of a record.
+    """What the model of a record lacks.
 
     Parameters
     ----------
@@ -132,8 +136,8 @@ class Diagnosis(_Result):
     slow_noise : dict
         `sd_nm`, and `ar1`, the correlation of neighbouring pulse intervals.
     base : dict
-        The model of the structure that was criticised: `fit_percent`, `rms_nm`, `ceiling_percent`, each with a
-        `held_out_` one beside it, and `held_out_by`, where those come from.
+        The model of the examined structure: `fit_percent`, `rms_nm`, `ceiling_percent`, the same with `held_out_`, and
+        `held_out_by`, which says how the held-out values were found.
     verdict : str
         "effect_missing", "nothing_missing" or "unexplained_structure".
     probability : float
@@ -143,20 +147,20 @@ class Diagnosis(_Result):
         `next_experiment` (words) and `next_experiment_plan`, `form`, `equation`, `parameters`, `rival_probabilities`,
         `plain`.
     where : tuple of dict
-        Where the error sits, as in `Comparison`.
+        Where the error is, as in `Comparison`.
     with_all : dict
         The model with all of `missing`: the keys of `base`, and `noise_sd_nm`.
     explained : float
-        Share, 0 to 1, of the explicable log-likelihood that the effects took.
+        Share, 0 to 1, of the explainable log-likelihood that the effects explain.
     structure_left : float
-        Log-likelihood by which work and rest still differ.
+        Log-likelihood by which the residuals at work and at rest still differ.
     unseen : dict or None
-        Error of the last model on rows not seen, `rms_nm`, and what noise and its own uncertainty allow, `allowed_nm`,
-        both of means over a pulse interval; None where those rows can say nothing.
+        Error of the last model on held-out rows, `rms_nm`, and the error that noise and its uncertainty allow,
+        `allowed_nm`, both of means over pulse intervals; None if there are too few held-out rows.
     candidates : tuple of list of dict
-        What was tried in each round, best first: `effect`, `form`, `log_evidence_gain`, `rms_nm`, `forms`.
+        Effects tried in each round, best first: `effect`, `form`, `log_evidence_gain`, `rms_nm`, `forms`.
     notes : tuple of str
-        Reasons that no figure shows.
+        Further reasons for the verdict.
     plain : tuple of str
         Sentences for people.
     """
@@ -187,9 +191,9 @@ class Diagnosis(_Result):
             rows.append(("with all", both_words(self.with_all)))
         told = [row for row in self.missing if row["confused_with"]]
         rows += [("next test", row["next_experiment"]) for row in told[:1]]
-        # Where nothing is missing the worst of the noise is no place to look at.
+        # If nothing is missing, the places of the largest noise do not matter.
         places = () if self.verdict == "nothing_missing" else self.where[:FEW]
-        rows += [("error sits" if number == 0 else "", row["text"]) for number, row in enumerate(places)]
+        rows += [("error in" if number == 0 else "", row["text"]) for number, row in enumerate(places)]
         rows += [("note", text) for text in (*self.notes, caution(vars(self))) if text]
         verdict = VERDICTS.get(self.verdict, self.verdict)
         named = "".join(f", {row['effect']}" for row in self.missing)
@@ -198,19 +202,19 @@ class Diagnosis(_Result):
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Improvement(_Result):
-    """Models of a record, each with one effect more than the one before.
+    """Models of a record, each with one more effect than the one before.
 
     Parameters
     ----------
     noise_sd_nm : float
         White measurement noise of a sample, N·m.
     verdict : str
-        As in `Diagnosis`: on the first of the models, before anything was added.
+        As in `Diagnosis`, for the first model, before effects were added.
     steps : tuple of dict
         `added` (None in the first), `fit_percent`, `rms_nm`, `held_out_rms_nm`, `held_out_fit_percent`,
         `ceiling_percent`, `model_id`, `reason`.
     models : tuple of Model
-        One a step; the last one holds all that was added.
+        One per step; the last one has all added effects.
     refused : tuple of dict
         Effects that were not added, best first: `effect`, `log_evidence_gain`, `reason`.
     """
@@ -235,7 +239,7 @@ class Improvement(_Result):
             for number, row in enumerate(self.refused[:FEW])
         ]
         if len(self.refused) > FEW:
-            rows.append(("", f"and {len(self.refused) - FEW} effects more"))
+            rows.append(("", f"and {len(self.refused) - FEW} more effects"))
         added = ", ".join(str(step["added"]) for step in self.steps[1:]) or "no effect"
         before, after = (torque(step, "held_out_rms_nm") for step in (self.steps[0], self.steps[-1]))
         return Sheet(f"Improvement: {added} added, held-out rms from {before} to {after}", tuple(rows))
@@ -245,13 +249,13 @@ def _held(model: Model) -> str:
     return ", ".join(str(effect["id"]) for effect in model.effects) or "no effects"
 
 
-def _figures(figures: Figures) -> str:
+def _figures(figures: FitStatistics) -> str:
     above = quantity(figures["excess_rms_nm"], "N·m")
     return f"{fit_words(figures)}, above the noise {above}, {figures['samples']} samples"
 
 
 def _shares(rows: Sequence[Row]) -> str:
-    """Where the error above the noise sits, largest part first."""
+    """Shares of the error above the noise, largest first."""
     ranked = sorted((row for row in rows if row["share_of_excess"] > 0.005), key=lambda row: -row["share_of_excess"])
     parts = [f"{row['label']} {100 * row['share_of_excess']:.0f} %" for row in ranked]
     return f"{', '.join(parts)} of the error above the noise" if parts else "nothing above the noise"
@@ -263,5 +267,7 @@ def _found(row: Row) -> str:
         f"{torque(row, 'rms_after_nm')}, held out from {torque(row, 'held_out_rms_before_nm')} to "
         f"{torque(row, 'held_out_rms_after_nm')}"
     )
+    for name, entry in list(row["parameters"].items())[:MOST_PARAMETERS]:
+        text += f"; {name} {estimate(entry['value'], entry['sd'], entry['unit'])}"
     others = ", ".join(row["confused_with"])
-    return f"{text}; this record can't tell it from {others}" if others else text
+    return f"{text}; this record cannot separate it from {others}" if others else text

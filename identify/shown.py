@@ -1,20 +1,27 @@
-"""How a result shows itself: one line, a sheet of about ten lines, the same sheet as a table for notebooks."""
+"""How results are shown: as one line, as a summary of about ten lines, and as a table in notebooks."""
 
 from __future__ import annotations
 
 import html
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from identify.errors import BadRequest
+
+Plotter = Callable[[Any, Any], Any]
+"""`plotter(result, record) -> figure`: draws a model, comparison, diagnosis or improvement. The record may be None."""
+_plotters: list[Plotter] = []
+"""At most one; `identify` itself draws nothing and imports no plotting library."""
+
 NONE = "–"
 SURE, LIKELY = 0.9, 0.6
-"""Probabilities above which a thing is very probably, and probably, so."""
+"""Probabilities above which the words are "very probably" and "probably"."""
 LONGEST = 300
-"""Characters of a line at most."""
+"""Largest number of characters of a line."""
 
 
 @dataclass(frozen=True)
@@ -24,9 +31,9 @@ class Sheet:
     Parameters
     ----------
     title : str
-        What it is, and the figures that count, in one line.
+        What it is, with the most important values, in one line.
     rows : tuple of (str, str)
-        Each is a line.
+        One line each.
     """
 
     title: str
@@ -37,13 +44,13 @@ class Sheet:
         return one_line(self.title)
 
     def text(self) -> str:
-        """Title and rows, labels aligned."""
+        """Title and rows, with aligned labels."""
         rows = [(one_line(label), one_line(words)) for label, words in self.rows]
         width = max((len(label) for label, _ in rows), default=0)
         return "\n".join([self.line(), *[f"{label.ljust(width)}  {words}".rstrip() for label, words in rows]])
 
     def html(self) -> str:
-        """A table that needs no style sheet, no script and no other file; every word is escaped."""
+        """An HTML table without style sheet, script or other file; all text is escaped."""
         style = "text-align:left;vertical-align:top"
         rows = "".join(
             f'<tr><th scope="row" style="{style}">{_escaped(label)}</th><td style="{style}">{_escaped(words)}</td></tr>'
@@ -53,14 +60,26 @@ class Sheet:
         return f"<table>{caption}<tbody>{rows}</tbody></table>"
 
 
+def register_plotter(plotter: Plotter) -> None:
+    """Set the function that draws results; it replaces an earlier one.
+
+    Parameters
+    ----------
+    plotter : callable
+        `plotter(result, record) -> figure`, with a `Model`, `Comparison`, `Diagnosis` or `Improvement` as result, and
+        a `Record` or None. It raises `BadRequest` if it cannot draw this result.
+    """
+    _plotters[:] = [plotter]
+
+
 class Shown:
-    """Base of what shows itself."""
+    """Base class of results that are printed and shown in notebooks."""
 
     def _sheet(self) -> Sheet:
         raise NotImplementedError
 
     def summary(self) -> str:
-        """About ten lines for people."""
+        """A summary of about ten lines."""
         return self._sheet().text()
 
     def __str__(self) -> str:
@@ -72,9 +91,31 @@ class Shown:
     def _repr_html_(self) -> str:
         return self._sheet().html()
 
+    def plot(self, record: Any = None) -> Any:
+        """Draw the result with the registered plotter.
+
+        Parameters
+        ----------
+        record : Record or None
+            The measurement to draw beside it; a model needs one.
+
+        Returns
+        -------
+        figure
+            Whatever the plotter returns.
+
+        Raises
+        ------
+        BadRequest
+            No plotter is registered, or it cannot draw this result.
+        """
+        if not _plotters:
+            raise BadRequest("no plotter is registered", place="plot", fix="Import stimrig first; it registers one.")
+        return _plotters[0](self, record)
+
 
 def one_line(text: str) -> str:
-    """A text without line breaks and other signs that no one sees, cut where it is very long."""
+    """A text without line breaks and unprintable characters, shortened if it is very long."""
     seen = "".join(sign if sign.isprintable() else " " for sign in str(text))
     words = " ".join(seen.split())
     return words if len(words) <= LONGEST else f"{words[: LONGEST - 1]}…"
@@ -85,9 +126,9 @@ def _escaped(text: str) -> str:
 
 
 def quantity(value: Any, unit: str) -> str:
-    """A number with its unit, three digits (percentages: one decimal); a dash where there is none.
+    """A number with its unit, with three digits (per cent: one decimal); a dash if there is no number.
 
-    The unit "1" is left out: a pure number has none.
+    The unit "1" of a pure number is left out.
     """
     if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not math.isfinite(value):
         return NONE
@@ -95,34 +136,40 @@ def quantity(value: Any, unit: str) -> str:
     return digits if unit in ("", "1") else f"{digits} {unit}"
 
 
+def estimate(value: Any, sd: Any, unit: str) -> str:
+    """An estimate with its standard deviation, such as "0.53 ± 0.01 s"; without the ± if there is no deviation."""
+    spread = "" if sd is None or quantity(sd, "") == NONE else f" ± {sd:.2g}"
+    return f"{quantity(value, '')}{spread}{'' if unit in ('', '1') else f' {unit}'}"
+
+
 def fit_words(figures: Mapping[str, Any], prefix: str = "") -> str:
-    """How well a model fits: percentages, what the noise allows, and the error."""
+    """How well a model fits: fit, the best fit that the noise allows, and error."""
     allowed = figures.get(f"{prefix}ceiling_percent")
     most = "" if allowed is None else f" (the noise allows {quantity(allowed, '%')})"
     return f"fit {quantity(figures.get(f'{prefix}fit_percent'), '%')}{most}, rms {torque(figures, f'{prefix}rms_nm')}"
 
 
 def both_words(figures: Mapping[str, Any]) -> str:
-    """The same on fitted rows and on rows held out, in one line."""
+    """The same for fitted rows and held-out rows, in one line."""
     held_out = f"{quantity(figures.get('held_out_fit_percent'), '%')}, rms {torque(figures, 'held_out_rms_nm')}"
     return f"{fit_words(figures)}; {held_out_label(figures)} {held_out}"
 
 
 def held_out_label(figures: Mapping[str, Any]) -> str:
-    """What the held-out figures are: those of `validate`; without it, of blocks left out of the fit in turn."""
+    """Name of the held-out errors: from `validate`, or from blocks that were left out of the fit in turn."""
     return "cross-validated" if figures.get("held_out_by") == "cross-validation" else "held out"
 
 
 def sure(value: float) -> str:
-    """A probability in a word."""
+    """A probability in words."""
     return "very probably" if value > SURE else "probably" if value > LIKELY else "possibly"
 
 
 def torque(figures: Mapping[str, Any], key: str) -> str:
-    """A torque of a table, N·m."""
+    """A torque from a dict, with its unit."""
     return quantity(figures.get(key), "N·m")
 
 
 def probability(value: float) -> str:
-    """A probability in per cent; what is nearly sure stays below 100."""
+    """A probability in per cent; 100 % only if it is exactly 1."""
     return f"{min(round(100 * value), 99)} %" if value < 1.0 else "100 %"

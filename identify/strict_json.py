@@ -1,4 +1,4 @@
-"""JSON from others, read strictly: how deep it may go is known before it is parsed, and no key stands twice."""
+"""Strict reading of JSON from outside: limited depth, no duplicate keys."""
 
 from __future__ import annotations
 
@@ -10,32 +10,33 @@ from typing import Any
 
 DEEPEST = 32
 TOKEN = re.compile(r'"[^"\\]*+(?:\\.[^"\\]*+)*+(?:"|\\?\Z)|[\[{]|[\]}]', re.DOTALL)
-"""A whole string (to the text's end where it is not closed), or a bracket: each sign is looked at once."""
+"""A whole string (to the end of the text if it is not closed), or a bracket. Each character is read once."""
 
 
 class BadJson(ValueError):
-    """Text that is no JSON, or JSON that is not taken; the message says what and where."""
+    """Not JSON, or JSON that is not accepted; the message says what and where."""
 
 
 class NotJson(BadJson):
-    """Text that breaks off, or that is something else."""
+    """Text that is incomplete, or is not JSON at all."""
 
 
 def parse(text: str | bytes, *, deepest: int = DEEPEST, finite: bool = True) -> Any:
-    """The value that a JSON text holds.
+    """Parse a JSON text.
 
     Parameters
     ----------
     text : str or bytes
         Bytes are UTF-8.
     deepest : int
-        How many brackets may be open at once.
+        Largest number of brackets within one another.
     finite : bool
         Whether NaN, Infinity and numbers too large for a float are refused.
 
     Raises
     ------
     BadJson
+        With the line, where it is known.
     """
     if isinstance(text, bytes):
         try:
@@ -50,8 +51,8 @@ def parse(text: str | bytes, *, deepest: int = DEEPEST, finite: bool = True) -> 
         raise NotJson(f"not JSON (line {error.lineno}, column {error.colno}: {error.msg})") from error
     except BadJson:
         raise
-    except ValueError as error:  # a whole number of thousands of digits
-        raise BadJson("a number without an end") from error
+    except ValueError as error:  # an integer with thousands of digits
+        raise BadJson("a number with too many digits") from error
 
 
 def _check_depth(text: str, deepest: int) -> None:
@@ -69,16 +70,16 @@ def _single(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     if len(found) < len(pairs):
         names = [name for name, _ in pairs]
         twice = next(name for name, count in Counter(names).items() if count > 1)
-        raise BadJson(f"the key {twice[:60]!r} stands twice")
+        raise BadJson(f"the key {twice[:60]!r} is there twice")
     return found
 
 
 def _refused(name: str) -> Any:
-    raise BadJson(f"{name} is no number")
+    raise BadJson(f"{name} is not a number")
 
 
 def _finite(digits: str) -> float:
     value = float(digits)
     if not math.isfinite(value):
-        raise BadJson(f"{digits[:40]} is no number that can be used")
+        raise BadJson(f"{digits[:40]} is too large for a number")
     return value

@@ -21,7 +21,7 @@ from rig.clock import Clock
 from rig.devices import Stimulator
 from rig.errors import DeviceError, JournalError
 from rig.journal import Journal, Kind
-from rig.limits import Limit, Refusal, admit, check
+from rig.limits import Admitted, Limit, Refusal, admit, check
 from rig.signals import Ack, LateError, Pulse, PulseStatus
 
 LATE_ACK_S = 0.015
@@ -146,20 +146,7 @@ class Gate:
             refusal = self._too_much(now_s, verdict.charge_uc)
             if refusal is not None:
                 return self._skip(journal, index, PulseStatus.REFUSED, str(refusal))
-            intent = jn.INTENT.pack(index, now_s, due_s, verdict.pulse_width_us, verdict.current_ma)
-            journal.append(Kind.INTENT, intent)
-            try:
-                number = self._stimulator.send(verdict, latest_s)  # checks the clock as its last step before the write
-            except LateError:  # the disk or the line was slow
-                return self._skip(journal, index, PulseStatus.DROPPED)
-            written_s = self._clock.now_s()
-            self.on_its_way = OnItsWay(index, number, written_s)
-            self._recent.append((written_s, verdict.charge_uc))
-            self.last_pulse_s = written_s
-            self.lateness_s.append(written_s - due_s)
-            self.charge_uc += verdict.charge_uc
-            journal.append(Kind.WRITTEN, jn.WRITTEN.pack(index, number, written_s))
-        return PulseStatus.UNACKNOWLEDGED
+            return self._send(journal, index, verdict, now_s, due_s, latest_s)
 
     def feed(self) -> None:
         """Feed the device's watchdog after a health check; does nothing unless a test runs. Raises DeviceError."""
@@ -203,6 +190,24 @@ class Gate:
         with contextlib.suppress(DeviceError):
             self.stop()
         self._stimulator.close()
+
+    def _send(
+        self, journal: Journal, index: int, pulse: Admitted, now_s: float, due_s: float, latest_s: float
+    ) -> PulseStatus:
+        """Intent to the journal, pulse to the line, then the counts; `fire` holds the lock."""
+        journal.append(Kind.INTENT, jn.INTENT.pack(index, now_s, due_s, pulse.pulse_width_us, pulse.current_ma))
+        try:
+            number = self._stimulator.send(pulse, latest_s)  # checks the clock as its last step before the write
+        except LateError:  # the disk or the line was slow
+            return self._skip(journal, index, PulseStatus.DROPPED)
+        written_s = self._clock.now_s()
+        self.on_its_way = OnItsWay(index, number, written_s)
+        self._recent.append((written_s, pulse.charge_uc))
+        self.last_pulse_s = written_s
+        self.lateness_s.append(written_s - due_s)
+        self.charge_uc += pulse.charge_uc
+        journal.append(Kind.WRITTEN, jn.WRITTEN.pack(index, number, written_s))
+        return PulseStatus.UNACKNOWLEDGED
 
     def _skip(self, journal: Journal, index: int, status: PulseStatus, reason: str = "") -> PulseStatus:
         now_s = self._clock.now_s()

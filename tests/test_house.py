@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 import subprocess
 from pathlib import Path
@@ -11,7 +12,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 FIXED_TOP_LEVEL = {"pyproject.toml", "rig", "identify", "api", "hardware_sim", "tests", "deploy"}
 BESIDE = {
-    "README.md", "Makefile", "stimrig", "docs", "examples", "bench", "requirements", "LICENSE",
+    "README.md", "CONTRIBUTING.md", "Makefile", "stimrig", "docs", "examples", "bench", "requirements", "LICENSE",
     ".ci", ".gitignore", ".pre-commit-config.yaml",
 }  # fmt: skip
 
@@ -73,6 +74,23 @@ def test_the_emulator_and_identify_import_nothing_of_one_another_or_the_rig() ->
         )
         for path in (ROOT / package).rglob("*.py"):
             assert not pattern.search(path.read_text(encoding="utf-8")), path
+
+
+def test_no_private_name_crosses_modules_of_identify() -> None:
+    """A name with an underscore belongs to its module; import-linter sees modules, not names."""
+    offenders = []
+    for path in sorted((ROOT / "identify").rglob("*.py")):
+        nodes = list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
+        imported = [alias for node in nodes if isinstance(node, ast.ImportFrom) for alias in node.names]
+        modules = {alias.asname or alias.name for alias in imported}
+        names = [alias.name for alias in imported]
+        names += [
+            node.attr
+            for node in nodes
+            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in modules
+        ]
+        offenders += [f"{path.relative_to(ROOT)}: {name}" for name in names if name.startswith("_")]
+    assert offenders == []
 
 
 def test_tests_import_nothing_from_the_benches() -> None:

@@ -57,10 +57,10 @@ def falling(rows: list[dict[str, Any]]) -> dict[str, Any]:
     sizes = [13 if row["current"] else 8 for row in rows]
     noise = next((row["noise_sd_nm"] for row in reversed(rows) if row.get("noise_sd_nm")), None)
     held = [row["held_out_rms_nm"] for row in rows]
-    data = [line(names, [row["rms_nm"] for row in rows], "rows it was fitted on", MEASURED, 2.0,
+    data = [line(names, [row["rms_nm"] for row in rows], "rows used to fit", MEASURED, 2.0,
                  mode="lines+markers", marker={"size": sizes})]  # fmt: skip
     if any(value is not None for value in held):
-        data.append(line(names, held, "rows it has not seen", MODEL, 2.6, mode="lines+markers", marker={"size": sizes}))
+        data.append(line(names, held, "rows not used to fit", MODEL, 2.6, mode="lines+markers", marker={"size": sizes}))
     shapes, labels = [], []
     if noise:
         shapes.append({"type": "line", "xref": "paper", "x0": 0, "x1": 1, "y0": noise, "y1": noise,

@@ -1,4 +1,4 @@
-"""What must hold on a machine before a rig runs on it; each check says what it saw and what mends it.
+"""What a machine needs before a rig runs on it; each check says what it saw and how to fix it.
 
 Reads and measures only: no device is opened, nothing is sent. A check is a generator function of this module whose name
 begins with `check_`.
@@ -42,7 +42,7 @@ class Finding:
     check: str
     verdict: Verdict
     says: str
-    mend: str = ""
+    fix: str = ""
 
 
 def examine(settings: Settings) -> list[Finding]:
@@ -52,7 +52,7 @@ def examine(settings: Settings) -> list[Finding]:
         try:
             found += check(settings)
         except Exception as error:
-            found.append(Finding(name, "care", f"could not be looked at: {type(error).__name__}: {error}"))
+            found.append(Finding(name, "care", f"could not be checked: {type(error).__name__}: {error}"))
     return found
 
 
@@ -73,13 +73,13 @@ def as_dict(found: list[Finding]) -> dict[str, Any]:
 def check_rig_file(settings: Settings) -> Iterator[Finding]:
     """The rig file, read by the rig's own reader, in a process of its own."""
     if settings.rig_file is None:
-        yield Finding("rig file", "ok", "none given: the emulated rig would be used")
+        yield Finding("rig file", "ok", "none given: the emulated rig will be used")
         return
     code = "import sys, pathlib; from rig import config; config.load(pathlib.Path(sys.argv[1]))"
     command = [sys.executable, "-c", code, str(settings.rig_file)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     if done.returncode == 0:
-        yield Finding("rig file", "ok", f"{settings.rig_file}: every key holds")
+        yield Finding("rig file", "ok", f"{settings.rig_file}: every key is valid")
     else:
         last = (done.stderr.strip().splitlines() or ["it cannot be read"])[-1].partition("Error: ")
         yield Finding("rig file", "fails", last[2] or last[0], "docs/rig-file.md lists every key")
@@ -101,14 +101,14 @@ def check_devices(settings: Settings) -> Iterator[Finding]:
 def port_finding(what: str, port: Path) -> Finding:
     """A serial port: there, a device, and ours to use."""
     if not port.exists():
-        mend = "plug it in and switch it on; `ls -l /dev/serial/by-id /dev/stimrig` shows what is there"
-        return Finding(what, "fails", f"{port} is not there", mend)
+        fix = "plug it in and switch it on; `ls -l /dev/serial/by-id /dev/stimrig` shows what is there"
+        return Finding(what, "fails", f"{port} is not there", fix)
     mode = port.stat().st_mode
     if not stat.S_ISCHR(mode):
         return Finding(what, "fails", f"{port} is no serial port", "give its name under /dev in the rig file")
     if not os.access(port, os.R_OK | os.W_OK):
-        mend = "add this user to the port's group (dialout), or install deploy/udev/70-stimrig.rules; sign in again"
-        return Finding(what, "fails", f"{port} may not be read and written by this user", mend)
+        fix = "add this user to the port's group (dialout), or install deploy/udev/70-stimrig.rules; sign in again"
+        return Finding(what, "fails", f"{port} may not be read and written by this user", fix)
     return Finding(what, "ok", f"{port} is there and may be used")
 
 
@@ -120,11 +120,11 @@ def bus_finding(bus: dict[str, Any]) -> Finding:
     if kind == "socketcan":
         link = Path("/sys/class/net") / channel
         if not link.exists():
-            mend = f"plug the adapter in; systemctl start stimrig-can@{channel} brings it up"
-            return Finding("load cell", "fails", f"there is no interface {channel}", mend)
+            fix = f"plug the adapter in; systemctl start stimrig-can@{channel} brings it up"
+            return Finding("load cell", "fails", f"there is no interface {channel}", fix)
         if not int((link / "flags").read_text(), 16) & 1:
-            mend = f"ip link set {channel} up type can bitrate …, or systemctl start stimrig-can@{channel}"
-            return Finding("load cell", "fails", f"{channel} is down", mend)
+            fix = f"ip link set {channel} up type can bitrate …, or systemctl start stimrig-can@{channel}"
+            return Finding("load cell", "fails", f"{channel} is down", fix)
         return Finding("load cell", "ok", f"{channel} is up")
     if kind == "socketcand":
         host, port = str(bus.get("host", "127.0.0.1")), int(bus.get("port", 29536))
@@ -134,7 +134,7 @@ def bus_finding(bus: dict[str, Any]) -> Finding:
             says = f"socketcand at {host}:{port}: {error.strerror or error}"
             return Finding("load cell", "fails", says, "start socketcand on that machine")
         return Finding("load cell", "ok", f"socketcand answers at {host}:{port}")
-    return Finding("load cell", "care", f"a {kind} bus cannot be looked at without opening it")
+    return Finding("load cell", "care", f"a {kind} bus cannot be checked without opening it")
 
 
 def check_rig(settings: Settings) -> Iterator[Finding]:
@@ -148,12 +148,12 @@ def check_rig(settings: Settings) -> Iterator[Finding]:
             line.sendall(b'{"kind": "status", "id": 1}\n')
             body = json.loads(line.makefile().readline())["body"]
     except (OSError, ValueError, KeyError) as error:
-        mend = "systemctl status stimrig-rig; its journal says why"
-        yield Finding("rig", "fails", f"{settings.rig_socket}: no answer ({error})", mend)
+        fix = "systemctl status stimrig-rig; its journal says why"
+        yield Finding("rig", "fails", f"{settings.rig_socket}: no answer ({error})", fix)
         return
     if body["state"] in ("latched", "uncertain", "disconnected"):
-        mend = "look at the participant and the rig, then re-arm it on the page"
-        yield Finding("rig", "fails", f"{body['state']}: {body['reason']}", mend)
+        fix = "check the participant and the rig, then re-arm it on the page"
+        yield Finding("rig", "fails", f"{body['state']}: {body['reason']}", fix)
     else:
         yield Finding("rig", "ok", body["state"])
 
@@ -163,22 +163,20 @@ def check_data(settings: Settings) -> Iterator[Finding]:
     folder = settings.data_dir.absolute()
     nearest = next(place for place in (folder, *folder.parents) if place.exists())
     if not os.access(nearest, os.W_OK | os.X_OK):
-        mend = f"chown it to this user, or set STIMRIG_DATA_DIR; deploy/install.sh makes {folder} as it should be"
-        yield Finding("data folder", "fails", f"{nearest} may not be written by this user", mend)
+        fix = f"chown it to this user, or set STIMRIG_DATA_DIR; deploy/install.sh makes {folder} as it should be"
+        yield Finding("data folder", "fails", f"{nearest} may not be written by this user", fix)
         return
     if folder.exists() and folder.stat().st_mode & stat.S_IROTH:
         yield Finding("data folder", "care", f"{folder} may be read by every user", f"chmod o-rwx {folder}")
     else:
         yield Finding("data folder", "ok", f"{folder} may be written, by this user and its group")
     free_gb = shutil.disk_usage(nearest).free / 1e9
-    says, mend = f"{free_gb:.1f} GB free; a test takes 5 MB", "make room, or move old recordings to the backup"
-    yield Finding(
-        "disk", "fails" if free_gb < LEAST_FREE_GB else "care" if free_gb < GOOD_FREE_GB else "ok", says, mend
-    )
+    says, fix = f"{free_gb:.1f} GB free; a test takes 5 MB", "make room, or move old recordings to the backup"
+    yield Finding("disk", "fails" if free_gb < LEAST_FREE_GB else "care" if free_gb < GOOD_FREE_GB else "ok", says, fix)
     slowest_ms = max(synced_ms(nearest) for _ in range(5))
-    says = f"slowest of five writes brought to the disk: {slowest_ms:.0f} ms"
+    says = f"slowest of five writes to the disk: {slowest_ms:.0f} ms"
     yield Finding(
-        "disk speed", "care" if slowest_ms > SLOW_DISK_MS else "ok", says, "use a local disk, not a network's"
+        "disk speed", "care" if slowest_ms > SLOW_DISK_MS else "ok", says, "use a local disk, not a network disk"
     )
 
 
@@ -210,10 +208,10 @@ def check_database(settings: Settings) -> Iterator[Finding]:
     broken = audit.first_broken(entries)
     store.close()
     if broken is None:
-        yield Finding("database", "ok", f"opens; the audit trail's {len(entries)} entries hold together")
+        yield Finding("database", "ok", f"opens; the chain of the audit trail's {len(entries)} entries is complete")
     else:
-        mend = "compare with the backup's; somebody wrote to the database by other ways than the service"
-        yield Finding("database", "fails", f"the audit trail is broken at entry {broken}", mend)
+        fix = "compare with the backup: the database was changed outside the service"
+        yield Finding("database", "fails", f"the audit trail is broken at entry {broken}", fix)
 
 
 def check_clock(_settings: Settings) -> Iterator[Finding]:
@@ -226,18 +224,18 @@ def check_clock(_settings: Settings) -> Iterator[Finding]:
     if answer == "yes":
         yield Finding("clock", "ok", "set by NTP")
     else:
-        says = "not set by NTP" if answer == "no" else "whether NTP sets it cannot be told here"
-        mend = "timedatectl set-ntp true; without a network set it by hand: recordings and approvals carry its date"
-        yield Finding("clock", "care", says, mend)
+        says = "not set by NTP" if answer == "no" else "it is not known whether NTP sets it"
+        fix = "timedatectl set-ntp true; without a network set it by hand: recordings and approvals carry its date"
+        yield Finding("clock", "care", says, fix)
     late_ms = []
     for _ in range(200):
         began = time.perf_counter()
         time.sleep(0.002)
         late_ms.append(1000 * (time.perf_counter() - began) - 2)
     worst_ms = sorted(late_ms)[-3]
-    mend = "end what else runs here; give the rig real-time priority"
+    fix = "end other programs on this machine; give the rig real-time priority"
     says = f"wakes up {worst_ms:.2f} ms late at the 99th percentile (a pulse is dropped at 10 ms)"
-    yield Finding("wake-up", "ok" if worst_ms < LATE_MS else "care", says, mend)
+    yield Finding("wake-up", "ok" if worst_ms < LATE_MS else "care", says, fix)
 
 
 def check_priority(_settings: Settings) -> Iterator[Finding]:
@@ -245,8 +243,8 @@ def check_priority(_settings: Settings) -> Iterator[Finding]:
     code = f"import os; os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param({SENDER_PRIORITY}))"
     allowed = subprocess.run([sys.executable, "-c", code], capture_output=True, timeout=30).returncode == 0
     says = "real-time priority is granted" if allowed else "no real-time priority for this user"
-    mend = "LimitRTPRIO=60 as in deploy/systemd/stimrig-rig.service, or `rtprio 60` in /etc/security/limits.d"
-    yield Finding("priority", "ok" if allowed else "care", says, "" if allowed else mend)
+    fix = "LimitRTPRIO=60 as in deploy/systemd/stimrig-rig.service, or `rtprio 60` in /etc/security/limits.d"
+    yield Finding("priority", "ok" if allowed else "care", says, "" if allowed else fix)
 
 
 def check_compiled(_settings: Settings) -> Iterator[Finding]:
@@ -257,8 +255,8 @@ def check_compiled(_settings: Settings) -> Iterator[Finding]:
     nearest = next(folder for folder in (place, *place.parents) if folder.exists())
     kept = os.access(nearest, os.W_OK | os.X_OK)
     says = f"{place} {'may' if kept else 'may not'} be written"
-    mend = "set NUMBA_CACHE_DIR to a folder of this user; else each start compiles anew, for some ten seconds"
-    yield Finding("compiled code", "ok" if kept else "care", says, "" if kept else mend)
+    fix = "set NUMBA_CACHE_DIR to a folder of this user; otherwise each start compiles again, for about ten seconds"
+    yield Finding("compiled code", "ok" if kept else "care", says, "" if kept else fix)
 
 
 def check_door(settings: Settings) -> Iterator[Finding]:
@@ -273,7 +271,7 @@ def check_door(settings: Settings) -> Iterator[Finding]:
     with socket.socket(socket.AF_INET6 if ":" in settings.host else socket.AF_INET) as line:
         line.settimeout(1)
         taken = line.connect_ex((settings.host, settings.port)) == 0
-    says = f"{settings.host}:{settings.port} {'answers: the service, or another one' if taken else 'is free'}"
+    says = f"{settings.host}:{settings.port} {'is in use, by the service or another program' if taken else 'is free'}"
     yield Finding("address", "ok", says)
 
 
@@ -283,9 +281,9 @@ def check_workers(_settings: Settings) -> Iterator[Finding]:
     done = subprocess.run(command, capture_output=True, text=True, timeout=30)
     left_open = json.loads(done.stdout)
     if not left_open:
-        says = "shut in: no network, no file but recordings, bounds on memory and time"
+        says = "isolated: no network, no files but recordings, limits on memory and time"
         yield Finding("workers", "ok", says)
     for what, why in left_open.items():
-        mend = "a kernel from 5.13 on with Landlock" if what == "files" else "Linux on x86_64 or aarch64 with seccomp"
-        says = f"{what}: workers that read uploads cannot be shut off from them here ({why})"
-        yield Finding("workers", "care", says, f"{mend}; until then take in files of people you trust only")
+        fix = "a kernel from 5.13 on with Landlock" if what == "files" else "Linux on x86_64 or aarch64 with seccomp"
+        says = f"{what}: workers that read uploads cannot be isolated from them here ({why})"
+        yield Finding("workers", "care", says, f"{fix}; until then upload only files from people you trust")

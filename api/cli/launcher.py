@@ -82,9 +82,9 @@ class Child:
             self.process.wait(2)
         code = self.process.poll()
         self.end()
-        words = self.last_words() or (f"it ended with code {code}" if code is not None else "it did not get ready")
+        words = self.last_words() or (f"it ended with code {code}" if code is not None else "it did not start in time")
         words = words.removeprefix(f"{self.name}: ").removeprefix("stimrig: ").removeprefix("stimrig emulate: ")
-        if code == 2:  # bad input: the words name the place and the mend
+        if code == 2:  # bad input: the words name the place and the fix
             return LaunchError(words, 2)
         return LaunchError(f"{self.name}: {words} (log: {self.log})")
 
@@ -256,7 +256,7 @@ class Services:
         words = child.last_words()
         child.end()
         child.start()
-        return f"{child.name} had ended ({words or 'without a word'}) and was started again"
+        return f"{child.name} had ended ({words or 'without a message'}) and was started again"
 
     def stop(self) -> None:
         """End what was started here: the rig first, since it stops stimulation; the service hears its test's end."""

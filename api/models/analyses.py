@@ -180,8 +180,8 @@ class Analyses:
         if same is not None:
             return same
         if force and not reason.strip():
-            detail = "Forcing an effect goes against the evidence; say why, it is kept in the audit trail."
-            raise ApiError(422, "reason-missing", "A forced effect wants a reason", detail)
+            detail = "The evidence is against this effect. Give a reason; it is kept in the audit trail."
+            raise ApiError(422, "reason-missing", "Adding an effect against the evidence needs a reason", detail)
         if not force:
             effect_evidence.require(await self.diagnosis(model, on_call), model.effects, added)
         path = await asyncio.to_thread(self.path, model.recording_id)

@@ -20,8 +20,12 @@ def require(diagnosis: dict[str, Any], present: Sequence[str], added: Sequence[s
     found = {effect: reason for effect, reason in reasons.items() if reason}
     if found:
         detail = " ".join(f"{effect}: {reason}" for effect, reason in found.items())
-        detail += " A person can add it all the same and say why (`force`); the held-out error then shows what it does."
-        raise ApiError(409, "effect-not-there", "The recording does not ask for this effect", detail, reasons=found)
+        detail += (
+            " To add it against the evidence, send `force` and a reason; the held-out error then shows its effect."
+        )
+        raise ApiError(
+            409, "effect-not-there", "The recording gives no evidence for this effect", detail, reasons=found
+        )
 
 
 def refusal(diagnosis: dict[str, Any], present: Sequence[str], effect: str) -> str | None:
@@ -33,12 +37,13 @@ def refusal(diagnosis: dict[str, Any], present: Sequence[str], effect: str) -> s
             return None
     rows = [row for rows in diagnosis.get("candidates") or [] for row in rows if row["effect"] == effect]
     if not rows:
-        return "it was not considered on this recording: it needs columns that are not in it, or was seen otherwise."
+        return "it was not tested on this recording: the recording lacks the columns that it needs."
     gain = rows[-1]["log_evidence_gain"]
     if gain <= 0:
         return f"the recording speaks against it (log evidence {gain:+.1f})."
     better = [entry for entry in diagnosis.get("missing") or [] if entry["effect"] != effect]
     if better and rows[0]["log_evidence_gain"] > 6:
         names = " and ".join((entry.get("name") or entry["effect"]).lower() for entry in better)
-        return f"{names} explains the same better; beside it, {effect} gains too little (log evidence {gain:+.1f})."
-    return f"too little speaks for it (log evidence {gain:+.1f}): what it would explain looks like noise."
+        beside = f"with it in the model, {effect} gains too little (log evidence {gain:+.1f})."
+        return f"{names} explains the same error better; {beside}"
+    return f"the evidence is too weak (log evidence {gain:+.1f}): what it explains looks like noise."

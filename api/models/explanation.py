@@ -64,10 +64,10 @@ def headline(
     if diagnosis["verdict"] == "unexplained_structure":
         where = diagnosis.get("where") or []
         sits = f" It sits mostly here: {where[0]['text']}." if where else ""
-        words = f"The error goes with the muscle's work and is not the measurement's noise.{sits}{beside}"
+        words = f"The error depends on what the muscle does, so it is not measurement noise.{sits}{beside}"
         return {
             "kind": "unexplained",
-            "title": "Structure is left that no effect of the library explains",
+            "title": "The error has structure that no effect of the library explains",
             "words": words,
         }
     if missing:
@@ -76,28 +76,28 @@ def headline(
         sure = " possibly" if max(entry.get("probability") or 1.0 for entry in missing) <= LIKELY else ""
         title = f"{len(missing)} effects are" if many else "An effect is"
         title = f"{title}{sure} missing in this model"
-        return {"kind": "missing", "title": title, "words": f"The recording asks for {names}.{beside}"}
+        return {"kind": "missing", "title": title, "words": f"The recording gives evidence for {names}.{beside}"}
     more = " more" if effects else ""
     poor = caution(diagnosis)
     if poor:
         title = "This recording cannot tell whether something is missing"
         return {"kind": "unsure", "title": title, "words": poor}
     if times is not None and times > NOISE_LIKE:
-        title = f"The library names nothing{more} that this recording asks for"
+        title = f"No{more} effect of the library has enough evidence in this recording"
         return {
             "kind": "unsure",
             "title": title,
-            "words": f"Something is left, but too little speaks for any effect of the library.{beside}",
+            "words": f"Some error is left, but the evidence for each effect of the library is too weak.{beside}",
         }
     return {
         "kind": "nothing",
         "title": f"Nothing{more} is missing: what is left is noise",
-        "words": f"No effect of the library would explain more than noise does.{beside}",
+        "words": f"No effect of the library explains more than noise would.{beside}",
     }
 
 
 def _on(comparison: dict[str, Any] | None) -> str:
-    return " on rows it has not seen" if comparison and comparison.get("held_out") else ""
+    return " on rows not used to fit" if comparison and comparison.get("held_out") else ""
 
 
 def times_noise(comparison: dict[str, Any] | None) -> float | None:
@@ -122,7 +122,7 @@ def card(entry: dict[str, Any], library: dict[str, Any]) -> dict[str, Any]:
         sure = "possibly"
     errors = [
         (label, entry.get(f"{prefix}rms_before_nm"), entry.get(f"{prefix}rms_after_nm"))
-        for label, prefix in (("rows it was fitted on", ""), ("rows it has not seen", "held_out_"))
+        for label, prefix in (("rows used to fit", ""), ("rows not used to fit", "held_out_"))
     ]
     return {
         **entry,
@@ -195,7 +195,7 @@ def others(diagnosis: dict[str, Any], effects: Sequence[str], library: dict[str,
     ranked = sorted(newest, key=lambda effect: -newest[effect])
     return [
         {"id": effect, "name": name_of(effect, library), "reason": refusal(diagnosis, effects, effect)
-         or "the recording cannot tell it from what it asks for."}
+         or "the recording cannot tell it apart from the effects named above."}
         for effect in ranked if effect not in asked
     ]  # fmt: skip
 

@@ -71,7 +71,7 @@ class Versions:
             if same is not None:
                 if same.etag == row.etag:
                     return same
-                detail = f"{row.id} is stored with other contents; nothing was overwritten."
+                detail = f"{row.id} is stored already, with other contents. Nothing was overwritten."
                 raise ApiError(409, "model-exists", "A model version cannot be changed", detail)
             session.add(row)
             audit.write(session, now, by, "store model", row.id, recording=recording_id, effects=row.effects)

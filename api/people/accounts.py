@@ -109,7 +109,7 @@ class People:
             right = await self.passwords.verify(lane, row.password_hash if row else None, password)
         if not right:
             await asyncio.to_thread(self._note, principal.name, "confirmation refused")
-            detail = "Nothing was decided. Go back and give it once more."
+            detail = "Nothing was decided. Go back and enter it again."
             raise unauthorized(detail, "wrong-password", "The password does not match")
         self.guesses.confirmation_was_right(held)
         await asyncio.to_thread(self._confirm, held)
@@ -134,7 +134,7 @@ class People:
                 await self.confirm(principal, password)
         if not await asyncio.to_thread(self._use_confirmation, principal.session_hash):
             detail = (
-                "Approving needs your password once more: as `password` in the form, or by POST /v1/sessions/confirm "
+                "To approve, enter your password again: as `password` in the form, or by POST /v1/sessions/confirm "
                 f"at most {CONFIRMED_S:.0f} s before."
             )
             raise ApiError(403, "confirm-password", "Please confirm with your password", detail)

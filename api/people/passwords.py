@@ -43,7 +43,7 @@ class Passwords:
         """
         lane = self._known if known else self._strangers
         if lane.inside >= lane.most:
-            problem = ApiError(429, "too-many-tries", "Too many sign in at once", "Try again in 2 s.")
+            problem = ApiError(429, "too-many-tries", "Too many people sign in at once", "Try again in 2 s.")
             problem.headers["Retry-After"] = "2"
             raise problem
         lane.inside += 1

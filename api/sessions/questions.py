@@ -100,9 +100,9 @@ class Questions:
         """
         found = self._all.get(number)
         if found is None or found.participant != participant or found.asker != (who.name, who.csrf):
-            raise gone("It was asked of somebody else, or before the service was started.")
+            raise gone("It was shown to another person, or before the service was restarted.")
         if found.answer is None and not self._fresh(found):
-            raise gone(f"It may be answered for {LIFE_S / 60:.0f} minutes; what it shows may not be so any more.")
+            raise gone(f"It is valid for {LIFE_S / 60:.0f} minutes; what it shows may have changed.")
         return found
 
     def _fresh(self, question: Question) -> bool:
@@ -120,6 +120,4 @@ class Questions:
 
 def gone(why: str) -> ApiError:
     """410: there is nothing to be answered any more."""
-    return ApiError(
-        410, "too-late", "This question is no longer open", f"{why} Nothing was done. Go back and ask again."
-    )
+    return ApiError(410, "too-late", "This question is closed", f"{why} Nothing was done. Go back and start again.")

@@ -161,7 +161,7 @@ class RigClient:
             self._writer = None
         for future in self._waiting.values():
             if not future.done():
-                future.set_exception(no_rig("The connection broke while it was asked."))
+                future.set_exception(no_rig("The connection to the rig broke."))
         if self.connected:
             log.warning("the rig's socket closed")
             self.connected = False
@@ -224,7 +224,7 @@ def line_of(message: Any) -> bytes:
     """A request as a line. Raises ApiError (422) where the rig would not hear it out."""
     line = message.model_dump_json().encode() + b"\n"
     if len(line) > LONGEST_LINE:
-        detail = f"{len(line)} bytes are sent to the rig, at most {LONGEST_LINE} are heard. Make the test shorter."
+        detail = f"The plan has {len(line)} bytes; the rig takes at most {LONGEST_LINE}. Make the test shorter."
         raise ApiError(422, "too-long", "The plan is too long", detail)
     return line
 

@@ -182,10 +182,10 @@ class Runner:
     def _refuse_overtaken(self, since_s: float) -> None:
         """A start that a stop has overtaken, or whose asker has long given up, is not played."""
         if self._halted_s >= since_s:
-            detail = "Nothing was played. Look at the participant and the rig, re-arm it, and start again."
-            raise ApiError(409, "stopped-meanwhile", "A stop came after this start was asked for", detail)
+            detail = "Nothing was sent. Check the participant and the rig, re-arm the rig, and start again."
+            raise ApiError(409, "stopped-meanwhile", "The start was cancelled by a stop", detail)
         if not (self.clock.monotonic_s() - since_s <= START_S):
-            detail = f"It could not begin within {START_S:g} s. Nothing was played. Start again."
+            detail = f"It could not begin within {START_S:g} s. Nothing was sent. Start again."
             raise ApiError(503, "too-late", "The start took too long", detail)
 
     async def _stop_quietly(self, reason: str) -> None:
@@ -429,14 +429,14 @@ class Runner:
 def not_what_was_seen(why: str) -> ApiError:
     """409: a person said yes to something else."""
     return ApiError(
-        409, "not-what-was-seen", "This is no longer what you saw", f"{why} Nothing was started; look again."
+        409, "not-what-was-seen", "This page is out of date", f"{why} Nothing was started. Go back and check."
     )
 
 
 def busy(current: Current) -> ApiError:
     """409, naming the holder."""
     detail = (
-        f"{current.test_id} for participant {current.participant}, started by {current.by}, holds the rig. "
+        f"{current.test_id} for participant {current.participant}, started by {current.by}, uses the rig. "
         "Wait for its end, or stop it."
     )
     holder = {"test_id": current.test_id, "participant": current.participant, "by": current.by}

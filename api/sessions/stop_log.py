@@ -50,9 +50,9 @@ class StopLog:
         told = self._told.get(key)
         if told is None:
             detail = (
-                "The service was restarted since, or many stops came after this one. The bar above says what the rig "
-                "does now: look there. Where it does not say that the rig has stopped, press stop, or use the "
-                "stimulator's own emergency switch. The audit trail holds each stop."
+                "The service was restarted, or many stops came after this one. The bar above shows what the rig "
+                "does now. If it does not say that the rig has stopped, press Stop, or use the "
+                "emergency switch on the stimulator. The audit trail lists each stop."
             )
-            raise ApiError(404, "not-found", "What this stop did is not known here any more", detail)
+            raise ApiError(404, "not-found", "The result of this stop is no longer kept here", detail)
         return told

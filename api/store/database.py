@@ -44,12 +44,12 @@ class Store:
                 event.listen(self.engine, "connect", _durable_sqlite)
             migrations.bring_up(self.engine)
         except migrations.SchemaError as error:
-            raise ApiError(503, "database", "The database does not fit", str(error)) from error
+            raise ApiError(503, "database", "The database has another version", str(error)) from error
         except (ArgumentError, DatabaseError, ImportError, OSError) as error:
-            mend = "set STIMRIG_DATABASE_URL or STIMRIG_DATA_DIR to a place this user may write"
+            fix = "set STIMRIG_DATABASE_URL or STIMRIG_DATA_DIR to a place this user may write"
             if isinstance(error, DatabaseError) and not isinstance(error, OperationalError):
-                mend = "restore the database from a backup, or set STIMRIG_DATA_DIR to another folder"
-            raise ApiError(503, "database", "The database does not open", f"{_first_line(error)}; {mend}") from error
+                fix = "restore the database from a backup, or set STIMRIG_DATA_DIR to another folder"
+            raise ApiError(503, "database", "The database cannot be opened", f"{_first_line(error)}; {fix}") from error
         self._sessions = sessionmaker(self.engine, expire_on_commit=False)
         self.write_lock = threading.RLock()
 

@@ -28,7 +28,7 @@ DATABASE_MEND = "stop it, or take another database: STIMRIG_DATABASE_URL"
 
 
 class HeldError(OSError):
-    """Another service holds the place, or it cannot be held; one line with the mend."""
+    """Another service holds the place, or it cannot be held; one line with the fix."""
 
 
 class ServiceLock:
@@ -49,8 +49,8 @@ class ServiceLock:
         self._files: list[IO[str]] = []
         self._since_utc = (clock or Clock()).utc()
         try:
-            for place, shown, mend in _places(settings):
-                self._files.append(_held(place, shown, mend))
+            for place, shown, fix in _places(settings):
+                self._files.append(_held(place, shown, fix))
         except BaseException:
             self.release()
             raise
@@ -96,7 +96,7 @@ def _places(settings: Settings) -> Iterator[tuple[Path, Path, str]]:
     yield real.with_name(f"{real.name}.lock"), database, DATABASE_MEND
 
 
-def _held(place: Path, shown: Path, mend: str) -> IO[str]:
+def _held(place: Path, shown: Path, fix: str) -> IO[str]:
     try:
         file = os.fdopen(os.open(place, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600), "r+", encoding="utf-8")
     except OSError as error:
@@ -106,7 +106,7 @@ def _held(place: Path, shown: Path, mend: str) -> IO[str]:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         with file:
-            raise HeldError(f"{shown}: another service runs on it: {_who(file)}; {mend}") from None
+            raise HeldError(f"{shown}: another service runs on it: {_who(file)}; {fix}") from None
     except OSError as error:
         file.close()
         raise HeldError(f"{place}: cannot be locked ({error.strerror}); take a folder on a local disk") from error

@@ -67,7 +67,7 @@ class BodyLimit:
                 async with asyncio.timeout_at(None if whole else end_s):
                     message = await receive()
             except TimeoutError:
-                raise HTTPException(408, "The request did not come whole in time. Send it again.") from None
+                raise HTTPException(408, "The request was not complete in time. Send it again.") from None
             taken += len(message.get("body", b""))
             whole = not message.get("more_body", False)
             if taken > limit:
@@ -79,6 +79,6 @@ class BodyLimit:
 
 def crowded() -> JSONResponse:
     """503: others' previews are in work."""
-    detail = f"{MOST_PREVIEWS} previews are in work already. Ask again in a second."
+    detail = f"{MOST_PREVIEWS} previews are being worked out already. Try again in a second."
     problem = ApiError(503, "crowded", "Too many previews at once", detail)
     return JSONResponse(problem.body(PREVIEW), 503, media_type="application/problem+json", headers={"Retry-After": "1"})

@@ -16,7 +16,7 @@ def same_origin(request: Request) -> None:
     """Refuse a sign-in that another site's page sends: there is no session yet whose CSRF token could be asked for."""
     origin = request.headers.get("origin")
     if origin and urlsplit(origin).netloc != request.headers.get("host"):
-        raise ApiError(403, "forbidden", "Not allowed", "The page of another site asked.")
+        raise ApiError(403, "forbidden", "Not allowed", "The request came from a page of another site.")
 
 
 def set_cookie(context: Context, answer: Response, cookie: str) -> None:

@@ -25,7 +25,7 @@ def from_validation(error: RequestValidationError) -> ApiError:
         place = ".".join(str(part) for part in item.get("loc", ()) if part != "body") or "body"
         found.append({"field": place, "detail": str(item.get("msg", "")), "got": _short(item.get("input"))})
     names = "; ".join(f"{item['field']}: {item['detail']}" for item in found)
-    return ApiError(422, "invalid-input", "The request does not hold what the route expects", names, errors=found)
+    return ApiError(422, "invalid-input", "The request is not valid", names, errors=found)
 
 
 def _short(value: Any) -> str:

@@ -70,11 +70,11 @@ def refuse_open_door(settings: Settings) -> None:
     """
     if loopback(settings.host) or (settings.tls_proxy and settings.secure_cookies):
         return
-    mend = (
+    fix = (
         "listen on 127.0.0.1 and put the TLS proxy of deploy/nginx in front; if one stands in front on another "
         "machine, set STIMRIG_TLS_PROXY=true and STIMRIG_SECURE_COOKIES=true"
     )
-    raise OSError(f"{settings.host}: refused, it is not this machine's loopback; {mend}")
+    raise OSError(f"{settings.host}: refused, it is not this machine's loopback; {fix}")
 
 
 def loopback(host: str) -> bool:

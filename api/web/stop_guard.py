@@ -44,7 +44,7 @@ async def anyone_who_may_stop(request: Request) -> Press:
             if by is not None:
                 return Press(by, reason)
             error.title = "Nothing was stopped"
-            error.detail = f"Use the stimulator's own emergency switch now, or sign in and press stop. {error.detail}"
+            error.detail = f"Use the emergency switch on the stimulator now, or sign in and press Stop. {error.detail}"
             raise
     finally:
         coming.cancel()

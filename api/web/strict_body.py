@@ -56,7 +56,7 @@ class StrictBody:
 
 async def _refused() -> Message:
     """Where the body should come: whoever reads it is told, and a stop, which needs none, is a stop all the same."""
-    raise HTTPException(400, "The form says that it is not UTF-8. Send it in UTF-8; a browser does so by itself.")
+    raise HTTPException(400, "The form is not in UTF-8. Send it in UTF-8, as browsers do.")
 
 
 def refuse_unsound(body: bytes) -> None:

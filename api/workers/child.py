@@ -62,7 +62,7 @@ def describe(error: Exception) -> dict[str, Any]:
     import traceback
 
     if isinstance(error, IdentifyError):
-        place, mend = error.place, error.mend
+        place, mend = error.place, error.fix
         return {"expected": True, "detail": one_line(error), "place": text_or_none(place), "mend": text_or_none(mend)}
     if isinstance(error, MemoryError):
         megabytes = confinement.MEMORY_BYTES // 2**20

@@ -161,7 +161,7 @@ class Worker:
                 await process.wait()
         except ValueError as error:  # no line of ours: this worker is not one to go on with
             await self.close()
-            detail = "It answered what cannot be read. The data are safe; ask again. See logs/api.log."
+            detail = "Its answer cannot be read. Your data are safe. Try again, or see logs/api.log."
             raise ApiError(500, "worker-died", "The worker process was ended", detail) from error
         except TimeoutError:
             await self.close()
@@ -171,7 +171,7 @@ class Worker:
         if process.returncode == -signal.SIGXCPU:
             raise too_long(call.verb, processor_s)
         how = f"{ending(process.returncode)} while it did the {call.verb}"
-        detail = f"{how}. The data are safe; ask again. See logs/api.log."
+        detail = f"{how}. Your data are safe. Try again, or see logs/api.log."
         raise ApiError(500, "worker-died", "The worker process died", detail)
 
     async def _converse(
@@ -212,15 +212,15 @@ def call_error(verb: str, error: dict[str, Any]) -> ApiError:
     """A worker's error as a problem."""
     if error.get("expected"):
         extra = {key: error[key] for key in ("place", "mend") if error.get(key)}
-        return ApiError(422, "data", "The data do not allow it", error["detail"], **extra)
-    detail = f"{error['detail']}. The data are safe. See logs/api.log."
+        return ApiError(422, "data", "The data do not allow this", error["detail"], **extra)
+    detail = f"{error['detail']}. Your data are safe. See logs/api.log."
     return ApiError(500, "analysis-failed", f"The {verb} failed", detail)
 
 
 def too_long(verb: str, seconds: float) -> ApiError:
     """A call that was ended because it computed for too long."""
     detail = f"The {verb} was ended after {seconds:g} s. Cut the recording, or resample it to a lower rate."
-    return ApiError(422, "data", "The data do not allow it", detail)
+    return ApiError(422, "data", "The data do not allow this", detail)
 
 
 def ending(code: int | None) -> str:

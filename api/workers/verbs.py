@@ -181,7 +181,7 @@ def export_csv(data: str, progress: Progress, out: str) -> dict[str, Any]:
         return {"rows": int(record.time_s.size)}
     if abs(record.pulse_rate_hz - 40.0) > 1e-6:
         message = f"{record.pulse_rate_hz:g} pulses/s; a CSV file would be read as 40"
-        raise identify.BadRecord(message, mend="Take the HDF5 file.")
+        raise identify.BadRecord(message, fix="Take the HDF5 file.")
     names = ["time_s", "pulse_width_us", "torque_nm"]
     also = record.columns()
     columns = [column.tolist() for column in (*(getattr(record, name) for name in names), *also.values())]

@@ -1,4 +1,4 @@
-"""Measurement against model: where it errs, how much of that is noise, and whether the residual is only noise."""
+"""Comparison of a model with a measurement: where the error is, and how much of it is noise."""
 
 from __future__ import annotations
 
@@ -10,39 +10,39 @@ from identify.criticism.correlation import correlation_tests
 from identify.criticism.doubt import left_out, refuse_doubted
 from identify.criticism.shares import by_direction, by_frequency, by_level, by_segment, by_time
 from identify.criticism.where import worst_places
-from identify.dynamics.pulse_grid import make_grid
-from identify.estimation.figures import UNDEFINED, best_fit_percent, ceiling_percent, rms
-from identify.estimation.prepare import inspect
-from identify.estimation.quality import check
+from identify.dynamics.make_grid import make_grid
+from identify.estimation.fit_statistics import UNDEFINED, best_fit_percent, ceiling_percent, rms
+from identify.estimation.quality import range_warnings
+from identify.estimation.samples import inspect
 from identify.model import Model
 from identify.records.record import Record
-from identify.results import Comparison, Figures
+from identify.results import Comparison, FitStatistics
 
 POINTS = 4000
-"""Points of a plotted series at most."""
+"""Largest number of points of a plotted series."""
 BAND = 1.959964
 
 
 def compare(model: Model, record: Record) -> Comparison:
-    """A model against a measurement.
+    """Compare a model with a measurement.
 
     Parameters
     ----------
     model : Model
         With effects or without.
     record : Record
-        The one it was fitted on, or any other.
+        The record that the model was fitted on, or any other.
 
     Returns
     -------
     Comparison
-        Figures of all rows, of the fitted and the held-out ones; the error split up, tested, placed and in words.
-        What is doubted counts in no figure.
+        Fit statistics of all rows, of fitted and of held-out rows; the error by segment, level, direction, time and
+        frequency; tests of the residual; the places of the largest error. Doubted samples count nowhere.
 
     Raises
     ------
     BadRecord
-        It is nowhere known what was felt.
+        All samples are doubted.
     """
     grid = make_grid(record)
     refuse_doubted(grid)
@@ -57,7 +57,7 @@ def compare(model: Model, record: Record) -> Comparison:
     whole = _figures(record, predicted, noise, counted)
     held_out = _figures(record, predicted, noise, held) if held.any() else None
     said = left_out(grid)
-    outside = [f"{warning[0].upper()}{warning[1:]}." for warning in check(model, record)]
+    outside = [f"{warning[0].upper()}{warning[1:]}." for warning in range_warnings(model, record)]
     return Comparison(
         **whole,
         noise_sd_nm=noise,
@@ -78,7 +78,7 @@ def compare(model: Model, record: Record) -> Comparison:
     )
 
 
-def _figures(record: Record, predicted: np.ndarray, noise: float, rows: np.ndarray) -> Figures:
+def _figures(record: Record, predicted: np.ndarray, noise: float, rows: np.ndarray) -> FitStatistics:
     measured, guess = record.torque_nm[rows], predicted[rows]
     return {
         "fit_percent": best_fit_percent(measured, guess, noise),
@@ -107,7 +107,7 @@ def _series(model: Model, record: Record, predicted: np.ndarray, noise: float) -
 
 
 def _band(model: Model, record: Record, predicted: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray]:
-    """95 % band for a measured sample: the model's uncertainty, where it carries one, and the noise."""
+    """95 % band for a measured sample: noise, and the model's uncertainty if the model has a covariance."""
     half = np.full(predicted.size, BAND * noise)
     if model.covariance is not None:
         from identify.estimation.uncertainty import prediction_band
@@ -118,20 +118,26 @@ def _band(model: Model, record: Record, predicted: np.ndarray, noise: float) -> 
 
 
 def _plain(
-    whole: Figures, held_out: Figures | None, noise_sd_nm: float, tests: dict[str, Any], places: list[dict[str, Any]]
+    whole: FitStatistics,
+    held_out: FitStatistics | None,
+    noise_sd_nm: float,
+    tests: dict[str, Any],
+    places: list[dict[str, Any]],
 ) -> list[str]:
-    noise = f"noise of {noise_sd_nm:.3g} N·m"
+    noise = f"the noise of {noise_sd_nm:.3g} N·m"
     if np.isfinite(whole["fit_percent"]):
-        lines = [f"The model fits {whole['fit_percent']:.1f} %; {noise} allows {whole['ceiling_percent']:.1f} %."]
+        lines = [
+            f"The model fits {whole['fit_percent']:.1f} %; {noise} allows {whole['ceiling_percent']:.1f} % at most."
+        ]
     else:
-        lines = [f"The model errs by {whole['rms_nm']:.3g} N·m beside {noise}; its fit is {UNDEFINED}."]
+        lines = [f"The error of the model is {whole['rms_nm']:.3g} N·m, with {noise}; its fit is {UNDEFINED}."]
     if held_out is not None:
         share = f"its fit is {UNDEFINED}"
         if np.isfinite(held_out["fit_percent"]):
-            share = f"{held_out['fit_percent']:.1f} %, at most {held_out['ceiling_percent']:.1f} %"
-        lines.append(f"On rows it was not fitted on it errs by {held_out['rms_nm']:.3g} N·m ({share}).")
+            share = f"{held_out['fit_percent']:.1f} %, where the noise allows {held_out['ceiling_percent']:.1f} %"
+        lines.append(f"On rows of `validate` its error is {held_out['rms_nm']:.3g} N·m ({share}).")
     alarms = [test["words"] for test in tests["tests"] if not test["passed"]]
-    lines.append(" ".join(alarms) if alarms else "What is left looks like noise: none of the correlations stands out.")
+    lines.append(" ".join(alarms) if alarms else "The remaining error looks like noise: no correlation is significant.")
     if alarms:
         lines += [f"{place['text']}." for place in places[:3]]
     return lines

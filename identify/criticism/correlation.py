@@ -1,7 +1,8 @@
-"""Is the residual noise? Correlations with itself, u, u² and y, with bands whose false-alarm rate is what it says.
+"""Whether the residual is noise: its correlation with itself, u, u² and y, with bands of a known false-alarm rate.
 
-A band of 1.96/√N at each lag alarms far more often than 5 % over all lags. Here the band of a function is the 95 %
-quantile of its largest value over all lags, found by drawing noise for this very record: its length, gaps and input.
+With a band of 1.96/√N at each lag, a false alarm at any lag is far more frequent than 5 %. Here the band of a function
+is the 95 % quantile of its largest value over all lags, found by simulating noise for this record: its length, gaps and
+input.
 """
 
 from __future__ import annotations
@@ -18,10 +19,10 @@ LAGS = 25
 DRAWS = 1500
 LEVEL = 0.95
 WORDS = {
-    "residual": "The residual is correlated with itself: slow noise, or dynamics that the model lacks.",
-    "u": "The residual goes with the pulse width: delay, threshold or dynamics are off.",
-    "u2": "The residual goes with the square of the pulse width: the recruitment curve or what follows it is off.",
-    "y": "The residual goes with the torque itself: gain, speed or saturation change with level.",
+    "residual": "The residual is correlated with itself: the noise is slow, or the model lacks dynamics.",
+    "u": "The residual is correlated with the pulse width: delay, threshold or dynamics are wrong.",
+    "u2": "The residual is correlated with the squared pulse width: the recruitment curve or the dynamics are wrong.",
+    "y": "The residual is correlated with the torque: gain or speed change with the level, or the torque saturates.",
 }
 
 
@@ -39,15 +40,15 @@ def correlation_tests(grid: Grid, residual_nm: np.ndarray) -> dict[str, Any]:
     -------
     dict
         `lags_s`; `tests`: one for each of residual, u, u2, y with `values`, `band`, `passed`, `largest`, `words`;
-        `false_alarm_rate`: what the bands are made for; `innovations`: whether the cross-correlations were taken on
-        the residual freed of its slow noise.
+        `false_alarm_rate` of each function; `innovations`: whether the cross-correlations are those of the residual
+        without its slow noise.
     """
     known = (grid.count > 0) & ~grid.doubted
     residual = np.where(known, block_means(grid, residual_nm), 0.0)
     residual = residual - residual[known].mean()
     torque = np.where(known, grid.torque_nm, 0.0)
     white, ar1 = _innovations(residual, known)
-    # As they were felt: with late pulses on even slots an error that goes with the drive is smeared over lags.
+    # At the times at which the pulses truly came: late pulses on even slots would spread a correlation over lags.
     width = grid.pulse_width_us
     signals = {"u": grid.held(width), "u2": grid.held(width**2), "y": torque - residual}
     functions = {"residual": _auto(residual)} | {
@@ -77,7 +78,7 @@ def correlation_tests(grid: Grid, residual_nm: np.ndarray) -> dict[str, Any]:
 
 
 def _innovations(residual: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, float]:
-    """The residual freed of slow noise: cross-correlations of coloured noise wander without any cause."""
+    """The residual without slow noise: cross-correlations of coloured noise become large by chance."""
     parts = runs(known)
     start = np.array([p.start for p in parts], np.int64)
     stop = np.array([p.stop for p in parts], np.int64)
@@ -107,7 +108,7 @@ def _cross(residual: np.ndarray, signal: np.ndarray) -> np.ndarray:
 
 
 def _bands(signals: dict[str, np.ndarray], known: np.ndarray) -> dict[str, float]:
-    """95 % quantile of the largest value over lags, on white noise drawn for this record (always the same draws)."""
+    """95 % quantile of the largest value over lags, for simulated white noise (the same draws every time)."""
     rng = np.random.default_rng(20240229)
     size = known.size
     padded = 1 << int(np.ceil(np.log2(size + LAGS + 1)))

@@ -1,4 +1,4 @@
-"""What of a record is not counted, since it is not known what was felt then."""
+"""The doubted samples of a record: which pulses acted there is not known, so they are not counted."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from identify.dynamics.pulse_grid import Grid
 from identify.errors import BadRecord
 
 TOLD_S = 5e-3
-"""Pulses as late as this are counted in the sentence: a fifth of an interval, more than any healthy host's jitter."""
+"""Pulses at least this late are reported: a fifth of an interval, more than the jitter of a healthy computer."""
 LEAST = 8
-"""Intervals without which nothing can be said."""
+"""Fewer known intervals are not enough for any result."""
 
 
 def left_out(grid: Grid) -> str:
-    """How much is left out and why, in one sentence; empty where no pulse was late or lost and nothing is doubted."""
+    """One sentence: how much is left out, and why; empty if no pulse was late or lost and no sample is doubted."""
     late = np.zeros(grid.size) if grid.late_s is None else np.where(grid.pulse_width_us > 0, grid.late_s, 0.0)
     pulses = int(np.sum(np.abs(late) >= TOLD_S)) + _lost(grid)
     seconds = float(np.sum(grid.doubted[grid.count > 0])) * grid.step_s
@@ -22,21 +22,22 @@ def left_out(grid: Grid) -> str:
         return ""
     told = "1 pulse came late or was lost" if pulses == 1 else f"{pulses} pulses came late or were lost"
     if not seconds:
-        return f"{told}; when each was felt is known, and nothing is left out."
+        return f"{told}; the time of each is known, so nothing is left out."
     if not pulses:
-        return f"{seconds:.1f} s are left out: what was applied is not known there."
-    return f"{told}; {seconds:.1f} s are left out, where it is not known what was felt."
+        return f"{seconds:.1f} s are left out: the stimulation there is not known."
+    return f"{told}; {seconds:.1f} s are left out, where the time of the pulses is not known."
 
 
 def refuse_doubted(grid: Grid) -> None:
-    """Refuse a record of which next to nothing is known.
+    """Refuse a record of which hardly any stimulation is known.
 
     Raises
     ------
     BadRecord
+        Fewer than eight pulse intervals are known.
     """
     if np.sum(~grid.doubted & (grid.count > 0)) < LEAST:
-        raise BadRecord("it is not known what was felt", place="doubted", mend="Give a record with other rows, too.")
+        raise BadRecord("nearly all samples are doubted", place="doubted", fix="Give a record with known pulses.")
 
 
 def _lost(grid: Grid) -> int:

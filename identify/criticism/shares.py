@@ -1,4 +1,4 @@
-"""The error split up: by segment, level of pulse width, direction, time and frequency; of samples that count."""
+"""The error by segment, level of pulse width, direction, time and frequency, without doubted samples."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ SPANS = 10
 OCTAVES_HZ = (0.0, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4, 12.8, 25.6, 51.2, 102.4, 204.8, 409.6, 1000.0)
 
 
-def part(label: str, rows: np.ndarray, residual_nm: np.ndarray, noise_sd_nm: float, total: float) -> dict[str, Any]:
-    """One row of a table: size, mean, share of the error above the noise."""
+def _row(label: str, rows: np.ndarray, residual_nm: np.ndarray, noise_sd_nm: float, total: float) -> dict[str, Any]:
+    """One row of a table: number of samples, error, mean, and share of the error above the noise."""
     values = residual_nm[rows]
     excess = float(np.sum(values**2) - values.size * noise_sd_nm**2)
     return {
@@ -39,14 +39,14 @@ def _table(
     groups = groups if counted is None else [group & counted for group in groups]
     total = _total(groups, residual, noise)
     return [
-        part(label, group, residual, noise, total) for label, group in zip(labels, groups, strict=True) if group.any()
+        _row(label, group, residual, noise, total) for label, group in zip(labels, groups, strict=True) if group.any()
     ]
 
 
 def by_segment(
     record: Record, residual_nm: np.ndarray, noise_sd_nm: float, counted: np.ndarray | None = None
 ) -> list[dict[str, Any]]:
-    """Each segment in order."""
+    """By segment, in order."""
     groups = [record.segment == i for i in range(len(record.segment_names))]
     return _table(list(record.segment_names), groups, residual_nm, noise_sd_nm, counted)
 
@@ -54,7 +54,7 @@ def by_segment(
 def by_level(
     record: Record, residual_nm: np.ndarray, noise_sd_nm: float, counted: np.ndarray | None = None
 ) -> list[dict[str, Any]]:
-    """Pulse width zero, then equal spans up to the largest."""
+    """By pulse width: zero, then equal ranges up to the largest."""
     u, top = record.pulse_width_us, float(record.pulse_width_us.max())
     labels, groups = ["0 µs"], [u <= 0]
     edges = np.linspace(0.0, top, LEVELS + 1)
@@ -67,7 +67,7 @@ def by_level(
 def by_direction(
     record: Record, residual_nm: np.ndarray, noise_sd_nm: float, counted: np.ndarray | None = None
 ) -> list[dict[str, Any]]:
-    """Pulse width rising, falling or held over the last third of a second."""
+    """By direction: pulse width rising, falling or held over the last 0.3 s."""
     sign = direction_of(record)
     return _table(["rising", "falling", "held"], [sign > 0, sign < 0, sign == 0], residual_nm, noise_sd_nm, counted)
 
@@ -75,7 +75,7 @@ def by_direction(
 def by_time(
     record: Record, residual_nm: np.ndarray, noise_sd_nm: float, counted: np.ndarray | None = None
 ) -> list[dict[str, Any]]:
-    """Equal spans since the start."""
+    """By time: equal spans from the start."""
     t = record.time_s - record.time_s[0]
     edges = np.linspace(0.0, t[-1] + 1e-9, SPANS + 1)
     labels = [f"{a:.1f}-{b:.1f} s" for a, b in itertools.pairwise(edges)]
@@ -86,7 +86,7 @@ def by_time(
 def by_frequency(
     record: Record, residual_nm: np.ndarray, noise_sd_nm: float, counted: np.ndarray | None = None
 ) -> list[dict[str, Any]]:
-    """Octaves: root mean square of the residual in each, and of white noise there."""
+    """By octave: root mean square of the residual and of white noise in each."""
     rate = record.sample_rate_hz
     known = np.ones(residual_nm.size, bool) if counted is None else counted
     longest = max(runs(known), key=lambda r: r.stop - r.start)

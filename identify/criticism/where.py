@@ -1,4 +1,4 @@
-"""Where a model fails: the worst stretches, named by segment, pulse width and direction."""
+"""The places of the largest error, named by segment, pulse width and direction."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ STRETCH_S = 0.5
 
 
 def direction_of(record: Record) -> np.ndarray:
-    """+1 where the pulse width rises over the last half second, -1 where it falls, 0 where it is held; shape (N,)."""
+    """+1 where the pulse width rose over the last 0.3 s, -1 where it fell, 0 where it was held; shape (N,)."""
     u = record.pulse_width_us
     back = max(round(0.3 * record.sample_rate_hz), 1)
     change = u - np.r_[np.full(back, u[0]), u[:-back]]
@@ -23,7 +23,7 @@ def direction_of(record: Record) -> np.ndarray:
 def worst_places(
     record: Record, residual_nm: np.ndarray, noise_sd_nm: float, *, most: int = 5, rows: np.ndarray | None = None
 ) -> list[dict[str, Any]]:
-    """Stretches that hold most of the error above the noise.
+    """The stretches with most of the error above the noise.
 
     Parameters
     ----------
@@ -34,14 +34,14 @@ def worst_places(
     noise_sd_nm : float
         White noise of a sample, N·m.
     most : int
-        Places at most.
+        Largest number of places.
     rows : ndarray of bool or None, shape (N,)
-        Rows to look at; all by default.
+        Rows to examine; all by default.
 
     Returns
     -------
     list of dict
-        As `where` in the contract, worst first, with `mean_error_nm` (positive: the model is too low) and `text`.
+        As `where` in `diagnose --json`, worst first, with `mean_error_nm` (positive: the model is too low) and `text`.
     """
     rate, size = record.sample_rate_hz, record.time_s.size
     length = max(round(STRETCH_S * rate), 1)
@@ -69,7 +69,7 @@ def worst_places(
 
 
 def _merge(pieces: list[list[Any]], record: Record) -> list[list[Any]]:
-    """Neighbouring stretches of one segment and direction, each with a fair share of error, become one place."""
+    """Join neighbouring stretches of the same segment and direction, if each has much of the error."""
     if not pieces:
         return []
     level = 0.3 * max(piece[2] / (piece[1] - piece[0]) for piece in pieces)
@@ -118,5 +118,5 @@ def _words(name: str, widths: np.ndarray, direction: str, error: float, size: fl
     if abs(error) > 0.6 * size:
         what = f"model too {'low' if error > 0 else 'high'} by {abs(error):.2g} N·m"
     else:
-        what = f"model off by {size:.2g} N·m both ways"
+        what = f"error of {size:.2g} N·m in both directions"
     return f"{part}, {span}: {what}, {100 * share:.0f} % of the error above the noise"

@@ -1,10 +1,10 @@
-"""What is missing from the model of a record: candidates, evidence, verdict, words."""
+"""What the model of a record lacks: the search for effects, the verdict on it, and the result in words."""
 
 from __future__ import annotations
 
-from identify.diagnosis.analysis import Analysis, analyse
 from identify.diagnosis.candidates import Progress
-from identify.diagnosis.report import report
+from identify.diagnosis.result import diagnosis_of
+from identify.diagnosis.search import EffectSearch, search_effects
 from identify.diagnosis.verdict import Verdict, judge
 from identify.dynamics.linear import SecondOrder
 from identify.errors import BadRequest
@@ -14,18 +14,18 @@ from identify.results import Diagnosis
 
 
 def diagnose(record: Record, model: Model | None = None, progress: Progress | None = None) -> Diagnosis:
-    """What is missing from a Hammerstein model of this record.
+    """Say which effects a Hammerstein model of this record lacks.
 
     Parameters
     ----------
     record : Record
-        Pulse widths and torque; rows of `validate` are never used to fit or to choose an effect; they may
-        only speak against one.
+        Pulse widths and torque. Rows of `validate` are never used to fit or to choose an effect; they can only speak
+        against one.
     model : Model or None
-        Whose structure is criticised: its effects in their forms, fitted to this record. The plain Hammerstein
-        structure where none is given.
+        Its structure (its effects in their forms) is fitted to this record and examined. Without a model, the plain
+        Hammerstein structure is examined.
     progress : callable or None
-        Called with a share of 0 to 1 and a line of text; may raise `Cancelled`.
+        Called with the share done, 0 to 1, and a line of text. It may raise `Cancelled`.
 
     Returns
     -------
@@ -37,32 +37,32 @@ def diagnose(record: Record, model: Model | None = None, progress: Progress | No
     BadRecord
         Too short, or sampled too slowly.
     BadRequest
-        A model whose dynamics are not of the second order: effects do not stand on it.
+        The model's dynamics are not of second order: effects cannot be added to it.
     """
-    work = analyse(record, progress, structure=structure_of(model))
-    result = report(work, judge(work))
+    search = search_effects(record, progress, structure=structure_of(model))
+    result = diagnosis_of(search, judge(search))
     if progress is not None:
         progress(1.0, "done")
     return result
 
 
 def structure_of(model: Model | None) -> list[str]:
-    """The effects of a model with their forms, as `analyse` takes them; none for the plain structure.
+    """The effects of a model as `search_effects` takes them ("id:form"); an empty list for the plain structure.
 
     Raises
     ------
     BadRequest
-        The model's dynamics are not of the second order.
+        The model's dynamics are not of second order.
     """
     if model is None:
         return []
     if not isinstance(model.linear, SecondOrder):
         raise BadRequest(
-            f"effects do not stand on a model of {model.method}",
+            f"effects cannot be added to a model of {model.method}",
             place="model",
-            mend="Give one of maximum-likelihood or two-stage.",
+            fix="Give a model of maximum-likelihood or two-stage.",
         )
     return [f"{effect['id']}:{effect.get('form', '')}" for effect in model.effects]
 
 
-__all__ = ["Analysis", "Verdict", "analyse", "diagnose", "judge", "structure_of"]
+__all__ = ["EffectSearch", "Verdict", "diagnose", "judge", "search_effects", "structure_of"]

@@ -1,4 +1,4 @@
-"""Every effect of the library tried on a record: its likeliest form, and the evidence for it."""
+"""Every effect of the library tried on a model: its most likely form, and the evidence for it."""
 
 from __future__ import annotations
 
@@ -8,23 +8,24 @@ from dataclasses import replace
 
 from identify.diagnosis.side_by_side import side_by_side
 from identify.effects.base import Effect, Form
-from identify.estimation.adding import Candidate, names, try_effect
+from identify.estimation.effect_fit import Candidate, effect_names, try_effect
 from identify.estimation.joint import Fitted
 from identify.simulation.problem import Problem
 from identify.simulation.setup import Setup
 
 WORKERS = min(2, os.cpu_count() or 1)
-"""Processes that try effects side by side."""
+"""Processes that try effects in parallel."""
 FORMS = 3
-"""Forms of an effect tried beside another effect."""
+"""Forms of an effect that are tried beside another effect."""
 
 Progress = Callable[[float, str], None]
 _Tried = tuple[str, Fitted, float, dict[str, float]]
-"""Form, fit without its problem (a function can't be sent from one process to another), gain, gains of all forms."""
+"""Form, fit without its problem (it holds functions, which cannot be sent between processes), gain, gains by form."""
 
 
 def applicable(effect: Effect, setup: Setup, present: Iterable[str]) -> bool:
-    """Whether an effect can be considered: its columns are there, it isn't sought elsewhere, it isn't in already."""
+    """Whether an effect can be tried: the record has its columns, no earlier step looks for it, and it is not
+    present."""
     record = setup.grid.record
     if effect.raw or effect.id in present:
         return False
@@ -32,7 +33,7 @@ def applicable(effect: Effect, setup: Setup, present: Iterable[str]) -> bool:
 
 
 def likeliest_forms(effect: Effect, before: Candidate | None) -> list[Form]:
-    """Forms worth a fit beside another effect: those that did best alone; chains are kept whole."""
+    """Forms to try beside another effect: those that were best alone; all forms of a chain."""
     if before is None or effect.band or any(form.grows for form in effect.forms):
         return list(effect.forms)
     ranked = sorted(before.forms, key=lambda name: -before.forms[name])
@@ -46,10 +47,10 @@ def scan(
     share: tuple[float, float] = (0.0, 1.0),
     before: list[Candidate] | None = None,
 ) -> list[Candidate]:
-    """Every applicable effect added to a model, best first; `before` is what an earlier round found of them."""
-    present = set(names(base))
+    """Add each applicable effect to a model; best first. `before` holds the candidates of an earlier round."""
+    present = set(effect_names(base))
     listed = [effect for effect in effects if applicable(effect, base.problem.setup, present)]
-    # Costly ones first, so that all processes end together.
+    # Slow ones first, so that all processes end at about the same time.
     listed.sort(key=lambda effect: -len(effect.forms))
     earlier = {candidate.effect.id: candidate for candidate in before or []}
 

@@ -1,4 +1,4 @@
-"""Adding what is missing, one effect after the other, while the evidence lasts."""
+"""Add the missing effects one after the other, as long as the evidence is sufficient."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ from collections.abc import Sequence
 from typing import Any
 
 from identify.diagnosis import structure_of
-from identify.diagnosis.analysis import MOST, Analysis, analyse
 from identify.diagnosis.candidates import Progress
+from identify.diagnosis.held_out_error import held_out_rise
+from identify.diagnosis.search import MOST, EffectSearch, search_effects
 from identify.diagnosis.steps import Step, steps
-from identify.diagnosis.unseen import rise
 from identify.diagnosis.verdict import judge
 from identify.effects import get
-from identify.estimation.adding import add, names
+from identify.estimation.effect_fit import add_effect, effect_names
+from identify.estimation.evaluation import evaluate
 from identify.estimation.finish import finish
-from identify.estimation.prepare import Raw
-from identify.estimation.statistics import statistics
+from identify.estimation.samples import Raw
 from identify.model import Model
 from identify.records.record import Record
 from identify.results import Improvement
@@ -30,118 +30,123 @@ def improve(
     force: Sequence[str] = (),
     model: Model | None = None,
 ) -> Improvement:
-    """Models of a record, each with one effect more, up to as many as are there.
+    """Fit models to a record, each with one effect more, until no further effect is needed.
 
     Parameters
     ----------
     record : Record
         Pulse widths and torque.
     progress : callable or None
-        Called with a share of 0 to 1 and a line of text.
+        Called with the share done, 0 to 1, and a line of text. It may raise `Cancelled`.
     max_effects : int or None
-        Effects at most.
+        Effects to add at most.
     force : sequence of str
-        Effects that a person wants added although the record doesn't ask for them; the held-out error then shows it.
+        Effects to add although the evidence does not ask for them. The held-out error shows what they do.
     model : Model or None
-        Whose structure is added to, fitted anew; the plain Hammerstein structure where none is given.
+        Effects are added to its structure, which is fitted again. Without a model: to the plain structure.
 
     Returns
     -------
     Improvement
-        The steps, each with its model (`extra["parent"]` is its forebear's id) and its reason, and what was refused.
+        The steps, each with its model (`extra["parent"]` is the id of the model before) and its reason, and the
+        effects that were not added.
 
     Raises
     ------
     BadRequest
-        A forced effect is unknown, or effects do not stand on the model given.
+        A forced effect is unknown, or effects cannot be added to the given model.
     NotIdentifiable
-        A forced effect needs a column that the record lacks, or nothing in the record looks like it.
+        A forced effect needs a column that the record does not have, or its fit finds nothing to start from.
     """
     for effect in force:
         get(effect)
     most = MOST if max_effects is None else min(max_effects, MOST)
-    work = analyse(record, progress, most=most, structure=structure_of(model))
-    verdict = judge(work)
-    row, against = helpful(work)
+    search = search_effects(record, progress, most=most, structure=structure_of(model))
+    verdict = judge(search)
+    row, against = helpful(search)
     if max_effects is not None:
         row = row[: max_effects + 1]
-    reasons = [_reason(work, step) for step in row]
+    reasons = [_reason(search, step) for step in row]
     for effect in force:
-        step = _forced(row[-1], effect, work.raw)
+        step = _forced(row[-1], effect, search.raw)
         if step is not None:
             row.append(step)
-            reasons.append("Added because a person asked for it; the record doesn't.")
+            reasons.append("Added on request. The evidence does not ask for it.")
     models = _models(row)
     return Improvement(
-        noise_sd_nm=work.raw.noise_sd_nm,
+        noise_sd_nm=search.raw.noise_sd_nm,
         verdict=verdict.kind,
         steps=tuple(
             {"added": step.added}
-            | {key: step.figures[key] for key in COLUMNS}
-            | {"model_id": model.model_id, "reason": reason, "ceiling_percent": step.figures["ceiling_percent"]}
+            | {key: step.statistics[key] for key in COLUMNS}
+            | {"model_id": model.model_id, "reason": reason, "ceiling_percent": step.statistics["ceiling_percent"]}
             for step, model, reason in zip(row, models, reasons, strict=True)
         ),
         models=tuple(models),
-        refused=(*against, *refused(work)),
+        refused=(*against, *refused(search)),
     )
 
 
-def helpful(work: Analysis) -> tuple[list[Step], list[dict[str, Any]]]:
-    """The steps up to the first after which the error on rows not seen rises; and what is refused for that."""
-    row = steps(work)
-    for number in range(1 + len(work.given), len(row)):
-        errors = rise(row[number - 1].fitted, row[number].fitted)
+def helpful(search: EffectSearch) -> tuple[list[Step], list[dict[str, Any]]]:
+    """The steps up to the first that raises the error on held-out rows, and the effect refused for that reason."""
+    row = steps(search)
+    for number in range(1 + len(search.detected), len(row)):
+        errors = held_out_rise(row[number - 1].fitted, row[number].fitted)
         if errors is not None:
-            reason = f"The error on rows not seen would rise from {errors[0]:.3g} to {errors[1]:.3g} N·m."
+            reason = f"The error on held-out rows would rise from {errors[0]:.3g} to {errors[1]:.3g} N·m."
             return row[:number], [{"effect": row[number].added, "log_evidence_gain": None, "reason": reason}]
     return row, []
 
 
-def _reason(work: Analysis, step: Step) -> str:
+def _reason(search: EffectSearch, step: Step) -> str:
     if step.added is None:
-        held = ", ".join(get(name).name.lower() for name in names(work.base))
-        return f"As given, with {held}." if held else "Recruitment and linear dynamics alone."
-    if step.added in work.given:
-        return "Seen in the raw samples."
-    number = work.added.index(step.added)
-    gain = next(c.gain for c in work.rounds[number] if c.effect.id == step.added)
-    return f"Log evidence rises by {gain:.0f}; {work.margins[number]:.3g} would do."
+        held = ", ".join(get(name).name.lower() for name in effect_names(search.base))
+        return (
+            f"The given structure, with {held}."
+            if held
+            else "The plain structure: recruitment curve and linear dynamics."
+        )
+    if step.added in search.detected:
+        return "The samples show it directly, before any fit."
+    number = search.added.index(step.added)
+    gain = next(c.gain for c in search.rounds[number] if c.effect.id == step.added)
+    return f"Log evidence rises by {gain:.0f}; at least {search.margins[number]:.3g} is required."
 
 
-def refused(work: Analysis) -> list[dict[str, Any]]:
-    """Effects that were tried on the last model and not added, best first, with the reason."""
-    present = set(names(work.last))
-    if not work.rounds:
+def refused(search: EffectSearch) -> list[dict[str, Any]]:
+    """Effects that were tried on the last model and not added, best first, each with the reason."""
+    present = set(effect_names(search.last))
+    if not search.rounds:
         return []
-    number = min(len(work.added), len(work.rounds) - 1)
-    margin = work.margins[number] if number < len(work.margins) else 0.0
+    number = min(len(search.added), len(search.rounds) - 1)
+    margin = search.margins[number] if number < len(search.margins) else 0.0
     rows = []
-    for candidate in work.rounds[number]:
+    for candidate in search.rounds[number]:
         if candidate.effect.id in present:
             continue
         if candidate.gain <= 0.0:
-            reason = f"The record speaks against it: log evidence {candidate.gain:+.1f}."
+            reason = f"The evidence is against it: log evidence changes by {candidate.gain:+.1f}."
         elif candidate.gain < margin:
             reason = (
-                f"Too little speaks for it: log evidence {candidate.gain:+.1f}, at least {margin:.0f} is asked for."
+                f"Too little evidence: log evidence rises by {candidate.gain:.1f}; at least {margin:.0f} is required."
             )
         else:
-            reason = "Another effect explains the same better."
+            reason = "Another effect explains the same error better."
         rows.append({"effect": candidate.effect.id, "log_evidence_gain": candidate.gain, "reason": reason})
     return rows
 
 
 def _forced(last: Step, effect: str, raw: Raw) -> Step | None:
-    if effect in names(last.fitted):
+    if effect in effect_names(last.fitted):
         return None
-    fitted = add(last.fitted, get(effect), "", raw)
-    return Step(effect, fitted, statistics(fitted))
+    fitted = add_effect(last.fitted, get(effect), "", raw)
+    return Step(effect, fitted, evaluate(fitted))
 
 
 def _models(row: list[Step]) -> list[Model]:
     models: list[Model] = []
     for number, step in enumerate(row):
         parent = models[-1].model_id if models else None
-        model = finish("maximum-likelihood", step.fitted, figures=step.figures)
+        model = finish("maximum-likelihood", step.fitted, statistics=step.statistics)
         models.append(model.with_(extra=model.extra | {"parent": parent, "added": step.added, "step": number}))
     return models

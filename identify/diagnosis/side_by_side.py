@@ -1,6 +1,6 @@
-"""Tasks done by this process and copies of it side by side, where the system can make copies.
+"""Tasks done in parallel by this process and forked copies of it, where the system can fork.
 
-Threads wait for one another here: between two compiled parts each of them needs the interpreter.
+Threads would not help: between two compiled functions each of them needs the interpreter lock.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ Copy = tuple[Any, Any]
 
 
 def side_by_side(work: Callable[[int], Any], count: int, processes: int) -> Iterator[tuple[int, Any]]:
-    """Number and result of each task as it is done; a result must be one that can be pickled.
+    """Yield the number and the result of each task as it is done. Results must be picklable.
 
-    A task that fails in a copy, or whose copy ends, is done again here, so that its error is seen here.
+    A task that fails in a copy, or whose copy ends early, is done again here, so that its error is raised here.
 
     Parameters
     ----------
@@ -32,7 +32,7 @@ def side_by_side(work: Callable[[int], Any], count: int, processes: int) -> Iter
     count : int
         Of tasks, 256 at most: each number is one byte.
     processes : int
-        How many share them, this one included.
+        Processes that share the tasks, this one included.
     """
     numbers, put = os.pipe()
     os.write(put, bytes(range(count)))
@@ -60,7 +60,7 @@ def side_by_side(work: Callable[[int], Any], count: int, processes: int) -> Iter
 
 
 def _come(results: Any, waiting: set[int], *, wait: bool) -> Iterator[tuple[int, Any]]:
-    """What a copy has done so far, or until it ends."""
+    """Results of a copy: those that are there, or, with `wait`, all until it ends."""
     try:
         while wait or results.poll():
             number, result = results.recv()
@@ -71,18 +71,18 @@ def _come(results: Any, waiting: set[int], *, wait: bool) -> Iterator[tuple[int,
 
 
 def _copy(work: Callable[[int], Any], numbers: int) -> Copy | None:
-    """A copy of this process at work; None where there can be none."""
+    """A forked copy of this process that does tasks; None if it cannot be made."""
     if sys.platform != "linux":
         return None
     import fcntl  # not there on every system
 
     results, put = multiprocessing.Pipe(duplex=False)
     with contextlib.suppress(OSError):
-        # Room for a result or two: a copy should not wait until this process has ended a task of its own.
+        # Room for one or two results, so that a copy need not wait until this process has finished its own task.
         fcntl.fcntl(put.fileno(), fcntl.F_SETPIPE_SZ, ROOM_BYTES)
     process = multiprocessing.get_context("fork").Process(target=_work, args=(work, numbers, put), daemon=True)
     try:
-        # Were another thread compiling, the copy would wait for ever for a lock whose holder it does not have.
+        # If another thread held the compiler lock during the fork, the copy would wait for it for ever.
         with global_compiler_lock:
             process.start()
     except (OSError, AssertionError):  # too many processes; a daemon may have none
@@ -94,9 +94,9 @@ def _copy(work: Callable[[int], Any], numbers: int) -> Copy | None:
 
 
 def _work(work: Callable[[int], Any], numbers: int, put: Any) -> None:
-    """What a copy does, as long as there are tasks and somebody who waits for them."""
+    """Main function of a copy: do tasks while there are any and the parent process lives."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    # Whoever reads what the first process writes waits for the end of that one, not of this.
+    # The copy must not keep the parent's output streams open: their reader would wait for the copy to end.
     silent = os.open(os.devnull, os.O_RDWR)
     for stream in (0, 1, 2):
         os.dup2(silent, stream)

@@ -1,18 +1,18 @@
-"""The models of an analysis one after the other, each with one effect more, and their errors."""
+"""The models of a search one after the other, each with one effect more, and their fit statistics."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Any
 
-from identify.diagnosis.analysis import Analysis
+from identify.diagnosis.search import EffectSearch
+from identify.estimation.evaluation import evaluate
 from identify.estimation.joint import Fitted
-from identify.estimation.statistics import statistics
 
 
 @dataclass(frozen=True)
 class Step:
-    """One model of the row.
+    """One of these models.
 
     Parameters
     ----------
@@ -20,19 +20,19 @@ class Step:
         The effect that this model has more than the one before; None for the base.
     fitted : Fitted
         The model.
-    figures : dict
-        See `identify.estimation.statistics`.
+    statistics : dict
+        See `identify.estimation.evaluation`.
     """
 
     added: str | None
     fitted: Fitted
-    figures: dict[str, Any]
+    statistics: dict[str, Any]
 
 
-def steps(work: Analysis) -> list[Step]:
-    """Base, what the samples gave, what was found, in this order."""
-    models = [work.base, *work.with_given, *work.chain[1:]]
+def steps(search: EffectSearch) -> list[Step]:
+    """The base, then the detected effects, then the effects found, in this order."""
+    models = [search.base, *search.with_detected, *search.chain[1:]]
     return [
-        Step(name, fitted, statistics(fitted))
-        for name, fitted in zip([None, *work.given, *work.added], models, strict=True)
+        Step(name, fitted, evaluate(fitted))
+        for name, fitted in zip([None, *search.detected, *search.added], models, strict=True)
     ]

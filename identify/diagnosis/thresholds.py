@@ -1,7 +1,8 @@
-"""Every threshold that decides a verdict, each with its reason and with what it was calibrated on.
+"""Every threshold that decides a verdict, with the reason for it.
 
-Calibrated on development records alone (seeds 0 to 99 of `bench.diagnosis`); docs/diagnosis.md gives the figures on
-others. Log evidence is a natural logarithm.
+All were calibrated on development records only (seeds 0 to 99 of `bench.diagnosis`); docs/diagnosis.md gives the
+results on other records. Log evidence is a natural logarithm. A "predictable" effect follows from the pulse widths;
+efforts and tremor do not. The muscle is "at work" in the intervals in which it pulls, and "at rest" in all others.
 """
 
 from __future__ import annotations
@@ -9,78 +10,78 @@ from __future__ import annotations
 FIRST_MARGIN = 4.5
 """Log evidence that the first effect must gain."""
 NEXT_MARGIN = 10.0
-"""Log evidence that a further effect must gain."""
-PATCH = 0.12
-"""And in proportion to what the first gained."""
-KINDRED = 0.25
-"""In proportion, where it resembles the first or both change the dynamics: one in an imperfect form looks like both."""
-SEEN_APART = 0.03
-"""In proportion, where something else bears it out: rests for a drift of zero, a gain without a law for a slow gain."""
-BORNE_OUT = 0.4
-"""Share of a slow gain's evidence that a gain without a law must find, too."""
-PATCHER = 0.4
-"""Of those that cannot be foreseen, and mend anything, more is asked for."""
-AFTER_LAWS = 0.92
-"""What evidence counts for efforts: of two that explain the same a law is believed, for it can be wrong elsewhere."""
-AT_WORK_ONLY = 0.85
-"""What evidence counts for efforts of which the rests show nothing: they'd be the first to keep to the stimulation."""
-ONLY_AT_WORK = 0.85
-"""Probability at most of efforts of which the rests show nothing: it may be something that the stimulation does."""
+"""Log evidence that every further effect must gain, at least."""
+NEXT_SHARE = 0.12
+"""A further effect must also gain this share of what the first effect gained."""
+SIMILAR_SHARE = 0.25
+"""The same if it resembles the first one, or both change the dynamics: one effect in an inexact form looks like two."""
+CONFIRMED_SHARE = 0.03
+"""The same if something confirms it: rests confirm a drift of the zero, a gain without a law confirms a slow gain."""
+FREE_GAIN_CONFIRMS = 0.4
+"""A gain without a law confirms a slow gain if it finds this share of its log evidence."""
+UNPREDICTABLE_SHARE = 0.4
+"""The same for effects that are not predictable: they can repair any error, so more is required."""
+EFFORT_WEIGHT = 0.92
+"""Weight of the evidence for efforts. Where a law explains as much, the law is preferred, since it can be tested."""
+EFFORT_WEIGHT_ONLY_AT_WORK = 0.85
+"""Weight of the evidence for efforts that do not appear at rest: true efforts do not wait for the stimulation."""
+ONLY_AT_WORK_PROBABILITY = 0.85
+"""Largest probability of efforts that do not appear at rest: the stimulation itself may cause them."""
 SEEN_AT_REST = 0.15
-"""Least share of an effort's torque, rests against work, that counts as seen at rest."""
+"""An effort is seen at rest if its torque there is at least this share of its torque at work."""
 DYNAMIC = {"speed", "branch", "delay", "filter"}
-"""Stages that change how quickly torque follows."""
-SLOWEST = 0.97
-"""Correlation of neighbours above which slow noise may as well be a drift."""
+"""Stages that change how quickly the torque follows."""
+SLOWEST_AR1 = 0.97
+"""Correlation of neighbours above which slow noise may also be a drift."""
 TEMPERATURE = 2.0
-"""Spread, in log evidence, that the best form of a rival may lose by chance."""
+"""Log evidence that the best form of a rival may lose by chance."""
 RELATIVE = 0.03
-"""And in proportion to the gain: a form close to the truth explains most, not all."""
+"""The same as a share of the gain: a form close to the true one explains most of the error, not all."""
 LEAST_EXPLAINED = 0.68
-"""Share of the explicable log-likelihood below which the rest counts as structure of another kind."""
-LEAST_BY_EFFORTS = 0.8
-"""The same where efforts are named first: they mend anything a little."""
-LEAST_BY_BAND = 0.94
-"""Share of the power that a tremor must take, where work and rest differ beside it."""
-MANY = 4
-"""Efforts, none of them at rest, that are more likely something the stimulation does."""
-EVERYWHERE = 0.33
-"""Share of the test that efforts last from which they are something that is always there."""
+"""Share of the explainable log-likelihood that effects must explain; otherwise another kind of structure is left."""
+LEAST_EXPLAINED_BY_EFFORTS = 0.8
+"""The same if efforts are found first: they repair every error a little."""
+LEAST_EXPLAINED_BY_BAND = 0.94
+"""Share of the residual's power that a tremor must explain, if work and rest differ beside it."""
+MANY_EFFORTS = 4
+"""This many efforts, none of them at rest, are more likely caused by the stimulation."""
+EFFORTS_LAST = 0.33
+"""Share of the test above which efforts last too long to be efforts."""
 APART_S = 1.2
-"""Between the middles of two bumps that are two efforts."""
-UNSTEADY = 60.0
-"""Log-likelihood by which work and rest must differ beside a tremor for it to be something else."""
+"""Two bumps whose middles are farther apart are two efforts."""
+STRUCTURE_BESIDE_BAND = 60.0
+"""Log-likelihood by which work and rest must differ beside a tremor for structure to be left."""
 STRUCTURE = 12.0
 """Log-likelihood by which work and rest must differ for structure to be left."""
-LAPSE = 0.04
-"""Probability kept for what no form of the library foresees."""
-NAMELESS = 8.0
-"""Log evidence by which a gain without a law must beat the best effect."""
+UNKNOWN_FORM = 0.04
+"""Probability that is kept for what no form in the library describes."""
+FREE_GAIN_MARGIN = 8.0
+"""If a gain without a law beats the best effect by this log evidence, the cause is not in the library."""
 EXPLAINED_BY_LAWS = 0.9
-"""Share that effects together must explain for a gain without a law not to count."""
-UNSEEN_RATIO = 2.5
-"""Error on rows not seen over what is allowed there, above which structure may be left."""
-UNSEEN_SHARE = 0.5
-"""And in proportion to what the plain structure leaves there: a law close to the truth takes most, not all."""
-UNSEEN_RISE = 1.1
-"""Rise of the error on rows not seen that speaks against an effect, and ends improving."""
+"""If the effects explain this share, a better gain without a law does not count."""
+HELD_OUT_RATIO = 2.5
+"""Error on held-out rows, divided by what is allowed there, above which structure may be left."""
+HELD_OUT_SHARE = 0.5
+"""The same as a share of the plain structure's error there: a law close to the true one takes most of it, not all."""
+HELD_OUT_RISE = 1.1
+"""If the error on held-out rows rises by this factor, it speaks against the effect, and `improve` stops there."""
 DOUBTED = 0.45
-"""Probability at most of what something speaks against."""
-HELD = 0.3
+"""Largest probability of an effect that something speaks against."""
+REPEATED_SHARE = 0.3
 """Share of repeated samples that no noisy converter gives."""
 COUNTS = 2.5
-"""Counts by which readings change from one to the next, at the median, from which a repeat is none of the counting."""
+"""If the median change between readings has this many counts, a repeated reading is not due to rounding."""
 QUIET = 0.025
 """Share of the largest torque below which the muscle counts as resting."""
 CLOSE = 0.8
-"""Share of the best one's gain from which an effect that resembles it is named beside it."""
+"""An effect that resembles the best one is named beside it from this share of its gain."""
 RIVAL = 0.04
-"""Probability from which an effect is named as one that the record can't tell from the best."""
+"""Probability from which an effect is named as one that this record cannot tell from the best."""
 NEAR = 0.02
-"""Distance to a width that was fitted, as a share of the largest, beyond which the curve is a guess."""
-FORM = 0.01
-"""Error, as a share of the largest torque, that a curve of few knots may leave on rows not seen: nulls do."""
-FORM_OF_EFFECTS = 0.003
-"""The same where an effect is named: its law must hold on rows not seen, too."""
-LEAST_UNSEEN_ROWS = 40
-"""Intervals, a second at 40 pulses/s: of fewer nothing is said."""
+"""A width farther than this (share of the largest) from every fitted width lies on a guessed part of the curve."""
+FORM_ERROR = 0.01
+"""Error, as a share of the largest torque, that a curve of few knots may leave on held-out rows without any effect."""
+FORM_ERROR_WITH_EFFECTS = 0.003
+"""The same if an effect is named: its law must also hold on held-out rows."""
+LEAST_HELD_OUT_ROWS = 40
+"""With fewer held-out pulse intervals (1 s at 40 pulses/s) nothing is concluded from them."""

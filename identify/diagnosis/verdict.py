@@ -1,4 +1,4 @@
-"""From evidence to a verdict with probabilities, calibrated on development records (docs/diagnosis.md)."""
+"""The verdict of a search for effects, with probabilities calibrated on development records (docs/diagnosis.md)."""
 
 from __future__ import annotations
 
@@ -6,40 +6,40 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from identify.diagnosis.analysis import Analysis, seen_at_rest
-from identify.diagnosis.structure import held_readings
+from identify.diagnosis.held_out_error import HeldOutError, held_out_error, held_out_rise
+from identify.diagnosis.residual_structure import held_readings
+from identify.diagnosis.search import EffectSearch, seen_at_rest
 from identify.diagnosis.thresholds import (
     APART_S,
     DOUBTED,
-    EVERYWHERE,
+    EFFORTS_LAST,
     EXPLAINED_BY_LAWS,
     FIRST_MARGIN,
-    FORM,
-    FORM_OF_EFFECTS,
-    HELD,
-    LAPSE,
-    LEAST_BY_BAND,
-    LEAST_BY_EFFORTS,
+    FORM_ERROR,
+    FORM_ERROR_WITH_EFFECTS,
+    FREE_GAIN_MARGIN,
+    HELD_OUT_RATIO,
+    HELD_OUT_SHARE,
     LEAST_EXPLAINED,
-    MANY,
-    NAMELESS,
-    ONLY_AT_WORK,
+    LEAST_EXPLAINED_BY_BAND,
+    LEAST_EXPLAINED_BY_EFFORTS,
+    MANY_EFFORTS,
+    ONLY_AT_WORK_PROBABILITY,
     RELATIVE,
+    REPEATED_SHARE,
     SEEN_AT_REST,
     STRUCTURE,
+    STRUCTURE_BESIDE_BAND,
     TEMPERATURE,
-    UNSEEN_RATIO,
-    UNSEEN_SHARE,
-    UNSTEADY,
+    UNKNOWN_FORM,
 )
-from identify.diagnosis.unseen import Unseen, rise, unseen
 from identify.effects import get
-from identify.estimation.adding import Candidate
+from identify.estimation.effect_fit import Candidate
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a record says.
+    """The verdict on a search for effects.
 
     Parameters
     ----------
@@ -48,17 +48,17 @@ class Verdict:
     found : dict
         Probability by effect, of those added.
     rivals : dict
-        Probability by effect of all that were tried in the round in which each was added.
+        For each effect found: the probabilities of all effects tried in the same round.
     explained : float
-        Share of the explicable log-likelihood that the effects took.
+        Share of the explainable log-likelihood that the effects explain.
     structure : float
-        Log-likelihood by which work and rest still differ.
+        Log-likelihood by which the residuals at work and at rest still differ.
     probability : float
         Of the verdict as a whole.
-    unseen : Unseen or None
-        What the rows not seen say of the last model; None where they can say nothing.
+    held_out_error : HeldOutError or None
+        Error of the last model on held-out rows; None if they tell nothing.
     contradicted : bool
-        Whether they say that structure is left.
+        Whether that error shows that structure is left.
     notes : list of str
         Reasons, for people.
     """
@@ -69,22 +69,22 @@ class Verdict:
     explained: float
     structure: float
     probability: float
-    unseen: Unseen | None = None
+    held_out_error: HeldOutError | None = None
     contradicted: bool = False
     notes: list[str] = field(default_factory=list)
 
 
 def shares(candidates: list[Candidate]) -> dict[str, float]:
-    """Probability of each candidate, given that one of them is there, and of none ("")."""
+    """Probability of each candidate, and under the key "" that none of them is there."""
     if not candidates:
         return {"": 1.0}
     top = candidates[0].gain
     spread = TEMPERATURE + RELATIVE * max(top, 0.0)
     weights = {c.effect.id: float(np.exp(max((c.gain - top) / spread, -60.0))) for c in candidates}
-    # At the margin an effect is as likely there as not.
+    # An effect whose gain equals the margin has a probability of one half.
     weights[""] = float(np.exp(np.clip(FIRST_MARGIN - top, -60.0, 60.0)))
     total = sum(weights.values())
-    return {name: (1.0 - LAPSE) * weight / total for name, weight in weights.items()}
+    return {name: (1.0 - UNKNOWN_FORM) * weight / total for name, weight in weights.items()}
 
 
 def _nothing(candidates: list[Candidate]) -> float:
@@ -92,97 +92,97 @@ def _nothing(candidates: list[Candidate]) -> float:
     return 1.0 / (1.0 + sum(float(np.exp(min(c.gain - FIRST_MARGIN, 60.0))) for c in candidates))
 
 
-def _no_effort(work: Analysis, explained: float, structure: float) -> bool:
-    """Whether what looks like efforts is more likely something the stimulation does."""
-    if explained < LEAST_BY_EFFORTS and structure > STRUCTURE:
+def _no_effort(search: EffectSearch, explained: float, structure: float) -> bool:
+    """Whether what looks like efforts is more likely caused by the stimulation."""
+    if explained < LEAST_EXPLAINED_BY_EFFORTS and structure > STRUCTURE:
         return True
-    effort = work.added[0]
-    holder = work.chain[1]
-    if seen_at_rest(work.quiet, holder, effort) >= SEEN_AT_REST:
+    effort = search.added[0]
+    holder = search.chain[1]
+    if seen_at_rest(search.quiet, holder, effort) >= SEEN_AT_REST:
         return False
-    return "resisting" in dict(holder.effects)[effort].name or _efforts(holder.parameters_of(effort)) >= MANY
+    return "resisting" in dict(holder.effects)[effort].name or _efforts(holder.parameters_of(effort)) >= MANY_EFFORTS
 
 
-def _only_at_work(work: Analysis, number: int) -> bool:
-    """Whether an added torque that nobody can foresee is seen nowhere in the rests."""
-    effect, holder = work.added[number], work.chain[number + 1]
+def _only_at_work(search: EffectSearch, number: int) -> bool:
+    """Whether an unpredictable added torque does not appear at rest."""
+    effect, holder = search.added[number], search.chain[number + 1]
     form = dict(holder.effects).get(effect)
-    if form is None or form.stage != "additive" or get(effect).foreseeable:
+    if form is None or form.stage != "additive" or get(effect).predictable:
         return False
-    return seen_at_rest(work.quiet, holder, effect) < SEEN_AT_REST
+    return seen_at_rest(search.quiet, holder, effect) < SEEN_AT_REST
 
 
-def _everywhere(work: Analysis) -> bool:
-    """Whether what looks like efforts lasts for much of the test: efforts are seldom."""
-    effort = work.added[0]
-    holder = work.chain[1]
+def _everywhere(search: EffectSearch) -> bool:
+    """Whether what looks like efforts lasts for much of the test: efforts are rare."""
+    effort = search.added[0]
+    holder = search.chain[1]
     widths = [value for name, value in holder.parameters_of(effort).items() if name.startswith(("width_", "decay_"))]
     setup = holder.problem.setup
-    return 2.0 * sum(widths) > EVERYWHERE * float(setup.fitted.sum()) * setup.grid.step_s
+    return 2.0 * sum(widths) > EFFORTS_LAST * float(setup.fitted.sum()) * setup.grid.step_s
 
 
 def _efforts(parameters: dict[str, float]) -> int:
-    """How many efforts the bumps make: those close to one another are one."""
+    """Number of efforts: bumps close to one another count as one."""
     centres = np.sort([value for name, value in parameters.items() if name.startswith("centre_")])
     return int(np.sum(np.diff(centres) > APART_S)) + 1 if centres.size else 0
 
 
-def _contradicted(before: Unseen | None, after: Unseen) -> bool:
-    """Whether the rows not seen say that something is left, whatever the fitted rows say."""
-    if after.ratio < UNSEEN_RATIO:
+def _contradicted(before: HeldOutError | None, after: HeldOutError) -> bool:
+    """Whether the error on held-out rows shows that structure is left."""
+    if after.ratio < HELD_OUT_RATIO:
         return False
-    return before is None or after.excess_nm > UNSEEN_SHARE * before.excess_nm
+    return before is None or after.excess_nm > HELD_OUT_SHARE * before.excess_nm
 
 
-def judge(work: Analysis) -> Verdict:
-    """The verdict on an analysis."""
-    first, last = work.plain if work.held else work.chain[0], work.last
-    effects = [*work.held, *work.added]
-    left = work.left[-1]
+def judge(search: EffectSearch) -> Verdict:
+    """The verdict on a search for effects."""
+    first, last = search.plain if search.held else search.chain[0], search.last
+    effects = [*search.held, *search.added]
+    left = search.residuals[-1]
     possible = max(left.ideal - first.log_likelihood, 1.0)
     explained = (last.log_likelihood - first.log_likelihood) / possible if effects else 0.0
-    held = held_readings(work.record)
+    held = held_readings(search.record)
     notes: list[str] = []
-    found: dict[str, float] = dict.fromkeys(work.given, 0.99)
+    found: dict[str, float] = dict.fromkeys(search.detected, 0.99)
     rivals: dict[str, dict[str, float]] = {}
-    for number, effect in enumerate(work.added):
+    for number, effect in enumerate(search.added):
         rivals[effect] = shares(
-            [c for c in work.rounds[number] if c.effect.id == effect or c.effect.id not in work.added]
+            [c for c in search.rounds[number] if c.effect.id == effect or c.effect.id not in search.added]
         )
-        # What was added later stands on what was added before.
-        found[effect] = min([rivals[effect].get(effect, 0.5), *(found[e] for e in work.added[:number] if e in found)])
-        if _only_at_work(work, number):
-            found[effect] = min(found[effect], ONLY_AT_WORK)
-        if rise(work.chain[number], work.chain[number + 1]) is not None:
+        # A later effect is at most as probable as those before it.
+        found[effect] = min([rivals[effect].get(effect, 0.5), *(found[e] for e in search.added[:number] if e in found)])
+        if _only_at_work(search, number):
+            found[effect] = min(found[effect], ONLY_AT_WORK_PROBABILITY)
+        if held_out_rise(search.chain[number], search.chain[number + 1]) is not None:
             found[effect] = min(found[effect], DOUBTED)
-            notes.append(f"{get(effect).name}: the error on rows not seen rises with it.")
+            notes.append(f"{get(effect).name}: it raises the error on held-out rows.")
     structure = left.ratio
     if last.noise.band > 0.0:
-        # The band's own surprise isn't structure: what counts is what remains beside it.
-        before = max(work.left[0].busy_nm ** 2 - left.white_nm**2, 1e-12)
+        # The narrow band itself is not structure: what counts is what remains beside it.
+        before = max(search.residuals[0].busy_nm ** 2 - left.white_nm**2, 1e-12)
         explained = 1.0 - max(left.busy_nm**2 - left.white_nm**2, 0.0) / before
-    strange = held > HELD
+    strange = held > REPEATED_SHARE
     if strange:
-        notes.append(f"{100 * held:.0f} % of the readings repeat the one before exactly: the converter holds or steps.")
+        notes.append(f"{100 * held:.0f} % of the readings equal the one before: the converter repeats values.")
     if effects:
         strange = strange or (explained < LEAST_EXPLAINED and structure > STRUCTURE)
-        lawless = work.nameless[0] > work.rounds[0][0].gain + NAMELESS
+        lawless = search.free_gain[0] > search.rounds[0][0].gain + FREE_GAIN_MARGIN
         strange = strange or (lawless and explained < EXPLAINED_BY_LAWS)
         if get(effects[0]).band:
-            strange = strange or (explained < LEAST_BY_BAND and structure > UNSTEADY)
-        elif work.added and not get(work.added[0]).foreseeable:
-            strange = strange or _everywhere(work) or _no_effort(work, explained, structure)
+            strange = strange or (explained < LEAST_EXPLAINED_BY_BAND and structure > STRUCTURE_BESIDE_BAND)
+        elif search.added and not get(search.added[0]).predictable:
+            strange = strange or _everywhere(search) or _no_effort(search, explained, structure)
     else:
         strange = strange or structure > STRUCTURE
-    # Who names an effect says more than who names none, and is held to more.
-    form = FORM_OF_EFFECTS if effects else FORM
-    before, after = (unseen(fitted, form, last) for fitted in (first, last))
+    # Naming an effect claims more than naming none, so less error is allowed.
+    form = FORM_ERROR_WITH_EFFECTS if effects else FORM_ERROR
+    before, after = (held_out_error(fitted, form, last) for fitted in (first, last))
     contradicted = after is not None and _contradicted(before, after)
     if after is not None and contradicted:
         strange = True
         notes.append(
-            f"On rows not seen the last model errs by {after.ratio:.1f} times what noise and its own uncertainty "
-            "allow: structure is left."
+            f"On held-out rows the error of the last model is {after.ratio:.1f} times what noise and its uncertainty "
+            "allow: something is still missing."
         )
     if strange:
         found = {effect: min(p, DOUBTED) for effect, p in found.items()}
@@ -191,7 +191,7 @@ def judge(work: Analysis) -> Verdict:
     elif found:
         kind, probability = "effect_missing", max(found.values())
     else:
-        kind, probability = "nothing_missing", _nothing(work.rounds[0] if work.rounds else [])
+        kind, probability = "nothing_missing", _nothing(search.rounds[0] if search.rounds else [])
     return Verdict(
         kind, found, rivals, float(explained), float(structure), float(probability), after, contradicted, notes
     )

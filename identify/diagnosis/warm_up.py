@@ -1,4 +1,4 @@
-"""Compile, or load from the cache, all that is compiled: a worker does so before somebody waits for it."""
+"""Compile all numba functions, or load them from the cache, before the first request needs them."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from identify.effects import registry
 from identify.estimation.joint import start_from
-from identify.estimation.prepare import plain, prepare
+from identify.estimation.prepare import fit_plain, prepare
 from identify.estimation.rows import fitted_rows
 from identify.noise.level import find_band
 from identify.records.record import Record
@@ -14,19 +14,19 @@ from identify.simulation.problem import Problem
 
 
 def warm() -> None:
-    """Compile (or load from the cache) what is compiled, on a second of made-up data."""
+    """Compile (or load from the cache) all numba functions, by running them on four seconds of artificial data."""
     time_s = np.arange(400) / 100.0
     width = np.where((np.floor(time_s * 4) % 2) == 1, 200.0, 0.0)
     torque = np.convolve(width / 100.0, np.exp(-np.arange(40) / 10.0) / 10.0)[:400]
     record = Record.from_arrays(time_s, width, torque + 0.01 * np.sin(37.0 * np.arange(400) ** 1.3))
     grid, _ = prepare(record)
-    base = plain(grid, fitted_rows(grid, None))
+    base = fit_plain(grid, fitted_rows(grid, None))
     setup = base.problem.setup
     find_band(base.residual_nm, setup.stretches, setup.grid.step_s)
     for effect in registry().values():
         if effect.needs or effect.raw or effect.band:
             continue
-        for form in effect.forms[:6] if effect.foreseeable else effect.forms[:1]:
+        for form in effect.forms[:6] if effect.predictable else effect.forms[:1]:
             problem = Problem(setup, [(effect.id, form)])
             problem.run(start_from(problem, base, {0: form.starts(setup.scene)[0]}), derivatives=True)
 

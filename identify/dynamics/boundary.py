@@ -1,4 +1,4 @@
-"""States of second-order dynamics at the ends of the pulse intervals, and the curve between them, compiled."""
+"""States of second-order dynamics at the ends of the pulse intervals, and the curve between them; compiled."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def boundary_states(
     time_constant_s, damping, step_s : float
         As in `transition`.
     drive_nm : ndarray, shape (K,) or (K, M)
-        Held input of each interval; columns are filtered apart.
+        Held input of each interval, N·m; columns are filtered separately.
     initial : tuple of float
         Torque, N·m, and its rate, N·m/s, at the start; at rest by default.
 
@@ -112,15 +112,15 @@ def boundary_states(
 
 
 CUBIC = (0.0, 1.0)
-"""In place of T and ζ where no dynamics are given."""
+"""Used in place of T and ζ if no dynamics are given."""
 
 
 @njit(cache=True, nogil=True)
 def curve_weights(fraction, step_s, time_constant_s, damping):  # pragma: no cover
     """Weights of (y0, y0', y1, y1') for the curve between two boundary states, shape (N, 4).
 
-    The cubic, with the least change that makes it exact wherever the input is held: a lag of a few milliseconds bends
-    the curve more sharply than a cubic can.
+    It is the cubic with the smallest change that makes it exact for a held input. Without the change, a lag of a few
+    milliseconds would bend the curve more sharply than a cubic can.
 
     Parameters
     ----------
@@ -133,7 +133,7 @@ def curve_weights(fraction, step_s, time_constant_s, damping):  # pragma: no cov
     exact = time_constant_s > 0.0
     ends, lift, reached = np.zeros((3, 4)), np.zeros((3, 4)), 1.0
     if exact:
-        # All that is possible under a held input: standing still, the response to a step, that to an initial rate.
+        # The three possible motions with a held input: constant, response to a step, response to an initial rate.
         p11, p12, p21, p22 = step_matrix(time_constant_s, damping, step_s)
         ends[0, 0] = ends[0, 2] = ends[1, 2] = ends[2, 1] = 1.0
         ends[1, 3] = -step_s * p21 / (1.0 - p11)
@@ -160,16 +160,16 @@ def curve_weights(fraction, step_s, time_constant_s, damping):  # pragma: no cov
 
 @njit(cache=True, nogil=True)
 def read_at(torque, rate, interval, place, offset, weights):  # pragma: no cover
-    """The curve through boundary states at samples, shape (N,); before them the first stands, after them the last.
+    """The curve through boundary states at samples, shape (N,); constant before the first and after the last state.
 
     Parameters
     ----------
     torque, rate : ndarray, shape (K + 1,)
         Boundary states.
     interval, place : ndarray of int, shape (N,)
-        Interval of each sample, and which of the places in an interval is its own.
+        Interval of each sample, and index of its place within an interval.
     offset : ndarray of int, shape (U,)
-        Intervals from the one of the sample to that in which the curve is read, for each place.
+        For each place: number of intervals from the sample's own to the one in which the curve is read.
     weights : ndarray, shape (U, 4)
         As `curve_weights` gives them.
     """

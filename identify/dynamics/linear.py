@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 TIME_CONSTANT_BOUNDS_S = (0.003, 4.0)
 DAMPING_BOUNDS = (0.15, 8.0)
-"""What a muscle's dynamics are looked for in; at the upper damping the second lag is too short to be seen."""
+"""Bounds of the search; at the largest damping the second lag is too short to be seen."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class SecondOrder:
     damping : float
         ζ, 1 is critical.
     delay_s : float
-        Lag behind the pulses, s.
+        Delay after the pulses, s.
     """
 
     time_constant_s: float
@@ -43,12 +43,12 @@ class SecondOrder:
 
     @property
     def memory_s(self) -> float:
-        """Time after which an impulse is forgotten to about 1 part in 1000, s."""
+        """Time after which the response to an impulse has fallen to about 1/1000, s."""
         slowest = self.damping - np.sqrt(max(self.damping**2 - 1.0, 0.0))
         return self.delay_s + 7.0 * self.time_constant_s / max(slowest, 1e-3)
 
     def on_grid(self, grid: Grid, drive_nm: np.ndarray) -> np.ndarray:
-        """Block means of the response to a drive by even slots, (K,) or (K, M) N·m, as it was felt, from rest."""
+        """Interval means of the response from rest to a drive given on even slots, shape (K,) or (K, M), N·m."""
         torque, rate = grid.states(self.core, drive_nm)
         return grid.block_mean(torque, rate, self.delay_s, grid.curve(self.core))
 
@@ -60,14 +60,14 @@ class SecondOrder:
     def discrete(self, sample_rate_hz: float) -> tuple[np.ndarray, np.ndarray, int]:
         """(b, a, d) of equations (1) to (3) at a sampling rate, exact for an input held between samples.
 
-        A delay that is no whole number of samples goes into b, as a third coefficient.
+        A delay that is not a whole number of samples gives b a third coefficient.
         """
         step = 1.0 / sample_rate_hz
-        # A curve read up to a sample early is one that is not late: d is 0 at least.
+        # A small negative delay would need a future input: d is at least 0.
         whole = max(int(np.floor(self.delay_s / step + 1e-9)), -1)
         rest = max(self.delay_s - whole * step, 0.0)
         phi, gamma = transition(self.time_constant_s, self.damping, step)
-        # The input changes `rest` after the sample: the older value acts first, then the newer for step - rest.
+        # The input changes `rest` after the sample: first the old value acts, then the new one for step - rest.
         newer = transition(self.time_constant_s, self.damping, step - rest)[1]
         older = gamma - newer
         a = np.array([1.0, -np.trace(phi), np.linalg.det(phi)])
@@ -109,7 +109,7 @@ class Discrete:
     step_s : float
         Pulse interval, s.
     centre : float
-        Where in the interval its mean stands, 0 to 1: 0 for one sample a pulse, near 0.5 for many.
+        Place of the mean within the interval, 0 to 1: 0 for one sample per pulse, near 0.5 for many.
     """
 
     b: tuple[float, ...]
@@ -130,13 +130,13 @@ class Discrete:
 
     @property
     def memory_s(self) -> float:
-        """Time after which an impulse is forgotten to about 1 part in 1000, s."""
+        """Time after which the response to an impulse has fallen to about 1/1000, s."""
         slowest = min(float(np.max(np.abs(self.poles), initial=0.0)), 1.0 - 1e-6)
         decay = 7.0 / -np.log(slowest) if slowest > 0 else 0.0
         return self.step_s * (self.delay_samples + len(self.b) + decay)
 
     def on_grid(self, grid: Grid, drive_nm: np.ndarray) -> np.ndarray:
-        """Block means of the response to a drive by even slots, (K,) or (K, M) N·m, as it was felt, from rest."""
+        """Interval means of the response from rest to a drive given on even slots, shape (K,) or (K, M), N·m."""
         felt = grid.held(drive_nm)
         if abs(grid.step_s - self.step_s) > 1e-9:
             return _resampled(self, grid, felt)
@@ -153,7 +153,7 @@ class Discrete:
         return self.between(grid, self.on_grid(grid, drive_nm))
 
     def between(self, grid: Grid, mean: np.ndarray) -> np.ndarray:
-        """Block means read at the record's samples: a cubic through them at their centres, shape (N,)."""
+        """Interval means interpolated to the record's samples by a cubic through their centres, shape (N,)."""
         position = grid.interval + grid.fraction - self.centre
         if np.allclose(position, np.round(position), atol=1e-6):
             return mean[np.clip(np.round(position).astype(np.int64), 0, mean.size - 1)]
@@ -176,7 +176,7 @@ class Discrete:
 
 
 def _resampled(block: Discrete, grid: Grid, drive_nm: np.ndarray) -> np.ndarray:
-    """A discrete block on a grid of another pulse interval: run at its own, read at the other."""
+    """A discrete block on a grid with another pulse interval: run at its own interval, then interpolated."""
     size = int(np.ceil(grid.size * grid.step_s / block.step_s))
     own = np.arange(size) * block.step_s
     source = np.clip(np.floor((own + 1e-9) / grid.step_s).astype(np.int64), 0, grid.size - 1)

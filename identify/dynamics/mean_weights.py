@@ -1,4 +1,4 @@
-"""Means of an interval's samples, read off the boundary states, compiled."""
+"""Means of an interval's samples, computed from the boundary states; compiled."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ def mean_weights(four, offset, place, interval, count):  # pragma: no cover
     four : ndarray, shape (U, 4)
         Weights of (y, y') before and after each place in an interval at which samples were taken.
     offset : ndarray of int, shape (U,)
-        Steps from the sample's interval to the one in which its curve is read.
+        Number of intervals from the sample's own to the one in which the curve is read.
     place, interval : ndarray of int, shape (N,)
-        Of each sample.
+        Place and interval of each sample.
     count : ndarray of int, shape (K,)
         Samples in each interval.
 
@@ -42,7 +42,7 @@ def mean_weights(four, offset, place, interval, count):  # pragma: no cover
 
 @njit(cache=True, nogil=True)
 def read_means(torque, rate, first, weights):  # pragma: no cover
-    """Means over intervals, shape (M, K), from boundary states of shape (M, K + 1); before and after they stand.
+    """Means over intervals, shape (M, K), from boundary states; constant before the first and after the last state.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ def read_means(torque, rate, first, weights):  # pragma: no cover
     first : int
         Offset of the earliest boundary.
     weights : ndarray, shape (K, B, 2) or (1, B, 2)
-        As `mean_weights` gives them; one row stands for all intervals.
+        As `mean_weights` gives them; a single row holds for all intervals.
     """
     rows, size = torque.shape[0], torque.shape[1] - 1
     even = weights.shape[0] == 1 and size > 1

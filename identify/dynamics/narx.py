@@ -10,11 +10,11 @@ from identify.dynamics.linear import Discrete
 from identify.dynamics.pulse_grid import Grid
 
 LIMIT = 20.0
-"""Scaled torque beyond which a free run counts as run away."""
+"""Scaled torque at which a diverging free run is stopped."""
 
 
 def run(recipe: dict[str, Any], width_us: np.ndarray) -> np.ndarray:
-    """Free run above the baseline for one width a pulse, from rest, N·m; held where it runs away."""
+    """Free run from rest for one pulse width per interval, N·m above the baseline; limited if it diverges."""
     variables, terms, weights = recipe["variables"], recipe["terms"], recipe["weights"]
     width = (np.asarray(width_us, float) / recipe["width_scale_us"]).tolist()
     lead = max((lag for _, lag in variables), default=1)
@@ -32,6 +32,6 @@ def run(recipe: dict[str, Any], width_us: np.ndarray) -> np.ndarray:
 
 
 def at_samples(recipe: dict[str, Any], grid: Grid, centre: float) -> np.ndarray:
-    """Free run at the record's samples, its own baseline included, N·m, shape (N,)."""
+    """Free run at the record's samples, with its baseline, N·m, shape (N,)."""
     means = run(recipe, grid.held(grid.pulse_width_us)) + recipe["baseline_nm"]
     return Discrete((1.0,), (1.0,), 0, grid.step_s, centre).between(grid, means)

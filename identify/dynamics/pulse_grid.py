@@ -1,9 +1,9 @@
-"""From samples to pulse intervals: one row a pulse, whatever the sampling rate.
+"""From samples to pulse intervals: one row per pulse, whatever the sampling rate.
 
-Everything is estimated on the grid of pulses: 40 rows a second carry all that a muscle of 0.1 s and slower can show,
-memory is a time and not a count of samples, and the mean over an interval keeps the information of its samples.
-Half a sample counts (1.25 ms cost 36 log-likelihood units in a trial), so the mean is modelled as what it is, the mean
-of the model's curve at the very times at which the samples of that interval were taken.
+All estimates use the grid of pulses: 40 rows per second show all that a muscle with a time constant of 0.1 s or more
+does, and the mean over an interval keeps the information of its samples. The exact times matter: an error of 1.25 ms
+(half a sample) cost 36 units of log-likelihood in a trial. Therefore the model of a mean is the mean of the model's
+curve at the times of that interval's samples.
 """
 
 from __future__ import annotations
@@ -16,24 +16,21 @@ import numpy as np
 from identify.dynamics.boundary import CUBIC, boundary_states, curve_weights, read_at
 from identify.dynamics.mean_weights import mean_weights, read_means
 from identify.dynamics.second_order import Core
-from identify.errors import BadRecord
-from identify.records.pulse_phase import pulse_phase_s
-from identify.records.record import FORGOTTEN_S, Record
+from identify.records.record import Record
 
-STANDS = 0.2
-"""In intervals: a pulse less late (early) prolongs (cuts) the drive before it; one later is moved, its effect whole.
+FUSED = 0.2
+"""Share of an interval. A pulse that is late by less prolongs the drive before it (an early one shortens it). The
+drive of a pulse that is late by more is moved as a whole to the interval in which it came.
 
-Twitches fuse over a short pause and not over a long one. 0 would be twitches that add up, 1 a drive that stands until
-it changes. 1 errs more than taking all pulses as on time, wherever those due after a late one are dropped, as the rig
-does: for a fast muscle whose pulses add up, 5 % of them up to 60 ms late, by 2.7 times the noise, against 1.8 on time
-and 1.0 with this.
+Twitches fuse over a short pause, but not over a long one. With 0, twitches would always add up; with 1, a drive would
+always last until it changes. For a fast muscle with 5 % of the pulses up to 60 ms late, the error was 1.0 times the
+noise with this value, 2.7 times with 1, and 1.8 times if all pulses were taken as on time.
 """
-
-
 PLACES = 1024
-"""Places in an interval that are told apart, where samples have more of them: 12 µs at 40 pulses/s is no torque."""
+"""Largest number of different sample places within an interval. More are rounded: 24 µs at 40 pulses/s does not
+matter."""
 LONG = 8.0
-"""Steps above which the quicker lag is long: a cubic then errs by less than 2e-6 of the torque."""
+"""If the quicker lag is longer than this many intervals, the error of a cubic is less than 2e-6 of the torque."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +40,7 @@ class Grid:
     Parameters
     ----------
     record : Record
-        What it was made from.
+        The record.
     start_s : float
         Time of the first pulse slot, s.
     step_s : float
@@ -53,9 +50,9 @@ class Grid:
     torque_nm : ndarray, shape (K,)
         Mean of the samples in each interval, N·m.
     count : ndarray of int, shape (K,)
-        Samples in each interval; 0 where there is none (its torque is then NaN, and it is never fitted).
+        Samples in each interval. Where it is 0, the torque is NaN and the interval is never fitted.
     interval, fraction : ndarray, shape (N,)
-        For each sample: its interval, and where in it, 0 to 1.
+        For each sample: its interval, and its place within it, 0 to 1.
     held_out : ndarray of bool, shape (K,)
         Intervals with any held-out sample.
     segment : ndarray of int, shape (K,)
@@ -63,15 +60,15 @@ class Grid:
     angle_rad, velocity_rad_s : ndarray or None, shape (K,)
         Means over each interval.
     late_s : ndarray or None, shape (K,)
-        By how much later than its slot each interval's pulse was felt, s; None where none was late.
+        Delay of each interval's pulse after its slot, s; None if none was late.
     doubted : ndarray of bool, shape (K,)
-        Intervals in which it is not known what was felt.
+        Intervals in which the stimulation is not known.
     part : ndarray of int, shape (K,)
-        Index into the record's `parts`; the pause between two belongs to the part before it.
+        Index into the record's `parts`; a pause belongs to the part before it.
     resumed : ndarray of int
-        Intervals at whose start nobody knows the muscle's state: what was applied just before is not known.
+        Intervals at whose start the muscle's state is not known, since the stimulation before is not known.
     noise_sd_nm : float
-        White noise of a sample, as the raw samples show it, N·m; 0 where nobody has looked.
+        White noise of a sample, estimated from the samples, N·m; 0 if it was not estimated.
     """
 
     record: Record
@@ -106,15 +103,15 @@ class Grid:
     def fitted(self) -> np.ndarray:
         """bool, shape (K,): intervals that may be used to fit and to choose.
 
-        An interval with fewer than half of its samples (an edge, a gap) is left out: its mean is noisier than the rest.
-        One in which it is not known what was felt is left out, too.
+        An interval with fewer than half of its samples (at an edge or a gap) is left out, since its mean is noisier. So
+        is an interval in which the stimulation is not known.
         """
         usual = float(np.median(self.count[self.count > 0])) if np.any(self.count) else 1.0
         return ~self.held_out & ~self.doubted & (self.count > 0) & (2 * self.count >= usual)
 
     @cached_property
     def counted(self) -> np.ndarray:
-        """bool, shape (N,): samples whose error counts, those of `validate` among them."""
+        """bool, shape (N,): samples whose error counts; samples of `validate` are among them."""
         return ~self.doubted[self.interval]
 
     @cached_property
@@ -124,36 +121,36 @@ class Grid:
 
     @cached_property
     def starts(self) -> np.ndarray:
-        """Intervals at whose start the state is open, shape (S,): those at which parts begin, and those resumed."""
+        """Intervals at whose start the state is unknown, shape (S,): the starts of parts, and `resumed`."""
         return np.union1d(self.begins, self.resumed)
 
     @property
     def delay_bounds_s(self) -> tuple[float, float]:
-        """Timing that every model leaves open: a sample either way; a longer delay is an effect."""
+        """Bounds of the delay in every model, s: one sample in both directions. A longer delay is an effect."""
         sample_s = min(1.02 / self.record.sample_rate_hz, 1.02 * self.step_s)
         return -sample_s, sample_s
 
     def stretches(self, rows: np.ndarray) -> list[slice]:
-        """Contiguous runs of some of the intervals, of one part each: noise is correlated inside one, not across."""
+        """Contiguous runs of some intervals, each within one part. Noise is correlated only within a run."""
         return [run for index in range(len(self.record.parts)) for run in runs(rows & (self.part == index))]
 
     def held(self, drive_nm: np.ndarray, axis: int = 0) -> np.ndarray:
-        """The drive of each interval as it was felt: the input itself where nothing was late.
+        """The mean drive of each interval, with late pulses at their true time.
 
-        A pulse felt late by a small part of an interval (`STANDS`) leaves the drive before it standing for that part;
-        an early one takes the part from it; what follows the last pulse of a train begins as late as that pulse was.
-        A pulse that was later falls into the intervals in which it was felt, beside what is felt there.
+        If a pulse is late by less than `FUSED` of an interval, the drive before it lasts that much longer; if it is
+        early, that much shorter. The silence after the last pulse of a train begins as late as that pulse. The drive of
+        a pulse that is later is added to the intervals in which it came.
 
         Parameters
         ----------
         drive_nm : ndarray, shape (K,), (K, M) or (M, K)
-            Drive by even slots.
+            Drive on even slots, N·m.
         axis : int
-            That of the intervals.
+            Axis of the intervals.
         """
-        if self._felt is None:
+        if self._shifts is None:
             return drive_nm
-        rows, late, early, moved, at, share = self._felt
+        rows, late, early, moved, at, share = self._shifts
         drive = np.moveaxis(drive_nm, axis, 0)
         lift = (slice(None),) + (None,) * (drive.ndim - 1)
         result = np.copy(drive, order="K")
@@ -168,12 +165,12 @@ class Grid:
         return np.moveaxis(result, 0, axis)
 
     @cached_property
-    def _felt(self) -> tuple[np.ndarray, ...] | None:
-        """Which intervals late pulses change, and how: rows with their parts of before and after, and pulses moved."""
+    def _shifts(self) -> tuple[np.ndarray, ...] | None:
+        """How late pulses change the drive: rows with their shares of the intervals before and after; moved pulses."""
         if self.late_s is None or not np.any(self.late_s):
             return None
         part = self.late_s / self.step_s
-        moved = np.flatnonzero((np.abs(part) >= STANDS) & (part != 0) & (self.pulse_width_us > 0))
+        moved = np.flatnonzero((np.abs(part) >= FUSED) & (part != 0) & (self.pulse_width_us > 0))
         whole = np.floor(part[moved]).astype(np.int64)
         rest = part[moved] - whole
         part[moved] = 0.0
@@ -190,38 +187,38 @@ class Grid:
         return rows, late[rows], early[rows], moved, at, np.stack([1.0 - rest, rest])
 
     def states(self, core: Core, drive_nm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Torque and rate at the ends of the intervals, (K + 1,) or (K + 1, M), from rest; the drive as it was felt."""
+        """Torque and rate at the ends of the intervals, from rest, shape (K + 1,) or (K + 1, M)."""
         return boundary_states(*core, self.step_s, self.held(drive_nm))
 
     def at_samples(
         self, torque_nm: np.ndarray, rate_nm_s: np.ndarray, lag: float, core: Core | None = None
     ) -> np.ndarray:
-        """The curve of dynamics `core` through boundary states at the samples, `lag` intervals late, shape (N,)."""
+        """The curve through boundary states at the samples, delayed by `lag` intervals, shape (N,)."""
         places, place = self._places
         offset = np.floor(places - lag)
         four = curve_weights(places - lag - offset, self.step_s, *(core or CUBIC))
         return read_at(torque_nm, rate_nm_s, self.interval, place, offset.astype(np.int64), four)
 
     def mean_weights(self, delay_s: float = 0.0, core: Core | None = None) -> tuple[int, np.ndarray]:
-        """How an interval's mean is read off the boundary states, for a model that lags by `delay_s`.
+        """Weights that give each interval's mean from the boundary states, for a model with a delay.
 
         Parameters
         ----------
         delay_s : float
-            Lag behind the pulses, s.
+            Delay after the pulses, s.
         core : (float, float) or None
-            T, s, and ζ of the dynamics, whose curve is then exact between two states; a cubic where none is given.
+            T, s, and ζ of the dynamics: the curve between two states is then exact. None: a cubic.
 
         Returns
         -------
         first : int
             Offset of the earliest boundary used, relative to the interval (0 or negative).
-        weights : ndarray, shape (K, B, 2), or (1, B, 2) where every interval has the same
+        weights : ndarray, shape (K, B, 2), or (1, B, 2) if all intervals have the same
             Weights of (y, y') at boundaries first, first + 1, … relative to each interval: the mean of interval k is
             sum over b of weights[k, b, 0] * y[k + first + b] + weights[k, b, 1] * y'[k + first + b].
         """
         if (delay_s, core) not in self._weights:
-            if len(self._weights) >= 8:  # a search asks for the same ones several times, then never again
+            if len(self._weights) >= 8:  # a fit needs the same weights several times, then never again
                 self._weights.clear()
             self._weights[delay_s, core] = self._new_weights(delay_s, core)
         return self._weights[delay_s, core]
@@ -237,20 +234,20 @@ class Grid:
 
     @cached_property
     def _places(self) -> tuple[np.ndarray, np.ndarray]:
-        """Places in an interval at which samples were taken, shape (U,), and which is that of each sample, (N,)."""
+        """Places of samples within an interval, shape (U,), and the index of each sample's place, shape (N,)."""
         if self._alike:
             each = int(self.count[0])
             return self.fraction[:each], np.tile(np.arange(each), self.size)
         places, place = np.unique(np.round(self.fraction, 8), return_inverse=True)
-        if places.size > PLACES:  # a clock that wanders
+        if places.size > PLACES:  # the clocks of samples and pulses drift apart
             places, place = np.unique(np.round(self.fraction * PLACES), return_inverse=True)
             places = places / PLACES
         return places, place
 
     def curve(self, core: Core) -> Core | None:
-        """How to read the curve of dynamics `core`: as its own, or, where both lags are long, as a cubic for all alike.
+        """How to read the curve between states: exactly (`core`), or as a cubic (None) if both lags are long.
 
-        Whoever compares neighbours reads them as one of them, for a derivative knows no jump.
+        For a numerical derivative use the same choice for all points; otherwise the result has a jump.
         """
         time_constant_s, damping = core
         quick_s = time_constant_s / (max(damping, 1.0) + np.sqrt(max(damping * damping - 1.0, 0.0)))
@@ -261,7 +258,7 @@ class Grid:
         shifted = places - delay_s / self.step_s
         offset = np.floor(shifted).astype(np.int64)
         four = curve_weights(shifted - offset, self.step_s, *(core or CUBIC))
-        if self._alike:  # one row, standing for all
+        if self._alike:  # one row holds for all intervals
             only = np.zeros(places.size, np.int64)
             return mean_weights(four, offset, np.arange(places.size), only, self.count[:1])
         return mean_weights(four, offset, place, self.interval, self.count)
@@ -278,9 +275,9 @@ class Grid:
         Parameters
         ----------
         torque_nm, rate_nm_s : ndarray, shape (K + 1,) or (K + 1, M)
-            States at the ends of the intervals; the muscle is taken to be at `torque_nm[0]` before the first.
+            States at the ends of the intervals; before the first the torque is `torque_nm[0]`.
         delay_s : float
-            Lag of the curve behind the pulses, s; may be negative by less than a step.
+            Delay of the curve after the pulses, s; may be negative by less than a step.
         core : (float, float) or None
             As in `mean_weights`.
 
@@ -298,153 +295,3 @@ def runs(flags: np.ndarray) -> list[slice]:
     """Contiguous runs of true values, as slices."""
     edges = np.flatnonzero(np.diff(np.r_[0, flags.astype(np.int8), 0]))
     return [slice(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
-
-
-def make_grid(record: Record) -> Grid:
-    """Put a record on the grid of its pulses.
-
-    Raises
-    ------
-    BadRecord
-        Fewer than eight pulse intervals, or sampled more slowly than the pulses.
-    """
-    refuse_nonsense(record)
-    step_s = 1.0 / record.pulse_rate_hz
-    rate_hz = record.sample_rate_hz
-    if not rate_hz >= 0.999 * record.pulse_rate_hz:
-        raise BadRecord(
-            f"sampled at {rate_hz:.4g} Hz, below the {record.pulse_rate_hz:g} pulses a second",
-            mend="Record at 40 Hz or faster.",
-        )
-    start_s = record.time_s[0] + pulse_phase_s(record)
-    # A hair early, so that a sample taken at the pulse itself falls into the interval that the pulse opens.
-    position = (record.time_s - start_s) / step_s + 1e-6 + 1e-3 * min(1.0, record.pulse_rate_hz / rate_hz)
-    interval = np.floor(position).astype(np.int64)
-    lowest = int(interval[0])
-    start_s, position, interval = start_s + lowest * step_s, position - lowest, interval - lowest
-    size = int(interval[-1]) + 1
-    if size < 8:
-        raise BadRecord(f"only {size} pulse intervals long", mend="Give at least a few seconds of data.")
-    count = np.bincount(interval, minlength=size)
-    filled = np.maximum(count, 1)
-
-    def mean(values: np.ndarray) -> np.ndarray:
-        total = np.bincount(interval, values, minlength=size) / filled
-        return np.where(count > 0, total, np.nan)
-
-    first_of = np.searchsorted(interval, np.arange(size))
-    # The middle sample of an interval: not touched by a pulse that came a sample early or late.
-    middle = np.minimum(first_of + count // 2, record.time_s.size - 1)
-    # Where samples are missing the last width seen is taken to be in force still.
-    middle = np.where(count > 0, middle, np.maximum(first_of - 1, 0))
-    following = record.part[np.minimum(first_of, record.time_s.size - 1)]
-    part = record.part[middle]
-    pause = (count == 0) & (following != part)
-    width, late_s, doubted, resumed = _applied(record, middle, start_s, step_s, (count == 0) & ~pause, part)
-    # Between two parts nothing is stimulated, whatever the first one ended with.
-    width[pause] = 0.0
-    if late_s is not None:
-        late_s[pause] = 0.0
-    if record.doubted is not None:
-        doubted |= np.bincount(interval, record.doubted, minlength=size) > 0
-    return Grid(
-        record=record,
-        start_s=start_s,
-        step_s=step_s,
-        pulse_width_us=width,
-        torque_nm=mean(record.torque_nm),
-        count=count,
-        interval=interval,
-        fraction=np.clip((record.time_s - start_s) / step_s - interval, 0.0, 1.0),
-        held_out=np.bincount(interval, record.held_out, minlength=size) > 0,
-        segment=record.segment[middle],
-        angle_rad=None if record.angle_rad is None else mean(record.angle_rad),
-        velocity_rad_s=None if record.velocity_rad_s is None else mean(record.velocity_rad_s),
-        late_s=late_s,
-        doubted=doubted,
-        part=part,
-        resumed=resumed,
-    )
-
-
-def _applied(
-    record: Record, middle: np.ndarray, start_s: float, step_s: float, gaps: np.ndarray, part: np.ndarray
-) -> tuple[np.ndarray, np.ndarray | None, np.ndarray, np.ndarray]:
-    """Width of each interval, its lateness, where it is not known what was applied, and where the state is open then.
-
-    Where samples are missing the pulses tell, if the record has them. Else the last width seen is taken to be in force
-    still, unless no pulse came before and the torque after is the same; what comes after begins in a state of its own,
-    and is doubted as long as a delay may show what was applied in the gap; where held out, until that is forgotten.
-    """
-    width = record.pulse_width_us[middle]
-    late = np.zeros(width.size) if record.late_s is None else record.late_s[middle]
-    doubted, resumed = np.zeros(width.size, bool), []
-    if gaps.any() and record.pulses is not None:
-        known = record.pulses
-        place = np.round((known.time_s - start_s) / step_s).astype(np.int64)
-        inside = (place >= 0) & (place < width.size)
-        for target, values in ((width, known.width_us), (late, known.late_s)):
-            told = np.zeros(width.size)
-            told[place[inside]] = values[inside]
-            target[gaps] = told[gaps]
-    elif gaps.any():
-        for gap in runs(gaps):
-            if not (width[gap.start - 1] or _moved(record, middle, gap)):
-                continue
-            # Rows held out can't say in which state they begin: there the muscle must have forgotten.
-            unseen = record.held_out[middle[gap.stop]]
-            reach_s = FORGOTTEN_S if unseen else LONGEST_DELAY_S
-            after = slice(gap.start, gap.stop + round(reach_s / step_s))
-            doubted[after] |= part[after] == part[gap.start]
-            if not unseen:
-                resumed.append(gap.stop)
-    return width, late if late.any() else None, doubted, np.array(resumed, np.int64)
-
-
-def _moved(record: Record, middle: np.ndarray, gap: slice) -> bool:
-    """Whether the torque after a gap is another than before: between two rests something was cut out, no pause."""
-    before, after = middle[max(gap.start - 2, 0)], middle[min(gap.stop, middle.size - 1)]
-    near = max(round(record.sample_rate_hz / record.pulse_rate_hz), 1)
-    levels = [float(np.mean(record.torque_nm[at : at + near])) for at in (before, after)]
-    return abs(levels[1] - levels[0]) > MOVED * float(np.ptp(record.torque_nm))
-
-
-MOVED = 0.04
-"""Share of the torque's range by which rest differs from rest across a gap that was no pause."""
-LONGEST_DELAY_S = 0.25
-"""So long after a pulse a muscle may begin to answer; longer memory is in its state."""
-LONGEST_S = 24 * 3600.0
-LONGEST_LATE_S = 1.0
-
-
-def refuse_nonsense(record: Record) -> None:
-    """Refuse arrays that no measurement gives, whatever front door they came through.
-
-    Raises
-    ------
-    BadRecord
-        Not finite, negative widths, time that doesn't rise, a pulse rate that is none, or more than a day.
-    """
-    if not 1.0 <= record.pulse_rate_hz <= 200.0:
-        raise BadRecord(f"{record.pulse_rate_hz:g} pulses a second", place="pulse_rate_hz", mend="Give 1 to 200 Hz.")
-    columns = {"time_s": record.time_s, "pulse_width_us": record.pulse_width_us, "torque_nm": record.torque_nm}
-    for name, column in columns.items():
-        finite = np.isfinite(column)
-        if not finite.all():
-            raise BadRecord(
-                "not finite", place=f"{name}, sample {int(np.argmin(finite))}", mend="Cut the record there."
-            )
-    if record.late_s is not None and (wild := np.flatnonzero(~(np.abs(record.late_s) <= LONGEST_LATE_S))).size:
-        raise BadRecord(
-            f"{record.late_s[wild[0]]:g} s late",
-            place=f"late_s, sample {int(wild[0])}",
-            mend="Give lateness in seconds.",
-        )
-    if np.any(record.pulse_width_us < 0):
-        place = f"pulse_width_us, sample {int(np.argmax(record.pulse_width_us < 0))}"
-        raise BadRecord("negative", place=place, mend="A pulse width is 0 (no pulse) or positive.")
-    if np.any(np.diff(record.time_s) <= 0):
-        place = f"time_s, sample {int(np.argmax(np.diff(record.time_s) <= 0)) + 1}"
-        raise BadRecord("time doesn't rise", place=place, mend="Sort the samples by time, once each.")
-    if record.time_s[-1] - record.time_s[0] > LONGEST_S:
-        raise BadRecord("longer than a day", place="time_s", mend="Give time in seconds.")

@@ -1,9 +1,9 @@
 """Second-order muscle dynamics on the grid of pulses, exact for a held input.
 
 The linear block of the paper in physical terms, T² y'' + 2 ζ T y' + y = w, with w held over each pulse interval.
-The state (y, y') is carried from one pulse to the next by the matrix exponential; inside an interval y is a smooth
-curve, read off the states at its two ends: exactly for a held input, as a cubic where both lags are long. A delay
-therefore needs no states of its own: it shifts the times at which the curve is read.
+The matrix exponential gives the state (y, y') at the next pulse. Within an interval y is a smooth curve between the
+states at its two ends: exact for a held input, or a cubic if both lags are long. A delay needs no further states: it
+shifts the times at which the curve is read.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ Core = tuple[float, float]
 
 
 def step_matrix(time_constant_s: float, damping: float, step_s: float) -> tuple[float, float, float, float]:
-    """Transition of x = (y, y') over a step without drive, row by row; `boundary` compiles it, too."""
+    """Transition matrix of x = (y, y') over one step without drive, row by row. `boundary` compiles this function."""
     h = step_s / time_constant_s
     decay = np.exp(-damping * h)
     gap = damping * damping - 1.0
@@ -46,7 +46,7 @@ def transition(time_constant_s: float, damping: float, step_s: float) -> tuple[n
     damping : float
         ζ, positive, 1 is critical.
     step_s : float or ndarray
-        Length of the step, s; of several, the shape follows those below.
+        Length of the step, s; for an array, its shape follows those given below.
 
     Returns
     -------
@@ -62,15 +62,15 @@ def transition(time_constant_s: float, damping: float, step_s: float) -> tuple[n
 def recursion(a: np.ndarray, forced: np.ndarray) -> np.ndarray:
     """y[k] = forced[k] - a[1] y[k-1] - a[2] y[k-2] …, from rest, along the first axis.
 
-    A lower triangular banded system, which LAPACK solves by exactly this recursion; scipy.signal's filter does the same
-    but takes 0.3 s to import, a third of what `stimrig fit` may take as a whole.
+    This is a lower triangular banded system, which LAPACK solves by this recursion. scipy.signal.lfilter does the same,
+    but its import takes 0.3 s, a third of the time of `stimrig fit`.
 
     Parameters
     ----------
     a : ndarray, shape (l + 1,)
         Denominator, a[0] = 1.
     forced : ndarray, shape (K,) or (K, M)
-        Right-hand side; in Fortran's order it is overwritten.
+        Right-hand side; it is overwritten if it is in Fortran order.
     """
     bands = np.empty((len(a), forced.shape[0]), order="F")
     bands[:] = np.asarray(a, float)[:, None]

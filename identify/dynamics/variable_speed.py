@@ -1,7 +1,7 @@
-"""Second-order muscle dynamics whose speed may vary from pulse to pulse, compiled.
+"""Second-order muscle dynamics whose speed depends on the state; compiled.
 
-T² y'' + 2 ζ T y' + y = w with w held over each pulse interval, and T there multiplied by a factor that depends on the
-state at its start. Where the factor is exactly 1 the transition of the base is used, bit for bit.
+T² y'' + 2 ζ T y' + y = w, with w held over each pulse interval. A speed law multiplies T, or one of the two lags, by a
+factor that depends on the state. Without a law the transition of the linear dynamics is used, bit for bit.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ from numba import njit
 from identify.dynamics.boundary import step_matrix, through
 
 PARTS = 3
-"""Steps in which a speed law is followed through a pulse interval."""
+"""Number of steps within a pulse interval in which a speed law is evaluated."""
 LAWS = 27
 """Columns of the speed law: see `factor`."""
 
 
 @njit(cache=True, nogil=True, inline="always")
 def _uptake(slope, w, a):  # pragma: no cover
-    """Lag of a pump that saturates, w/(1 + s w) - a/(1 + s a) being what drives a towards w."""
+    """Factor on the lag of a saturating uptake, where w/(1 + s w) - a/(1 + s a) drives a towards w."""
     w, a = min(max(w, 0.0), 1.2), min(max(a, 0.0), 1.2)
     return max(1.0 + slope * w, 0.08) * max(1.0 + slope * a, 0.08)
 
@@ -105,7 +105,7 @@ def _factor(law, w, y, v, scale_nm, slow_s, quick_s, bound):  # pragma: no cover
 
 @njit(cache=True, nogil=True, inline="always")
 def _second(law, linear, inverse, y, v, lag_s, scale_nm):  # pragma: no cover
-    """Factor on the second of two lags; `lag_s` is what it is now."""
+    """Factor on the second of two lags; `lag_s` is its present value, s."""
     factor = 1.0
     if law[linear] != 0.0:
         factor *= max(1.0 + law[linear] * min(max((y + lag_s * v) / scale_nm, 0.0), 1.2), 0.08)
@@ -129,18 +129,18 @@ def run_core(
     law : ndarray, shape (M, LAWS)
         Coefficients of the speed law.
     multiplier : ndarray, shape (M or 1 or 0, K)
-        A further factor on T, given; no rows where there is none.
+        A further, given factor on T; no rows if there is none.
     begins : ndarray of int, shape (B,)
         Intervals at whose start a part of the record begins; the first is 0.
     initial : ndarray, shape (M, B, 2)
         Torque, N·m, and its rate, N·m/s, with which each part begins.
     scale_nm : float
-        Torque that counts as full, N·m.
+        Full torque, N·m.
     step_s : float
         Pulse interval, s.
     shared : bool
-        Rows that differ from row 0 by their drive alone go through row 0's transitions: a derivative by the drive
-        without that of the speed, ten times cheaper and good enough to descend by.
+        Rows that differ from row 0 only in their drive use row 0's transitions. Their derivative then ignores that the
+        drive changes the speed: ten times faster, and good enough for the fit.
 
     Returns
     -------
@@ -191,7 +191,7 @@ def run_core(
             w = drive[m, k]
             given_f = multiplier[m if given > 1 else 0, k] if given > 0 else 1.0
             p11, p12, p21, p22 = 1.0, 0.0, 0.0, 1.0
-            # The law is asked several times in an interval: its side may turn in between.
+            # The law is evaluated several times in an interval, since its sign may change within it.
             for _ in range(PARTS):
                 f, d, q = 1.0, 1.0, 1.0
                 if lawful:
@@ -205,7 +205,7 @@ def run_core(
                     second = _second(law[m], 23, 24, y, v, last * quick_s, scale_nm)
                     q *= second
                     turned, last = last / second, second
-                v *= turned  # y' = (a - y) / lag: what is kept is a
+                v *= turned  # y' = (a - y) / lag: a stays the same when the lag changes
                 f *= given_f
                 # The slower lag times d, the quicker times q: T² = quick·slow, 2 ζ T = quick + slow.
                 t = base * f * np.sqrt(d * q)

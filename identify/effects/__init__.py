@@ -1,4 +1,4 @@
-"""The library of physical effects: one file each, found by scanning this package, entry points and a folder.
+"""The library of physical effects: one file each, found in this package, in entry points and in a user's folder.
 
 A user's own effect is a file with `EFFECT = Effect(...)`, found in the folder named by the environment variable
 STIMRIG_EFFECTS_DIR, or through an entry point of the group `stimrig.effects`. See `docs/add-an-effect.md`.
@@ -38,7 +38,7 @@ def _everything(folder: str) -> dict[str, Effect]:
     for place, effect in added:
         if effect.id in places:
             message = f"the effect {effect.id!r} is also in {places[effect.id]}"
-            raise BadEffect(message, place=place, mend="Give one of them another id.")
+            raise BadEffect(message, place=place, fix="Give one of them another id.")
         places[effect.id] = place
         found[effect.id] = effect
     return found
@@ -50,16 +50,14 @@ def _from_packages() -> Iterator[tuple[str, Effect]]:
         try:
             effect = point.load()
         except Exception as error:
-            raise BadEffect(own_file.in_one_line(error), place=place, mend=own_file.MEND) from error
+            raise BadEffect(own_file.in_one_line(error), place=place, fix=own_file.FIX) from error
         yield place, own_file.checked(effect, place)
 
 
 def _from_folder(folder: Path) -> Iterator[tuple[str, Effect]]:
     if not folder.is_dir():
         what = "a file, not a folder" if folder.exists() else "no such folder"
-        raise BadEffect(
-            what, place=f"{FOLDER_VARIABLE}={folder}", mend="Name the folder that holds the effects' files."
-        )
+        raise BadEffect(what, place=f"{FOLDER_VARIABLE}={folder}", fix="Name the folder that holds the effects' files.")
     for path in sorted(folder.glob("*.py")):
         yield str(path), own_file.effect_of(path)
 
@@ -70,7 +68,7 @@ def registry() -> dict[str, Effect]:
     Raises
     ------
     BadEffect
-        A user's folder is not there, or one of their files can't be loaded or used.
+        A user's folder is not there, or one of the files cannot be loaded or used.
     """
     return dict(_everything(os.environ.get(FOLDER_VARIABLE, "")))
 
@@ -81,16 +79,16 @@ def get(effect_id: str) -> Effect:
     Raises
     ------
     BadRequest
-        There is none of that name.
+        No effect has this id.
     """
     effects = registry()
     if effect_id not in effects:
-        raise BadRequest(f"no effect is called {effect_id!r}", mend=f"Known: {', '.join(sorted(effects))}.")
+        raise BadRequest(f"unknown effect {effect_id!r}", fix=f"Known: {', '.join(sorted(effects))}.")
     return effects[effect_id]
 
 
 def library() -> list[dict[str, Any]]:
-    """The library as plain data, for `stimrig effects` and the page."""
+    """The library as dicts, for `stimrig effects` and the page."""
     return [_describe(effect) for effect in registry().values()]
 
 
@@ -119,7 +117,7 @@ def _describe(effect: Effect) -> dict[str, Any]:
         "separated_by": effect.separated_by,
         "plain": effect.plain,
         "needs": list(effect.needs),
-        "foreseeable": effect.foreseeable,
+        "predictable": effect.predictable,
     }
 
 

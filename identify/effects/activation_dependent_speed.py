@@ -11,7 +11,7 @@ def _form(name: str, equation: str, column: int, lower: float = -0.85, upper: fl
 
 
 def _two_lags(name: str, equation: str, column: int, source: str) -> Form:
-    """A form for two real lags: where the base found none apart, it begins with two that are."""
+    """A form for two different lags; it is also started from two different lags, in case the base model has none."""
     slope = Parameter("slope", "1", -0.9, 20.0, 0.0, (0.5, -0.35), about="change of the lag from rest to full torque")
     apart = ({"slope": 1.0, "base.damping": 1.25},)
     return Form(name, "speed", equation, (slope,), law={"slope": column}, restarts=apart, source=source)
@@ -31,33 +31,34 @@ EFFECT = Effect(
         _form("exponential", "T exp(slope·y/y_max)", 4, -2.0, 2.0),
         _form("inverse_torque", "T/(1 + slope·y/y_max)", 5),
         _form("inverse_drive", "T/(1 + slope·w/y_max)", 6),
-        _form("slow_lag", "slower of the two lags times (1 + slope·y/y_max)", 7),
-        _form("inverse_slow_lag", "slower of the two lags over (1 + slope·w/y_max)", 9),
-        _form("bound", "slower of the two lags times (1 + slope·1.15 s/(s + 0.15)), s = w/y_max", 13),
-        _form("activation", "T (1 + slope·a/y_max), a the state between the two lags", 11),
+        _form("slow_lag", "slower lag times (1 + slope·y/y_max)", 7),
+        _form("inverse_slow_lag", "slower lag divided by (1 + slope·w/y_max)", 9),
+        _form("bound", "slower lag times (1 + slope·1.15 s/(s + 0.15)), s = w/y_max", 13),
+        _form("activation", "T (1 + slope·a/y_max), a: the state between the two lags", 11),
         _form(
             "calcium_slow_lag",
-            "slower lag times (1 + slope·c), c bound calcium: c follows the stimulation",
+            "slower lag times (1 + slope·c), c: bound calcium, which follows the stimulation",
             18,
             -0.9,
             12.0,
         ),
-        _form("calcium_quick_lag", "quicker lag times (1 + slope·c), c bound calcium", 19, -0.9, 12.0),
-        _two_lags("activation_slow_lag", "a' = (w - a)/quick, y' = (a - y)/(slow (1 + slope·a/y_max))", 21, _BOUND),
-        _two_lags("attached_slow_lag", "a' = (w - a)/quick, y' = (a - y)(1 + slope·y/y_max)/slow", 22, _ATTACHED),
+        _form("calcium_quick_lag", "faster lag times (1 + slope·c), c: bound calcium", 19, -0.9, 12.0),
+        _two_lags("activation_slow_lag", "a' = (w - a)/fast, y' = (a - y)/(slow (1 + slope·a/y_max))", 21, _BOUND),
+        _two_lags("attached_slow_lag", "a' = (w - a)/fast, y' = (a - y)(1 + slope·y/y_max)/slow", 22, _ATTACHED),
         _two_lags("activation_quick_lag", "a' = (w - a)/slow, y' = (a - y)/(quick (1 + slope·a/y_max))", 23, _BOUND),
         _two_lags("attached_quick_lag", "a' = (w - a)/slow, y' = (a - y)(1 + slope·y/y_max)/quick", 24, _ATTACHED),
         _two_lags(
-            "pump_slow_lag", "a' = (w/(1 + s·w) - a/(1 + s·a))/slow, y' = (a - y)/quick, s = slope/y_max", 25, _PUMP
+            "pump_slow_lag", "a' = (w/(1 + s·w) - a/(1 + s·a))/slow, y' = (a - y)/fast, s = slope/y_max", 25, _PUMP
         ),
         _two_lags(
-            "pump_quick_lag", "a' = (w/(1 + s·w) - a/(1 + s·a))/quick, y' = (a - y)/slow, s = slope/y_max", 26, _PUMP
+            "pump_quick_lag", "a' = (w/(1 + s·w) - a/(1 + s·a))/fast, y' = (a - y)/slow, s = slope/y_max", 26, _PUMP
         ),
     ),
-    signature="Small torques come faster (or slower) than large ones: the error's sign goes with level and time.",
+    signature="Small torques develop faster (or slower) than large ones: the sign of the error depends on level and "
+    "time.",
     resembles=("asymmetric_relaxation", "voluntary_effort", "mixed_fibres", "output_saturation"),
-    separated_by="A small PRBS around three or four levels.",
-    plain="The muscle is quicker, or slower, when it works hard. One linear model can be right at one level only; the "
-    "controller should know the speed at each.",
+    separated_by="A PRBS of small amplitude around three or four levels.",
+    plain="The muscle is faster or slower when it works hard. One linear model is right at one level only; the "
+    "controller should know the speed at each level.",
     source="Hunt, Munih, Donaldson, Barr 1998: speed varied fivefold with level, small-signal gain up to threefold",
 )

@@ -1,4 +1,4 @@
-"""Development and decay of torque with time constants of their own."""
+"""Different time constants for the development and the decay of torque."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ _LAGS = (
     Parameter("rise_s", "s", 0.0, 0.35, 0.0, (0.02, 0.1), about="activation"),
     Parameter("fall_s", "s", 0.0, 0.35, 0.0, (0.08, 0.03), about="deactivation"),
 )
-_RATIO = Parameter("ratio", "1", 0.12, 8.0, 1.0, (1.6, 0.6), "log", about="time constant of decay over development")
+_RATIO = Parameter(
+    "ratio", "1", 0.12, 8.0, 1.0, (1.6, 0.6), "log", about="time constant of decay divided by that of development"
+)
 
 
 def _kinetics(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
@@ -34,7 +36,7 @@ EFFECT = Effect(
         Form(
             "by_drive",
             "speed",
-            "T·ratio while the drive is below the torque, T above",
+            "T·ratio while the drive is below the torque, else T",
             (_RATIO,),
             law={"ratio": 0},
             log_law=("ratio",),
@@ -42,7 +44,7 @@ EFFECT = Effect(
         Form(
             "by_rate",
             "speed",
-            "T·ratio while the torque falls, T while it rises",
+            "T·ratio while the torque falls, else T",
             (_RATIO,),
             law={"ratio": 1},
             log_law=("ratio",),
@@ -50,7 +52,7 @@ EFFECT = Effect(
         Form(
             "slow_lag",
             "speed",
-            "as by_drive, on the slower of the two lags alone",
+            "slower lag·ratio while the drive is below the torque",
             (_RATIO,),
             law={"ratio": 8},
             log_law=("ratio",),
@@ -58,17 +60,17 @@ EFFECT = Effect(
         *(
             Form(name, "speed", words, (_RATIO,), law={"ratio": column}, log_law=("ratio",))
             for name, words, column in (
-                ("slow_lag_by_rate", "as by_rate, on the slower of the two lags alone", 17),
-                ("quick_lag", "as by_drive, on the quicker of the two lags alone", 16),
-                ("quick_lag_by_rate", "as by_rate, on the quicker of the two lags alone", 15),
+                ("slow_lag_by_rate", "slower lag·ratio while the torque falls", 17),
+                ("quick_lag", "faster lag·ratio while the drive is below the torque", 16),
+                ("quick_lag_by_rate", "faster lag·ratio while the torque falls", 15),
             )
         ),
         *(
             Form(
                 name,
                 "speed",
-                f"{lag}·ratio·c^-power while the drive is below the torque, ·c^power above; c = 0.5 + 1.5 y/y_max",
-                (_RATIO, Parameter("power", "1", 0.1, 2.0, 0.0, (0.5, 1.0), about="how much the level counts")),
+                f"{lag}·ratio·c^-power while the drive is below the torque, else {lag}·c^power; c = 0.5 + 1.5 y/y_max",
+                (_RATIO, Parameter("power", "1", 0.1, 2.0, 0.0, (0.5, 1.0), about="influence of the level")),
                 law={"ratio": first, "power": second},
                 log_law=("ratio",),
                 source="Winters 1995; Thelen 2003",
@@ -81,7 +83,7 @@ EFFECT = Effect(
         Form(
             "kinetics",
             "gain",
-            "a' = (w - a)/τ, τ = rise where w > a, else fall; the second order follows a",
+            "a' = (w - a)/τ, τ = rise if w > a, else fall; a drives the linear dynamics",
             _LAGS,
             _kinetics,
             True,
@@ -90,17 +92,17 @@ EFFECT = Effect(
         Form(
             "kinetics_by_level",
             "gain",
-            "a' = (w - a)/τ, τ = rise (0.5 + 1.5 a) where w > a, else fall/(0.5 + 1.5 a)",
+            "a' = (w - a)/τ, τ = rise (0.5 + 1.5 a) if w > a, else fall/(0.5 + 1.5 a)",
             _LAGS,
             _kinetics_by_level,
             True,
             source="Winters 1995; Thelen 2003",
         ),
     ),
-    signature="Torque above the model on the way up and below it on the way down, or the reverse, at every switch.",
+    signature="Torque above the model when it rises and below it when it falls, or the reverse, after every change.",
     resembles=("output_saturation", "activation_dependent_speed", "catch_like", "mixed_fibres"),
     separated_by="Steps on and off at several levels.",
-    plain="The muscle relaxes at another speed than it contracts. After a stroke both are changed, each by itself. A "
-    "controller with one speed reacts too late in one direction.",
+    plain="The muscle does not relax at the same speed as it contracts. A stroke can change either of the two. A "
+    "controller that uses one speed reacts too late in one direction.",
     source="McCrea, Eng, Hodgson 2003 (development and decay impaired independently); Thelen 2003",
 )

@@ -1,4 +1,4 @@
-"""What an effect is: one or more published forms, each a pure array function with its parameters."""
+"""What an effect is: one or more published forms, each a pure function of arrays, with its parameters."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 STAGES = ("pulse_width", "gain", "speed", "branch", "delay", "filter", "output", "additive", "sensor")
-"""Where a form enters, in the order in which the signal passes: see `Form`."""
+"""The stages at which a form can act, in the order in which the signal passes them: see `Form`."""
 
 
 @dataclass(frozen=True)
@@ -19,22 +19,22 @@ class Parameter:
     Parameters
     ----------
     name : str
-        Ends in its unit where it has one.
+        Ends in its unit, if it has one.
     unit : str
-        SI or the field's (µs, s, N·m, 1).
+        Such as µs, s, N·m; "1" for a pure number.
     lower, upper : float
-        Bounds; they're part of the test, so keep them honest.
+        Bounds. They set the width of the prior, and so the evidence: choose them as physiology allows, not wider.
     neutral : float
-        Value at which the form changes nothing, alone or with another of the same form; may lie outside the bounds.
+        Value at which the form changes nothing, alone or together with other parameters; may be outside the bounds.
     start : tuple of float
-        Values from which the fit starts, one run each (the longest of a form's parameters sets the number of runs).
+        Starting values, one for each run of the fit. The parameter with most values sets the number of runs.
     scale : str
-        "linear" or "log": how the parameter is varied, and on which scale the prior is flat-ish.
+        "linear" or "log": the scale on which the parameter is varied and on which its prior is symmetric.
     relative : str
-        "torque", "width" or "span": bounds, start and neutral are in units of the record's largest torque, its largest
-        pulse width or its length; "level": of its largest torque, above its zero, as the sensor counts.
+        "torque", "width" or "span": bounds, start and neutral are multiples of the record's largest torque, largest
+        pulse width or length. "level": multiples of the largest torque, counted from the sensor's zero.
     about : str
-        One line for the page.
+        One line for people.
     """
 
     name: str
@@ -65,7 +65,7 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Scene:
-    """What a form may know of the record, at the times at which it is asked.
+    """What a form can use of the record, at the times at which it is evaluated.
 
     Parameters
     ----------
@@ -76,21 +76,21 @@ class Scene:
     step_s : float
         Pulse interval, s.
     scale_nm : float
-        The record's largest torque, N·m: a fixed number, not a parameter.
+        The record's largest torque, N·m; a constant, not a parameter.
     largest_us : float
         Largest pulse width, µs.
     angle_rad, velocity_rad_s : ndarray or None, shape (K,)
-        Joint angle and velocity, where the record has them.
+        Joint angle, rad, and velocity, rad/s, if the record has them.
     noise_sd_nm : float
         White noise of a sample, N·m.
     zero_nm : float
-        Zero of the record's torque, N·m: the sensor counts from it, everything else above it.
+        Zero of the record's torque, N·m. Only the sensor stage sees it; at other stages torque is relative to it.
     reference_s : float
-        Time to which the recruitment curve belongs where it drifts: the middle of the partly recruited pulses.
+        Time at which a drifting recruitment curve holds, s: the mean time of the partly recruited pulses.
     fitted : ndarray of bool or None, shape (K,)
         Where the torque is used for fitting.
     pauses_s : ndarray or None, shape (K,)
-        What of a pause between two parts of a record is not in `time_s`, s, at the part's first interval.
+        For the first interval of each part: the part of the pause before it that `time_s` does not contain, s.
     """
 
     time_s: np.ndarray
@@ -108,7 +108,7 @@ class Scene:
 
     @property
     def rest_s(self) -> np.ndarray:
-        """Rest before each interval that the intervals do not show, s, shape (K,)."""
+        """Rest before each interval that `time_s` does not contain, s, shape (K,)."""
         return np.zeros(self.time_s.size) if self.pauses_s is None else self.pauses_s
 
     @property
@@ -129,17 +129,17 @@ Apply = Callable[[Any, dict[str, Any], Scene], Any]
 class Form:
     """One published form of an effect.
 
-    `apply(x, p, scene)` by stage, with x and the result of shape (K,), and p the parameters by name:
+    `apply(x, p, scene)` depends on the stage. x and the result have shape (K,); p holds the parameters by name:
 
-    - "pulse_width": pulse widths, µs, to pulse widths that act.
-    - "gain": drive f(u), N·m, to drive.
-    - "speed": (drive, torque), to a factor on the time constant.
-    - "branch": drive, to a list of (drive, factor on the time constant), whose responses add up.
-    - "delay": None, to a delay in s.
-    - "filter": (torque, its rate) at the ends of the pulse intervals, shape (K + 1,), to the same.
-    - "output": torque to torque, each instant by itself.
-    - "additive": None, to a torque added at `scene.time_s`.
-    - "sensor": torque to torque, last of all.
+    - "pulse_width": x is the pulse width, µs; returns the pulse width that acts.
+    - "gain": x is the drive f(u), N·m; returns the drive.
+    - "speed": x is (drive, torque); returns a factor on the time constant.
+    - "branch": x is the drive; returns a list of (drive, factor on the time constant), whose responses are added.
+    - "delay": x is None; returns a delay, s.
+    - "filter": x is (torque, rate) at the ends of the pulse intervals, shape (K + 1,); returns the same.
+    - "output": x is the torque; returns the torque. Each time by itself.
+    - "additive": x is None; returns a torque that is added at `scene.time_s`.
+    - "sensor": x is the torque, after all other stages; returns the measured torque.
 
     Parameters
     ----------
@@ -148,31 +148,32 @@ class Form:
     stage : str
         One of `STAGES`.
     equation : str
-        For the page.
+        The equation, for people.
     parameters : tuple of Parameter
-        In the order in which starting values are paired.
+        The parameters; their first starting values form the first run, their second ones the second, and so on.
     apply : callable
-        See above. At the neutral values it returns x itself, bit for bit.
+        See above. At the neutral values it must return x itself, bit for bit.
     batched : bool
-        Whether `apply` takes x of shape (M, K) and parameters of shape (M, 1); if not, it is called row by row.
+        Whether `apply` takes x of shape (M, K) and parameters of shape (M, 1). If not, it is called row by row.
     law : dict
-        For "speed" alone: column of the compiled law by parameter; `apply` is then not called.
+        For "speed" only: the `SpeedLaw` of each parameter. `apply` is then not called.
     log_law : tuple of str
-        Parameters of which the law takes the logarithm.
+        Parameters whose logarithm the law uses.
     propose : callable or None
-        `propose(residual_nm, scene, previous)` gives starting values found in the data: a list of dicts, none where
-        there is nothing to start from. `previous` holds the parameters of the form before in a chain.
+        `propose(residual_nm, scene, previous)` returns starting values found in the data, as a list of dicts; empty if
+        there are none. `previous` holds the parameters of the form before it in a chain.
     restarts : tuple of dict
-        Further starts that also set the base's T and ζ (`base.time_constant_s`, `base.damping`): where the base has
-        bent its own dynamics to imitate the effect.
+        Further starts that also set T and ζ of the linear dynamics (`base.time_constant_s`, `base.damping`): for cases
+        in which the model without the effect has imitated it by its linear dynamics.
     accept : callable or None
-        `accept(parameters, scene)`: whether a fit makes sense.
+        `accept(parameters, scene)`: whether the result of a fit is plausible.
     grows : bool
-        The form is the next in a chain: it is tried only while the form before it gained.
-    settled : bool
-        Its parameters are found in the raw samples, and the target no longer holds it: nothing of it is fitted.
+        Whether the form is the next in a chain. It is tried only while the forms before it gain.
+    fixed : bool
+        Whether its parameters are found in the samples before the fit, and are not fitted. The fitted torque is
+        corrected for it beforehand.
     source : str
-        Paper and equation.
+        Publication.
     """
 
     name: str
@@ -187,18 +188,18 @@ class Form:
     grows: bool = False
     accept: Callable[[dict[str, float], Scene], bool] | None = None
     restarts: tuple[dict[str, float], ...] = ()
-    settled: bool = False
+    fixed: bool = False
     source: str = ""
 
     def starts(self, scene: Scene) -> list[dict[str, float]]:
-        """Starting values, one dict a run."""
+        """Starting values, one dict per run."""
         on = [p.on(scene) for p in self.parameters]
         runs = max((len(p.start) for p in on), default=1)
         listed = [{p.name: p.start[min(i, len(p.start) - 1)] for p in on} for i in range(runs)]
         return listed + [dict(start) for start in self.restarts]
 
     def call(self, x: Any, p: dict[str, np.ndarray], scene: Scene) -> Any:
-        """`apply` for rows of parameters: x of shape (M, K) (or a tuple of such, or None), p of shape (M, 1)."""
+        """`apply` for M rows of parameters: x of shape (M, K), a tuple of such arrays, or None; p of shape (M, 1)."""
         assert self.apply is not None
         if self.batched:
             return self.apply(x, p, scene)
@@ -219,35 +220,35 @@ class Effect:
     Parameters
     ----------
     id : str
-        As in the contract.
+        Such as "fatigue"; used in files, commands and the REST API.
     name : str
-        For people.
+        Name for people.
     forms : tuple of Form
-        The published variants; the fit takes the likeliest.
+        The published variants. The fit takes the most likely one.
     signature : str
-        What it leaves in the residual of a model without it.
+        What it looks like in the residual of a model without it.
     resembles : tuple of str
-        Ids of effects that a record often can't tell from it.
+        Ids of effects that a record often cannot separate from it.
     separated_by : str
-        The test that tells them apart.
+        The test that separates them.
     plain : str
-        A paragraph a clinician understands.
+        A paragraph for clinicians.
     source : str
         Where the physics is described.
     needs : tuple of str
-        Columns without which it isn't considered.
-    foreseeable : bool
-        Whether it can be predicted for rows not fitted (bumps and tremor can't).
+        Columns that the record must have; otherwise the effect is not tried.
+    predictable : bool
+        Whether it can be predicted from the pulse widths. Efforts and tremor cannot.
     raw : bool
-        Whether it is sought at the record's own rate, before averaging.
+        Whether it is detected in the samples, before the means over pulse intervals are taken.
     band : bool
-        Whether it is a narrow band of noise: sought in the residual's spectrum, and part of the noise while others are
-        weighed.
-    seen : callable or None
-        `seen(raw)`: the form and its parameters where the raw samples show the effect beyond doubt, else None; `raw` is
-        what `identify.estimation.prepare.inspect` saw. It is then taken as there, before any fit.
+        Whether it is a narrow band of noise: it is found in the residual's spectrum, and is part of the noise while
+        other effects are compared.
+    detect : callable or None
+        `detect(raw)` returns the form and its parameters if the samples show the effect beyond doubt, else None. `raw`
+        is the result of `inspect` in `identify.estimation`. A detected effect is added before any fit.
     prior : float
-        Odds against it beforehand, as a natural logarithm, on top of the common ones.
+        Logarithm of its prior odds, relative to other effects.
     """
 
     id: str
@@ -259,19 +260,19 @@ class Effect:
     plain: str
     source: str = ""
     needs: tuple[str, ...] = ()
-    foreseeable: bool = True
+    predictable: bool = True
     raw: bool = False
     band: bool = False
-    seen: Callable[[Any], tuple[str, dict[str, float]] | None] | None = None
+    detect: Callable[[Any], tuple[str, dict[str, float]] | None] | None = None
     prior: float = 0.0
 
     @property
     def stage(self) -> str:
-        """Where its first form enters."""
+        """The stage of its first form."""
         return self.forms[0].stage
 
     def form(self, name: str) -> Form:
-        """A form by its name (the first where the name is empty)."""
+        """A form by its name; the first form if the name is empty."""
         for form in self.forms:
             if form.name == name or not name:
                 return form

@@ -1,4 +1,4 @@
-"""Drift of the zero: the cell warms up, the limb settles, an offset creeps."""
+"""Drift of the zero: the load cell warms up, the limb settles, an offset changes."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def _wander(_: None, p: dict[str, Any], scene: Scene) -> np.ndarray:
     return CubicSpline(knots, np.eye(KNOTS + 1), bc_type="natural")(place).dot(values.T).T
 
 
-_SLOPE = Parameter("slope_nm_per_s", "N·m/s", -0.04, 0.04, 0.0, (0.0,), relative="torque", about="drift in a second")
+_SLOPE = Parameter("slope_nm_per_s", "N·m/s", -0.04, 0.04, 0.0, (0.0,), relative="torque", about="drift per second")
 _WAVE = (-0.22, 0.22, 0.0, (0.003,), "linear", "torque")
 
 EFFECT = Effect(
@@ -53,7 +53,9 @@ EFFECT = Effect(
             "y + shift (1 - exp(-t/time_constant))",
             (
                 Parameter("shift_nm", "N·m", -0.6, 0.6, 0.0, (0.0,), relative="torque", about="final shift"),
-                Parameter("time_constant_s", "s", 2.0, 80.0, 15.0, (5.0, 20.0), "log", about="how fast it settles"),
+                Parameter(
+                    "time_constant_s", "s", 2.0, 80.0, 15.0, (5.0, 20.0), "log", about="time constant of the shift"
+                ),
             ),
             _warming,
             True,
@@ -64,7 +66,9 @@ EFFECT = Effect(
             "y + slope·t + bend (t/60)²",
             (
                 _SLOPE,
-                Parameter("bend_nm", "N·m", -1.8, 1.8, 0.0, (0.0,), relative="torque", about="bend over a minute"),
+                Parameter(
+                    "bend_nm", "N·m", -1.8, 1.8, 0.0, (0.0,), relative="torque", about="curvature over one minute"
+                ),
             ),
             _bent,
             True,
@@ -84,7 +88,7 @@ EFFECT = Effect(
         Form(
             "wander",
             "additive",
-            "y + s(t), s a natural cubic spline through six knots over the record",
+            "y + s(t), s: a natural cubic spline with six knots over the record",
             tuple(
                 Parameter(
                     f"knot_{i}_nm",
@@ -94,7 +98,7 @@ EFFECT = Effect(
                     0.0,
                     (0.0,),
                     relative="torque",
-                    about=f"shift at {i} sixths of the record",
+                    about=f"shift at {i}/6 of the record",
                 )
                 for i in range(1, KNOTS + 1)
             ),
@@ -102,9 +106,10 @@ EFFECT = Effect(
             True,
         ),
     ),
-    signature="The rests don't return to the same torque; the error is the same whether the muscle works or not.",
+    signature="The rests do not return to the same torque; the error does not depend on the stimulation.",
     resembles=("voluntary_effort", "fatigue", "mixed_fibres", "passive_torque"),
     separated_by="Rests at zero pulse width before and after each part.",
-    plain="The zero of the measurement moves. It isn't the muscle: let the cell warm up, support the limb, zero again.",
-    source="Load-cell warm-up and limb settling",
+    plain="The zero of the measurement drifts; the muscle is not the cause. Let the load cell warm up, support the "
+    "limb, and set the zero again.",
+    source="Warm-up of load cells, settling of the limb",
 )

@@ -1,4 +1,4 @@
-"""Catch-like property: the first pulses of a train give more than the later ones."""
+"""Catch-like property: the first pulses of a train give more torque than the later ones."""
 
 from __future__ import annotations
 
@@ -10,10 +10,12 @@ from identify.effects.base import Effect, Form, Parameter, Scene
 from identify.effects.kernels import adapt, since_onset, train, used_up
 
 ENGAGED = 0.03
-"""Share of full torque from which pulses engage the muscle."""
+"""Share of full torque from which pulses are taken to recruit the muscle."""
 _GAIN = Parameter("gain", "1", 0.0, 4.0, 0.0, (0.3, 0.8), about="extra torque at the onset")
-_DECAY = Parameter("decay_s", "s", 0.12, 1.2, 0.3, (0.25, 0.5), "log", about="time constant with which it fades")
-_RECOVERY = Parameter("recovery_s", "s", 0.02, 4.0, 0.3, (0.1, 1.0), "log", about="silence after which it is back")
+_DECAY = Parameter("decay_s", "s", 0.12, 1.2, 0.3, (0.25, 0.5), "log", about="time constant of its decay")
+_RECOVERY = Parameter(
+    "recovery_s", "s", 0.02, 4.0, 0.3, (0.1, 1.0), "log", about="time constant of recovery in silence"
+)
 
 
 def _depletes(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
@@ -29,7 +31,7 @@ def _by_level(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
 
 
 def _after_silence(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
-    """The longer the silence before a train, the larger the boost at its onset."""
+    """The boost at the onset of a train grows with the silence before it."""
     since, gap = train(scene.on, scene.step_s)
     return drive * (1.0 + p["gain"] * -np.expm1(-gap / p["recovery_s"]) * np.exp(-since / p["decay_s"]))
 
@@ -40,7 +42,7 @@ def _counts(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
 
 
 def _sharp(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
-    """As after_silence, back more at once: a silence half as long as recovery brings back little."""
+    """As `after_silence`, but the recovery has a threshold: after half the recovery time little has recovered."""
     since, gap = train(scene.on, scene.step_s)
     back = (gap / p["recovery_s"]) ** 2.5
     return drive * (1.0 + p["gain"] * back / (1.0 + back) * np.exp(-since / p["decay_s"]))
@@ -53,7 +55,7 @@ def _flat(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
 
 
 def _trains(least_gap_s: float) -> Any:
-    """As after_silence, where shorter silences don't end a train."""
+    """As `after_silence`, but shorter silences do not end a train."""
 
     def apply(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
         since, gap = train(scene.on, scene.step_s, least_gap_s)
@@ -71,7 +73,7 @@ def _burst(length_s: float, least_gap_s: float) -> Any:
 
 
 def _engaged(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
-    """A burst that rises and fades from where pulses begin to recruit, after a silence in which they did not."""
+    """A boost that rises and decays from the time at which pulses begin to recruit the muscle."""
     since, gap = np.empty_like(drive), np.empty_like(drive)
     for m in range(drive.shape[0]):
         working = (np.abs(drive[m]) > ENGAGED * scene.scale_nm).astype(float)
@@ -80,7 +82,7 @@ def _engaged(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
     return drive * (1.0 + p["gain"] * -np.expm1(-gap / p["recovery_s"]) * (z + 0.3) * np.exp(-z))
 
 
-_QUICK = Parameter("decay_s", "s", 0.05, 1.2, 0.3, (0.12, 0.4), "log", about="time constant with which it fades")
+_QUICK = Parameter("decay_s", "s", 0.05, 1.2, 0.3, (0.12, 0.4), "log", about="time constant of its decay")
 
 EFFECT = Effect(
     id="catch_like",
@@ -130,7 +132,7 @@ EFFECT = Effect(
             Form(
                 f"trains_{gap * 1000:.0f}_ms",
                 "gain",
-                f"as after_silence, a silence of less than {gap:g} s doesn't end a train",
+                f"as after_silence, but a silence of less than {gap:g} s does not end a train",
                 (_GAIN, _QUICK, _RECOVERY),
                 _trains(gap),
                 batched=True,
@@ -140,7 +142,7 @@ EFFECT = Effect(
         Form(
             "engaged",
             "gain",
-            "w = (1 + gain (1 - exp(-silence/recovery)) (z + 0.3) exp(-z)) f(u), z = t/decay since pulses recruit",
+            "w = (1 + gain (1 - exp(-silence/recovery)) (z + 0.3) exp(-z)) f(u), z = t/decay, t since pulses recruit",
             (_GAIN, _QUICK, _RECOVERY),
             _engaged,
             batched=True,
@@ -152,7 +154,7 @@ EFFECT = Effect(
             "w = (1 + gain (1 - exp(-silence/recovery)) exp(-(t/length)³)) f(u)",
             (
                 _GAIN,
-                Parameter("length_s", "s", 0.08, 0.9, 0.3, (0.15, 0.4), "log", about="how long the boost lasts"),
+                Parameter("length_s", "s", 0.08, 0.9, 0.3, (0.15, 0.4), "log", about="duration of the boost"),
                 _RECOVERY,
             ),
             _flat,
@@ -170,10 +172,10 @@ EFFECT = Effect(
             for length, gap in ((0.06, 0.1),)
         ),
     ),
-    signature="Torque above the model in the first tenths of a second after every silence.",
+    signature="Torque above the model in the first tenths of a second after every rest.",
     resembles=("asymmetric_relaxation", "activation_dependent_speed", "fatigue"),
-    separated_by="Plain trains after silences of different length, one of them opened by a doublet.",
-    plain="The first pulses after a silence pull harder than those that follow. Trains that begin with a close pair of "
-    "pulses use this; a controller that doesn't know it overshoots at every start.",
+    separated_by="Equal trains after rests of different length; one of them starts with a doublet.",
+    plain="The first pulses after a rest give more torque than those that follow. Without it in the model, a "
+    "controller overshoots at every start.",
     source="Bickel, Slade, Dudley 2004; Binder-Macleod, Kesar 2005",
 )

@@ -9,7 +9,9 @@ import numpy as np
 from identify.effects.base import Effect, Form, Parameter, Scene
 from identify.effects.kernels import activate
 
-_DELAY = Parameter("delay_s", "s", 0.0, 0.15, 0.0, (0.02, 0.06), about="delay beyond the record's own timing")
+_DELAY = Parameter(
+    "delay_s", "s", 0.0, 0.15, 0.0, (0.02, 0.06), about="delay in addition to that of the linear dynamics"
+)
 
 
 def _delay(_: None, p: dict[str, Any], _scene: Scene) -> np.ndarray:
@@ -29,7 +31,7 @@ def _chain(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
 
 
 def _spread(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
-    """A delay, in whole and broken pulse intervals, then a lag: fibres with delays of their own."""
+    """A delay of any number of pulse intervals, then a lag: fibres with different delays."""
     steps = p["delay_s"] / scene.step_s
     late = drive
     for _ in range(6):
@@ -48,35 +50,35 @@ EFFECT = Effect(
         Form(
             "lag",
             "gain",
-            "a' = (w - a)/lag: a spread-out delay, one more pole",
-            (Parameter("lag_s", "s", 0.0, 0.12, 0.0, (0.03,), about="mean of the spread-out delay"),),
+            "a' = (w - a)/lag: a distributed delay, one more pole",
+            (Parameter("lag_s", "s", 0.0, 0.12, 0.0, (0.03,), about="mean of the distributed delay"),),
             _lag,
             True,
         ),
         Form(
             "chain",
             "gain",
-            "three equal lags, lag in all",
-            (Parameter("lag_s", "s", 0.0, 0.2, 0.0, (0.06,), about="mean of the delay"),),
+            "three equal lags in series, lag in total",
+            (Parameter("lag_s", "s", 0.0, 0.2, 0.0, (0.06,), about="mean of the distributed delay"),),
             _chain,
             True,
         ),
         Form(
             "spread",
             "gain",
-            "a' = (w(t - delay) - a)/lag: fibres with delays of their own",
+            "a' = (w(t - delay) - a)/lag: fibres with different delays",
             (
-                Parameter("delay_s", "s", 0.0, 0.13, 0.0, (0.03,), about="least delay"),
+                Parameter("delay_s", "s", 0.0, 0.13, 0.0, (0.03,), about="smallest delay"),
                 Parameter("lag_s", "s", 0.0, 0.12, 0.0, (0.02,), about="spread of the delays"),
             ),
             _spread,
             True,
         ),
     ),
-    signature="The model is early at every change: residual like the torque's rate, correlated from sample to sample.",
+    signature="The model is too early at every change: the residual looks like the rate of the torque.",
     resembles=("series_compliance", "mixed_fibres", "asymmetric_relaxation"),
     separated_by="Single pulses, sampled at 400 Hz or faster.",
-    plain="Some hundredths of a second pass between the pulse and the first torque. Longer delays force a gentler "
-    "controller.",
+    plain="Some hundredths of a second pass between a pulse and its first torque. With a longer delay the controller "
+    "must react more gently.",
     source="Sinclair et al.: quadriceps onset 31 ± 3 ms at 90°, 67 ± 24 ms at 15°; offset 58 ± 5 ms",
 )

@@ -1,4 +1,4 @@
-"""Muscle fatigue: the gain falls with use and comes back with rest."""
+"""Muscle fatigue: the gain falls during use and recovers at rest."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from identify.effects.base import Effect, Form, Parameter, Scene
 from identify.effects.kernels import adapt
 
-_DEPTH = Parameter("depth", "1", 0.0, 0.95, 0.0, (0.3, 0.6), about="largest share of torque that can be lost")
+_DEPTH = Parameter("depth", "1", 0.0, 0.95, 0.0, (0.3, 0.6), about="largest share of torque that is lost")
 _ONSET = Parameter("onset_s", "s", 3.0, 250.0, 30.0, (15.0, 50.0), "log", about="time constant under full stimulation")
 _RECOVERY = Parameter("recovery_s", "s", 4.0, 400.0, 50.0, (40.0, 90.0), "log", about="time constant at rest")
 
@@ -59,16 +59,17 @@ EFFECT = Effect(
         Form(
             "by_pulses",
             "gain",
-            "as fitness, with a = 1 while pulses come, whatever their width",
+            "w = μ f(u); μ = 1 - depth·x; x' = a(1 - x)/onset - (1 - a) x/recovery; a = 1 under pulses of any width, "
+            "else 0",
             (_DEPTH, _ONSET, _RECOVERY),
             _by_pulses,
             batched=True,
         ),
     ),
-    signature="Torque above the model early in stimulation, below it late; the sign turns in rest.",
+    signature="Torque above the model early in the stimulation and below it late; after a rest it is higher again.",
     resembles=("threshold_drift", "potentiation", "baseline_drift"),
-    separated_by="Repeat the ramp after stimulation and again after a rest.",
-    plain="The muscle tires: the same pulse gives less torque the longer it has worked, and recovers when it rests. "
-    "After a stroke muscles tire sooner. Late in a session it needs more charge, or longer rests.",
+    separated_by="The ramp repeated after stimulation, and once more after a rest.",
+    plain="The muscle tires: the longer it has worked, the less torque the same pulse gives. It recovers at rest. "
+    "After a stroke, muscles tire sooner. Late in a session the muscle needs more charge, or longer rests.",
     source="Riener et al. 1996; Ding et al. 2003",
 )

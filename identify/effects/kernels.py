@@ -1,4 +1,4 @@
-"""Recursions that numpy can't vectorise over time, compiled: rows are parameter sets, columns are pulse intervals."""
+"""Compiled recursions over time. Rows are sets of parameters, columns are pulse intervals."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from numba import njit
 def adapt(
     drive: np.ndarray, onset_s: np.ndarray, recovery_s: np.ndarray, constant: bool, step_s: float, rest_s: np.ndarray
 ) -> np.ndarray:  # pragma: no cover
-    """State x in [0, 1] with x' = a (1 - x)/onset - (1 - a) x/recovery, exact for a held drive a; from x = 0.
+    """State x in [0, 1] with x' = a (1 - x)/onset - (1 - a) x/recovery, from x = 0; exact for a held drive a.
 
-    With `constant` the recovery goes on under stimulation, too: x' = a (1 - x)/onset - x/recovery.
+    With `constant`, recovery also continues under stimulation: x' = a (1 - x)/onset - x/recovery.
 
     Parameters
     ----------
@@ -25,12 +25,12 @@ def adapt(
     step_s : float
         Length of an interval, s.
     rest_s : ndarray, shape (K,)
-        Rest before each interval that the intervals do not show, s.
+        Additional rest before each interval, s.
 
     Returns
     -------
     ndarray, shape (M, K)
-        Mean of x at the two ends of each interval.
+        Mean of x at the start and the end of each interval.
     """
     rows, size = drive.shape
     out = np.empty((rows, size))
@@ -54,7 +54,7 @@ def adapt(
 
 @njit(cache=True, nogil=True)
 def play(width_us: np.ndarray, half_us: np.ndarray, growth_per_us: np.ndarray) -> np.ndarray:  # pragma: no cover
-    """Play operator: the output follows the input at a distance of at most half (1 + growth·input); from 0.
+    """Play operator: the output stays within half (1 + growth·input) of the input; it starts at 0.
 
     Shapes (M, K), (M,), (M,).
     """
@@ -72,7 +72,10 @@ def play(width_us: np.ndarray, half_us: np.ndarray, growth_per_us: np.ndarray) -
 
 @njit(cache=True, nogil=True)
 def dahl(width_us: np.ndarray, reach_us: np.ndarray) -> np.ndarray:  # pragma: no cover
-    """Direction memory z in [-1, 1]: dz = (du - z |du|)/reach, Dahl's friction; from -1. Shapes (M, K), (M,)."""
+    """Dahl's friction, a memory of direction z in [-1, 1]: dz = (du - z |du|)/reach. Shapes (M, K), (M,).
+
+    Before the first change z is 0.
+    """
     rows, size = width_us.shape
     out = np.empty((rows, size))
     for m in range(rows):
@@ -91,9 +94,9 @@ def dahl(width_us: np.ndarray, reach_us: np.ndarray) -> np.ndarray:  # pragma: n
 def activate(
     drive: np.ndarray, rise_s: np.ndarray, fall_s: np.ndarray, step_s: float
 ) -> np.ndarray:  # pragma: no cover
-    """First-order activation with its own time constants for rise and fall; mean over each interval, from 0.
+    """First-order activation with time constants for rise and fall; mean over each interval, from 0.
 
-    a' = (w - a)/τ, τ = rise where the drive exceeds the activation. A time constant of 0 follows at once.
+    a' = (w - a)/τ, τ = rise if the drive is above the activation, else fall. With τ = 0, a follows w at once.
     Shapes (M, K), (M,).
     """
     rows, size = drive.shape
@@ -115,7 +118,7 @@ def activate(
 
 @njit(cache=True, nogil=True)
 def since_onset(on: np.ndarray, least_gap_s: float, step_s: float) -> np.ndarray:  # pragma: no cover
-    """Time since the first pulse of the present train, s, at the middle of each interval; large where there is none."""
+    """Time since the first pulse of the present train, s, at the middle of each interval; 1e9 without a pulse."""
     out = np.full(on.size, 1e9)
     gap, since = 1e9, 1e9
     for k in range(on.size):
@@ -135,7 +138,7 @@ def since_onset(on: np.ndarray, least_gap_s: float, step_s: float) -> np.ndarray
 def follow(
     torque: np.ndarray, slope: np.ndarray, phi: np.ndarray, gamma: np.ndarray, step_s: float
 ) -> tuple[np.ndarray, np.ndarray]:  # pragma: no cover
-    """A second-order system driven by the cubic through boundary states; (M, K + 1) to (M, K + 1).
+    """Response of a second-order system to the cubic through boundary states; (M, K + 1) to (M, K + 1).
 
     `slope` is the rate times the step; `phi` (M, 2, 2) and `gamma` (M, 2, 4) act on (z, z'·step), (x0, x0', x1, x1').
     """
@@ -193,9 +196,9 @@ def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:  # pragma: no cover
 
 @njit(cache=True, nogil=True)
 def train(on: np.ndarray, step_s: float, least_gap_s: float = 0.0) -> tuple[np.ndarray, np.ndarray]:  # pragma: no cover
-    """Time under pulses since the onset of the present train and the silence before it, s.
+    """Time under pulses since the onset of the present train, and the silence before that train, s.
 
-    A train is pulses without a gap, or with none as long as `least_gap_s`.
+    A silence longer than `least_gap_s` ends a train.
     """
     since = np.full(on.size, 1e9)
     before = np.zeros(on.size)
@@ -217,7 +220,7 @@ def train(on: np.ndarray, step_s: float, least_gap_s: float = 0.0) -> tuple[np.n
 def activate_by_level(
     drive: np.ndarray, rise_s: np.ndarray, fall_s: np.ndarray, scale: float, step_s: float
 ) -> np.ndarray:  # pragma: no cover
-    """As `activate`, slower to rise and quicker to fall at high levels: rise (0.5 + 1.5 a), fall/(0.5 + 1.5 a)."""
+    """As `activate`, with time constants that depend on the level: rise (0.5 + 1.5 a), fall/(0.5 + 1.5 a)."""
     rows, size = drive.shape
     parts = 5
     out = np.empty((rows, size))
@@ -242,7 +245,7 @@ def activate_by_level(
 
 
 SPRING_PARTS = 12
-"""Leapfrog steps in an interval: at 16 Hz and 40 pulses a second a fifth of a radian each."""
+"""Leapfrog steps per interval: at 16 Hz and 40 pulses/s a step is a fifth of a radian."""
 
 
 @njit(cache=True, nogil=True)
@@ -255,7 +258,7 @@ def follow_curved(
     toe: bool,
     step_s: float,
 ) -> tuple[np.ndarray, np.ndarray]:  # pragma: no cover
-    """A mass on a curved spring behind the torque x, the cubic through boundary states; all rows side by side.
+    """A mass on a nonlinear spring, driven by the cubic x through boundary states.
 
     With a toe q'' = ω² (x - z) - 2 ζ ω q', z = q (1 + β q²) the spring's torque; else z'' = ω² (1 + β |z|)(x - z) -
     2 ζ ω z'. Shapes (M, K) and (M,); β in 1/(N·m)² or 1/(N·m).
@@ -293,7 +296,7 @@ def follow_curved(
 def bumps(
     time_s: np.ndarray, centre: np.ndarray, width: np.ndarray, height: np.ndarray, flatness: np.ndarray
 ) -> np.ndarray:  # pragma: no cover
-    """Sum of bumps; (K,), (M, n) each, flatness (M,), to (M, K). Beyond what rounds to zero nothing is evaluated."""
+    """Sum of bumps. Shapes (K,), (M, n) for each of three, flatness (M,); to (M, K). Negligible tails are skipped."""
     rows, count = centre.shape
     out = np.zeros((rows, time_s.size))
     for m in range(rows):
@@ -310,7 +313,7 @@ def bumps(
 def used_up(
     on: np.ndarray, decay_s: np.ndarray, recovery_s: np.ndarray, step_s: float
 ) -> np.ndarray:  # pragma: no cover
-    """Time under pulses, forgotten in silence: x' = 1/decay, or -x/recovery; (K,), (M,) to (M, K)."""
+    """x' = 1/decay under pulses, -x/recovery in silence. Shapes (K,), (M,), (M,); to (M, K)."""
     rows = decay_s.size
     out = np.empty((rows, on.size))
     for m in range(rows):

@@ -1,4 +1,4 @@
-"""Mains hum: a line at 50 or 60 Hz and its harmonics, sought at the record's own rate."""
+"""Mains hum: a line at 50 or 60 Hz and its harmonics, detected in the samples."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ EFFECT = Effect(
             (Parameter("frequency_hz", "Hz", 49.0, 61.0, 50.0, (50.0, 60.0), about="mains frequency"), *_PARTS),
             _hum,
             batched=True,
-            settled=True,
+            fixed=True,
         ),
     ),
-    signature="Lines at 50 or 60 Hz and multiples; in one mean a pulse they fold to some low frequency.",
+    signature="Lines at 50 or 60 Hz and multiples; in means over pulse intervals they appear at low frequencies.",
     resembles=(),
-    separated_by="The spectrum at rest, at a high sampling rate.",
-    plain="The mains couples into the load cell. It isn't the muscle: check shielding and earth.",
-    source="Interference",
+    separated_by="The spectrum of a rest, at a high sampling rate.",
+    plain="The mains supply disturbs the load cell; the muscle is not the cause. Check shielding and earth.",
+    source="Electrical interference",
     raw=True,
-    seen=lambda raw: None if raw.hum is None else ("line", raw.hum),
+    detect=lambda raw: None if raw.hum is None else ("line", raw.hum),
 )

@@ -1,4 +1,4 @@
-"""Fast and slow fibres side by side."""
+"""Fast and slow fibres in parallel."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from identify.effects.base import Effect, Form, Parameter, Scene
 
 _SHARE = Parameter("slow_share", "1", 0.0, 0.9, 0.0, (0.3, 0.15), about="share of torque from the slow fibres")
-_RATIO = Parameter("ratio", "1", 1.4, 12.0, 2.0, (2.0, 4.0), "log", about="slow time constant over fast")
+_RATIO = Parameter("ratio", "1", 1.4, 12.0, 2.0, (2.0, 4.0), "log", about="slow time constant divided by fast")
 
 
 def _parallel(drive: np.ndarray, p: dict[str, Any], _scene: Scene) -> list:
@@ -31,16 +31,16 @@ EFFECT = Effect(
         Form(
             "ordered",
             "branch",
-            "as parallel, with s = slow_share·(f/f_max)^order: slow fibres join late (order > 0) or early",
+            "as parallel, with s = slow_share·(f/f_max)^order: slow fibres are recruited late (order > 0) or early",
             (_SHARE, _RATIO, Parameter("order", "1", -0.9, 3.0, 0.0, (1.0, -0.4), about="order of recruitment")),
             _ordered,
             True,
         ),
     ),
-    signature="After every step a fast part, then a long tail.",
+    signature="After every step a fast part of the response, then a long tail.",
     resembles=("electromechanical_delay", "asymmetric_relaxation", "baseline_drift", "activation_dependent_speed"),
-    separated_by="One long step, and its long tail.",
-    plain="The muscle is a mixture of quick and slow fibres: a step comes fast at first, and creeps on for a while.",
+    separated_by="One long step.",
+    plain="The muscle has fast and slow fibres: after a step the torque first rises fast, then slowly for a while.",
     source="Parallel fast and slow branches; cf. Ding et al. 2003 for the two fibre types' time constants",
     prior=-1.5,
 )

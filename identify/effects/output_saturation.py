@@ -1,4 +1,4 @@
-"""Saturation after the dynamics: tendon, joint stop or fixture take no more."""
+"""Saturation after the dynamics: tendon, joint stop or fixture limit the torque."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from identify.effects.base import Effect, Form, Parameter, Scene
 
-_CEILING = Parameter("ceiling_nm", "N·m", 0.4, 4.0, np.inf, (1.2, 2.0), "log", "torque", "torque never exceeded")
+_CEILING = Parameter("ceiling_nm", "N·m", 0.4, 4.0, np.inf, (1.2, 2.0), "log", "torque", "largest possible torque")
 
 
 def _knee(y: np.ndarray, p: dict[str, Any], _scene: Scene) -> np.ndarray:
@@ -25,7 +25,7 @@ def _exponential(y: np.ndarray, p: dict[str, Any], _scene: Scene) -> np.ndarray:
 def _yielding(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
     width = p["corner"] * scene.scale_nm
     over, rest = np.abs(y) - p["knee_nm"], -p["knee_nm"]
-    # A soft corner, exactly zero at zero torque.
+    # A smooth corner, exactly zero at zero torque.
     soft = 0.5 * (over + np.sqrt(over * over + width * width)) - 0.5 * (rest + np.sqrt(rest * rest + width * width))
     return y - np.sign(y) * p["yield_share"] * soft
 
@@ -49,7 +49,7 @@ EFFECT = Effect(
         Form(
             "yielding",
             "output",
-            "y - yield·max(y - knee, 0), with a soft corner",
+            "y - yield·max(y - knee, 0), with a smooth corner",
             (
                 Parameter("knee_nm", "N·m", 0.2, 1.1, 0.8, (0.6, 0.8), "log", "torque", "where it begins to yield"),
                 Parameter("yield_share", "1", 0.0, 1.0, 0.0, (0.5, 0.8), about="share lost above the knee"),
@@ -59,10 +59,10 @@ EFFECT = Effect(
             True,
         ),
     ),
-    signature="Tops are cut whatever the way to them: fast rises near the top, slow ones alike.",
+    signature="High torques are cut off, whether they are reached fast or slowly.",
     resembles=("asymmetric_relaxation", "sensor_clipping", "activation_dependent_speed"),
-    separated_by="The plateaus of a staircase, approached from both sides.",
-    plain="Above some torque the limb or the fixture gives way, or the tendon takes no more: the muscle pulls harder, "
-    "the cell doesn't see it.",
+    separated_by="The plateaus of a staircase, reached from below and from above.",
+    plain="Above some torque the limb or the fixture gives way: the muscle pulls harder, but the load cell does not "
+    "show it.",
     source="Soft knee of tendon and compliance after the dynamics (Wiener structure)",
 )

@@ -13,7 +13,7 @@ import numpy as np
 from identify.effects.base import STAGES, Effect, Form, Parameter, Scene
 from identify.errors import IdentifyError
 
-MEND = "See docs/add-an-effect.md."
+FIX = "See docs/add-an-effect.md."
 SCALES = ("linear", "log")
 RELATIVE = ("", "torque", "width", "span", "level")
 ROWS = 80
@@ -34,14 +34,14 @@ def effect_of(path: Path) -> Effect:
     """
     spec = importlib.util.spec_from_file_location(f"stimrig_effect_{path.stem}", path)
     if spec is None or spec.loader is None:
-        raise BadEffect("not a Python file", place=str(path), mend=MEND)
+        raise BadEffect("not a Python file", place=str(path), fix=FIX)
     module = importlib.util.module_from_spec(spec)
     try:
         spec.loader.exec_module(module)
     except (Exception, SystemExit) as error:
-        raise BadEffect(in_one_line(error), place=_place(path, error), mend=MEND) from error
+        raise BadEffect(in_one_line(error), place=_place(path, error), fix=FIX) from error
     if not hasattr(module, "EFFECT"):
-        raise BadEffect("no EFFECT in it", place=str(path), mend="End the file with EFFECT = Effect(...).")
+        raise BadEffect("no EFFECT in it", place=str(path), fix="End the file with EFFECT = Effect(...).")
     return checked(module.EFFECT, str(path), path)
 
 
@@ -69,18 +69,18 @@ def checked(effect: Any, place: str, path: Path | None = None) -> Effect:
     """
     if not isinstance(effect, Effect):
         message = f"EFFECT is a {type(effect).__name__}, not an Effect"
-        raise BadEffect(message, place=place, mend="Give EFFECT = Effect(...).")
+        raise BadEffect(message, place=place, fix="Give EFFECT = Effect(...).")
     if not isinstance(effect.id, str) or not re.fullmatch(r"[a-z][a-z0-9_]{0,63}", effect.id):
         raise BadEffect(
-            f"id {effect.id!r}", place=place, mend="Use small letters, digits and _, beginning with a letter."
+            f"id {effect.id!r}", place=place, fix="Use small letters, digits and _, beginning with a letter."
         )
     forms = effect.forms
     if not isinstance(forms, tuple) or not forms or not all(isinstance(form, Form) for form in forms):
-        mend = "Give forms=(Form(...),), with a comma before the closing bracket."
-        raise BadEffect("forms is no tuple of Form", place=place, mend=mend)
+        fix = "Give forms=(Form(...),), with a comma before the closing bracket."
+        raise BadEffect("forms is no tuple of Form", place=place, fix=fix)
     names = [form.name for form in forms]
     if twice := [name for name in names if names.count(name) > 1]:
-        raise BadEffect(f"two forms are called {twice[0]!r}", place=place, mend="Name each form once.")
+        raise BadEffect(f"two forms are called {twice[0]!r}", place=place, fix="Name each form once.")
     for form in forms:
         _check_form(form, place, path)
     return effect
@@ -89,17 +89,17 @@ def checked(effect: Any, place: str, path: Path | None = None) -> Effect:
 def _check_form(form: Form, place: str, path: Path | None) -> None:
     where = f"{place}, form {form.name!r}"
     if form.stage not in STAGES:
-        raise BadEffect(f"no stage is called {form.stage!r}", place=where, mend=f"Give one of {', '.join(STAGES)}.")
+        raise BadEffect(f"no stage is called {form.stage!r}", place=where, fix=f"Give one of {', '.join(STAGES)}.")
     if not isinstance(form.parameters, tuple) or not all(isinstance(p, Parameter) for p in form.parameters):
-        mend = "Give parameters=(Parameter(...),), with a comma before the closing bracket."
-        raise BadEffect("parameters is no tuple of Parameter", place=where, mend=mend)
+        fix = "Give parameters=(Parameter(...),), with a comma before the closing bracket."
+        raise BadEffect("parameters is no tuple of Parameter", place=where, fix=fix)
     names = [parameter.name for parameter in form.parameters]
     if twice := [name for name in names if names.count(name) > 1]:
-        raise BadEffect(f"two parameters are called {twice[0]!r}", place=where, mend="Name each parameter once.")
+        raise BadEffect(f"two parameters are called {twice[0]!r}", place=where, fix="Name each parameter once.")
     for parameter in form.parameters:
         _check_parameter(parameter, where)
     if form.apply is None and not form.law:
-        raise BadEffect("no apply", place=where, mend="Give apply=, a function of (x, p, scene).")
+        raise BadEffect("no apply", place=where, fix="Give apply=, a function of (x, p, scene).")
     if form.apply is not None and form.stage not in ("speed", "branch", "filter"):
         _try_out(form, where, path)
 
@@ -108,21 +108,21 @@ def _check_parameter(parameter: Parameter, where: str) -> None:
     place = f"{where}, parameter {parameter.name!r}"
     if parameter.scale not in SCALES or parameter.relative not in RELATIVE:
         message = f"scale {parameter.scale!r}, relative {parameter.relative!r}"
-        mend = f"scale is one of {', '.join(SCALES)}; relative one of {', '.join(RELATIVE[1:])}, or left out."
-        raise BadEffect(message, place=place, mend=mend)
+        fix = f"scale is one of {', '.join(SCALES)}; relative one of {', '.join(RELATIVE[1:])}, or left out."
+        raise BadEffect(message, place=place, fix=fix)
     try:
         numbers = np.array([parameter.lower, parameter.upper, *parameter.start], float)
     except (TypeError, ValueError) as error:
         message = "a bound or a start that is no number"
-        raise BadEffect(message, place=place, mend="Give lower, upper, neutral, and a tuple of starts.") from error
+        raise BadEffect(message, place=place, fix="Give lower, upper, neutral, and a tuple of starts.") from error
     if not np.isfinite(numbers).all() or not parameter.lower < parameter.upper or numbers.size < 3:
         message = f"bounds {parameter.lower} to {parameter.upper}, starts {parameter.start}"
-        raise BadEffect(message, place=place, mend="Give finite bounds, the lower one first, and at least one start.")
+        raise BadEffect(message, place=place, fix="Give finite bounds, the lower one first, and at least one start.")
     if not ((numbers[2:] >= parameter.lower) & (numbers[2:] <= parameter.upper)).all():
         message = f"a start of {parameter.start} is not within {parameter.lower} and {parameter.upper}"
-        raise BadEffect(message, place=place, mend="Start within the bounds.")
+        raise BadEffect(message, place=place, fix="Start within the bounds.")
     if parameter.scale == "log" and not parameter.lower > 0:
-        raise BadEffect("a logarithmic scale from 0 or below", place=place, mend="Give a lower bound above 0.")
+        raise BadEffect("a logarithmic scale from 0 or below", place=place, fix="Give a lower bound above 0.")
 
 
 def _try_out(form: Form, where: str, path: Path | None) -> None:
@@ -136,6 +136,6 @@ def _try_out(form: Form, where: str, path: Path | None) -> None:
         found = np.asarray(form.call(x if x is None else x[None, :], values, scene), float)
     except Exception as error:
         place = where if path is None else f"{_place(path, error)}, form {form.name!r}"
-        raise BadEffect(f"apply fails: {in_one_line(error)}", place=place, mend=MEND) from error
+        raise BadEffect(f"apply fails: {in_one_line(error)}", place=place, fix=FIX) from error
     if not np.isfinite(found).all():
-        raise BadEffect("apply gives numbers that are none", place=where, mend="Check it at the starting values.")
+        raise BadEffect("apply gives numbers that are none", place=where, fix="Check it at the starting values.")

@@ -1,4 +1,4 @@
-"""Passive torque of the joint: present without stimulation, follows angle and velocity."""
+"""Passive torque of the joint: present without stimulation, depends on angle and velocity."""
 
 from __future__ import annotations
 
@@ -43,7 +43,15 @@ def _two_sided(_: None, p: dict[str, Any], scene: Scene) -> np.ndarray:
 
 
 _STIFF = Parameter(
-    "stiffness_nm_per_rad", "N·m/rad", -3.0, 3.0, 0.0, (0.0, 0.15), "linear", "torque", "elastic part, at the start"
+    "stiffness_nm_per_rad",
+    "N·m/rad",
+    -3.0,
+    3.0,
+    0.0,
+    (0.0, 0.15),
+    "linear",
+    "torque",
+    "elastic part, at the angle of the start",
 )
 
 EFFECT = Effect(
@@ -83,7 +91,7 @@ EFFECT = Effect(
                     (0.0,),
                     "linear",
                     "torque",
-                    "both ends' stiffening",
+                    "stiffening at both ends",
                 ),
                 _VISCOUS,
             ),
@@ -91,10 +99,10 @@ EFFECT = Effect(
             True,
         ),
     ),
-    signature="Torque that follows the movement also where there is no stimulation.",
+    signature="Torque that follows the movement, also without stimulation.",
     resembles=("baseline_drift", "torque_velocity"),
-    separated_by="Passive sweeps without stimulation.",
-    plain="The joint itself resists being moved, stimulation or not: stiffness and, after a stroke, spasticity.",
+    separated_by="Passive movement without stimulation.",
+    plain="The joint resists movement also without stimulation: stiffness and, after a stroke, spasticity.",
     source="De Groote et al. 2016; Riener et al. 1996",
     needs=("angle_rad",),
 )

@@ -1,4 +1,4 @@
-"""Potentiation: the gain grows with use before fatigue sets in."""
+"""Potentiation: the gain grows with use, before fatigue begins."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ EFFECT = Effect(
         Form(name, "gain", equation, (_GAIN, _ONSET, _RECOVERY), _make(name), batched=True)
         for name, equation in (
             ("by_level", "w = (1 + gain·x) f(u); x' = a(1 - x)/onset - (1 - a) x/recovery; a = |f|/f_max"),
-            ("steady_decay", "as by_level, with x' = a(1 - x)/onset - x/recovery"),
-            ("by_pulses", "as by_level, with a = 1 while pulses come"),
+            ("steady_decay", "w = (1 + gain·x) f(u); x' = a(1 - x)/onset - x/recovery; a = |f|/f_max"),
+            ("by_pulses", "as by_level, with a = 1 under pulses of any width, else 0"),
         )
     ),
-    signature="Torque below the model early in stimulation, above it late: the opposite of fatigue.",
+    signature="Torque below the model early in the stimulation and above it late: the opposite of fatigue.",
     resembles=("threshold_drift", "fatigue", "baseline_drift"),
-    separated_by="A conditioning train before the ramp, and the ramp again after a rest.",
-    plain="The muscle warms up: after some seconds of work the same pulse gives more torque, and over a minute of rest "
-    "that gain fades. A short conditioning train before training makes the muscle repeatable.",
+    separated_by="The ramp after a conditioning train, and once more after a rest.",
+    plain="The muscle warms up: after some seconds of work the same pulse gives more torque. Within about a minute of "
+    "rest this gain is lost. A short conditioning train before the session makes the response repeatable.",
     source="O'Leary, Hope, Sale 1997: twitch +45 % at 5 s and +28 % at 1 min after 7 s at 100 Hz",
 )

@@ -1,4 +1,4 @@
-"""Hysteresis of recruitment: rising and falling pulse widths recruit differently."""
+"""Hysteresis of recruitment: rising and falling pulse widths give different torques."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ _LEVELS = (0.1, 0.25, 0.4, 0.55, 0.7, 0.85)
 
 
 def _difference(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
-    """Two curves whose difference is free at six levels of torque: units that join and leave each at its own width."""
+    """Two curves whose difference is free at six levels of torque."""
     width = np.broadcast_to(scene.pulse_width_us, drive.shape)
     z = dahl(np.ascontiguousarray(width), p["reach_us"][:, 0])
     level = drive / scene.scale_nm
@@ -57,8 +57,10 @@ def _difference(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarra
     return drive - z * gap
 
 
-_HALF = Parameter("half_width_us", "µs", 0.0, 45.0, 0.0, (8.0, 20.0), about="half the distance of the two curves")
-_REACH = Parameter("reach_us", "µs", 1.0, 80.0, 10.0, (4.0, 25.0), "log", about="change of width that turns it over")
+_HALF = Parameter("half_width_us", "µs", 0.0, 45.0, 0.0, (8.0, 20.0), about="half the distance between the two curves")
+_REACH = Parameter(
+    "reach_us", "µs", 1.0, 80.0, 10.0, (4.0, 25.0), "log", about="change of width after which the other curve holds"
+)
 
 EFFECT = Effect(
     id="recruitment_hysteresis",
@@ -83,14 +85,14 @@ EFFECT = Effect(
         Form(
             "distributed",
             "pulse_width",
-            "w = f(u + share (mean of five play operators, r up to half_width, - u))",
+            "w = f(u + share (p - u)), p: mean of five play operators with r up to half_width",
             (
-                Parameter("share", "1", 0.0, 1.6, 0.0, (0.4, 0.9), about="share of the units that remember"),
+                Parameter("share", "1", 0.0, 1.6, 0.0, (0.4, 0.9), about="share of motor units with hysteresis"),
                 Parameter("half_width_us", "µs", 3.0, 150.0, 20.0, (50.0, 15.0), "log", about="widest play"),
             ),
             _distributed,
             True,
-            source="Prandtl and Ishlinskii; Preisach's plane with units spread evenly",
+            source="Prandtl and Ishlinskii; Preisach's plane with an even distribution",
         ),
         Form(
             "memory",
@@ -118,7 +120,7 @@ EFFECT = Effect(
         Form(
             "difference",
             "gain",
-            "w = f(u) - z·gap(f), gap linear between six levels of torque; dz = (du - z|du|)/reach",
+            "w = f(u) - z·gap(f), gap: linear between six levels of torque; dz = (du - z|du|)/reach",
             (
                 *(
                     Parameter(f"gap_{i}_nm", "N·m", -0.2, 0.2, 0.0, (0.02,), "linear", "torque", f"at {level:.0%}")
@@ -139,11 +141,11 @@ EFFECT = Effect(
             True,
         ),
     ),
-    signature="Torque below the model while the pulse width rises, above it while it falls, at equal widths.",
+    signature="At equal pulse widths: torque below the model while the width rises, above it while it falls.",
     resembles=("voluntary_effort", "threshold_drift", "fatigue", "asymmetric_relaxation"),
-    separated_by="The ramp twice, at two speeds: hysteresis is the same at both, a slow muscle or fatigue is not.",
-    plain="The muscle answers differently to the same pulse on the way up and on the way down. The controller needs to "
-    "know where it comes from, or it will be off by the distance of two curves.",
-    source="Two curves, one a direction, come out of a ramp's deconvolution: Durfee, MacLean 1989",
+    separated_by="Two ramps of different speed: hysteresis is equal in both; a slow muscle or fatigue is not.",
+    plain="The same pulse width gives different torques when it rises and when it falls. Without this in the model, "
+    "the controller's error is the distance between the two curves.",
+    source="Durfee, MacLean 1989: deconvolution of a ramp gives one curve for each direction",
     prior=-2.5,
 )

@@ -1,4 +1,4 @@
-"""The load cell or its amplifier reaches the end of its range."""
+"""Clipping: the load cell or its amplifier reaches the end of its range."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from identify.effects.base import Effect, Form, Parameter, Scene
 
 
 def _clipped(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
-    """Mean of min(y + noise, ceiling): near the ceiling only the noise's upper half is cut."""
+    """Mean of min(y + noise, ceiling): near the ceiling only positive noise is cut off."""
     ceiling, sd = p["ceiling_nm"], max(scene.noise_sd_nm, 1e-6)
     with np.errstate(invalid="ignore"):
         over = (y - ceiling) / sd
@@ -28,7 +28,7 @@ def _both(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
     return _floored(_clipped(y, p, scene), p, scene)
 
 
-def _seen(raw: Any) -> tuple[str, dict[str, float]] | None:
+def _detect(raw: Any) -> tuple[str, dict[str, float]] | None:
     levels = {"ceiling": raw.ceiling_nm, "floor": raw.floor_nm}
     found = {name: value for name, value in levels.items() if value is not None}
     if not found:
@@ -36,8 +36,12 @@ def _seen(raw: Any) -> tuple[str, dict[str, float]] | None:
     return "both" if len(found) == 2 else next(iter(found)), {f"{name}_nm": value for name, value in found.items()}
 
 
-_CEILING = Parameter("ceiling_nm", "N·m", -1.5, 1.5, np.inf, (0.9,), "linear", "level", "largest torque shown")
-_FLOOR = Parameter("floor_nm", "N·m", -1.5, 1.5, -np.inf, (-0.5,), "linear", "level", "smallest torque shown")
+_CEILING = Parameter(
+    "ceiling_nm", "N·m", -1.5, 1.5, np.inf, (0.9,), "linear", "level", "largest torque that the sensor shows"
+)
+_FLOOR = Parameter(
+    "floor_nm", "N·m", -1.5, 1.5, -np.inf, (-0.5,), "linear", "level", "smallest torque that the sensor shows"
+)
 
 EFFECT = Effect(
     id="sensor_clipping",
@@ -47,11 +51,13 @@ EFFECT = Effect(
         Form("floor", "sensor", "max(y + noise, floor)", (_FLOOR,), _floored, True),
         Form("both", "sensor", "min(max(y + noise, floor), ceiling)", (_CEILING, _FLOOR), _both, True),
     ),
-    signature="Flat tops: many samples at exactly the same greatest value.",
+    signature="Flat peaks: many samples have exactly the same largest (or smallest) value.",
     resembles=("output_saturation",),
-    separated_by="A lower gain of the amplifier; the count of equal greatest values.",
-    plain="The measurement hits its ceiling: the muscle gives more than the cell shows. Lower the gain or the charge.",
+    separated_by="The same test with a lower amplifier gain: clipping then disappears, saturation of the muscle "
+    "remains.",
+    plain="The measurement reaches the end of its range: the muscle gives more torque than the load cell shows. "
+    "Reduce the amplifier's gain, or the charge.",
     source="Range of the analogue-to-digital converter",
     raw=True,
-    seen=_seen,
+    detect=_detect,
 )

@@ -1,4 +1,4 @@
-"""A spring in series: tendon, strap or fixture add a resonance between muscle and load cell."""
+"""Compliance in series: tendon, strap or fixture add a resonance between muscle and load cell."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ _RESTARTS = tuple(
     for hz, t in ((1.6, 0.1), (3.0, 0.15))
 )
 _RESONANCE = (
-    Parameter("resonance_hz", "Hz", 1.2, 16.0, np.inf, (3.0, 6.0, 10.0), "log", about="of the series spring"),
-    Parameter("damping", "1", 0.02, 0.7, 0.2, (0.15,), "log", about="of the resonance, 1 is critical"),
+    Parameter("resonance_hz", "Hz", 1.2, 16.0, np.inf, (3.0, 6.0, 10.0), "log", about="resonance of the series spring"),
+    Parameter("damping", "1", 0.02, 0.7, 0.2, (0.15,), "log", about="damping of the resonance, 1 is critical"),
 )
 
 
 def _steps(frequency_hz: float, damping: float, step_s: float) -> tuple[np.ndarray, np.ndarray]:
-    """Exact transition of z'' = ω²(x - z) - 2ζω z' for x a cubic between states (x, x') at both ends."""
+    """Exact transition of z'' = ω²(x - z) - 2ζω z', where x is the cubic between the states (x, x') at both ends."""
     omega = 2 * np.pi * frequency_hz * step_s
     system = np.zeros((6, 6))
     system[0, 1] = 1.0
@@ -52,7 +52,7 @@ def _partly(x: tuple[np.ndarray, np.ndarray], p: dict[str, Any], scene: Scene) -
 
 
 def _inertia(x: tuple[np.ndarray, np.ndarray], p: dict[str, Any], scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """The cell bears the mass as well: what its acceleration takes is missing from the reading."""
+    """The load cell also carries the mass: the torque that accelerates it is missing from the reading."""
     (y, y_rate), share = x, p["share"]
     z, z_rate = _series(x, p, scene)
     if z is y:
@@ -93,10 +93,10 @@ EFFECT = Effect(
         Form(
             "inertia",
             "filter",
-            "y - share·z''/ω², z as in series: the cell feels the mass's acceleration",
+            "y - share·z''/ω², z as in series: the load cell also carries the mass",
             (
                 *_RESONANCE,
-                Parameter("share", "1", 0.0, 1.5, 0.0, (0.5,), about="share of the mass that the cell bears"),
+                Parameter("share", "1", 0.0, 1.5, 0.0, (0.5,), about="share of the mass that the load cell carries"),
             ),
             _inertia,
             True,
@@ -127,9 +127,10 @@ EFFECT = Effect(
             grows=True,
         ),
     ),
-    signature="Ringing after every step.",
+    signature="The torque oscillates after every step.",
     resembles=("electromechanical_delay",),
-    separated_by="Steps, sampled fast.",
-    plain="Strap, tendon or fixture give like a spring: torque rings after every step. Fasten limb and cell.",
-    source="An extra resonance in series with the muscle",
+    separated_by="Steps, at a high sampling rate.",
+    plain="Strap, tendon or fixture act as a spring: the torque oscillates after every step. Fasten the limb and the "
+    "load cell more firmly.",
+    source="A resonance in series with the muscle",
 )

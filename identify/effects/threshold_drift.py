@@ -17,14 +17,14 @@ def _linear(width: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
     return _moved(width, p["slope_us_per_s"] * scene.time_s)
 
 
-def _settled(p: dict[str, Any], scene: Scene) -> np.ndarray:
-    """1 - exp(-t/time_constant), less its value at the reference time: else it only relabels the curve."""
+def _exponential(p: dict[str, Any], scene: Scene) -> np.ndarray:
+    """1 - exp(-t/time_constant), minus its value at the reference time, at which the recruitment curve holds."""
     tau = p["time_constant_s"]
     return np.exp(-scene.reference_s / tau) - np.exp(-scene.time_s / tau)
 
 
 def _settling(width: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
-    return _moved(width, p["shift_us"] * _settled(p, scene))
+    return _moved(width, p["shift_us"] * _exponential(p, scene))
 
 
 def _scaling(width: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
@@ -32,7 +32,7 @@ def _scaling(width: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
 
 
 def _fading(width: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
-    return width * (1.0 - p["share"] * _settled(p, scene))
+    return width * (1.0 - p["share"] * _exponential(p, scene))
 
 
 def _charge(width: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
@@ -40,7 +40,7 @@ def _charge(width: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
     return _moved(width, p["slope_us_per_s"] * used)
 
 
-_SLOPE = Parameter("slope_us_per_s", "µs/s", -4.0, 4.0, 0.0, (0.5, -0.5), about="shift of the threshold in a second")
+_SLOPE = Parameter("slope_us_per_s", "µs/s", -4.0, 4.0, 0.0, (0.5, -0.5), about="shift of the threshold per second")
 
 EFFECT = Effect(
     id="threshold_drift",
@@ -50,10 +50,11 @@ EFFECT = Effect(
         Form(
             "settling",
             "pulse_width",
-            "w = f(u - shift (exp(-t_ref/time_constant) - exp(-t/time_constant))) where u > 0; t_ref mid-ramp",
+            "w = f(u - shift (exp(-t_ref/time_constant) - exp(-t/time_constant))) where u > 0; t_ref: middle of the "
+            "ramp",
             (
                 Parameter("shift_us", "µs", -80.0, 80.0, 0.0, (15.0, -15.0), about="final shift"),
-                Parameter("time_constant_s", "s", 5.0, 90.0, 15.0, (10.0,), "log", about="how fast it settles"),
+                Parameter("time_constant_s", "s", 5.0, 90.0, 15.0, (10.0,), "log", about="time constant of the shift"),
             ),
             _settling,
             True,
@@ -62,7 +63,11 @@ EFFECT = Effect(
             "scaling",
             "pulse_width",
             "w = f(u (1 - slope·t))",
-            (Parameter("slope_per_s", "1/s", -0.02, 0.02, 0.0, (0.003, -0.003), about="share lost in a second"),),
+            (
+                Parameter(
+                    "slope_per_s", "1/s", -0.02, 0.02, 0.0, (0.003, -0.003), about="share of the width lost per second"
+                ),
+            ),
             _scaling,
             True,
         ),
@@ -71,8 +76,8 @@ EFFECT = Effect(
             "pulse_width",
             "w = f(u (1 - share (exp(-t_ref/time_constant) - exp(-t/time_constant))))",
             (
-                Parameter("share", "1", -0.7, 0.7, 0.0, (0.1, -0.1), about="share lost in the end"),
-                Parameter("time_constant_s", "s", 5.0, 90.0, 15.0, (12.0,), "log", about="how fast it settles"),
+                Parameter("share", "1", -0.7, 0.7, 0.0, (0.1, -0.1), about="share of the width lost in the end"),
+                Parameter("time_constant_s", "s", 5.0, 90.0, 15.0, (12.0,), "log", about="time constant of the shift"),
             ),
             _fading,
             True,
@@ -87,11 +92,12 @@ EFFECT = Effect(
             True,
         ),
     ),
-    signature="The curve moves along the pulse width: torque errs where the curve is steep, and more so later.",
+    signature="The recruitment curve moves along the pulse width: the error is large where it is steep, and grows "
+    "with time.",
     resembles=("fatigue", "potentiation", "voluntary_effort", "recruitment_hysteresis"),
-    separated_by="Repeat the ramp at the end; log the electrodes' impedance.",
-    plain="The pulse width at which the muscle begins to answer moves during the session, as gel dries, skin warms or "
-    "an electrode shifts. Strong pulses look unchanged, weak ones are lost. Check the electrodes.",
+    separated_by="The ramp repeated at the end; the impedance of the electrodes.",
+    plain="The pulse width at which the muscle begins to respond changes during the session: the gel dries, the skin "
+    "warms, or an electrode moves. Weak pulses change most, strong ones hardly. Check the electrodes.",
     source="Electrode and skin impedance; no single source, see docs/diagnosis.md",
     prior=-2.5,
 )

@@ -1,4 +1,4 @@
-"""Active torque depends on the joint's angle."""
+"""Dependence of the active torque on the joint's angle."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ KNOTS = 8
 
 
 def _curve(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
-    """Linear between knots over the angles that were met."""
+    """Linear between knots over the recorded angles."""
     assert scene.angle_rad is not None
     low, high = float(scene.angle_rad.min()), float(scene.angle_rad.max())
     place = (scene.angle_rad - low) / max(high - low, 1e-6) * (KNOTS - 1)
@@ -54,7 +54,9 @@ EFFECT = Effect(
             "output",
             "y (1 + slope·Δ + bend·Δ²), Δ = angle - angle at the start",
             (
-                Parameter("slope_per_rad", "1/rad", -4.0, 4.0, 0.0, (0.3, -0.3), about="at the angle of the start"),
+                Parameter(
+                    "slope_per_rad", "1/rad", -4.0, 4.0, 0.0, (0.3, -0.3), about="slope at the angle of the start"
+                ),
                 Parameter("bend_per_rad2", "1/rad²", -6.0, 6.0, 0.0, (0.0,), about="curvature"),
             ),
             _parabola,
@@ -66,9 +68,11 @@ EFFECT = Effect(
             "output",
             "y (1 + slope·Δ + bend·Δ² + twist·Δ³)",
             (
-                Parameter("slope_per_rad", "1/rad", -4.0, 4.0, 0.0, (0.3, -0.3), about="at the angle of the start"),
+                Parameter(
+                    "slope_per_rad", "1/rad", -4.0, 4.0, 0.0, (0.3, -0.3), about="slope at the angle of the start"
+                ),
                 Parameter("bend_per_rad2", "1/rad²", -6.0, 6.0, 0.0, (0.0,), about="curvature"),
-                Parameter("twist_per_rad3", "1/rad³", -12.0, 12.0, 0.0, (0.0,), about="one end against the other"),
+                Parameter("twist_per_rad3", "1/rad³", -12.0, 12.0, 0.0, (0.0,), about="third-order part"),
             ),
             _cubic,
             True,
@@ -78,8 +82,10 @@ EFFECT = Effect(
             "output",
             "y exp(-sharpness ((Δ - best)² - best²))",
             (
-                Parameter("sharpness_per_rad2", "1/rad²", 0.0, 8.0, 0.0, (0.5,), about="of the length-tension curve"),
-                Parameter("best_rad", "rad", -1.5, 1.5, 0.0, (0.5, -0.5), about="optimal angle, from the start's"),
+                Parameter(
+                    "sharpness_per_rad2", "1/rad²", 0.0, 8.0, 0.0, (0.5,), about="sharpness of the length-tension curve"
+                ),
+                Parameter("best_rad", "rad", -1.5, 1.5, 0.0, (0.5, -0.5), about="optimal angle, relative to the start"),
             ),
             _bell,
             True,
@@ -88,9 +94,9 @@ EFFECT = Effect(
         Form(
             "curve",
             "output",
-            "y (1 + c(angle)), c linear between eight knots: whatever muscle length and moment arm make together",
+            "y (1 + c(angle)), c: linear between eight knots, for muscle length and moment arm together",
             tuple(
-                Parameter(f"gain_{i}", "1", -0.8, 0.8, 0.0, (0.0,), about="share of torque more at a knot")
+                Parameter(f"gain_{i}", "1", -0.8, 0.8, 0.0, (0.0,), about="additional share of torque at a knot")
                 for i in range(KNOTS)
             ),
             _curve,
@@ -100,20 +106,22 @@ EFFECT = Effect(
         Form(
             "drive",
             "gain",
-            "w = f(u) (1 + slope·Δ + bend·Δ²): the muscle's force, before the dynamics",
+            "w = f(u) (1 + slope·Δ + bend·Δ²): acts on the force, before the dynamics",
             (
-                Parameter("slope_per_rad", "1/rad", -4.0, 4.0, 0.0, (0.3, -0.3), about="at the angle of the start"),
+                Parameter(
+                    "slope_per_rad", "1/rad", -4.0, 4.0, 0.0, (0.3, -0.3), about="slope at the angle of the start"
+                ),
                 Parameter("bend_per_rad2", "1/rad²", -6.0, 6.0, 0.0, (0.0,), about="curvature"),
             ),
             _parabola,
             True,
         ),
     ),
-    signature="The error follows the measured angle, and only under stimulation.",
+    signature="The error follows the measured angle, but only under stimulation.",
     resembles=("torque_velocity", "fatigue"),
     separated_by="Isometric tests at three angles.",
-    plain="The muscle is stronger at some elbow angles than at others. A controller that knows the angle can allow "
-    "for it; a test at one angle can't show it.",
+    plain="The muscle is stronger at some elbow angles than at others. A controller that knows the angle can correct "
+    "for it. A test at a single angle cannot show it.",
     source="Marion et al. 2010; Thelen 2003",
     needs=("angle_rad",),
 )

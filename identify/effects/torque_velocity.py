@@ -1,4 +1,4 @@
-"""Active torque depends on the joint's velocity."""
+"""Dependence of the active torque on the joint's velocity."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def _linear(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
 
 
 def _hill(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
-    """Hill's hyperbola on the shortening side, its mirror to a plateau on the other."""
+    """Hill's hyperbola for shortening, continued to a plateau for lengthening."""
     assert scene.velocity_rad_s is not None
     v = p["slope_s_per_rad"] * scene.velocity_rad_s
     shape = p["shape"]
@@ -36,7 +36,7 @@ def _marion(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
 
 
 def _bell(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
-    """The same as a share of the torque, the slope being that at the angle where it is most."""
+    """As `_marion`, but as a share of the torque; the slope is the largest one over all angles."""
     assert scene.angle_rad is not None and scene.velocity_rad_s is not None
     place = p["decay_per_rad"] * np.abs(scene.angle_rad)
     share = p["slope_s_per_rad"] * place * np.exp(1.0 - place) * scene.velocity_rad_s
@@ -51,11 +51,13 @@ EFFECT = Effect(
         Form(
             "hill",
             "output",
-            "y (1 - v)/(1 + v/shape) shortening; to `top` lengthening; v = slope·velocity",
+            "y (1 - v)/(1 + v/shape) for shortening, up to `top`·y for lengthening; v = slope·velocity",
             (
                 _SIDE,
                 Parameter("shape", "1", 0.1, 2.0, 0.25, (0.25,), "log", about="Hill's a/F0"),
-                Parameter("top", "1", 1.05, 1.9, 1.4, (1.4,), about="greatest torque when lengthened, over isometric"),
+                Parameter(
+                    "top", "1", 1.05, 1.9, 1.4, (1.4,), about="largest torque when lengthening, divided by isometric"
+                ),
             ),
             _hill,
             True,
@@ -83,11 +85,11 @@ EFFECT = Effect(
             source="Marion, Wexler, Hull: V1 θ exp(-V2 θ) θ', as a share of the torque",
         ),
     ),
-    signature="The error follows the measured velocity, and only under stimulation.",
+    signature="The error follows the measured velocity, but only under stimulation.",
     resembles=("torque_angle", "passive_torque"),
     separated_by="The same movement with stimulation and without.",
-    plain="A muscle that shortens quickly pulls less, one that is stretched pulls more. In a held limb it makes no "
-    "difference.",
+    plain="A muscle that shortens quickly gives less torque; one that is stretched gives more. It does not matter "
+    "while the limb is held still.",
     source="Hill 1938; Marion et al. 2010; De Groote et al. 2016",
     needs=("velocity_rad_s",),
 )

@@ -11,7 +11,7 @@ from identify.effects.base import Effect, Form, Parameter, Scene
 
 LOWEST_HZ, HIGHEST_HZ = 2.6, 14.0
 KNOTS = (1, 8, 20, 45, 90, 180)
-"""Numbers of times between which the amplitudes run straight."""
+"""Number of times between which the amplitudes are linear, for each form."""
 
 
 def _wave(knots: int) -> Callable[..., np.ndarray]:
@@ -49,11 +49,11 @@ EFFECT = Effect(
     id="tremor",
     name="Tremor",
     forms=tuple(_form(knots) for knots in KNOTS),
-    signature="A line or narrow hump in the residual's spectrum between 3 and 14 Hz, in rests as well.",
+    signature="A line or a narrow peak in the residual's spectrum between 3 and 14 Hz, also at rest.",
     resembles=(),
-    separated_by="The spectrum at rest.",
-    plain="The limb trembles. It adds to the torque but isn't caused by the pulses, and can't be predicted from them.",
-    source="Narrow band near 5 Hz (pathological), 8 to 12 Hz (physiological)",
-    foreseeable=False,
+    separated_by="The spectrum of a rest.",
+    plain="The limb trembles. This adds to the torque, but the pulses do not cause it, so it cannot be predicted.",
+    source="Narrow band near 5 Hz (pathological) or from 8 to 12 Hz (physiological)",
+    predictable=False,
     band=True,
 )

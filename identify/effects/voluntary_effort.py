@@ -1,4 +1,4 @@
-"""Voluntary effort or spasm: torque that has nothing to do with the stimulation."""
+"""Voluntary effort or spasm: torque that does not depend on the stimulation."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from identify.effects.base import Effect, Form, Parameter, Scene
 from identify.effects.kernels import bumps
 
 MOST = 6
-"""Bumps at most: with more, they imitate anything."""
+"""Largest number of bumps: more of them could imitate any error."""
 
 
 _PARTS = (("centre", "s"), ("width", "s"), ("height", "nm"))
@@ -29,7 +29,7 @@ def _bumps(count: int) -> Callable[..., np.ndarray]:
 
 def _propose(count: int, sign: float) -> Callable[..., list[dict[str, float]]]:
     def propose(residual_nm: np.ndarray, scene: Scene, previous: dict[str, float]) -> list[dict[str, float]]:
-        """The bump that best matches the residual, at each of a few widths."""
+        """The two bumps that match the residual best, among a few widths."""
         known = np.isfinite(residual_nm)
         value = sign * np.where(known, residual_nm, 0.0)
         found = []
@@ -76,7 +76,7 @@ def _spasms(count: int) -> Callable[..., np.ndarray]:
 
 def _propose_spasm(count: int) -> Callable[..., list[dict[str, float]]]:
     def propose(residual_nm: np.ndarray, scene: Scene, previous: dict[str, float]) -> list[dict[str, float]]:
-        """The burst that best matches the residual, at each of a few decays."""
+        """The burst that matches the residual best, among a few decay times."""
         known = np.isfinite(residual_nm)
         value = np.where(known, residual_nm, 0.0)
         found = []
@@ -100,19 +100,19 @@ def _propose_spasm(count: int) -> Callable[..., list[dict[str, float]]]:
 
 
 def _spasm_parameters(count: int) -> tuple[Parameter, ...]:
-    listed = [Parameter("rise_s", "s", 0.02, 0.14, 0.07, (0.07,), "log", about="how quickly they burst")]
+    listed = [Parameter("rise_s", "s", 0.02, 0.14, 0.07, (0.07,), "log", about="time constant of the rise")]
     for i in range(count):
         listed += [
-            Parameter(f"centre_{i}_s", "s", 0.0, 1.0, 0.0, (0.5,), relative="span", about="begin"),
-            Parameter(f"decay_{i}_s", "s", 0.15, 3.0, 0.6, (0.6,), "log", about="how slowly it lets go"),
+            Parameter(f"centre_{i}_s", "s", 0.0, 1.0, 0.0, (0.5,), relative="span", about="start"),
+            Parameter(f"decay_{i}_s", "s", 0.15, 3.0, 0.6, (0.6,), "log", about="time constant of the decay"),
             Parameter(f"height_{i}_nm", "N·m", 0.0, 0.9, 0.0, (0.1,), relative="torque", about="peak torque"),
         ]
     return tuple(listed)
 
 
-def _seen(count: int) -> Callable[[dict[str, float], Scene], bool]:
+def _in_fitted_rows(count: int) -> Callable[[dict[str, float], Scene], bool]:
     def accept(p: dict[str, float], scene: Scene) -> bool:
-        """A bump is seen where it stands: not in rows left out, where it would only mend what lies beside them."""
+        """Accept bumps in fitted rows only. In other rows a bump could only repair errors in the rows beside them."""
         if scene.fitted is None:
             return True
         at = np.array([p[f"centre_{i}_s"] for i in range(count)])
@@ -124,7 +124,7 @@ def _seen(count: int) -> Callable[[dict[str, float], Scene], bool]:
 
 def _parameters(count: int, sign: float) -> tuple[Parameter, ...]:
     low, high = (0.0, 0.9) if sign > 0 else (-0.9, 0.0)
-    listed = [Parameter("flatness", "1", 1.6, 6.0, 2.0, (2.0,), "log", about="2 is a Gaussian, more is flatter")]
+    listed = [Parameter("flatness", "1", 1.6, 6.0, 2.0, (2.0,), "log", about="2: Gaussian; larger: flatter")]
     for i in range(count):
         listed += [
             Parameter(f"centre_{i}_s", "s", 0.0, 1.0, 0.0, (0.5,), relative="span", about="middle"),
@@ -141,37 +141,37 @@ EFFECT = Effect(
         Form(
             f"{name}_{count}",
             "additive",
-            f"y + Σ height·exp(-|t - centre|^flatness/(2 width^flatness)), {count} of them, {words}",
+            f"y + Σ height·exp(-|t - centre|^flatness/(2 width^flatness)), {count} bumps, {words}",
             _parameters(count, sign),
             _bumps(count),
             batched=True,
             propose=_propose(count, sign),
-            accept=_seen(count),
+            accept=_in_fitted_rows(count),
             grows=count > 1,
         )
-        for name, words, sign in (("bumps", "helping", 1.0), ("resisting", "resisting", -1.0))
+        for name, words, sign in (("bumps", "in the direction of pull", 1.0), ("resisting", "against it", -1.0))
         for count in range(1, MOST + 1)
     )
     + tuple(
         Form(
             f"spasms_{count}",
             "additive",
-            f"y + Σ height·(exp(-t/decay) - exp(-t/rise)), t since its begin, {count} of them",
+            f"y + Σ height·(exp(-t/decay) - exp(-t/rise)), t since its start, {count} bursts",
             _spasm_parameters(count),
             _spasms(count),
             batched=True,
             propose=_propose_spasm(count),
-            accept=_seen(count),
+            accept=_in_fitted_rows(count),
             grows=count > 1,
         )
         for count in range(1, MOST + 1)
     ),
-    signature="Isolated bumps, in rests as well, at times that have nothing to do with the stimulation.",
+    signature="Single bumps of torque, also at rest, at times that do not depend on the stimulation.",
     resembles=("threshold_drift", "recruitment_hysteresis", "catch_like", "baseline_drift"),
-    separated_by="A sham trial without stimulation; EMG; the instruction to relax.",
-    plain="The participant helped, resisted, or had a spasm. No model of the muscle can predict it. Repeat the test "
-    "with the instruction to relax, and leave these stretches out.",
-    source="Additive torque unrelated to the stimulation",
-    foreseeable=False,
+    separated_by="A test without stimulation; EMG; the instruction to relax.",
+    plain="The participant helped, resisted, or had a spasm. No model of the muscle can predict this. Repeat the test "
+    "with the instruction to relax, or leave these parts out.",
+    source="Additive torque that does not depend on the stimulation",
+    predictable=False,
     prior=-5.0,
 )

@@ -1,4 +1,4 @@
-"""Held-out figures for a record without `validate`: blocked cross-validation around the solution."""
+"""Held-out errors of a record without `validate`: blocked cross-validation around the solution."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ FOLDS = 5
 
 
 def held_out_change(fitted: Fitted) -> np.ndarray:
-    """By how much each fitted row's block mean changes when its fold isn't fitted, N·m, shape (K,).
+    """Change of the predicted torque in each fitted interval when its fold is left out of the fit, N·m, shape (K,).
 
-    Blocks of 2 s go to five folds in turn. The refit without a fold is one Gauss-Newton step from the solution, under
-    the noise that the solution was found under: exact in all that is linear (recruitment, baseline), first order in the
-    rest. The state in which the record begins is kept: without its first seconds nobody would predict it backwards.
-    What comes of it is an error of prediction, as on `validate`: it is not whitened.
+    Blocks of 2 s are assigned to five folds in turn. The refit without a fold is one Gauss-Newton step from the
+    solution, with the same noise: exact for all linear parameters (recruitment, baseline), first order for the others.
+    The initial state of the record is kept, since it could not be found without the first seconds. The resulting error
+    is an error of prediction, as on `validate`; it is not whitened.
     """
     problem = fitted.problem
     setup, grid = problem.setup, problem.setup.grid

@@ -1,4 +1,4 @@
-"""From a fit to a model: figures, tests, covariance, bands, what it holds for."""
+"""From a fit to a model: fit statistics, residual tests, covariance, bands, range of validity."""
 
 from __future__ import annotations
 
@@ -13,24 +13,26 @@ import numpy as np
 from identify.dynamics.linear import Discrete, SecondOrder
 from identify.dynamics.narx import run
 from identify.dynamics.pulse_grid import Grid, runs
-from identify.estimation.figures import figures, white_sd
+from identify.estimation.band_effect import band_as_effect
+from identify.estimation.evaluation import evaluate
+from identify.estimation.fit_statistics import fit_statistics, white_sd
 from identify.estimation.joint import Fitted
 from identify.estimation.quality import quality, valid_for
 from identify.estimation.residual_tests import residual_tests
-from identify.estimation.statistics import statistics
-from identify.estimation.tremor import with_band
 from identify.estimation.uncertainty import bands
 from identify.model import Covariance, Model, Noise
-from identify.noise.ar1 import noise_evidence
+from identify.noise.ar1 import ar1_or_white
 from identify.recruitment.curve import Curve
 from identify.simulation.predict import fingerprint, predict_on
 
 EASED = 0.98
-"""Share of the penalty that is taken away to see what it hides."""
+"""Share of the penalty that is removed to see how far it holds the curve back."""
 
 
-def finish(method_id: str, fitted: Fitted, reasons: Sequence[str] = (), figures: dict[str, Any] | None = None) -> Model:
-    """The model of a fit, with everything that MODEL.json tells.
+def finish(
+    method_id: str, fitted: Fitted, reasons: Sequence[str] = (), statistics: dict[str, Any] | None = None
+) -> Model:
+    """The model of a fit, with all that MODEL.json contains.
 
     Parameters
     ----------
@@ -40,13 +42,13 @@ def finish(method_id: str, fitted: Fitted, reasons: Sequence[str] = (), figures:
         With effects or without.
     reasons : sequence of str
         Why the structure is as it is.
-    figures : dict, optional
-        Where they are known already.
+    statistics : dict, optional
+        The fit statistics, if they are known already.
     """
-    figures = figures or statistics(fitted)
+    statistics = statistics or evaluate(fitted)
     tests = residual_tests(fitted)
     known = fitted.problem.size
-    written = with_band(fitted)
+    written = band_as_effect(fitted)
     problem, values, setup = written.problem, written.physical, written.problem.setup
     covariance = _covariance(written, known)
     torque, rate = setup.sign * values[list(problem.initials)[:2]]
@@ -56,37 +58,39 @@ def finish(method_id: str, fitted: Fitted, reasons: Sequence[str] = (), figures:
         linear=SecondOrder(*(float(value) for value in values[:3])),
         pulse_rate_hz=1.0 / setup.grid.step_s,
         sample_rate_hz=setup.grid.record.sample_rate_hz,
-        baseline_nm=float(setup.unframed(values[problem.baselines.start])),
+        baseline_nm=float(setup.to_record(values[problem.baselines.start])),
         initial=(float(torque), float(rate)),
         covariance=covariance,
         noise=Noise(
-            white_sd_nm=figures["noise_sd_nm"],
+            white_sd_nm=statistics["noise_sd_nm"],
             block_sd_nm=fitted.noise.sd_nm,
             ar1=0.0 if fitted.noise.is_white else fitted.noise.ar1,
         ),
         effects=tuple(_effect(written, index) for index in range(len(problem.chosen))),
-        fit=figures,
+        fit=statistics,
         residual_tests=tests,
         reasons=tuple(reasons),
         extra=_parts(written),
     )
     model = _named(model, setup.grid)
-    model = model.with_(bands=bands(model, _bent(fitted)), valid_for=valid_for(model, setup.grid, setup.fitted))
-    return model.with_(quality=quality(model, setup.grid, setup.fitted, fitted.settled))
+    model = model.with_(
+        bands=bands(model, _unpenalised_change(fitted)), valid_for=valid_for(model, setup.grid, setup.fitted)
+    )
+    return model.with_(quality=quality(model, setup.grid, setup.fitted, fitted.converged))
 
 
 def _parts(fitted: Fitted) -> dict[str, Any]:
-    """Baseline, N·m, torque, N·m, and its rate, N·m/s, wherever the state is open in a record, if more than once."""
+    """Baseline, torque, N·m, and rate, N·m/s, of every initial state, if the record has more than one."""
     problem, setup, values = fitted.problem, fitted.problem.setup, fitted.physical
     if setup.starts.size == 1:
         return {}
     states = setup.sign * values[list(problem.initials)].reshape(-1, 2)
-    baselines = setup.unframed(values[list(problem.baselines)])[setup.grid.part[setup.starts]]
+    baselines = setup.to_record(values[list(problem.baselines)])[setup.grid.part[setup.starts]]
     return {"parts": np.c_[baselines, states].tolist()}
 
 
-def _bent(fitted: Fitted) -> np.ndarray:
-    """How far the recruitment coefficients would go with little of the penalty on bends left, N·m, to first order."""
+def _unpenalised_change(fitted: Fitted) -> np.ndarray:
+    """Change of the recruitment coefficients if most of the penalty were removed, N·m, to first order."""
     problem = fitted.problem
     mean, precision = problem.prior
     at = problem.coefficients
@@ -98,7 +102,7 @@ def _bent(fitted: Fitted) -> np.ndarray:
 
 
 def _named(model: Model, grid: Grid) -> Model:
-    """The model with a name of its own, and where it comes from."""
+    """The model with an id, the date, and the record that it was fitted on."""
     source = grid.record.source
     return model.with_(
         model_id=str(uuid4()),
@@ -113,10 +117,10 @@ def _named(model: Model, grid: Grid) -> Model:
 
 
 def _covariance(fitted: Fitted, known: int) -> Covariance:
-    """Covariance of all parameters that were estimated, in the record's own sign.
+    """Covariance of all estimated parameters, with the record's sign of torque.
 
-    The penalty stands for a prior, so this is the posterior's covariance; bands from it cover the truth as often as
-    they say, averaged over the curve (Nychka 1988).
+    The penalty is a prior, so this is the covariance of the posterior. Averaged over the curve, bands from it contain
+    the truth as often as stated (Nychka 1988).
     """
     problem = fitted.problem
     sign = np.ones(known)
@@ -148,9 +152,10 @@ def _effect(fitted: Fitted, index: int) -> dict[str, Any]:
 
 
 def describe_parameters(fitted: Fitted, index: int) -> dict[str, dict[str, Any]]:
-    """Value, sd and unit of an effect's parameters by name; and the direction of torques where the record's is another.
+    """Value, sd and unit of an effect's parameters by name; with `direction` if the record has the opposite sign.
 
-    An effect's torques count as the muscle pulls, but for what the sensor does, which knows the record's own alone.
+    Torques of an effect are positive in the direction in which the muscle pulls, except those of the sensor, which have
+    the sign of the record.
     """
     chosen = fitted.problem.chosen[index]
     matrix = fitted.covariance()
@@ -172,7 +177,7 @@ def finish_discrete(
     reasons: Sequence[str] = (),
     extra: dict[str, Any] | None = None,
 ) -> Model:
-    """The model of a method that gives a discrete block and a curve, without covariance."""
+    """The model of a method that gives a discrete block and a curve, but no covariance."""
     if extra and "narx" in extra:
         response = run(extra["narx"], grid.held(grid.pulse_width_us))
     else:
@@ -180,7 +185,7 @@ def finish_discrete(
     residual = np.nan_to_num(grid.torque_nm) - np.nan_to_num(response, nan=1e6, posinf=1e6, neginf=-1e6)
     baseline = float(np.mean(residual[rows]))
     free = curve.basis.size + len(block.a) + len(block.b)
-    ar1, delta_bic = noise_evidence(residual - baseline, runs(rows))
+    ar1, delta_bic = ar1_or_white(residual - baseline, runs(rows))
     spread = float(np.sum((residual - baseline)[rows] ** 2)) / max(int(rows.sum()) - free, 1)
     model = Model(
         method=method_id,
@@ -197,13 +202,13 @@ def finish_discrete(
 
 
 def completed(model: Model, grid: Grid, rows: np.ndarray, freedom: float) -> Model:
-    """A model without covariance, with its figures, its name, and what it holds for."""
+    """Complete a model without covariance: fit statistics, id, range of validity and quality."""
     model = _named(model, grid)
     predicted = predict_on(model, grid)
     noise = white_sd(grid, predicted, model.noise.block_sd_nm, freedom, model.noise.ar1 == 0.0)
     model = model.with_(
         noise=replace(model.noise, white_sd_nm=noise),
-        fit=figures(grid, rows, predicted, noise),
+        fit=fit_statistics(grid, rows, predicted, noise),
         valid_for=valid_for(model, grid, rows),
     )
     return model.with_(quality=quality(model, grid, rows))

@@ -1,4 +1,4 @@
-"""Products of few long rows, compiled."""
+"""Products of a few long rows, compiled."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from numba import njit
 
 @njit(cache=True, nogil=True, fastmath=True)
 def gram(rows):  # pragma: no cover
-    """rows @ rows.T for few long rows, on one core: a library's threads cost more than they give here."""
+    """rows @ rows.T for a few long rows, on one core: the threads of a library cost more time than they save here."""
     count, size = rows.shape
     out = np.empty((count, count))
     for i in range(count):

@@ -1,4 +1,4 @@
-"""Maximum a posteriori by Gauss-Newton on whitened residuals, with the noise profiled, and the evidence by Laplace."""
+"""Maximum a posteriori by Gauss-Newton on whitened residuals, with profiled noise, and the log evidence by Laplace."""
 
 from __future__ import annotations
 
@@ -13,33 +13,33 @@ from identify.noise.level import NoiseLevel, profile, whitened
 from identify.simulation.problem import Problem
 
 OPTIMISM = 3.0
-"""Times what a parabola promises that a losing run is credited with before it is given up."""
+"""A run is stopped only if it stays below the floor even with this many times the gain that a parabola predicts."""
 
 
 @dataclass(frozen=True)
 class Fitted:
-    """A candidate at its most probable parameters.
+    """A problem solved: its most probable parameters, and what follows from them.
 
     Parameters
     ----------
     problem : Problem
-        Stages and parameters.
+        The model's stages and parameters.
     theta : ndarray, shape (P,)
-        On the scale of variation.
+        Parameters, on the scale on which they are varied.
     noise : NoiseLevel
-        Profiled.
+        The most likely noise.
     log_likelihood : float
         At the optimum.
     log_evidence : float
-        Laplace's approximation with the priors of `Problem.prior`.
+        By Laplace's approximation, with the prior `Problem.prior`.
     residual_nm : ndarray, shape (K,)
-        Target minus prediction, all intervals.
+        Target minus prediction in all intervals, N·m.
     slopes : ndarray, shape (P, K)
         Derivatives of the interval means by the parameters.
     hessian : ndarray, shape (P, P)
         Of minus the log posterior.
-    settled : bool
-        Whether the search ended because nothing more was to be gained.
+    converged : bool
+        Whether the iteration ended because there was no further gain.
     """
 
     problem: Problem
@@ -50,11 +50,11 @@ class Fitted:
     residual_nm: np.ndarray
     slopes: np.ndarray
     hessian: np.ndarray
-    settled: bool = True
+    converged: bool = True
 
     @property
     def freedom(self) -> float:
-        """Effective number of parameters: those that the rows, not the priors, decide."""
+        """Effective number of parameters: those that the data determine, not the prior."""
         precision = self.problem.prior[1]
         scale = 1.0 / np.sqrt(np.maximum(np.diag(self.hessian), 1e-300))
         scaled = self.hessian * scale[:, None] * scale[None, :] + 1e-12 * np.eye(scale.size)
@@ -73,7 +73,7 @@ class Fitted:
 
     @property
     def rms_nm(self) -> float:
-        """Of the fitted intervals' residual, N·m."""
+        """Root mean square of the residual in the fitted intervals, N·m."""
         return float(np.sqrt(np.mean(self.residual_nm[self.problem.setup.fitted] ** 2)))
 
     def parameters_of(self, effect: str) -> dict[str, float]:
@@ -114,28 +114,28 @@ def solve(
     tolerance: float = 0.02,
     floor: float | None = None,
 ) -> Fitted:
-    """Most probable parameters, from a start.
+    """Find the most probable parameters, from a start.
 
     Parameters
     ----------
     problem : Problem
-        The candidate.
+        What is solved.
     theta : ndarray, shape (P,)
-        Start, on the scale of variation.
+        Start, on the scale on which parameters are varied.
     noise : NoiseLevel
         Start of the noise.
     most : int
-        Steps at most.
+        Largest number of steps.
     tolerance : float
-        Gain in log posterior below which it stops.
+        Stop when the log posterior rises by less.
     floor : float or None
-        Log evidence that is worth having: a run that promises less after its first step is given up.
+        Stop after the first step if this log evidence is out of reach.
     """
     at = _at(problem, np.clip(theta, problem.lower, problem.upper), noise, wide=True)
     assert at is not None
     frozen = np.zeros(problem.size, bool)
     for chosen in problem.chosen:
-        if chosen.form.settled:
+        if chosen.form.fixed:
             frozen[chosen.places.start : chosen.places.stop] = True
     damping, iterations = 1e-3, 0
     prior_mean, precision = problem.prior
@@ -146,12 +146,12 @@ def solve(
         gradient = products[0, 1:] - precision @ (at.theta - prior_mean)
         hessian = products[1:, 1:] + precision
         step, shortened = _step(hessian, gradient, min(damping, 1e-3), at.theta, problem, frozen)
-        # By the whole step, were it the parabola that it looks like: of one shortened the next ones do the rest.
+        # Gain of the whole step if the log posterior were a parabola; later steps do what a shortened one leaves.
         promised = 0.5 * float(gradient @ step) * shortened
-        # An effect's start may be one from which nothing is to be gained at first.
+        # The start of an effect may be a point where the gradient is zero at first.
         if (iterations > 1 or not problem.chosen) and promised < 0.5 * tolerance:
             break
-        # What the first step promises, from a start that may be far off, says little: a sixth of what came, in a trial.
+        # The first step predicts too little from a distant start: in a trial, a sixth of the final gain.
         if floor is not None and iterations > 1:
             reached = at.value - 0.5 * _log_det_ratio(problem, hessian)
             if reached + OPTIMISM * (promised + 1.0) < floor:
@@ -173,13 +173,13 @@ def solve(
         residual_nm=at.residual,
         slopes=at.slopes,
         hessian=hessian,
-        settled=most == 0 or iterations < most,
+        converged=most == 0 or iterations < most,
     )
 
 
 @dataclass(frozen=True)
 class _Point:
-    """Where a run stands: parameters, residual, slopes, noise, log-likelihood, and the log posterior."""
+    """The present point: parameters, residual, slopes, noise, log-likelihood, and log posterior (`value`)."""
 
     theta: np.ndarray
     residual: np.ndarray
@@ -207,7 +207,7 @@ def _advance(
     frozen: np.ndarray,
     step: np.ndarray,
 ) -> tuple[_Point | None, float]:
-    """The next point that is no worse, with the damping to go on with; None where there is none near."""
+    """The next point that is not worse, and the damping to continue with; None if none is found."""
     for attempt in range(6):
         if attempt or damping > 1e-3:
             step, _ = _step(hessian, gradient, damping, at.theta, problem, frozen)
@@ -221,7 +221,7 @@ def _advance(
 def _step(
     hessian: np.ndarray, gradient: np.ndarray, damping: float, theta: np.ndarray, problem: Problem, frozen: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """Damped Newton step, and by what it is shortened; parameters at a bound that want further out stay."""
+    """Damped Newton step, and the factor by which it was shortened. Parameters at a bound do not leave it."""
     stuck = frozen | ((theta <= problem.lower) & (gradient < 0)) | ((theta >= problem.upper) & (gradient > 0))
     free = np.flatnonzero(~stuck)
     scale = np.sqrt(np.diag(hessian)[free])
@@ -232,7 +232,7 @@ def _step(
     if failed:
         raise np.linalg.LinAlgError("the information is not positive definite")
     step[free] = solved / scale
-    # Time constants and damping move by a factor of 2 at most, effects by a third of their range.
+    # The time constant and the damping change by a factor of 2 at most, effects by a third of their range.
     limit = np.full(theta.size, np.inf)
     limit[:2] = 0.7
     for chosen in problem.chosen:
@@ -247,16 +247,16 @@ def _log_det_ratio(problem: Problem, hessian: np.ndarray) -> float:
 
 
 def start_from(problem: Problem, base: Fitted, values: dict[int, dict[str, float]]) -> np.ndarray:
-    """A start for a larger problem: what a smaller one found, and values for the effects it lacks.
+    """A start for a larger problem: the solution of a smaller one, and values for the additional effects.
 
     Parameters
     ----------
     problem : Problem
-        The larger.
+        The larger problem.
     base : Fitted
-        The smaller; its effects come first in `problem.chosen` in the same order, unless given in `values`.
+        Solution of the smaller one. Its effects come first in `problem.chosen`, in the same order.
     values : dict
-        Parameters in their units by index in `problem.chosen`.
+        For each index in `problem.chosen`: parameters by name, in their units.
     """
     theta = np.zeros(problem.size)
     common = problem.coefficients.stop
@@ -277,7 +277,7 @@ def start_from(problem: Problem, base: Fitted, values: dict[int, dict[str, float
 
 
 def linear_start(problem: Problem, theta: np.ndarray, noise: NoiseLevel) -> np.ndarray:
-    """Coefficients and baseline solved for, at given other parameters."""
+    """Solve for coefficients and baseline, with all other parameters given."""
     mean, jacobian = problem.run(theta, derivatives=True)
     assert jacobian is not None
     free = np.arange(problem.baselines.start, problem.coefficients.stop)

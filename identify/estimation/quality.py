@@ -1,4 +1,4 @@
-"""For what a model holds, and whether it may be used: gates, and the one verdict on a model."""
+"""The range in which a model is valid, and its quality: checks, and one verdict."""
 
 from __future__ import annotations
 
@@ -16,16 +16,17 @@ UNDER_CEILING_POINTS = 1.0
 LARGEST_DIP = 0.05
 LEAST_FIT_PERCENT = 30.0
 GOOD_GAP, LARGEST_GAP = 2.0, 8.0
-"""Points of fit below the ceiling on rows not seen: up to the first little is missing, above the second too much."""
+"""Percentage points of fit below the ceiling on held-out rows: above the first something is missing, above the second
+too much."""
 WITHIN_NOISE = 1.3
-"""Error over the noise up to which what is left passes for noise, however little the torque moves beside it."""
-OWN = "its own rows"
+"""If the error is at most this many times the noise, it passes as noise, even if the torque hardly changes."""
+OWN = "the fitted rows"
 NEGLIGIBLE = 5e-4
-"""Share of the torque's range below which it doesn't matter what an error looks like."""
+"""Share of the torque's range below which the kind of an error does not matter."""
 
 
 def valid_for(model: Model, grid: Grid, rows: np.ndarray) -> dict[str, Any]:
-    """Pulse widths, torques and rates that the fitted rows covered."""
+    """Pulse widths, torques and rates of the fitted rows."""
     widths = grid.pulse_width_us[rows]
     largest = float(np.max(widths))
     table = model.recruitment(np.linspace(0.0, largest, 101))
@@ -39,46 +40,46 @@ def valid_for(model: Model, grid: Grid, rows: np.ndarray) -> dict[str, Any]:
     }
 
 
-def check(model: Model, record: Record) -> list[str]:
-    """Warnings where a record leaves what the model holds for; empty where it doesn't.
+def range_warnings(model: Model, record: Record) -> list[str]:
+    """Warnings if a record is outside the model's range of validity; otherwise empty.
 
     Raises
     ------
     BadModel
-        The pulse rate is another: recruitment and dynamics both change with it.
+        The pulse rate differs too much: recruitment and dynamics both change with it.
     """
     refuse_rate(model, record)
     warnings = []
     low, high = model.valid_for.get("pulse_rate_hz", (0.0, np.inf))
     if not low <= record.pulse_rate_hz <= high:
         warnings.append(
-            f"fitted at {model.pulse_rate_hz:g} pulses a second, used at {record.pulse_rate_hz:g}: "
-            "fit again at that rate"
+            f"fitted at {model.pulse_rate_hz:g} pulses/s, but used at {record.pulse_rate_hz:g} pulses/s: "
+            "fit a model at that rate"
         )
     largest = model.valid_for.get("pulse_width_us", (0.0, np.inf))[1]
     beyond = record.pulse_width_us > largest * (1 + 1e-6)
     if np.any(beyond):
         warnings.append(
-            f"{100 * float(np.mean(beyond)):.0f} % of the pulse widths are above the largest fitted, {largest:g} µs: "
-            "the recruitment curve is held level there"
+            f"{100 * float(np.mean(beyond)):.0f} % of the pulse widths are above the largest fitted width, "
+            f"{largest:g} µs: the recruitment curve is constant there"
         )
     return warnings
 
 
 def quality(model: Model, grid: Grid, rows: np.ndarray, converged: bool = True) -> dict[str, Any]:
-    """The one verdict on a model: everything that shows one shows this, from MODEL.json.
+    """The verdict on a model. It is stored in MODEL.json, and every page and command shows this one.
 
-    A gate that refuses makes a model not usable; one that asks for care makes it usable with care, however many fail.
+    A failed check of severity "refuse" makes a model not usable; one of severity "care" makes it usable with care.
 
     Returns
     -------
     dict
-        `verdict`: usable, usable with care, not usable; `words`: it in one sentence; `reasons`: what the failed gates
-        say, those that refuse first; `gates`: name -> {"passed", "severity", "says"}.
+        `verdict`: usable, usable with care, or not usable; `words`: one sentence with the main reason; `reasons`: the
+        texts of the failed checks, "refuse" first; `gates`: the checks by name, {"passed", "severity", "says"}.
     """
     gates = {
         "stable": _stable(model),
-        "converged": _gate(converged, "care", "the search for the dynamics did not settle"),
+        "converged": _gate(converged, "care", "the search for the dynamics did not converge"),
         "torque": _torque(model, grid, rows),
         "monotone": _monotone(model),
         "range": _range(grid, rows),
@@ -98,9 +99,9 @@ def quality(model: Model, grid: Grid, rows: np.ndarray, converged: bool = True) 
 
 def _words(model: Model, bad: bool, reasons: list[str]) -> str:
     if reasons:
-        return f"{'Do not rely on it' if bad else 'Use it with care'}, since {reasons[0]}."
+        return f"{'Do not use this model' if bad else 'Check this before use'}: {reasons[0]}."
     reached, ceiling, where = _reach(model)[:3]
-    return f"It fits {reached:.1f} % on {where}, where the noise allows {ceiling:.1f} %: little is left to explain."
+    return f"The model fits {reached:.1f} % on {where}; the noise allows {ceiling:.1f} % at most."
 
 
 def _gate(passed: bool, severity: str, says: str) -> dict[str, Any]:
@@ -115,17 +116,17 @@ def _stable(model: Model) -> dict[str, Any]:
 
 
 def _torque(model: Model, grid: Grid, rows: np.ndarray) -> dict[str, Any]:
-    """Whether stimulation moves the torque at all, beside the noise."""
+    """Whether stimulation changes the torque by more than the noise."""
     table = model.recruitment(np.linspace(0.0, float(np.max(grid.pulse_width_us)), 101))
     spread = float(np.ptp(table))
     seen = float(np.ptp(grid.torque_nm[rows]))
     finite = bool(np.all(np.isfinite(table))) and spread < 50 * max(seen, 1e-12)
     if not finite:
-        return _gate(False, "refuse", "the recruitment curve is far outside the torque that was measured")
+        return _gate(False, "refuse", "the recruitment curve is far outside the measured torque")
     return _gate(
         spread > 4 * model.noise.block_sd_nm,
         "refuse",
-        "stimulation hardly moves the torque: check electrodes, current and load cell",
+        "stimulation hardly changes the torque: check electrodes, current and load cell",
     )
 
 
@@ -138,7 +139,7 @@ def _monotone(model: Model) -> dict[str, Any]:
     return _gate(
         share <= LARGEST_DIP,
         "care",
-        f"the recruitment curve falls by {100 * share:.0f} % of its range somewhere: its inverse jumps there",
+        f"the recruitment curve falls by {100 * share:.0f} % of its range at one place: its inverse jumps there",
     )
 
 
@@ -147,68 +148,68 @@ def _range(grid: Grid, rows: np.ndarray) -> dict[str, Any]:
     return _gate(
         widths.size >= 8,
         "care",
-        f"only {widths.size} pulse widths were fitted: the recruitment curve between them is a guess; record a ramp",
+        f"only {widths.size} pulse widths were fitted: between them the recruitment curve is a guess; record a ramp",
     )
 
 
 def _ceiling(model: Model) -> dict[str, Any]:
-    fit, ceiling = _figure(model, "fit_percent"), _figure(model, "ceiling_percent")
+    fit, ceiling = _statistic(model, "fit_percent"), _statistic(model, "ceiling_percent")
     if not np.isfinite(fit) or not np.isfinite(ceiling):
-        return _gate(False, "care", "the fit can't be compared with its ceiling")
+        return _gate(False, "care", "the fit cannot be compared with what the noise allows")
     if fit < LEAST_FIT_PERCENT or (fit < 50.0 and ceiling > 60.0):
-        return _gate(False, "refuse", f"the fit, {fit:.1f} %, is too poor: torque hardly follows the pulses")
+        return _gate(False, "refuse", f"the fit of {fit:.1f} % is too poor: the torque hardly follows the pulses")
     return _gate(
         fit >= ceiling - UNDER_CEILING_POINTS,
         "care",
-        f"the fit, {fit:.1f} %, is {ceiling - fit:.1f} points below what the noise allows ({ceiling:.1f} %): "
+        f"the fit of {fit:.1f} % is {ceiling - fit:.1f} points below what the noise allows ({ceiling:.1f} %): "
         "an effect is missing, or the noise is slow; see the diagnosis",
     )
 
 
 def _held_out(model: Model) -> dict[str, Any]:
-    error, fitted_error = _figure(model, "held_out_rms_nm"), _figure(model, "rms_nm")
+    error, fitted_error = _statistic(model, "held_out_rms_nm"), _statistic(model, "rms_nm")
     if not np.isfinite(error) or not np.isfinite(fitted_error):
         return _gate(True, "care", "")
     return _gate(
         error
         <= max(1.5 * fitted_error, 1.5 * model.noise.white_sd_nm, NEGLIGIBLE * np.ptp(model.valid_for["torque_nm"])),
         "care",
-        f"the error on rows not fitted, {error:.3g} N·m, is {error / max(fitted_error, 1e-12):.1f} times "
-        "that on fitted ones",
+        f"the error on held-out rows, {error:.3g} N·m, is {error / max(fitted_error, 1e-12):.1f} times "
+        "that on fitted rows",
     )
 
 
 def _gap(model: Model) -> dict[str, Any]:
-    """How far the fit on rows not seen stays below what the noise allows there.
+    """Whether the fit on held-out rows is near what the noise allows there.
 
-    Where their torque is level, their error above the noise counts as a share of the fitted torque's spread.
+    If the torque is constant there, their error above the noise is taken as a share of the fitted torque's spread.
     """
     reached, ceiling, where, error = _reach(model)
     gap, noise = ceiling - reached, model.noise.white_sd_nm
-    says = f"on {where} it reaches {reached:.1f} % where the noise allows {ceiling:.1f} %"
-    unseen = _figure(model, "held_out_rms_nm")
+    says = f"on {where} the fit is {reached:.1f} %, and the noise allows {ceiling:.1f} %"
+    unseen = _statistic(model, "held_out_rms_nm")
     if where == OWN and np.isfinite(unseen):
         gap, error = 100.0 * (unseen - noise) * (1.0 - reached / 100.0) / max(error, 1e-300), unseen
-        says = f"on rows it has not seen, whose torque is level, it errs by {unseen:.3g} N·m (noise {noise:.3g})"
+        says = f"on held-out rows, whose torque is constant, the error is {unseen:.3g} N·m (noise {noise:.3g} N·m)"
     if not np.isfinite(gap):
         return _gate(True, "care", "")
     far = gap > LARGEST_GAP and not error <= WITHIN_NOISE * noise
     much = "too much" if far else "something"
-    return _gate(gap <= GOOD_GAP, "refuse" if far else "care", f"{says}: {much} is missing in it; see the diagnosis")
+    return _gate(gap <= GOOD_GAP, "refuse" if far else "care", f"{says}: {much} is missing; see the diagnosis")
 
 
 def _reach(model: Model) -> tuple[float, float, str, float]:
-    """Fit, ceiling, the rows they hold for and the error there: rows not seen, where their torque isn't level."""
-    prefix, where = "held_out_", "rows it has not seen"
-    if not np.isfinite(_figure(model, "held_out_fit_percent")):
+    """Fit, ceiling, name of the rows and error there: of the held-out rows, unless the torque is constant there."""
+    prefix, where = "held_out_", "held-out rows"
+    if not np.isfinite(_statistic(model, "held_out_fit_percent")):
         prefix, where = "", OWN
     names = ("fit_percent", "ceiling_percent", "rms_nm")
-    reached, ceiling, error = (_figure(model, prefix + name) for name in names)
+    reached, ceiling, error = (_statistic(model, prefix + name) for name in names)
     return reached, ceiling, where, error
 
 
-def _figure(model: Model, name: str) -> float:
-    """A figure of the fit; NaN where there is none."""
+def _statistic(model: Model, name: str) -> float:
+    """A number of the fit statistics; NaN if there is none."""
     value = model.fit.get(name)
     return float("nan") if value is None else float(value)
 
@@ -217,11 +218,11 @@ def _residual(model: Model, span_nm: float) -> dict[str, Any]:
     if model.noise.block_sd_nm < NEGLIGIBLE * span_nm:
         return _gate(True, "care", "")
     failed = [name for name, test in model.residual_tests.items() if not test.get("passed", True)]
-    return _gate(not failed, "care", f"the residual is not noise ({', '.join(failed)} test): see the diagnosis")
+    return _gate(not failed, "care", f"the residual is not pure noise ({', '.join(failed)} test): see the diagnosis")
 
 
 def _sensor(grid: Grid, baseline_nm: float) -> dict[str, Any]:
-    """Flat tops: many samples at exactly the largest (or smallest) torque."""
+    """Whether the sensor clips: many samples in a row at exactly the largest (or smallest) torque."""
     torque = grid.record.torque_nm
     span = float(np.ptp(torque))
     if not span > 0:
@@ -231,5 +232,5 @@ def _sensor(grid: Grid, baseline_nm: float) -> dict[str, Any]:
         in_a_row = np.max(np.diff(np.flatnonzero(np.r_[True, ~at_edge, True])) - 1, initial=0)
         driven = at_edge & (grid.pulse_width_us[grid.interval] > 0)
         if in_a_row >= 20 and driven.any() and abs(edge - baseline_nm) > 0.2 * span:
-            return _gate(False, "care", f"the load cell is clipped at {edge:.3g} N·m ({int(at_edge.sum())} samples)")
+            return _gate(False, "care", f"the load cell clips at {edge:.3g} N·m ({int(at_edge.sum())} samples)")
     return _gate(True, "care", "")

@@ -1,9 +1,9 @@
-"""Tests of a residual whose false alarms are what they say, on the grid of pulses.
+"""Tests of the residual on the grid of pulses, with a true false-alarm rate.
 
-What a fit takes out of the noise leaves the rest correlated: in 1200 simulated records Ljung-Box, which knows nothing
-of it, alarmed in 1.9 % at a nominal 1 % (a published package's band, 1.96/√(2N-1), in 16 % at a nominal 5). The fit's
-penalty stands for a prior, under which the covariance of the whitened residual is that of the noise times I - H, H the
-smoother; mean and covariance of any sum or product of residuals follow from it exactly.
+A fit removes a part of the noise, which leaves the rest correlated. The Ljung-Box test ignores this: in 1200 simulated
+records it gave 1.9 % false alarms instead of 1 % (a published package's band, 1.96/√(2N-1), gave 16 % instead of 5 %).
+Here the penalty of the fit is taken as a prior. Under it the covariance of the whitened residual is that of the noise
+times I - H, where H is the smoother; the mean and covariance of any sum or product of residuals follow exactly.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from identify.noise.level import correlation_slopes, whitened
 LAGS = 20
 ALARM = 0.01
 NEGLIGIBLE = 0.01
-"""Share of the noise along a direction that the fit takes out, below which it counts as none."""
+"""A direction along which the fit removes less than this share of the noise is ignored."""
 
 
 def chi_square_p(statistic: float, freedom: float) -> float:
-    """P(chi² > statistic), by Wilson and Hilferty's cube root: right to 1e-3 where it matters here."""
+    """P(chi² > statistic), by the cube root of Wilson and Hilferty: accurate to 1e-3 in the range used here."""
     if statistic <= 0:
         return 1.0
     z = ((statistic / freedom) ** (1 / 3) - (1 - 2 / (9 * freedom))) / sqrt(2 / (9 * freedom))
@@ -32,28 +32,28 @@ def chi_square_p(statistic: float, freedom: float) -> float:
 
 
 def residual_tests(fitted: Fitted) -> dict[str, Any]:
-    """Whiteness, and structure that the model's own structure can't give.
+    """Test the residual for whiteness, and for structure that the model cannot describe.
 
     Returns
     -------
     dict
-        `whiteness`: correlations of the innovations over 20 lags against what the fit leaves of white noise.
-        `structure`: share of the residual explained by six signals of missing physics (drift, gain drift, output
-        squared, rate, direction, onset), what the model itself explains taken out first. Each with statistic, freedom,
-        p_value, passed.
+        `whiteness`: correlations of the innovations over 20 lags, compared with what the fit leaves of white noise.
+        `structure`: share of the residual that six signals of missing physics explain (drift, gain drift, squared
+        output, rate, direction, onset), without what the model itself explains. Each has statistic, freedom, p_value
+        and passed. Empty if the residual is zero.
     """
     setup = fitted.problem.setup
     if not fitted.rms_nm > 1e-12 * setup.scale_nm:
         return {}
     white = whitened(fitted.residual_nm[None, :] / setup.spread, setup.stretches, fitted.noise)[0]
-    taken = _taken_out(fitted)
+    taken = _smoother_rows(fitted)
     return {"whiteness": _whiteness(fitted, white, taken), "structure": _structure(fitted, white, taken)}
 
 
-def _taken_out(fitted: Fitted) -> np.ndarray:
-    """Rows whose products with themselves sum to the smoother: H = rows.T @ rows, on whitened intervals in order.
+def _smoother_rows(fitted: Fitted) -> np.ndarray:
+    """Rows that give the smoother as H = rows.T @ rows, on the whitened intervals in order.
 
-    A parameter that stands at its bound took nothing out: what it would have explained is left in the residual.
+    A parameter at its bound removes nothing from the residual.
     """
     problem, setup = fitted.problem, fitted.problem.setup
     free = np.flatnonzero((fitted.theta > problem.lower) & (fitted.theta < problem.upper))
@@ -68,11 +68,11 @@ def _taken_out(fitted: Fitted) -> np.ndarray:
 
 
 def _whiteness(fitted: Fitted, white: np.ndarray, taken: np.ndarray) -> dict[str, Any]:
-    apart = Apart(*fitted.problem.setup.stretches)
-    lags = apart.lags
-    mean, covariance = apart.moments(taken)
-    found = apart.correlations(white)
-    # Beside the power: how large the noise is nobody told.
+    padded = PaddedRows(*fitted.problem.setup.stretches)
+    lags = padded.lags
+    mean, covariance = padded.moments(taken)
+    found = padded.correlations(white)
+    # Relative to the power, since the variance of the noise is not known.
     ratio = mean[1:] / mean[0]
     beside = np.c_[-ratio, np.eye(lags)]
     away = beside @ found * (mean[0] / found[0])
@@ -80,7 +80,7 @@ def _whiteness(fitted: Fitted, white: np.ndarray, taken: np.ndarray) -> dict[str
     kept = values > 1e-6 * max(float(values.max()), 1e-300)
     root = (vectors[:, kept] / np.sqrt(values[kept])).T
     part = root @ away
-    # Along what was estimated of the noise the correlations were made to vanish.
+    # The estimated noise parameters made the correlations vanish along these directions.
     slopes = root @ correlation_slopes(fitted.noise, lags).T
     size = np.linalg.norm(slopes, axis=0)
     left, strength, _ = np.linalg.svd(slopes[:, size > 0] / size[size > 0], full_matrices=False)
@@ -89,13 +89,13 @@ def _whiteness(fitted: Fitted, white: np.ndarray, taken: np.ndarray) -> dict[str
     return _verdict(float(part @ part), max(int(kept.sum()) - left.shape[1], 1)) | {"lags": lags}
 
 
-class Apart:
-    """Rows of whitened intervals with zeros between their stretches, so that no lag reaches from one to the next."""
+class PaddedRows:
+    """Rows of whitened intervals, with zeros between the stretches so that no lag reaches from one to the next."""
 
     def __init__(self, start: np.ndarray, stop: np.ndarray) -> None:
         length = stop - start
         total = int(length.sum())
-        # However short single stretches are: a lag counts as long as half of the rows have a partner there.
+        # A lag counts if at least half of the rows have a partner at that lag.
         pairs = np.array([int(np.sum(np.maximum(length - lag, 0))) for lag in range(1, LAGS + 1)])
         self.lags = max(min(int(np.sum(2 * pairs >= total)), total // 4), 1)
         self.pairs = np.r_[total, 0.5 * pairs[: self.lags]]
@@ -115,24 +115,26 @@ class Apart:
         return wide
 
     def correlations(self, row: np.ndarray) -> np.ndarray:
-        """Sums of products of the row with itself at lags 0, 1, …, not scaled."""
+        """Autocorrelation sums of the row at lags 0, 1, …, not scaled."""
         wide = self._wide(row)
         return np.array([wide[: self.size - lag] @ wide[lag:] for lag in range(self.lags + 1)])
 
     def moments(self, taken: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Mean and covariance of `correlations` for white noise of variance 1 of which H = taken.T @ taken is gone.
+        """Mean and covariance of `correlations` for white noise of variance 1 from which H = taken.T @ taken is
+        removed.
 
-        Each is a form r'Sr: its mean is tr(SM) and the covariance of two is 2 tr(SMS'M), with M = I - H.
+        Each correlation is a quadratic form r'Sr: its mean is tr(SM), and the covariance of two is 2 tr(SMS'M), with
+        M = I - H.
         """
         wide, lag = self._wide(taken), np.arange(self.lags + 1)
         products = np.stack([wide[:, : self.size - k] @ wide[:, k:].T for k in lag])
         removed = np.trace(products, axis1=1, axis2=2)
-        # Row behind row: the zeros between them keep them apart.
+        # All rows as one line: the zeros between them separate them.
         line = wide.ravel()
         further = [line[:-k] @ line[k:] for k in range(self.lags + 1, 2 * self.lags + 1)]
         all_lags = np.r_[removed, further]
         twice = 0.5 * (all_lags[np.abs(lag[:, None] - lag)] + all_lags[lag[:, None] + lag])
-        # S has no row where there is no interval: what its neighbours would put there is taken off again.
+        # S has no row where there is no interval: the neighbours' share there is subtracted.
         outside = 0.5 * (wide[:, self.beside[:, None] + lag] + wide[:, self.beside[:, None] - lag])
         outside = outside.reshape(-1, lag.size)
         both = (0.5 * (products + products.transpose(0, 2, 1))).reshape(lag.size, -1)
@@ -143,7 +145,7 @@ class Apart:
 def _structure(fitted: Fitted, white: np.ndarray, taken: np.ndarray) -> dict[str, Any]:
     problem, setup = fitted.problem, fitted.problem.setup
     mean = np.nan_to_num(setup.target_nm - fitted.residual_nm)
-    # As it was felt: a late pulse drives late.
+    # At the times at which the pulses truly came.
     drive = setup.grid.held(fitted.physical[problem.coefficients] @ setup.design)
     time = np.linspace(-1.0, 1.0, setup.grid.size)
     rate = np.gradient(mean)
@@ -151,10 +153,10 @@ def _structure(fitted: Fitted, white: np.ndarray, taken: np.ndarray) -> dict[str
     scale = np.linalg.norm(signals, axis=1)
     signals = signals[scale > 0] / scale[scale > 0][:, None]
     extra = whitened(signals / setup.spread, setup.stretches, fitted.noise)
-    # The penalised fit takes out less than a projection: the same smoother is applied to the signals. A search stops
-    # near the top, not at it; what it left along the model's own slopes is not looked at.
+    # The same smoother is applied to the signals, since a penalised fit removes less than a projection. The fit stops
+    # near its optimum; what it leaves along the model's own slopes is not tested.
     left = extra - (extra @ taken.T) @ taken
-    # Under the null the score left·r has about the variance left·left (the smoother is nearly a projection).
+    # Without structure the score left·r has about the variance left·left (the smoother is nearly a projection).
     values, vectors = np.linalg.eigh(left @ left.T)
     kept = values > 1e-6 * max(float(values.max()), 1e-300)
     part = (vectors.T @ (left @ white))[kept] / np.sqrt(values[kept])

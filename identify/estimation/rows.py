@@ -18,14 +18,14 @@ def rows_of(grid: Grid, names: Sequence[str]) -> np.ndarray:
 
 
 def fitted_rows(grid: Grid, fit_on: Sequence[str] | None) -> np.ndarray:
-    """Rows to fit: those of the named segments (and the rests, which anchor the baseline), never held-out ones.
+    """Rows to fit: those of the named segments and the rests, which determine the baseline; never held-out rows.
 
     Raises
     ------
     BadRequest
-        A named segment isn't in the record, or is the held-out one.
+        A named segment is not in the record, or is the held-out one.
     NotIdentifiable
-        Nothing is left to fit.
+        Fewer than eight pulse intervals are left to fit.
     """
     if fit_on is not None:
         check_segments(grid, fit_on)
@@ -34,21 +34,22 @@ def fitted_rows(grid: Grid, fit_on: Sequence[str] | None) -> np.ndarray:
         rows = grid.fitted
     if rows.sum() < 8:
         raise NotIdentifiable(
-            f"only {int(rows.sum())} pulse intervals may be fitted", mend="Give rows of segments other than `validate`."
+            f"only {int(rows.sum())} pulse intervals may be fitted", fix="Give rows of segments other than `validate`."
         )
     return rows
 
 
 def check_segments(grid: Grid, names: Sequence[str]) -> None:
-    """Refuse names of segments that the record doesn't have, and the held-out one.
+    """Refuse names of segments that the record does not have, and the held-out one.
 
     Raises
     ------
     BadRequest
+        With the names that can be used.
     """
     there = tuple(dict.fromkeys(grid.record.segment_names))
     for name in names:
         if name == HELD_OUT:
-            raise BadRequest("`validate` is never fitted on", place="fit_on", mend="Name other segments.")
+            raise BadRequest("rows of `validate` are never fitted", place="fit_on", fix="Name other segments.")
         if name not in there:
-            raise BadRequest(f"no segment {name!r} in the record", place="fit_on", mend=f"It has: {', '.join(there)}.")
+            raise BadRequest(f"no segment {name!r} in the record", place="fit_on", fix=f"It has: {', '.join(there)}.")

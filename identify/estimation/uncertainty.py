@@ -1,7 +1,7 @@
 """95 % bands on the recruitment curve, the step response and the prediction, from the parameters' covariance.
 
-Two kinds: the pointwise band covers the truth at any one place 95 % of the time; the whole band covers it everywhere at
-once in 95 % of records, its factor found by drawing curves from the covariance.
+There are two kinds. The pointwise band contains the true value at any one place in 95 % of records. The whole band
+contains the whole true curve in 95 % of records; its width is found by drawing curves from the covariance.
 """
 
 from __future__ import annotations
@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from identify.dynamics.linear import SecondOrder
-from identify.dynamics.pulse_grid import Grid, make_grid
+from identify.dynamics.make_grid import make_grid
+from identify.dynamics.pulse_grid import Grid
 from identify.model import Covariance, Model
 from identify.records.record import Record
 from identify.recruitment.curve import Basis
@@ -20,15 +21,15 @@ from identify.simulation.predict import slopes
 
 POINTWISE = 1.959964
 BENT = 2.0
-"""How far beyond what less penalty shows a bend may go: the whole band then holds 95 % of 120 development curves."""
+"""Factor on the change without penalty; the whole band then contains 95 % of 120 development curves."""
 DRAWS = 256
 DYNAMICS = ("time_constant_s", "damping", "delay_s")
 
 
-def bands(model: Model, bent_nm: np.ndarray | None = None, points: int = 41) -> dict[str, Any]:
-    """Bands on both curves, as MODEL.json carries them; empty where the method gives no covariance.
+def bands(model: Model, unpenalised_change_nm: np.ndarray | None = None, points: int = 41) -> dict[str, Any]:
+    """Bands on both curves, as in MODEL.json; empty if the method gives no covariance.
 
-    `bent_nm` is how far the recruitment's coefficients would go were the curve left more freedom, N·m.
+    `unpenalised_change_nm` is the change of the recruitment coefficients if most of the penalty were removed, N·m.
     """
     covariance, linear = model.covariance, model.linear
     if covariance is None or not isinstance(linear, SecondOrder):
@@ -36,8 +37,8 @@ def bands(model: Model, bent_nm: np.ndarray | None = None, points: int = 41) -> 
     width = np.linspace(0.0, model.recruitment.basis.largest_us, points)
     time_s = np.linspace(0.0, linear.memory_s, points)
     curve = _band(model.recruitment(width), recruitment_slopes(model.recruitment.basis, covariance, width), covariance)
-    if bent_nm is not None:
-        _widen(curve, model.recruitment.basis.design(width) @ bent_nm)
+    if unpenalised_change_nm is not None:
+        _widen(curve, model.recruitment.basis.design(width) @ unpenalised_change_nm)
     step = _band(linear.step_response(time_s), step_slopes(linear, covariance, time_s), covariance)
     return {
         "level_percent": 95,
@@ -54,7 +55,7 @@ def recruitment_slopes(basis: Basis, covariance: Covariance, width_us: np.ndarra
 
 
 def _coefficients(basis: Basis, covariance: Covariance) -> slice:
-    """Where f's coefficients stand: behind the dynamics, before the effects (`effect.parameter`)."""
+    """Place of f's coefficients: after the dynamics, before the effects (`effect.parameter`)."""
     last = len(covariance.names) - sum("." in name for name in covariance.names)
     return slice(last - basis.size, last)
 
@@ -71,9 +72,9 @@ def step_slopes(linear: SecondOrder, covariance: Covariance, time_s: np.ndarray)
 
 
 def prediction_band(model: Model, record: Record) -> tuple[np.ndarray, np.ndarray]:
-    """Pointwise 95 % band on the clean torque that the model predicts, N·m: lower and upper, each shape (N,).
+    """Pointwise 95 % band on the predicted torque without noise, N·m: lower and upper, each of shape (N,).
 
-    Noise of the measurement isn't in it: it is what is uncertain in the model.
+    It contains the uncertainty of the model, not the noise of the measurement.
 
     Raises
     ------
@@ -82,7 +83,7 @@ def prediction_band(model: Model, record: Record) -> tuple[np.ndarray, np.ndarra
     """
     covariance, linear = model.covariance, model.linear
     if covariance is None or not isinstance(linear, SecondOrder):
-        raise ValueError("this model carries no covariance")
+        raise ValueError("this model has no covariance")
     grid = make_grid(record)
     return _around(model, record, grid, _sd(slopes(model, grid, covariance.names), covariance))
 
@@ -121,13 +122,13 @@ def _band(value: np.ndarray, slopes: np.ndarray, covariance: Covariance) -> dict
 
 
 def _widen(band: dict[str, np.ndarray], bias_nm: np.ndarray) -> None:
-    """Let the whole band hold what the smoothness may hide at a bend, beside what noise leaves open."""
+    """Widen the whole band by what the smoothness penalty may hide at a bend."""
     for side, sign in (("whole_lower", -1.0), ("whole_upper", 1.0)):
         band[side] = band["value"] + sign * (np.abs(band[side] - band["value"]) + BENT * np.abs(bias_nm))
 
 
 def whole_factor(matrix: np.ndarray, sd: np.ndarray) -> float:
-    """How many standard deviations hold a whole curve in 95 % of draws from its covariance."""
+    """Number of standard deviations within which 95 % of whole curves drawn from the covariance lie."""
     known = sd > 1e-9 * max(float(sd.max()), 1e-300)
     if not known.any():
         return POINTWISE
@@ -140,5 +141,5 @@ def whole_factor(matrix: np.ndarray, sd: np.ndarray) -> float:
 
 @cache
 def _draws(size: int) -> np.ndarray:
-    """Fixed draws: the same record gives the same band."""
+    """Normal random numbers, always the same, so that a record always gives the same band."""
     return np.random.default_rng(1).standard_normal((DRAWS, size))

@@ -1,4 +1,4 @@
-"""Which sequence tells two rival effects apart: the shortest, of those the rig can play."""
+"""The next experiment: the shortest test, among those that the rig can do, that separates rival effects."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from identify.dynamics.pulse_grid import make_grid
+from identify.dynamics.make_grid import make_grid
 from identify.effects import get
 from identify.errors import BadRequest
-from identify.estimation.adding import fitted_with
+from identify.estimation.effect_fit import fitted_with
 from identify.estimation.joint import Fitted
 from identify.experiments.designs import Design, designs
 from identify.noise.level import whitened
@@ -19,35 +19,35 @@ from identify.records.record import Record
 from identify.simulation.problem import Problem
 
 ENOUGH = 7.0
-"""Expected log evidence that decides: odds of a thousand to one."""
+"""Expected log evidence that is enough to decide: odds of about 1000 to 1."""
 PER_PULSE = 4
-"""Samples a pulse of the simulated test."""
+"""Samples per pulse of the simulated test."""
 
 
 def next_experiment(record: Record, rivals: Sequence[str]) -> dict[str, Any]:
-    """The shortest safe test that separates rivals, found by simulating each as it was fitted on this record.
+    """Find the shortest test that separates rival effects, by simulating each as it was fitted to this record.
 
     Parameters
     ----------
     record : Record
-        On which the rivals can't be told apart.
+        The record that does not separate the rivals.
     rivals : sequence of str
-        Ids of effects, two or more; one alone is set against no effect at all.
+        Ids of effects. A single one is compared with a model without effects.
 
     Returns
     -------
     dict
         `segments` for the rig (`name`, `sequence`, `settings`), `duration_s`, `dose`, `expected_log_evidence` (of the
-        worst-separated pair), `decides`, `text`, `alternatives` (every design tried, best first).
+        pair with the smallest), `decides`, `text`, `alternatives` (all designs, best first).
 
     Raises
     ------
     BadRequest
-        An unknown effect, or none.
+        An effect is unknown, or none is given.
     """
     names = list(dict.fromkeys(rivals))
     if not names:
-        raise BadRequest("no rival was named", place="rivals", mend="Name two effects.")
+        raise BadRequest("no rival was named", place="rivals", fix="Name two effects.")
     for name in names:
         get(name)
     fits = {name: fitted_with(record, [name]) for name in names}
@@ -57,7 +57,7 @@ def next_experiment(record: Record, rivals: Sequence[str]) -> dict[str, Any]:
 
 
 def plan(record: Record, fits: dict[str, Fitted]) -> dict[str, Any]:
-    """As `next_experiment`, for rivals that are fitted already, by name."""
+    """As `next_experiment`, for rivals that are already fitted, by name."""
     names = [name for name in fits if name != "nothing"]
     largest_us = float(record.pulse_width_us.max())
     rows = [_row(design, record, fits) for design in designs(largest_us)]
@@ -76,8 +76,11 @@ def _text(best: dict[str, Any], names: list[str]) -> str:
     those = " from ".join(get(name).name.lower() for name in names[:2])
     lead = f"{best['words']} ({best['duration_s']:.0f} s) "
     if best["expected_log_evidence"] >= ENOUGH:
-        return lead + f"should tell {those}: expected log evidence {best['expected_log_evidence']:.0f}."
-    return lead + f"is the best there is to tell {those}, but may not decide: {best['expected_log_evidence']:.1f}."
+        return lead + f"should separate {those}: expected log evidence {best['expected_log_evidence']:.0f}."
+    return (
+        lead + f"is the best test to separate {those}, but it may not be enough: expected log evidence "
+        f"{best['expected_log_evidence']:.1f}; at least {ENOUGH:g} is required."
+    )
 
 
 def _row(design: Design, record: Record, fits: dict[str, Fitted]) -> dict[str, Any]:
@@ -120,9 +123,9 @@ def _blank(record: Record, width: np.ndarray) -> Record:
 
 
 def separation(truth: Fitted, rival: Fitted, record: Record) -> float:
-    """Log evidence by which a rival is expected to lose on a new test, were the other one true.
+    """Log evidence by which a rival is expected to lose in a new test, if `truth` is true.
 
-    The rival may adapt within what the old record left open: its parameters' covariance is the prior of the new fit.
+    The rival is fitted again to the new test, with its fit to the old record as prior.
     """
     true_mean = _simulate(truth, record, False)[0]
     rival_mean, slopes = _simulate(rival, record, True)
@@ -138,12 +141,12 @@ def separation(truth: Fitted, rival: Fitted, record: Record) -> float:
 
 
 def _simulate(fitted: Fitted, record: Record, derivatives: bool) -> tuple[np.ndarray, np.ndarray | None]:
-    """Interval means of a fitted candidate on another record; what can't be foreseen stays out."""
+    """Interval means of a fitted candidate on another record, without unpredictable effects."""
     grid = make_grid(record)
     setup = fitted.problem.setup.with_(grid=grid, target_nm=np.zeros(grid.size), fitted=np.ones(grid.size, bool))
-    kept = [(effect, form) for effect, form in fitted.effects if get(effect).foreseeable]
+    kept = [(effect, form) for effect, form in fitted.effects if get(effect).predictable]
     problem = Problem(setup, kept)
-    # By name: a new test is one part, begins at rest, and lacks what can't be foreseen.
+    # Parameters are copied by name: the new test has one part, starts at rest, and has no unpredictable effects.
     known = {name: place for place, name in enumerate(fitted.problem.names)}
     place = np.array([known[name] for name in problem.names])
     theta = fitted.theta[place]

@@ -1,7 +1,6 @@
-"""Tests that the rig can play, as segments with settings; and their pulse widths, for simulation.
+"""Tests that the rig can do, as segments with settings, and their pulse widths for simulation.
 
-`identify` knows no rig: these shapes follow the settings' meaning in `docs/sequences.md`, and a test holds both to each
-other.
+`identify` does not import the rig. These shapes repeat the meaning of the rig's settings; a test compares both.
 """
 
 from __future__ import annotations
@@ -19,11 +18,11 @@ class Segment:
     Parameters
     ----------
     name : str
-        Of the segment in the recording.
+        Name of the segment in the recording.
     sequence : str
         rest, prbs, ramp, multilevel, staircase or steps.
     settings : dict
-        As the rig takes them.
+        As the rig expects them.
     """
 
     name: str
@@ -38,9 +37,9 @@ class Design:
     Parameters
     ----------
     name : str
-        Short.
+        Short name.
     words : str
-        For people.
+        Description for people.
     segments : tuple of Segment
         In order.
     """
@@ -50,7 +49,7 @@ class Design:
     segments: tuple[Segment, ...]
 
     def pulse_widths(self, pulse_rate_hz: float) -> np.ndarray:
-        """One width a pulse, µs."""
+        """Pulse widths, one per pulse, µs."""
         return np.concatenate([SHAPES[s.sequence](s.settings, pulse_rate_hz) for s in self.segments])
 
 
@@ -97,7 +96,7 @@ SHAPES = {"rest": _rest, "ramp": _ramp, "steps": _steps, "staircase": _staircase
 
 
 def designs(largest_us: float) -> list[Design]:
-    """Designs up to a largest pulse width, µs; none goes above what was applied before."""
+    """All designs, for a largest pulse width, µs; none exceeds it."""
     top = float(largest_us)
 
     def rest(seconds: float, name: str = "rest") -> Segment:
@@ -124,7 +123,9 @@ def designs(largest_us: float) -> list[Design]:
     return [
         Design("ramp", "One more ramp", (rest(2), ramp(5), rest(2))),
         Design("fast ramp", "A fast ramp", (rest(2), ramp(1.5), rest(2))),
-        Design("repeated ramp", "Two ramps with a short rest between", (rest(2), ramp(4), rest(2), ramp(4), rest(2))),
+        Design(
+            "repeated ramp", "Two ramps with a short rest between them", (rest(2), ramp(4), rest(2), ramp(4), rest(2))
+        ),
         Design("two speeds", "A fast ramp and a slow one", (rest(2), ramp(1.5), rest(2), ramp(6), rest(2))),
         Design("ramps and rest", "A ramp, a long rest, a ramp", (rest(2), ramp(4), rest(15), ramp(4), rest(2))),
         Design("steps", "Steps on and off", (rest(2), steps(1.0, 1.5, 4), rest(2))),
@@ -139,11 +140,11 @@ def designs(largest_us: float) -> list[Design]:
             (rest(2), prbs(0.45), rest(1), prbs(0.7), rest(1), prbs(1.0), rest(2)),
         ),
         Design("staircase", "A staircase up and down", (rest(2), stairs, rest(2))),
-        Design("long step", "One long step and its tail", (rest(2), steps(6.0, 5.0, 1))),
+        Design("long step", "One long step", (rest(2), steps(6.0, 5.0, 1))),
         Design(
             "conditioning",
-            "A ramp, ten seconds of work, a ramp, a rest, a ramp",
+            "A ramp, 10 s of stimulation, a ramp, a rest, a ramp",
             (rest(2), ramp(3), steps(10.0, 1.0, 1), ramp(3), rest(15), ramp(3), rest(2)),
         ),
-        Design("sham", "A sham test without stimulation", (rest(10, "sham"),)),
+        Design("sham", "A test without stimulation", (rest(10, "sham"),)),
     ]

@@ -1,6 +1,6 @@
-"""Identification methods: one file each, found by scanning this folder.
+"""Identification methods: one file each, found in this folder.
 
-A method is a module here with a module-level `METHOD`, an object that satisfies `Method`.
+The module of a method has a variable `METHOD`, an object that satisfies `Method`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from identify.model import Model
 
 @runtime_checkable
 class Method(Protocol):
-    """A way to get a Hammerstein model from a record.
+    """A method that estimates a Hammerstein model from a record.
 
     Attributes
     ----------
@@ -40,7 +40,7 @@ class Method(Protocol):
     def options(self) -> Mapping[str, str]: ...
 
     def fit(self, grid: Grid, fit_on: tuple[str, ...] | None, **options: Any) -> Model:
-        """Model of the grid's record, from rows that may be fitted; `fit_on` names the segments to use."""
+        """Fit a model to the grid's record; `fit_on` names the segments to use."""
         ...
 
 
@@ -56,12 +56,12 @@ def methods() -> dict[str, Method]:
 
 
 def method_of(name: str) -> Method:
-    """The method of that id; its file alone is loaded where the file has the id's name.
+    """The method with this id. If its file has the same name, no other method is imported.
 
     Raises
     ------
     BadRequest
-        There is none.
+        No method has this id.
     """
     own = name.replace("-", "_")
     if own.isidentifier() and any(info.name == own for info in pkgutil.iter_modules(__path__)):
@@ -69,19 +69,19 @@ def method_of(name: str) -> Method:
         if isinstance(found, Method) and found.id == name:
             return found
     if name not in methods():
-        raise BadRequest(f"unknown method {name!r}", place="method", mend=f"Known: {', '.join(methods())}.")
+        raise BadRequest(f"unknown method {name!r}", place="method", fix=f"Known: {', '.join(methods())}.")
     return methods()[name]
 
 
-def known_options(chosen: Method, options: Mapping[str, Any]) -> None:
-    """Refuse options that a method doesn't have.
+def check_options(chosen: Method, options: Mapping[str, Any]) -> None:
+    """Refuse options that a method does not have.
 
     Raises
     ------
     BadRequest
-        Naming the option and those there are.
+        With the name of the option, and the known ones.
     """
     for name in options:
         if name not in chosen.options:
             known = ", ".join(chosen.options) or "none"
-            raise BadRequest(f"unknown option {name!r} of {chosen.id}", place=name, mend=f"Known: {known}.")
+            raise BadRequest(f"unknown option {name!r} of {chosen.id}", place=name, fix=f"Known: {known}.")

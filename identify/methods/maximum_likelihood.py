@@ -1,7 +1,7 @@
-"""Maximum likelihood: recruitment and dynamics in one joint estimate on all segments, under the noise that is there.
+"""Maximum likelihood: one joint estimate of recruitment and dynamics on all segments, with white or correlated noise.
 
-Beyond the paper: its cost (12) is minimised as it stands, on output error, over recruitment and dynamics together,
-instead of one after the other; noise may be correlated; the spline's smoothness is chosen from the data.
+It differs from the paper: the cost (12), the output error, is minimised over recruitment and dynamics together, instead
+of one after the other; the noise may be correlated; the smoothness of the spline is chosen from the data.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from identify.dynamics.pulse_grid import Grid
 from identify.errors import BadRequest
 from identify.estimation.finish import finish
 from identify.estimation.joint import Fitted
+from identify.estimation.pilot import estimate
 from identify.estimation.prepare import to_fitted
-from identify.estimation.projected import estimate
 from identify.estimation.rows import fitted_rows
 from identify.methods.support.alternatives import monotone, power_series, sigmoid
 from identify.methods.support.common import flag, order_option
@@ -34,10 +34,10 @@ class MaximumLikelihood:
     options: Mapping[str, str] = MappingProxyType(
         {
             "recruitment": "spline (default, (8)), power-series (6) or sigmoid (30)",
-            "monotone": "true: the spline never falls (false)",
-            "knots": "how many knots the spline has (19, or 31 where the curve is steep)",
-            "power": "order of the power series (by BIC)",
-            "delay_s": "a delay that is known, s (estimated)",
+            "monotone": "true: the spline never falls (default: false)",
+            "knots": "number of knots of the spline (default: 19, or 31 if the curve is steep)",
+            "power": "order of the power series (default: by BIC)",
+            "delay_s": "a known delay, s (default: estimated)",
             "order": "second-order (default), auto, or l,n,d of equations (1) to (3)",
         }
     )
@@ -52,7 +52,7 @@ class MaximumLikelihood:
         return finish(self.id, fitted, [*reasons, *_why(fitted)])
 
     def start(self, grid: Grid, rows: np.ndarray, options: Mapping[str, Any]) -> tuple[Fitted, list[str]]:
-        """The structure without effects, fitted: what effects are added to; with the reasons for its shape."""
+        """Fit the structure without effects, to which effects are added; with the reasons for its form."""
         delay_s = float(options["delay_s"]) if "delay_s" in options else None
         solution, _ = estimate(grid, rows, int(options["knots"]) if "knots" in options else None, delay_s)
         kind = str(options.get("recruitment", "spline"))
@@ -61,13 +61,14 @@ class MaximumLikelihood:
         elif kind == "sigmoid":
             solution, reason = sigmoid(solution), "sigmoid (30)"
         elif kind == "spline":
-            reason = (
-                f"spline of {solution.problem.basis.size} coefficients, smoothed to {solution.freedom:.1f} effective"
-            )
+            size = solution.projection.basis.size
+            reason = f"spline of {size} coefficients, smoothed to {solution.freedom:.1f} effective ones"
         else:
-            raise BadRequest(f"recruitment {kind!r}", place="recruitment", mend="Give spline, power-series or sigmoid.")
+            raise BadRequest(
+                f"unknown recruitment {kind!r}", place="recruitment", fix="Give spline, power-series or sigmoid."
+            )
         if flag(options.get("monotone", False), "monotone"):
-            return to_fitted(monotone(solution), most=0), [reason, "recruitment held monotone"]
+            return to_fitted(monotone(solution), most=0), [reason, "recruitment constrained to be monotone"]
         return to_fitted(solution, most=20 if kind == "spline" else 0), [reason]
 
 
@@ -77,9 +78,9 @@ METHOD = MaximumLikelihood()
 def _why(fitted: Fitted) -> list[str]:
     time_constant_s, damping, delay_s = fitted.physical[:3]
     noise = fitted.noise
-    said = "white" if noise.is_white else f"slow and white, {100 * min(noise.share, 1.0):.0f} % of its variance slow"
-    enough = "a white residual" if noise.is_white else "but the residual isn't white: see the diagnosis"
+    said = "white" if noise.is_white else f"slow and white; {100 * min(noise.share, 1.0):.0f} % of the variance is slow"
+    enough = "a white residual" if noise.is_white else "the residual is not white: see the diagnosis"
     return [
         f"second order: T {time_constant_s:.4g} s, damping {damping:.3g}, delay {1e3 * delay_s:.1f} ms; {enough}",
-        f"noise taken as {said}",
+        f"noise: {said}",
     ]

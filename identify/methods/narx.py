@@ -1,8 +1,8 @@
-"""Polynomial NARX, the black box of the paper's introduction (reference 6): a rival, scored in free run.
+"""Polynomial NARX, the black box of the paper's introduction (reference 6), for comparison.
 
-Terms are products of past torques and pulse widths up to the third degree, taken one at a time by the share of the
-error they explain (orthogonal forward regression with the error reduction ratio, Billings 1988) until BIC stops it.
-One step ahead such models look perfect; run free they may drift or run away, and only the free run counts here.
+Terms are products of past torques and pulse widths up to the third degree. They are chosen one at a time by the share
+of the error that they explain (orthogonal forward regression with the error reduction ratio, Billings 1988), until BIC
+rises. Such models predict one step ahead very well, but may drift or diverge in a free run; only the free run counts.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ class Narx:
     """The black box."""
 
     id = "narx"
-    summary = "Polynomial NARX of degree 3 by orthogonal forward regression: a black box as a rival, in free run."
+    summary = "Polynomial NARX of degree 3 by orthogonal forward regression: a black box, for comparison."
     options: Mapping[str, str] = MappingProxyType(
         {
-            "torque_lags": "past torques (2)",
-            "width_lags": "past pulse widths (3)",
-            "degree": "highest degree (3)",
-            "terms": f"terms at most ({MOST_TERMS})",
+            "torque_lags": "number of past torques (default: 2)",
+            "width_lags": "number of past pulse widths (default: 3)",
+            "degree": "highest degree (default: 3)",
+            "terms": f"largest number of terms (default: {MOST_TERMS})",
         }
     )
 
@@ -79,12 +79,12 @@ METHOD = Narx()
 
 
 def name_of(term: tuple[int, ...], variables: list[tuple[int, int]]) -> str:
-    """As in y[k-1]·u[k-2]."""
+    """A term as text, such as y[k-1]·u[k-2]."""
     return "·".join(f"{'yu'[variables[v][0]]}[k-{variables[v][1]}]" for v in term)
 
 
 def forward_regression(candidates: np.ndarray, target: np.ndarray, most: int) -> tuple[list[int], np.ndarray]:
-    """Columns in the order of what they explain, until BIC rises, and their weights."""
+    """Columns in the order of the error that they explain, until BIC rises, and their weights."""
     rest, left, chosen = candidates.copy(), target.copy(), []
     size = target.size
     best = size * np.log(max(float(left @ left) / size, 1e-300))
@@ -106,7 +106,7 @@ def forward_regression(candidates: np.ndarray, target: np.ndarray, most: int) ->
 
 
 def steady_curve(recipe: dict[str, Any], largest_us: float) -> Curve:
-    """Where the free run settles for each pulse width: what stands for a recruitment curve."""
+    """Steady-state torque of the free run for each pulse width, used as recruitment curve."""
     basis = SplineBasis(np.linspace(0.0, largest_us, 13))
     level = np.linspace(0.0, largest_us, 41)
     torque = np.array([run(recipe, np.full(400, u))[-1] for u in level])

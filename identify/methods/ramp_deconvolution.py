@@ -1,4 +1,4 @@
-"""Ramp deconvolution (section IV.A of the paper; Durfee & MacLean 1989): dynamics assumed, recruitment from one ramp.
+"""Ramp deconvolution (section IV.A of the paper; Durfee & MacLean 1989): given dynamics, recruitment from one ramp.
 
 The linear activation dynamics are critically damped with a natural frequency from the literature, 0.85π rad/s (31).
 The torque of the triangular ramp is deconvolved with them; against pulse width that gives two recruitment curves, one
@@ -20,7 +20,7 @@ from identify.errors import BadRequest, NotIdentifiable
 from identify.estimation.finish import completed
 from identify.methods.support.common import near_rest, quiet_level, segment_rows
 from identify.model import Model, Noise
-from identify.noise.ar1 import noise_evidence
+from identify.noise.ar1 import ar1_or_white
 from identify.recruitment.sigmoid_fit import fit_points
 from identify.recruitment.smoothing import choose_weight
 from identify.recruitment.spline import SplineBasis
@@ -30,23 +30,25 @@ KNOTS_PER_S = 6.0
 
 
 class RampDeconvolution:
-    """One ramp, dynamics from the literature."""
+    """Recruitment from one ramp, with dynamics from the literature."""
 
     id = "ramp-deconvolution"
     summary = "The ramp deconvolved with critically damped dynamics of given frequency, then the sigmoid (30)."
     options: Mapping[str, str] = MappingProxyType(
-        {"natural_frequency_rad_s": "1/Tω of the critically damped dynamics (0.85π = 2.67)"}
+        {"natural_frequency_rad_s": "1/Tω of the critically damped dynamics (default: 0.85π = 2.67)"}
     )
 
     def fit(self, grid: Grid, fit_on: tuple[str, ...] | None, **options: Any) -> Model:
-        """Fit; `fit_on` names the ramp where it isn't called `ramp`."""
+        """Fit; `fit_on` names the ramp if it is not called `ramp`."""
         frequency = float(options.get("natural_frequency_rad_s", NATURAL_FREQUENCY_RAD_S))
         if not 0.05 <= frequency <= 100.0:
-            raise BadRequest(f"{frequency:g} rad/s", place="natural_frequency_rad_s", mend="Give 0.05 to 100 rad/s.")
+            raise BadRequest(
+                f"{frequency:g} rad/s is out of range", place="natural_frequency_rad_s", fix="Give 0.05 to 100 rad/s."
+            )
         ramp = segment_rows(grid, fit_on or ("ramp",), self.id)
         if np.unique(grid.pulse_width_us[ramp]).size < 8:
             raise NotIdentifiable(
-                "the ramp has fewer than 8 pulse widths", mend="Record a triangular ramp over the whole range."
+                "the ramp has fewer than 8 pulse widths", fix="Record a triangular ramp over the whole range."
             )
         linear = SecondOrder(1.0 / frequency, 1.0)
         drive, baseline = deconvolved(grid, ramp, linear)
@@ -56,7 +58,7 @@ class RampDeconvolution:
         curve = fit_points(width[ramp], drive[ramp])
         residual = np.nan_to_num(grid.torque_nm) - baseline - linear.on_grid(grid, curve(width))
         rows = near_rest(grid, ramp)
-        ar1, delta_bic = noise_evidence(residual, runs(rows))
+        ar1, delta_bic = ar1_or_white(residual, runs(rows))
         model = Model(
             method=self.id,
             recruitment=curve,
@@ -65,7 +67,7 @@ class RampDeconvolution:
             sample_rate_hz=grid.record.sample_rate_hz,
             baseline_nm=baseline,
             noise=Noise(block_sd_nm=float(np.std(residual[rows])), ar1=ar1, delta_bic=delta_bic),
-            reasons=(f"dynamics assumed: critically damped, {frequency:.4g} rad/s",),
+            reasons=(f"given dynamics: critically damped, {frequency:.4g} rad/s",),
             extra={"deconvolved": {"rising": _curve(width, drive, rising), "falling": _curve(width, drive, falling)}},
         )
         return completed(model, grid, rows, 5.0)
@@ -77,17 +79,17 @@ METHOD = RampDeconvolution()
 def deconvolved(grid: Grid, ramp: np.ndarray, linear: SecondOrder) -> tuple[np.ndarray, float]:
     """The drive w(t) whose response is the measured torque, N·m, shape (K,), and the baseline.
 
-    Inverting (31) takes two derivatives of a noisy torque. Instead w is a spline in time, its smoothness chosen by
-    REML, whose response through G fits the torque: the same curve without the noise blown up.
+    Inverting (31) needs two derivatives of a noisy torque. Instead, w is a spline in time whose response through G is
+    fitted to the torque, with a smoothness chosen by REML. This gives the same curve without amplified noise.
     """
     first, last = int(np.flatnonzero(ramp)[0]), int(np.flatnonzero(ramp)[-1])
     rows = near_rest(grid, ramp) & (np.arange(grid.size) >= first)
     span = (last - first + 1) * grid.step_s
     basis = SplineBasis(np.linspace(0.0, span, max(int(KNOTS_PER_S * span), 8)))
-    # SplineBasis vanishes at zero, as w does when the ramp sets out.
+    # SplineBasis is zero at zero, as w is at the start of the ramp.
     columns = basis.design(np.clip((np.arange(grid.size) - first) * grid.step_s, 0.0, span))
     columns[last + 1 :] = 0.0
-    # What earlier stimulation left in the muscle when the ramp sets out decays by the same dynamics.
+    # The torque that is left from earlier stimulation at the start of the ramp decays by the same dynamics.
     left, idle = np.zeros((grid.size, 2)), np.zeros(grid.size - first)
     for column, state in enumerate(np.eye(2)):
         states = boundary_states(linear.time_constant_s, linear.damping, grid.step_s, idle, (state[0], state[1]))

@@ -1,8 +1,8 @@
 """Separable least squares (section IV.B of the paper; Westwick & Kearney 2001): impulse response times sigmoid.
 
-The model (32) is linear in the weights of the impulse response and nonlinear in the sigmoid's shape alone; the search
-runs over the shape, the weights are solved for. The paper takes 41 taps, which at 40 Hz is 1 s: shorter than the
-muscle's memory. `memory_s` gives a memory in seconds instead.
+The model (32) is linear in the weights of the impulse response, and nonlinear only in the shape of the sigmoid: the
+shape is searched, the weights are solved for. The paper uses 41 taps, which is 1 s at 40 Hz and shorter than the memory
+of the muscle. `memory_s` gives the length in seconds instead.
 """
 
 from __future__ import annotations
@@ -28,29 +28,32 @@ TAPS = 41
 
 
 class SeparableLeastSquares:
-    """Taps and sigmoid."""
+    """Impulse response and sigmoid."""
 
     id = "separable-least-squares"
     summary = "Finite impulse response (41 taps) behind the sigmoid (30), by separable least squares."
     options: Mapping[str, str] = MappingProxyType(
-        {"taps": "length of the impulse response in pulses (41)", "memory_s": "or its length in seconds"}
+        {"taps": "length of the impulse response in pulses (default: 41)", "memory_s": "or its length in seconds"}
     )
 
     def fit(self, grid: Grid, fit_on: tuple[str, ...] | None, **options: Any) -> Model:
         """Fit on the named segments, or on all that may be fitted."""
         if "taps" in options and "memory_s" in options:
-            raise BadRequest("both taps and memory_s are given", place="options", mend="Give one of them.")
+            raise BadRequest("both taps and memory_s are given", place="options", fix="Give one of them.")
         taps = int(options.get("taps", TAPS))
         if "memory_s" in options:
             taps = round(float(options["memory_s"]) / grid.step_s) + 1
         if not 2 <= taps <= 2000:
-            raise BadRequest(f"{taps} taps", place="taps", mend="Give 2 to 2000.")
+            raise BadRequest(f"{taps} taps is out of range", place="taps", fix="Give 2 to 2000.")
         rows = fitted_rows(grid, fit_on)
         if rows.sum() <= taps + 4:
-            raise NotIdentifiable(f"{int(rows.sum())} rows for {taps} taps", mend="Record longer, or take fewer taps.")
+            raise NotIdentifiable(
+                f"{int(rows.sum())} pulse intervals are too few for {taps} taps",
+                fix="Record longer, or use fewer taps.",
+            )
         seen = grid.pulse_width_us[rows]
         if not np.ptp(seen) > 0:
-            raise NotIdentifiable("the pulse width never changes", mend="Record a PRBS and a ramp.")
+            raise NotIdentifiable("the pulse width never changes", fix="Record a PRBS and a ramp.")
         basis, response = separate(grid, rows, taps)
         gain = float(response.sum())
         block = Discrete(tuple(response / gain), (1.0,), 0, grid.step_s, float(np.mean(grid.fraction)))
@@ -73,7 +76,7 @@ def separate(grid: Grid, rows: np.ndarray, taps: int) -> tuple[SigmoidBasis, np.
     def solve(basis: SigmoidBasis) -> tuple[np.ndarray, np.ndarray]:
         columns = design(basis)
         gram = columns.T @ columns
-        # A hair of ridge: a tap that the input never excites stays at zero.
+        # A very small ridge: a tap that the input never excites stays at zero.
         ridge = 1e-10 * np.trace(gram) / len(gram) * np.eye(len(gram))
         weights = np.linalg.solve(gram + ridge, columns.T @ torque)
         return weights, torque - columns @ weights

@@ -1,14 +1,14 @@
 """The paper's two-stage method (section III): PRBS for the dynamics, ramp for the recruitment, dynamics once more.
 
-Where the text works it is followed: the PRBS's two levels make w proportional to u (15); the linear part found there
-serves to find the spline on the ramp (stage one); with the spline known the linear part is found again (stage two);
-one iteration. Three deviations, each since the text fails under output noise (docs/results/table1.md shows it):
+With the two levels of the PRBS, w is proportional to u (15), which gives a first linear part. With it, the spline is
+found on the ramp (stage one). With the spline, the linear part is found again (stage two). One iteration is made.
+There are three differences from the paper, whose text fails with output noise (docs/results/table1.md):
 
-- the linear part minimises the output error (12) instead of the equation error (25), which puts poles 4 times too slow;
-- the spline is fitted through G forward instead of inverting G (26), whose zero near -1 makes the inverse unstable;
-- the spline is the B-spline of (8) with a penalty chosen from the data instead of few bare knots.
+- the linear part minimises the output error (12), not the equation error (25), which makes the poles 4 times too slow;
+- the spline is fitted to the output of G; the inverse of G (26) is unstable because of a zero near -1;
+- the spline has many knots and a penalty chosen from the data, not few knots without a penalty.
 
-`linear="equation-error"` and `inverse=True` bring the text back, for comparison.
+`linear="equation-error"` and `inverse=True` follow the text of the paper, for comparison.
 """
 
 from __future__ import annotations
@@ -23,15 +23,10 @@ from identify.dynamics.linear import Discrete, SecondOrder
 from identify.dynamics.pulse_grid import Grid
 from identify.errors import BadRequest
 from identify.estimation.finish import finish, finish_discrete
+from identify.estimation.pilot import pilot_curve, pilot_solution
 from identify.estimation.prepare import to_fitted
-from identify.estimation.projected import (
-    Projection,
-    Solution,
-    pilot_curve,
-    pilot_solution,
-    project,
-    search,
-)
+from identify.estimation.projected_search import project, search
+from identify.estimation.projection import Projection, Solution
 from identify.methods.support.common import active_level, flag, near_rest, order_option, quiet_level, segment_rows
 from identify.methods.support.output_error import OutputError, choose_order, equation_error, output_error, stable
 from identify.model import Model
@@ -45,17 +40,17 @@ STARTS_S = (0.06, 0.15, 0.35, 0.8)
 
 
 class TwoStage:
-    """PRBS, then ramp."""
+    """Dynamics from the PRBS, recruitment from the ramp."""
 
     id = "two-stage"
-    summary = "The paper's: dynamics from the PRBS, recruitment spline from the ramp, dynamics again; one iteration."
+    summary = "The paper's method: dynamics from the PRBS, recruitment spline from the ramp, dynamics again."
     options: Mapping[str, str] = MappingProxyType(
         {
-            "iterations": "how often stage one and stage two are run (1)",
+            "iterations": "number of iterations of stage one and stage two (default: 1)",
             "order": "second-order (default), auto, or l,n,d of equations (1) to (3)",
             "linear": "output-error (default) or equation-error, equation (25) as printed",
-            "inverse": "true: recruitment by inverting G, equation (26) as printed (false)",
-            "knots": "how many knots the spline has (31)",
+            "inverse": "true: recruitment by inverting G, equation (26) as printed (default: false)",
+            "knots": "number of knots of the spline (default: 31)",
         }
     )
 
@@ -66,7 +61,7 @@ class TwoStage:
             raise BadRequest(
                 "two-stage needs two segments, the first for the dynamics, the second for the recruitment",
                 place="fit_on",
-                mend="Give for instance prbs,ramp.",
+                fix="Give, for example, prbs,ramp.",
             )
         prbs = segment_rows(grid, names[:1], self.id)
         ramp = segment_rows(grid, names[1:], self.id)
@@ -99,7 +94,7 @@ def physical(
         See `TwoStage.options`.
     """
     largest = float(np.max(grid.pulse_width_us))
-    # Preliminary experiment: two levels, so f is a straight line through both (15).
+    # Two levels only, so f can be taken as a straight line through both (15).
     straight = Projection(grid, PowerBasis(1, largest), np.zeros((1, 1)), near_rest(grid, prbs))
     starts = [project(straight, SecondOrder(t, 0.9, 0.02)) for t in STARTS_S]
     linear = search(straight, min(starts, key=lambda s: s.variance).linear).linear
@@ -107,18 +102,18 @@ def physical(
     both = near_rest(grid, prbs) | near_rest(grid, ramp)
     solution = _recruitment(grid, near_rest(grid, ramp), linear, knots)
     for _ in range(iterations):
-        basis = solution.problem.basis
+        basis = solution.projection.basis
         shape = FixedShape(Curve(basis, solution.coefficients[: basis.size]))
         linear = search(Projection(grid, shape, np.zeros((1, 1)), both), linear).linear
         solution = _recruitment(grid, near_rest(grid, ramp), linear, knots)
     reasons.append(f"after stage two: T {linear.time_constant_s:.4g} s, damping {linear.damping:.3g}")
-    # The last curve belongs to the last dynamics; the baseline and the noise are of both segments.
-    final = Projection(grid, solution.problem.basis, solution.problem.roughness, both)
+    # The last curve and the last dynamics; baseline and noise are estimated from both segments.
+    final = Projection(grid, solution.projection.basis, solution.projection.roughness, both)
     return project(final, linear, weight=solution.weight), reasons
 
 
 def _recruitment(grid: Grid, rows: np.ndarray, linear: SecondOrder, knots: int) -> Solution:
-    """Stage one: the spline for given dynamics, through G forward."""
+    """Stage one: the spline for given dynamics, fitted to the output of G."""
     largest = float(np.max(grid.pulse_width_us))
     coarse = SplineBasis(even_knots(largest, PILOT_KNOTS))
     pilot = project(Projection(grid, coarse, spline_roughness(coarse), rows), linear)
@@ -181,7 +176,7 @@ def straight_drive(grid: Grid, prbs: np.ndarray) -> np.ndarray:
 
 
 def joint_drive(grid: Grid, rows: np.ndarray) -> np.ndarray:
-    """Drive where all segments are used at once: the curve of a pilot fit of second order, unit range."""
+    """Drive if all segments are used at once: the curve of a second-order pilot fit, scaled to a range of 1."""
     u, curve = pilot_curve(pilot_solution(grid, rows))
     drive = np.interp(grid.pulse_width_us, u, curve)
     return drive / max(float(np.ptp(curve)), 1e-300)
@@ -190,6 +185,6 @@ def joint_drive(grid: Grid, rows: np.ndarray) -> np.ndarray:
 def _curve_through(
     grid: Grid, block: Discrete, rows: np.ndarray, knots: int, baseline_nm: float, inverse: bool
 ) -> Curve:
-    from identify.methods.support.discrete_recruitment import invert, through
+    from identify.methods.support.discrete_recruitment import from_inverse, from_output
 
-    return (invert if inverse else through)(grid, block, rows, knots, baseline_nm)
+    return (from_inverse if inverse else from_output)(grid, block, rows, knots, baseline_nm)

@@ -8,7 +8,7 @@ LARGEST_AR1 = 0.995
 
 
 def whiten(rows: np.ndarray, stretches: list[slice], ar1: float) -> np.ndarray:
-    """Rows of AR(1) noise made white, exactly, stretch by stretch.
+    """Whiten rows of AR(1) noise exactly, stretch by stretch.
 
     Parameters
     ----------
@@ -22,8 +22,8 @@ def whiten(rows: np.ndarray, stretches: list[slice], ar1: float) -> np.ndarray:
     Returns
     -------
     ndarray
-        Fitted rows only, in order; the first of each stretch is scaled by sqrt(1 - ar1²), so that the determinant of
-        the likelihood is that of the stationary process.
+        The fitted rows in order. The first of each stretch is scaled by sqrt(1 - ar1²), so that the likelihood is that
+        of the stationary process.
     """
     if ar1 == 0.0:
         parts = [rows[stretch] for stretch in stretches]
@@ -68,15 +68,15 @@ def best_ar1(residual: np.ndarray, stretches: list[slice]) -> float:
         return -0.5 * rows * np.log(squares) + 0.5 * len(stretches) * np.log1p(-ar1 * ar1)
 
     low, high, found = -0.5, LARGEST_AR1, 0.0
-    for _ in range(3):  # the score has one peak there: three ever finer scans find it to 1e-5
+    for _ in range(3):  # the score has one maximum: three scans, each finer, find it to 1e-5
         trial = np.linspace(low, high, 61)
         best = int(np.argmax(score(trial)))
         low, high, found = float(trial[max(best - 1, 0)]), float(trial[min(best + 1, 60)]), float(trial[best])
     return found
 
 
-def noise_evidence(residual: np.ndarray, stretches: list[slice]) -> tuple[float, float]:
-    """AR(1) or white: the better account's correlation (0 for white), and ΔBIC in favour of AR(1).
+def ar1_or_white(residual: np.ndarray, stretches: list[slice]) -> tuple[float, float]:
+    """Choose AR(1) or white noise: the correlation (0 for white), and ΔBIC (positive in favour of AR(1)).
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The noise of a fit on the grid: white plus slow, and a narrow band where there is a tremor."""
+"""The noise of a fit on the grid of pulses: white plus slow, and a narrow band if there is a tremor."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ LOWEST_HZ, HIGHEST_HZ = 2.8, 14.5
 
 @dataclass(frozen=True)
 class NoiseLevel:
-    """Noise of the intervals' means.
+    """Noise of the interval means.
 
     Parameters
     ----------
     ar1 : float
         Correlation of neighbours of the slow part.
     share : float
-        Share of the variance that is slow; above 1: all of it, and smoothed by the mean over an interval.
+        Share of the variance that is slow. Above 1: all of it is slow, and smoothed by the mean over an interval.
     sd_nm : float
         Total standard deviation of an interval's mean, N·m.
     turn, keep, band : float
-        Of a narrow band: its angle a step, rad, its memory a step, its share of the variance; no band where 0.
+        Of a narrow band: angle per step, rad, decay factor per step, and share of the variance (0: no band).
     slowest, fastest : float
         Bounds of the angle, rad.
     """
@@ -43,14 +43,14 @@ class NoiseLevel:
 
     @property
     def is_white(self) -> bool:
-        """Whether next to nothing of it is correlated from one interval to the next."""
+        """Whether hardly any of it is correlated from one interval to the next."""
         return self.band <= 0.0 and min(self.share, 1.0) * self.ar1 < 0.05
 
 
 def profile(
     residual: np.ndarray, stretches: Stretches, near: NoiseLevel, wide: bool = True
 ) -> tuple[NoiseLevel, float]:
-    """The likeliest noise of a residual, of the kind of `near`, and its log-likelihood; sought far off if `wide`."""
+    """The most likely noise of the same kind as `near`, and its log-likelihood; searched over a `wide` range or not."""
     start, stop = stretches
     if near.band <= 0.0:
         ar1, share, sd, log_likelihood = profile_noise(residual, start, stop, near.ar1, near.share, wide)
@@ -97,7 +97,7 @@ def _search(
 
 
 def find_band(residual: np.ndarray, stretches: Stretches, step_s: float) -> tuple[NoiseLevel, float]:
-    """The likeliest noise with a narrow band between 2.8 and 14.5 Hz, and its log-likelihood."""
+    """The most likely noise with a narrow band between 2.8 and 14.5 Hz, and its log-likelihood."""
     best: tuple[NoiseLevel, float] | None = None
     turns = (2 * np.pi * LOWEST_HZ * step_s, 2 * np.pi * min(HIGHEST_HZ, 0.42 / step_s) * step_s)
     for frequency_hz in _peaks(residual, stretches, step_s):
@@ -111,7 +111,7 @@ def find_band(residual: np.ndarray, stretches: Stretches, step_s: float) -> tupl
 
 
 def _peaks(residual: np.ndarray, stretches: Stretches, step_s: float) -> list[float]:
-    """Two frequencies at which the residual's spectrum stands out of a smooth background."""
+    """Two frequencies at which the residual's spectrum is highest above a smooth background."""
     value = np.zeros(residual.size)
     for a, b in zip(*stretches, strict=True):
         value[a:b] = residual[a:b] - np.mean(residual[a:b])
@@ -129,7 +129,7 @@ def _peaks(residual: np.ndarray, stretches: Stretches, step_s: float) -> list[fl
 
 
 def whitened(rows: np.ndarray, stretches: Stretches, noise: NoiseLevel) -> np.ndarray:
-    """Rows (M, K) made white and of unit variance, fitted intervals in order."""
+    """Rows, shape (M, K), whitened to unit variance; the fitted intervals in order."""
     start, stop = stretches
     if noise.band <= 0.0:
         return whiten_rows(rows, start, stop, noise.ar1, noise.share)[0] / noise.sd_nm
@@ -138,7 +138,7 @@ def whitened(rows: np.ndarray, stretches: Stretches, noise: NoiseLevel) -> np.nd
 
 
 def band_part(residual: np.ndarray, stretches: Stretches, noise: NoiseLevel) -> np.ndarray:
-    """The narrow band's part of a residual, zero where nothing was fitted."""
+    """The narrow band's part of a residual; zero in intervals that were not fitted."""
     if noise.band <= 0.0:
         return np.zeros(residual.size)
     start, stop = stretches
@@ -146,20 +146,20 @@ def band_part(residual: np.ndarray, stretches: Stretches, noise: NoiseLevel) -> 
 
 
 POINTS = 1 << 14
-"""Frequencies of a spectrum: a band that is kept for a thousand steps is drawn by ten of them."""
+"""Number of frequencies of a spectrum: a band with a memory of 1000 steps covers ten of them."""
 NUDGE = 1e-4
 LEAST_SHARE = 1e-9
 
 
 def correlation_slopes(noise: NoiseLevel, lags: int) -> np.ndarray:
-    """How the innovations' correlations at lags 1 to `lags` move with what was estimated of the noise.
+    """Derivatives of the innovations' correlations at lags 1 to `lags` by the estimated parameters of the noise.
 
-    A number at its bound was not fitted to anything, and has no row; nor has one that the others leave without a say.
+    A parameter at its bound, or without influence, has no row.
 
     Returns
     -------
     ndarray, shape (numbers, lags)
-        The derivative of the log spectrum by a number is the spectrum of what whitening with a wrong one leaves.
+        From the derivative of the log spectrum by each parameter: the spectrum that a wrong value leaves.
     """
     slow = noise.share > LEAST_SHARE and noise.ar1 > LEAST_SHARE
     names = []
@@ -170,7 +170,7 @@ def correlation_slopes(noise: NoiseLevel, lags: int) -> np.ndarray:
         names += ["band", "turn", "keep"]
     rows = []
     for name in names:
-        # Away from the bounds, and for a share away from the bend at 1.
+        # Towards smaller values: away from the bounds, and from the kink of `share` at 1.
         nudge = -NUDGE * max(1.0 - getattr(noise, name), NUDGE) if name in ("ar1", "keep") else -NUDGE
         moved = replace(noise, **{name: max(getattr(noise, name) + nudge, 0.0)})
         change = (_log_spectrum(moved) - _log_spectrum(noise)) / nudge
@@ -179,8 +179,8 @@ def correlation_slopes(noise: NoiseLevel, lags: int) -> np.ndarray:
 
 
 def _log_spectrum(noise: NoiseLevel) -> np.ndarray:
-    """Log of the noise's spectrum from frequency 0 to half a turn a step, up to a constant."""
-    # A narrow band is a hundred times as narrow as the slowest noise.
+    """Log of the noise's spectrum from frequency 0 to half the pulse rate, up to a constant."""
+    # A narrow band is 100 times narrower than the spectrum of the slowest noise.
     angle = np.linspace(0.0, np.pi, (POINTS if noise.band > 0.0 else POINTS // 4) // 2 + 1)
     if noise.band <= 0.0 and noise.share > 1.0:
         mean = (noise.share - 1.0) * MEAN_OF_SLOW
@@ -194,5 +194,5 @@ def _log_spectrum(noise: NoiseLevel) -> np.ndarray:
 
 
 def _pole(angle: np.ndarray, keep: float) -> np.ndarray:
-    """Spectrum of noise of variance 1 whose correlation falls by the factor `keep` a step."""
+    """Spectrum of noise of variance 1 whose correlation falls by the factor `keep` per step."""
     return (1.0 - keep * keep) / (1.0 + keep * keep - 2.0 * keep * np.cos(angle))

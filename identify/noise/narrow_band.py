@@ -1,7 +1,7 @@
-"""Noise with a narrow band in it: white plus slow plus a stochastic oscillator, by an exact Kalman filter, compiled.
+"""Noise with a narrow band: white plus slow plus a stochastic oscillator, by an exact Kalman filter; compiled.
 
-Tremor isn't a function of the stimulation, and wanders in frequency and size: as part of the noise it needs three
-numbers, and everything else can be weighed beside it.
+Tremor does not depend on the stimulation, and its frequency and size vary. As part of the noise it needs only three
+parameters, and other effects can be compared beside it.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def _gains(length, ar1, slow, turn, keep, band):  # pragma: no cover
 
 @njit(cache=True, nogil=True)
 def whiten_band(rows, start, stop, ar1, slow, turn, keep, band):  # pragma: no cover
-    """As `whiten_rows`, with an oscillator: `turn` is its angle a step, `keep` its memory a step, `band` its share."""
+    """As `whiten_rows`, with an oscillator: `turn` is its angle per step, `keep` its decay, `band` its share."""
     total, longest = 0, 0
     for i in range(start.size):
         total += stop[i] - start[i]

@@ -1,4 +1,4 @@
-"""White noise plus slow AR(1) noise of interval means: exact likelihood and whitening, compiled."""
+"""White noise plus slow AR(1) noise of interval means: exact likelihood and whitening; compiled."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import numpy as np
 from numba import njit
 
 MEAN_OF_SLOW = 0.27
-"""Correlation of neighbouring innovations that averaging over an interval brings, at most."""
+"""Largest correlation of neighbouring innovations that the mean over an interval causes."""
 SHORTEST = 0.006
-"""1 - ar1 of the slowest noise (a memory of 4 s at 40 pulses/s): what is slower is a drift, and has a cause."""
+"""1 - ar1 of the slowest noise (a memory of 4 s at 40 pulses/s); anything slower is a drift, which has a cause."""
 
 
 @njit(cache=True, nogil=True)
 def _ratio(ar1, mean):  # pragma: no cover
-    """Variance of means of slow noise over that of their innovations."""
+    """Variance of means of slow noise, divided by that of their innovations."""
     return (1.0 + 2.0 * ar1 * mean + mean * mean) / (1.0 - ar1 * ar1)
 
 
@@ -55,7 +55,7 @@ def whiten_rows(rows, start, stop, ar1, share):  # pragma: no cover
         Correlation of neighbours of the slow part.
     share : float
         Share of the variance that is slow, 0 … 1; the rest is white. Above 1: means of slow noise over an interval,
-        which are smoother than slow noise read at instants.
+        which are smoother than its values at single times.
 
     Returns
     -------
@@ -99,7 +99,7 @@ def whiten_rows(rows, start, stop, ar1, share):  # pragma: no cover
 
 @njit(cache=True, nogil=True)
 def _squares(row, start, stop, ar1, share):  # pragma: no cover
-    """Sum of squared innovations, half the log determinant, count; the filter's gain settles within some steps."""
+    """Sum of squared innovations, half the log determinant, count. The filter's gain converges within some steps."""
     total, squares, logdet = 0, 0.0, 0.0
     if share > 1.0:
         mean = (share - 1.0) * MEAN_OF_SLOW
@@ -153,7 +153,7 @@ def _minus_log_likelihood(row, start, stop, ar1, share):  # pragma: no cover
 
 @njit(cache=True, nogil=True)
 def profile_noise(row, start, stop, ar1, share, wide):  # pragma: no cover
-    """Correlation and slow share that make a residual most likely, by a pattern search from where it stands.
+    """The most likely correlation and slow share of a residual, by a pattern search from the given start.
 
     Returns
     -------
@@ -163,7 +163,7 @@ def profile_noise(row, start, stop, ar1, share, wide):  # pragma: no cover
     total = 0
     for i in range(start.size):
         total += stop[i] - start[i]
-    # On the scale of memory: a = log(1 - ar1), from SHORTEST (long memory) to 1 (none).
+    # a = log(1 - ar1), from log(SHORTEST) (long memory) to 0 (none).
     low, high = np.log(SHORTEST), 0.0
     a = min(max(np.log(1.0 - min(ar1, 1.0 - SHORTEST)), low), high)
     b = min(max(share, 0.0), 2.0)

@@ -18,7 +18,7 @@ def recruitment(width_us: np.ndarray) -> np.ndarray:
 def torque(width_us: np.ndarray, sample_rate_hz: float, pulse_rate_hz: float = 40.0) -> np.ndarray:
     """Clean torque at the samples for one pulse width an interval, from rest, N·m.
 
-    scipy's discretisation for a held input, not `identify.dynamics`: what identifies is not what simulates.
+    It uses scipy's discretisation for a held input, so that the simulation does not depend on `identify.dynamics`.
     """
     from scipy.signal import cont2discrete, lfilter
 
@@ -29,9 +29,9 @@ def torque(width_us: np.ndarray, sample_rate_hz: float, pulse_rate_hz: float = 4
 
 
 def prbs(bits: int = 7, hold: int = 5, level_us: float = TOP_US) -> np.ndarray:
-    """Maximum-length sequence of 2^bits - 1 levels 0 or `level_us`, each held for `hold` pulses.
+    """Maximum-length sequence of 2^bits - 1 levels, 0 or `level_us`, each held for `hold` pulses.
 
-    Feedback taps of primitive polynomials (x⁷ + x⁶ + 1 and its like).
+    The feedback taps are those of primitive polynomials, such as x⁷ + x⁶ + 1.
     """
     taps = {5: (5, 3), 6: (6, 5), 7: (7, 6), 8: (8, 6, 5, 4)}[bits]
     state, levels = [1] * bits, []
@@ -52,14 +52,14 @@ def ramp(seconds: float = 10.0, top_us: float = TOP_US, pulse_rate_hz: float = 4
 
 
 def multilevel(seconds: float = 15.0, hold: int = 20, top_us: float = TOP_US, seed: int = 0) -> np.ndarray:
-    """Random levels over the whole range, each held for `hold` pulses: an input no method has seen."""
+    """Random levels over the whole range, each held for `hold` pulses; for validation only."""
     size = round(seconds * 40.0)
     levels = np.random.default_rng(seed).uniform(0.0, top_us, size // hold + 1)
     return np.repeat(levels, hold)[:size]
 
 
 def protocol() -> tuple[np.ndarray, list[str]]:
-    """One width and one segment's name a pulse: rest, PRBS, rest, ramp, rest, validate, rest (48 s)."""
+    """Width and segment name of each pulse: rest, PRBS, rest, ramp, rest, validate, rest (48 s)."""
     rest = np.zeros
     parts = [
         ("rest", rest(40)),

@@ -1,7 +1,7 @@
-"""Table I of the paper, ours beside theirs: three methods, six noise levels; and what the table doesn't tell.
+"""Table I of the paper: best-fit rates of its three methods at six noise levels, as printed and as computed here.
 
-Beside the best-fit rate against the noisy ramp stand the ceiling that the noise itself sets, the fit to the clean
-torque of the ramp, and the fit on an unseen multi-level input.
+In addition to the fit on the noisy ramp: the best fit that the noise allows, the fit to the torque of the ramp without
+noise, and the fit on a multi-level input that was not fitted.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from identify.estimation.figures import best_fit_percent
+from identify.estimation.fit_statistics import best_fit_percent
 from identify.fitting import fit
 from identify.paper import muscle
 from identify.records.record import Record
@@ -29,7 +29,7 @@ FIRST_SEED = 20_000
 
 
 def simulate(noise_nm: float, seed: int, sample_rate_hz: float = 40.0) -> tuple[Record, np.ndarray]:
-    """One trial: the record, and its clean torque. The input is the same in all; the noise is not."""
+    """One trial: the record, and its torque without noise. All trials have the same input and different noise."""
     widths, names = muscle.protocol()
     clean = muscle.torque(widths, sample_rate_hz)
     each = round(sample_rate_hz / 40.0)
@@ -39,7 +39,7 @@ def simulate(noise_nm: float, seed: int, sample_rate_hz: float = 40.0) -> tuple[
 
 
 def score(record: Record, clean_nm: np.ndarray, method: str, **options: Any) -> dict[str, float]:
-    """Best-fit rates of one fit, %: noisy ramp, clean ramp, unseen input (clean), and the noise's ceiling."""
+    """Best-fit rates of one fit, %: noisy ramp, clean ramp, unseen input (clean), and the ceiling set by the noise."""
     predicted = predict(fit(record, method=method, **options), record)
     names = np.array(record.segment_names)[record.segment]
     ramp, unseen = names == "ramp", names == "validate"
@@ -57,24 +57,24 @@ def run(
     sample_rate_hz: float = 40.0,
     noise_levels_nm: tuple[float, ...] = NOISE_NM,
 ) -> dict[str, Any]:
-    """The table.
+    """Compute the table.
 
     Parameters
     ----------
     trials : int
-        Records a noise level (one where there is no noise: nothing differs).
+        Records per noise level (without noise: one, since all would be equal).
     progress : callable, optional
-        Called with the share done and a word.
+        Called with the share done, 0 to 1, and a line of text.
     sample_rate_hz : float
-        Samples a second; the paper samples at 1600 and stimulates at 40.
+        Sampling rate, Hz; the paper uses 1600 Hz, with 40 pulses/s.
     noise_levels_nm : tuple of float
-        Standard deviations of the output noise.
+        Standard deviations of the output noise, N·m.
 
     Returns
     -------
     dict
-        `rows`: one a noise level and method, with noise_nm, method, paper, paper_sd, ours, ours_sd, ceiling, clean,
-        unseen (means over trials, %); beside it what it was made from.
+        `rows`: one per noise level and method, with noise_nm, method, paper, paper_sd, ours, ours_sd, ceiling, clean,
+        unseen (means over trials, %); and the settings.
     """
     rows: list[dict[str, Any]] = []
     total, done = len(noise_levels_nm) * len(OURS), 0

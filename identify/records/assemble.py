@@ -111,8 +111,8 @@ def check_numbers(columns: Columns, at: Callable[[int, str], str]) -> None:
     for name, column in columns.items():
         missing = np.isnan(column) if name in MAY_LACK else False
         if (bad := np.flatnonzero(~(np.abs(column) <= bounds.largest(name)) & ~np.asarray(missing))).size:
-            mend = "Cut the record before it; values must be finite."
-            raise BadRecord(f"{column[bad[0]]:g} is no measurement", place=at(int(bad[0]), name), mend=mend)
+            fix = "Cut the record before it; values must be finite."
+            raise BadRecord(f"{column[bad[0]]:g} is no measurement", place=at(int(bad[0]), name), fix=fix)
 
 
 def without_holes(found: Found) -> Found:
@@ -133,7 +133,7 @@ def without_holes(found: Found) -> Found:
     if count > MOST_HOLES * rows.size:
         message = f"no number here, nor in {count - 1} of {rows.size} rows" if count > 1 else "no number"
         raise BadRecord(
-            message, place=found.at(first, column), mend=f"At most {100 * MOST_HOLES:.0f} % of the rows may lack one."
+            message, place=found.at(first, column), fix=f"At most {100 * MOST_HOLES:.0f} % of the rows may lack one."
         )
     kept = np.flatnonzero(~rows)
     times = "1 row is" if count == 1 else f"{count} rows are"
@@ -169,14 +169,14 @@ def check_widths(columns: Columns, at: Callable[[int, str], str]) -> None:
         raise BadRecord(
             f"{width_us[negative[0]]:g} µs is negative",
             place=at(int(negative[0]), "pulse_width_us"),
-            mend="A pulse width is 0 (no pulse) or positive.",
+            fix="A pulse width is 0 (no pulse) or positive.",
         )
     largest_us = float(np.max(width_us, initial=0.0))
     if 0.0 < largest_us < LEAST_LARGEST_US:
         raise BadRecord(
             f"the largest is {largest_us:g} µs, and no stimulator gives so little",
             place=at(int(width_us.argmax()), "pulse_width_us"),
-            mend="Give µs: multiply seconds by 1000000, milliseconds by 1000; or say the unit, "
+            fix="Give µs: multiply seconds by 1000000, milliseconds by 1000; or say the unit, "
             "for instance --map pulse_width_us=pulse_width_us:s.",
         )
     doubted = columns.get("doubted", np.zeros(0))
@@ -184,5 +184,5 @@ def check_widths(columns: Columns, at: Callable[[int, str], str]) -> None:
         raise BadRecord(
             f"{doubted[bad[0]]:g} is neither 0 nor 1",
             place=at(int(bad[0]), "doubted"),
-            mend="1 is a row in which it is not known what was felt, 0 any other.",
+            fix="1 is a row in which it is not known what was felt, 0 any other.",
         )

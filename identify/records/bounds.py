@@ -48,17 +48,17 @@ def content_of(path: Path) -> bytes:
                 pieces.append(piece)
                 size += len(piece)
     except FileNotFoundError as error:
-        raise BadRecord("no such file", place=str(path), mend="Check the path.") from error
+        raise BadRecord("no such file", place=str(path), fix="Check the path.") from error
     except IsADirectoryError as error:
-        raise BadRecord("a directory, not a record", place=str(path), mend="Name the file in it.") from error
+        raise BadRecord("a directory, not a record", place=str(path), fix="Name the file in it.") from error
     except OSError as error:
         reason = error.strerror or str(error)
-        raise BadRecord(f"can't be read ({reason})", place=str(path), mend="Check its rights.") from error
+        raise BadRecord(f"can't be read ({reason})", place=str(path), fix="Check its rights.") from error
     except ValueError as error:  # a NUL in the name
-        raise BadRecord("no such file", place=repr(str(path)), mend="Check the path.") from error
+        raise BadRecord("no such file", place=repr(str(path)), fix="Check the path.") from error
     if size > LARGEST_FILE_BYTES:
-        mend = "Cut the record, or give the sealed recording."
-        raise BadRecord(f"more than {LARGEST_FILE_BYTES // 2**20} MB", place=str(path), mend=mend)
+        fix = "Cut the record, or give the sealed recording."
+        raise BadRecord(f"more than {LARGEST_FILE_BYTES // 2**20} MB", place=str(path), fix=fix)
     return b"".join(pieces)
 
 
@@ -77,7 +77,7 @@ def check_rate(pulse_rate_hz: float, place: str) -> None:
     """
     lo, hi = PULSE_RATES_HZ
     if not (lo <= pulse_rate_hz <= hi):
-        raise BadRecord(f"{pulse_rate_hz:g} pulses a second", place=place, mend=f"Give {lo:g} to {hi:g} Hz.")
+        raise BadRecord(f"{pulse_rate_hz:g} pulses a second", place=place, fix=f"Give {lo:g} to {hi:g} Hz.")
 
 
 def check_sampling(rate_hz: float, place: str) -> None:
@@ -89,7 +89,7 @@ def check_sampling(rate_hz: float, place: str) -> None:
         Below 40 Hz or above 2 kHz, by more than rounding.
     """
     if not (LOWEST_HZ <= rate_hz <= HIGHEST_HZ):
-        raise BadRecord(f"sampled at {rate_hz:.4g} Hz", place=place, mend="40 Hz to 2 kHz can be used.")
+        raise BadRecord(f"sampled at {rate_hz:.4g} Hz", place=place, fix="40 Hz to 2 kHz can be used.")
 
 
 def check_name(name: str, place: str) -> None:
@@ -101,12 +101,12 @@ def check_name(name: str, place: str) -> None:
         Empty, too long, or with signs that cannot be printed.
     """
     if not name.strip():
-        raise BadRecord("empty", place=place, mend="Name it: rest, prbs, ramp, validate…")
+        raise BadRecord("empty", place=place, fix="Name it: rest, prbs, ramp, validate…")
     if len(name) > LONGEST_NAME:
-        mend = f"A segment's name has at most {LONGEST_NAME}."
-        raise BadRecord(f"a name of {len(name)} characters", place=place, mend=mend)
+        fix = f"A segment's name has at most {LONGEST_NAME}."
+        raise BadRecord(f"a name of {len(name)} characters", place=place, fix=fix)
     if not name.isprintable():
-        raise BadRecord("a name that cannot be printed", place=place, mend="Use letters, digits, - and _.")
+        raise BadRecord("a name that cannot be printed", place=place, fix="Use letters, digits, - and _.")
 
 
 def check_span(time_s: np.ndarray, place: str) -> None:
@@ -119,5 +119,5 @@ def check_span(time_s: np.ndarray, place: str) -> None:
     """
     span_s = float(time_s[-1] - time_s[0])
     if not (span_s <= LONGEST_S):
-        mend = f"At most {LONGEST_S / 3600:g} h in one record; is the time in seconds?"
-        raise BadRecord(f"from the first to the last sample {span_s:.6g} s", place=place, mend=mend)
+        fix = f"At most {LONGEST_S / 3600:g} h in one record; is the time in seconds?"
+        raise BadRecord(f"from the first to the last sample {span_s:.6g} s", place=place, fix=fix)

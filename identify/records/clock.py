@@ -78,7 +78,7 @@ def regular(columns: Columns, at: At, told: At, pulse_rate_hz: float) -> tuple[C
             raise BadRecord(
                 f"sampled at {1 / part.step_s:.4g} Hz after a pause, {1 / step_s:.4g} Hz before it",
                 place=at(edge),
-                mend="Resample to one rate.",
+                fix="Resample to one rate.",
             )
     even = [part.even_s for part in parts if part.even_s is not None]
     if len(even) < len(parts):
@@ -89,14 +89,14 @@ def regular(columns: Columns, at: At, told: At, pulse_rate_hz: float) -> tuple[C
 
 def _check_rising(time_s: np.ndarray, at: At) -> None:
     if time_s.size < LEAST_SAMPLES:
-        raise BadRecord(f"only {time_s.size} samples", place=at(0), mend="Give a few seconds of data.")
+        raise BadRecord(f"only {time_s.size} samples", place=at(0), fix="Give a few seconds of data.")
     gaps = np.diff(time_s)
     backwards = np.flatnonzero(~(gaps > 0))
     if backwards.size:
         index = int(backwards[0]) + 1
         verb = "stands still" if gaps[index - 1] == 0 else "runs backwards"
-        mend = "Sort the rows by time, once each."
-        raise BadRecord(f"time {verb} at {time_s[index]:g} s", place=at(index), mend=mend)
+        fix = "Sort the rows by time, once each."
+        raise BadRecord(f"time {verb} at {time_s[index]:g} s", place=at(index), fix=fix)
 
 
 def _finer(time_s: np.ndarray) -> tuple[np.ndarray, list[str]]:
@@ -118,14 +118,14 @@ def _pauses(time_s: np.ndarray, width_us: np.ndarray, at: At) -> list[int]:
     least_s = max(PAUSE_S, 20 * float(np.median(steps)))
     jumps = np.flatnonzero((steps >= least_s) & (width_us[:-1] == 0) & (width_us[1:] == 0)) + 1
     if jumps.size > MOST_PAUSES:
-        mend = "Give a record without holes."
-        raise BadRecord(f"more than {MOST_PAUSES} pauses", place=at(int(jumps[MOST_PAUSES])), mend=mend)
+        fix = "Give a record without holes."
+        raise BadRecord(f"more than {MOST_PAUSES} pauses", place=at(int(jumps[MOST_PAUSES])), fix=fix)
     return [0, *jumps.tolist(), time_s.size]
 
 
 def _part(time_s: np.ndarray, torque_nm: np.ndarray, first: int, at: At) -> _Part:
     if time_s.size < LEAST_SAMPLES:
-        raise BadRecord(f"only {time_s.size} samples", place=at(first), mend="Give a few seconds of data.")
+        raise BadRecord(f"only {time_s.size} samples", place=at(first), fix="Give a few seconds of data.")
     gaps = np.diff(time_s)
     typical_s = float(np.median(gaps))
     near = np.abs(gaps - typical_s) <= NEAR * typical_s
@@ -183,7 +183,7 @@ def _lost_note(rows: np.ndarray, time_s: np.ndarray, at: At, told: At) -> list[s
         return []
     if rows.size > max(MOST_PAUSES, MOST_GAPS * time_s.size):
         place = at(int(rows[MOST_PAUSES]))
-        raise BadRecord(f"{rows.size} gaps in {time_s.size} samples", place=place, mend="Give a record without holes.")
+        raise BadRecord(f"{rows.size} gaps in {time_s.size} samples", place=place, fix="Give a record without holes.")
     longest_s = float(np.max(time_s[rows] - time_s[rows - 1]))
     places = "1 place" if rows.size == 1 else f"{rows.size} places"
     return [f"samples are missing at {places} (first at {told(int(rows[0]))}; longest {longest_s:.3g} s): left as gaps"]

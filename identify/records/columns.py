@@ -77,12 +77,12 @@ def parsed(given: Mapping[str, str] | Iterable[str] | None) -> Given:
     found: dict[str, Asked] = {}
     for target, text in pairs:
         if target not in TARGETS:
-            mend = f"Give one of {', '.join(TARGETS)}, for instance --map torque_nm=Moment:Nm."
-            raise BadRecord(f"no column is called {_short(target)!r}", place="--map", mend=mend)
+            fix = f"Give one of {', '.join(TARGETS)}, for instance --map torque_nm=Moment:Nm."
+            raise BadRecord(f"no column is called {_short(target)!r}", place="--map", fix=fix)
         if target in found:
-            raise BadRecord(f"{target} is given twice", place="--map", mend="Give each column once.")
+            raise BadRecord(f"{target} is given twice", place="--map", fix="Give each column once.")
         if not str(text).strip():
-            raise BadRecord(f"no name for {target}", place="--map", mend=f"Give --map {target}=NAME:UNIT.")
+            raise BadRecord(f"no name for {target}", place="--map", fix=f"Give --map {target}=NAME:UNIT.")
         found[target] = Asked(target, str(text).strip())
     return found
 
@@ -94,8 +94,8 @@ def _texts(given: Iterable[str]) -> list[str]:
 def _pair(text: str) -> tuple[str, str]:
     target, equals, name = text.partition("=")
     if not equals:
-        mend = "Give TARGET=NAME:UNIT, for instance --map torque_nm=Moment:Nm."
-        raise BadRecord(f"{_short(text)!r} has no '='", place="--map", mend=mend)
+        fix = "Give TARGET=NAME:UNIT, for instance --map torque_nm=Moment:Nm."
+        raise BadRecord(f"{_short(text)!r} has no '='", place="--map", fix=fix)
     return target.strip(), name
 
 
@@ -214,31 +214,31 @@ def _asked_for(cells: Sequence[str], asked: Asked) -> list[int]:
 def _missing(cells: Sequence[str], missing: Sequence[str], given: Given, place: str) -> BadRecord:
     here = ", ".join(_short(cell) for cell in cells[:MOST_SHOWN] if cell) + (", …" if len(cells) > MOST_SHOWN else "")
     if asked := next((given[target] for target in missing if target in given), None):
-        return BadRecord(f"no column {_short(asked.text)!r} for {asked.target}", place=place, mend=f"It has: {here}.")
+        return BadRecord(f"no column {_short(asked.text)!r} for {asked.target}", place=place, fix=f"It has: {here}.")
     target = missing[0]
     unit = units.SHOWN[target][0]
-    mend = f"Say which it is, for instance --map {target}=NAME:{unit}; it has: {here}."
-    return BadRecord(f"no column {', '.join(missing)}", place=place, mend=mend)
+    fix = f"Say which it is, for instance --map {target}=NAME:{unit}; it has: {here}."
+    return BadRecord(f"no column {', '.join(missing)}", place=place, fix=fix)
 
 
 def _twice(cells: Sequence[str], target: str, indices: Sequence[int], place: str) -> BadRecord:
     first, second = (cells[index] for index in indices[:2])
     if first == second:
-        return BadRecord(f"column {_short(first)} is there twice", place=place, mend="Keep one of them.")
-    mend = f"Say which, for instance --map {target}={_short(first)}."
-    return BadRecord(f"{target} may be {_short(first)!r} or {_short(second)!r}", place=place, mend=mend)
+        return BadRecord(f"column {_short(first)} is there twice", place=place, fix="Keep one of them.")
+    fix = f"Say which, for instance --map {target}={_short(first)}."
+    return BadRecord(f"{target} may be {_short(first)!r} or {_short(second)!r}", place=place, fix=fix)
 
 
 def _unit(name: str, target: str, unit: str, place: str) -> BadRecord:
     known = units.SHOWN.get(target, ("1",))
     shown = _short(_split(name, target)[0] or name)
-    mend = f"Give --map {target}={shown}:{known[0]}" + (f" (or {', '.join(known[1:])})." if known[1:] else ".")
+    fix = f"Give --map {target}={shown}:{known[0]}" + (f" (or {', '.join(known[1:])})." if known[1:] else ".")
     if target == "torque_nm" and units.plain(unit) in ("n", "kg", "kn", "v", "mv"):
-        mend = "Torque is asked for: multiply by the lever arm or the sensor's scale first."
+        fix = "Torque is asked for: multiply by the lever arm or the sensor's scale first."
     said = f"its unit {_short(unit)!r} is not known" if unit else "its unit is not said"
     if unit and units.factor(target, unit) is not None:
         said = f"below it stands {_short(unit)!r}"
-    return BadRecord(f"column {_short(name)!r} is taken for {target}, but {said}", place=place, mend=mend)
+    return BadRecord(f"column {_short(name)!r} is taken for {target}, but {said}", place=place, fix=fix)
 
 
 def _short(text: str) -> str:

@@ -28,7 +28,7 @@ def read_csv(content: bytes, path: Path, pulse_rate_hz: float | None = None, giv
     Raises
     ------
     BadRecord
-        With file, line and column, and the mend.
+        With file, line and column, and what to do.
     """
     name = str(path)
     encoding, encoded = text.encoding_of(content, name)
@@ -39,7 +39,7 @@ def read_csv(content: bytes, path: Path, pulse_rate_hz: float | None = None, giv
     table.fill(layout.rows)
     if not table.lines:
         place = f"{name}, line {layout.line + 1}"
-        raise BadRecord("no row under the header", place=place, mend="Give a few seconds of data.")
+        raise BadRecord("no row under the header", place=place, fix="Give a few seconds of data.")
     source = Source(path.name, sha256=hashlib.sha256(content).hexdigest(), notes=_notes(encoded, layout, table, known))
     found = Found(
         columns={column: np.array(values) for column, values in table.numbers.items()},
@@ -73,7 +73,7 @@ def _cells_of_parts(header: list[str], known: dict[str, Column], place: str) -> 
     if not {"part", "pause_s", "segment"} <= set(header):
         return {}
     if twice := [column for column in ("part", *parts_csv.CELLS) if header.count(column) > 1]:
-        raise BadRecord(f"column {twice[0]} is there twice", place=place, mend="Keep one of them.")
+        raise BadRecord(f"column {twice[0]} is there twice", place=place, fix="Keep one of them.")
     known["part"] = Column(header.index("part"))
     return {column: header.index(column) for column in parts_csv.CELLS if column in header}
 
@@ -83,7 +83,7 @@ def _joined(found: Found, table: Table, pulse_rate_hz: float | None) -> Record:
     for column, values in found.columns.items():
         if (bad := np.flatnonzero(~(np.abs(values) <= bounds.LARGEST[column]))).size:
             place = found.at(int(bad[0]), column)
-            raise BadRecord(f"{values[bad[0]]:g} is no measurement", place=place, mend=parts_csv.MEND)
+            raise BadRecord(f"{values[bad[0]]:g} is no measurement", place=place, fix=parts_csv.FIX)
     check_widths(found.columns, found.at)
     time_s = found.columns["time_s"]
     joined = parts_csv.parsed(found.columns, table.parts, table.lines, table.name)

@@ -13,7 +13,7 @@ import numpy as np
 
 from identify.errors import BadRecord
 from identify.records import bounds
-from identify.records.hdf5 import MEND, StrictFile
+from identify.records.hdf5 import FIX, StrictFile
 from identify.records.record import FORGOTTEN_S, Pulses
 
 SENT_AND_ACKNOWLEDGED, DROPPED, REFUSED = 0, 2, 3
@@ -64,7 +64,7 @@ def read_pulses(file: StrictFile, name: str, time_s: np.ndarray, pulse_rate_hz: 
         return Pulses(nothing, nothing, nothing, np.zeros(0, bool)), np.zeros(time_s.size, bool)
     sync = file.numbers("/torque/sync") if file.has("/torque/sync") else np.full(time_s.size, 255.0)
     if sync.size != time_s.size:
-        raise BadRecord("columns of different lengths", place=f"{name}, /torque/sync", mend=MEND)
+        raise BadRecord("columns of different lengths", place=f"{name}, /torque/sync", fix=FIX)
     sound = sent.sound
     # Even slots, late by what the promptest pulses were late together.
     lag = float(np.quantile((sent.written - sent.planned)[sound], PROMPT)) if sound.any() else 0.0
@@ -87,13 +87,13 @@ def _sent(file: StrictFile, name: str, interval_s: float) -> _Sent:
     path = "/pulses/acknowledged_time_s"
     acknowledged = file.numbers(path) if file.has(path) else written
     if not (planned.size == sent.size == written.size == status.size == acknowledged.size):
-        raise BadRecord("columns of different lengths", place=f"{name}, /pulses", mend=MEND)
+        raise BadRecord("columns of different lengths", place=f"{name}, /pulses", fix=FIX)
     sent = np.where(np.isnan(sent), 0.0, sent)
     if (bad := np.flatnonzero(~((sent >= 0) & (sent <= bounds.LARGEST["pulse_width_us"])))).size:
         place = f"{name}, /pulses/sent_pulse_width_us, pulse {bad[0]}"
-        raise BadRecord(f"{sent[bad[0]]:g} µs is no pulse width", place=place, mend=MEND)
+        raise BadRecord(f"{sent[bad[0]]:g} µs is no pulse width", place=place, fix=FIX)
     if not (np.diff(planned) > 0).all() or not np.isfinite(planned).all():
-        raise BadRecord("pulses do not follow one another", place=f"{name}, /pulses/planned_time_s", mend=MEND)
+        raise BadRecord("pulses do not follow one another", place=f"{name}, /pulses/planned_time_s", fix=FIX)
     written, acknowledged = (
         np.where(np.abs(t) <= bounds.LARGEST["time_s"], t, np.nan) for t in (written, acknowledged)
     )

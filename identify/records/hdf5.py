@@ -19,7 +19,7 @@ from identify.errors import BadRecord
 from identify.records import hdf5_chunks
 from identify.records.bounds import LARGEST_ROWS, MOST_SEGMENTS
 
-MEND = "Give a sealed recording, as written by the rig at the end of a test."
+FIX = "Give a sealed recording, as written by the rig at the end of a test."
 LONGEST_TEXT = 10_000
 FILTERS = (h5z.FILTER_DEFLATE, h5z.FILTER_SHUFFLE, h5z.FILTER_FLETCHER32)
 
@@ -140,7 +140,7 @@ class StrictFile:
         for part in path.strip("/").encode().split(b"/"):
             with self._asking(path):
                 if not isinstance(here, h5g.GroupID) or not here.links.exists(part):
-                    raise BadRecord(f"incomplete recording (no {path})", place=self.name, mend=MEND)
+                    raise BadRecord(f"incomplete recording (no {path})", place=self.name, fix=FIX)
                 if here.links.get_info(part).type != h5l.TYPE_HARD:
                     raise self._bad("a link to somewhere else", path)
                 here = h5o.open(here, part)
@@ -188,7 +188,7 @@ class StrictFile:
             raise self._bad("unreadable or half-written HDF5", path) from error
 
     def _bad(self, message: str, path: str) -> BadRecord:
-        return BadRecord(message, place=f"{self.name}, {path}" if path else self.name, mend=MEND)
+        return BadRecord(message, place=f"{self.name}, {path}" if path else self.name, fix=FIX)
 
 
 def _sound(text: str | bytes) -> str:

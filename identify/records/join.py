@@ -80,19 +80,19 @@ def join(records: Sequence[Record], begun_s: Sequence[float | None]) -> Record:
         Pulse rates differ, too little in one or too much together, or fewer than two samples a pulse in a slow part.
     """
     if len(records) != len(begun_s) or not records:
-        raise BadRecord(f"{len(records)} records with {len(begun_s)} begins", mend="Give one for each.")
+        raise BadRecord(f"{len(records)} records with {len(begun_s)} begins", fix="Give one for each.")
     rate_hz = records[0].pulse_rate_hz
     pieces: list[_Piece] = []
     for number, (record, begun) in enumerate(zip(records, begun_s, strict=True), start=1):
         if abs(record.pulse_rate_hz - rate_hz) > 1e-6:
             message = f"{record.pulse_rate_hz:g} pulses/s, the first has {rate_hz:g}"
-            raise BadRecord(message, place=f"recording {number}", mend="Join recordings of one pulse rate.")
+            raise BadRecord(message, place=f"recording {number}", fix="Join recordings of one pulse rate.")
         if record.time_s.size < LEAST_SAMPLES:
             message = f"only {record.time_s.size} samples"
-            raise BadRecord(message, place=f"recording {number}", mend="Give a few seconds of data.")
+            raise BadRecord(message, place=f"recording {number}", fix="Give a few seconds of data.")
         pieces += _pieces(record, begun)
     if len(pieces) > bounds.MOST_PARTS:
-        raise BadRecord(f"{len(pieces)} parts", mend=f"Join at most {bounds.MOST_PARTS}.")
+        raise BadRecord(f"{len(pieces)} parts", fix=f"Join at most {bounds.MOST_PARTS}.")
     if all(piece.begun_s is not None for piece in pieces):
         pieces = [replace(piece, follows=False) for piece in sorted(pieces, key=_order)]
     return _joined(_at_one_rate(pieces, rate_hz), rate_hz)
@@ -150,7 +150,7 @@ def _at_one_rate(pieces: list[_Piece], rate_hz: float) -> list[_Piece]:
     if each < 2:
         raise BadRecord(
             f"sampled at {lowest:.4g} and {max(own):.4g} Hz",
-            mend=f"Recordings of different rates are joined from {2 * rate_hz:g} Hz on.",
+            fix=f"Recordings of different rates are joined from {2 * rate_hz:g} Hz on.",
         )
     return [
         replace(piece, record=_block_means(piece, each, rate_hz)) if own_hz > (1 + SAME_RATE) * lowest else piece
@@ -195,7 +195,7 @@ def _joined(pieces: list[_Piece], rate_hz: float) -> Record:
     """One record of pieces at one rate."""
     total = sum(piece.record.time_s.size for piece in pieces)
     if total > bounds.LARGEST_ROWS:
-        raise BadRecord(f"{total} samples together", mend=f"At most {bounds.LARGEST_ROWS} in one record.")
+        raise BadRecord(f"{total} samples together", fix=f"At most {bounds.LARGEST_ROWS} in one record.")
     times, parts, codes, names, sources = [], [], [], [], []
     pulses: list[Pulses] = []
     first, ended, slot_s = 0, 0, pieces[0].slot_s

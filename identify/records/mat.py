@@ -13,7 +13,7 @@ from identify.errors import BadRecord
 from identify.records import bounds, columns
 from identify.records.assemble import PULSE_RATE_HZ, Found, record_of
 from identify.records.columns import Column, Given
-from identify.records.mat_file import CELL, CHAR, MEND, BadMat, Variable, variables
+from identify.records.mat_file import CELL, CHAR, FIX, BadMat, Variable, variables
 from identify.records.record import Record, Source
 
 RATE = "pulse_rate_hz"
@@ -27,7 +27,7 @@ def read_mat(content: bytes, path: Path, pulse_rate_hz: float | None = None, giv
     Raises
     ------
     BadRecord
-        With the file and the variable, and the mend.
+        With the file and the variable, and what to do.
     """
     name = str(path)
     scope, known, given = _scope(variables(content, name), given or {}, name)
@@ -67,13 +67,13 @@ def _scope(top: Mapping[str, Variable], given: Given, name: str) -> tuple[str, M
         try:
             fields = variable.fields()
         except BadMat as error:
-            raise BadRecord(str(error), place=f"{name}, {title}", mend=MEND) from error
+            raise BadRecord(str(error), place=f"{name}, {title}", fix=FIX) from error
         inside = {target: replace(asked, text=asked.text.removeprefix(f"{title}.")) for target, asked in given.items()}
         if fields and columns.complete(columns.places(list(fields), inside)):
             scopes.append((title, fields, inside))
     if len(scopes) > 1:
         both = " and ".join(title for title, *_ in scopes[:2])
-        raise BadRecord(f"records in {both}", place=name, mend="Save each in a file of its own.")
+        raise BadRecord(f"records in {both}", place=name, fix="Save each in a file of its own.")
     if not scopes:
         raise _nothing(top, given, name)
     return scopes[0]
@@ -81,7 +81,7 @@ def _scope(top: Mapping[str, Variable], given: Given, name: str) -> tuple[str, M
 
 def _nothing(top: Mapping[str, Variable], given: Given, name: str) -> BadRecord:
     if not top:
-        return BadRecord("no variable", place=name, mend=MEND)
+        return BadRecord("no variable", place=name, fix=FIX)
     try:
         columns.columns(list(top), given, [], name)
     except BadRecord as error:
@@ -101,9 +101,9 @@ def _check_lengths(numbers: Mapping[str, np.ndarray], of: Mapping[str, str], nam
     for target, column in numbers.items():
         if column.size != size:
             message = f"{column.size} numbers, and {of['time_s']} has {size}"
-            raise BadRecord(message, place=f"{name}, {of[target]}", mend="Give one for each sample.")
+            raise BadRecord(message, place=f"{name}, {of[target]}", fix="Give one for each sample.")
     if not size:
-        raise BadRecord("no number", place=f"{name}, {of['time_s']}", mend="Give a few seconds of data.")
+        raise BadRecord("no number", place=f"{name}, {of['time_s']}", fix="Give a few seconds of data.")
 
 
 def _segments(variable: Variable, size: int, place: str) -> tuple[np.ndarray, list[str]]:
@@ -115,11 +115,11 @@ def _segments(variable: Variable, size: int, place: str) -> tuple[np.ndarray, li
     if len(texts) == 1:
         texts = texts * size
     if len(texts) != size:
-        raise BadRecord(f"{len(texts)} names for {size} samples", place=place, mend="Give one for each sample.")
+        raise BadRecord(f"{len(texts)} names for {size} samples", place=place, fix="Give one for each sample.")
     names: dict[str, int] = {}
     code = np.array([names.setdefault(text.strip(), len(names)) for text in texts])
     if len(names) > bounds.MOST_SEGMENTS:
-        raise BadRecord(f"{len(names)} different names", place=place, mend="Name segments by what they are.")
+        raise BadRecord(f"{len(names)} different names", place=place, fix="Name segments by what they are.")
     for text in names:
         bounds.check_name(text, place)
     return code, list(names)

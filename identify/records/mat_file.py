@@ -30,7 +30,7 @@ COMPLEX = 0x0800
 KINDS = {3: "an object", 5: "a sparse matrix", 16: "a function handle", 17: "an object (table, string, datetime, …)"}
 MOST_VARIABLES = 10_000
 LONGEST_TEXT = 10_000
-MEND = "Save plain columns of numbers from MATLAB: save('record.mat', 'time_s', 'pulse_width_us', 'torque_nm', '-v7')."
+FIX = "Save plain columns of numbers from MATLAB: save('record.mat', 'time_s', 'pulse_width_us', 'torque_nm', '-v7')."
 OBJECTS = "Turn it into plain numbers or texts first: seconds(t), cellstr(s), table2struct(T, 'ToScalar', true)."
 
 
@@ -156,7 +156,7 @@ def variables(content: bytes, name: str) -> dict[str, Variable]:
     order = {b"\x00\x01IM": "<", b"\x01\x00MI": ">"}.get(content[124:HEADER_BYTES])
     if order is None:
         what = "a MAT file of version 7.3" if content.startswith(b"MATLAB 7.3") else "no MAT file of version 5 to 7"
-        raise BadRecord(what, place=name, mend=MEND)
+        raise BadRecord(what, place=name, fix=FIX)
     view, place = memoryview(content), HEADER_BYTES
     found: dict[str, Variable] = {}
     try:
@@ -168,7 +168,7 @@ def variables(content: bytes, name: str) -> dict[str, Variable]:
             if len(found) > MOST_VARIABLES:
                 raise BadMat(f"more than {MOST_VARIABLES} variables")
     except BadMat as error:
-        raise BadRecord(f"a damaged MAT file ({error})", place=name, mend=MEND) from error
+        raise BadRecord(f"a damaged MAT file ({error})", place=name, fix=FIX) from error
     return found
 
 

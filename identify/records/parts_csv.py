@@ -22,7 +22,7 @@ CELLS = ("pause_s", "folded_s", "own_s", "begun_s", "pulse_rate_hz", "name", "re
 """Columns of which only a part's first row is filled; all but `pause_s` may be missing or empty."""
 LARGEST_UNIX_S = 1e11
 LONGEST_TEXT = 300
-MEND = "Join the recordings again."
+FIX = "Join the recordings again."
 
 
 def write(record: Record, path: Path) -> None:
@@ -52,7 +52,7 @@ def write(record: Record, path: Path) -> None:
             size += file.write(",".join(row) + described.get(index, empty) + "\n")
             if size > bounds.LARGEST_FILE_BYTES:
                 message = f"more than {bounds.LARGEST_FILE_BYTES // 2**20} MB as a file"
-                raise BadRecord(message, mend="Join fewer recordings.")
+                raise BadRecord(message, fix="Join fewer recordings.")
 
 
 def _descriptions(record: Record) -> list[str]:
@@ -107,14 +107,14 @@ def parsed(
             return f"{name}, line {lines[row]}, column {column}"
 
         if columns["part"][row] != number:
-            raise BadRecord(f"{columns['part'][row]:g} where part {number} begins", place=at("part"), mend=MEND)
+            raise BadRecord(f"{columns['part'][row]:g} where part {number} begins", place=at("part"), fix=FIX)
         found.append(_part(row, texts, float(time_s[row]), at))
         gap_s = time_s[row] - time_s[row - 1] if number else 0.0
         if found[-1][0].folded_s > gap_s + 1e-6:
-            raise BadRecord("longer than the jump of the time", place=at("folded_s"), mend=MEND)
+            raise BadRecord("longer than the jump of the time", place=at("folded_s"), fix=FIX)
     rates = {rate for *_, rate in found}
     if len(rates) > 1:
-        raise BadRecord("parts of different pulse rates", place=f"{name}, column pulse_rate_hz", mend=MEND)
+        raise BadRecord("parts of different pulse rates", place=f"{name}, column pulse_rate_hz", fix=FIX)
     return Parts(tuple(part for part, *_ in found), tuple(source for _, source, _ in found), rates.pop())
 
 
@@ -124,11 +124,11 @@ def _check_time(time_s: np.ndarray, firsts: Sequence[int], lines: Sequence[int],
     if backwards.size:
         row = int(backwards[0]) + 1
         place = f"{name}, line {lines[row]}, column time_s"
-        raise BadRecord(f"time does not rise at {time_s[row]:g} s", place=place, mend=MEND)
+        raise BadRecord(f"time does not rise at {time_s[row]:g} s", place=place, fix=FIX)
     for row, end in zip(firsts, [*firsts[1:], time_s.size], strict=True):
         place = f"{name}, line {lines[row]}, column time_s"
         if end - row < 2:
-            raise BadRecord("a part of one sample", place=place, mend=MEND)
+            raise BadRecord("a part of one sample", place=place, fix=FIX)
         bounds.check_sampling(1 / float(np.median(np.diff(time_s[row:end]))), place)
 
 
@@ -144,18 +144,18 @@ def _part(
         except ValueError:
             value = np.nan
         if not (text.isascii() and "_" not in text and lowest <= value <= highest):
-            raise BadRecord(f"{text[:40]!r} is not {lowest:g} to {highest:g}", place=at(column), mend=MEND)
+            raise BadRecord(f"{text[:40]!r} is not {lowest:g} to {highest:g}", place=at(column), fix=FIX)
         return value
 
     def text(column: str) -> str:
         found = texts.get(column, "")
         if len(found) > LONGEST_TEXT or not found.isprintable():
-            raise BadRecord("a name that cannot be", place=at(column), mend=MEND)
+            raise BadRecord("a name that cannot be", place=at(column), fix=FIX)
         return found
 
     pause_s = number("pause_s", 0.0, bounds.LONGEST_S)
     if pause_s is None:
-        raise BadRecord("empty", place=at("pause_s"), mend="Give the pause before each part, 0 if it isn't known.")
+        raise BadRecord("empty", place=at("pause_s"), fix="Give the pause before each part, 0 if it isn't known.")
     folded_s, latest_s = number("folded_s", 0.0, pause_s), bounds.LARGEST["time_s"]
     own_s = number("own_s", -latest_s, latest_s)
     rate_hz = number("pulse_rate_hz", *bounds.PULSE_RATES_HZ)

@@ -33,7 +33,7 @@ def read(
     Raises
     ------
     BadRecord
-        With file, line and column, and the mend.
+        With file, line and column, and what to do.
     """
     path = Path(path)
     if pulse_rate_hz is not None:
@@ -44,7 +44,7 @@ def read(
         from identify.records.recording import read_recording
 
         if given:
-            raise BadRecord("a sealed recording has its own columns", place=str(path), mend="Leave --map out.")
+            raise BadRecord("a sealed recording has its own columns", place=str(path), fix="Leave --map out.")
         return read_recording(content, path, pulse_rate_hz)
     if is_mat(content) or path.suffix.lower() == ".mat":
         from identify.records.mat import read_mat

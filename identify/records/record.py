@@ -173,7 +173,7 @@ class Record(Shown):
         given = {"angle_rad": angle_rad, "velocity_rad_s": velocity_rad_s, "late_s": late_s, "doubted": doubted}
         optional = {label: _checked(label, column, size) for label, column in given.items() if column is not None}
         if size == 0:
-            raise BadRecord("the record holds no sample", mend="Give at least a few seconds of data.")
+            raise BadRecord("the record holds no sample", fix="Give at least a few seconds of data.")
         changed = np.r_[True, code[1:] != code[:-1]]
         changed[[part.first for part in parts]] = True
         starts = np.flatnonzero(changed)
@@ -288,12 +288,12 @@ def _checked(label: str, column: np.ndarray, size: int) -> np.ndarray:
     values = np.ascontiguousarray(column, float)
     finite = np.isfinite(values)
     if not finite.all():
-        raise BadRecord("not finite", place=f"{label}, sample {int(np.argmin(finite))}", mend="Leave the column out.")
+        raise BadRecord("not finite", place=f"{label}, sample {int(np.argmin(finite))}", fix="Leave the column out.")
     if label != "doubted":
         return values
     if (bad := np.flatnonzero((values != 0) & (values != 1))).size:
         place = f"{label}, sample {int(bad[0])}"
-        raise BadRecord(f"{values[bad[0]]:g} is neither 0 nor 1", place=place, mend="1 is doubted, 0 is not.")
+        raise BadRecord(f"{values[bad[0]]:g} is neither 0 nor 1", place=place, fix="1 is doubted, 0 is not.")
     return values > 0
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from identify.errors import BadRecord
 from identify.records import bounds
 from identify.records.felt import read_pulses
-from identify.records.hdf5 import MEND, StrictFile
+from identify.records.hdf5 import FIX, StrictFile
 from identify.records.record import Pulses, Record, Source
 
 FORMAT = "stimrig-recording"
@@ -49,11 +49,11 @@ def read_recording(content: bytes, path: Path, pulse_rate_hz: float | None = Non
     code, names = _segments(file, name, time_s)
     inside = code >= 0
     if not inside.any():
-        raise BadRecord("no sample inside a segment", place=f"{name}, /segments", mend=MEND)
+        raise BadRecord("no sample inside a segment", place=f"{name}, /segments", fix=FIX)
     largest = bounds.LARGEST["torque_nm"]
     if (bad := np.flatnonzero(inside & ~(np.abs(torque) <= largest))).size:
         what = "is not finite" if not np.isfinite(torque[bad[0]]) else f"{torque[bad[0]]:g} N·m is no measurement"
-        raise BadRecord(f"torque {what}", place=f"{name}, /torque/torque_nm, sample {bad[0]}", mend=MEND)
+        raise BadRecord(f"torque {what}", place=f"{name}, /torque/torque_nm, sample {bad[0]}", fix=FIX)
     pulses, doubts = read_pulses(file, name, time_s, rate)
     width, late = _in_force(pulses, time_s, rate)
     bounds.check_span(time_s[inside], f"{name}, /torque/time_s")
@@ -68,11 +68,11 @@ def read_recording(content: bytes, path: Path, pulse_rate_hz: float | None = Non
 
 def _check_format(file: StrictFile) -> None:
     if file.text("format", "") != FORMAT:
-        raise BadRecord("HDF5, but no stimrig recording", place=file.name, mend=MEND)
+        raise BadRecord("HDF5, but no stimrig recording", place=file.name, fix=FIX)
     version = file.number("format_version", 0)
     if version != 1:
         raise BadRecord(
-            f"format version {version:g}, this software reads 1", place=file.name, mend="Update the software."
+            f"format version {version:g}, this software reads 1", place=file.name, fix="Update the software."
         )
 
 
@@ -80,12 +80,12 @@ def _samples(file: StrictFile, name: str) -> tuple[np.ndarray, np.ndarray]:
     """Times, rising, and torques."""
     time_s, torque = file.numbers("/torque/time_s"), file.numbers("/torque/torque_nm")
     if time_s.size != torque.size or not time_s.size:
-        raise BadRecord("no torque sample", place=f"{name}, /torque", mend=MEND)
+        raise BadRecord("no torque sample", place=f"{name}, /torque", fix=FIX)
     backwards = np.flatnonzero(~(np.diff(time_s) > 0))
     if backwards.size:
-        raise BadRecord("time runs backwards", place=f"{name}, /torque/time_s, sample {backwards[0] + 1}", mend=MEND)
+        raise BadRecord("time runs backwards", place=f"{name}, /torque/time_s, sample {backwards[0] + 1}", fix=FIX)
     if not (np.abs(time_s[[0, -1]]) <= bounds.LARGEST["time_s"]).all():
-        raise BadRecord("times that no clock shows", place=f"{name}, /torque/time_s", mend=MEND)
+        raise BadRecord("times that no clock shows", place=f"{name}, /torque/time_s", fix=FIX)
     if time_s.size > 1:
         bounds.check_sampling(1 / float(np.median(np.diff(time_s))), f"{name}, /torque/time_s")
     return time_s, torque
@@ -96,9 +96,9 @@ def _segments(file: StrictFile, name: str, time_s: np.ndarray) -> tuple[np.ndarr
     starts, ends = file.numbers("/segments/start_s"), file.numbers("/segments/end_s")
     names = file.names("/segments/name")
     if not (starts.size == ends.size == len(names)):
-        raise BadRecord("names, starts and ends differ in number", place=f"{name}, /segments", mend=MEND)
+        raise BadRecord("names, starts and ends differ in number", place=f"{name}, /segments", fix=FIX)
     if not ((np.diff(starts) >= 0).all() and (ends >= starts).all()):
-        raise BadRecord("segments do not follow one another", place=f"{name}, /segments", mend=MEND)
+        raise BadRecord("segments do not follow one another", place=f"{name}, /segments", fix=FIX)
     for index, text in enumerate(names):
         bounds.check_name(text, f"{name}, /segments/name, segment {index}")
     if not names:

@@ -86,8 +86,8 @@ class Table:
                 raise self._short(row, lines[index], "pause_s")
             self.parts[before + index] = {column: row[at].strip() for column, at in self.cells.items()}
             if len(self.parts) > bounds.MOST_PARTS:
-                mend = f"At most {bounds.MOST_PARTS} in one record."
-                raise BadRecord("too many parts", place=self.at(lines[index], "part"), mend=mend)
+                fix = f"At most {bounds.MOST_PARTS} in one record."
+                raise BadRecord("too many parts", place=self.at(lines[index], "part"), fix=fix)
 
     def _column(self, rows: list[list[str]], column: str, lines: list[int]) -> np.ndarray:
         """The numbers of a column in its own unit; NaN where the file has none."""
@@ -118,7 +118,7 @@ class Table:
             raise BadRecord(
                 f"{shown} is no measurement" if shown else "empty",
                 place=self.at(lines[bad[0]], column),
-                mend="Remove the row's cause, or cut the record before it; values must be finite.",
+                fix="Remove the row's cause, or cut the record before it; values must be finite.",
             )
         return values
 
@@ -133,8 +133,8 @@ class Table:
             cell, line = next(pair for pair in zip(cells, lines, strict=True) if sign in pair[0])
             other = f"after numbers with a decimal {'comma' if sign == '.' else 'point'}"
             message = f"{_shown(cell)!r} {other if self.decimal else 'between separating commas'}"
-            mend = "Write all numbers with a decimal point, without signs between thousands."
-            raise BadRecord(message, place=self.at(line, column), mend=mend)
+            fix = "Write all numbers with a decimal point, without signs between thousands."
+            raise BadRecord(message, place=self.at(line, column), fix=fix)
 
     def _number(self, cell: str, column: str, line: int) -> float:
         """One number; NaN where the tool says that it has none."""
@@ -142,18 +142,18 @@ class Table:
             return np.nan
         if is_number(cell):
             return float(cell)
-        message, mend = f"{_shown(cell)!r} is no number", "Give a number with a decimal point."
-        raise BadRecord(message, place=self.at(line, column), mend=mend)
+        message, fix = f"{_shown(cell)!r} is no number", "Give a number with a decimal point."
+        raise BadRecord(message, place=self.at(line, column), fix=fix)
 
     def _new_name(self, text: str, line: int) -> int:
         bounds.check_name(text, self.at(line, "segment"))
         if len(self.names) == bounds.MOST_SEGMENTS:
-            mend = "Name segments by what they are (rest, prbs…), not each row."
-            raise BadRecord(f"more than {bounds.MOST_SEGMENTS} names", place=self.at(line, "segment"), mend=mend)
+            fix = "Name segments by what they are (rest, prbs…), not each row."
+            raise BadRecord(f"more than {bounds.MOST_SEGMENTS} names", place=self.at(line, "segment"), fix=fix)
         return self.names.setdefault(text, len(self.names))
 
     def _short(self, row: list[str], line: int, column: str) -> BadRecord:
-        return BadRecord(f"only {len(row)} cells", place=self.at(line, column), mend=CUT)
+        return BadRecord(f"only {len(row)} cells", place=self.at(line, column), fix=CUT)
 
     def at(self, line: int, column: str) -> str:
         """How messages call a cell."""

@@ -41,7 +41,7 @@ def encoding_of(content: bytes, name: str) -> tuple[str, str]:
             if zeros.count(0) > 0.9 * len(zeros) and b"\0" not in signs:
                 return codec, "read as UTF-16 text"
         place = f"{name}, line {content.count(10, 0, content.index(0)) + 1}"
-        raise BadRecord("not text (a zero byte)", place=place, mend="Save the file as CSV text.")
+        raise BadRecord("not text (a zero byte)", place=place, fix="Save the file as CSV text.")
     if content.isascii() or _is_utf8(content):
         return "utf-8-sig", ""
     return "cp1252", "not UTF-8: read as Windows-1252 (Latin-1) text"
@@ -71,14 +71,14 @@ def lines(content: bytes, encoding: str, name: str) -> Iterator[str]:
     try:
         for number, line in enumerate(file, start=1):
             if len(line) > LONGEST_LINE:
-                mend = "One row a line; is it text at all?"
-                raise BadRecord(f"more than {LONGEST_LINE} characters", place=f"{name}, line {number}", mend=mend)
+                fix = "One row a line; is it text at all?"
+                raise BadRecord(f"more than {LONGEST_LINE} characters", place=f"{name}, line {number}", fix=fix)
             if number > bounds.LARGEST_ROWS:
-                mend = "Cut the record, or resample it to a lower rate."
-                raise BadRecord(f"more than {bounds.LARGEST_ROWS} lines", place=f"{name}, line {number}", mend=mend)
+                fix = "Cut the record, or resample it to a lower rate."
+                raise BadRecord(f"more than {bounds.LARGEST_ROWS} lines", place=f"{name}, line {number}", fix=fix)
             yield line
     except UnicodeDecodeError:
-        raise BadRecord("not text", place=f"{name}, line {number + 1}", mend="Save the file as UTF-8 CSV.") from None
+        raise BadRecord("not text", place=f"{name}, line {number + 1}", fix="Save the file as UTF-8 CSV.") from None
 
 
 @dataclass
@@ -154,7 +154,7 @@ def _rows(source: Iterable[str], separator: str, first_line: int, name: str) -> 
                 yield before + reader.line_num, row
     except csv.Error as error:
         place = f"{name}, line {before + reader.line_num}"
-        raise BadRecord(f"not CSV ({error})", place=place, mend="Save the file as comma-separated text.") from error
+        raise BadRecord(f"not CSV ({error})", place=place, fix="Save the file as comma-separated text.") from error
 
 
 def _below(found: Layout, content: bytes, name: str) -> Layout:
@@ -186,13 +186,13 @@ def _check_width(found: Layout, line: int, row: list[str], name: str) -> None:
     used = max((index for index, cell in enumerate(row, start=1) if cell.strip()), default=0)
     if used == len(found.header) or (used < len(found.header) and used > 1 and found.separator != BLANKS):
         return
-    mend = "Name every column."
+    fix = "Name every column."
     if used < len(found.header):
-        mend = f"The header is separated by {SEPARATORS[found.separator]}: separate the rows alike."
+        fix = f"The header is separated by {SEPARATORS[found.separator]}: separate the rows alike."
     elif found.separator == ",":
-        mend = "Name every column; with decimal commas, separate the cells with semicolons."
+        fix = "Name every column; with decimal commas, separate the cells with semicolons."
     message = f"{used} {'cell' if used == 1 else 'cells'} under a header of {len(found.header)}"
-    raise BadRecord(message, place=f"{name}, line {line}", mend=mend)
+    raise BadRecord(message, place=f"{name}, line {line}", fix=fix)
 
 
 def _no_header(before: list[str], given: Given, name: str) -> BadRecord:
@@ -205,12 +205,12 @@ def _no_header(before: list[str], given: Given, name: str) -> BadRecord:
             if score > best[0]:
                 best = (score, number, cells)
     _, number, cells = best
-    mend = "The first line must be time_s,pulse_width_us,torque_nm,segment, or name your columns with --map."
+    fix = "The first line must be time_s,pulse_width_us,torque_nm,segment, or name your columns with --map."
     if not cells:
         filled = any(line.strip("\ufeff \t\r\n") for line in before)
         if filled and any(is_number(cell) for cell in re.split(r"[,;|\s]+", before[0].strip())[:1]):
-            mend = "Say which column is which: --map time_s=#1:s --map pulse_width_us=#2:µs --map torque_nm=#3:Nm."
-        return BadRecord("no header" if filled else "empty", place=f"{name}, line 1", mend=mend)
+            fix = "Say which column is which: --map time_s=#1:s --map pulse_width_us=#2:µs --map torque_nm=#3:Nm."
+        return BadRecord("no header" if filled else "empty", place=f"{name}, line 1", fix=fix)
     try:
         columns.columns(cells, given, [], f"{name}, line {number}")
     except BadRecord as error:

@@ -1,1 +1,1 @@
-"""Recruitment curves: a basis each, torque at rest state against pulse width, zero at zero width."""
+"""Recruitment curves: steady-state torque as a function of pulse width, zero at zero width; one file per basis."""

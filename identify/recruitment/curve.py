@@ -1,4 +1,4 @@
-"""A recruitment curve: a basis and its coefficients, its table, its inverse."""
+"""A recruitment curve: basis and coefficients, with its table and its inverse."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from identify.errors import BadModel
 
 
 class Basis(Protocol):
-    """What a kind of recruitment curve is made of; every function is zero at zero pulse width."""
+    """The basis functions of one kind of recruitment curve; all are zero at zero pulse width."""
 
     @property
     def size(self) -> int: ...
@@ -50,7 +50,7 @@ class Curve:
     def table(self, tolerance: float = 2e-4, most: int = 2001) -> tuple[np.ndarray, np.ndarray]:
         """Pulse widths, µs, and torques, N·m, dense enough for linear interpolation.
 
-        The grid is halved until interpolation at the midpoints errs by less than `tolerance` of the curve's range.
+        The spacing is halved until the error at the midpoints is below `tolerance` times the curve's range.
         """
         size = 151
         while True:
@@ -65,8 +65,8 @@ class Curve:
     def inverse(self, size: int = 201) -> tuple[np.ndarray, np.ndarray]:
         """Torques, N·m, strictly rising from 0, and the smallest pulse width that reaches each, µs.
 
-        The running maximum is inverted, so a curve that dips (noise, or a real dip) still has one answer: the least
-        charge that gives the torque.
+        The running maximum is inverted, so a curve that falls somewhere still has one answer: the smallest charge that
+        gives the torque.
         """
         u, torque = self.table()
         sign = 1.0 if torque[np.argmax(np.abs(torque))] >= 0 else -1.0
@@ -99,6 +99,6 @@ def basis_from_dict(data: dict[str, Any]) -> Basis:
     kinds = {"cubic-spline": SplineBasis, "power-series": PowerBasis, "sigmoid": SigmoidBasis}
     if data.get("kind") not in kinds:
         raise BadModel(
-            f"unknown basis {data.get('kind')!r}", place="recruitment.basis.kind", mend=f"Known: {', '.join(kinds)}."
+            f"unknown basis {data.get('kind')!r}", place="recruitment.basis.kind", fix=f"Known: {', '.join(kinds)}."
         )
     return kinds[data["kind"]].from_dict(data)

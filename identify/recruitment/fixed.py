@@ -1,4 +1,4 @@
-"""A curve whose shape is given: one coefficient, its gain. For stages that estimate dynamics alone."""
+"""A curve of given shape, with one coefficient, its gain: for steps that estimate only the dynamics."""
 
 from __future__ import annotations
 

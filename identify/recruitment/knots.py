@@ -1,4 +1,4 @@
-"""Where the knots of the recruitment spline stand, and how much each part may bend: one design for a record."""
+"""Places of the knots of the recruitment spline, and the penalty on its bending."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from identify.recruitment.spline import SplineBasis
 
 KNOTS = 31
 SMOOTH_KNOTS = 19
-"""Enough where a pilot's curve takes more than a quarter of the range to rise: less to compute, nothing lost."""
+"""Enough if the pilot's curve rises over more than a quarter of the range: less to compute, and nothing is lost."""
 QUIET_KNOTS = 61
-"""Where the noise is so small that what fewer knots leave at a bend would look like an effort or a tremor."""
+"""For very small noise: the error of fewer knots at a bend would look like an effort or a tremor."""
 PILOT_KNOTS = 9
 NARROWEST_US = 0.5
 STRAIGHTEST = 0.003
-"""Least share of the strongest bending that the penalty expects anywhere, so that no part is forced straight."""
+"""The penalty expects at least this share of the strongest bending everywhere, so no part is forced to be straight."""
 
 
 def even_knots(largest_us: float, count: int) -> np.ndarray:
@@ -23,7 +23,7 @@ def even_knots(largest_us: float, count: int) -> np.ndarray:
 
 
 def knots_for(pilot_curve: tuple[np.ndarray, np.ndarray]) -> int:
-    """How many knots a curve needs that a pilot of few knots has drawn (10 to 90 % of its rise)."""
+    """Number of knots that a curve needs, from the width of its rise (10 to 90 %) in a pilot fit."""
     u, torque = pilot_curve
     level = np.abs(torque) / max(float(np.max(np.abs(torque))), 1e-300)
     rise = u[np.argmax(level >= 0.9)] - u[np.argmax(level >= 0.1)]
@@ -31,10 +31,10 @@ def knots_for(pilot_curve: tuple[np.ndarray, np.ndarray]) -> int:
 
 
 def adapted_knots(pilot_curve: tuple[np.ndarray, np.ndarray], largest_us: float, count: int = KNOTS) -> np.ndarray:
-    """Knots from a pilot curve (pulse widths, torques): half by length, half by how it bends."""
+    """Knots from a pilot curve (pulse widths, torques): their density follows half the length, half the bending."""
     u, torque = pilot_curve
     bend = np.abs(np.gradient(np.gradient(torque, u), u)) ** 0.5
-    # Smoothed, since a pilot knows only roughly where the bend is.
+    # Smoothed, since the pilot shows the place of the bend only roughly.
     width = max(u.size // 40, 1)
     bend = np.convolve(np.pad(bend, width, mode="edge"), np.ones(2 * width + 1) / (2 * width + 1), mode="valid")
     density = 0.5 + 0.5 * bend / max(float(np.mean(bend)), 1e-300)
@@ -49,8 +49,9 @@ FEW_LEVELS = 6
 
 
 def bending_order(widths_us: np.ndarray) -> int:
-    """Which derivative to keep small: the third, or the second where so few widths were applied that a parabola would
-    be free to do anything between them.
+    """Derivative that the penalty keeps small: the third, or with few different widths the second.
+
+    With few widths a penalty on the third derivative would leave a parabola between them undetermined.
     """
     return 3 if np.unique(widths_us).size > FEW_LEVELS else 2
 
@@ -58,20 +59,20 @@ def bending_order(widths_us: np.ndarray) -> int:
 def spline_roughness(
     basis: SplineBasis, pilot: tuple[SplineBasis, np.ndarray] | None = None, order: int = 3
 ) -> np.ndarray:
-    """∫ω f'''² over the knots (or ∫ω f''²), scaled to be free of units.
+    """Penalty ∫ω f'''² over the knots (or ∫ω f''²), scaled to have no unit.
 
-    The third derivative, since a recruitment curve is a smooth bend and not a straight line; ω lets it bend where it
-    does bend: from a pilot's own third derivative where there is one, else from the spacing of the knots. A rise
-    within a few µs then doesn't cost the smoothness of the plateau.
+    The third derivative is used because a recruitment curve is a smooth bend, not a straight line. ω allows bending
+    where the curve bends: it follows the third derivative of a pilot, or else the spacing of the knots. So a rise
+    within a few µs does not make the plateau rough.
 
     Parameters
     ----------
     basis : SplineBasis
         The spline that is penalised.
     pilot : tuple of SplineBasis and ndarray, optional
-        A first estimate: basis and coefficients.
+        Basis and coefficients of a first estimate.
     order : int
-        Derivative that is kept small, 3 or 2 (see `bending_order`).
+        Derivative that the penalty keeps small, 3 or 2 (see `bending_order`).
     """
     if order == 2:
         return basis.roughness * basis.largest_us**3

@@ -1,4 +1,4 @@
-"""Power series recruitment, equation (6) of the paper: u, u², …; zero at zero width by its very form."""
+"""Power series recruitment, equation (6) of the paper: u, u², …"""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class PowerBasis:
     order : int
         Highest power.
     scale_us : float
-        Pulse width taken as 1, so that the powers stay of one size, µs.
+        Pulse width that is scaled to 1, so that all powers have a similar size, µs.
     """
 
     order: int

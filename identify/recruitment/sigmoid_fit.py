@@ -11,7 +11,7 @@ from identify.recruitment.sigmoid import SigmoidBasis
 
 
 def basis_at(steepness_log: float, middle_us: float, largest_us: float) -> SigmoidBasis:
-    """The sigmoid of a log steepness whose middle lies at a pulse width: numbers a search can handle."""
+    """The sigmoid with a given log steepness and middle, µs: parameters that suit a numerical search."""
     a2 = float(np.exp(steepness_log))
     return SigmoidBasis(a2, float(max(np.exp(min(a2 * middle_us, 600.0)) - 2.0, -0.999)), largest_us)
 
@@ -19,16 +19,16 @@ def basis_at(steepness_log: float, middle_us: float, largest_us: float) -> Sigmo
 def fit_shape(
     residual_of: Callable[[SigmoidBasis], np.ndarray], largest_us: float, seen_us: np.ndarray
 ) -> SigmoidBasis:
-    """The two shape parameters of least squares, from a coarse scan and then Levenberg-Marquardt.
+    """Least-squares estimate of the two shape parameters: a coarse scan, then a bounded trust-region search.
 
     Parameters
     ----------
     residual_of : callable
-        Residual for a shape, everything linear already solved for.
+        Gives the residual for a shape, with all linear parameters solved for.
     largest_us : float
         Largest pulse width.
     seen_us : ndarray
-        Pulse widths that were applied; the middle stays inside.
+        Pulse widths that were applied, µs; they bound the middle.
     """
     from scipy.optimize import least_squares
 
@@ -52,7 +52,7 @@ def fit_shape(
 
 
 def fit_points(width_us: np.ndarray, torque_nm: np.ndarray) -> Curve:
-    """The sigmoid through points, with its gain."""
+    """The sigmoid fitted to points, with its gain."""
     largest = float(np.max(width_us))
 
     def gain_and_residual(basis: SigmoidBasis) -> tuple[float, np.ndarray]:

@@ -1,4 +1,4 @@
-"""How smooth a recruitment curve must be: the penalty's weight from the data, by restricted marginal likelihood."""
+"""Smoothness of a recruitment curve: the penalty's weight from the data, by restricted maximum likelihood (REML)."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Choice:
 
 
 def straight_lines(roughness: np.ndarray) -> int:
-    """Dimension of the shapes that a penalty leaves alone."""
+    """Dimension of the shapes that are not penalised."""
     values = np.linalg.eigvalsh(roughness)
     return int(np.sum(values <= 1e-13 * max(float(values[-1]), 1e-300)))
 
@@ -45,25 +45,25 @@ def choose_weight(
     free: int = 0,
     null: int | None = None,
 ) -> Choice:
-    """The weight that makes the data most likely, coefficients integrated out (REML).
+    """The weight of the penalty in min ||y - Z c||² + weight c'Rc that makes the data most likely (REML).
 
-    Of min ||y - Z c||² + weight c'Rc the marginal likelihood under the prior that the penalty stands for, with the
-    noise variance profiled (Wahba 1985; Wood 2011). One eigendecomposition serves every weight.
+    The penalty is taken as a prior, the coefficients are integrated out, and the noise variance is profiled (Wahba
+    1985; Wood 2011). One eigendecomposition serves all weights.
 
     Parameters
     ----------
     gram, moment, energy : ndarray (P, P), ndarray (P,), float
-        Z'Z, Z'y and y'y of whitened rows, columns that aren't penalised already projected out.
+        Z'Z, Z'y and y'y of whitened rows; columns without a penalty are already projected out.
     rows : int
         Number of rows.
     roughness : ndarray, shape (P, P)
         R.
     free : int
-        How many columns were projected out.
+        Number of columns that were projected out.
     null : int, optional
-        Dimension of what R leaves alone, where it is known already.
+        `straight_lines(roughness)`, if it is known already.
     """
-    # What the penalty leaves alone is a property of it, not of the data: where no data are, every shape looks bent.
+    # This dimension is computed from the penalty, not from the data, which do not cover all shapes.
     straight = straight_lines(roughness) if null is None else null
     freedom_left = max(rows - free - straight, 1)
     weight, freedom, left = _weighed(gram, moment, energy, freedom_left, roughness, straight)

@@ -1,4 +1,4 @@
-"""Cubic spline recruitment, equation (8) of the paper in the numerically sound basis of B-splines."""
+"""Cubic spline recruitment: equation (8) of the paper, in the basis of B-splines."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ DEGREE = 3
 class SplineBasis:
     """Cubic splines on given knots that vanish at zero pulse width.
 
-    Spans the same functions as equation (8) of the paper: the truncated cubes |u - u_i|³ there are so nearly parallel
-    that their normal equations lose half the digits; B-splines span the same space and lose none. f(0) = 0 holds by
-    leaving out the one B-spline that is not zero there.
+    They are the same functions as in equation (8) of the paper. The cubes |u - u_i|³ used there are nearly collinear,
+    and their normal equations lose half of the digits; B-splines lose none. f(0) = 0 holds because the one B-spline
+    that is not zero there is left out.
 
     Parameters
     ----------
@@ -38,7 +38,7 @@ class SplineBasis:
     def design(self, pulse_width_us: np.ndarray, derivative: int = 0) -> np.ndarray:
         """Basis functions (or a derivative) at pulse widths of any shape; shape (..., size).
 
-        Beyond the knots the value at the last knot stands (derivatives vanish).
+        Beyond the knots the function is constant (its derivatives are zero).
         """
         u = np.asarray(pulse_width_us, float)
         inside = np.clip(u, self.knots_us[0], self.knots_us[-1])
@@ -76,16 +76,16 @@ class SplineBasis:
 def bsplines(padded: np.ndarray, degree: int, at: np.ndarray, derivative: int = 0) -> np.ndarray:
     """B-splines, or their derivative, by the recursion of Cox and de Boor (de Boor 1978, ch. X); shape (N, size).
 
-    Our own, in a dozen lines, since scipy.interpolate would add 0.2 s to every start of the command.
+    Not from scipy.interpolate, whose import would add 0.2 s to every start of the command.
 
     Parameters
     ----------
     padded : ndarray
-        Knots with the outer ones repeated `degree` times more.
+        Knots, with the outer ones repeated `degree` times.
     degree : int
         3 is cubic.
     at : ndarray, shape (N,)
-        Within the knots.
+        Places within the knots.
     derivative : int
         0 to `degree`.
     """

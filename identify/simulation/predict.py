@@ -1,4 +1,4 @@
-"""Free-run prediction: from the recorded pulse widths alone, at the record's own rate."""
+"""Free-run prediction: from the recorded pulse widths only, at the record's samples."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ import numpy as np
 
 from identify.dynamics import narx
 from identify.dynamics.linear import Discrete, Linear, SecondOrder
-from identify.dynamics.pulse_grid import Grid, make_grid
+from identify.dynamics.make_grid import make_grid
+from identify.dynamics.pulse_grid import Grid
 from identify.effects import get
 from identify.errors import BadModel
 from identify.records.record import Record
@@ -23,7 +24,7 @@ LARGEST_RATE_CHANGE = 0.25
 
 
 class Muscle(Protocol):
-    """What of a model its simulation needs."""
+    """The attributes of a model that its simulation needs."""
 
     @property
     def recruitment(self) -> Curve: ...
@@ -51,36 +52,36 @@ class Muscle(Protocol):
 
 
 def predict(model: Muscle, record: Record) -> np.ndarray:
-    """Torque the model gives for the record's pulse widths, N·m, shape (N,).
+    """Torque that the model predicts for the record's pulse widths, N·m, shape (N,).
 
-    No measured torque is used: this is what the controller would have seen. What can't be foreseen (bumps, tremor) is
-    given back on the rows that it was fitted on alone.
+    No measured torque is used: a controller would predict the same. Effects that are not predictable (efforts, tremor)
+    are included only on the rows that they were fitted on.
 
     Raises
     ------
     BadModel
-        The pulse rate is another, an effect or its form is unknown here, or the record lacks a column that it needs.
+        The pulse rate differs too much, an effect or its form is unknown here, or the record lacks a column it needs.
     """
     refuse_rate(model, record)
     return predict_on(model, make_grid(record))
 
 
 def predict_on(model: Muscle, grid: Grid) -> np.ndarray:
-    """As `predict`, for a grid that is already made."""
+    """As `predict`, for a record on its grid."""
     if isinstance(model.linear, Discrete):
         if model.extra.get("narx"):
             return narx.at_samples(model.extra["narx"], grid, model.linear.centre)
         return model.linear.at_samples(grid, model.recruitment(grid.pulse_width_us)) + model.baseline_nm
     problem, theta = problem_of(model, grid)
-    unforeseen = frozenset(e["id"] for e in model.effects if not get(e["id"]).foreseeable)
-    foreseen = problem.at_samples(theta, unforeseen)
-    if not unforeseen or not same_data(model, grid.record):
-        return foreseen
-    return np.where(grid.record.held_out, foreseen, problem.at_samples(theta))
+    unpredictable = frozenset(e["id"] for e in model.effects if not get(e["id"]).predictable)
+    predictable = problem.at_samples(theta, unpredictable)
+    if not unpredictable or not same_data(model, grid.record):
+        return predictable
+    return np.where(grid.record.held_out, predictable, problem.at_samples(theta))
 
 
 def problem_of(model: Muscle, grid: Grid) -> tuple[Problem, np.ndarray]:
-    """The problem whose solution a model is, on another record, and its parameters there.
+    """The model as a `Problem` on a record, and its parameters there.
 
     Raises
     ------
@@ -88,7 +89,7 @@ def problem_of(model: Muscle, grid: Grid) -> tuple[Problem, np.ndarray]:
         As `predict`.
     """
     if not isinstance(model.linear, SecondOrder):
-        raise BadModel("effects stand on a second order only", mend="Fit with maximum-likelihood.")
+        raise BadModel("only second-order dynamics can have effects", fix="Fit with maximum-likelihood.")
     settings = model.effects[0].get("settings", {}) if model.effects else {}
     setup = Setup(
         grid=grid,
@@ -110,18 +111,22 @@ def problem_of(model: Muscle, grid: Grid) -> tuple[Problem, np.ndarray]:
             form = effect.form(entry.get("form", ""))
             parameters += [float(_value(entry["parameters"][p.name])) for p in form.parameters]
         except Exception as error:
-            raise BadModel(f"{error}", place=f"effects.{entry.get('id')}", mend="Install the effect's file.") from error
+            raise BadModel(f"{error}", place=f"effects.{entry.get('id')}", fix="Install the effect's file.") from error
         for need in effect.needs:
             if getattr(grid.record, need) is None:
-                raise BadModel(f"{effect.id} needs the column {need}", place=need, mend="Record it, or leave it out.")
+                raise BadModel(
+                    f"{effect.id} needs the column {need}",
+                    place=need,
+                    fix="Record this column, or fit without the effect.",
+                )
         effects.append((effect.id, form))
     problem = Problem(setup, effects)
     values = np.zeros(problem.size)
     values[:3] = model.linear.time_constant_s, model.linear.damping, model.linear.delay_s
-    values[list(problem.baselines)] = setup.framed(np.asarray(model.baseline_nm))
+    values[list(problem.baselines)] = setup.to_muscle(np.asarray(model.baseline_nm))
     if same_data(model, grid.record):
         parts = np.asarray(model.extra.get("parts", [[model.baseline_nm, *model.initial]]))[: grid.starts.size]
-        values[np.array(problem.baselines)[grid.part[grid.starts[: len(parts)]]]] = setup.framed(parts[:, 0])
+        values[np.array(problem.baselines)[grid.part[grid.starts[: len(parts)]]]] = setup.to_muscle(parts[:, 0])
         values[list(problem.initials)[: 2 * len(parts)]] = setup.sign * parts[:, 1:].ravel()
     values[problem.coefficients] = setup.sign * model.recruitment.coefficients_nm
     values[problem.coefficients.stop :] = parameters
@@ -131,12 +136,12 @@ def problem_of(model: Muscle, grid: Grid) -> tuple[Problem, np.ndarray]:
 def slopes(model: Muscle, grid: Grid, names: Sequence[str]) -> np.ndarray:
     """Derivatives of each interval's mean torque by named parameters of the model, shape (K, len(names)).
 
-    On another record the beginning of the model's own does not matter, and its baseline holds for all parts.
+    On another record than the fitted one, the initial state is zero and one baseline holds for all parts.
     """
     problem, theta = problem_of(model, grid)
     jacobian = problem.run(theta, derivatives=True)[1]
     assert jacobian is not None
-    # In the record's own sign the parameters in N·m turn with the torque: the same derivative.
+    # With the record's sign, parameters in N·m change sign as the torque does: their derivative stays the same.
     turned = np.ones(problem.size)
     turned[:3] = problem.setup.sign
     turned[problem.coefficients.stop :] = problem.setup.sign
@@ -153,17 +158,18 @@ def slopes(model: Muscle, grid: Grid, names: Sequence[str]) -> np.ndarray:
 
 
 def refuse_rate(model: Muscle, record: Record) -> None:
-    """Refuse a record of a pulse rate for which the model says nothing.
+    """Refuse a record whose pulse rate is outside the model's range.
 
     Raises
     ------
     BadModel
+        The rates differ by more than 25 %.
     """
     if not abs(record.pulse_rate_hz / model.pulse_rate_hz - 1.0) <= LARGEST_RATE_CHANGE:
         raise BadModel(
             f"the model holds for {model.pulse_rate_hz:g} pulses a second, the record has {record.pulse_rate_hz:g}",
             place="pulse_rate_hz",
-            mend="Fit a model at that rate.",
+            fix="Fit a model at that rate.",
         )
 
 
@@ -172,7 +178,7 @@ def _value(entry: Any) -> float:
 
 
 def same_data(model: Muscle, record: Record) -> bool:
-    """Whether the record is the very one that the model was fitted on."""
+    """Whether the record is the one that the model was fitted on."""
     return bool(model.data.get("fingerprint")) and model.data["fingerprint"] == fingerprint(record)
 
 

@@ -1,8 +1,8 @@
-"""A set of effects around f and G as a function of its parameters: simulation and its derivatives.
+"""A candidate model (f, G and effects) as a function of its parameters: its simulation and the derivatives.
 
-The signal passes stages in a fixed order. A derivative is found by perturbing a parameter at its own stage and letting
-the perturbed signal run through the rest beside the others, as one more row of the same arrays: what lies before the
-stage is computed once.
+The signal passes the stages in a fixed order. For a derivative, a parameter is perturbed at its own stage, and the
+perturbed signal passes all later stages as one more row of the same arrays. What comes before the stage is computed
+only once.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ SHARED = True
 
 @dataclass(frozen=True)
 class Chosen:
-    """An effect in one of its forms, as it stands in a problem."""
+    """An effect in one of its forms, with the place of its parameters in a problem."""
 
     effect: str
     form: Form
@@ -40,7 +40,7 @@ class Chosen:
 
 
 def extended(basis: Basis, width_us: np.ndarray) -> np.ndarray:
-    """Basis functions at widths that a drift may have moved beyond the largest: there straight on; (K, n)."""
+    """Basis functions at widths that a drift may have moved beyond the largest; continued linearly; shape (K, n)."""
     top = basis.largest_us
     design = basis.design(width_us)
     over = np.clip(width_us - top, 0.0, 0.35 * top)
@@ -51,14 +51,14 @@ def extended(basis: Basis, width_us: np.ndarray) -> np.ndarray:
 
 
 class Problem:
-    """Parameters and stages of one candidate.
+    """The parameters and stages of one candidate model.
 
-    Parameters are kept on the scale on which they're varied (logarithms for those of scale "log").
+    `theta` holds parameters on the scale on which they are varied: logarithms for those of scale "log".
 
     Parameters
     ----------
     setup : Setup
-        What all candidates share.
+        What all candidates of a record share.
     effects : list of (str, Form)
         Effects by id, each in one form, in the order in which they were added.
     """
@@ -95,7 +95,7 @@ class Problem:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Of all parameters; those of an effect after its id: `fatigue.onset_s`."""
+        """Names of all parameters; those of an effect start with its id: `fatigue.onset_s`."""
         own = [f"{chosen.effect}.{p.name}" for chosen in self.chosen for p in chosen.parameters]
         return (*(p.name for p in self.table[: self.coefficients.stop]), *own)
 
@@ -114,7 +114,7 @@ class Problem:
 
     @cached_property
     def prior(self) -> tuple[np.ndarray, np.ndarray]:
-        """Mean of the parameters' prior and its precision matrix."""
+        """Mean and precision matrix of the prior of `theta`."""
         inside = np.isfinite(self.lower) & np.isfinite(self.upper)
         mean = np.zeros(self.size)
         mean[inside] = 0.5 * (self.lower[inside] + self.upper[inside])
@@ -136,7 +136,7 @@ class Problem:
 
     @cached_property
     def step(self) -> np.ndarray:
-        """Perturbations for derivatives."""
+        """Perturbation of each parameter for its derivative, on the scale of `theta`."""
         size = np.full(self.size, 1e-5)
         size[self.baselines.start : self.coefficients.stop] = 1e-4 * self.setup.scale_nm
         for chosen in self.chosen:
@@ -148,29 +148,29 @@ class Problem:
 
     def run(self, theta: np.ndarray, *, derivatives: bool = False) -> tuple[np.ndarray, np.ndarray | None]:
         """Predicted interval means, N·m, shape (K,), and derivatives, shape (P, K), per unit of `theta`."""
-        walk = _Walk(self, theta, derivatives)
-        mean = walk.read(*walk.to_boundaries())
-        mean = walk.add(mean)
-        mean = walk.sense(mean)
+        stages = _StagePass(self, theta, derivatives)
+        mean = stages.read(*stages.to_boundaries())
+        mean = stages.add(mean)
+        mean = stages.sense(mean)
         if not derivatives:
             return mean[0], None
-        places, steps = zip(*walk.owners, strict=True)
+        places, steps = zip(*stages.owners, strict=True)
         jacobian = np.zeros((self.size, mean.shape[1]))
         jacobian[list(places)] = (mean[1:] - mean[0]) / np.array(steps)[:, None]
         return mean[0], jacobian
 
     def at_samples(self, theta: np.ndarray, skip: frozenset[str] = frozenset()) -> np.ndarray:
-        """Torque as the record counts it, at its samples, N·m; effects named in `skip` are left out of the sum."""
-        walk = _Walk(self, theta, False)
-        torque, rate, delay, _ = walk.to_boundaries()
+        """Torque at the record's samples, with its sign and zero, N·m; additive effects in `skip` are left out."""
+        stages = _StagePass(self, theta, False)
+        torque, rate, delay, _ = stages.to_boundaries()
         grid = self.setup.grid
-        value = grid.at_samples(torque[0], rate[0], delay[0] / grid.step_s, walk.curves()[0])[None, :]
-        value = walk.add(value, self.setup.scene_at_samples, skip)
-        return self.setup.unframed(walk.sense(value, self.setup.scene_at_samples)[0])
+        value = grid.at_samples(torque[0], rate[0], delay[0] / grid.step_s, stages.curves()[0])[None, :]
+        value = stages.add(value, self.setup.scene_at_samples, skip)
+        return self.setup.to_record(stages.sense(value, self.setup.scene_at_samples)[0])
 
 
-class _Walk:
-    """One pass through the stages, with the perturbed rows that have joined so far."""
+class _StagePass:
+    """One pass of the signal through the stages. Row 0 is the model; each further row has one perturbed parameter."""
 
     def __init__(self, problem: Problem, theta: np.ndarray, derivatives: bool) -> None:
         self.problem, self.setup, self.theta, self.derivatives = problem, problem.setup, theta, derivatives
@@ -178,7 +178,15 @@ class _Walk:
         self.owners: list[tuple[int, float]] = []
 
     def join(self, places: range) -> tuple[np.ndarray, np.ndarray]:
-        """Let the perturbed rows of some parameters join: rows to take of the input, values (rows, parameters)."""
+        """Add a perturbed row for each of some parameters.
+
+        Returns
+        -------
+        rows : ndarray of int, shape (M,)
+            Row of the input from which each row of the output is computed.
+        values : ndarray, shape (M, len(places))
+            Parameters of each row, in their units.
+        """
         present = len(self.owners) + 1
         own = self.value[places.start : places.stop]
         if not self.derivatives:
@@ -201,14 +209,15 @@ class _Walk:
         return {p.name: values[:, i : i + 1] for i, p in enumerate(chosen.parameters)}
 
     def to_boundaries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """States that rows are read off, and for each row its delay, s, and the states that are its own."""
+        """States at the ends of the intervals (torque, rate), and for each row its delay, s, and which states it
+        uses."""
         setup, scene = self.setup, self.setup.scene
         drive = self.recruit()
         for chosen in self.forms("gain"):
             rows, values = self.join(chosen.places)
             drive = np.asarray(chosen.form.call(drive[rows], self.named(chosen, values), scene))
         torque, rate = self.dynamics(drive)
-        # A delay changes where the states are read, and not the states: rows that differ by it share theirs.
+        # A delay changes where the states are read, not the states: rows that differ only in delay share them.
         owned, values = self.join(self.problem.delay)
         delay = values[:, 0]
         for chosen in self.forms("delay"):
@@ -283,7 +292,7 @@ class _Walk:
             branches = split
         self.cores = core
         torque, rate = self.respond(branches, core, law, initial, _NONE)
-        # A law given as a function of whole arrays is met by a few passes, each with the torque of the last.
+        # A speed law given as a Python function needs the torque: it is iterated, starting from the torque without it.
         for _ in range(4 if given else 0):
             factor = np.ones_like(drive)
             for chosen, values in given:
@@ -298,7 +307,7 @@ class _Walk:
     def respond(
         self, branches: list, core: np.ndarray, law: np.ndarray, initial: np.ndarray, multiplier: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Responses of all branches in sum; each begins with its share of the initial state."""
+        """Sum of the responses of all branches; each starts with its share of the initial state."""
         setup = self.setup
         begin = initial.reshape(initial.shape[0], -1, 2) / len(branches)
         responses = [
@@ -323,7 +332,7 @@ class _Walk:
     def bend(
         self, chosen: Chosen, torque: np.ndarray, rate: np.ndarray, values: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """A static output at the boundary states; the rate follows by the chain rule, taken numerically."""
+        """A static output stage at the boundary states; the rate follows by a numerical chain rule."""
         p, ends = self.named(chosen, values), self.setup.scene_at_ends
         bent = np.asarray(chosen.form.call(torque, p, ends))
         if np.array_equal(bent, torque):
@@ -338,7 +347,7 @@ class _Walk:
         mean = np.empty((delay.size, grid.size))
         alike: dict[tuple[float, Core | None], list[int]] = {}
         curves = self.curves()
-        for row, lag in enumerate(delay.tolist()):  # rows that joined later are read as the base
+        for row, lag in enumerate(delay.tolist()):  # rows added later have the dynamics of row 0
             alike.setdefault((lag, curves[row if row < len(curves) else 0]), []).append(row)
         for (lag, core), rows in alike.items():
             own = owned[rows]
@@ -348,7 +357,7 @@ class _Walk:
         return mean
 
     def curves(self) -> list[Core | None]:
-        """How rows' curves are read: by their T and ζ as they are where nothing changes the speed, or all as cubics."""
+        """How the curve of each row is read: exactly, from its T and ζ; or all as cubics, where both lags are long."""
         cores: list[Core] = [(time_constant_s, damping) for time_constant_s, damping in self.cores.tolist()]
         return [*cores] if self.setup.grid.curve(cores[0]) else [None] * len(cores)
 
@@ -363,7 +372,7 @@ class _Walk:
             value = value[rows]
             if chosen.effect in skip:
                 continue
-            # What is added doesn't depend on the signal: rows that differ elsewhere alone share one evaluation.
+            # An added torque does not depend on the signal: rows with the same parameters share one evaluation.
             own = np.r_[0, np.arange(present, rows.size)]
             added = np.asarray(chosen.form.call(None, self.named(chosen, values[own]), scene))
             value[:present] += added[:1]
@@ -371,13 +380,13 @@ class _Walk:
         return value
 
     def sense(self, value: np.ndarray, scene=None) -> np.ndarray:
-        """What the sensor makes of the torque; it knows nothing of the muscle's zero and direction."""
+        """Apply the sensor stage, which works with the record's own zero and sign."""
         for chosen in self.forms("sensor"):
             rows, values = self.join(chosen.places)
             value = value[rows]
-            if scene is None and chosen.form.settled:  # the target no longer holds it
+            if scene is None and chosen.form.fixed:  # the target was corrected for it
                 continue
-            seen = self.setup.unframed(value)
+            seen = self.setup.to_record(value)
             shown = np.asarray(chosen.form.call(seen, self.named(chosen, values), scene or self.setup.scene))
-            value = np.where(shown == seen, value, self.setup.framed(shown))
+            value = np.where(shown == seen, value, self.setup.to_muscle(shown))
         return value

@@ -1,4 +1,4 @@
-"""What all candidates of a record share: grid, scenes, one recruitment spline with its penalty, timing bounds."""
+"""What all candidates of a record share: grid, scenes, one recruitment spline with its penalty, bounds of the delay."""
 
 from __future__ import annotations
 
@@ -14,35 +14,35 @@ from identify.recruitment.curve import Basis
 
 @dataclass(frozen=True)
 class Setup:
-    """A record made ready for fitting.
+    """A record prepared for fitting.
 
     Parameters
     ----------
     grid : Grid
-        The record on the grid of pulses, with `target_nm` in place of its torque.
+        The record on the grid of pulses.
     target_nm : ndarray, shape (K,)
-        Torque to be explained, N·m: hum removed, above `zero_nm`, and counted in the direction in which the muscle
-        pulls; NaN where there is none.
+        Torque to be explained, N·m: without hum, relative to `zero_nm`, and positive in the direction in which the
+        muscle pulls; NaN where there is none.
     fitted : ndarray of bool, shape (K,)
-        Intervals that may be used.
+        Intervals that are fitted.
     basis : Basis
         Of the recruitment curve, common to all candidates.
     roughness : ndarray, shape (n, n)
-        Prior precision of its coefficients, 1/(N·m)²: how much the curve may bend.
+        Prior precision of its coefficients, 1/(N·m)²; it limits how much the curve bends.
     scale_nm : float
         Largest torque, smoothed, N·m.
     noise_sd_nm : float
         White noise of a sample, N·m.
     delay_bounds_s : tuple of float
-        Timing left open to every candidate: about a sample either way.
+        Bounds of the delay that every candidate has: about one sample in both directions.
     zero_nm : float
         Zero of the record's torque, N·m.
     sign : float
         1 where stimulation raises the record's torque, -1 where it lowers it.
     spread : ndarray, shape (K,), or float
-        Noise of each interval over the noise of all: parts of a record are recorded with noises of their own.
+        Noise of each interval, divided by the mean noise: each part of a record has its own noise.
     reference_s : float
-        Time to which the recruitment curve belongs where it drifts.
+        Time at which the recruitment curve holds, if an effect makes it drift, s.
     """
 
     grid: Grid
@@ -60,7 +60,7 @@ class Setup:
 
     @cached_property
     def stretches(self) -> tuple[np.ndarray, np.ndarray]:
-        """Starts and ends of the runs of fitted intervals, of one part each."""
+        """Starts and ends of the runs of fitted intervals, each within one part."""
         runs = self.grid.stretches(self.fitted)
         return np.array([r.start for r in runs], np.int64), np.array([r.stop for r in runs], np.int64)
 
@@ -71,11 +71,11 @@ class Setup:
 
     @property
     def starts(self) -> np.ndarray:
-        """Intervals at whose start the state is open, shape (S,)."""
+        """Intervals at whose start the state is unknown, shape (S,)."""
         return self.grid.starts
 
     def part_of(self, at_samples: bool) -> np.ndarray | None:
-        """Part of each sample or of each interval; None where there is one part."""
+        """Index of the part of each sample or interval; None if there is one part only."""
         if self.begins.size == 1:
             return None
         return self.grid.part[self.grid.interval] if at_samples else self.grid.part
@@ -131,18 +131,19 @@ class Setup:
     @cached_property
     def penalty(self) -> np.ndarray:
         """Prior precision of the coefficients, shape (n, n)."""
-        # Each function of a spline is worth some torque; powers of the width cancel, and their size says nothing.
+        # A coefficient of a spline is a torque of plausible size; powers of the width cancel each other and may be
+        # large.
         ridge = (1.0 if np.any(self.roughness) else 1e-6) / (3.0 * self.scale_nm) ** 2
         return self.roughness + ridge * np.eye(self.basis.size)
 
-    def framed(self, torque_nm: np.ndarray) -> np.ndarray:
-        """Torque of the record as the model counts it: above its zero, in the direction in which the muscle pulls."""
+    def to_muscle(self, torque_nm: np.ndarray) -> np.ndarray:
+        """From the record's torque to the muscle's: relative to its zero, positive in the direction of pull, N·m."""
         return self.sign * (torque_nm - self.zero_nm)
 
-    def unframed(self, torque_nm: np.ndarray) -> np.ndarray:
-        """The inverse of `framed`."""
+    def to_record(self, torque_nm: np.ndarray) -> np.ndarray:
+        """The inverse of `to_muscle`."""
         return self.zero_nm + self.sign * torque_nm
 
     def with_(self, **changes: object) -> Setup:
-        """The set-up with some fields changed (derived arrays are made anew)."""
+        """The set-up with some fields changed (derived arrays are computed again)."""
         return replace(self, **changes)  # type: ignore[arg-type]

@@ -11,7 +11,6 @@ import asyncio
 import contextlib
 import hashlib
 import json
-import math
 import signal
 import sys
 import threading
@@ -25,6 +24,7 @@ import numpy as np
 from pydantic import TypeAdapter
 
 from rig import messages as m
+from tests.harness.muscle import Patient
 
 REQUESTS: TypeAdapter[Any] = TypeAdapter(m.Request)
 PULSE_RATE_HZ = 40.0
@@ -55,23 +55,13 @@ def default_widths() -> tuple[list[float], list[dict[str, Any]]]:
     return widths, segments
 
 
+PATIENT = Patient(gain=6.9, a2=1 / 25, a3=float(np.exp(6)))
+
+
 def muscle(widths: list[float], rate_hz: float) -> list[float]:
-    """A sigmoid and a second-order lag, with a wobble for noise; only to have curves that look right."""
-    per = round(rate_hz / PULSE_RATE_HZ)
-    period, damping, y, v, torque = 0.5284, 0.6369, 0.0, 0.0, []
-    seed = 12345
-    for width in widths:
-        level = 6.9 / (1 + math.exp(-(width - 150) / 25)) - 6.9 / (1 + math.exp(6))
-        for _ in range(per):
-            acceleration = (level - y - 2 * damping * period * v) / period**2
-            v += acceleration / rate_hz
-            y += v / rate_hz
-            noise = 0.0
-            for _ in range(4):
-                seed = (seed * 1103515245 + 12345) & 0x7FFFFFFF
-                noise += seed / 0x7FFFFFFF - 0.5
-            torque.append(y + 0.07 * noise)
-    return torque
+    """Torque of the patient with noise of 0.04 N·m, the same for the same widths."""
+    torque = PATIENT.torque(np.array(widths), rate_hz, PULSE_RATE_HZ)
+    return (torque + 0.04 * np.random.default_rng(12345).standard_normal(torque.size)).tolist()
 
 
 class FakeRig:

@@ -81,7 +81,7 @@ def test_pages_without_a_test(browser: Any, tab: Any, service: Service) -> None:
     tab.get_by_role("button", name="Start now").wait_for()
     examined(tab, "before current flows")
     tab.get_by_role("link", name="No, go back").click()
-    tab.get_by_text("Take in a recording of another tool").click()
+    tab.get_by_text("Upload a recording of another tool").click()
     examined(tab, "participant, all open")
     for path in ("/models/none", "/nowhere", "/participants/X1/calibration", "/compare"):
         visit(tab, service, path)

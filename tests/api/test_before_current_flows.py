@@ -213,7 +213,7 @@ def test_many_questions_of_one_drop_no_one_elses() -> None:
     first, own = of(ben), [of(ada) for _ in range(3 * MOST)]
     assert questions.find("P1", first, ben).title == "Yes?"
     assert questions.find("P1", own[-MOST], ada) and len(questions._all) == MOST + 1
-    with pytest.raises(Exception, match="no longer open"):
+    with pytest.raises(Exception, match="question is closed"):
         questions.find("P1", own[-MOST - 1], ada)
 
 

@@ -73,7 +73,7 @@ def test_a_form_without_a_reason_decides_nothing(service: Service) -> None:
 def test_every_export_of_a_model_and_a_test_is_there(tab: Any, service: Service) -> None:
     done = a_model(service, "C3")
     tab.goto(f"{service.url}/models/{done['model_id']}")
-    exports = tab.get_by_role("group", name="Take with you")
+    exports = tab.get_by_role("group", name="Export")
     for name, suffix in (("MODEL.json", ".json"), ("HDF5", ".h5"), ("CSV", ".csv")):
         with tab.expect_download() as caught:
             exports.get_by_role("link", name=name).click()
@@ -96,9 +96,9 @@ def test_a_recording_of_another_tool_is_taken_in_on_the_page(tab: Any, service: 
     path = tmp_path / "other.csv"
     path.write_text("time_s,pulse_width_us,torque_nm,segment\n0.0,0,0,rest\n")
     participant(tab, service, f"U{time.time_ns() % 10**9}")
-    tab.get_by_text("Take in a recording of another tool").click()
+    tab.get_by_text("Upload a recording of another tool").click()
     tab.get_by_label(re.compile("or HDF5")).set_input_files(path)
-    tab.get_by_role("button", name="Take in and identify").click()
+    tab.get_by_role("button", name="Upload and identify").click()
     tab.get_by_role("heading", name="Measurement against model").wait_for()
     assert tab.get_by_role("link", name="CSV").is_visible() and tab.get_by_role("link", name="HDF5").count() == 0
 
@@ -129,7 +129,7 @@ def test_a_reader_sees_no_deeds_and_may_stop(blank: Any, service: Service) -> No
         body = {"name": "Rosa", "password": PASSWORD, "scopes": ["read-live", "read-model"]}
         assert http.post("/v1/users", json=body).status_code in (201, 409)
     sign_in(blank, service, "Rosa")
-    assert blank.get_by_text("Nothing to see here").is_visible() and blank.get_by_text("C4").count() == 0
+    assert blank.get_by_text("You may not see this list").is_visible() and blank.get_by_text("C4").count() == 0
     blank.goto(f"{service.url}/models/{model}")
     blank.get_by_text("A clinician approves or rejects it.").wait_for()
     for action in ("Approve", "Reject", "Improve", "Add this effect", "Run it now", "Undo"):
@@ -155,7 +155,7 @@ def test_an_administrator_adds_a_clinician_and_a_key_by_clicking(blank: Any, ser
     with service.client(key) as controller:
         assert controller.get("/v1/participants/none/model").status_code == 404
         assert controller.get("/v1/rig").status_code == 403
-    assert blank.get_by_text("The chain of hashes is whole").is_visible()
+    assert blank.get_by_text("The chain of hashes is complete").is_visible()
     with blank.expect_download() as caught:
         blank.get_by_role("link", name="Export all").click()
     from api.cli import main

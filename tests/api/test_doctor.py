@@ -1,4 +1,4 @@
-"""`stimrig doctor` says what is wrong and what mends it; logs carry the test's id; metrics are Prometheus' text."""
+"""`stimrig doctor` says what is wrong and how to fix it; logs carry the test's id; metrics are Prometheus' text."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_little_room_and_a_slow_disk(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 def test_folder_open_to_all_is_said(tmp_path: Path) -> None:
     tmp_path.chmod(0o755)
-    assert finding("data folder", data_dir=tmp_path).mend.startswith("chmod")
+    assert finding("data folder", data_dir=tmp_path).fix.startswith("chmod")
     tmp_path.chmod(0o750)
     assert finding("data folder", data_dir=tmp_path).verdict == "ok"
 
@@ -98,7 +98,7 @@ def test_rig_that_is_not_there_or_stands_still(service: Service, tmp_path: Path)
     with service.client() as client:
         client.post("/v1/stop")
     found = finding("rig", data_dir=tmp_path, rig_socket=service.rig.path)
-    assert found.verdict == "fails" and "latched" in found.says and "re-arm" in found.mend
+    assert found.verdict == "fails" and "latched" in found.says and "re-arm" in found.fix
 
 
 def test_tampered_trail_is_found(service: Service) -> None:

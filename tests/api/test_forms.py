@@ -171,7 +171,7 @@ def test_a_form_gone_stale_is_refused_with_both_values(tab: httpx.Client, client
     client.put("/v1/participants/P017/profile", json={"current_ma": 9, "max_torque_nm": 20})
     for path in ("profile", "tests"):
         refused = tab.post(f"{PAGE}/{path}", data={**mine, "max_torque_nm": "25"})
-        assert refused.status_code == 409 and "changed meanwhile by administrator" in refused.text
+        assert refused.status_code == 409 and "changed by administrator" in refused.text
         assert re.search(r"Torque that stops a test \(N·m\)</th><td>25</td><td>20</td>", refused.text)
     again = inputs(refused.text)
     assert again["current_ma"] == "9", "only what was typed is kept; the other's new current is not set back"
@@ -244,7 +244,7 @@ def test_each_step_says_what_it_sends_and_sends_nothing_else(tab: httpx.Client, 
     assert tab.post(f"{BEGIN}/step/up", data=seen).status_code == 303
     assert "Wider: 20 µs at 9.5 mA" in tab.get(BEGIN).text
     late = tab.post(f"{BEGIN}/step/up", data=seen)
-    assert late.status_code == 409 and "no longer what you saw" in late.text
+    assert late.status_code == 409 and "page is out of date" in late.text
     known = service.rig.calibration
     assert known is not None and [train.pulse_width_us for train in known.trains] == [10]
 

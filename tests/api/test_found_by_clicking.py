@@ -36,9 +36,9 @@ def test_hidden_effect_is_found_added_and_approved_by_clicking(tab: Any, service
     subprocess.run(command, check=True, cwd=ROOT, capture_output=True)
     (record,) = tmp_path.glob("*.csv")
     participant(tab, service, "H1")
-    tab.get_by_text("Take in a recording of another tool").click()
+    tab.get_by_text("Upload a recording of another tool").click()
     tab.get_by_label("or HDF5").set_input_files(record)
-    tab.get_by_role("button", name="Take in and identify").click(timeout=PATIENCE_MS)
+    tab.get_by_role("button", name="Upload and identify").click(timeout=PATIENCE_MS)
     tab.get_by_text("An effect is missing in this model").wait_for(timeout=PATIENCE_MS)
     first = tab.url.split("#")[0].split("?")[0]
     tab.get_by_role("heading", name="Hysteresis of recruitment").wait_for()

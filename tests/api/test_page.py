@@ -199,7 +199,7 @@ def test_hidden_effect_is_found_and_added_by_clicking(tab: Any, service: Service
     tab.set_viewport_size({"width": WIDE[0], "height": WIDE[1]})
     assert tab.locator(".place-share", has_text="31 %").is_visible()
     tab.get_by_role("button", name="Add this effect").click()
-    tab.get_by_role("heading", name="The error over the versions").wait_for()
+    tab.get_by_role("heading", name="Error of each version").wait_for()
     tab.locator("[data-figure=falling] .main-svg").first.wait_for()
     assert tab.locator("tr.current").inner_text().startswith("2. + fatigue")
     tab.locator("[data-job]").wait_for(state="detached")

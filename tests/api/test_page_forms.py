@@ -119,7 +119,7 @@ def test_an_effect_that_is_none_is_told_in_one_sentence(
     with service.client(token, headers=HTML) as client:
         data = {} if effect is None else {"effect": effect}
         answer = client.post(f"/models/{known['model_id']}/effects", data=data)
-    assert answer.status_code == 422 and "<h1>This cannot be used</h1>" in answer.text
+    assert answer.status_code == 422 and "<h1>This value cannot be used</h1>" in answer.text
     assert "effect: " in answer.text and "Nothing was changed" in answer.text and "^[a-z" not in answer.text
 
 

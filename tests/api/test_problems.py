@@ -1,4 +1,4 @@
-"""Everything that goes wrong comes as RFC 9457 problem+json that names the place and the mend."""
+"""Everything that goes wrong comes as RFC 9457 problem+json that names the place and the fix."""
 
 from __future__ import annotations
 

@@ -271,8 +271,8 @@ def test_an_upload_is_never_taken_for_the_recording_of_a_lost_test(tmp_path: Pat
         (b'{"code": "P1\xff"}', "not UTF-8"),
         (b'{"participant": "P1", "segments": [{"name": "a", "sequence": "rest", "settings": {"a": %s1%s}}]}'
          % (b'{"a":' * 900, b"}" * 900), "more than 16 brackets"),
-        (b'{"code": "P1", "profile": {"current_ma": 10, "current_ma": 90}}', "'current_ma' stands twice"),
-        (b'{"code": ' + b"1" * 5000 + b"}", "a number without an end"),
+        (b'{"code": "P1", "profile": {"current_ma": 10, "current_ma": 90}}', "'current_ma' is there twice"),
+        (b'{"code": ' + b"1" * 5000 + b"}", "a number with too many digits"),
     ],
 )  # fmt: skip
 @pytest.mark.parametrize("path", ["/v1/participants", "/v1/tests", "/v1/preview", "/v1/sessions"])

@@ -66,7 +66,7 @@ def test_an_unconfirmed_stop_keeps_its_warning_when_loaded_again(service: Servic
             told = browser.get(led.headers["location"])
             assert told.status_code == 503 and "emergency switch" in told.text
         unknown = browser.get("/stopped/none")  # as after a restart of the service
-        assert unknown.status_code == 404 and "The bar above says what the rig does now" in unknown.text
+        assert unknown.status_code == 404 and "The bar above shows what the rig does now" in unknown.text
         assert 'id="rig-state"' in unknown.text and 'action="/v1/stop"' in unknown.text
     service.rig.confirms_stop = True
     with service.client() as http:

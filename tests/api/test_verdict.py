@@ -89,7 +89,7 @@ def test_level_held_out_torque_has_no_percent(
             sent = client.post("/v1/participants/P1/recordings", content=data.read_bytes(), timeout=200)
             assert sent.status_code == 201, sent.text
             found = sent.json()["model"]
-            assert found["verdict"] == "not usable" and "whose torque is level" in found["words"]
+            assert found["verdict"] == "not usable" and "whose torque is constant" in found["words"]
             assert found["held_out_fit_percent"] is None and found["held_out_rms_nm"] > 0
             assert client.get(f"/v1/models/{found['id']}/comparison").status_code == 200
             for path in (f"/models/{found['id']}?diagnose=0", f"/models/{found['id']}/report"):

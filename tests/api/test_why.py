@@ -108,7 +108,7 @@ def test_effect_that_is_not_there_is_refused_with_the_reason(client: httpx.Clien
     assert refused.status_code == 409 and refused.json()["type"] == "/problems/effect-not-there"
     assert "log evidence -4.0" in refused.json()["reasons"]["tremor"]
     silent = client.post(f"/v1/models/{model}/effects", json={"effects": ["tremor"], "force": True})
-    assert silent.status_code == 422 and "say why" in silent.json()["detail"]
+    assert silent.status_code == 422 and "Give a reason" in silent.json()["detail"]
     body = {"effects": ["tremor"], "force": True, "reason": "seen with the eye"}
     forced = client.post(f"/v1/models/{model}/effects", json=body)
     assert forced.status_code == 201 and forced.json()["effects"] == ["tremor"]
@@ -161,9 +161,9 @@ def test_version_with_effects_is_criticised_with_them(client: httpx.Client, serv
     assert (own["structure"], [entry["effect"] for entry in own["missing"]]) == (["fatigue"], ["threshold_drift"])
     with signed_in(service) as browser:
         page = browser.get(f"/models/{better}").text
-        assert "Structure criticised: fatigue" in page and 'id="effect-threshold_drift"' in page
+        assert "Structure of the model: fatigue" in page and 'id="effect-threshold_drift"' in page
         assert 'id="effect-fatigue"' not in page
-        assert "Structure criticised: plain" in browser.get(f"/models/{model}").text
+        assert "Structure of the model: plain" in browser.get(f"/models/{model}").text
     added = client.post(f"/v1/models/{better}/effects", json={"effects": ["threshold_drift"]})
     assert added.status_code == 201 and added.json()["effects"] == ["fatigue", "threshold_drift"]
 
@@ -183,7 +183,7 @@ def test_diagnosis_kept_before_structures_were_told_is_read(client: httpx.Client
     context.analyses._keep(model, "diagnosis", old)
     assert client.get(f"/v1/models/{model}/diagnosis").json()["noise_sd_nm"] == 0.123
     with signed_in(service) as browser:
-        assert "Structure criticised: plain" in browser.get(f"/models/{model}").text
+        assert "Structure of the model: plain" in browser.get(f"/models/{model}").text
     assert client.get(f"/v1/models/{with_fatigue(client, model)}/diagnosis").json()["noise_sd_nm"] == 0.04
 
 
@@ -195,10 +195,10 @@ def refusal(missing: list[dict[str, Any]], gains: list[list[tuple[str, float]]],
 def test_reasons_against_an_effect() -> None:
     fatigue = {"effect": "fatigue", "name": "Fatigue", "confused_with": []}
     assert refusal([fatigue], [[("fatigue", 90)]], "fatigue") is None
-    assert "explains the same better" in str(refusal([fatigue], [[("drift", 50)], [("drift", 2)]], "drift"))
+    assert "explains the same error better" in str(refusal([fatigue], [[("drift", 50)], [("drift", 2)]], "drift"))
     assert "speaks against" in str(refusal([], [[("drift", -3)]], "drift"))
-    assert "too little" in str(refusal([], [[("drift", 3)]], "drift"))
-    assert "not considered" in str(refusal([], [], "torque_angle"))
+    assert "too weak" in str(refusal([], [[("drift", 3)]], "drift"))
+    assert "not tested" in str(refusal([], [], "torque_angle"))
 
 
 # ---- the next experiment ------------------------------------------------------------------------------------
@@ -274,7 +274,7 @@ def shown(verdict: str, missing: list[dict[str, Any]], effects: list[str], times
 
 
 def test_verdict_on_this_model_in_words() -> None:
-    assert "ask" in shown("effect_missing", [FATIGUE], [], 6)["words"]
+    assert "evidence" in shown("effect_missing", [FATIGUE], [], 6)["words"]
     after = shown("effect_missing", [FATIGUE], ["fatigue"], 1.1)
     assert after["title"] == "Nothing more is missing: what is left is noise" and after["missing"] == []
     assert shown("nothing_missing", [], [], 1.0)["title"] == "Nothing is missing: what is left is noise"
@@ -296,7 +296,7 @@ def test_page_shows_the_diagnosis_adds_by_a_form_and_shows_the_fall(service: Ser
             "Why does it fail?",
             "Fatigue",
             "93 %",
-            "This record cannot tell it from",
+            "This recording cannot tell it apart from",
             "Run it now",
             "falling prbs",
         ):
@@ -311,7 +311,7 @@ def test_page_shows_the_diagnosis_adds_by_a_form_and_shows_the_fall(service: Ser
             time.sleep(0.1)
             target = browser.get(target).headers.get("location", target)
         after = browser.get(target).text
-        assert "The error over the versions" in after and "Undo: back to the version before" in after
+        assert "Error of each version" in after and "Undo: back to the previous version" in after
         assert "+ fatigue" in after and re.search(r"1\. <a[^>]*>base model", after)
 
 
@@ -320,7 +320,9 @@ def test_forcing_on_the_page_wants_a_reason_and_refusals_are_pages(service: Serv
         led = browser.post(f"/models/{model}/effects", data={"csrf": csrf(browser), "effect": "tremor"})
         page = until(lambda: (found := browser.get(led.headers["location"])).status_code != 200 and found)
         assert (
-            page.status_code == 409 and "does not ask for this effect" in page.text and "Back to the model" in page.text
+            page.status_code == 409
+            and "gives no evidence for this effect" in page.text
+            and "Back to the model" in page.text
         )
 
 

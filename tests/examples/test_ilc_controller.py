@@ -15,7 +15,7 @@ import h5py
 import numpy as np
 import pytest
 
-from tests.harness.patients import Patient
+from tests.harness.muscle import Patient
 
 PATH = Path(__file__).parents[2] / "examples" / "ilc_controller.py"
 

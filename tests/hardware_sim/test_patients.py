@@ -18,7 +18,7 @@ from hardware_sim.patients import registry
 from hardware_sim.patients.calcium import CalciumMuscle
 from hardware_sim.patients.paper import PaperMuscle
 from hardware_sim.patients.paper import Parameters as PaperParameters
-from tests.harness.patients import Patient
+from tests.harness.muscle import Patient
 
 PERIOD_S = 0.025
 PAPER = Patient()

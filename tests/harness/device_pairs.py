@@ -9,18 +9,20 @@ from typing import Any
 import h5py
 import numpy as np
 
+from hardware_sim import stimulators
+from hardware_sim.load_cells import cells, transports
+from hardware_sim.scan import modules_with
 from rig import archive
 from tests.harness.processes import Bench, RigClient, control, kill_hard, short_plan
 
-STIMULATORS = ("p24", "rehastim2")
+STIMULATORS = tuple(modules_with(stimulators, "Firmware"))
+TRANSPORTS = tuple(modules_with(transports, "Transport"))
 CELLS = {
-    "plain": ("--cell", "plain"),
-    "plain x3": ("--cell", "plain", "--samples-per-frame", "3"),
-    "counts": ("--cell", "counts"),
-    "counts x4": ("--cell", "counts", "--samples-per-frame", "4"),
-    "canopen": ("--cell", "canopen"),
+    f"{name} x{count}" if count > 1 else name: ("--cell", name, "--samples-per-frame", str(count))
+    for name, module in modules_with(cells, "Cell").items()
+    for count in {module.Cell.layouts[0], module.Cell.layouts[-1]}
 }
-TRANSPORTS = ("socketcand", "slcan")
+"""Every emulated cell with its fewest and its most samples per frame, as options of the emulator."""
 HOLD = [
     {"name": "rest", "sequence": "rest", "settings": {"duration_s": 0.5}},
     {"name": "hold", "sequence": "steps", "settings": {"on_s": 8.0, "off_s": 0.0, "repeats": 1}},

@@ -78,7 +78,7 @@ def test_every_command_of_the_page_does_what_it_says(place: Path) -> None:
 
 @pytest.mark.parametrize("seed", range(3011, 3015))
 def test_it_is_found_on_other_records_that_have_it(place: Path, seed: int) -> None:
-    """The emulator's own amplifiers: period, phase and shape are drawn by the seed, and no seed was looked at before."""
+    """The emulator's own amplifiers: period, phase and shape are drawn by the seed. No seed was looked at before."""
     record = hidden_records.generate("sensor_gain_swing", "strong", seed=seed, rate_hz=100)
     hidden_records.write_csv(record, place / f"{seed}.csv")
     found = json.loads(run(["diagnose", f"{seed}.csv", "--json"], place, "my_effects"))

@@ -112,7 +112,7 @@ def test_numbers_that_are_none():
                 identify.fit(replace(record, **{column: spoiled}))
     backwards = record.time_s.copy()
     backwards[50] = backwards[49] - 1
-    with pytest.raises(identify.BadRecord, match="time doesn't rise"):
+    with pytest.raises(identify.BadRecord, match="time does not rise"):
         identify.fit(replace(record, time_s=backwards))
     with pytest.raises(identify.BadRecord, match="negative"):
         identify.fit(replace(record, pulse_width_us=record.pulse_width_us - 1))

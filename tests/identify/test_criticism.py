@@ -10,7 +10,7 @@ import pytest
 import identify
 from identify.criticism import compare
 from identify.criticism.correlation import _auto, _bands, _cross, _filtered
-from identify.dynamics.pulse_grid import make_grid
+from identify.dynamics.make_grid import make_grid
 from tests.identify import hidden_muscles
 
 

@@ -11,7 +11,7 @@ from identify import fit
 from identify.effects import get, library, registry
 from identify.effects.base import STAGES
 from identify.errors import BadRequest, NotIdentifiable
-from identify.estimation.prepare import plain, prepare
+from identify.estimation.prepare import fit_plain, prepare
 from identify.model import Model
 from identify.records.record import Record
 from identify.simulation.problem import Problem
@@ -58,7 +58,7 @@ def moving() -> Record:
 @pytest.fixture(scope="module")
 def setup(moving):
     grid, _ = prepare(moving)
-    return plain(grid, grid.fitted).problem.setup
+    return fit_plain(grid, grid.fitted).problem.setup
 
 
 def _theta(problem: Problem) -> np.ndarray:

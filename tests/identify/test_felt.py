@@ -12,12 +12,14 @@ import identify
 from identify.criticism import compare
 from identify.criticism.correlation import correlation_tests
 from identify.dynamics import pulse_grid
-from identify.dynamics.pulse_grid import Grid, make_grid
+from identify.dynamics.make_grid import make_grid
+from identify.dynamics.pulse_grid import Grid
 from identify.methods import methods
 from identify.records.read import read
 from identify.records.record import OPTIONAL, Record
 from identify.simulation.predict import predict
-from tests.harness.patients import FINE_HZ, Patient, make_record, protocol, second_order
+from tests.harness.muscle import FINE_HZ, Patient, second_order
+from tests.harness.patients import make_record, protocol
 
 PULSE_S = 0.025
 FINE = round(FINE_HZ * PULSE_S)
@@ -444,7 +446,7 @@ def test_it_is_said_how_much_was_left_out(tmp_path):
     seal(tmp_path / "r.h5", seed=1, sync=False)
     record = read(tmp_path / "r.h5")
     words = compare(identify.fit(record), record).left_out
-    assert "s are left out, where it is not known what was felt." in words
+    assert "s are left out, where the time of the pulses is not known." in words
 
 
 def test_a_record_of_nothing_but_doubt_is_refused():
@@ -453,7 +455,7 @@ def test_a_record_of_nothing_but_doubt_is_refused():
     blind = Record.from_arrays(
         record.time_s, record.pulse_width_us, record.torque_nm, doubted=np.ones(record.time_s.size)
     )
-    with pytest.raises(identify.IdentifyError, match="it is not known what was felt"):
+    with pytest.raises(identify.IdentifyError, match="nearly all samples are doubted"):
         compare(model, blind)
     with pytest.raises(identify.IdentifyError, match="may be fitted"):
         identify.fit(blind)

@@ -10,9 +10,9 @@ import pytest
 import identify
 from identify.dynamics.linear import SecondOrder
 from identify.estimation.cross_validation import BLOCK_S, FOLDS, held_out_change
-from identify.estimation.figures import best_fit_percent
+from identify.estimation.fit_statistics import best_fit_percent
 from identify.estimation.joint import solve
-from identify.estimation.prepare import plain, prepare
+from identify.estimation.prepare import fit_plain, prepare
 from identify.paper import muscle
 from identify.records.record import Record
 from identify.simulation.problem import Problem
@@ -135,7 +135,7 @@ def test_without_validate_the_held_out_error_is_cross_validated():
 def test_cross_validation_agrees_with_refits_of_the_same_design(ar1: float):
     record, _ = make_record(Patient(), np.random.default_rng(9), rate_hz=40, noise_nm=0.2, ar1=ar1, validate=False)
     grid, _ = prepare(record)
-    fitted_all = plain(grid, grid.fitted)
+    fitted_all = fit_plain(grid, grid.fitted)
     setup = fitted_all.problem.setup
     fold = (np.cumsum(grid.fitted) // round(BLOCK_S * 40)) % FOLDS
     change = held_out_change(fitted_all)

@@ -11,7 +11,8 @@ from scipy.integrate import solve_ivp
 from identify.dynamics import pulse_grid
 from identify.dynamics.boundary import boundary_states
 from identify.dynamics.linear import SecondOrder
-from identify.dynamics.pulse_grid import make_grid, runs
+from identify.dynamics.make_grid import make_grid
+from identify.dynamics.pulse_grid import runs
 from identify.dynamics.second_order import transition
 from identify.errors import BadRecord
 from identify.noise.ar1 import best_ar1, log_likelihood, whiten
@@ -129,11 +130,14 @@ def test_critical_damping_has_no_seam() -> None:
     np.testing.assert_allclose(above, at, atol=1e-5)
 
 
-def test_a_delay_of_nothing_changes_no_bit() -> None:
+def test_means_are_those_of_the_curve_at_the_samples_and_a_delay_shifts_them() -> None:
     grid = make_grid(Record.from_arrays(np.arange(4000) / 400, np.repeat(schedule()[:400], 10), np.zeros(4000)))
     states = boundary_states(0.3, 0.8, grid.step_s, grid.pulse_width_us)
-    assert np.array_equal(grid.block_mean(*states), grid.block_mean(*states, 0.0))
-    assert grid.mean_weights(0.0)[0] == 0
+    at_once, late = grid.block_mean(*states), grid.block_mean(*states, grid.step_s)
+    sampled = grid.at_samples(*states, 0.0).reshape(-1, 10).mean(axis=1)
+    assert np.ptp(at_once) > 100.0
+    np.testing.assert_allclose(at_once, sampled, atol=1e-9)
+    np.testing.assert_allclose(late[1:], at_once[:-1], atol=1e-9)
 
 
 def test_held_out_rows_are_never_fitted() -> None:
@@ -147,7 +151,7 @@ def test_held_out_rows_are_never_fitted() -> None:
 def test_what_cannot_be_put_on_the_grid_is_refused(rate_hz: int, size: int) -> None:
     with pytest.raises(BadRecord) as refusal:
         make_grid(Record.from_arrays(np.arange(size) / rate_hz, np.zeros(size), np.zeros(size)))
-    assert refusal.value.mend
+    assert refusal.value.fix
 
 
 def test_runs() -> None:

@@ -40,7 +40,7 @@ def test_each_step_is_a_model_that_predicts_what_the_step_says(improved):
 def test_what_is_not_there_is_refused_with_a_reason_and_can_be_forced(improved):
     _, result = improved
     assert result.steps[-1]["added"] == "electromechanical_delay"
-    assert "person" in result.steps[-1]["reason"]
+    assert "on request" in result.steps[-1]["reason"]
     refusals = {row["effect"]: row["reason"] for row in result.refused}
     assert "log evidence" in refusals["electromechanical_delay"]
 
@@ -70,8 +70,11 @@ def test_a_model_with_effects_carries_bands_and_a_verdict():
         lower, upper = prediction_band(model, record)
         assert held(clean, lower, upper) > 0.8
         assert held(clean, *prediction_band(base, record)) < 0.65
-        curve = model.bands["recruitment"]
-        assert np.all(np.asarray(curve["lower"]) <= np.asarray(curve["upper"]))
+        curve = {key: np.asarray(values) for key, values in model.bands["recruitment"].items()}
+        true_nm = hidden_muscles.recruited(curve["pulse_width_us"])
+        assert np.mean((curve["whole_lower"] <= true_nm) & (true_nm <= curve["whole_upper"])) > 0.85
+        assert np.max(np.abs(curve["value"] - true_nm)) < 0.15
+        assert np.max(np.abs(np.asarray(base.bands["recruitment"]["value"]) - true_nm)) > 0.5
         widths.append(float(np.mean((upper - lower)[~record.held_out])))
         assert widths[-1] < noise_nm  # the whole band: some two hundred samples a parameter
     assert 1.4 < widths[1] / widths[0] < 2.8

@@ -10,8 +10,9 @@ import pytest
 
 import identify
 from identify import Record
-from identify.dynamics.pulse_grid import Grid, make_grid, runs
-from identify.estimation.prepare import plain, prepare
+from identify.dynamics.make_grid import make_grid
+from identify.dynamics.pulse_grid import Grid, runs
+from identify.estimation.prepare import fit_plain, prepare
 from identify.records import parts_csv
 from identify.records.join import PAUSE_S, join
 from identify.records.record import Part, Pulses, Source
@@ -153,7 +154,7 @@ def test_noise_is_not_carried_from_one_part_into_the_next():
     joined = join([one, replace(one, torque_nm=one.torque_nm[::-1] * 0.5)], [0.0, 3.0])
     grid = make_grid(joined)
     assert [set(grid.part[run]) for run in runs(grid.fitted)] == [{0, 1}]
-    setup = plain(*_rows(joined)).problem.setup
+    setup = fit_plain(*_rows(joined)).problem.setup
     start, stop = setup.stretches
     assert [set(grid.part[a:b]) for a, b in zip(start, stop, strict=True)] == [{0}, {1}]
 

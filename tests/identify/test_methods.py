@@ -7,8 +7,8 @@ import pytest
 
 import identify
 from identify.dynamics.linear import Discrete, SecondOrder
-from identify.dynamics.pulse_grid import make_grid
-from identify.estimation.figures import best_fit_percent
+from identify.dynamics.make_grid import make_grid
+from identify.estimation.fit_statistics import best_fit_percent
 from identify.methods import Method, method_of, methods
 from identify.methods.support.output_error import choose_order, output_error
 from identify.paper import table1
@@ -48,7 +48,7 @@ def test_options_that_a_method_does_not_have(clean_record):
         identify.fit(clean_record[0], method="two-stage", taps=3)
     with pytest.raises(identify.BadRequest, match="order"):
         identify.fit(clean_record[0], method="two-stage", order="two")
-    with pytest.raises(identify.BadRequest, match="unusable option"):
+    with pytest.raises(identify.BadRequest, match="invalid option"):
         identify.fit(clean_record[0], knots="many")
 
 

@@ -11,7 +11,7 @@ from scipy.signal import lfilter
 
 import identify
 from identify.dynamics.linear import Discrete, SecondOrder
-from identify.estimation.quality import check
+from identify.estimation.quality import range_warnings
 from identify.records.record import Record
 from identify.recruitment.curve import Curve
 from identify.recruitment.power import PowerBasis
@@ -78,8 +78,8 @@ def test_bad_models_are_refused(case):
         ("[]", "JSON object"),
         ("{}", "schema version"),
         (json.dumps(document | {"schema_version": "9.0"}), "schema version 9.0"),
-        (json.dumps({k: v for k, v in document.items() if k != "linear"}), "linear: key is missing"),
-        (json.dumps(document | {"linear": {"kind": "second-order", "time_constant_s": "x"}}), "'x' is no number"),
+        (json.dumps({k: v for k, v in document.items() if k != "linear"}), "linear: the key is missing"),
+        (json.dumps(document | {"linear": {"kind": "second-order", "time_constant_s": "x"}}), "'x' is not a number"),
         (json.dumps(document | {"recruitment": {"basis": {"kind": "magic"}}}), "unknown basis"),
     ):
         with pytest.raises(identify.BadModel, match=says):
@@ -136,14 +136,14 @@ def test_bases_of_the_spline_span_equation_8():
 
 def test_warns_and_refuses_outside_what_it_holds_for(case):
     record, model = case
-    assert check(model, record) == []
+    assert range_warnings(model, record) == []
     wider = replace(record, pulse_width_us=record.pulse_width_us * 1.5)
-    assert any("above the largest fitted" in warning for warning in check(model, wider))
+    assert any("above the largest fitted" in warning for warning in range_warnings(model, wider))
     assert "above the largest fitted" in identify.compare(model, wider).plain[-1]
     with pytest.raises(identify.BadModel, match="pulses a second"):
         identify.predict(model, replace(record, pulse_rate_hz=20.0))
     slightly = replace(record, pulse_rate_hz=44.0)
-    assert any("fit again" in warning for warning in check(model, slightly))
+    assert any("fit a model at that rate" in warning for warning in range_warnings(model, slightly))
 
 
 def test_predicts_at_the_records_own_rate(case):
@@ -163,6 +163,6 @@ def test_a_polynomial_whose_parts_do_not_go_together_is_refused(case):
         "baseline_nm": 0.0,
     }  # fmt: skip
     identify.Model.from_dict(document | {"extra": {"narx": narx}})
-    for change, says in (({"terms": [[0], []]}, "differ in number"), ({"terms": [[1]]}, "not there")):
+    for change, says in (({"terms": [[0], []]}, "differ in number"), ({"terms": [[1]]}, "does not exist")):
         with pytest.raises(identify.BadModel, match=says):
             identify.Model.from_dict(document | {"extra": {"narx": narx | change}})

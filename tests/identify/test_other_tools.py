@@ -12,7 +12,8 @@ import pytest
 
 import identify
 from identify.records.record import Record
-from tests.harness.patients import FINE_HZ, Patient, make_record, protocol
+from tests.harness.muscle import FINE_HZ
+from tests.harness.patients import Patient, make_record, protocol
 
 RATE_HZ = 100
 WIDTHS_US = np.linspace(0.0, 300.0, 31)

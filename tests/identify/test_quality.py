@@ -10,8 +10,8 @@ import pytest
 
 import identify
 from identify.criticism import compare
-from identify.dynamics.pulse_grid import make_grid
-from identify.estimation.figures import UNDEFINED, best_fit_percent, ceiling_percent
+from identify.dynamics.make_grid import make_grid
+from identify.estimation.fit_statistics import UNDEFINED, best_fit_percent, ceiling_percent
 from identify.estimation.quality import quality
 from tests.harness.patients import Patient, make_record
 
@@ -45,7 +45,7 @@ def test_a_model_of_level_held_out_rows(record: identify.Record, effects: tuple[
     found = identify.fit(level, effects=effects)
     again = identify.Model.from_json(found.to_json())
     assert again.fit["held_out_fit_percent"] is None and again.fit["held_out_ceiling_percent"] is None
-    assert found.quality["verdict"] == "not usable" and "whose torque is level" in found.quality["words"]
+    assert found.quality["verdict"] == "not usable" and "whose torque is constant" in found.quality["words"]
     grid = make_grid(level)
     assert quality(again, grid, grid.fitted)["words"] == found.quality["words"]
     assert any(UNDEFINED in line for line in compare(again, level).plain)
@@ -80,16 +80,18 @@ def test_the_gap_on_rows_not_seen_is_in_the_verdict(
     seen = {"held_out_fit_percent": reached, "held_out_ceiling_percent": 98.0, "held_out_rms_nm": rms_nm}
     found = judged(model, record, **seen)
     assert found["verdict"] == verdict
-    assert ("rows it has not seen" in found["words"]) == (rms_nm <= 0.3 or verdict == "not usable")
+    assert ("held-out rows" in found["words"]) == (rms_nm <= 0.3 or verdict == "not usable")
 
 
 def test_a_residual_that_is_not_noise_asks_for_care_alone(record: identify.Record, model: identify.Model) -> None:
-    assert model.quality["verdict"] == "usable" and model.quality["words"].endswith("little is left to explain.")
+    assert model.quality["verdict"] == "usable" and model.quality["words"].endswith("% at most.")
     grid = make_grid(record)
     alarmed = model.with_(residual_tests={"whiteness": {"passed": False}})
     found = quality(alarmed, grid, grid.fitted)
     assert found["verdict"] == "usable with care"
-    assert found["words"] == "Use it with care, since the residual is not noise (whiteness test): see the diagnosis."
+    assert (
+        found["words"] == "Check this before use: the residual is not pure noise (whiteness test): see the diagnosis."
+    )
 
 
 def test_what_refuses_is_said_first(record: identify.Record, model: identify.Model) -> None:
@@ -97,5 +99,5 @@ def test_what_refuses_is_said_first(record: identify.Record, model: identify.Mod
     broken = model.with_(noise=replace(model.noise, block_sd_nm=100.0), residual_tests={"a": {"passed": False}})
     found = quality(broken, grid, grid.fitted, converged=False)
     assert found["verdict"] == "not usable"
-    assert found["words"].startswith("Do not rely on it, since stimulation hardly moves the torque")
+    assert found["words"].startswith("Do not use this model: stimulation hardly changes the torque")
     assert len(found["reasons"]) == 3

@@ -16,7 +16,7 @@ import pytest
 
 import identify
 from identify.methods import methods
-from identify.shown import Sheet, fit_words, one_line, probability, quantity
+from identify.shown import Sheet, estimate, fit_words, one_line, probability, quantity, register_plotter
 from tests.identify import hidden_muscles
 
 FOLDER = Path(__file__).parents[2] / "docs" / "schema"
@@ -102,10 +102,10 @@ def test_nothing_missing_and_nothing_held_out_keep_to_the_schema():
 
 def test_rivals_and_the_test_between_them_keep_to_the_schema(record, monkeypatch):
     """Every effect that was tried is made a rival, so that there is a test to plan."""
-    monkeypatch.setattr(import_module("identify.diagnosis.report"), "RIVAL", 0.0)
+    monkeypatch.setattr(import_module("identify.diagnosis.result"), "RIVAL", 0.0)
     found = identify.diagnose(record)
     assert found.missing[0]["next_experiment_plan"]["segments"] and errors("diagnosis", found.to_dict()) == []
-    assert "can't tell it from" in str(found) and "next test" in str(found)
+    assert "cannot separate it from" in str(found) and "next test" in str(found)
 
 
 def test_the_check_sees_a_key_too_many_and_one_too_few(results):
@@ -206,7 +206,7 @@ def test_nothing_missing_names_no_worst_place_and_says_when_the_record_is_too_po
     found = dataclasses.replace(results["diagnosis"], verdict="nothing_missing", missing=(), notes=())
     base = {**found.base, "held_out_rms_nm": found.noise_sd_nm}
     calm = str(dataclasses.replace(found, base=base))
-    assert "error sits" not in calm and "too short or too poor" not in calm
+    assert "error in" not in calm and "too short or too poor" not in calm
     poor = str(dataclasses.replace(found, base={**base, "held_out_rms_nm": 20 * found.noise_sd_nm}))
     assert "too short or too poor" in poor
 
@@ -249,6 +249,30 @@ def test_a_model_of_another_version_with_little_in_it_still_shows_itself(results
 )  # fmt: skip
 def test_a_number_has_three_digits_and_its_unit(value, unit, said):
     assert quantity(value, unit) == said
+
+
+def test_a_model_tells_its_parameters_with_their_standard_deviations(results):
+    model = results["model"]
+    said = dict(line.split("  ", 1) for line in str(model).splitlines()[1:])
+    for name, word in (("time_constant_s", "time constant"), ("damping", "damping")):
+        value, sd = getattr(model.linear, name), model.covariance.sd(name)
+        assert f"{word} {value:.3g} ± {sd:.2g}" in said["dynamics"]
+    assert " ± " in said["recruitment"] and " ± " in said["baseline"]
+
+
+def test_an_estimate_without_a_deviation_has_no_plus_minus():
+    assert estimate(0.5284, 0.0123, "s") == "0.528 ± 0.012 s" and estimate(0.64, 0.01, "1") == "0.64 ± 0.01"
+    assert estimate(2.0, None, "s") == estimate(2.0, float("nan"), "s") == "2 s"
+
+
+def test_results_are_drawn_by_the_registered_plotter(results, record, monkeypatch):
+    monkeypatch.setattr("identify.shown._plotters", [])
+    with pytest.raises(identify.BadRequest, match="no plotter is registered"):
+        results["model"].plot(record)
+    drawn = []
+    register_plotter(lambda result, measured: drawn.append((result, measured)) or "figure")
+    assert results["model"].plot(record) == results["comparison"].plot() == "figure"
+    assert drawn == [(results["model"], record), (results["comparison"], None)]
 
 
 def test_small_words():

@@ -107,6 +107,7 @@ def test_who_stops_half_way_leaves_no_copy_behind():
 
 def test_results_longer_than_a_pipe_arrive_whole():
     found = dict(side_by_side(lambda number: bytes(3_000_000) + bytes([number]), 6, 2))
+    assert sorted(found) == list(range(6))
     assert all(len(value) == 3_000_001 and value[-1] == number for number, value in found.items())
 
 

@@ -61,7 +61,7 @@ def test_an_effect_with_spoiled_parameters_is_refused_or_predicts(effect: str, r
                 model = identify.Model.from_dict(with_effect(plain, effect, form.name, parameters))
             except identify.BadModel as error:
                 refused += 1
-                assert "\n" not in str(error) and "is no number from" in str(error)
+                assert "\n" not in str(error) and "is not a number from" in str(error)
             else:
                 assert np.isfinite(identify.predict(model, record)).all(), parameters
         assert refused

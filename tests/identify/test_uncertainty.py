@@ -10,9 +10,9 @@ import pytest
 
 import identify
 from identify.dynamics.linear import SecondOrder
-from identify.estimation.residual_tests import LAGS, Apart, chi_square_p
+from identify.estimation.residual_tests import LAGS, PaddedRows, chi_square_p
 from identify.estimation.uncertainty import prediction_band
-from identify.noise.ar1 import best_ar1, log_likelihood, noise_evidence, whiten
+from identify.noise.ar1 import ar1_or_white, best_ar1, log_likelihood, whiten
 from identify.noise.level import NoiseLevel, correlation_slopes
 from tests.harness.patients import Patient, make_record
 
@@ -88,7 +88,7 @@ def test_a_delay_that_the_model_does_not_hold_is_told():
 def test_correlations_after_a_fit_have_the_moments_that_are_told():
     rng = np.random.default_rng(3)
     start, stop = np.array([0, 70]), np.array([60, 100])
-    apart = Apart(start, stop)
+    apart = PaddedRows(start, stop)
     basis = np.linalg.qr(rng.standard_normal((90, 12)).cumsum(axis=0))[0].T * np.linspace(0.5, 1.0, 12)[:, None]
     left = np.eye(90) - basis.T @ basis
     forms = [np.eye(90)]
@@ -104,8 +104,8 @@ def test_correlations_after_a_fit_have_the_moments_that_are_told():
 
 
 def test_a_sliver_between_doubted_rows_leaves_the_lags_alone():
-    assert Apart(np.array([0, 610]), np.array([600, 613])).lags == LAGS
-    assert Apart(np.arange(0, 1000, 10), np.arange(5, 1000, 10)).lags == 2
+    assert PaddedRows(np.array([0, 610]), np.array([600, 613])).lags == LAGS
+    assert PaddedRows(np.arange(0, 1000, 10), np.arange(5, 1000, 10)).lags == 2
 
 
 def test_what_was_estimated_of_the_noise_is_known_lag_by_lag():
@@ -158,8 +158,8 @@ def test_noise_evidence_finds_the_correlation():
         slow[k] = 0.9 * slow[k - 1] + white[k]
     pieces = [slice(0, 1000), slice(1200, 3000)]
     assert best_ar1(slow, pieces) == pytest.approx(0.9, abs=0.03)
-    assert noise_evidence(slow, pieces)[1] > 100
-    assert noise_evidence(white, pieces)[0] == 0.0
+    assert ar1_or_white(slow, pieces)[1] > 100
+    assert ar1_or_white(white, pieces)[0] == 0.0
 
 
 def test_chi_square_tail_against_scipy():

@@ -87,6 +87,8 @@ def test_what_comes_to_no_pulse_is_a_rest(tmp_path: Path, width_us: float, curre
     setup = Setup(tmp_path)
     assert setup.fire(width_us, current_ma) == status
     assert len(setup.stimulator.sent) == (status == PulseStatus.UNACKNOWLEDGED)
+    skipped = status != PulseStatus.UNACKNOWLEDGED and width_us > 0  # of a planned rest nothing is written
+    assert len(blocks(setup, Kind.SKIPPED)) == skipped
     assert setup.gate.dropped == 0
 
 
@@ -272,6 +274,18 @@ def test_a_watchdog_is_fed_while_the_gate_is_open_alone(tmp_path: Path):
     setup.gate.shut()
     setup.gate.feed()
     assert setup.stimulator.fed_s == [T0_S]
+
+
+def test_a_new_test_does_not_wait_for_an_ack_of_the_one_before(tmp_path: Path):
+    """Arming is answered in order: what was on its way before has gone through, or is lost."""
+    setup = Setup(tmp_path)
+    setup.stimulator.ack_delay_s = None
+    setup.fire(100)
+    setup.gate.release()
+    setup.wait(1.0)
+    setup.gate.open(setup.journal, limits.HARD_LIMITS)
+    assert setup.gate.on_its_way is None
+    assert setup.fire(100) == PulseStatus.UNACKNOWLEDGED
 
 
 def test_a_gate_whose_device_or_journal_fails_stays_shut(tmp_path: Path):

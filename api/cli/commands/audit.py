@@ -29,10 +29,10 @@ def register(app: typer.Typer) -> None:
 def verify(
     data: DataDir = None,
     file: Annotated[Path | None, typer.Option(help="an exported file instead of the database")] = None,
-    head: Annotated[str, typer.Option(help="hash that was noted elsewhere: it must stand in the chain")] = "",
+    head: Annotated[str, typer.Option(help="hash that was noted elsewhere: it must be in the chain")] = "",
     as_json: Json = False,
 ) -> None:
-    """Exit 0 if the chain holds; 1 if an entry was changed, taken out or put in."""
+    """Exit 0 if the chain is complete; 1 if an entry was changed, removed or added."""
     entries = read_export(file) if file is not None else stored(data)
     broken = audit.first_broken(entries)
     missing = bool(head) and head not in {entry.hash for entry in entries}

@@ -12,7 +12,7 @@ from api.structure import in_words, worded
 VERDICTS = {
     "effect_missing": "An effect is missing in the model.",
     "nothing_missing": "Nothing is missing: what is left looks like noise.",
-    "unexplained_structure": "Structure is left that no effect of the library explains.",
+    "unexplained_structure": "The error has structure that no effect of the library explains.",
 }
 
 
@@ -27,7 +27,7 @@ def diagnose(
     columns: ColumnMap = None,
     as_json: Json = False,
 ) -> None:
-    """What is missing in a model's structure, ranked; or that nothing is; or that what is left has no name here.
+    """What is missing in a model's structure, most probable first; or nothing; or structure that no effect explains.
 
     Takes 5 to 30 s. DATA decides: a model given with --model lends its structure, not its numbers.
     """

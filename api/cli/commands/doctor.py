@@ -1,4 +1,4 @@
-"""`stimrig doctor`: what on this machine keeps a rig from working, and what mends it."""
+"""`stimrig doctor`: what on this machine keeps a rig from working, and how to fix it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def doctor(
     socket: Annotated[Path | None, typer.Option(help="a running rig's socket, or STIMRIG_RIG_SOCKET")] = None,
     as_json: Json = False,
 ) -> None:
-    """Look at devices, permissions, clock, disk, priority; say what to mend. Sends nothing. Exit 1 if one fails."""
+    """Check devices, permissions, clock, disk, priority; say how to fix each. Sends nothing. Exit 1 if one fails."""
     given: dict[str, Any] = {"rig_file": rig, "data_dir": data, "rig_socket": socket}
     settings = Settings(**{key: value for key, value in given.items() if value is not None})
     found = checks.examine(settings)
@@ -35,7 +35,7 @@ def doctor(
     else:
         for finding in found:
             say(f"{MARKS[finding.verdict]}  {finding.check:14} {finding.says}")
-            if finding.verdict != "ok" and finding.mend:
-                say(f"{'':23}-> {finding.mend}")
+            if finding.verdict != "ok" and finding.fix:
+                say(f"{'':23}-> {finding.fix}")
     if report["verdict"] == "fails":
         raise typer.Exit(1)

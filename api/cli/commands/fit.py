@@ -35,7 +35,7 @@ def fit(
     effects: Annotated[
         str,
         typer.Option(
-            help="effects that the model is to hold, comma-separated (`stimrig effects` lists them), each `id` or "
+            help="effects of the model, comma-separated (`stimrig effects` lists them), each `id` or "
             "`id:form`; or `auto`: those that the record asks for, as `improve` adds them. Only with maximum-likelihood"
         ),
     ] = "",

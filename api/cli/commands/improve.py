@@ -1,4 +1,4 @@
-"""`stimrig improve`: effects added one by one while the evidence lasts."""
+"""`stimrig improve`: effects added one by one as long as the evidence supports it."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def improve(
     columns: ColumnMap = None,
     as_json: Json = False,
 ) -> None:
-    """Add effects one by one to a model's structure while the evidence lasts; each step is a model.
+    """Add effects one by one to a model's structure as long as the evidence supports it; each step is a model.
 
     Takes 5 to 40 s. Without -o nothing is kept.
     """

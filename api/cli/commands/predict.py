@@ -39,7 +39,7 @@ def predict(
     import numpy as np
 
     import identify
-    from identify.estimation.figures import best_fit_percent
+    from identify.estimation.fit_statistics import best_fit_percent
 
     model = load_model(model_json)
     record = load_record(data, columns)

@@ -19,15 +19,15 @@ def register(app: typer.Typer) -> None:
 
 
 def recover(
-    journal: Annotated[Path, typer.Argument(help="a rig's journal, also a damaged one", metavar="JOURNAL")],
+    journal: Annotated[Path, typer.Argument(help="a journal of the rig; it may be damaged", metavar="JOURNAL")],
     output: Annotated[Path | None, typer.Option("-o", "--output", help="folder for the recording")] = None,
     as_json: Json = False,
 ) -> None:
-    """Seal what a journal holds, and say what is missing; the journal stays. In a process of the rig's own code."""
+    """Make a sealed recording from a journal, and say what is missing. The journal is kept."""
     options = [*(["-o", str(output)] if output else []), *(["--json"] if as_json else [])]
     command = [sys.executable, "-m", "rig.recover", *options, "--", str(journal)]
     ended = subprocess.run(command, capture_output=True, text=True)
     if ended.returncode:
-        words = (ended.stderr.strip().splitlines() or ["it ended without a word"])[-1].removeprefix("recover: ")
+        words = (ended.stderr.strip().splitlines() or ["it ended without a message"])[-1].removeprefix("recover: ")
         raise InputError(words) if ended.returncode == 2 else LaunchError(words, ended.returncode)
     print(ended.stdout, end="")

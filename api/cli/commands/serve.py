@@ -28,7 +28,7 @@ def serve(
     host: Annotated[str | None, typer.Option(help="default 127.0.0.1, or STIMRIG_HOST")] = None,
     rig: Annotated[Path | None, typer.Option(help="rig file (TOML); default: the emulated rig")] = None,
     rig_socket: Annotated[
-        Path | None, typer.Option(help="attach to the rig that listens here and start none; or STIMRIG_RIG_SOCKET")
+        Path | None, typer.Option(help="use the running rig that listens here; or STIMRIG_RIG_SOCKET")
     ] = None,
     data: Annotated[Path | None, typer.Option(help="data folder; default ./var, or STIMRIG_DATA_DIR")] = None,
     emulate: Annotated[str, typer.Option(help='options for the emulator, e.g. "--hidden 7"')] = "",

@@ -34,7 +34,7 @@ def test(
     emulate: Annotated[str, typer.Option(help='options for the emulator, e.g. "--patient calcium"')] = "",
     as_json: Json = False,
 ) -> None:
-    """One pre-session test: PRBS, ramp and held-out levels played, the muscle identified. Approves nothing."""
+    """One pre-session test: PRBS, ramp and held-out levels are sent, and the muscle is identified. Approves nothing."""
     if url:
         token = os.environ.get("STIMRIG_TOKEN") or os.environ.get("STIMRIG_ADMIN_TOKEN")
         if not token:

@@ -71,8 +71,8 @@ def _numbered(connection: Connection) -> str | None:
 
 
 def _newer(found: object) -> SchemaError:
-    mend = "install the stimrig that wrote it, or set STIMRIG_DATA_DIR to another folder"
-    return SchemaError(f"it is of version {found}, this stimrig knows versions up to {NEWEST}; {mend}")
+    fix = "install the stimrig that wrote it, or set STIMRIG_DATA_DIR to another folder"
+    return SchemaError(f"it is of version {found}, this stimrig knows versions up to {NEWEST}; {fix}")
 
 
 def _refuse_lacking(connection: Connection) -> None:

@@ -119,8 +119,8 @@ async def step(
     if trains is not None:
         found = await calibration.standing(context, code)
         if trains != str(len(found["trains"])):
-            detail = "Another train was played since this page was shown. Nothing was sent. Go back and look again."
-            raise ApiError(409, "not-what-was-seen", "This is no longer what you saw", detail)
+            detail = "Another train was sent after this page was shown. Nothing was sent now. Go back and check."
+            raise ApiError(409, "not-what-was-seen", "This page is out of date", detail)
     await calibration.step(context, code, wanted)
     return back(code)
 

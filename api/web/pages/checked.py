@@ -32,4 +32,4 @@ def checked(model: Any, **fields: Any) -> Any:
         field = NAMES.get(field, field)
         wrong = f"{str(first['input'])[:40]!r} will not do" if first["type"] == PATTERN else first["msg"]
         detail = f"{field}: {wrong}. {HINTS.get(field, '')}".strip()
-        raise ApiError(422, "invalid-input", "This cannot be used", detail) from None
+        raise ApiError(422, "invalid-input", "This value cannot be used", detail) from None

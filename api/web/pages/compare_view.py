@@ -27,8 +27,8 @@ async def compare(
 ) -> Response:
     """Two models of one participant."""
     if model is None or len(model) != 2:
-        detail = f"{len(model or [])} are ticked. Go back and tick two models of the participant."
-        raise ApiError(422, "two-models", "Two models are compared", detail)
+        detail = f"{len(model or [])} are chosen. Go back and choose two models of the participant."
+        raise ApiError(422, "two-models", "Choose two models to compare", detail)
     rows = [await asyncio.to_thread(context.versions.get, model_id) for model_id in model]
     if rows[0].participant != rows[1].participant:
         detail = f"{rows[0].id} is of {rows[0].participant}, {rows[1].id} of {rows[1].participant}."

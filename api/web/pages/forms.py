@@ -59,7 +59,7 @@ async def decide(context: Context, by: str, model_id: str, approved: bool, reaso
     """
     if not reason.strip():
         detail = "Go back and say in a few words why; it is kept in the audit trail. Nothing was decided."
-        raise ApiError(422, "reason-missing", "A decision wants a reason", detail)
+        raise ApiError(422, "reason-missing", "A decision needs a reason", detail)
     await asyncio.to_thread(context.versions.decide, model_id, approved, by, reason.strip()[:500])
     return RedirectResponse(f"/models/{model_id}", 303)
 

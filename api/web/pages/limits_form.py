@@ -89,7 +89,7 @@ def _take(form: LimitsForm, name: str, sent: FormData, saved: float) -> None:
 
 
 def _stale(form: LimitsForm, sent: FormData) -> LimitsForm:
-    form.notice = "Nothing was saved, nothing was started. The limits were changed meanwhile"
+    form.notice = "Nothing was saved, nothing was started. The limits were changed"
     for name, limit in profiles.LIMITS.items():
         text = _one(sent, name)
         if text is None or text == _one(sent, f"seen_{name}"):

@@ -158,7 +158,7 @@ async def run_experiment(context: Ctx, who: Tester, model_id: str) -> Response:
     found = await asyncio.to_thread(context.analyses.known_diagnosis, row)
     experiment = (found or {}).get("experiment")
     if not experiment:
-        detail = "The diagnosis of this recording names none: nothing is left to be told apart."
+        detail = "The diagnosis of this recording names none: no effects need to be told apart."
         raise ApiError(409, "no-experiment", "There is no next experiment", detail)
     body = TestIn.model_validate(
         {"participant": row.participant, "kind": "next-experiment", "segments": experiment["segments"], "joins": row.id}

@@ -133,7 +133,7 @@ async def sound(context: Context, code: str) -> dict[str, Any]:
     """
     found = await standing(context, code)
     if found["outdated"]:
-        raise ApiError(409, "changed-meanwhile", "The limits were changed meanwhile", found["outdated"])
+        raise ApiError(409, "changed-meanwhile", "The limits were changed by someone else", found["outdated"])
     return found
 
 

@@ -87,8 +87,10 @@ def _change(context: Context, code: str, change: Change, by: str) -> Participant
         check_asked(context, row.profile, change.asked)
         profile, voids = profiles.changed(row.profile, change.asked)
         if voids and not change.voids:
-            detail = f"{voids[0].upper()}{voids[1:]}. To lose the calibration and set it: ?void_calibration=true."
-            raise ApiError(409, "voids-calibration", "This would void the calibration", detail)
+            detail = (
+                f"{voids[0].upper()}{voids[1:]}. To set it and make the calibration invalid: ?void_calibration=true."
+            )
+            raise ApiError(409, "voids-calibration", "This would make the calibration invalid", detail)
         row.profile = profile
         audit.write(session, context.clock.utc(), by, "set profile", code, profile=profile, voids=voids)
     return row
@@ -97,7 +99,7 @@ def _change(context: Context, code: str, change: Change, by: str) -> Participant
 def check_asked(context: Context, profile: dict[str, Any], asked: dict[str, float]) -> None:
     """Refuse first limits that are not whole, and what this rig would refuse."""
     if lacking := [name for name in profiles.LIMITS if {**profile, **asked}.get(name) is None]:
-        raise ApiError(422, "invalid-input", "These limits are not whole", f"Send {', '.join(lacking)}, too.")
+        raise ApiError(422, "invalid-input", "Some limits are missing", f"Send {', '.join(lacking)}, too.")
     status = context.rig.status
     if found := profiles.outside(asked, profile, status.limits if status else {}):
         errors = [{"field": name, "detail": words} for name, words in found.items()]
@@ -108,8 +110,9 @@ def check_asked(context: Context, profile: dict[str, Any], asked: dict[str, floa
 def stale(row: Participant) -> ApiError:
     """412: somebody changed the limits since they were looked at."""
     now = ", ".join(f"{name} {row.profile[name]:g}" for name in profiles.LIMITS)
-    detail = f"The limits of {row.code} were changed meanwhile; they are {now}. Look at them, then change them again."
-    return ApiError(412, "changed-meanwhile", "The limits were changed meanwhile", detail, profile=row.profile)
+    title = "The limits were changed by someone else"
+    detail = f"The limits of {row.code} are now {now}. Check them, then change them again."
+    return ApiError(412, "changed-meanwhile", title, detail, profile=row.profile)
 
 
 def meanwhile(context: Context, code: str) -> str:

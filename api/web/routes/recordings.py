@@ -80,7 +80,7 @@ async def upload(
     response: Response,
     columns: Annotated[list[str], Query(alias="map", max_length=MOST_COLUMNS)] = [],  # noqa: B006
 ) -> dict[str, Any]:
-    """Take in a recording of another tool (CSV, MAT or HDF5 as the request's body) and identify a model from it.
+    """Upload a recording of another tool (CSV, MAT or HDF5 as the request's body) and identify a model from it.
 
     `map` says what a column is called there and its unit, once for each column: `map=torque_nm=Drehmoment:Nm`.
     What was assumed is told in `warnings`.

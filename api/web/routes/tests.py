@@ -76,7 +76,7 @@ def _admit(socket: WebSocket, context: Context, test_id: str) -> Test:
         raise ApiError(403, "forbidden", "Not allowed", f"This needs the scope {Scope.READ_LIVE}.")
     origin = socket.headers.get("origin")
     if principal.csrf is not None and origin and urlsplit(origin).netloc != socket.headers.get("host"):
-        raise ApiError(403, "forbidden", "Not allowed", "The page of another site asked.")
+        raise ApiError(403, "forbidden", "Not allowed", "The request came from a page of another site.")
     return find(context, test_id)
 
 

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUNDS_S, SecondOrder
-from identify.estimation.projected import Projection, Solution, project, search
+from identify.estimation.projected_search import project, search
+from identify.estimation.projection import Projection, Solution
 from identify.noise.ar1 import log_likelihood, whiten
 from identify.recruitment.power import PowerBasis
 from identify.recruitment.sigmoid import SigmoidBasis
@@ -17,8 +18,8 @@ HIGHEST_POWER = 9
 
 
 def power_series(first: Solution, order: int | None = None) -> tuple[Solution, str]:
-    """Joint estimate with the power series (6), of given order or of least BIC, and why."""
-    old = first.problem
+    """Joint estimate with the power series (6), of given order or of smallest BIC, and the reason."""
+    old = first.projection
     largest = float(np.max(old.grid.pulse_width_us))
     found: dict[int, tuple[float, Solution]] = {}
     linear = first.linear
@@ -31,14 +32,14 @@ def power_series(first: Solution, order: int | None = None) -> tuple[Solution, s
         found[power] = (-2 * likelihood + power * np.log(rows), solution)
         linear = solution.linear
     best = min(found, key=lambda power: found[power][0])
-    return found[best][1], f"power series of order {best}" + ("" if order else ": least BIC")
+    return found[best][1], f"power series of order {best}" + ("" if order else ", by BIC")
 
 
 def sigmoid(first: Solution) -> Solution:
     """Joint estimate with the sigmoid (30): shape and dynamics searched, gain and baseline projected out."""
     from scipy.optimize import least_squares
 
-    old, start = first.problem, first.linear
+    old, start = first.projection, first.linear
     largest = float(np.max(old.grid.pulse_width_us))
     curve = old.basis.design(np.linspace(0.0, largest, 401)) @ first.coefficients[: old.basis.size]
     half = curve[np.argmax(np.abs(curve))] / 2
@@ -71,14 +72,14 @@ def sigmoid(first: Solution) -> Solution:
 
 
 def monotone(solution: Solution) -> Solution:
-    """The solution with a recruitment curve that never falls (or never rises, where stimulation pulls the other way).
+    """The solution with a recruitment curve that never falls (or never rises, if stimulation lowers the torque).
 
-    A B-spline curve rises where its coefficients do: the coefficients are sums of steps of one sign, found by
-    non-negative least squares of the same penalised problem, at the same dynamics.
+    A B-spline curve rises if its coefficients rise. The coefficients are sums of steps of one sign, found by
+    non-negative least squares for the same penalised problem and the same dynamics.
     """
     from scipy.optimize import nnls
 
-    problem, size = solution.problem, solution.problem.basis.size
+    problem, size = solution.projection, solution.projection.basis.size
     white = whiten(solution.columns, problem.stretches, solution.ar1)
     target = whiten(problem.target, problem.stretches, solution.ar1)
     penalty = np.zeros((white.shape[1], white.shape[1]))

@@ -1,4 +1,4 @@
-"""What several methods need: rows by segment name."""
+"""Functions for several methods: rows by segment name, baseline, options."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ def segment_rows(grid: Grid, names: tuple[str, ...], method_id: str) -> np.ndarr
     Raises
     ------
     NotIdentifiable
-        The record has none; says what the method needs.
+        The record has no such segment.
     """
     there = tuple(dict.fromkeys(grid.record.segment_names))
     rows = grid.fitted & rows_of(grid, names)
     if not rows.any():
         raise NotIdentifiable(
             f"{method_id} needs a segment {' or '.join(names)}; the record has {', '.join(there)}",
-            mend="Name the segments to use with fit_on, or use maximum-likelihood, which takes any.",
+            fix="Name the segments to use with fit_on, or use maximum-likelihood, which takes any.",
         )
     return rows
 
 
 def near_rest(grid: Grid, rows: np.ndarray) -> np.ndarray:
-    """The rows with the rests that touch them: they hold the baseline, the rise and the tail."""
+    """The rows and the rests next to them, which show the baseline and the tail of the response."""
     result = rows.copy()
     rest = grid.fitted & rows_of(grid, ("rest",))
     for _ in range(2):
@@ -43,9 +43,10 @@ QUIET_AFTER_S = 4.0
 
 
 def quiet_level(grid: Grid) -> float:
-    """Zero-torque baseline from the rests, N·m: before the first pulse, else long after one, else the lowest torques.
+    """Baseline at zero torque, N·m: from the time before the first pulse, else 4 s after a pulse, else the lowest
+    torque.
 
-    Two seconds after a pulse don't do: an underdamped muscle of 0.5 s then swings through below zero.
+    2 s after a pulse are not enough: an underdamped muscle with a time constant of 0.5 s still oscillates then.
     """
     still = grid.pulse_width_us == 0
     before = grid.fitted & np.logical_and.accumulate(still)
@@ -69,7 +70,7 @@ def active_level(grid: Grid, rows: np.ndarray) -> float:
     """
     widths = grid.pulse_width_us[rows]
     if not np.ptp(widths) > 0:
-        raise NotIdentifiable("the pulse width never changes in the segment for the dynamics", mend="Record a PRBS.")
+        raise NotIdentifiable("the pulse width never changes in the segment for the dynamics", fix="Record a PRBS.")
     return float(np.max(widths))
 
 
@@ -79,6 +80,7 @@ def order_option(value: object) -> str | tuple[int, int, int]:
     Raises
     ------
     BadRequest
+        It is none of these.
     """
     if value in ("second-order", "auto"):
         return str(value)
@@ -90,19 +92,22 @@ def order_option(value: object) -> str | tuple[int, int, int]:
         zeros = delay = 0
     if not (1 <= poles <= 6 and 0 <= zeros <= 6 and 0 <= delay <= 40):
         raise BadRequest(
-            f"order {value!r}", place="order", mend="Give second-order, auto, or poles,zeros,delay such as 2,1,1."
+            f"invalid order {value!r}",
+            place="order",
+            fix="Give second-order, auto, or poles,zeros,delay such as 2,1,1.",
         )
     return poles, zeros, delay
 
 
 def flag(value: object, name: str) -> bool:
-    """true or false, from a bool or from text.
+    """True or False, from a bool or from text.
 
     Raises
     ------
     BadRequest
+        It is neither.
     """
     text = str(value).lower()
     if text not in {"true", "false", "1", "0", "yes", "no"}:
-        raise BadRequest(f"{name}={value!r}", place=name, mend="Give true or false.")
+        raise BadRequest(f"invalid value {value!r}", place=name, fix="Give true or false.")
     return text in {"true", "1", "yes"}

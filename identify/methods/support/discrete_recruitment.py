@@ -1,4 +1,4 @@
-"""The recruitment spline for a given discrete linear block: forward through it, or by inverting it."""
+"""The recruitment spline for a given discrete linear block: fitted to its output, or by inverting it."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from identify.recruitment.smoothing import choose_weight
 from identify.recruitment.spline import SplineBasis
 
 
-def through(grid: Grid, block: Discrete, rows: np.ndarray, knots: int, baseline_nm: float) -> Curve:
-    """Least squares of the output: the spline's columns are filtered, the torque is left as it was measured."""
+def from_output(grid: Grid, block: Discrete, rows: np.ndarray, knots: int, baseline_nm: float) -> Curve:
+    """Least squares on the output: the columns of the spline are filtered, the torque is not."""
     target = grid.torque_nm[rows] - baseline_nm
     return _penalised(grid, lambda columns: block.filter(grid.held(columns))[rows], target, knots)
 
 
-def invert(grid: Grid, block: Discrete, rows: np.ndarray, knots: int, baseline_nm: float) -> Curve:
+def from_inverse(grid: Grid, block: Discrete, rows: np.ndarray, knots: int, baseline_nm: float) -> Curve:
     """Equations (26) to (28) as printed: w = G⁻¹ y, then the spline by least squares on w.
 
-    The inverse runs away where G has a zero on or outside the unit circle; it is cut off at numbers that still fit.
+    The inverse diverges if G has a zero on or outside the unit circle; it is then limited to ±1e6 N·m.
     """
     torque = np.nan_to_num(grid.torque_nm) - baseline_nm
     b = np.asarray(block.b) / block.b[0]

@@ -1,7 +1,7 @@
 """Output-error estimate of the general linear block (l, n, d), and the choice of its order from the data.
 
-Least squares on the equation error (25) is biased under output noise (Tω 2.1 s for 0.53 at 0.02 N·m and 40 Hz): the
-regressors hold the noise. Here the model runs free and the cost is (12), the error of its output.
+Least squares on the equation error (25) is biased by output noise, since the regressors contain it (at 0.02 N·m and
+40 Hz it gives Tω = 2.1 s instead of 0.53 s). Here the cost is (12), the error of the model's output in a free run.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ LARGEST_POLE = 0.9995
 
 @dataclass(frozen=True)
 class OutputError:
-    """A fitted block.
+    """A fitted linear block.
 
     Parameters
     ----------
     b, a : ndarray
-        Of equations (2), (3); gain included, not normalised.
+        Coefficients of equations (2), (3), with the gain.
     delay_samples : int
         d.
     baseline_nm : float
@@ -61,7 +61,7 @@ def shifted(values: np.ndarray, by: int) -> np.ndarray:
 
 
 def stable(a: np.ndarray) -> np.ndarray:
-    """A with poles outside the unit circle mirrored into it, and all kept a hair inside."""
+    """A with poles outside the unit circle mirrored into it; all poles have at most the modulus 0.9995."""
     roots = np.roots(a)
     size = np.abs(roots)
     roots = np.where(size > 1, roots / np.maximum(size, 1e-12) ** 2, roots)
@@ -97,13 +97,13 @@ def output_error(
     Parameters
     ----------
     torque, drive : ndarray, shape (K,)
-        Output (anything where it isn't fitted) and input.
+        Output and input.
     rows : ndarray of bool, shape (K,)
-        Rows that count.
+        Rows that are fitted.
     order : tuple of int
         (l, n, d): poles, zeros, delay.
     start : ndarray, optional
-        A to begin from; by default Steiglitz and McBride's iteration from (25).
+        Start for A; by default from (25), improved by the iteration of Steiglitz and McBride.
 
     Raises
     ------
@@ -112,7 +112,7 @@ def output_error(
     """
     poles, zeros, delay = order
     if not np.ptp(drive) > 0:
-        raise NotIdentifiable("the input of the linear block never changes", mend="Record a PRBS.")
+        raise NotIdentifiable("the input of the linear block never changes", fix="Record a PRBS.")
     target = np.where(rows, np.nan_to_num(torque), 0.0)
 
     def solve(a: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
@@ -163,7 +163,7 @@ def _rest_level(torque: np.ndarray, drive: np.ndarray, rows: np.ndarray) -> floa
 def _steiglitz_mcbride(
     target: np.ndarray, drive: np.ndarray, rows: np.ndarray, order: tuple[int, int, int], a: np.ndarray
 ) -> np.ndarray:
-    """Equation error of signals filtered by 1/A, repeated: removes most of the bias of (25)."""
+    """Repeated equation error of signals filtered by 1/A, which removes most of the bias of (25)."""
     poles, zeros, delay = order
     best, best_cost = a, np.inf
     for _ in range(12):
@@ -187,16 +187,16 @@ def _steiglitz_mcbride(
 def choose_order(
     torque: np.ndarray, drive: np.ndarray, rows: np.ndarray, earliest: int, longest: int = 4
 ) -> tuple[OutputError, list[str]]:
-    """(l, n, d) of least BIC among l = 1 … 3 poles, n < l + 1 zeros and a few delays, with the reasons.
+    """(l, n, d) with the smallest BIC among l = 1 … 3 poles, n = l - 1 zeros and a few delays, with the reasons.
 
     Parameters
     ----------
     torque, drive, rows : ndarray, shape (K,)
         As for `output_error`.
     earliest : int
-        Smallest delay that makes sense: 1 for a sample taken at the pulse, 0 for means over the interval.
+        Smallest possible delay: 1 for a sample taken at the pulse, 0 for means over the interval.
     longest : int
-        How many delays are tried.
+        Largest number of delays to try.
     """
     tried: dict[tuple[int, int, int], OutputError] = {}
     for poles in (1, 2, 3):

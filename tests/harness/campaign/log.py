@@ -13,6 +13,7 @@ from typing import Any
 
 from tests.harness.campaign.judge import Verdict
 from tests.harness.campaign.runner import Job
+from tests.harness.commit import commit
 
 
 class Log:
@@ -48,7 +49,8 @@ class Log:
         self.path.parent.mkdir(parents=True, exist_ok=True)
         self._began_s = time.monotonic()
         load = round(os.getloadavg()[0], 1)
-        self.sessions.append({**conditions, "utc": f"{datetime.now(UTC):%Y-%m-%d %H:%M}", "load": load, "took_s": 0.0})
+        begun = {"utc": f"{datetime.now(UTC):%Y-%m-%d %H:%M}", "commit": commit(), "load": load, "took_s": 0.0}
+        self.sessions.append({**conditions, **begun})
         self._append({"session": self.sessions[-1]})
 
     def add(self, verdict: Verdict) -> None:
@@ -72,7 +74,8 @@ class Log:
         speed = "in real time" if first["speed"] == 1 else f"at {first['speed']:g} times the world's speed"
         loads = ", ".join(f"{session['load']:g}" for session in self.sessions)
         return (
-            f"{judged} injections in {minutes:.1f} min on {self.sessions[-1]['utc']} UTC, {speed}, "
+            f"{judged} injections in {minutes:.1f} min on {self.sessions[-1]['utc']} UTC, "
+            f"commit {self.sessions[-1].get('commit', 'not known')}, {speed}, "
             f"seed {first['seed']}, {first['workers']} emulated rigs at once on {os.cpu_count()} processors "
             f"({platform.machine()}, Python {platform.python_version()}); load average before it {loads}."
         )

@@ -1,4 +1,4 @@
-"""Values as JSON holds them."""
+"""Values as JSON can hold them."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 
 
-def plain(value: Any) -> Any:
-    """Arrays and numpy numbers as lists and numbers; what is not finite as null, which JSON can hold."""
+def json_value(value: Any) -> Any:
+    """Arrays as lists, numpy numbers as numbers, and numbers that are not finite as None."""
     if isinstance(value, dict):
-        return {str(key): plain(item) for key, item in value.items()}
+        return {str(key): json_value(item) for key, item in value.items()}
     if isinstance(value, np.ndarray):
-        return plain(value.tolist())
+        return json_value(value.tolist())
     if isinstance(value, (list, tuple)):
-        return [plain(item) for item in value]
+        return [json_value(item) for item in value]
     if isinstance(value, (bool, np.bool_)):
         return bool(value)
     if isinstance(value, (int, np.integer)):

@@ -1,4 +1,4 @@
-"""Figures of a fit: best-fit %, errors, white noise, and the ceiling that noise sets."""
+"""Statistics of a fit: best-fit %, error, white noise, and the best fit that the noise allows."""
 
 from __future__ import annotations
 
@@ -8,28 +8,28 @@ import numpy as np
 
 from identify.dynamics.pulse_grid import Grid
 
-LEVEL = 1e-9
-"""Torque that spreads by less than this (N·m, or share of its size) is level: what is left is rounding."""
+CONSTANT = 1e-9
+"""Torque whose standard deviation is below this (N·m, or share of its size) is constant, but for rounding."""
 NOISE_SHARE = 0.5
-"""Torque that spreads by less than this share of the noise's standard deviation is level, too."""
-UNDEFINED = "not defined: the torque is level there"
+"""Torque whose standard deviation is below this share of that of the noise is constant, too."""
+UNDEFINED = "not defined, since the torque is constant there"
 
 
 def best_fit_percent(measured_nm: np.ndarray, predicted_nm: np.ndarray, noise_sd_nm: float = 0.0) -> float:
-    """100 (1 - ||y - ŷ|| / ||y - mean y||), as in the paper; NaN (null in JSON) where the torque is level."""
-    if is_level(measured_nm, noise_sd_nm):
+    """100 (1 - ||y - ŷ|| / ||y - mean y||), as in the paper; NaN (null in JSON) if the torque is constant."""
+    if is_constant(measured_nm, noise_sd_nm):
         return float("nan")
     spread = float(np.linalg.norm(measured_nm - np.mean(measured_nm)))
     return 100.0 * (1.0 - float(np.linalg.norm(measured_nm - predicted_nm)) / spread)
 
 
-def is_level(measured_nm: np.ndarray, noise_sd_nm: float = 0.0) -> bool:
-    """Whether the torque does not spread: then no share of its spread can be told."""
+def is_constant(measured_nm: np.ndarray, noise_sd_nm: float = 0.0) -> bool:
+    """Whether the torque is constant: then its fit in per cent is not defined."""
     if not measured_nm.size:
         return True
     largest = float(np.max(np.abs(measured_nm)))
     spread = float(np.std(measured_nm))
-    return not spread > max(LEVEL * max(largest, 1.0), NOISE_SHARE * noise_sd_nm)
+    return not spread > max(CONSTANT * max(largest, 1.0), NOISE_SHARE * noise_sd_nm)
 
 
 def rms(residual_nm: np.ndarray) -> float:
@@ -40,22 +40,22 @@ def rms(residual_nm: np.ndarray) -> float:
 def white_sd(grid: Grid, predicted_nm: np.ndarray, block_sd_nm: float, freedom: float, white: bool) -> float:
     """White measurement noise at the record's own rate, N·m.
 
-    Where the residual is white on the grid and as large there as white samples would make it, from all of it, which is
-    the efficient way. Else something slower is left in it (a missing effect, correlated noise, hum), and the noise is
-    estimated from second differences, which hardly see what is slow.
+    If the residual is white on the grid of pulses, and as large as white samples make it, the whole residual is used,
+    which is efficient. Otherwise it contains something slower (a missing effect, correlated noise, hum), and the noise
+    is estimated from second differences, which slow parts hardly change.
 
     Parameters
     ----------
     grid : Grid
         The record.
     predicted_nm : ndarray, shape (N,)
-        Of the model.
+        Torque of the model, N·m.
     block_sd_nm : float
         Standard deviation of the residual on the grid.
     freedom : float
         Effective number of parameters.
     white : bool
-        Whether the residual on the grid is better called white than correlated.
+        Whether the residual on the grid is white rather than correlated.
     """
     rows = grid.fitted[grid.interval] & ~grid.record.held_out
     residual = grid.record.torque_nm - predicted_nm
@@ -68,20 +68,31 @@ def white_sd(grid: Grid, predicted_nm: np.ndarray, block_sd_nm: float, freedom: 
 
 
 def ceiling_percent(measured_nm: np.ndarray, sd_nm: float) -> float:
-    """Best-fit % that the true system would reach on this noisy record: 100 (1 - ||noise|| / ||y - mean y||)."""
-    if is_level(measured_nm, sd_nm):
+    """Best-fit % that the true system would reach on this record: 100 (1 - ||noise|| / ||y - mean y||)."""
+    if is_constant(measured_nm, sd_nm):
         return float("nan")
     return 100.0 * (1.0 - sd_nm / float(np.std(measured_nm)))
 
 
-def figures(
+def fit_statistics(
     grid: Grid, rows: np.ndarray, predicted_nm: np.ndarray, sd_nm: float, held_out_change: np.ndarray | None = None
 ) -> dict[str, Any]:
-    """What MODEL.json tells under `fit`, at the record's own rate.
+    """The key `fit` of MODEL.json, computed at the record's samples.
 
-    Percentages are NaN where the torque is level; samples that are doubted are not counted.
+    Percentages are NaN if the torque is constant. Doubted samples are not counted.
 
-    Without `validate`, `held_out_change` (N·m, shape (K,)) turns the fit into that of blocked cross-validation.
+    Parameters
+    ----------
+    grid : Grid
+        The record.
+    rows : ndarray of bool, shape (K,)
+        Fitted intervals.
+    predicted_nm : ndarray, shape (N,)
+        Torque of the model, N·m.
+    sd_nm : float
+        White noise of a sample, N·m.
+    held_out_change : ndarray or None, shape (K,)
+        For a record without `validate`: see `held_out_change`, N·m.
     """
     record = grid.record
     measured = record.torque_nm
@@ -98,7 +109,7 @@ def figures(
         "held_out_by": "none",
         "samples": int(used.sum()),
         "held_out_samples": int(held.sum()),
-        "segments": segment_figures(grid, predicted_nm, sd_nm),
+        "segments": segment_statistics(grid, predicted_nm, sd_nm),
     }
     if held.any():
         result |= {
@@ -119,8 +130,8 @@ def figures(
     return result
 
 
-def segment_figures(grid: Grid, predicted_nm: np.ndarray, sd_nm: float) -> list[dict[str, Any]]:
-    """Fit and ceiling of each segment, in order, without samples that are doubted."""
+def segment_statistics(grid: Grid, predicted_nm: np.ndarray, sd_nm: float) -> list[dict[str, Any]]:
+    """Fit and ceiling of each segment, in order, without doubted samples."""
     record, rows = grid.record, []
     edges = np.searchsorted(record.segment, np.arange(len(record.segment_names) + 1))
     for name, start, end in zip(record.segment_names, edges[:-1], edges[1:], strict=True):

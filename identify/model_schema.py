@@ -1,7 +1,7 @@
-"""What a MODEL.json may hold, field by field: checked before anything is computed from it.
+"""What a MODEL.json may contain, field by field. It is checked before anything is computed from it.
 
 A check is a function of a value and its place; it raises `BadModel` with the place, or returns nothing. Fields that
-are not named here are let pass: a later version may write more.
+are not listed here are not checked, since a later version may write more.
 """
 
 from __future__ import annotations
@@ -13,33 +13,33 @@ from typing import Any
 from identify.errors import BadModel
 
 Check = Callable[[Any, str], None]
-MEND = "Fit the record again."
+FIX = "Fit the record again."
 MOST_KNOTS = 1000
 LONGEST = 10_000
 
 
 def number(lo: float, hi: float) -> Check:
-    """A finite number within bounds; no boolean."""
+    """A number within bounds; not a boolean."""
 
     def check(value: Any, place: str) -> None:
         if isinstance(value, bool) or not isinstance(value, int | float) or not (lo <= value <= hi):
-            raise BadModel(f"{_short(value)} is no number from {lo:g} to {hi:g}", place=place, mend=MEND)
+            raise BadModel(f"{_short(value)} is not a number from {lo:g} to {hi:g}", place=place, fix=FIX)
 
     return check
 
 
 def text(value: Any, place: str) -> None:
-    """Some text, not too long."""
+    """A text, not too long."""
     if not isinstance(value, str) or len(value) > LONGEST:
-        raise BadModel(f"{_short(value)} is no text", place=place, mend=MEND)
+        raise BadModel(f"{_short(value)} is not a text, or too long", place=place, fix=FIX)
 
 
 def anything(value: Any, place: str) -> None:
-    """Whatever JSON holds."""
+    """Any value."""
 
 
 def maybe(inner: Check) -> Check:
-    """The same, or null."""
+    """The inner check, or null."""
 
     def check(value: Any, place: str) -> None:
         if value is not None:
@@ -49,7 +49,7 @@ def maybe(inner: Check) -> Check:
 
 
 def either(first: Check, second: Check) -> Check:
-    """One or the other; the second's words count."""
+    """One of two checks; the message is that of the second."""
 
     def check(value: Any, place: str) -> None:
         try:
@@ -61,22 +61,22 @@ def either(first: Check, second: Check) -> Check:
 
 
 def several(inner: Check, least: int = 0, most: int = LONGEST, rising: bool = False) -> Check:
-    """A list of values, each of which holds."""
+    """A list whose values all pass the inner check."""
 
     def check(value: Any, place: str) -> None:
         if not isinstance(value, list) or not (least <= len(value) <= most):
             what = f"a list of {len(value)}" if isinstance(value, list) else _short(value)
-            raise BadModel(f"{what}, not a list of {least} to {most}", place=place, mend=MEND)
+            raise BadModel(f"{what}, not a list of {least} to {most}", place=place, fix=FIX)
         for index, item in enumerate(value):
             inner(item, f"{place}.{index}")
         if rising and any(not (b > a) for a, b in pairwise(value)):
-            raise BadModel("the values do not rise", place=place, mend=MEND)
+            raise BadModel("the values are not strictly rising", place=place, fix=FIX)
 
     return check
 
 
 def each(inner: Check) -> Check:
-    """An object, whose values all hold."""
+    """An object whose values all pass the inner check."""
 
     def check(value: Any, place: str) -> None:
         for name, item in _object(value, place).items():
@@ -86,14 +86,14 @@ def each(inner: Check) -> Check:
 
 
 def fields(wanted: Mapping[str, Check], optional: Mapping[str, Check] | None = None) -> Check:
-    """An object with these fields, and more."""
+    """An object with these fields; it may have more."""
 
     def check(value: Any, place: str) -> None:
         prefix = f"{place}." if place else ""
         found = _object(value, place)
         for name, inner in wanted.items():
             if name not in found:
-                raise BadModel("key is missing", place=prefix + name, mend=MEND)
+                raise BadModel("the key is missing", place=prefix + name, fix=FIX)
             inner(found[name], prefix + name)
         for name, inner in (optional or {}).items():
             if name in found:
@@ -103,13 +103,13 @@ def fields(wanted: Mapping[str, Check], optional: Mapping[str, Check] | None = N
 
 
 def kinds(known: Mapping[str, Check], default: str = "") -> Check:
-    """An object whose `kind` says what else it holds."""
+    """An object whose `kind` selects the check of its other fields."""
 
     def check(value: Any, place: str) -> None:
         kind = _object(value, place).get("kind", default)
         if not isinstance(kind, str) or kind not in known:
             message = f"unknown {place.rpartition('.')[2]} {_short(kind)}"
-            raise BadModel(message, place=f"{place}.kind", mend=f"Known: {', '.join(known)}.")
+            raise BadModel(message, place=f"{place}.kind", fix=f"Known: {', '.join(known)}.")
         known[kind](value, place)
 
     return check
@@ -117,7 +117,7 @@ def kinds(known: Mapping[str, Check], default: str = "") -> Check:
 
 def _object(value: Any, place: str) -> dict[str, Any]:
     if not isinstance(value, dict):
-        raise BadModel(f"{_short(value)} is no JSON object", place=place, mend=MEND)
+        raise BadModel(f"{_short(value)} is not a JSON object", place=place, fix=FIX)
     return value
 
 
@@ -128,8 +128,8 @@ def _short(value: Any) -> str:
 
 ANY = number(-1e300, 1e300)
 WIDTH = number(0.0, 1e6)
-FIGURE = maybe(ANY)
-FIGURES = (
+STATISTIC = maybe(ANY)
+STATISTICS = (
     "fit_percent", "ceiling_percent", "rms_nm", "noise_sd_nm", "held_out_fit_percent", "held_out_ceiling_percent",
     "held_out_rms_nm",
 )  # fmt: skip
@@ -164,27 +164,30 @@ LINEAR = kinds(
     },
     "discrete",
 )  # fmt: skip
-LIKELY = 1e6
-"""Larger than any torque, N·m, and any time, s, of a record."""
+PLAUSIBLE = 1e6
+"""Larger than any torque, N·m, or time, s, in a record."""
 
 
 def sign(value: Any, place: str) -> None:
     """1 or -1."""
     if isinstance(value, bool) or value not in (1, -1):
-        raise BadModel(f"{_short(value)} is no sign, 1 or -1", place=place, mend=MEND)
+        raise BadModel(f"{_short(value)} is not 1 or -1", place=place, fix=FIX)
 
 
-def bare(value: Any) -> Any:
-    """A parameter's number, which may stand alone or with its spread and unit."""
+def parameter_value(value: Any) -> Any:
+    """The number of a parameter, which is given alone or as {"value", "sd", "unit"}."""
     return value["value"] if isinstance(value, dict) and "value" in value else value
 
 
 SETTINGS = {
-    "scale_nm": number(1e-9, LIKELY), "noise_sd_nm": number(0.0, LIKELY), "zero_nm": number(-LIKELY, LIKELY),
-    "sign": sign, "reference_s": number(-LIKELY, LIKELY),
-}  # fmt: skip
+    "scale_nm": number(1e-9, PLAUSIBLE),
+    "noise_sd_nm": number(0.0, PLAUSIBLE),
+    "zero_nm": number(-PLAUSIBLE, PLAUSIBLE),
+    "sign": sign,
+    "reference_s": number(-PLAUSIBLE, PLAUSIBLE),
+}
 EFFECT = fields(
-    {"id": text, "parameters": each(lambda value, place: ANY(bare(value), place))},
+    {"id": text, "parameters": each(lambda value, place: ANY(parameter_value(value), place))},
     {"form": text, "settings": fields({}, SETTINGS)},
 )
 WHOLE = number(0, LONGEST)
@@ -197,13 +200,13 @@ _NARX = fields(
 
 
 def narx(value: Any, place: str) -> None:
-    """A polynomial: a weight for each term, and in the terms numbers of variables that there are."""
+    """A NARX polynomial: one weight per term, and terms that use existing variables."""
     _NARX(value, place)
     if len(value["terms"]) != len(value["weights"]):
-        raise BadModel("terms and weights differ in number", place=place, mend=MEND)
+        raise BadModel("terms and weights differ in number", place=place, fix=FIX)
     largest = max((index for term in value["terms"] for index in term), default=-1)
     if not (largest < len(value["variables"])):
-        raise BadModel(f"a term of variable {largest}, which is not there", place=f"{place}.terms", mend=MEND)
+        raise BadModel(f"a term uses variable {largest}, which does not exist", place=f"{place}.terms", fix=FIX)
 
 
 COVARIANCE = fields(
@@ -228,7 +231,7 @@ MODEL = fields(
         "noise": each(maybe(ANY)),
         "effects": several(EFFECT, most=50),
         "uncertainty": maybe(fields({}, {"covariance": maybe(COVARIANCE), "bands": each(anything)})),
-        "fit": fields({}, dict.fromkeys(FIGURES, FIGURE)),
+        "fit": fields({}, dict.fromkeys(STATISTICS, STATISTIC)),
         "residual_tests": each(each(anything)),
         "valid_for": each(PAIR),
         "quality": fields(
@@ -248,4 +251,4 @@ MODEL = fields(
         "created": text,
     },
 )
-"""The whole document."""
+"""Check of the whole document."""

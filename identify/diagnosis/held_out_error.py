@@ -1,4 +1,4 @@
-"""What rows not seen say of a model: its error there beside what the noise and the model's own band allow."""
+"""The error of a model on held-out rows, and the error that noise and the model's uncertainty allow there."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from identify.diagnosis.thresholds import FORM, LEAST_UNSEEN_ROWS, NEAR, UNSEEN_RISE
+from identify.diagnosis.thresholds import FORM_ERROR, HELD_OUT_RISE, LEAST_HELD_OUT_ROWS, NEAR
 from identify.dynamics.pulse_grid import Grid
 from identify.effects import get
 from identify.estimation.joint import Fitted
@@ -17,7 +17,7 @@ MEDIAN = 0.6745
 
 
 @dataclass(frozen=True)
-class Unseen:
+class HeldOutError:
     """The error of one model on the intervals held out.
 
     Parameters
@@ -25,7 +25,7 @@ class Unseen:
     rms_nm : float
         Error of the intervals' means, N·m.
     allowed_nm : float
-        What noise as in the fitted rows and the uncertainty of the model's parameters give there, N·m.
+        Error that the noise of the fitted rows and the uncertainty of the parameters explain there, N·m.
     """
 
     rms_nm: float
@@ -42,20 +42,27 @@ class Unseen:
         return self.rms_nm / self.allowed_nm
 
 
-def unseen(fitted: Fitted, form: float = FORM, beside: Fitted | None = None) -> Unseen | None:
-    """The model on the intervals held out; None where there are none, or where a tremor is everywhere.
+def held_out_error(fitted: Fitted, form: float = FORM_ERROR, beside: Fitted | None = None) -> HeldOutError | None:
+    """The error on the held-out intervals; None if there are too few, or if there is a tremor.
 
-    Rows count whose pulse widths, and those of the last seconds, were fitted: elsewhere the curve is a guess.
+    Only rows count whose pulse widths, and those of the seconds before, are near fitted ones: elsewhere the recruitment
+    curve is a guess. Efforts cannot be predicted, but they are rare: if one of the models has one, the median of the
+    error counts instead of its root mean square.
 
-    `form` is what the form of the model may err by there, as a share of the largest torque.
-    Efforts cannot be foreseen, but they are seldom: where the model or the one beside it holds one, the median error
-    counts.
+    Parameters
+    ----------
+    fitted : Fitted
+        The model.
+    form : float
+        Error allowed because the model's form is inexact, as a share of the largest torque.
+    beside : Fitted or None
+        A model that this one is compared with.
     """
     setup = fitted.problem.setup
     grid = setup.grid
     rows = grid.held_out & ~grid.doubted & (2 * grid.count >= np.median(grid.count[setup.fitted]))
     rows &= _covered(grid, setup.fitted)
-    if rows.sum() < LEAST_UNSEEN_ROWS or fitted.noise.band > 0.0:
+    if rows.sum() < LEAST_HELD_OUT_ROWS or fitted.noise.band > 0.0:
         return None
     residual = fitted.residual_nm[rows]
     scale = 1.0 / np.sqrt(np.maximum(np.diag(fitted.hessian), 1e-300))
@@ -63,21 +70,22 @@ def unseen(fitted: Fitted, form: float = FORM, beside: Fitted | None = None) -> 
     slopes = fitted.slopes[:, rows] * scale[:, None]
     band = np.sum(slopes * np.linalg.solve(scaled, slopes), axis=0)
     allowed = np.sqrt(fitted.noise.sd_nm**2 + float(np.mean(band)) + (form * setup.scale_nm) ** 2)
-    if all(get(effect).foreseeable for effect, _ in [*fitted.effects, *(beside.effects if beside else [])]):
-        return Unseen(float(np.sqrt(np.mean(residual**2))), float(allowed))
-    return Unseen(float(np.median(np.abs(residual)) / MEDIAN), float(allowed))
+    if all(get(effect).predictable for effect, _ in [*fitted.effects, *(beside.effects if beside else [])]):
+        return HeldOutError(float(np.sqrt(np.mean(residual**2))), float(allowed))
+    return HeldOutError(float(np.median(np.abs(residual)) / MEDIAN), float(allowed))
 
 
-def rise(before: Fitted, after: Fitted) -> tuple[float, float] | None:
-    """Errors on the intervals held out, N·m, without and with an effect, where they rise and so speak against it."""
-    old, new = unseen(before, beside=after), unseen(after)
-    if old is None or new is None or new.rms_nm <= UNSEEN_RISE * max(old.rms_nm, new.allowed_nm):
+def held_out_rise(before: Fitted, after: Fitted) -> tuple[float, float] | None:
+    """Errors on held-out rows without and with an effect, N·m, if they rise and so speak against it; else None."""
+    old, new = held_out_error(before, beside=after), held_out_error(after)
+    if old is None or new is None or new.rms_nm <= HELD_OUT_RISE * max(old.rms_nm, new.allowed_nm):
         return None
     return old.rms_nm, new.rms_nm
 
 
 def _covered(grid: Grid, fitted: np.ndarray) -> np.ndarray:
-    """bool, shape (K,): intervals before which, as long as a muscle remembers, all widths are among those fitted."""
+    """bool, shape (K,): intervals whose width, and all widths within the muscle's memory before, are near fitted
+    ones."""
     widths = np.unique(grid.pulse_width_us[fitted])
     if widths.size < 2:
         return np.zeros(grid.size, bool)

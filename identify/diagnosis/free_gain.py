@@ -1,4 +1,4 @@
-"""A rival without a name: gain that wanders with no law. Where it beats the library, the cause isn't in the library."""
+"""A gain that varies without a law: if it beats every effect, the cause is not in the library."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from identify.effects.base import Effect, Form, Parameter, Scene
 KNOTS = 36
 
 
-def _wander(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+def _free_gain(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
     place = np.clip(scene.time_s / max(scene.span_s, 1e-9), 0.0, 1.0) * (KNOTS - 1)
     first = np.minimum(place.astype(np.int64), KNOTS - 2)
     part = place - first
@@ -19,19 +19,19 @@ def _wander(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
     return drive * np.exp(values[:, first] * (1.0 - part) + values[:, first + 1] * part)
 
 
-WANDER = Effect(
-    id="wandering_gain",
-    name="Gain that wanders without a law",
+FREE_GAIN = Effect(
+    id="free_gain",
+    name="Gain that varies without a law",
     forms=(
         Form(
-            "wander",
+            "free",
             "gain",
             "w = g(t) f(u), log g linear between knots",
             tuple(
                 Parameter(f"log_gain_{i}", "1", -0.45, 0.45, 0.0, (0.0,), about="log gain at a knot")
                 for i in range(KNOTS)
             ),
-            _wander,
+            _free_gain,
             batched=True,
         ),
     ),

@@ -8,9 +8,9 @@ import pytest
 import identify
 from hardware_sim.hidden_records import generate
 from identify.effects import get
-from identify.estimation.adding import fitted_with, try_effect
-from identify.estimation.prepare import plain, prepare
-from identify.estimation.tremor import predict_fitted
+from identify.estimation.band_effect import predict_fitted
+from identify.estimation.effect_fit import fitted_with, try_effect
+from identify.estimation.prepare import fit_plain, prepare
 from identify.noise.level import NoiseLevel, band_part, profile, whitened
 from identify.noise.slow_and_white import whiten_rows
 from identify.records.record import Record
@@ -67,7 +67,7 @@ def test_noise_is_found_again():
 def test_derivatives_are_those_of_central_differences(names):
     record = hidden_muscles.record(seed=2, rate_hz=100)
     grid, _ = prepare(record)
-    setup = plain(grid, grid.fitted).problem.setup
+    setup = fit_plain(grid, grid.fitted).problem.setup
     problem = Problem(setup, [(n.split(":")[0], get(n.split(":")[0]).form(n.split(":")[1])) for n in names])
     values = np.r_[[0.2, 0.8, 0.001, 0.1, 0.5, 0.2], np.linspace(0, 6, setup.basis.size)]
     starts = [p.start[0] for c in problem.chosen for p in c.parameters]
@@ -123,7 +123,7 @@ def test_a_form_whose_start_promises_little_is_followed_all_the_same():
     record = Record.from_arrays(made["time_s"], made["pulse_width_us"], made["torque_nm"], made["segment"])
     grid, _ = prepare(record)
     effect = get("series_compliance")
-    found = try_effect(effect, plain(grid, grid.fitted), [effect.form("series"), effect.form("toe")])
+    found = try_effect(effect, fit_plain(grid, grid.fitted), [effect.form("series"), effect.form("toe")])
     assert found is not None
     assert found.form.name == "toe"
     assert found.gain > found.forms["series"] + 400

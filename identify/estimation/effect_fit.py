@@ -1,4 +1,4 @@
-"""An effect added to a model: its likeliest form, and the evidence for it."""
+"""An effect added to a model: its most likely form, and the evidence for it."""
 
 from __future__ import annotations
 
@@ -11,20 +11,21 @@ from identify.effects import get, registry
 from identify.effects.base import STAGES, Effect, Form, Scene
 from identify.errors import BadRequest, NotIdentifiable
 from identify.estimation.joint import Fitted, solve, start_from
-from identify.estimation.prepare import Raw, plain, prepare
+from identify.estimation.prepare import fit_plain, prepare
 from identify.estimation.rows import fitted_rows
+from identify.estimation.samples import Raw
 from identify.noise.level import find_band
 from identify.records.record import Record
 from identify.simulation.problem import Problem
 
 PATIENCE = 2
-"""Steps of a chain (one bump, two bumps, …) without a gain after which it ends: one of four bumps hardly helps."""
+"""A chain of forms (one bump, two bumps, …) ends after this many steps without a gain."""
 TOLERANCE = 0.1
-"""Gain in log posterior below which a candidate's search ends: a fortieth of the least margin."""
+"""The fit of a candidate ends when the log posterior rises by less: a fortieth of the smallest margin."""
 WORTHLESS = -2.0
-"""Log evidence gained that decides nothing: an effect that gains less is not worth more steps of a search."""
+"""A candidate that promises a smaller gain of log evidence is not fitted to its end: it decides nothing."""
 BAND_COST = 16.0
-"""Log evidence that a narrow band's three numbers cost."""
+"""Log evidence that the three parameters of a narrow band cost."""
 
 
 @dataclass(frozen=True)
@@ -34,13 +35,13 @@ class Candidate:
     Parameters
     ----------
     effect : Effect
-        Which.
+        The effect.
     form : Form
-        Its likeliest form.
+        Its most likely form.
     fitted : Fitted
         The model with it.
     gain : float
-        Log evidence over the model without it, the effect's prior odds included.
+        Log evidence gained over the model without it, with the effect's prior odds.
     forms : dict
         Gain by form.
     """
@@ -55,9 +56,9 @@ class Candidate:
 def try_effect(
     effect: Effect, base: Fitted, forms: Iterable[Form] | None = None, least: float = WORTHLESS
 ) -> Candidate | None:
-    """The effect's best form added to a model; None where there is nothing to start from.
+    """Add the best form of an effect to a model; None if there is nothing to start from.
 
-    What promises to gain less than `least` is not followed to its end.
+    A fit that promises to gain less than `least`, in log evidence, is not continued to its end.
     """
     if effect.band:
         return try_band(effect, base)
@@ -72,7 +73,7 @@ def try_effect(
             previous, residual, idle, top = {}, base.residual_nm, 0, -np.inf
         elif idle >= PATIENCE:
             continue
-        # A chain needs each of its steps at its best: the next begins there.
+        # The next form of a chain starts from this one, which must therefore be fitted to its end.
         whole = form.propose is not None or least == -np.inf
         floor = max(base.log_evidence + least - effect.prior, best.log_evidence if best else -np.inf)
         found = fit_form(effect, form, base, residual, previous, -np.inf if whole else floor)
@@ -91,7 +92,7 @@ def try_effect(
 
 
 def try_band(effect: Effect, base: Fitted) -> Candidate | None:
-    """A narrow band added to the noise."""
+    """Add a narrow band to the noise; None if it hardly gains."""
     setup = base.problem.setup
     noise, log_likelihood = find_band(base.residual_nm, setup.stretches, setup.grid.step_s)
     if log_likelihood - base.log_likelihood < BAND_COST:
@@ -109,7 +110,10 @@ def fit_form(
     previous: dict[str, float],
     floor: float = -np.inf,
 ) -> Fitted | None:
-    """One form added to a model, from each of its starting values; the best. What stays below the floor is given up."""
+    """Add one form to a model, from each of its starting values, and return the best fit.
+
+    A fit that will not reach the log evidence `floor` is stopped early.
+    """
     setup = base.problem.setup
     scene: Scene = setup.scene
     problem = Problem(setup, [*base.effects, (effect.id, form)])
@@ -120,7 +124,7 @@ def fit_form(
     for start in starts:
         apart = start.get("base.damping")
         if apart is not None and "base.time_constant_s" not in start and base.physical[1] >= apart:
-            continue  # the base has its lags apart already
+            continue  # the lags of the base model already differ
         theta = start_from(problem, base, {len(base.effects): start})
         found = solve(problem, theta, base.noise, tolerance=TOLERANCE, floor=floor)
         if form.accept is not None and not form.accept(found.parameters_of(effect.id), scene):
@@ -131,73 +135,73 @@ def fit_form(
     return best
 
 
-def names(fitted: Fitted) -> list[str]:
-    """Effects in a model, tremor included where the noise has a narrow band."""
+def effect_names(fitted: Fitted) -> list[str]:
+    """Ids of the effects in a model; with `tremor` if its noise has a narrow band."""
     listed = [name for name, _ in fitted.effects]
     if fitted.noise.band > 0.0:
         listed += [effect.id for effect in registry().values() if effect.band and effect.id not in listed]
     return listed
 
 
-def add(base: Fitted, effect: Effect, form: str, raw: Raw) -> Fitted:
-    """The model with one effect more, in the form named or in its likeliest.
+def add_effect(base: Fitted, effect: Effect, form: str, raw: Raw) -> Fitted:
+    """The model with one more effect, in the named form or in its most likely one.
 
     Raises
     ------
     BadRequest
-        It has no such form.
+        The effect has no such form.
     NotIdentifiable
-        It needs a column that the record lacks, or isn't there to be started from.
+        It needs a column that the record does not have, or its fit finds nothing to start from.
     """
     for need in effect.needs:
         if getattr(base.problem.setup.grid.record, need) is None:
-            raise NotIdentifiable(f"{effect.id} needs the column {need}", place=need, mend="Record it.")
+            raise NotIdentifiable(f"{effect.id} needs the column {need}", place=need, fix="Record this column.")
     try:
         forms = [effect.form(form)] if form else list(effect.forms)
     except KeyError as error:
         raise BadRequest(f"{effect.id} has no form {form!r}", place="effects") from error
-    for identifier, seen, values in given_by_samples(raw):
+    for identifier, seen, values in detected_effects(raw):
         if identifier == effect.id:
-            return added(base, identifier, seen, values)
-    # What only the raw samples show is not there where they do not.
-    # And what somebody asks for is fitted to its end, whatever it gains.
-    found = None if any(form.settled for form in forms) else try_effect(effect, base, forms, -np.inf)
+            return fit_from(base, identifier, seen, values)
+    # An effect that is found in the samples only is absent if they do not show it.
+    # A requested effect is fitted to its end, whatever it gains.
+    found = None if any(form.fixed for form in forms) else try_effect(effect, base, forms, -np.inf)
     if found is None:
-        raise NotIdentifiable(f"nothing in the record looks like {effect.id}", mend="Leave it out.")
+        raise NotIdentifiable(f"the record shows nothing that looks like {effect.id}", fix="Leave this effect out.")
     return found.fitted
 
 
-def added(base: Fitted, identifier: str, form: Form, values: dict[str, float]) -> Fitted:
-    """The model with one effect more, fitted from the values given."""
+def fit_from(base: Fitted, identifier: str, form: Form, values: dict[str, float]) -> Fitted:
+    """The model with one more effect, fitted from given starting values."""
     problem = Problem(base.problem.setup, [*base.effects, (identifier, form)])
     return solve(problem, start_from(problem, base, {len(base.effects): values}), base.noise)
 
 
-def given_by_samples(raw: Raw) -> list[tuple[str, Form, dict[str, float]]]:
-    """Effects that the samples show before any fit: a line of the mains, a ceiling; with their parameters."""
+def detected_effects(raw: Raw) -> list[tuple[str, Form, dict[str, float]]]:
+    """Effects that the samples show before any fit (mains hum, clipping), each with its form and parameters."""
     found = []
     for effect in sorted(registry().values(), key=lambda effect: STAGES.index(effect.stage)):
-        seen = effect.seen(raw) if effect.seen is not None else None
-        if seen is not None:
-            found.append((effect.id, effect.form(seen[0]), seen[1]))
+        shown = effect.detect(raw) if effect.detect is not None else None
+        if shown is not None:
+            found.append((effect.id, effect.form(shown[0]), shown[1]))
     return found
 
 
 def with_effects(base: Fitted, wanted: Sequence[str], raw: Raw) -> Fitted:
-    """The model and the effects named, each in its likeliest form, or in the one named after a colon.
+    """The model with the named effects, each in its most likely form or in the one given after a colon.
 
     Raises
     ------
     BadRequest, NotIdentifiable
-        As `add`; no effect of that name.
+        As `add_effect`; or no effect has that name.
     """
     for name in wanted:
         identifier, _, form = name.partition(":")
-        base = add(base, get(identifier), form, raw)
+        base = add_effect(base, get(identifier), form, raw)
     return base
 
 
 def fitted_with(record: Record, wanted: Sequence[str]) -> Fitted:
-    """The plain structure of a record with the effects named."""
+    """The plain structure fitted to a record, with the named effects."""
     grid, raw = prepare(record)
-    return with_effects(plain(grid, fitted_rows(grid, None)), wanted, raw)
+    return with_effects(fit_plain(grid, fitted_rows(grid, None)), wanted, raw)

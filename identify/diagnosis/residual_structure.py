@@ -1,4 +1,4 @@
-"""Is anything left? The residual while the muscle works against the residual while it rests, and against the noise."""
+"""Whether structure is left in a residual: the residual at work, compared with that at rest and with the noise."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from identify.records.record import Record
 
 
 @dataclass(frozen=True)
-class Left:
-    """What is left of the residual of one model.
+class ResidualStructure:
+    """What the residual of one model shows.
 
     Parameters
     ----------
     white_nm : float
-        Standard deviation of an interval's mean from the samples' white noise alone, N·m.
+        Standard deviation that white noise of the samples alone gives an interval's mean, N·m.
     busy_nm : float
         Residual while the muscle works, N·m.
     ratio : float
-        Log-likelihood gained by giving rests and work a noise of their own: large where structure goes with work.
+        Log-likelihood gained if rest and work each have their own noise: large if structure appears at work.
     ideal : float
-        Log-likelihood that noise as in the rests would have everywhere.
+        Log-likelihood if the noise were everywhere as it is at rest.
     slow_nm : float
         Standard deviation of the slow part of the residual, N·m.
     ar1 : float
@@ -42,8 +42,8 @@ class Left:
     ar1: float
 
 
-def left_over(fitted: Fitted, quiet: np.ndarray, noise_sd_nm: float) -> Left:
-    """Weigh a model's residual.
+def residual_structure(fitted: Fitted, quiet: np.ndarray, noise_sd_nm: float) -> ResidualStructure:
+    """Compare a model's residual at work and at rest.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ def left_over(fitted: Fitted, quiet: np.ndarray, noise_sd_nm: float) -> Left:
     resting, working = _profile(residual, rests), _profile(residual, works)
     ratio = resting[3] + working[3] - together[3] if rests and works else 0.0
     lag = _lag_one(residual, setup.fitted)
-    return Left(
+    return ResidualStructure(
         white_nm=white,
         busy_nm=_rms(residual, works),
         ratio=ratio,
@@ -74,7 +74,7 @@ def left_over(fitted: Fitted, quiet: np.ndarray, noise_sd_nm: float) -> Left:
 
 
 def _ideal(fitted: np.ndarray, resting: tuple, white: float, size: int) -> float:
-    """Log-likelihood a record of this length would have, were its noise that of the rests throughout."""
+    """Log-likelihood of a record of this length if its noise were everywhere as it is at rest."""
     total = int(fitted.sum())
     at_white = -0.5 * total * (np.log(2 * np.pi * white * white) + 1.0)
     if size < 40:
@@ -107,7 +107,7 @@ def _lag_one(residual: np.ndarray, fitted: np.ndarray) -> float:
 
 
 def quiet_rows(fitted: Fitted) -> np.ndarray:
-    """bool, shape (K,): the muscle rests, as the model sees it."""
+    """bool, shape (K,): intervals in which the muscle rests, according to the model."""
     setup = fitted.problem.setup
     problem, physical = fitted.problem, fitted.physical
     part = setup.part_of(at_samples=False)
@@ -116,17 +116,17 @@ def quiet_rows(fitted: Fitted) -> np.ndarray:
     drive = setup.grid.held(physical[problem.coefficients] @ setup.design)
     level = QUIET * setup.scale_nm
     still = (np.abs(torque) < level) & (np.abs(drive) < level)
-    # Half a second after the last torque: slow tails belong to work.
+    # The half second after the last torque counts as work: slow tails belong to it.
     tail = round(0.5 / setup.grid.step_s)
     busy = np.convolve(~still, np.r_[np.zeros(tail), np.ones(tail + 1)], "same") > 0
     return still & ~busy
 
 
 def held_readings(record: Record) -> float:
-    """Share of samples that repeat the one before exactly, where that is not the coarse count of a quiet signal."""
+    """Share of samples equal to the one before; 0 where coarse rounding of a quiet signal explains it."""
     torque = record.torque_nm
     change = np.abs(np.diff(torque[(torque > torque.min()) & (torque < torque.max())]))
     moved = change[change > 1e-9 * max(float(np.ptp(torque)), 1e-300)]
     if change.size < 100 or not moved.size or np.median(moved) < COUNTS * np.min(moved):
-        return 0.0  # it moves by single counts: between two of them it stands
+        return 0.0  # it changes by single counts of the converter: between two of them it repeats
     return float(np.mean(change == 0.0))

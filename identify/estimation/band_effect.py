@@ -1,4 +1,4 @@
-"""A tremor, which is part of the noise while a model is fitted, written out as a wave."""
+"""A narrow band of noise (tremor), written as an effect: a wave with slowly varying amplitude."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from identify.noise.level import band_part
 from identify.simulation.problem import Problem
 
 
-def with_band(fitted: Fitted) -> Fitted:
-    """A candidate whose noise has a narrow band, with that band written out as a tremor.
+def band_as_effect(fitted: Fitted) -> Fitted:
+    """The candidate with the narrow band of its noise written as the effect `tremor`; unchanged without a band.
 
-    The wave is the band's share of the residual, given all of it, as a sine whose amplitudes run straight between
-    knots: a description of what was measured, nothing that could be foreseen.
+    The wave is the smoothed part of the residual that belongs to the band: a cosine and a sine whose amplitudes are
+    linear between knots. It describes what was measured and cannot be predicted.
     """
     effect = next((e for e in registry().values() if e.band), None)
     if fitted.noise.band <= 0.0 or effect is None:
@@ -56,9 +56,9 @@ def with_band(fitted: Fitted) -> Fitted:
 def predict_fitted(fitted: Fitted) -> np.ndarray:
     """Free-run torque of a candidate at its own record's samples, N·m, shape (N,)."""
     record = fitted.problem.setup.grid.record
-    fitted = with_band(fitted)
-    unforeseen = frozenset(e for e, _ in fitted.effects if not get(e).foreseeable)
-    foreseen = fitted.problem.at_samples(fitted.theta, unforeseen)
-    if not unforeseen:
-        return foreseen
-    return np.where(record.held_out, foreseen, fitted.problem.at_samples(fitted.theta))
+    fitted = band_as_effect(fitted)
+    unpredictable = frozenset(e for e, _ in fitted.effects if not get(e).predictable)
+    predictable = fitted.problem.at_samples(fitted.theta, unpredictable)
+    if not unpredictable:
+        return predictable
+    return np.where(record.held_out, predictable, fitted.problem.at_samples(fitted.theta))

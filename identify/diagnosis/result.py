@@ -1,0 +1,176 @@
+"""The result of a diagnosis: the keys of `diagnose --json`, and sentences for people."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from identify.criticism.where import worst_places
+from identify.diagnosis.search import EffectSearch
+from identify.diagnosis.steps import Step, steps
+from identify.diagnosis.thresholds import CLOSE, RIVAL
+from identify.diagnosis.verdict import Verdict
+from identify.effects import get
+from identify.estimation.band_effect import band_as_effect, predict_fitted
+from identify.estimation.effect_fit import effect_names
+from identify.estimation.finish import describe_parameters
+from identify.experiments import plan
+from identify.results import Diagnosis
+from identify.shown import probability, sure
+
+STATISTICS = (
+    "fit_percent", "held_out_fit_percent", "rms_nm", "held_out_rms_nm", "ceiling_percent", "held_out_ceiling_percent",
+    "held_out_by",
+)  # fmt: skip
+
+
+def diagnosis_of(search: EffectSearch, verdict: Verdict) -> Diagnosis:
+    """The `Diagnosis` that a search and its verdict give."""
+    record, raw = search.record, search.raw
+    base_prediction = predict_fitted(search.base)
+    row = steps(search)
+    base = row[0].statistics
+    missing = [_missing(search, verdict, effect, row) for effect in _ranked(search, verdict)]
+    final = row[-1].statistics
+    residual = record.torque_nm - (
+        predict_fitted(search.last) if verdict.kind == "unexplained_structure" else base_prediction
+    )
+    where = worst_places(
+        record, residual, raw.noise_sd_nm, rows=~record.held_out & search.base.problem.setup.grid.counted
+    )
+    return Diagnosis(
+        noise_sd_nm=raw.noise_sd_nm,
+        slow_noise={
+            "sd_nm": search.last.noise.sd_nm * float(np.sqrt(min(search.last.noise.share, 1.0))),
+            "ar1": search.last.noise.ar1,
+        },
+        base={key: base[key] for key in STATISTICS},
+        verdict=verdict.kind,
+        probability=verdict.probability,
+        missing=tuple(missing),
+        where=tuple(where),
+        with_all={key: final[key] for key in STATISTICS} | {"noise_sd_nm": final["noise_sd_nm"]},
+        explained=verdict.explained,
+        structure_left=verdict.structure,
+        unseen=None
+        if verdict.held_out_error is None
+        else {"rms_nm": verdict.held_out_error.rms_nm, "allowed_nm": verdict.held_out_error.allowed_nm},
+        candidates=tuple(_candidates(search)),
+        notes=tuple(verdict.notes),
+        plain=tuple(_plain(search, verdict, base, final, missing, where)),
+    )
+
+
+def _ranked(search: EffectSearch, verdict: Verdict) -> list[str]:
+    """Effects by importance: those that the samples show, then by the log evidence lost without each."""
+    return sorted(
+        verdict.found, key=lambda e: (e not in search.detected, -search.losses.get(e, 0.0), -verdict.found[e])
+    )
+
+
+def _missing(search: EffectSearch, verdict: Verdict, effect: str, row: list[Step]) -> dict[str, Any]:
+    number = next(i for i, step in enumerate(row) if step.added == effect)
+    before, after = row[number - 1].statistics, row[number].statistics
+    fitted = band_as_effect(search.last)
+    index = [e for e, _ in fitted.effects].index(effect)
+    rivals = verdict.rivals.get(effect, {})
+    named = _close(search, effect)
+    ranked = sorted((name for name in rivals if name and name != effect), key=lambda name: -rivals[name])
+    confused = [name for name in ranked if rivals[name] >= RIVAL or name in named]
+    described = get(effect)
+    experiment = _experiment(search, effect, confused)
+    return {
+        "effect": effect,
+        "name": described.name,
+        "probability": verdict.found[effect],
+        "rms_before_nm": before["rms_nm"],
+        "rms_after_nm": after["rms_nm"],
+        "held_out_rms_before_nm": before["held_out_rms_nm"],
+        "held_out_rms_after_nm": after["held_out_rms_nm"],
+        "confused_with": confused,
+        "next_experiment": experiment["text"] if experiment else described.separated_by,
+        "next_experiment_plan": experiment,
+        "form": fitted.effects[index][1].name,
+        "equation": fitted.effects[index][1].equation,
+        "parameters": _few(describe_parameters(fitted, index)),
+        "rival_probabilities": {name: p for name, p in rivals.items() if name and p >= 0.005},
+        "plain": described.plain,
+    }
+
+
+def _close(search: EffectSearch, effect: str) -> set[str]:
+    """Effects that resemble this one and gain nearly as much: in another form they might be better."""
+    if effect not in search.added:
+        return set()
+    round_ = search.rounds[search.added.index(effect)]
+    gains = {c.effect.id: c.gain for c in round_}
+    alike = {c.effect.id for c in round_ if effect in c.effect.resembles} | set(get(effect).resembles)
+    return {name for name in alike if gains.get(name, 0.0) > CLOSE * gains.get(effect, 0.0)}
+
+
+def _experiment(search: EffectSearch, effect: str, confused: list[str]) -> dict[str, Any] | None:
+    """The shortest test that separates an effect from its first rival, both as fitted in the same round."""
+    if not confused or effect not in search.added:
+        return None
+    found = {c.effect.id: c.fitted for c in search.rounds[search.added.index(effect)]}
+    rivals = {name: found[name] for name in (effect, confused[0]) if name in found and not get(name).band}
+    if len(rivals) < 2:
+        return None
+    best = plan(search.record, rivals)
+    return {key: best[key] for key in ("segments", "duration_s", "dose", "expected_log_evidence", "decides", "text")}
+
+
+def _few(parameters: dict[str, Any]) -> dict[str, Any]:
+    """The first 24 parameters: the wave of a tremor has hundreds."""
+    return dict(list(parameters.items())[:24])
+
+
+def _candidates(search: EffectSearch) -> list[list[dict[str, Any]]]:
+    return [
+        [
+            {
+                "effect": c.effect.id,
+                "form": c.form.name,
+                "log_evidence_gain": c.gain,
+                "rms_nm": c.fitted.rms_nm,
+                "forms": c.forms,
+            }
+            for c in found
+        ]
+        for found in search.rounds
+    ]
+
+
+def _plain(
+    search: EffectSearch, verdict: Verdict, base: dict[str, Any], final: dict[str, Any], missing: list, where: list
+) -> list[str]:
+    noise = search.raw.noise_sd_nm
+    held = " and ".join(get(name).name.lower() for name in effect_names(search.base))
+    lines = [
+        f"The model {f'with {held}' if held else 'without effects'} fits {base['fit_percent']:.1f} %; the noise of "
+        f"{noise:.3g} N·m allows {base['ceiling_percent']:.1f} % at most. On rows that were not fitted its error is "
+        f"{base['held_out_rms_nm']:.3g} N·m."
+    ]
+    if verdict.kind == "nothing_missing":
+        lines.append("Nothing is missing: the remaining error looks like noise, both at work and at rest.")
+    if verdict.kind == "unexplained_structure":
+        lines.append(
+            "An error is left that no effect in the library explains. It appears when the muscle works, so it is not "
+            "measurement noise."
+        )
+        if where:
+            lines.append(f"Most of it is here: {where[0]['text']}.")
+    for entry in missing:
+        chance = entry["probability"]
+        text = f"{entry['name']} is {sure(chance)} missing ({probability(chance)}). {entry['plain']}"
+        if entry["confused_with"]:
+            others = ", ".join(get(name).name.lower() for name in entry["confused_with"])
+            text += f" This record cannot clearly separate it from: {others}. To decide: {entry['next_experiment']}"
+        lines.append(text)
+    if missing and verdict.kind == "effect_missing":
+        lines.append(
+            f"With {'it' if len(missing) == 1 else 'them'} the error on rows that were not fitted falls from "
+            f"{base['held_out_rms_nm']:.3g} to {final['held_out_rms_nm']:.3g} N·m."
+        )
+    return lines + verdict.notes

@@ -1,0 +1,351 @@
+"""The verdict's own arithmetic, on analyses made by hand: every rule at both sides of its threshold."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from identify.diagnosis import verdict
+from identify.diagnosis.held_out_error import HeldOutError
+from identify.diagnosis.search import EffectSearch
+from identify.diagnosis.verdict import Verdict, judge, shares
+from identify.effects import get
+
+FIRST, SECOND, EFFORT, TREMOR = "fatigue", "output_saturation", "voluntary_effort", "tremor"
+
+
+def candidate(effect: str, gain: float) -> Any:
+    return SimpleNamespace(effect=get(effect), gain=gain)
+
+
+def fitted(log_likelihood: float, *effects: str, band: float = 0.0, **parameters: float) -> Any:
+    """A fit as the verdict sees it: 100 s of fitted rows at 40 intervals a second; the base has -20."""
+
+    def parameters_of(effect: str) -> dict[str, float]:
+        assert effect in effects
+        return parameters
+
+    forms = tuple((effect, SimpleNamespace(stage=get(effect).forms[0].stage, name="bumps")) for effect in effects)
+    return SimpleNamespace(
+        log_likelihood=log_likelihood - 20.0,
+        effects=forms,
+        noise=SimpleNamespace(band=band),
+        parameters_of=parameters_of,
+        problem=SimpleNamespace(
+            setup=SimpleNamespace(fitted=np.ones(4000, bool), grid=SimpleNamespace(step_s=0.025)),
+        ),
+    )
+
+
+class Made:
+    """An analysis in which nothing is missing, to be changed; what the record says stands beside it."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.held_share = 0.0
+        self.at_rest = 1.0
+        self.rises: set[int] = set()
+        self.unseen: list[HeldOutError | None] = [None, None]
+        self.forms: list[float] = []
+        base = fitted(0.0)
+        self.work = EffectSearch(
+            record=object(), raw=None, plain=base, base=base,  # pyright: ignore[reportArgumentType]
+            rounds=[[candidate(FIRST, 1.0)]], chain=[base], free_gain=[0.0], residuals=[self.left()],
+        )  # fmt: skip
+        monkeypatch.setattr(verdict, "held_readings", self._held_readings)
+        monkeypatch.setattr(verdict, "seen_at_rest", self._seen_at_rest)
+        monkeypatch.setattr(verdict, "held_out_rise", self._rise)
+        monkeypatch.setattr(verdict, "held_out_error", self._unseen)
+
+    def left(self, ratio: float = 0.0, ideal: float = 80.0, busy_nm: float = 1.0, white_nm: float = 0.0) -> Any:
+        return SimpleNamespace(ratio=ratio, ideal=ideal, busy_nm=busy_nm, white_nm=white_nm)
+
+    def add(self, effect: str, gain: float, log_likelihood: float, rival: float = 0.0, **parameters: float) -> Made:
+        """One effect more, that took the log-likelihood so far."""
+        work = self.work
+        rounds = [candidate(effect, gain), candidate("potentiation", rival)]
+        work.rounds[len(work.added) :] = [rounds]
+        work.added.append(effect)
+        work.chain.append(fitted(log_likelihood, *work.added, **parameters))
+        return self
+
+    def leaves(self, **left: float) -> Made:
+        self.work.residuals = [self.work.residuals[0], self.left(**left)]
+        return self
+
+    def judged(self) -> Verdict:
+        return judge(self.work)
+
+    def _held_readings(self, record: Any) -> float:
+        assert record is self.work.record
+        return self.held_share
+
+    def _seen_at_rest(self, quiet: Any, holder: Any, effect: str) -> float:
+        assert quiet is self.work.quiet
+        assert holder is self.work.chain[self.work.added.index(effect) + 1]
+        return self.at_rest
+
+    def _rise(self, before: Any, after: Any) -> tuple[float, float] | None:
+        number = self.work.chain.index(before)
+        assert after is self.work.chain[number + 1]
+        return (1.0, 2.0) if number in self.rises else None
+
+    def _unseen(self, fit: Any, form: float, beside: Any) -> HeldOutError | None:
+        assert beside is self.work.last
+        self.forms.append(form)
+        return self.unseen[0 if fit is self.work.plain and len(self.forms) == 1 else 1]
+
+
+@pytest.fixture
+def made(monkeypatch: pytest.MonkeyPatch) -> Made:
+    return Made(monkeypatch)
+
+
+def test_nothing_missing(made: Made):
+    found = made.judged()
+    assert (found.kind, found.found, found.rivals, found.notes) == ("nothing_missing", {}, {}, [])
+    assert (found.explained, found.structure, found.contradicted) == (0.0, 0.0, False)
+    assert found.held_out_error is None
+    assert found.probability == pytest.approx(1 / (1 + np.exp(1.0 - 4.5)))
+    made.work.rounds = [[candidate(FIRST, 4.5), candidate(SECOND, 3.5)]]
+    assert made.judged().probability == pytest.approx(1 / (1 + 1 + np.exp(-1.0)))
+    made.work.rounds = []
+    assert made.judged().probability == 1.0
+    made.work.rounds = [[candidate(FIRST, 1e6)]]
+    assert made.judged().probability == pytest.approx(1 / (1 + np.exp(60.0)), rel=1e-9, abs=0)
+
+
+def test_probabilities_of_rivals():
+    assert shares([]) == {"": 1.0}
+    found = shares([candidate(FIRST, 20.0), candidate(SECOND, 17.4), candidate("potentiation", -1e9)])
+    weights = {FIRST: 1.0, SECOND: np.exp(-1.0), "potentiation": np.exp(-60.0), "": np.exp(4.5 - 20.0)}
+    total = sum(weights.values())
+    assert found == pytest.approx({name: 0.96 * weight / total for name, weight in weights.items()}, rel=1e-9, abs=0)
+    low = shares([candidate(FIRST, -2.0), candidate(SECOND, -4.0)])
+    assert low[SECOND] / low[FIRST] == pytest.approx(np.exp(-1.0)), "a negative gain does not narrow the spread"
+    assert low[""] / low[FIRST] == pytest.approx(np.exp(6.5))
+    assert shares([candidate(FIRST, 1e6)])[""] == pytest.approx(0.96 * np.exp(-60.0), rel=1e-9, abs=0)
+    assert shares([candidate(FIRST, -1e6)])[FIRST] == pytest.approx(0.96 * np.exp(-60.0), rel=1e-9, abs=0)
+
+
+def test_an_effect_missing(made: Made):
+    found = made.add(FIRST, 50.0, 80.0, rival=48.0).leaves(ratio=3.0).judged()
+    assert found.kind == "effect_missing"
+    assert found.explained == pytest.approx(0.8)
+    assert found.structure == 3.0
+    assert found.rivals == {FIRST: shares([candidate(FIRST, 50.0), candidate("potentiation", 48.0)])}
+    assert found.found == {FIRST: found.rivals[FIRST][FIRST]}
+    assert found.probability == found.found[FIRST]
+    assert made.forms == [0.003, 0.003], "who names an effect is held to more"
+
+
+def test_what_was_added_later_stands_on_what_was_added_before(made: Made):
+    made.add(FIRST, 50.0, 40.0, rival=50.0).add(SECOND, 90.0, 90.0)
+    found = made.judged()
+    assert found.rivals[SECOND][SECOND] > 0.9
+    assert found.found[SECOND] == found.found[FIRST] == found.rivals[FIRST][FIRST] < 0.5
+    assert set(found.rivals[FIRST]) == {FIRST, "potentiation", ""}
+    assert found.probability == found.found[FIRST]
+
+
+def test_what_was_taken_in_another_round_is_no_rival_here(made: Made):
+    made.add(FIRST, 50.0, 40.0).add(SECOND, 30.0, 90.0)
+    made.work.rounds[0].append(candidate(SECOND, 49.0))
+    assert SECOND not in made.judged().rivals[FIRST]
+
+
+def test_an_effect_that_was_exchanged_counts_as_half(made: Made):
+    made.add(FIRST, 50.0, 90.0)
+    made.work.rounds[0] = [candidate("potentiation", 20.0)]
+    assert made.judged().found[FIRST] == 0.5
+
+
+def test_effects_seen_in_the_raw_samples_are_almost_certain(made: Made):
+    made.work.detected = ["mains_hum"]
+    found = made.judged()
+    assert (found.kind, found.found, found.probability) == ("effect_missing", {"mains_hum": 0.99}, 0.99)
+    made.work.chain = [fitted(30.0, "mains_hum")]
+    made.add(FIRST, 50.0, 65.0)
+    assert made.judged().explained == pytest.approx(35.0 / 70.0), "what was given counts as known"
+
+
+@pytest.mark.parametrize(("ratio", "strange"), [(12.0, False), (12.1, True)])
+def test_structure_that_no_effect_explains(made: Made, ratio: float, strange: bool):
+    made.work.residuals = [made.left(ratio=ratio)]
+    found = made.judged()
+    assert (found.kind == "unexplained_structure") is strange
+    if strange:
+        assert found.probability == 0.9
+    assert found.structure == ratio
+
+
+@pytest.mark.parametrize(
+    ("log_likelihood", "ratio", "strange"), [(67.0, 12.1, True), (68.0, 12.1, False), (67.0, 12.0, False)]
+)
+def test_effects_that_explain_too_little(made: Made, log_likelihood: float, ratio: float, strange: bool):
+    found = made.add(FIRST, 50.0, log_likelihood).leaves(ratio=ratio).judged()
+    assert (found.kind == "unexplained_structure") is strange
+    assert (found.found[FIRST] == 0.45) is strange
+
+
+@pytest.mark.parametrize(
+    ("nameless", "log_likelihood", "strange"), [(58.1, 89.0, True), (58.0, 89.0, False), (58.1, 90.0, False)]
+)
+def test_a_gain_without_a_law_explains_more(made: Made, nameless: float, log_likelihood: float, strange: bool):
+    made.add(FIRST, 50.0, log_likelihood)
+    made.work.free_gain = [nameless]
+    assert (made.judged().kind == "unexplained_structure") is strange
+
+
+@pytest.mark.parametrize(("share", "strange"), [(0.3, False), (0.31, True)])
+def test_readings_that_repeat(made: Made, share: float, strange: bool):
+    made.held_share = share
+    found = made.judged()
+    assert (found.kind == "unexplained_structure") is strange
+    assert bool(found.notes) is strange
+    if strange:
+        made.held_share = 0.9
+        assert made.judged().notes == ["90 % of the readings equal the one before: the converter repeats values."]
+
+
+def test_an_effect_against_which_rows_not_seen_speak_is_doubted(made: Made):
+    made.add(FIRST, 50.0, 80.0).add(SECOND, 50.0, 90.0)
+    made.rises = {1}
+    found = made.judged()
+    assert found.found[SECOND] == 0.45
+    assert found.found[FIRST] > 0.9
+    assert len(found.notes) == 1
+    assert found.notes[0].startswith(get(SECOND).name)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "contradicted"),
+    [
+        (None, HeldOutError(2.5, 1.0), True),
+        (None, HeldOutError(2.4, 1.0), False),
+        (HeldOutError(4.0, 1.0), HeldOutError(2.5, 1.0), True),
+        (HeldOutError(9.0, 1.0), HeldOutError(2.5, 1.0), False),
+        (HeldOutError(9.0, 1.0), None, False),
+    ],
+)
+def test_rows_not_seen_may_contradict(
+    made: Made, before: HeldOutError | None, after: HeldOutError | None, contradicted: bool
+):
+    made.unseen = [before, after]
+    found = made.judged()
+    assert found.contradicted is contradicted
+    assert found.held_out_error is after
+    assert (found.kind == "unexplained_structure") is contradicted
+    assert len(found.notes) == contradicted
+    if contradicted:
+        assert found.notes == [
+            "On held-out rows the error of the last model is 2.5 times what noise and its uncertainty allow: "
+            "something is still missing."
+        ]
+    assert made.forms[:2] == [0.01, 0.01]
+
+
+def test_half_of_what_the_plain_structure_leaves_is_not_too_much(made: Made):
+    first = HeldOutError(float(np.sqrt(1 + 4 * 8.0)), 1.0)
+    made.unseen = [first, HeldOutError(3.0, 1.0)]  # both excesses squared: 32 and 8
+    assert not made.judged().contradicted
+    made.unseen = [first, HeldOutError(3.01, 1.0)]
+    made.forms.clear()
+    assert made.judged().contradicted
+
+
+EFFORTS = {f"centre_{i}": 10.0 * i for i in range(3)} | {"width_0": 1.0, "decay_0": 1.0}
+
+
+def test_efforts_seen_at_rest_are_efforts(made: Made):
+    made.at_rest = 0.15
+    found = made.add(EFFORT, 50.0, 90.0, **EFFORTS).judged()
+    assert found.kind == "effect_missing"
+    assert found.found[EFFORT] > 0.85
+    made.work.chain[1].effects[0][1].name = "resisting bumps"
+    assert made.judged().kind == "effect_missing"
+
+
+def test_efforts_are_looked_for_in_the_model_to_which_they_were_added(made: Made):
+    made.at_rest = 0.14
+    found = made.add(EFFORT, 50.0, 80.0, **EFFORTS).add(FIRST, 50.0, 90.0).judged()
+    assert found.found == {EFFORT: 0.85, FIRST: 0.85}
+
+
+def test_an_effort_that_was_exchanged_is_looked_for_nowhere(made: Made):
+    made.add(EFFORT, 50.0, 90.0)
+    made.work.chain[1].effects = ()
+    assert made.judged().found[EFFORT] > 0.9
+
+
+def test_efforts_seen_nowhere_at_rest_are_less_certain(made: Made):
+    made.at_rest = 0.14
+    found = made.add(EFFORT, 50.0, 90.0, **EFFORTS).judged()
+    assert (found.kind, found.found[EFFORT]) == ("effect_missing", 0.85)
+    made.work.chain[1].effects[0][1].name = "resisting bumps"
+    assert made.judged().kind == "unexplained_structure"
+
+
+def test_a_law_that_shows_nothing_at_rest_is_as_certain_as_ever(made: Made):
+    made.at_rest = 0.0
+    assert made.add("baseline_drift", 50.0, 90.0).judged().found["baseline_drift"] > 0.9
+
+
+@pytest.mark.parametrize(("apart_s", "strange"), [(1.25, True), (1.2, False)])
+@pytest.mark.parametrize("count", [3, 4])
+def test_many_efforts_none_at_rest_are_something_else(made: Made, count: int, apart_s: float, strange: bool):
+    made.at_rest = 0.0
+    centres = {f"centre_{i}": apart_s * (2 - i) for i in range(count)}  # in any order; these differ by 1.2 exactly
+    found = made.add(EFFORT, 50.0, 90.0, **centres).judged()
+    assert (found.kind == "unexplained_structure") is (strange and count == 4)
+
+
+@pytest.mark.parametrize(
+    ("log_likelihood", "ratio", "strange"), [(79.0, 12.1, True), (80.0, 12.1, False), (79.0, 12.0, False)]
+)
+def test_efforts_must_explain_more(made: Made, log_likelihood: float, ratio: float, strange: bool):
+    found = made.add(EFFORT, 50.0, log_likelihood, **EFFORTS).leaves(ratio=ratio).judged()
+    assert (found.kind == "unexplained_structure") is strange
+
+
+@pytest.mark.parametrize(("width_s", "strange"), [(16.5, False), (16.6, True)])
+@pytest.mark.parametrize("name", ["width_1", "decay_2"])
+def test_efforts_that_last_a_third_of_the_test_are_none(made: Made, name: str, width_s: float, strange: bool):
+    found = made.add(EFFORT, 50.0, 90.0, **{name: width_s, "height_0": 1e3}).judged()
+    assert (found.kind == "unexplained_structure") is strange
+
+
+@pytest.mark.parametrize(
+    ("busy_nm", "ratio", "strange"),
+    [(0.0435**0.5, 60.1, True), (0.0425**0.5, 60.1, False), (0.0435**0.5, 60.0, False)],
+)
+def test_a_tremor_takes_most_of_the_power(made: Made, busy_nm: float, ratio: float, strange: bool):
+    """Explained is what it took of the power above the white noise, 0.2 N·m here, of 0.3 N·m before."""
+    made.work.residuals = [made.left(busy_nm=0.3, white_nm=0.2)]
+    made.add(TREMOR, 50.0, 90.0)
+    made.work.chain[-1].noise.band = 0.5
+    found = made.leaves(ratio=ratio, busy_nm=busy_nm, white_nm=0.2).judged()
+    assert found.explained == pytest.approx(1 - (busy_nm**2 - 0.04) / 0.05)
+    assert (found.kind == "unexplained_structure") is strange
+
+
+def test_a_tremor_that_takes_exactly_as_much_as_is_asked_for(made: Made):
+    made.add(TREMOR, 50.0, 90.0)
+    made.work.chain[-1].noise.band = 0.5
+    found = made.leaves(ratio=60.1, busy_nm=0.06**0.5).judged()
+    assert (found.explained, found.kind) == (0.94, "effect_missing")
+
+
+def test_a_structure_that_holds_effects_is_measured_from_the_plain_one(made: Made):
+    made.work.base = made.work.chain[0] = fitted(60.0, FIRST)
+    found = made.judged()
+    assert found.explained == pytest.approx(0.6)
+    assert found.kind == "nothing_missing"
+
+
+def test_little_to_explain_is_not_divided_by(made: Made):
+    made.add(FIRST, 6.0, 0.5)
+    made.leaves(ideal=-19.9)
+    assert made.judged().explained == pytest.approx(0.5)
