@@ -1,11 +1,12 @@
-# stimrig: two commands on a fresh machine, `make demo` and `make test`; beside them `make serve` and `make bench`.
+# stimrig: two commands on a fresh machine, `make demo` and `make test`; `make help` lists the others.
 SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c
 VENV := .venv
 BIN := $(VENV)/bin
 export PYTHONUNBUFFERED = 1
+FAST := not wire and not browser and not service and not slow
 
-.PHONY: demo test serve bench faults mutation lint lock clean help setup setup-test
+.PHONY: demo test check fast lint types serve bench faults soak campaigns mutation lock clean help setup setup-test
 
 help:
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -16,16 +17,30 @@ demo: setup ## one whole pre-session test on the emulated rig, with its report
 serve: setup ## service and page on 127.0.0.1:8000 (emulated rig unless RIG=file is given)
 	@$(BIN)/stimrig serve $(if $(RIG),--rig $(RIG))
 
-test: setup-test lint ## every check and every test
+test: setup-test lint types ## every check and every test; with PYTEST_ARGS those tests alone
 	@$(BIN)/python -m $(if $(PYTEST_ARGS),pytest $(PYTEST_ARGS),tests)
 
-lint: setup-test ## style, types, layers
+check: setup-test ## within a minute: style, layers, types and the fast tests
+	@$(MAKE) --no-print-directory -j2 --output-sync=target lint types fast
+
+fast: setup-test
+	@echo "== fast tests"; $(BIN)/python -m pytest -n 2 --dist worksteal -m "$(FAST)" tests
+
+lint: setup-test ## style and layers
 	@echo "== ruff"; $(BIN)/ruff check . ; $(BIN)/ruff format --check .
 	@echo "== import-linter"; $(BIN)/lint-imports --no-cache
+
+types: setup-test ## types
 	@echo "== types"; $(BIN)/basedpyright --level error
 
 bench: $(VENV)-bench/.bench ## the figures in docs/, measured on this machine
 	@$(VENV)-bench/bin/python -m bench
+
+soak: setup-test ## an hour of recording with fits beside it (docs/results/soak.md)
+	@$(BIN)/python -m bench.soak --minutes 60
+
+campaigns: setup-test ## the tests that are too long for `make test`: whole grids, a hidden patient on the wire
+	@$(BIN)/python -m pytest --campaigns -m campaign tests
 
 faults: setup-test ## the fault campaign on the emulated rig (docs/results/faults.md)
 	@$(BIN)/python -m bench.faults

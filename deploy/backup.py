@@ -32,7 +32,7 @@ MARGIN_BYTES = 64 * 2**20
 
 
 class BackupError(Exception):
-    """What is wrong, where, and the mend; `code` is the exit code."""
+    """What is wrong, where, and how to fix it; `code` is the exit code."""
 
     def __init__(self, message: str, code: int = 1) -> None:
         super().__init__(message)

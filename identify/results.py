@@ -1,4 +1,4 @@
-"""The results of `compare`, `diagnose` and `improve`. Their fields are the keys of `--json`; docs/schema defines each.
+"""The results of `compare`, `diagnose` and `improve`. Their fields are the keys of `--json`; api/schemas defines each.
 
 Rows of tables are dicts with the keys of the schema. `to_dict()` gives JSON values. `print` shows about ten lines,
 `repr` one line, and a notebook a table.

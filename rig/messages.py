@@ -112,6 +112,13 @@ class PreviewRequest(Message):
     recruitment: RecruitmentTable | None = Field(None, description="to estimate the torque-time")
 
 
+class SequencesRequest(Message):
+    """Ask for the library of sequences, and for the default test. Reply: `Sequences`."""
+
+    kind: Literal["sequences"] = "sequences"
+    id: int = 0
+
+
 class StartRequest(Message):
     kind: Literal["start"] = "start"
     id: int = 0
@@ -179,6 +186,7 @@ Request = Annotated[
     StatusRequest
     | SubscribeRequest
     | PreviewRequest
+    | SequencesRequest
     | StartRequest
     | StopRequest
     | RearmRequest
@@ -204,7 +212,7 @@ class Reply(Message):
     problem: Problem | None = None
     body: dict[str, Any] = Field(default_factory=dict)
     """status, subscribe, start, rearm, calibrate-start, -step and -mark: a `Status`; preview: a `Preview`;
-    stop: a `StopEvidence`; calibrate-finish: a `CalibrationResult`."""
+    sequences: a `Sequences`; stop: a `StopEvidence`; calibrate-finish: a `CalibrationResult`."""
 
 
 class CalibrationTrain(Message):
@@ -270,6 +278,21 @@ class Status(Message):
         None,
         description="newest one since the rig started, recovered tests included; for clients that connect later",
     )
+
+
+class SequenceInfo(Message):
+    """One sequence of the library."""
+
+    id: str
+    description: str
+    settings: dict[str, Any] = Field(description="JSON Schema of its settings: units, ranges and defaults")
+
+
+class Sequences(Message):
+    """What this rig can play."""
+
+    sequences: list[SequenceInfo]
+    default: list[SegmentPlan] = Field(description="segments of the default pre-session test")
 
 
 class Preview(Message):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rig import sequences
 from rig.errors import PlanError, RefusedError
 from rig.limits import Limit, Refusal, Steps, admit, check
-from rig.messages import Preview, RecruitmentTable, SegmentPlan, TestPlan
+from rig.messages import Preview, RecruitmentTable, SegmentPlan, Sequences, TestPlan
 from rig.signals import Pulse
 
 MAX_SEGMENTS = 200
@@ -36,6 +36,17 @@ def default_segments() -> list[SegmentPlan]:
         SegmentPlan(name="validate", sequence="multilevel", settings={}),
         SegmentPlan(name="rest", sequence="rest", settings={"duration_s": 2.0}),
     ]
+
+
+def library() -> Sequences:
+    """All sequences with their settings as a plan gives them, and the default test."""
+    found = sequences.described()
+    for sequence in found:
+        width = sequence.settings["properties"].get(MAX_WIDTH_SETTING)
+        if width is not None:
+            del width["default"]
+            width["description"] += "; left out: the comfort maximum, or the test's own limit if that is lower"
+    return Sequences(sequences=found, default=default_segments())
 
 
 @dataclass(frozen=True, slots=True)

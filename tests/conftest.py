@@ -1,9 +1,30 @@
-"""Property tests know no time: the machine is shared, and how long an example takes is no property.
+"""What holds for every test: how many threads a process takes, how property tests run, and what is left to campaigns.
 
-Here, above all tests: the profile has to be loaded before the first of them is imported.
+Here, above all tests: both settings have to be made before the first of them is imported.
 """
 
+from __future__ import annotations
+
+import os
+
+import pytest
 from hypothesis import HealthCheck, settings
 
+for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")  # several test processes share the processors
+
+# The machine is shared: how long an example takes says nothing about the code.
 settings.register_profile("shared-machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("shared-machine")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--campaigns", action="store_true", help="run the tests marked `campaign`, too")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out what only a campaign runs, and count it as deselected."""
+    left_out = [item for item in items if item.get_closest_marker("campaign")]
+    if left_out and not config.getoption("--campaigns"):
+        config.hook.pytest_deselected(items=left_out)
+        items[:] = [item for item in items if not item.get_closest_marker("campaign")]

@@ -12,6 +12,7 @@ import sys
 import tempfile
 import traceback
 from pathlib import Path
+from typing import Annotated
 
 import typer
 from typer.exceptions import TyperException
@@ -21,8 +22,10 @@ from api.cli.errors import CommandError
 from api.cli.terminal import clear_progress
 from api.client.errors import Forbidden, Invalid, NotFound, ServiceError, Unauthorized, Unreachable
 from api.errors import ApiError, SettingsError
+from api.version import software_version
 from identify.errors import IdentifyError
 
+VERBS = sorted(info.name for info in pkgutil.iter_modules(commands.__path__))
 INPUT_AT_FAULT = (Unreachable, Unauthorized, Forbidden, NotFound, Invalid)
 """Errors of a service that stand for a wrong address, a wrong token or a request that cannot be used."""
 
@@ -41,11 +44,22 @@ def build(verb: str = "") -> typer.Typer:
         rich_markup_mode=None,
         context_settings={"help_option_names": ["-h", "--help"]},
     )
-    app.callback()(lambda: None)  # one verb alone stays a verb
-    names = sorted(info.name for info in pkgutil.iter_modules(commands.__path__))
-    for name in [verb] if verb in names else names:
+    app.callback()(_options)  # one verb alone stays a verb
+    for name in [verb] if verb in VERBS else VERBS:
         importlib.import_module(f"{commands.__name__}.{name}").register(app)
     return app
+
+
+def _version(asked: bool) -> None:
+    if asked:
+        print(f"stimrig {software_version()}")
+        raise typer.Exit
+
+
+def _options(
+    _version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="print it")] = False,
+) -> None:
+    pass
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -75,7 +89,7 @@ def run(arguments: list[str] | None = None) -> int:
 
 def _one_line(verb: str, error: Exception) -> int:
     """The error's line, and the exit code it stands for."""
-    name = f"stimrig {verb}".strip()
+    name = f"stimrig {verb}" if verb in VERBS else "stimrig"
     clear_progress()
     if isinstance(error, TyperException):
         message = error.format_message().strip()

@@ -48,6 +48,8 @@ class Analyses:
         self.settings = settings
         self.starting_effects = StartingEffects(store, pool, settings)
         self.running: dict[tuple[str, str], Call] = {}
+        """Begun and not kept yet."""
+        self._kept_count = 0
         self._ids: list[str] | None = None
 
     def path(self, recording_id: str) -> str:
@@ -119,11 +121,11 @@ class Analyses:
         background: bool = False,
         on_call: OnCall | None = None,
     ) -> dict[str, Any]:
-        known = await asyncio.to_thread(self.known, model.id, kind)
+        path = await asyncio.to_thread(self.path, recording_id or model.recording_id)
+        known = await self._known_now(model.id, kind)
         if known is not None:
             return known
-        path = await asyncio.to_thread(self.path, recording_id or model.recording_id)
-        key = (model.id, kind)
+        key = (model.id, kind)  # nothing is awaited from here to the call: two askers make one
         call = self.running.get(key)
         if call is not None and call.background and not background and call.progress < HALF_DONE:
             self.pool.cancel(call)  # somebody waits now: on a busy machine low priority could take minutes
@@ -134,16 +136,27 @@ class Analyses:
             on_call(call)
         found = await asyncio.shield(call.result)
         await asyncio.to_thread(self._keep, model.id, kind, found)
+        self._kept_count += 1
+        if self.running.get(key) is call:  # only now: who asks meanwhile shares it
+            del self.running[key]
         return found
+
+    async def _known_now(self, model_id: str, kind: str) -> dict[str, Any] | None:
+        """The finding if it has been made, by the time of the answer: what is kept while it is read is read again."""
+        while True:
+            before = self._kept_count
+            known = await asyncio.to_thread(self.known, model_id, kind)
+            if known is not None or self._kept_count == before:
+                return known
 
     def _begin(self, key: tuple[str, str], verb: str, background: bool, arguments: dict[str, Any]) -> Call:
         call = self.running[key] = self.pool.submit(verb, background=background, **arguments)
 
-        def done(_future: object) -> None:
-            if self.running.get(key) is call:
+        def failed(result: asyncio.Future[dict[str, Any]]) -> None:
+            if (result.cancelled() or result.exception()) and self.running.get(key) is call:
                 del self.running[key]
 
-        call.result.add_done_callback(done)
+        call.result.add_done_callback(failed)
         return call
 
     def _keep(self, model_id: str, kind: str, found: dict[str, Any]) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, StringConstraints, field_validator
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, StringConstraints, WithJsonSchema, field_validator
 
 from api.sessions.profiles import LIMITS
 
@@ -62,12 +62,24 @@ class ProfileIn(Body):
         return self.model_dump(exclude_unset=True)
 
 
+SETTINGS = {
+    "type": "object",
+    "description": "with the units and ranges that `GET /v1/sequences` gives for the sequence; the rig checks them",
+    "additionalProperties": {"type": ["number", "boolean", "array", "null"], "items": {"type": "number"}},
+    "examples": [{"max_pulse_width_us": 250.0, "bits": 7}],
+}
+
+
 class SegmentIn(Body):
     """One segment of a test: a sequence of the library by name, with its settings."""
 
-    name: Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_-]{1,40}$")]
-    sequence: Annotated[str, StringConstraints(min_length=1, max_length=40)]
-    settings: dict[str, Any] = Field(default_factory=dict)
+    name: Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_-]{1,40}$"), Field(examples=["prbs"])]
+    sequence: Annotated[
+        str,
+        StringConstraints(min_length=1, max_length=40),
+        Field(description="an id of `GET /v1/sequences`", examples=["prbs"]),
+    ]
+    settings: Annotated[dict[str, Any], WithJsonSchema(SETTINGS)] = Field(default_factory=dict)
 
 
 class TestIn(Body):

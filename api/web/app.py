@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from importlib.metadata import PackageNotFoundError, version
 
 from fastapi import FastAPI
 from starlette.types import ASGIApp
@@ -12,19 +11,12 @@ from starlette.types import ASGIApp
 from api.clock import Clock
 from api.settings import Settings
 from api.store.lock import ServiceLock
-from api.web import pages, problems, routes, strict_body
+from api.version import software_version
+from api.web import openapi, pages, problems, routes, strict_body
 from api.web.body_limit import BodyLimit
 from api.web.dependencies import Context, build
 from api.web.headers import Headers
 from api.workers.pool import WORKER
-
-
-def software_version() -> str:
-    """The installed distribution's version."""
-    try:
-        return version("stimrig")
-    except PackageNotFoundError:
-        return "0"
 
 
 class Service(FastAPI):
@@ -64,6 +56,7 @@ def create_app(
         title="stimrig",
         version=software_version(),
         summary="Pre-session tests, models of stimulated muscle, and the approved one for the controller.",
+        description=openapi.DESCRIPTION,
         lifespan=_lifespan(context),
         docs_url=None,
         redoc_url=None,
@@ -75,7 +68,7 @@ def create_app(
     problems.install(app)
     for router in [*routes.routers(), *pages.routers()]:
         app.include_router(router)
-    strict_body.describe(app)
+    openapi.describe(app)
     return app
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
-from fastapi import Depends, Request
+from fastapi import Depends, Request, Security
 from starlette.requests import HTTPConnection
 
 from api import owner_only
@@ -29,6 +29,7 @@ from api.store import Store, uploads
 from api.store.lock import ServiceLock
 from api.store.tables import Recording
 from api.web.guards import anyone_signed_in, require
+from api.web.openapi import problem
 from api.web.stop_guard import Press, anyone_who_may_stop
 from api.workers.pool import WORKER, Pool
 from api.workers.process import Places
@@ -153,17 +154,19 @@ async def from_request(request: Request) -> Context:
 Ctx = Annotated[Context, Depends(from_request)]
 Anyone = Annotated[Principal, Depends(anyone_signed_in)]
 MayStop = Annotated[Press, Depends(anyone_who_may_stop)]
-LiveReader = Annotated[Principal, Depends(require(Scope.READ_LIVE))]
-Tester = Annotated[Principal, Depends(require(Scope.RUN_TEST))]
-Rearmer = Annotated[Principal, Depends(require(Scope.REARM))]
-Approver = Annotated[Principal, Depends(require(Scope.APPROVE_MODEL))]
-ModelReader = Annotated[Principal, Depends(require(Scope.READ_MODEL))]
-Administrator = Annotated[Principal, Depends(require(Scope.ADMINISTER))]
+LiveReader = Annotated[Principal, Security(require(Scope.READ_LIVE), scopes=[Scope.READ_LIVE])]
+Tester = Annotated[Principal, Security(require(Scope.RUN_TEST), scopes=[Scope.RUN_TEST])]
+Rearmer = Annotated[Principal, Security(require(Scope.REARM), scopes=[Scope.REARM])]
+Approver = Annotated[Principal, Security(require(Scope.APPROVE_MODEL), scopes=[Scope.APPROVE_MODEL])]
+ModelReader = Annotated[Principal, Security(require(Scope.READ_MODEL), scopes=[Scope.READ_MODEL])]
+Administrator = Annotated[Principal, Security(require(Scope.ADMINISTER), scopes=[Scope.ADMINISTER])]
 
 PROBLEM: dict[int | str, dict[str, Any]] = {
-    code: {"description": text, "content": {"application/problem+json": {}}}
+    code: problem(text)
     for code, text in {
-        401: "not signed in", 403: "not allowed", 404: "not there", 409: "in conflict with what is",
-        422: "does not hold", 429: "too many wrong tries: `Retry-After`", 503: "the rig cannot be reached",
+        401: "not signed in", 403: "the scope or the form's token is missing", 404: "not there",
+        409: "in conflict with what is", 422: "does not hold: `errors` names the fields",
+        429: "too many wrong tries: `Retry-After`", 503: "the rig cannot be reached, or too much at once",
     }.items()
 }  # fmt: skip
+"""Problems of every route that asks who comes."""

@@ -4,20 +4,29 @@ from __future__ import annotations
 
 import hmac
 from collections.abc import Awaitable, Callable
-from typing import Any
+from typing import Annotated, Any
 
-from fastapi import Request
+from fastapi import Request, Security
+from fastapi.security import APIKeyCookie, HTTPBearer
 
 from api.errors import ApiError
-from api.people.auth import Principal, Scope
+from api.people.auth import COOKIE, Principal, Scope
 
 SAFE_METHODS = {"GET", "HEAD", "OPTIONS"}
+BEARER = HTTPBearer(scheme_name="token", description="a token, or a controller's key", auto_error=False)
+SESSION = APIKeyCookie(
+    name=COOKIE, scheme_name="session", auto_error=False,
+    description="set by `POST /v1/sessions`; everything but GET sends its `csrf` as `X-CSRF-Token`, too",
+)  # fmt: skip
+Token = Annotated[object, Security(BEARER)]
+Session = Annotated[object, Security(SESSION)]
+"""For the OpenAPI document; `Auth.identify` reads both."""
 
 
-def require(scope: Scope) -> Callable[[Request], Awaitable[Principal]]:
+def require(scope: Scope) -> Callable[..., Awaitable[Principal]]:
     """A dependency: the principal, if the scope is held and a session's form carries its CSRF token."""
 
-    async def check(request: Request) -> Principal:
+    async def check(request: Request, _token: Token, _session: Session) -> Principal:
         principal = request.app.state.context.auth.identify(request)
         if not principal.may(scope):
             detail = f"This needs the scope {scope}; {principal.name} holds {', '.join(sorted(principal.scopes))}."
@@ -31,7 +40,7 @@ def require(scope: Scope) -> Callable[[Request], Awaitable[Principal]]:
     return check
 
 
-async def anyone_signed_in(request: Request) -> Principal:
+async def anyone_signed_in(request: Request, _token: Token, _session: Session) -> Principal:
     """A dependency: anyone with a valid token or session."""
     principal = request.app.state.context.auth.identify(request)
     await check_csrf(request, principal)

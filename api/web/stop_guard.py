@@ -4,19 +4,24 @@ from __future__ import annotations
 
 import asyncio
 from dataclasses import dataclass
+from typing import Annotated
 
-from fastapi import Request
+from fastapi import Request, Security
+from fastapi.security import APIKeyHeader
 from pydantic import ValidationError
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
 from api.errors import ApiError
 from api.sessions.requests import StopIn
+from api.web.guards import Session, Token
 
 FIELD, HEADER = "right", "x-stop-right"
 PATIENCE_S, LONGEST_PATIENCE_S = 0.5, 3.0
 """A stop waits so long for its body; and so long where nothing but a right in it would allow the stop."""
 DEFAULT_REASON = "stop pressed"
+RIGHT = APIKeyHeader(name="X-Stop-Right", scheme_name="right", auto_error=False, description="a page's right to stop")
+Right = Annotated[object, Security(RIGHT)]
 
 
 @dataclass(frozen=True)
@@ -27,7 +32,7 @@ class Press:
     reason: str
 
 
-async def anyone_who_may_stop(request: Request) -> Press:
+async def anyone_who_may_stop(request: Request, _token: Token, _session: Session, _right: Right) -> Press:
     """A dependency for stop: who holds a page's right, or is signed in, be it that the session or token ran out.
 
     The right is looked at first: it needs no database, and nothing that holds back guesses holds it back.

@@ -8,9 +8,7 @@ from __future__ import annotations
 
 import re
 from codecs import BOM_UTF8
-from typing import Any
 
-from fastapi import FastAPI
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -77,20 +75,3 @@ def refuse_unsound(body: bytes) -> None:
         return  # the route names the field and the place
     except BadJson as error:
         raise HTTPException(400, f"The body: {error}. Send JSON (RFC 8259) in UTF-8.") from error
-
-
-def describe(app: FastAPI) -> None:
-    """Write what a body can be refused with into the OpenAPI document, at every operation that takes one."""
-    plain = app.openapi
-
-    def openapi() -> dict[str, Any]:
-        document = plain()
-        for methods in document["paths"].values():
-            for operation in methods.values():
-                if "requestBody" in operation:
-                    for code, words in REFUSALS.items():
-                        answer = {"description": words, "content": {"application/problem+json": {}}}
-                        operation["responses"].setdefault(code, answer)
-        return document
-
-    app.openapi = openapi

@@ -62,13 +62,13 @@ def describe(error: Exception) -> dict[str, Any]:
     import traceback
 
     if isinstance(error, IdentifyError):
-        place, mend = error.place, error.fix
-        return {"expected": True, "detail": one_line(error), "place": text_or_none(place), "mend": text_or_none(mend)}
+        place, fix = error.place, error.fix
+        return {"expected": True, "detail": one_line(error), "place": text_or_none(place), "fix": text_or_none(fix)}
     if isinstance(error, MemoryError):
         megabytes = confinement.MEMORY_BYTES // 2**20
-        mend = "Cut the record, or resample it to a lower rate."
-        detail = f"it takes more than the {megabytes} MB that a worker may have. {mend}"
-        return {"expected": True, "detail": detail, "place": None, "mend": mend}
+        fix = "Cut the record, or resample it to a lower rate."
+        detail = f"it takes more than the {megabytes} MB that a worker may have. {fix}"
+        return {"expected": True, "detail": detail, "place": None, "fix": fix}
     traceback.print_exc(file=sys.stderr)
     return {"expected": False, "detail": f"{type(error).__name__}: {one_line(error)}"}
 

@@ -211,7 +211,7 @@ class Worker:
 def call_error(verb: str, error: dict[str, Any]) -> ApiError:
     """A worker's error as a problem."""
     if error.get("expected"):
-        extra = {key: error[key] for key in ("place", "mend") if error.get(key)}
+        extra = {key: error[key] for key in ("place", "fix") if error.get(key)}
         return ApiError(422, "data", "The data do not allow this", error["detail"], **extra)
     detail = f"{error['detail']}. Your data are safe. See logs/api.log."
     return ApiError(500, "analysis-failed", f"The {verb} failed", detail)

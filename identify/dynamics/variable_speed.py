@@ -6,6 +6,8 @@ factor that depends on the state. Without a law the transition of the linear dyn
 
 from __future__ import annotations
 
+from enum import IntEnum
+
 import numpy as np
 from numba import njit
 
@@ -13,8 +15,64 @@ from identify.dynamics.boundary import step_matrix, through
 
 PARTS = 3
 """Number of steps within a pulse interval in which a speed law is evaluated."""
-LAWS = 27
-"""Columns of the speed law: see `factor`."""
+
+
+class SpeedLaw(IntEnum):
+    """What the speed depends on: each law is a column of the kernel's table, and is neutral at 0.
+
+    T is the time constant; y the torque, w the drive, a the state between the two lags, all as shares of y_max.
+    """
+
+    RATIO_BY_DRIVE = 0
+    """T: log ratio while the drive is below the torque"""
+    RATIO_BY_RATE = 1
+    """T: log ratio while the torque falls"""
+    TORQUE = 2
+    """T: linear in torque"""
+    DRIVE = 3
+    """T: linear in drive"""
+    EXPONENTIAL = 4
+    """T: exponential in torque"""
+    INVERSE_TORQUE = 5
+    """T: inverse linear in torque"""
+    INVERSE_DRIVE = 6
+    """T: inverse linear in drive"""
+    SLOW_TORQUE = 7
+    """slower lag: linear in torque"""
+    SLOW_RATIO_BY_DRIVE = 8
+    """slower lag: log ratio while the drive is below the torque"""
+    SLOW_INVERSE_DRIVE = 9
+    """slower lag: inverse linear in drive"""
+    ACTIVATION = 10
+    """T: linear in activation, the state between the two lags"""
+    LEVEL = 11
+    """T: power of 0.5 + 1.5 y/y_max; slower to rise and quicker to fall at high levels"""
+    SLOW_SATURATING_DRIVE = 12
+    """slower lag: linear in a drive that saturates"""
+    QUICK_RATIO_BY_RATE = 13
+    """quicker lag: log ratio while the torque falls"""
+    QUICK_RATIO_BY_DRIVE = 14
+    """quicker lag: log ratio while the drive is below the torque"""
+    SLOW_RATIO_BY_RATE = 15
+    """slower lag: log ratio while the torque falls"""
+    SLOW_CALCIUM = 16
+    """slower lag: linear in bound calcium, which follows with the quicker lag whether there is drive"""
+    QUICK_CALCIUM = 17
+    """quicker lag: linear in bound calcium, which follows with the slower lag"""
+    SLOW_LEVEL = 18
+    """slower lag: as LEVEL"""
+    SLOW_SECOND_ACTIVATION = 19
+    """two lags in a row, the slower one second: linear in its input a"""
+    SLOW_SECOND_ATTACHED = 20
+    """the same: inverse linear in torque"""
+    QUICK_SECOND_ACTIVATION = 21
+    """two lags in a row, the quicker one second: linear in its input a"""
+    QUICK_SECOND_ATTACHED = 22
+    """the same: inverse linear in torque"""
+    SLOW_PUMP = 23
+    """two lags in a row, the slower one first: a pump that saturates, linear in a and in drive"""
+    QUICK_PUMP = 24
+    """the same with the quicker one first"""
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -26,80 +84,61 @@ def _uptake(slope, w, a):  # pragma: no cover
 
 @njit(cache=True, nogil=True, inline="always")
 def _factor(law, w, y, v, scale_nm, slow_s, quick_s, bound):  # pragma: no cover
-    """Factors on T, on the slower and on the quicker lag. `law` holds, each neutral at 0:
-
-    0 log ratio where the drive is below the torque (relaxing), 1 log ratio where torque falls,
-    2 linear in torque, 3 linear in drive, 4 exponential in torque, 5 inverse linear in torque,
-    6 inverse linear in drive; on the slower of the two lags alone:
-    7 linear in torque, 8 log ratio where the drive is below the torque, 9 inverse linear in drive,
-    10 linear in activation (the state between the two lags), 11 on T, linear in activation, 12 on T, power of
-    0.5 + 1.5 a: slower to rise and quicker to fall at high levels, 13 linear in a drive that saturates;
-    on the quicker lag: 14 linear in activation, 15 log ratio where torque falls, 16 log ratio where the drive is
-    below the torque; 17 as 15 on the slower lag; 18 slower lag, linear in bound calcium c (c follows whether there is
-    drive at all, with the quicker lag), 19 quicker lag, linear in c (with the slower lag);
-    20 as 12 on the slower lag; two lags in a row, of which the second keeps its input a when its speed changes:
-    21 the slower second and linear in a, 22 the slower second and inverse linear in torque, 23 and 24 the same with
-    the quicker second; of which the first is a pump that saturates, linear in a and in drive: 25 the slower, 26 the
-    quicker first.
-    """
+    """Factors on T, on the slower and on the quicker lag; `law` holds a value for each `SpeedLaw`."""
     m = 1.0
-    if law[0] != 0.0:
+    if law[SpeedLaw.RATIO_BY_DRIVE] != 0.0:
         d = (w - y) / (0.02 * scale_nm)
-        m *= np.exp(law[0] * 0.5 * (1.0 - d / np.sqrt(1.0 + d * d)))
-    if law[1] != 0.0:
+        m *= np.exp(law[SpeedLaw.RATIO_BY_DRIVE] * 0.5 * (1.0 - d / np.sqrt(1.0 + d * d)))
+    if law[SpeedLaw.RATIO_BY_RATE] != 0.0:
         d = v / (0.1 * scale_nm)
-        m *= np.exp(law[1] * 0.5 * (1.0 - d / np.sqrt(1.0 + d * d)))
+        m *= np.exp(law[SpeedLaw.RATIO_BY_RATE] * 0.5 * (1.0 - d / np.sqrt(1.0 + d * d)))
     level = abs(y) / scale_nm
-    if law[2] != 0.0:
-        m *= max(1.0 + law[2] * level, 0.08)
-    if law[3] != 0.0:
-        m *= max(1.0 + law[3] * abs(w) / scale_nm, 0.08)
-    if law[4] != 0.0:
-        m *= np.exp(law[4] * level)
-    if law[5] != 0.0:
-        m *= 1.0 / max(1.0 + law[5] * level, 0.08)
-    if law[6] != 0.0:
-        m *= 1.0 / max(1.0 + law[6] * abs(w) / scale_nm, 0.08)
+    if law[SpeedLaw.TORQUE] != 0.0:
+        m *= max(1.0 + law[SpeedLaw.TORQUE] * level, 0.08)
+    if law[SpeedLaw.DRIVE] != 0.0:
+        m *= max(1.0 + law[SpeedLaw.DRIVE] * abs(w) / scale_nm, 0.08)
+    if law[SpeedLaw.EXPONENTIAL] != 0.0:
+        m *= np.exp(law[SpeedLaw.EXPONENTIAL] * level)
+    if law[SpeedLaw.INVERSE_TORQUE] != 0.0:
+        m *= 1.0 / max(1.0 + law[SpeedLaw.INVERSE_TORQUE] * level, 0.08)
+    if law[SpeedLaw.INVERSE_DRIVE] != 0.0:
+        m *= 1.0 / max(1.0 + law[SpeedLaw.INVERSE_DRIVE] * abs(w) / scale_nm, 0.08)
     d = 1.0
-    if law[7] != 0.0:
-        d *= max(1.0 + law[7] * level, 0.08)
-    if law[8] != 0.0:
+    if law[SpeedLaw.SLOW_TORQUE] != 0.0:
+        d *= max(1.0 + law[SpeedLaw.SLOW_TORQUE] * level, 0.08)
+    if law[SpeedLaw.SLOW_RATIO_BY_DRIVE] != 0.0:
         gap = (w - y) / (0.02 * scale_nm)
-        d *= np.exp(law[8] * 0.5 * (1.0 - gap / np.sqrt(1.0 + gap * gap)))
-    if law[9] != 0.0:
-        d *= 1.0 / max(1.0 + law[9] * abs(w) / scale_nm, 0.08)
-    if law[10] != 0.0 or law[11] != 0.0:
+        d *= np.exp(law[SpeedLaw.SLOW_RATIO_BY_DRIVE] * 0.5 * (1.0 - gap / np.sqrt(1.0 + gap * gap)))
+    if law[SpeedLaw.SLOW_INVERSE_DRIVE] != 0.0:
+        d *= 1.0 / max(1.0 + law[SpeedLaw.SLOW_INVERSE_DRIVE] * abs(w) / scale_nm, 0.08)
+    if law[SpeedLaw.ACTIVATION] != 0.0:
         between = min(max((y + slow_s * v) / scale_nm, 0.0), 1.2)
-        d *= max(1.0 + law[10] * between, 0.08)
-        m *= max(1.0 + law[11] * between, 0.08)
-    if law[12] != 0.0 or law[20] != 0.0:
+        m *= max(1.0 + law[SpeedLaw.ACTIVATION] * between, 0.08)
+    if law[SpeedLaw.LEVEL] != 0.0 or law[SpeedLaw.SLOW_LEVEL] != 0.0:
         gap = (w - y) / (0.02 * scale_nm)
         side = np.log(0.5 + 1.5 * min(level, 1.2)) * gap / np.sqrt(1.0 + gap * gap)
-        m *= np.exp(law[12] * side)
-        d *= np.exp(law[20] * side)
-    if law[13] != 0.0:
+        m *= np.exp(law[SpeedLaw.LEVEL] * side)
+        d *= np.exp(law[SpeedLaw.SLOW_LEVEL] * side)
+    if law[SpeedLaw.SLOW_SATURATING_DRIVE] != 0.0:
         part = abs(w) / scale_nm
-        d *= max(1.0 + law[13] * 1.15 * part / (part + 0.15), 0.08)
+        d *= max(1.0 + law[SpeedLaw.SLOW_SATURATING_DRIVE] * 1.15 * part / (part + 0.15), 0.08)
     q = 1.0
-    if law[14] != 0.0:
-        between = min(max((y + quick_s * v) / scale_nm, 0.0), 1.2)
-        q *= max(1.0 + law[14] * between, 0.08)
-    if law[15] != 0.0 or law[17] != 0.0:
+    if law[SpeedLaw.QUICK_RATIO_BY_RATE] != 0.0 or law[SpeedLaw.SLOW_RATIO_BY_RATE] != 0.0:
         gap = v / (0.1 * scale_nm)
         side = 0.5 * (1.0 - gap / np.sqrt(1.0 + gap * gap))
-        q *= np.exp(law[15] * side)
-        d *= np.exp(law[17] * side)
-    if law[16] != 0.0:
+        q *= np.exp(law[SpeedLaw.QUICK_RATIO_BY_RATE] * side)
+        d *= np.exp(law[SpeedLaw.SLOW_RATIO_BY_RATE] * side)
+    if law[SpeedLaw.QUICK_RATIO_BY_DRIVE] != 0.0:
         gap = (w - y) / (0.02 * scale_nm)
-        q *= np.exp(law[16] * 0.5 * (1.0 - gap / np.sqrt(1.0 + gap * gap)))
-    if law[18] != 0.0:
-        d *= max(1.0 + law[18] * bound, 0.08)
-    if law[19] != 0.0:
-        q *= max(1.0 + law[19] * bound, 0.08)
-    if law[25] != 0.0:
-        d *= _uptake(law[25], w / scale_nm, (y + quick_s * v) / scale_nm)
-    if law[26] != 0.0:
-        q *= _uptake(law[26], w / scale_nm, (y + slow_s * v) / scale_nm)
+        q *= np.exp(law[SpeedLaw.QUICK_RATIO_BY_DRIVE] * 0.5 * (1.0 - gap / np.sqrt(1.0 + gap * gap)))
+    if law[SpeedLaw.SLOW_CALCIUM] != 0.0:
+        d *= max(1.0 + law[SpeedLaw.SLOW_CALCIUM] * bound, 0.08)
+    if law[SpeedLaw.QUICK_CALCIUM] != 0.0:
+        q *= max(1.0 + law[SpeedLaw.QUICK_CALCIUM] * bound, 0.08)
+    if law[SpeedLaw.SLOW_PUMP] != 0.0:
+        d *= _uptake(law[SpeedLaw.SLOW_PUMP], w / scale_nm, (y + quick_s * v) / scale_nm)
+    if law[SpeedLaw.QUICK_PUMP] != 0.0:
+        q *= _uptake(law[SpeedLaw.QUICK_PUMP], w / scale_nm, (y + slow_s * v) / scale_nm)
     return min(max(m, 0.02), 50.0), min(max(d, 0.02), 50.0), min(max(q, 0.02), 50.0)
 
 
@@ -126,8 +165,8 @@ def run_core(
         Held drive of each interval, N·m.
     time_constant_s, damping : ndarray, shape (M,)
         T, s, and ζ.
-    law : ndarray, shape (M, LAWS)
-        Coefficients of the speed law.
+    law : ndarray, shape (M, len(SpeedLaw))
+        Coefficient of each speed law.
     multiplier : ndarray, shape (M or 1 or 0, K)
         A further, given factor on T; no rows if there is none.
     begins : ndarray of int, shape (B,)
@@ -165,10 +204,10 @@ def run_core(
         for j in range(law.shape[1]):
             alike = alike and law[m, j] == law[0, j]
         y, v, bound, part = 0.0, 0.0, 0.0, 0
-        slow_second = law[m, 21] != 0.0 or law[m, 22] != 0.0
-        quick_second = law[m, 23] != 0.0 or law[m, 24] != 0.0
+        slow_second = law[m, SpeedLaw.SLOW_SECOND_ACTIVATION] != 0.0 or law[m, SpeedLaw.SLOW_SECOND_ATTACHED] != 0.0
+        quick_second = law[m, SpeedLaw.QUICK_SECOND_ACTIVATION] != 0.0 or law[m, SpeedLaw.QUICK_SECOND_ATTACHED] != 0.0
         last = 1.0
-        forget = np.exp(-step_s / PARTS / max(quick_s if law[m, 18] != 0.0 else slow_s, 1e-4))
+        forget = np.exp(-step_s / PARTS / max(quick_s if law[m, SpeedLaw.SLOW_CALCIUM] != 0.0 else slow_s, 1e-4))
         if alike and varied:
             four[many % 4] = m
             many += 1
@@ -198,11 +237,27 @@ def run_core(
                     f, d, q = _factor(law[m], w, y, v, scale_nm, slow_s, quick_s, bound)
                 turned = 1.0
                 if slow_second:
-                    second = _second(law[m], 21, 22, y, v, last * slow_s, scale_nm)
+                    second = _second(
+                        law[m],
+                        SpeedLaw.SLOW_SECOND_ACTIVATION,
+                        SpeedLaw.SLOW_SECOND_ATTACHED,
+                        y,
+                        v,
+                        last * slow_s,
+                        scale_nm,
+                    )
                     d *= second
                     turned, last = last / second, second
                 elif quick_second:
-                    second = _second(law[m], 23, 24, y, v, last * quick_s, scale_nm)
+                    second = _second(
+                        law[m],
+                        SpeedLaw.QUICK_SECOND_ACTIVATION,
+                        SpeedLaw.QUICK_SECOND_ATTACHED,
+                        y,
+                        v,
+                        last * quick_s,
+                        scale_nm,
+                    )
                     q *= second
                     turned, last = last / second, second
                 v *= turned  # y' = (a - y) / lag: a stays the same when the lag changes

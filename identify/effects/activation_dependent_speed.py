@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+from identify.dynamics.variable_speed import SpeedLaw as Law
 from identify.effects.base import Effect, Form, Parameter
 
 
-def _form(name: str, equation: str, column: int, lower: float = -0.85, upper: float = 5.0) -> Form:
+def _form(name: str, equation: str, law: Law, lower: float = -0.85, upper: float = 5.0) -> Form:
     slope = Parameter("slope", "1", lower, upper, 0.0, (0.5, -0.35), about="change of T from rest to full torque")
-    return Form(name, "speed", equation, (slope,), law={"slope": column})
+    return Form(name, "speed", equation, (slope,), law={"slope": law})
 
 
-def _two_lags(name: str, equation: str, column: int, source: str) -> Form:
+def _two_lags(name: str, equation: str, law: Law, source: str) -> Form:
     """A form for two different lags; it is also started from two different lags, in case the base model has none."""
     slope = Parameter("slope", "1", -0.9, 20.0, 0.0, (0.5, -0.35), about="change of the lag from rest to full torque")
     apart = ({"slope": 1.0, "base.damping": 1.25},)
-    return Form(name, "speed", equation, (slope,), law={"slope": column}, restarts=apart, source=source)
+    return Form(name, "speed", equation, (slope,), law={"slope": law}, restarts=apart, source=source)
 
 
 _BOUND = "Ding, Wexler, Binder-Macleod 2000: force decays with τ1 + τ2·(bound calcium)"
@@ -26,32 +27,58 @@ EFFECT = Effect(
     id="activation_dependent_speed",
     name="Speed depends on activation",
     forms=(
-        _form("torque", "T (1 + slope·y/y_max)", 2),
-        _form("drive", "T (1 + slope·w/y_max)", 3),
-        _form("exponential", "T exp(slope·y/y_max)", 4, -2.0, 2.0),
-        _form("inverse_torque", "T/(1 + slope·y/y_max)", 5),
-        _form("inverse_drive", "T/(1 + slope·w/y_max)", 6),
-        _form("slow_lag", "slower lag times (1 + slope·y/y_max)", 7),
-        _form("inverse_slow_lag", "slower lag divided by (1 + slope·w/y_max)", 9),
-        _form("bound", "slower lag times (1 + slope·1.15 s/(s + 0.15)), s = w/y_max", 13),
-        _form("activation", "T (1 + slope·a/y_max), a: the state between the two lags", 11),
+        _form("torque", "T (1 + slope·y/y_max)", Law.TORQUE),
+        _form("drive", "T (1 + slope·w/y_max)", Law.DRIVE),
+        _form("exponential", "T exp(slope·y/y_max)", Law.EXPONENTIAL, -2.0, 2.0),
+        _form("inverse_torque", "T/(1 + slope·y/y_max)", Law.INVERSE_TORQUE),
+        _form("inverse_drive", "T/(1 + slope·w/y_max)", Law.INVERSE_DRIVE),
+        _form("slow_lag", "slower lag times (1 + slope·y/y_max)", Law.SLOW_TORQUE),
+        _form("inverse_slow_lag", "slower lag divided by (1 + slope·w/y_max)", Law.SLOW_INVERSE_DRIVE),
+        _form("bound", "slower lag times (1 + slope·1.15 s/(s + 0.15)), s = w/y_max", Law.SLOW_SATURATING_DRIVE),
+        _form("activation", "T (1 + slope·a/y_max), a: the state between the two lags", Law.ACTIVATION),
         _form(
             "calcium_slow_lag",
             "slower lag times (1 + slope·c), c: bound calcium, which follows the stimulation",
-            18,
+            Law.SLOW_CALCIUM,
             -0.9,
             12.0,
         ),
-        _form("calcium_quick_lag", "faster lag times (1 + slope·c), c: bound calcium", 19, -0.9, 12.0),
-        _two_lags("activation_slow_lag", "a' = (w - a)/fast, y' = (a - y)/(slow (1 + slope·a/y_max))", 21, _BOUND),
-        _two_lags("attached_slow_lag", "a' = (w - a)/fast, y' = (a - y)(1 + slope·y/y_max)/slow", 22, _ATTACHED),
-        _two_lags("activation_quick_lag", "a' = (w - a)/slow, y' = (a - y)/(quick (1 + slope·a/y_max))", 23, _BOUND),
-        _two_lags("attached_quick_lag", "a' = (w - a)/slow, y' = (a - y)(1 + slope·y/y_max)/quick", 24, _ATTACHED),
+        _form("calcium_quick_lag", "faster lag times (1 + slope·c), c: bound calcium", Law.QUICK_CALCIUM, -0.9, 12.0),
         _two_lags(
-            "pump_slow_lag", "a' = (w/(1 + s·w) - a/(1 + s·a))/slow, y' = (a - y)/fast, s = slope/y_max", 25, _PUMP
+            "activation_slow_lag",
+            "a' = (w - a)/fast, y' = (a - y)/(slow (1 + slope·a/y_max))",
+            Law.SLOW_SECOND_ACTIVATION,
+            _BOUND,
         ),
         _two_lags(
-            "pump_quick_lag", "a' = (w/(1 + s·w) - a/(1 + s·a))/fast, y' = (a - y)/slow, s = slope/y_max", 26, _PUMP
+            "attached_slow_lag",
+            "a' = (w - a)/fast, y' = (a - y)(1 + slope·y/y_max)/slow",
+            Law.SLOW_SECOND_ATTACHED,
+            _ATTACHED,
+        ),
+        _two_lags(
+            "activation_quick_lag",
+            "a' = (w - a)/slow, y' = (a - y)/(quick (1 + slope·a/y_max))",
+            Law.QUICK_SECOND_ACTIVATION,
+            _BOUND,
+        ),
+        _two_lags(
+            "attached_quick_lag",
+            "a' = (w - a)/slow, y' = (a - y)(1 + slope·y/y_max)/quick",
+            Law.QUICK_SECOND_ATTACHED,
+            _ATTACHED,
+        ),
+        _two_lags(
+            "pump_slow_lag",
+            "a' = (w/(1 + s·w) - a/(1 + s·a))/slow, y' = (a - y)/fast, s = slope/y_max",
+            Law.SLOW_PUMP,
+            _PUMP,
+        ),
+        _two_lags(
+            "pump_quick_lag",
+            "a' = (w/(1 + s·w) - a/(1 + s·a))/fast, y' = (a - y)/slow, s = slope/y_max",
+            Law.QUICK_PUMP,
+            _PUMP,
         ),
     ),
     signature="Small torques develop faster (or slower) than large ones: the sign of the error depends on level and "

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from identify.dynamics.variable_speed import SpeedLaw
 from identify.effects.base import Effect, Form, Parameter, Scene
 from identify.effects.kernels import activate, activate_by_level
 
@@ -38,7 +39,7 @@ EFFECT = Effect(
             "speed",
             "T·ratio while the drive is below the torque, else T",
             (_RATIO,),
-            law={"ratio": 0},
+            law={"ratio": SpeedLaw.RATIO_BY_DRIVE},
             log_law=("ratio",),
         ),
         Form(
@@ -46,7 +47,7 @@ EFFECT = Effect(
             "speed",
             "T·ratio while the torque falls, else T",
             (_RATIO,),
-            law={"ratio": 1},
+            law={"ratio": SpeedLaw.RATIO_BY_RATE},
             log_law=("ratio",),
         ),
         Form(
@@ -54,15 +55,15 @@ EFFECT = Effect(
             "speed",
             "slower lag·ratio while the drive is below the torque",
             (_RATIO,),
-            law={"ratio": 8},
+            law={"ratio": SpeedLaw.SLOW_RATIO_BY_DRIVE},
             log_law=("ratio",),
         ),
         *(
-            Form(name, "speed", words, (_RATIO,), law={"ratio": column}, log_law=("ratio",))
-            for name, words, column in (
-                ("slow_lag_by_rate", "slower lag·ratio while the torque falls", 17),
-                ("quick_lag", "faster lag·ratio while the drive is below the torque", 16),
-                ("quick_lag_by_rate", "faster lag·ratio while the torque falls", 15),
+            Form(name, "speed", words, (_RATIO,), law={"ratio": law}, log_law=("ratio",))
+            for name, words, law in (
+                ("slow_lag_by_rate", "slower lag·ratio while the torque falls", SpeedLaw.SLOW_RATIO_BY_RATE),
+                ("quick_lag", "faster lag·ratio while the drive is below the torque", SpeedLaw.QUICK_RATIO_BY_DRIVE),
+                ("quick_lag_by_rate", "faster lag·ratio while the torque falls", SpeedLaw.QUICK_RATIO_BY_RATE),
             )
         ),
         *(
@@ -76,8 +77,8 @@ EFFECT = Effect(
                 source="Winters 1995; Thelen 2003",
             )
             for name, lag, first, second in (
-                ("by_level", "T", 0, 12),
-                ("slow_lag_by_level", "slower lag", 8, 20),
+                ("by_level", "T", SpeedLaw.RATIO_BY_DRIVE, SpeedLaw.LEVEL),
+                ("slow_lag_by_level", "slower lag", SpeedLaw.SLOW_RATIO_BY_DRIVE, SpeedLaw.SLOW_LEVEL),
             )
         ),
         Form(

@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from identify.dynamics.variable_speed import SpeedLaw
+
 STAGES = ("pulse_width", "gain", "speed", "branch", "delay", "filter", "output", "additive", "sensor")
 """The stages at which a form can act, in the order in which the signal passes them: see `Form`."""
 
@@ -182,7 +184,7 @@ class Form:
     parameters: tuple[Parameter, ...]
     apply: Apply | None = None
     batched: bool = False
-    law: dict[str, int] = field(default_factory=dict)
+    law: dict[str, SpeedLaw] = field(default_factory=dict)
     log_law: tuple[str, ...] = ()
     propose: Callable[[np.ndarray, Scene, dict[str, float]], list[dict[str, float]]] | None = None
     grows: bool = False

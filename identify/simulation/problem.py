@@ -15,7 +15,7 @@ import numpy as np
 from identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUNDS_S
 from identify.dynamics.mean_weights import read_means
 from identify.dynamics.second_order import Core
-from identify.dynamics.variable_speed import LAWS, run_core
+from identify.dynamics.variable_speed import SpeedLaw, run_core
 from identify.effects.base import Form, Parameter
 from identify.recruitment.curve import Basis
 from identify.simulation.setup import Setup
@@ -267,7 +267,7 @@ class _StagePass:
         drive = drive[rows]
         rows, initial = self.join(self.problem.initials)
         drive, core = drive[rows], core[rows]
-        law = np.zeros((drive.shape[0], LAWS))
+        law = np.zeros((drive.shape[0], len(SpeedLaw)))
         given: list[tuple[Chosen, np.ndarray]] = []
         for chosen in self.forms("speed"):
             rows, values = self.join(chosen.places)

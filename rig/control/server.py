@@ -15,6 +15,7 @@ from typing import Any
 
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
+from rig import plan
 from rig.control.connections import Connections
 from rig.control.previews import Previews
 from rig.control.replies import head_of, id_of, internal_error, invalid_request, refusal, to_line
@@ -194,6 +195,8 @@ class Server:
         match request.kind:
             case "start":
                 return self.rig.start(request.plan)
+            case "sequences":
+                return plan.library()
             case "rearm":
                 return self.rig.rearm(request.by)
             case "calibrate-start":

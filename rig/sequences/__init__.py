@@ -14,6 +14,7 @@ declares `JUMPS = True`, or has a setting `jumps` if the caller decides.
 from __future__ import annotations
 
 import importlib
+import inspect
 import pkgutil
 from functools import cache
 from typing import Any, Protocol, cast
@@ -23,6 +24,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from rig.errors import PlanError
+from rig.messages import SequenceInfo
 
 Floats = NDArray[np.float64] | list[float]
 
@@ -85,6 +87,18 @@ def settings_of(sequence_id: str, settings: dict[str, Any]) -> SequenceSettings:
         place = ".".join(str(part) for part in first["loc"]) or "settings"
         known = ", ".join(model.model_fields) or "none"
         raise PlanError(f"{sequence_id}.{place}: {first['msg']} (settings: {known})") from None
+
+
+def described() -> list[SequenceInfo]:
+    """Every sequence with what its file says of it, and its settings as JSON Schema."""
+    return [
+        SequenceInfo(
+            id=name,
+            description=" ".join((inspect.getdoc(sequence) or "").partition("\n\n")[0].split()),
+            settings=sequence.Settings.model_json_schema(),
+        )
+        for name, sequence in library().items()
+    ]
 
 
 def build(sequence_id: str, settings: dict[str, Any], pulse_rate_hz: float) -> NDArray[np.float64]:

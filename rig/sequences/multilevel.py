@@ -18,11 +18,11 @@ JUMPS = True
 class Settings(SequenceSettings):
     max_pulse_width_us: float = Field(300.0, description="highest level c, µs")
     min_pulse_width_us: float = Field(0.0, ge=0, description="lowest level that is not zero, µs")
-    duration_s: float = Field(7.0, gt=0, le=600)
-    min_hold_s: float = Field(0.3, gt=0, le=600)
-    max_hold_s: float = Field(1.0, gt=0, le=600)
+    duration_s: float = Field(7.0, gt=0, le=600, description="length, s")
+    min_hold_s: float = Field(0.3, gt=0, le=600, description="shortest time on a level, s")
+    max_hold_s: float = Field(1.0, gt=0, le=600, description="longest time on a level, s")
     zero_share: float = Field(0.15, ge=0, lt=1, description="share of the levels that are zero")
-    seed: int = Field(20, ge=0)
+    seed: int = Field(20, ge=0, description="of the random numbers")
 
     @model_validator(mode="after")
     def _ordered(self) -> Settings:

@@ -11,8 +11,8 @@ from rig.sequences import SequenceSettings, pulses_in
 
 class Settings(SequenceSettings):
     max_pulse_width_us: float = Field(300.0, description="top of the ramp c, µs")
-    up_s: float = Field(5.0, gt=0, le=120)
-    down_s: float = Field(5.0, gt=0, le=120)
+    up_s: float = Field(5.0, gt=0, le=120, description="time from 0 to c, s")
+    down_s: float = Field(5.0, gt=0, le=120, description="time from c to 0, s")
 
 
 def pulse_count(settings: Settings, pulse_rate_hz: float) -> int:

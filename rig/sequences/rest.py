@@ -10,7 +10,7 @@ from rig.sequences import SequenceSettings, pulses_in
 
 
 class Settings(SequenceSettings):
-    duration_s: float = Field(2.0, gt=0, le=600)
+    duration_s: float = Field(2.0, gt=0, le=600, description="length, s")
 
 
 def pulse_count(settings: Settings, pulse_rate_hz: float) -> int:

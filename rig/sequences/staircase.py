@@ -14,7 +14,7 @@ JUMPS = True
 class Settings(SequenceSettings):
     max_pulse_width_us: float = Field(300.0, description="highest step c, µs")
     levels: int = Field(6, ge=1, le=100, description="steps from 0 up to c")
-    hold_s: float = Field(1.0, gt=0, le=60)
+    hold_s: float = Field(1.0, gt=0, le=60, description="time on each step, s")
     down: bool = Field(True, description="come down by the same steps")
 
 

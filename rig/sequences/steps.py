@@ -13,9 +13,9 @@ JUMPS = True
 
 class Settings(SequenceSettings):
     max_pulse_width_us: float = Field(300.0, description="level while on, µs")
-    on_s: float = Field(1.0, gt=0, le=120)
-    off_s: float = Field(1.5, ge=0, le=120)
-    repeats: int = Field(3, ge=1, le=1000)
+    on_s: float = Field(1.0, gt=0, le=120, description="time on, s")
+    off_s: float = Field(1.5, ge=0, le=120, description="time off, s")
+    repeats: int = Field(3, ge=1, le=1000, description="number of steps")
 
 
 def pulse_count(settings: Settings, pulse_rate_hz: float) -> int:

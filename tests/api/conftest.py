@@ -9,13 +9,16 @@ import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
 import uvicorn
+from argon2 import PasswordHasher
 
+from api.people import passwords
 from api.settings import Settings
 from api.web import connections
 from api.web.app import create_app
@@ -25,6 +28,21 @@ TOKEN = "administrator-token-of-the-tests"
 PATIENCE_S = 60.0
 """For each answer: a busy machine is slow, and a test says so where an answer has to be quick."""
 STUB = (sys.executable, str(Path(__file__).parent / "stub_worker.py"))
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Whatever asks for a running service, by whichever fixture, is marked `service`."""
+    for item in items:
+        if {"short_dir", "service"} & set(getattr(item, "fixturenames", ())):
+            item.add_marker("service")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def quick_passwords() -> Iterator[None]:
+    """A password check costs 0.1 s of a processor on purpose; `test_people` looks at the real parameters."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(passwords, "PasswordHasher", partial(PasswordHasher, time_cost=1, memory_cost=64, parallelism=1))
+        yield
 
 
 @dataclass

@@ -82,7 +82,7 @@ class FakeRig:
         self.warnings: list[str] = []
         self.torque_age_s = 0.004
         self.cell_speaks = True
-        self.mended = True
+        self.device_back = True
         self._idle: asyncio.Task[None] | None = None
         self.require_calibration = False
         self.limits = {
@@ -180,6 +180,14 @@ class FakeRig:
             segments=segments,
         ).model_dump()  # fmt: skip
 
+    async def _on_sequences(self, request: Any, writer: Any) -> dict[str, Any]:
+        rest = m.SequenceInfo(
+            id="rest", description="No pulses.",
+            settings={"type": "object", "properties": {"duration_s": {"type": "number", "maximum": 600}}},
+        )  # fmt: skip
+        default = [m.SegmentPlan(name="rest", sequence="rest", settings={"duration_s": 1.0})]
+        return m.Sequences(sequences=[rest], default=default).model_dump()
+
     async def _on_start(self, request: Any, writer: Any) -> dict[str, Any]:
         if self.state == "running":
             raise m_refusal("busy", "A test is running", "Wait or stop it.")
@@ -252,7 +260,7 @@ class FakeRig:
         ).model_dump()
 
     async def _on_rearm(self, request: Any, writer: Any) -> dict[str, Any]:
-        if not self.mended:
+        if not self.device_back:
             raise m_refusal("disconnected", "A device does not answer", "load cell: no torque comes; check its cable")
         self.become("ready")
         return self.status().model_dump()

@@ -127,11 +127,10 @@ def answer(verb: str, arguments: dict[str, Any], say: Any) -> dict[str, Any]:
         Path(arguments["out"]).write_text("\n".join(arguments["parts"]))
         return {"result": {"file_sha256": "0" * 64}}
     if verb == "effects":
-        return {
-            "result": {
-                "effects": [{"id": name} for name in ("fatigue", "tremor", "threshold_drift", "slow", "die", "bad")]
-            }
-        }
+        names = ("fatigue", "tremor", "threshold_drift", "slow", "die", "bad")
+        words = dict.fromkeys(("name", "stage", "equation", "source", "signature", "separated_by", "plain"), "made up")
+        lists = {name: [] for name in ("parameters", "forms", "confused_with", "needs")}
+        return {"result": {"effects": [{"id": name, **words, **lists, "predictable": True} for name in names]}}
     if verb == "export_csv":
         Path(arguments["out"]).write_text("time_s,pulse_width_us,torque_nm,segment\n0.0,0.0,0.0,rest\n")
         return {"result": {"rows": 1}}

@@ -40,6 +40,7 @@ def test_numbers_without_a_direction_and_those_of_the_sensor_say_nothing() -> No
     assert "direction" not in hum["sin_1_nm"]
 
 
+@pytest.mark.slow
 def test_the_diagnosis_tells_it_too_in_a_terminal_and_on_the_page() -> None:
     missing = identify.diagnose(drifting(-1)).missing
     entry = next(entry for entry in missing if entry["effect"] == "baseline_drift")

@@ -30,15 +30,13 @@ def seed_by_what_it_hides() -> int:
 
 
 @pytest.mark.wire
-@pytest.mark.slow
+@pytest.mark.campaign
 @pytest.mark.timeout(600)
 def test_hidden_effect_is_named_added_and_the_error_falls(tmp_path: Path) -> None:
+    """On a quiet machine: late and dropped pulses leave traces of their own in the record."""
     found = run(seed_by_what_it_hides(), 1.0, tmp_path)
     plain, last = (found["steps"][at]["times_noise"] for at in (0, -1))
-    good = found["agrees"] and last <= FALLS_TO * plain
-    late, dropped = found["lateness_ms"], found["dropped_pulses"]
-    if not good and (dropped or not (late["p99"] < TIMELY_MS and late["max"] < 10 * TIMELY_MS)):
-        pytest.skip(f"pulses late (p99 {late['p99']:.1f}, worst {late['max']:.1f} ms), {dropped} dropped: too busy")
+    assert found["dropped_pulses"] == 0 and found["lateness_ms"]["p99"] < TIMELY_MS, found
     assert found["agrees"], found
     assert plain > 5, found
     assert last <= FALLS_TO * plain, found

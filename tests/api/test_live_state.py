@@ -27,7 +27,7 @@ def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterat
 @pytest.fixture
 def tab(tab: Any, service: Service) -> Iterator[Any]:
     yield tab
-    service.rig.mute, service.rig.cell_speaks, service.rig.mended, service.rig.speed = False, True, True, SPEED
+    service.rig.mute, service.rig.cell_speaks, service.rig.device_back, service.rig.speed = False, True, True, SPEED
 
 
 @pytest.fixture(scope="module")
@@ -159,10 +159,10 @@ def test_a_silent_load_cell_leaves_a_way_back_on_every_page(tab: Any, service: S
 
 def test_a_reconnect_in_vain_says_why_and_can_be_tried_again(tab: Any, service: Service) -> None:
     service.rig_thread.become("disconnected", SILENT_CELL)
-    service.rig.mended = False
+    service.rig.device_back = False
     tab.get_by_role("button", name="Reconnect").click()
     tab.get_by_text("no torque arrives; check its cable").wait_for()
-    service.rig.mended = True
+    service.rig.device_back = True
     tab.get_by_role("button", name="Reconnect").click()
     says(tab, "No stimulation ready")
 

@@ -140,6 +140,7 @@ def test_an_older_stimrig_refuses_a_database_of_today(tmp_path: Path) -> None:
         assert database.execute("SELECT MAX(version) FROM schema_version").fetchone()[0] > 4
 
 
+@pytest.mark.slow
 def test_the_service_says_so_in_one_line_and_ends(tmp_path: Path) -> None:
     path = tmp_path / "stimrig.db"
     Store(f"sqlite:///{path}").close()

@@ -46,6 +46,7 @@ def served(data: Path, **more: str) -> Iterator[tuple[subprocess.Popen[str], str
         process.wait(20)
 
 
+@pytest.mark.slow
 def test_a_second_service_is_told_who_holds_the_data_and_a_kill_lets_go(tmp_path: Path) -> None:
     data, other, link = tmp_path / "data", tmp_path / "other", tmp_path / "link.db"
     with served(data) as (first, url):
@@ -165,6 +166,7 @@ def test_new_folders_are_closed_and_shared_ones_stay_as_they_are(tmp_path: Path)
     assert mode(shared) == 0o770
 
 
+@pytest.mark.slow
 def test_files_of_the_process_are_its_owners_alone(tmp_path: Path) -> None:
     """Uploads, exports and logs too: by the process's own mask, whatever it was started with."""
     before = os.umask(0)

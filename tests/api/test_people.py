@@ -9,12 +9,14 @@ import sqlite3
 from pathlib import Path
 from typing import Any
 
+import argon2
 import httpx
 import pytest
 from fastapi.routing import APIRoute
 
 from api.cli import main
 from api.clock import Clock
+from api.people import passwords
 from api.people.auth import Scope
 from api.people.pace import Pace
 from api.settings import Settings
@@ -23,10 +25,10 @@ from api.web.server import configuration, loopback, refuse_open_door
 from tests.api.conftest import PATIENCE_S, Service, run_test
 
 PASSWORD = "correct horse battery"
-OPEN_V1 = {("POST", "/v1/sessions")}
+OPEN_V1 = {("POST", "/v1/sessions"), ("GET", "/v1/schemas"), ("GET", "/v1/schemas/{name}")}
 OPEN_PAGES = {
     ("GET", "/"), ("GET", "/sign-in"), ("POST", "/sign-in"), ("GET", "/static/{name}"), ("GET", "/health"),
-    ("GET", "/metrics"), ("GET", "/rig/now"), ("GET", "/stopped/{key}"),
+    ("GET", "/metrics"), ("GET", "/rig/now"), ("GET", "/stopped/{key}"), ("GET", "/docs"),
 }  # fmt: skip
 """Signing in is for those who are not yet signed in."""
 
@@ -91,6 +93,12 @@ def test_every_route_of_the_api_turns_a_stranger_away(service: Service) -> None:
                 answer = stranger.request(method.upper(), re.sub(r"\{\w+\}", "x", path))
                 assert answer.status_code == 401, (method, path, answer.status_code)
                 assert answer.headers["content-type"] == "application/problem+json"
+
+
+def test_a_password_costs_what_rfc_9106_asks_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(passwords, "PasswordHasher", argon2.PasswordHasher)
+    kept = passwords.Passwords().hasher.hash(PASSWORD)
+    assert argon2.extract_parameters(kept) == argon2.profiles.RFC_9106_LOW_MEMORY
 
 
 def test_password_is_kept_as_argon2id_only(service: Service, clinician: httpx.Client) -> None:

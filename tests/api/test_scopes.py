@@ -19,6 +19,9 @@ TABLE = """
 GET    /health                                             anybody        200
 GET    /metrics                                            anybody        200
 GET    /static/page.css                                    anybody        200
+GET    /docs                                               anybody        200
+GET    /v1/schemas                                         anybody        200
+GET    /v1/schemas/x                                       anybody        404
 GET    /                                                   anybody        200
 GET    /rig/now                                            anybody        200
 GET    /stopped/x                                          anybody        404
@@ -30,6 +33,7 @@ GET    /rig/notice                                         anyone         200
 POST   /sign-out                                           anyone         303
 POST   /v1/sessions/confirm                                anyone         422
 DELETE /v1/sessions/current                                anyone         404
+GET    /v1/sequences                                       anyone         200
 GET    /v1/rig                                             read-live      200
 GET    /v1/tests                                           read-live      200
 GET    /v1/tests/x                                         read-live      404

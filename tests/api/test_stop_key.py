@@ -163,6 +163,7 @@ def test_no_rig_at_the_socket_is_one_line(tmp_path: Path, capsys: pytest.Capture
     assert said.count("\n") == 1 and str(path) in said and "python -m rig" in said
 
 
+@pytest.mark.slow
 def test_serve_attaches_stops_on_a_key_and_leaves_the_rig_alone(
     short_dir: Path, tmp_path: Path, terminal: tuple[int, int]
 ) -> None:

@@ -25,16 +25,25 @@ def stimrig(*words: object) -> str:
     return done.stdout
 
 
-def test_improve_writes_a_model_that_predicts_better(tmp_path: Path) -> None:
-    record = hidden_records.generate("fatigue", "strong", seed=41, rate_hz=100)
-    data = tmp_path / "record.csv"
+@pytest.fixture(scope="module")
+def tired(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A record of a muscle that tires, and what `improve` makes of it."""
+    folder = tmp_path_factory.mktemp("tired")
+    record = hidden_records.generate("fatigue", "strong", seed=41, rate_hz=100, design="short")
+    data = folder / "record.csv"
     hidden_records.write_csv(record, data)
-    base, better = tmp_path / "base.json", tmp_path / "better.json"
+    made = ("-o", folder / "better.json", "--html", folder / "report.html")
+    (folder / "improved.json").write_text(stimrig("improve", data, *made, "--json"))
+    return folder
+
+
+def test_improve_writes_a_model_that_predicts_better(tired: Path, tmp_path: Path) -> None:
+    data, base, better = tired / "record.csv", tmp_path / "base.json", tired / "better.json"
     stimrig("fit", data, "-o", base)
-    found = json.loads(stimrig("improve", data, "-o", better, "--html", tmp_path / "report.html", "--json"))
+    found = json.loads((tired / "improved.json").read_text())
     assert [step["added"] for step in found["steps"]][:2] == [None, "fatigue"]
     assert found["steps"][1]["rms_nm"] < found["steps"][0]["rms_nm"]
-    assert (tmp_path / "report.html").stat().st_size > 1000
+    assert (tired / "report.html").stat().st_size > 1000
 
     def rms_nm(model: Path) -> float:
         out = tmp_path / f"{model.stem}.csv"
@@ -48,12 +57,10 @@ def test_improve_writes_a_model_that_predicts_better(tmp_path: Path) -> None:
     assert rms_nm(better) < 0.5 * rms_nm(base)
 
 
-def test_what_a_model_holds_is_not_missing_in_it_and_auto_adds_what_improve_adds(tmp_path: Path) -> None:
-    record = hidden_records.generate("fatigue", "strong", seed=41, rate_hz=100)
-    data, held = tmp_path / "record.csv", tmp_path / "held.json"
-    hidden_records.write_csv(record, data)
+def test_what_a_model_holds_is_not_missing_in_it_and_auto_adds_what_improve_adds(tired: Path, tmp_path: Path) -> None:
+    data, held = tired / "record.csv", tmp_path / "held.json"
     fitted = json.loads(stimrig("fit", data, "--effects", "auto", "-o", held, "--json"))
-    improved = json.loads(stimrig("improve", data, "--json"))
+    improved = json.loads((tired / "improved.json").read_text())
     added = [step["added"] for step in improved["steps"][1:]]
     assert [effect["id"] for effect in fitted["effects"]] == added and "fatigue" in added
     forms = [f"{effect['id']} ({effect['form']})" for effect in fitted["effects"]]
@@ -73,7 +80,7 @@ def test_what_a_model_holds_is_not_missing_in_it_and_auto_adds_what_improve_adds
 
 
 def test_fit_with_effects_gives_a_model_of_the_contract(tmp_path: Path) -> None:
-    record = hidden_records.generate("output_saturation", "middle", seed=42, rate_hz=100)
+    record = hidden_records.generate("output_saturation", "middle", seed=42, rate_hz=100, design="short")
     data = tmp_path / "record.csv"
     hidden_records.write_csv(record, data)
     model = json.loads(stimrig("fit", data, "--effects", "output_saturation", "--json"))

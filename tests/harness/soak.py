@@ -85,20 +85,23 @@ def memory_mb(pid: int) -> float:
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
-def soak(minutes: float, every_minutes: float, fit: bool = True, patient: bool = False) -> dict[str, Any]:
-    """Run a session and give its figures; `patient`: with a rig that does not end a test for a torque 0.1 s old."""
+def soak(minutes: float, every_minutes: float, fit: bool = True, patient: bool = False, **plan: Any) -> dict[str, Any]:
+    """Run a session and give its figures.
+
+    `patient`: with a rig that does not end a test for a torque 0.1 s old. `plan`: fields of the tests' plan.
+    """
     with tempfile.TemporaryDirectory(prefix="rig-soak-") as folder:
         bench = Bench(Path(folder))
         try:
             client = bench.start_rig(watch=None if patient else CLINIC_WATCH)
             client.ask("subscribe")
             with fitting(bench.data / "recordings", fit) as fits:
-                return _session(bench, client, minutes, every_minutes) | {"fits_beside": len(fits)}
+                return _session(bench, client, minutes, every_minutes, plan) | {"fits_beside": len(fits)}
         finally:
             bench.close()
 
 
-def _session(bench: Bench, client: Any, minutes: float, every_minutes: float) -> dict[str, Any]:
+def _session(bench: Bench, client: Any, minutes: float, every_minutes: float, plan: dict[str, Any]) -> dict[str, Any]:
     assert bench.rig is not None
     pid, began_s = bench.rig.popen.pid, time.monotonic()
     memory, tests, oldest_ms, live = [memory_mb(pid)], [], 0.0, 0
@@ -106,7 +109,7 @@ def _session(bench: Bench, client: Any, minutes: float, every_minutes: float) ->
     while time.monotonic() - began_s < 60 * minutes:
         next_s = time.monotonic() + 60 * every_minutes
         name = f"soak{len(tests)}"
-        reply = client.start(default_plan(name))
+        reply = client.start(default_plan(name, **plan))
         if not reply["ok"]:
             tests.append({"outcome": "refused", "reason": reply["problem"]["detail"], "summary": {}})
             client.ask("rearm", by="soak")

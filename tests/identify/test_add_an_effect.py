@@ -29,7 +29,7 @@ def block(language: str) -> str:
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a record of a swinging amplifier, and the effect of the page in `my_effects`."""
     folder = tmp_path_factory.mktemp("own")
-    record = hidden_records.generate("sensor_gain_swing", "strong", seed=SEED, rate_hz=100)
+    record = hidden_records.generate("sensor_gain_swing", "strong", seed=SEED, rate_hz=100, design="short")
     hidden_records.write_csv(record, folder / "record.csv")
     (folder / "my_effects").mkdir()
     (folder / "my_effects" / "sensor_gain_swing.py").write_text(block("python"), encoding="utf-8")

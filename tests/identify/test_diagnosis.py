@@ -14,6 +14,8 @@ from identify.records.record import Record
 from tests.harness.patients import Patient
 from tests.identify import hidden_muscles
 
+pytestmark = pytest.mark.slow
+
 KEYS = {"effect", "probability", "rms_before_nm", "rms_after_nm", "held_out_rms_before_nm", "held_out_rms_after_nm"}
 KEYS |= {"confused_with", "next_experiment", "parameters"}
 HIDDEN = (
@@ -88,7 +90,7 @@ def test_noise_is_estimated_and_places_are_worded():
 
 
 def test_held_out_rows_are_only_reported():
-    record = hidden_muscles.record("asymmetric_relaxation", seed=41, rate_hz=100)
+    record = hidden_muscles.record("output_saturation", seed=41, rate_hz=100)
     spoilt = record.with_torque(np.where(record.held_out, 0.0, record.torque_nm))
     one, two = diagnose(record), diagnose(spoilt)
     assert one.candidates == two.candidates

@@ -23,6 +23,7 @@ def run(folder: Path, *options: str) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
 def test_biceps_example_on_a_simulated_muscle(tmp_path):
     """Trains of a muscle of T 0.08 s: its constants come back from pulse times and force alone."""
     rng = np.random.default_rng(0)

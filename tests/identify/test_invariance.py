@@ -168,13 +168,17 @@ def test_fit_with_the_effect_hardly_depends_on_the_samples(hidden, relation):
 # ---- the diagnosis ------------------------------------------------------------------------------------------
 
 
-LONG = ("asymmetric_relaxation", "electromechanical_delay")
-"""Hidden effects whose diagnosis takes longest."""
+def whole_grid(cases: list[tuple[str, ...]], always: set[tuple[str, ...]]) -> list:
+    """All cases: those of `always` in every run of the tests, the others with `--campaigns`."""
+    assert always <= set(cases)
+    return [pytest.param(*case, marks=[] if case in always else [pytest.mark.campaign]) for case in cases]
 
 
-@pytest.mark.parametrize(
-    "hidden", [pytest.param(name, marks=[pytest.mark.slow] if name in LONG else []) for name in HIDDEN]
-)
+EACH = [(hidden,) for hidden in HIDDEN]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("hidden", whole_grid(EACH, {("",), ("fatigue",), ("output_saturation",)}))
 def test_diagnosis_does_not_depend_on_how_torque_and_time_are_counted(hidden):
     """All at once: turned, ten times as large, 50 N·m lower, 1e4 s later."""
     record = record_of(hidden)
@@ -183,7 +187,7 @@ def test_diagnosis_does_not_depend_on_how_torque_and_time_are_counted(hidden):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("hidden", HIDDEN)
+@pytest.mark.parametrize("hidden", whole_grid(EACH, {("threshold_drift",)}))
 def test_diagnosis_does_not_depend_on_it_the_other_way_either(hidden):
     """A tenth, 50 N·m higher; then counted in 5 mN·m."""
     record = record_of(hidden)
@@ -192,30 +196,26 @@ def test_diagnosis_does_not_depend_on_it_the_other_way_either(hidden):
     assert said(counted(record)) == (*answer(hidden)[:2], pytest.approx(answer(hidden)[2], abs=0.02))
 
 
-@pytest.mark.parametrize(
-    ("hidden", "relation"),
-    [
-        ("", "a gap of 0.5 s"),
-        ("fatigue", "every second sample"),
-        ("output_saturation", "begun in the PRBS"),
-    ],
-)
+EACH_RELATION_ONCE = {
+    ("", "a gap of 0.5 s"),
+    ("", "without the last rest"),
+    ("fatigue", "every second sample"),
+    ("fatigue", "without validate"),
+    ("output_saturation", "begun in the PRBS"),
+    ("threshold_drift", "without the first rest"),
+    ("electromechanical_delay", "without the middle rest"),
+}
+RELATIONS = [(hidden, relation) for hidden in HIDDEN for relation in SAMPLING if relation != "in 5 mN·m"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("hidden", "relation"), whole_grid(RELATIONS, EACH_RELATION_ONCE))
 def test_diagnosis_stays_whichever_samples_show_the_muscle(hidden, relation):
     assert said(SAMPLING[relation](record_of(hidden)))[:2] == answer(hidden)[:2]
 
 
-def _diagnoses() -> list:
-    return [(hidden, relation) for hidden in HIDDEN for relation in SAMPLING if relation != "in 5 mN·m"]
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(("hidden", "relation"), _diagnoses())
-def test_diagnosis_stays_for_all_of_them(hidden, relation):
-    assert said(SAMPLING[relation](record_of(hidden)))[:2] == answer(hidden)[:2]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("hidden", ["", "fatigue", "threshold_drift"])
+@pytest.mark.parametrize("hidden", whole_grid([("",), ("fatigue",), ("threshold_drift",)], {("fatigue",)}))
 def test_without_the_prbs_where_its_pulses_are_known(hidden):
     assert said(without(PRBS, pulses=True)(record_of(hidden)))[:2] == answer(hidden)[:2]
 

@@ -111,6 +111,7 @@ def test_results_longer_than_a_pipe_arrive_whole():
     assert all(len(value) == 3_000_001 and value[-1] == number for number, value in found.items())
 
 
+@pytest.mark.slow
 def test_a_diagnosis_does_not_depend_on_who_did_what(monkeypatch):
     record = hidden_muscles.record("fatigue", seed=11, rate_hz=100)
     told = []

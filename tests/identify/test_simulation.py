@@ -107,6 +107,7 @@ def test_warming_up_touches_every_compiled_part():
     warm()
 
 
+@pytest.mark.slow
 def test_an_effect_asked_for_gets_the_form_that_the_diagnosis_would_give():
     """A spring with a toe: the forms before it in the list hardly help, and must not end the search."""
     made = generate(("series_compliance",), "strong", 81)

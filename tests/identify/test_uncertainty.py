@@ -33,6 +33,7 @@ def trials():
     return found
 
 
+@pytest.mark.slow
 def test_bands_cover_the_truth(trials):
     inside = {"curve": [], "whole": [], "step": [], "prediction": []}
     for patient, record, clean, model in trials:
@@ -69,6 +70,7 @@ def test_false_alarms_are_rare(trials):
         assert 0.35 < np.mean(p) < 0.65, name
 
 
+@pytest.mark.slow
 def test_false_alarms_are_rare_with_an_effect_that_is_not_there(trials):
     """Its parameters stand at a bound or are next to undetermined, and the search stops near the top."""
     models = [identify.fit(record, effects=["fatigue"]) for _, record, *_ in trials[:30]]

@@ -68,6 +68,7 @@ def blocks_of(data: bytes, *kinds: Kind) -> list[int]:
     return found
 
 
+@pytest.mark.slow
 def test_one_flipped_bit_anywhere_loses_no_pulse(tmp_path: Path, played: tuple[bytes, int, float]):
     data, pulses, charge_uc = played
     rng = np.random.default_rng(9)

@@ -23,6 +23,7 @@ anything = st.one_of(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=2000, deadline=None)
 @given(anything, anything, st.floats(0, 500), st.floats(0, 100))
 def test_no_pulse_outside_passes(width_us: float, current_ma: float, most_us: float, most_ma: float):
@@ -208,6 +209,7 @@ def test_every_limit_has_its_reason_and_source():
         assert row.lo < row.hi
 
 
+@pytest.mark.slow
 def test_mad_requests_at_the_gate_are_not_felt():
     """On a seed of its own, through both drivers; `python -m bench.rig_fuzz` makes a million on others."""
     found = fuzz(100_000, seed=20)

@@ -94,6 +94,7 @@ FAULTS: dict[str, tuple[Callable[[VirtualRig], object], str]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FAULTS)
 def test_every_fault_stops_the_test(tmp_path: Path, name: str):
     inject, words = FAULTS[name]
@@ -158,6 +159,7 @@ def test_no_torque_no_test(tmp_path: Path):
     assert {path: len(column) for path, column in recording.columns.items()} == {p: 0 for p, _, _ in archive.COLUMNS}
 
 
+@pytest.mark.slow
 def test_a_journal_cut_anywhere_seals_what_it_holds(tmp_path: Path):
     rig = VirtualRig(tmp_path)
     rig.execute()
@@ -246,6 +248,7 @@ def watched(tmp_path: Path, heard: Heard, at_stop_nm: float | None) -> tuple[boo
     return watch_decay(rig.gate, heard, rig.clock, 0.0, at_stop_nm)  # pyright: ignore[reportArgumentType]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("at_stop_nm", "now_nm", "confirmed"),
     [
@@ -267,6 +270,7 @@ def test_what_a_buffer_gives_up_confirms_no_stop(tmp_path: Path):
     )
 
 
+@pytest.mark.slow
 def test_a_stop_waits_while_a_backlog_is_read_and_not_where_nothing_comes(tmp_path: Path):
     """What comes after a backlog is of now; a cable that is out gives no such hope."""
     late = Heard(0.0, settles_s=1.5)

@@ -11,7 +11,7 @@ from markupsafe import Markup
 from api.charts import diagnosis_charts, model_charts
 from api.models import explanation, summary
 from api.web.pages.environment import HERE, environment
-from api.web.pages.static import plotly_path
+from api.web.pages.static import packaged
 
 
 def comparison_html(
@@ -94,7 +94,7 @@ def improvement_html(
 def _page(template: str, **values: Any) -> str:
     inside = {
         "style": Markup((HERE / "static" / "page.css").read_text("utf-8")),
-        "plotly": Markup(plotly_path().read_text("utf-8").replace("</script", "<\\/script")),
+        "plotly": Markup(packaged("plotly.min.js").read_text("utf-8").replace("</script", "<\\/script")),
         "script": Markup((HERE / "static" / "model.js").read_text("utf-8")),
     }
     policy = report_policy(inside["plotly"], inside["script"])

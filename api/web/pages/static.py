@@ -1,4 +1,4 @@
-"""Style, scripts and plotly, from this machine only; compressed once, kept by browsers for long."""
+"""Style, scripts, plotly and Swagger UI, from this machine only; compressed once, kept by browsers for long."""
 
 from __future__ import annotations
 
@@ -19,17 +19,26 @@ router = APIRouter(include_in_schema=False)
 KINDS = {".js": "text/javascript; charset=utf-8", ".css": "text/css; charset=utf-8", ".svg": "image/svg+xml"}
 
 
-def plotly_path() -> Path:
-    """plotly.min.js of the PyPI package, found without importing it."""
-    spec = find_spec("plotly")
+OF_PACKAGES = {
+    "plotly.min.js": ("plotly", "package_data"),
+    "swagger-ui-bundle.js": ("fastapi_offline", "static"),
+    "swagger-ui.css": ("fastapi_offline", "static"),
+}
+"""Files that a package on this machine brings along: the package and its folder."""
+
+
+def packaged(name: str) -> Path:
+    """A file of a package, found without importing it."""
+    package, folder = OF_PACKAGES[name]
+    spec = find_spec(package)
     assert spec is not None and spec.submodule_search_locations is not None
-    return Path(spec.submodule_search_locations[0]) / "package_data" / "plotly.min.js"
+    return Path(spec.submodule_search_locations[0]) / folder / name
 
 
 def locate(name: str) -> Path:
     """A file by its public name; nothing outside the folder."""
-    if name == "plotly.min.js":
-        return plotly_path()
+    if name in OF_PACKAGES:
+        return packaged(name)
     path = HERE / "static" / name
     if path.suffix not in KINDS or path.parent != HERE / "static" or not path.is_file():
         raise NotFoundError("file", name)

@@ -14,6 +14,8 @@ from api.sessions.requests import CalibrationIn, FinishIn, MarkIn, StepIn
 from api.store import audit
 from api.store.tables import Participant
 from api.web.dependencies import PROBLEM, Context, Ctx, Tester
+from api.web.responses.base import answers
+from api.web.responses.participants import CalibratedOut, CalibrationOut
 from api.web.routes import participants
 from rig.messages import (
     CalibrateFinishRequest,
@@ -162,31 +164,31 @@ def _store(
     return found
 
 
-@router.post("", status_code=201)
+@router.post("", status_code=201, **answers(CalibrationOut, 201, "open; nothing was sent yet"))
 async def begin_calibration(context: Ctx, who: Tester, code: str, body: CalibrationIn | None = None) -> dict[str, Any]:
     """Open a guided calibration: nothing is sent until a step is asked for."""
     return await begin(context, code, body or CalibrationIn.model_validate({}), who.name)
 
 
-@router.get("")
+@router.get("", **answers(CalibrationOut))
 async def calibration(context: Ctx, _who: Tester, code: str) -> dict[str, Any]:
     """Where it stands: width, ceiling and whose it is, marks, what is missing, every train."""
     return await standing(context, code)
 
 
-@router.post("/step", status_code=202)
+@router.post("/step", status_code=202, **answers(CalibrationOut, 202, "the train is on its way"))
 async def play_step(context: Ctx, _who: Tester, code: str, body: StepIn) -> dict[str, Any]:
     """Play one train a step wider, a step narrower, or the same again; over when `playing` is false again."""
     return await step(context, code, body.direction)
 
 
-@router.post("/mark")
+@router.post("/mark", **answers(CalibrationOut))
 async def set_mark(context: Ctx, who: Tester, code: str, body: MarkIn) -> dict[str, Any]:
     """Mark the last train's width as a threshold; marking again replaces."""
     return await mark(context, code, body.threshold, who.name)
 
 
-@router.post("/finish")
+@router.post("/finish", **answers(CalibratedOut))
 async def finish_calibration(context: Ctx, who: Tester, code: str, body: FinishIn | None = None) -> dict[str, Any]:
     """Close it: the profile holds until the end of the day; `discard` leaves the old one."""
     return await finish(context, code, bool(body and body.discard), who.name)

@@ -11,7 +11,8 @@ from fastapi.responses import JSONResponse
 from api.store.tables import Model
 from api.web.dependencies import PROBLEM, Context, Ctx, ModelReader, Tester
 from api.web.requests import EffectsIn
-from api.web.responses import ComparisonOut, DiagnosisOut, ImprovementOut, JobOut, VersionOut
+from api.web.responses.base import answers, published
+from api.web.responses.models import ComparisonOut, CurvesOut, DiagnosisOut, ImprovementOut, JobOut, VersionOut
 from api.workers.tracker import Job
 
 router = APIRouter(prefix="/v1", tags=["criticism"], responses=PROBLEM)
@@ -31,7 +32,7 @@ async def comparison(
     return await context.analyses.comparison(row, recording)
 
 
-@router.get("/models/{model_id}/curves")
+@router.get("/models/{model_id}/curves", **answers(CurvesOut))
 async def curves(context: Ctx, _who: ModelReader, model_id: str) -> dict[str, Any]:
     """The measured, predicted and commanded curves and the step response, thinned to what a screen shows."""
     row = await asyncio.to_thread(context.versions.get, model_id)
@@ -76,7 +77,7 @@ async def improve(context: Ctx, who: Tester, model_id: str, response: Response, 
     return {**found, "versions": versions}
 
 
-@router.get("/effects")
+@router.get("/effects", response_model=None, responses={200: published("effects", "the library")})
 async def effects(context: Ctx, _who: ModelReader) -> dict[str, Any]:
     """The library of effects."""
     return await context.pool.submit("effects").result

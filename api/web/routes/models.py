@@ -12,13 +12,26 @@ from api.errors import ApiError
 from api.web.dependencies import PROBLEM, Approver, Ctx, ModelReader
 from api.web.headers import entity_tags
 from api.web.requests import DecisionIn
-from api.web.responses import VersionOut
+from api.web.responses.base import published
+from api.web.responses.models import VersionOut
 from api.web.routes import participants
 
 router = APIRouter(prefix="/v1", tags=["models"], responses=PROBLEM)
+TAG = {"description": "send it as `If-None-Match`", "schema": {"type": "string"}}
+APPROVED: dict[int | str, dict[str, Any]] = {
+    200: {**published("model", "MODEL.json"), "headers": {"ETag": TAG}},
+    304: {"description": "it is the one of `If-None-Match`"},
+}
+WITH_MODEL: dict[str, Any] = {
+    "description": "the version, and its MODEL.json as `model`",
+    "content": {"application/json": {"schema": {"allOf": [
+        {"$ref": "#/components/schemas/VersionOut"},
+        {"type": "object", "required": ["model"], "properties": {"model": {"$ref": "#/components/schemas/ModelJson"}}},
+    ]}}},
+}  # fmt: skip
 
 
-@router.get("/participants/{code}/model", response_class=Response, responses={304: {"description": "unchanged"}})
+@router.get("/participants/{code}/model", response_class=Response, responses=APPROVED)
 async def approved_model(
     context: Ctx, _who: ModelReader, code: str, if_none_match: Annotated[str | None, Header()] = None
 ) -> Response:
@@ -50,14 +63,14 @@ def versions(context: Ctx, _who: ModelReader, code: str) -> list[dict[str, Any]]
     return [context.versions.document(row) for row in context.versions.of(code)]
 
 
-@router.get("/models/{model_id}", response_model=VersionOut)
+@router.get("/models/{model_id}", response_model=None, responses={200: WITH_MODEL})
 def one_model(context: Ctx, _who: ModelReader, model_id: str) -> dict[str, Any]:
     """A version: its errors, its verdict, its lineage, and the model."""
     row = context.versions.get(model_id)
     return {**context.versions.document(row), "model": json.loads(row.document)}
 
 
-@router.get("/models/{model_id}/file", response_class=Response)
+@router.get("/models/{model_id}/file", response_class=Response, responses={200: published("model", "MODEL.json")})
 def model_file(context: Ctx, _who: ModelReader, model_id: str) -> Response:
     """MODEL.json, as it was stored."""
     row = context.versions.get(model_id)

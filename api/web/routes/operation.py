@@ -18,11 +18,13 @@ from sqlalchemy import func, select, text
 
 from api.store.tables import AuditEntry, Model, Participant, Test
 from api.web.dependencies import Context, Ctx
+from api.web.responses.base import answers
+from api.web.responses.rig import HealthOut
 
 router = APIRouter(tags=["operation"])
 
 
-@router.get("/health")
+@router.get("/health", **answers(HealthOut))
 def health(context: Ctx) -> dict[str, Any]:
     """`ok` where database and rig answer; `degraded` says what does not. Holds nothing of any participant."""
     with context.store.read() as session:

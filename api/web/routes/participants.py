@@ -16,9 +16,18 @@ from api.store import audit
 from api.store.tables import Participant, Test
 from api.web.dependencies import PROBLEM, Context, Ctx, Tester
 from api.web.headers import entity_tags
+from api.web.openapi import problem
 from api.web.requests import ParticipantIn
+from api.web.responses.base import answers
+from api.web.responses.participants import ChangedOut, ParticipantOut
+from api.web.responses.rig import TestOut
 
 router = APIRouter(prefix="/v1/participants", tags=["participants"], responses=PROBLEM)
+TAG = {"description": "the version of the limits: send it as `If-Match`", "schema": {"type": "string"}}
+CHANGED: dict[int | str, dict[str, Any]] = {
+    200: {"model": ChangedOut, "description": "changed", "headers": {"ETag": TAG}},
+    412: problem("changed since it was looked at"),
+}
 
 
 def create(context: Context, body: ParticipantIn, by: str) -> Participant:
@@ -136,7 +145,7 @@ def etag(row: Participant) -> str:
     return f'"{profiles.version(row.profile)}"'
 
 
-@router.post("", status_code=201)
+@router.post("", status_code=201, **answers(ParticipantOut, 201, "made; see `Location`"))
 def make_participant(context: Ctx, who: Tester, body: ParticipantIn, response: Response) -> dict[str, Any]:
     """Make a participant: a code, never a name."""
     row = create(context, body, who.name)
@@ -144,13 +153,13 @@ def make_participant(context: Ctx, who: Tester, body: ParticipantIn, response: R
     return row.as_dict()
 
 
-@router.get("")
+@router.get("", **answers(list[ParticipantOut]))
 def list_participants(context: Ctx, _who: Tester) -> list[dict[str, Any]]:
     """All participants, by code."""
     return [row.as_dict() for row in context.store.all(Participant, order=Participant.code)]
 
 
-@router.get("/{code}")
+@router.get("/{code}", **answers(ParticipantOut, headers={"ETag": TAG}))
 def one_participant(context: Ctx, _who: Tester, code: str, response: Response) -> dict[str, Any]:
     """One participant with its profile; `ETag` is the version of its limits."""
     row = find(context, code)
@@ -158,7 +167,7 @@ def one_participant(context: Ctx, _who: Tester, code: str, response: Response) -
     return row.as_dict()
 
 
-@router.put("/{code}/profile", responses={412: {**PROBLEM[409], "description": "changed since it was looked at"}})
+@router.put("/{code}/profile", response_model=None, responses=CHANGED)
 async def set_profile(
     context: Ctx,
     who: Tester,
@@ -179,7 +188,7 @@ async def set_profile(
     return {**row.as_dict(), "meanwhile": meanwhile(context, code)}
 
 
-@router.get("/{code}/tests")
+@router.get("/{code}/tests", **answers(list[TestOut]))
 def tests_of(context: Ctx, _who: Tester, code: str) -> list[dict[str, Any]]:
     """A participant's tests, newest first."""
     find(context, code)

@@ -13,12 +13,13 @@ from api.errors import NotFoundError
 from api.people.auth import COOKIE, Principal, Scope, unauthorized
 from api.web.browser_session import local, same_origin, set_cookie
 from api.web.dependencies import PROBLEM, Administrator, Anyone, Context, Ctx
+from api.web.openapi import problem
+from api.web.responses.base import answers
+from api.web.responses.people import KeyOut, ListedUser, SessionOut, UserOut
 
 router = APIRouter(prefix="/v1", tags=["people"], responses=PROBLEM)
 
-TOO_MANY: dict[int | str, dict[str, Any]] = {
-    429: {"description": "too many wrong passwords: `Retry-After`", "content": {"application/problem+json": {}}}
-}
+TOO_MANY: dict[int | str, dict[str, Any]] = {429: problem("too many wrong passwords: `Retry-After`")}
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_.@-]{1,80}$")]
 Password = Annotated[str, StringConstraints(min_length=10, max_length=200)]
 
@@ -63,14 +64,14 @@ class KeyIn(_Body):
     days: Annotated[int, Field(strict=True, ge=1, le=366, description="it expires after these")] = 30
 
 
-@router.post("/users", status_code=201)
+@router.post("/users", status_code=201, **answers(UserOut, 201, "added"))
 async def add_user(context: Ctx, who: Administrator, body: UserIn) -> dict[str, Any]:
     """Add a person; the default scopes are a clinician's."""
     row = await context.people.add(body.name, body.password, body.scopes, who.name)
     return {"name": row.name, "scopes": body.scopes, "created_utc": row.created_utc}
 
 
-@router.get("/users")
+@router.get("/users", **answers(list[ListedUser]))
 def list_users(context: Ctx, _who: Administrator) -> list[dict[str, Any]]:
     """All users."""
     return context.people.documents()
@@ -99,7 +100,8 @@ def remove_user(context: Ctx, who: Administrator, name: str) -> None:
 @router.post(
     "/sessions",
     status_code=201,
-    responses=TOO_MANY,
+    response_model=None,
+    responses={**TOO_MANY, 201: {"model": SessionOut, "description": "signed in; the session is in `Set-Cookie`"}},
     openapi_extra={"requestBody": {"content": {"application/json": {"schema": SignIn.model_json_schema()}}}},
 )
 async def sign_in(context: Ctx, request: Request) -> Response:
@@ -145,7 +147,7 @@ def sign_out(context: Ctx, request: Request, _who: Anyone) -> None:
     context.auth.sign_out(cookie)
 
 
-@router.post("/controller-keys", status_code=201)
+@router.post("/controller-keys", status_code=201, **answers(KeyOut, 201, "issued"))
 def controller_key(context: Ctx, who: Administrator, body: KeyIn) -> dict[str, Any]:
     """A key for an ILC controller: reads models, nothing else, and expires. Its text is shown this once."""
     expires_utc = utc_label(context.clock.unix_s() + 86400.0 * body.days)

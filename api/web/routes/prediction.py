@@ -10,6 +10,8 @@ from pydantic import Field, FiniteFloat
 
 from api.sessions.requests import Body
 from api.web.dependencies import PROBLEM, Ctx, ModelReader
+from api.web.responses.base import answers
+from api.web.responses.models import PredictionOut
 
 router = APIRouter(prefix="/v1", tags=["models"], responses=PROBLEM)
 
@@ -23,7 +25,7 @@ class WidthsIn(Body):
     pulse_rate_hz: Annotated[FiniteFloat, Field(ge=10, le=100)] = 40.0
 
 
-@router.post("/models/{model_id}/prediction")
+@router.post("/models/{model_id}/prediction", **answers(PredictionOut))
 async def prediction(context: Ctx, _who: ModelReader, model_id: str, body: WidthsIn) -> dict[str, Any]:
     """Mean torque the pulses give in each pulse's period, N·m, after a second of rest; effects included."""
     row = await asyncio.to_thread(context.versions.get, model_id)

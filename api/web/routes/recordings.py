@@ -18,17 +18,27 @@ from api.errors import ApiError, NotFoundError
 from api.store import audit, uploads
 from api.store.tables import Model, Recording
 from api.web.dependencies import PROBLEM, Context, Ctx, ModelReader, Tester
+from api.web.openapi import problem
+from api.web.responses.base import answers
+from api.web.responses.rig import UploadOut
 from api.web.routes import participants
 
 router = APIRouter(prefix="/v1", tags=["recordings"], responses=PROBLEM)
 
 UPLOAD = {"requestBody": {"required": True, "content": {"application/octet-stream": {"schema": {"type": "string"}}}}}
+BINARY = {"schema": {"type": "string", "format": "binary"}}
+CSV = {"description": "one row a sample", "content": {"text/csv": BINARY}}
+RAW = {
+    "description": "the file as it was sealed or sent in; `X-Content-SHA256` is its checksum",
+    "content": {"application/x-hdf5": BINARY, "text/csv": BINARY, "application/x-matlab-data": BINARY},
+}
+GONE = problem("the file is not in its place any more")
 MOST_COLUMNS = 8
 KINDS = {".csv": "text/csv", ".mat": "application/x-matlab-data"}
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 
 
-@router.get("/recordings/{recording_id}", response_class=FileResponse)
+@router.get("/recordings/{recording_id}", response_class=FileResponse, responses={200: RAW, 410: GONE})
 def recording(context: Ctx, _who: ModelReader, recording_id: str) -> FileResponse:
     """The raw recording."""
     row, path = held(context, recording_id)
@@ -36,7 +46,7 @@ def recording(context: Ctx, _who: ModelReader, recording_id: str) -> FileRespons
     return FileResponse(path, media_type=kind, filename=path.name, headers={"X-Content-SHA256": row.file_sha256})
 
 
-@router.get("/recordings/{recording_id}/csv", response_class=FileResponse)
+@router.get("/recordings/{recording_id}/csv", response_class=FileResponse, responses={200: CSV, 410: GONE})
 async def recording_csv(context: Ctx, _who: ModelReader, recording_id: str) -> FileResponse:
     """The recording as CSV, one row a sample: what other tools read, and what can be uploaded again."""
     _row, source = await asyncio.to_thread(held, context, recording_id)
@@ -71,7 +81,9 @@ def held(context: Context, recording_id: str) -> tuple[Recording, Path]:
     return row, path
 
 
-@router.post("/participants/{code}/recordings", status_code=201, openapi_extra=UPLOAD)
+@router.post(
+    "/participants/{code}/recordings", status_code=201, openapi_extra=UPLOAD, **answers(UploadOut, 201, "taken in")
+)
 async def upload(
     context: Ctx,
     who: Tester,

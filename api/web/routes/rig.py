@@ -9,15 +9,19 @@ from fastapi import APIRouter, Request
 from fastapi.responses import JSONResponse, RedirectResponse, Response
 
 from api.errors import ApiError
-from api.sessions.requests import TestIn
+from api.sessions.requests import StopIn, TestIn
 from api.sessions.stop_log import StopResult
 from api.store import audit
 from api.web.browser_session import wants_html
-from api.web.dependencies import PROBLEM, Context, Ctx, LiveReader, MayStop, Rearmer, Tester
+from api.web.dependencies import PROBLEM, Anyone, Context, Ctx, LiveReader, MayStop, Rearmer, Tester
+from api.web.responses.base import answers
+from api.web.responses.rig import PreviewOut, RigOut, SequencesOut, StoppedOut
 from api.web.stop_guard import Press
-from rig.messages import RearmRequest, StopEvidence
+from rig.messages import RearmRequest, SequencesRequest, StopEvidence
 
 router = APIRouter(prefix="/v1", tags=["rig"], responses=PROBLEM)
+FORM = {"schema": StopIn.model_json_schema()}
+STOP = {"requestBody": {"content": {"application/json": FORM, "application/x-www-form-urlencoded": FORM}}}
 
 
 def rig_state(context: Context) -> dict[str, Any]:
@@ -38,13 +42,19 @@ def rig_state(context: Context) -> dict[str, Any]:
     }
 
 
-@router.get("/rig")
+@router.get("/rig", **answers(RigOut))
 def rig(context: Ctx, _who: LiveReader) -> dict[str, Any]:
     """State, devices, newest torque and its age."""
     return rig_state(context)
 
 
-@router.post("/stop")
+@router.get("/sequences", **answers(SequencesOut))
+async def sequences(context: Ctx, _who: Anyone) -> dict[str, Any]:
+    """What a test can be made of: this rig's sequences with their settings, units and ranges; and the default test."""
+    return await context.rig.ask(SequencesRequest())
+
+
+@router.post("/stop", **answers(StoppedOut, description="stopped, by the rig's evidence"), openapi_extra=STOP)
 async def stop(request: Request, context: Ctx, press: MayStop) -> Response:
     """Stop stimulation: anyone signed in, and any page that shows the button; JSON, a plain form, or no body at all.
 
@@ -82,7 +92,7 @@ async def rearm_rig(context: Context, by: str) -> dict[str, Any]:
     return rig_state(context)
 
 
-@router.post("/rearm")
+@router.post("/rearm", **answers(RigOut))
 async def rearm(context: Ctx, who: Rearmer) -> dict[str, Any]:
     """After a stop, a fault or a restart the rig stays still until a person re-arms it: who signed in with a password.
 
@@ -91,7 +101,7 @@ async def rearm(context: Ctx, who: Rearmer) -> dict[str, Any]:
     return await rearm_rig(context, who.name)
 
 
-@router.post("/preview", response_model=dict[str, Any])
+@router.post("/preview", **answers(PreviewOut))
 async def preview(context: Ctx, _who: Tester, body: TestIn) -> Response:
     """A test's duration, dose and pulse widths, without playing it. 503 where too many are asked for at once."""
     return JSONResponse(await context.runner.preview(body))

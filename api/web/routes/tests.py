@@ -14,6 +14,8 @@ from api.people.auth import Scope
 from api.sessions.requests import TestIn
 from api.store.tables import Test
 from api.web.dependencies import PROBLEM, Context, Ctx, LiveReader, Tester, of
+from api.web.responses.base import answers
+from api.web.responses.rig import TestOut
 
 router = APIRouter(prefix="/v1/tests", tags=["tests"], responses=PROBLEM)
 
@@ -26,7 +28,7 @@ def find(context: Context, test_id: str) -> Test:
     return row
 
 
-@router.post("", status_code=202)
+@router.post("", status_code=202, **answers(TestOut, 202, "begun; see `Location`"))
 async def start_test(context: Ctx, who: Tester, body: TestIn, response: Response) -> dict[str, Any]:
     """Start a test; `Location` is where its progress is read. One at a time: 409 names the holder."""
     row = await context.runner.start(body, who.name)
@@ -34,14 +36,14 @@ async def start_test(context: Ctx, who: Tester, body: TestIn, response: Response
     return context.runner.document(row)
 
 
-@router.get("")
+@router.get("", **answers(list[TestOut]))
 def list_tests(context: Ctx, _who: LiveReader, limit: int = 50) -> list[dict[str, Any]]:
     """The newest tests."""
     rows = context.store.all(Test, order=Test.requested_utc.desc(), limit=max(1, min(limit, 500)))
     return [context.runner.document(row) for row in rows]
 
 
-@router.get("/{test_id}")
+@router.get("/{test_id}", **answers(TestOut))
 def one_test(context: Ctx, _who: LiveReader, test_id: str) -> dict[str, Any]:
     """A test: state, segment, progress, time left; at its end recording, model, summary and fit."""
     return context.runner.document(find(context, test_id))

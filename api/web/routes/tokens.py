@@ -12,11 +12,13 @@ from api.store import audit
 from api.store.tables import AuditEntry, Token
 from api.web.dependencies import PROBLEM, Administrator, Ctx
 from api.web.requests import TokenIn
+from api.web.responses.base import answers
+from api.web.responses.people import AuditOut, ListedToken, TokenOut
 
 router = APIRouter(prefix="/v1", tags=["administration"], responses=PROBLEM)
 
 
-@router.post("/tokens", status_code=201)
+@router.post("/tokens", status_code=201, **answers(TokenOut, 201, "issued"))
 def issue_token(context: Ctx, who: Administrator, body: TokenIn) -> dict[str, Any]:
     """Issue a token; its text is shown this once."""
     known = {scope.value for scope in Scope}
@@ -29,7 +31,7 @@ def issue_token(context: Ctx, who: Administrator, body: TokenIn) -> dict[str, An
     return {"token": text, "name": body.name, "scopes": body.scopes, "expires_utc": body.expires_utc}
 
 
-@router.get("/tokens")
+@router.get("/tokens", **answers(list[ListedToken]))
 def list_tokens(context: Ctx, _who: Administrator) -> list[dict[str, Any]]:
     """All tokens, by their prefix; never their text."""
     rows = context.store.all(Token, order=Token.created_utc)
@@ -45,7 +47,7 @@ def revoke_token(context: Ctx, who: Administrator, token_id: str) -> None:
         raise NotFoundError("token", token_id, "GET /v1/tokens lists them.")
 
 
-@router.get("/audit")
+@router.get("/audit", **answers(AuditOut))
 def trail(context: Ctx, _who: Administrator) -> dict[str, Any]:
     """The audit trail, and whether its chain holds."""
     entries = context.store.all(AuditEntry, order=AuditEntry.seq)

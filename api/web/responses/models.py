@@ -1,16 +1,12 @@
-"""What clients get, typed for the OpenAPI document; further fields may come with newer versions."""
+"""Answers about models: versions, comparison, diagnosis, improving, effects, predictions, long work."""
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field, JsonValue
 
-
-class Document(BaseModel):
-    """Base of all answers."""
-
-    model_config = ConfigDict(extra="allow")
+from api.web.responses.base import Document, Problem, SegmentOut
 
 
 class VersionOut(Document):
@@ -75,9 +71,11 @@ class ComparisonOut(Document):
     rms_nm: float | None
     noise_sd_nm: float | None
     by: By | None = None
-    where: list[Place] = []
-    series: dict[str, Any] = Field(default={}, description="thinned curves for drawing")
-    plain: list[str] = []
+    where: list[Place] = Field([])
+    series: dict[str, list[JsonValue] | float | str | None] = Field(
+        default={}, description="curves for drawing, thinned, by name, and `noise_band_nm`, N·m"
+    )
+    plain: list[str] = Field([], description="in sentences")
 
 
 class ParameterOut(Document):
@@ -105,10 +103,25 @@ class ExperimentOut(Document):
 
     effect: str
     rivals: list[str]
-    segments: list[dict[str, Any]]
+    segments: list[SegmentOut]
     duration_s: float
     dose: dict[str, float]
     text: str
+
+
+class FiguresOut(Document):
+    """How well a model fits."""
+
+    fit_percent: float | None = Field(None, description="best-fit, %")
+    held_out_fit_percent: float | None = Field(None, description="best-fit of held-out rows, %")
+    rms_nm: float | None = Field(None, description="N·m")
+    held_out_rms_nm: float | None = Field(None, description="N·m")
+
+
+class StepOut(FiguresOut):
+    """A step of improving."""
+
+    added: str | None = Field(description="the effect that came; null: the structure it began with")
 
 
 class DiagnosisOut(Document):
@@ -119,7 +132,7 @@ class DiagnosisOut(Document):
     )
     verdict: Literal["effect_missing", "nothing_missing", "unexplained_structure"]
     noise_sd_nm: float | None = None
-    base: dict[str, Any] = {}
+    base: FiguresOut | None = None
     missing: list[MissingOut]
     where: list[Place]
     experiment: ExperimentOut | None = None
@@ -130,7 +143,7 @@ class ImprovementOut(Document):
 
     verdict: str
     noise_sd_nm: float | None = None
-    steps: list[dict[str, Any]]
+    steps: list[StepOut]
     versions: list[VersionOut] = Field(description="the versions of these steps, the first one included")
 
 
@@ -147,4 +160,38 @@ class JobOut(Document):
     elapsed_s: float
     time_left_s: float | None
     result_url: str | None
-    problem: dict[str, Any] | None
+    problem: Problem | None
+
+
+class SegmentSpan(Document):
+    """A stretch of a recording."""
+
+    name: str
+    start_s: float
+    end_s: float
+
+
+class StepResponse(Document):
+    """The linear part's answer to a unit step."""
+
+    time_s: list[float]
+    response: list[float] = Field(description="N·m for a step of 1 N·m")
+
+
+class CurvesOut(Document):
+    """Curves thinned to what a screen shows, all of one length."""
+
+    time_s: list[float]
+    torque_nm: list[float] = Field(description="measured, N·m")
+    predicted_torque_nm: list[float | None] = Field(description="the model's free run, N·m")
+    pulse_width_us: list[float] = Field(description="commanded, µs")
+    segments: list[SegmentSpan]
+    step_response: StepResponse
+
+
+class PredictionOut(Document):
+    """What a model says a list of pulse widths would give."""
+
+    model_id: str
+    pulse_rate_hz: float
+    torque_nm: list[float] = Field(description="mean torque in each pulse's period, N·m")

@@ -1,0 +1,69 @@
+"""The OpenAPI document: what FastAPI finds, and what it cannot see: problems, refused bodies, published schemas."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fastapi import FastAPI
+
+from api import schemas
+from api.web.responses.base import Problem
+from api.web.strict_body import REFUSALS
+
+PROBLEM_CONTENT = {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
+EMBEDDED = ("model", "effects")
+DESCRIPTION = """
+Programs send `Authorization: Bearer <token>`; browsers have a session's cookie. Each operation names its scope.
+
+Every error is `application/problem+json` (RFC 9457): `title` says what is wrong, `detail` what to do.
+
+A token with `read-model` fetches the approved model: `GET /v1/participants/{code}/model`; with `If-None-Match`, 304
+where it is known already. `GET /v1/sequences` says what a test can be made of; its segments go into `POST /v1/preview`,
+which plays nothing, and into `POST /v1/tests`.
+
+Live signals come over a WebSocket, `/v1/tests/{id}/live`, with the same token: JSON messages with a `type`, which is
+`history` (all curves so far, once), `live` (about 20 a second), `state` (the rig), `link` (is the rig there) or `test`
+(the test's document). It closes once the test is done.
+
+The same facts as JSON Schemas: `GET /v1/schemas`.
+"""
+
+
+def problem(description: str) -> dict[str, Any]:
+    """An error's answer."""
+    return {"description": description, "content": PROBLEM_CONTENT}
+
+
+def describe(app: FastAPI) -> None:
+    """Have the application's document made complete, once."""
+    plain = app.openapi
+
+    def openapi() -> dict[str, Any]:
+        made = app.openapi_schema is not None
+        document = plain()
+        if not made:
+            _complete(document)
+        return document
+
+    app.openapi = openapi
+
+
+def _complete(document: dict[str, Any]) -> None:
+    components = document["components"]["schemas"]
+    own = Problem.model_json_schema(ref_template="#/components/schemas/{model}")
+    components.update(own.pop("$defs", {}) | {"Problem": own})
+    components["JsonValue"] = {"description": "any JSON value: what it holds depends on its key"}
+    for name in ("HTTPValidationError", "ValidationError"):  # FastAPI's own words; ours are a Problem
+        components.pop(name, None)
+    components.update({schemas.component_name(name): schemas.component(name) for name in EMBEDDED})
+    for methods in document["paths"].values():
+        for operation in methods.values():
+            ways = operation.get("security", [])
+            needed = sorted({scope for way in ways for scopes in way.values() for scope in scopes})
+            if needed:
+                operation["description"] = f"{operation.get('description', '')}\n\nScope: `{'`, `'.join(needed)}`."
+            if "HTTPValidationError" in str(operation["responses"].get("422")):
+                del operation["responses"]["422"]
+            if "requestBody" in operation:
+                for code, words in REFUSALS.items():
+                    operation["responses"].setdefault(code, problem(words))

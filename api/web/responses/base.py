@@ -1,0 +1,76 @@
+"""What all answers share."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field, JsonValue
+
+from api.schemas import component_name
+
+
+class Document(BaseModel):
+    """Base of all answers; newer versions may add fields."""
+
+    model_config = ConfigDict(extra="allow")
+
+
+class FieldProblem(Document):
+    """One field that does not hold."""
+
+    field: str
+    detail: str
+    got: str = Field("", description="what was sent, shortened")
+
+
+class Holder(Document):
+    """The test that holds the rig."""
+
+    test_id: str
+    participant: str
+    by: str
+
+
+class Problem(Document):
+    """Why a request failed (RFC 9457)."""
+
+    type: str = Field(description="stable id of the problem: `/problems/…`", examples=["/problems/not-found"])
+    title: str = Field(description="what is wrong, in a few words")
+    status: int = Field(description="the HTTP status")
+    detail: str = Field(description="what is wrong here, and what to do")
+    instance: str = Field("", description="the address that was asked")
+    errors: list[FieldProblem] = Field([], description="422: each field that does not hold")
+    holder: Holder | None = Field(None, description="409 `rig-busy`: the test that holds the rig")
+    reasons: dict[str, str] = Field({}, description="409 of effects: why each one was not added, by its id")
+
+
+class SegmentOut(Document):
+    """A segment of a test, as `POST /v1/tests` takes it."""
+
+    name: str
+    sequence: str
+    settings: dict[str, JsonValue] = Field({}, description="as `GET /v1/sequences` describes them")
+
+
+class SchemasOut(Document):
+    """The published schemas."""
+
+    schemas: dict[str, str] = Field(description="`$id` by name")
+
+
+class SchemaOut(Document):
+    """A JSON Schema (draft 2020-12)."""
+
+    id: str = Field(alias="$id", description="`urn:stimrig:schema:<name>:<version>`")
+    title: str
+
+
+def published(name: str, description: str) -> dict[str, Any]:
+    """An answer that holds to a published schema (`api.schemas`)."""
+    schema = {"$ref": f"#/components/schemas/{component_name(name)}"}
+    return {"description": description, "content": {"application/json": {"schema": schema}}}
+
+
+def answers(model: Any, status: int = 200, description: str = "done", **more: Any) -> dict[str, Any]:
+    """Settings of a route whose answer is described, and not checked or changed on its way."""
+    return {"response_model": None, "responses": {status: {"model": model, "description": description, **more}}}

@@ -1,0 +1,51 @@
+"""Answers about participants and their calibration."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from api.web.responses.base import Document
+from rig.messages import CalibrationStatus, RigState
+
+
+class ProfileOut(Document):
+    """A participant's limits for the day."""
+
+    current_ma: float = Field(description="fixed current of every pulse, mA")
+    max_pulse_width_us: float = Field(description="comfort maximum, µs")
+    max_torque_nm: float = Field(description="torque at which a test stops, N·m")
+    sensory_pulse_width_us: float | None = Field(None, description="width at which it is first felt, µs")
+    motor_pulse_width_us: float | None = Field(None, description="width at which the muscle first moves, µs")
+    set_at_utc: str | None = Field(None, description="when the calibration was finished")
+    expires_at_utc: str | None = Field(None, description="when the calibration expires: the end of its day")
+    rest_between_tests_s: float | None = Field(None, description="shortest rest between two tests, s")
+
+
+class ParticipantOut(Document):
+    """A participant: a code, never a name."""
+
+    code: str
+    profile: ProfileOut
+    created_utc: str
+    created_by: str
+
+
+class ChangedOut(ParticipantOut):
+    """A participant whose limits were changed."""
+
+    meanwhile: str = Field(description="what the change means for a test that runs or a calibration that is open")
+
+
+class CalibrationOut(CalibrationStatus, Document):
+    """Where a guided calibration stands."""
+
+    rig_state: RigState
+    playing: bool = Field(description="a train is on its way")
+    outdated: str = Field(description="why it goes no further: the limits were changed since; else empty")
+
+
+class CalibratedOut(Document):
+    """A calibration that was closed."""
+
+    profile: ProfileOut | None = Field(description="null: discarded")
+    recordings: list[str] = Field(description="one sealed recording for each train")

@@ -1,0 +1,178 @@
+"""Answers about the rig, its tests, and the service's health."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from api.web.responses.base import Document, Holder, SegmentOut
+from api.web.responses.models import VersionOut
+from rig.messages import Bound, CalibrationStatus, RigState, StopEvidence
+
+
+class DeviceOut(Document):
+    """A device of the rig: what it is and how it is connected."""
+
+    device: str = ""
+
+
+class RigOut(Document):
+    """What is known of the rig, and how old it is."""
+
+    connected: bool = Field(description="whether the rig's process answers")
+    age_s: float | None = Field(description="time since it last said something, s")
+    state: RigState
+    reason: str = Field(description="why it is latched, uncertain or disconnected")
+    holder: Holder | None = Field(description="the test that holds it")
+    test_id: str | None = None
+    participant: str | None = None
+    segment: str | None = None
+    elapsed_s: float = Field(0.0, description="of the test that runs, s")
+    duration_s: float = Field(0.0, description="of the test that runs, s")
+    stimulator: DeviceOut = Field(DeviceOut(), description="device, id, firmware, port")
+    load_cell: DeviceOut = Field(DeviceOut(), description="device, measured sample rate, bus")
+    torque_nm: float | None = Field(None, description="newest torque, N·m")
+    torque_age_s: float | None = Field(None, description="its age, s")
+    calibration: CalibrationStatus | None = None
+    limits: dict[str, Bound] = Field({}, description="what this rig takes, by quantity")
+    require_calibration: bool | None = None
+
+
+class StoppedOut(Document):
+    """Stimulation has stopped."""
+
+    stopped: Literal[True]
+    evidence: StopEvidence
+    rig: RigOut
+
+
+class SettingOut(Document):
+    """One setting as JSON Schema: `type`, `default`, `minimum`, `maximum`, …"""
+
+    description: str = Field("", description="what it does, with its unit")
+
+
+class SettingsOut(Document):
+    """Settings of a sequence, as a JSON Schema that a segment's `settings` must hold to."""
+
+    type: Literal["object"]
+    properties: dict[str, SettingOut] = Field(description="by name; a name ends in its unit")
+    required: list[str] = Field([], description="settings without a default")
+
+
+class SequenceOut(Document):
+    """A sequence that the rig can play."""
+
+    id: str = Field(description="`sequence` of a segment")
+    description: str
+    settings: SettingsOut
+
+
+class SequencesOut(Document):
+    """The sequences of this rig."""
+
+    sequences: list[SequenceOut]
+    default: list[SegmentOut] = Field(description="the segments of a test that is given none")
+
+
+class SpanOut(Document):
+    """A segment's place in a test."""
+
+    name: str
+    start_s: float
+    end_s: float
+
+
+class PlannedOut(Document):
+    """What a test will take."""
+
+    duration_s: float = Field(0.0, description="s")
+    charge_uc: float = Field(0.0, description="charge of one phase, summed over the pulses, µC")
+    torque_time_nms: float | None = Field(None, description="estimated torque-time, N·m·s; null without a model")
+    segments: list[SpanOut] = Field([])
+
+
+class PreviewOut(PlannedOut):
+    """A test that is not played."""
+
+    pulse_width_us: list[float] = Field(description="one for each pulse, µs")
+
+
+class TestSummary(Document):
+    """What was recorded; empty until the test has ended."""
+
+    __test__ = False
+    duration_s: float | None = Field(None, description="s")
+    samples: int | None = Field(None, description="torque samples")
+    lost_samples: int | None = None
+    sample_rate_hz: float | None = Field(None, description="measured, Hz")
+    pulses: int | None = None
+    dropped_pulses: int | None = None
+    charge_uc: float | None = Field(None, description="charge of one phase, summed over the pulses, µC")
+    torque_peak_nm: float | None = Field(None, description="N·m")
+    warnings: list[str] = Field([], description="what is in doubt, in sentences")
+
+
+class WorkOut(Document):
+    """How far the identification is."""
+
+    progress: float = Field(0.0, description="share that is done, 0 to 1")
+    text: str = ""
+
+
+class TestOut(Document):
+    """A test."""
+
+    __test__ = False
+    id: str
+    participant: str
+    kind: str
+    state: Literal[
+        "requested", "running", "sealing", "identifying", "completed", "refused", "stopped", "fault", "failed"
+    ]
+    done: bool = Field(description="true in every final state")
+    reason: str = Field(description="why it ended other than completed")
+    segment: str | None = Field(description="what is played now")
+    elapsed_s: float
+    duration_s: float
+    time_left_s: float
+    progress: float = Field(description="share that is done, 0 to 1")
+    identification: WorkOut | None
+    requested_by: str
+    requested_utc: str
+    finished_utc: str | None
+    planned: PlannedOut
+    recording_id: str | None
+    recording_url: str | None
+    joins: str | None = Field(description="the model whose recording this one is joined to")
+    model_id: str | None
+    model_url: str | None
+    summary: TestSummary
+    fit: VersionOut | None = Field(description="the model's version, once it is identified")
+
+
+class UploadOut(Document):
+    """A recording of another tool that was taken in."""
+
+    recording_id: str
+    model: VersionOut
+    warnings: list[str]
+
+
+class RigHealth(Document):
+    """The rig in a few words."""
+
+    connected: bool
+    state: RigState
+    age_s: float | None
+    torque_age_s: float | None
+
+
+class HealthOut(Document):
+    """Whether the service does its work."""
+
+    status: Literal["ok", "degraded"]
+    database: Literal["ok"]
+    rig: RigHealth
+    uptime_s: float

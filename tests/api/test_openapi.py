@@ -1,0 +1,146 @@
+"""The OpenAPI document is enough to write a client with: what is sent, what comes back, who may, what can go wrong."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import jsonschema_rs
+import pytest
+
+from api.web.responses.rig import SequencesOut
+from rig import plan
+from tests.api.browser import open_tab
+from tests.api.conftest import STUB, Service, run_service, run_test
+
+OPEN = {"/health", "/metrics", "/v1/sessions", "/v1/schemas", "/v1/schemas/{name}"}
+FREE_FORM = {"JsonValue", "SchemaOut"}
+"""What is made to hold anything; each says so."""
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
+    yield from run_service(tmp_path_factory.mktemp("openapi"), short_dir, STUB)
+
+
+@pytest.fixture(scope="module")
+def document(service: Service) -> dict[str, Any]:
+    return httpx.get(f"{service.url}/openapi.json", timeout=60).json()
+
+
+def operations(document: dict[str, Any]) -> Iterator[tuple[str, str, dict[str, Any]]]:
+    for path, methods in document["paths"].items():
+        for method, operation in methods.items():
+            yield path, method, operation
+
+
+def bare(schema: dict[str, Any], place: str) -> Iterator[str]:
+    """Places where a schema says nothing of what is there."""
+    if not set(schema) - {"title", "description", "default", "examples"}:
+        yield f"{place}: anything"
+    unnamed = schema.get("additionalProperties", True) is True and not set(schema) & {"properties", "anyOf", "allOf"}
+    if schema.get("type") == "object" and unnamed:
+        yield f"{place}: an object without keys"
+    if schema.get("type") == "array" and "items" not in schema:
+        yield f"{place}: a list of anything"
+    for name, part in schema.get("properties", {}).items():
+        yield from bare(part, f"{place}.{name}")
+    for key in ("items", "additionalProperties"):
+        if isinstance(schema.get(key), dict):
+            yield from bare(schema[key], f"{place}[]")
+    for part in [part for key in ("anyOf", "oneOf", "allOf") for part in schema.get(key, [])]:
+        yield from bare(part, place)
+
+
+def test_no_body_and_no_answer_is_a_bare_object(document: dict[str, Any]) -> None:
+    found = [
+        place
+        for name, schema in document["components"]["schemas"].items()
+        if name not in FREE_FORM
+        for place in bare(schema, name)
+    ]
+    for path, method, operation in operations(document):
+        bodies = [operation.get("requestBody", {}), *operation["responses"].values()]
+        for kind, media in [pair for body in bodies for pair in body.get("content", {}).items()]:
+            found += list(bare(media.get("schema", {}), f"{method} {path} {kind}"))
+        done = [code for code in operation["responses"] if code.startswith("2") and code != "204"]
+        found += [
+            f"{method} {path} {code}: nothing" for code in done if not operation["responses"][code].get("content")
+        ]
+    assert found == []
+
+
+def test_every_operation_says_who_may_and_every_error_is_a_problem(document: dict[str, Any]) -> None:
+    assert document["components"]["securitySchemes"]["token"] == {
+        "type": "http", "scheme": "bearer", "description": "a token, or a controller's key"
+    }  # fmt: skip
+    for path, method, operation in operations(document):
+        assert bool(operation.get("security")) == (path not in OPEN), (method, path)
+        for code, answer in operation["responses"].items():
+            if code >= "400":
+                schema = answer["content"]["application/problem+json"]["schema"]
+                assert schema == {"$ref": "#/components/schemas/Problem"}, (method, path, code)
+    approve = document["paths"]["/v1/models/{model_id}/approve"]["post"]
+    assert {"token": ["approve-model"]} in approve["security"]
+    assert approve["description"].endswith("Scope: `approve-model`.")
+
+
+def test_real_answers_hold_to_the_document(service: Service, document: dict[str, Any]) -> None:
+    with service.client() as client:
+        client.post("/v1/participants", json={"code": "P017"}).raise_for_status()
+        test = run_test(client, "P017")
+        ids = {"code": "P017", "test_id": test["id"], "model_id": test["model_id"], "name": "model"}
+        client.post(f"/v1/models/{test['model_id']}/approve", json={"reason": "good"}).raise_for_status()
+        client.post("/v1/users", json={"name": "Ada", "password": "long enough"}).raise_for_status()
+        tried = 0
+        for path, method, operation in operations(document):
+            kinds = operation["responses"].get("200", {}).get("content", {})
+            if method != "get" or not any("json" in kind for kind in kinds) or "{job_id}" in path:
+                continue
+            if path.endswith(("/calibration", "/model", "/file")) or path == "/v1/models/{model_id}":
+                continue  # none is open; and MODEL.json of a stub is none: tests/api/test_schemas.py has a real one
+            answer = client.get(path.format(**ids))
+            assert answer.status_code == 200, (path, answer.text)
+            (media,) = kinds.values()
+            schema = {**media["schema"], "components": document["components"]}
+            errors = [error.message for error in jsonschema_rs.Draft202012Validator(schema).iter_errors(answer.json())]
+            assert errors == [], path
+            tried += 1
+    assert tried > 12
+
+
+def test_a_client_sees_which_sequences_there_are_and_what_they_take(service: Service) -> None:
+    with service.client(service.token("controller", "read-model")) as client:
+        found = client.get("/v1/sequences").json()
+    assert [sequence["id"] for sequence in found["sequences"]] == ["rest"]
+
+
+def test_every_sequence_of_the_rig_says_each_setting_with_its_unit() -> None:
+    found = json.loads(plan.library().model_dump_json())
+    SequencesOut.model_validate(found)
+    assert {"prbs", "ramp", "rest", "widths"} <= {sequence["id"] for sequence in found["sequences"]}
+    units = {"_us": "µs", "_s": ", s"}
+    for sequence in found["sequences"]:
+        jsonschema_rs.meta.validate(sequence["settings"])
+        assert sequence["description"].endswith(".")
+        for name, setting in sequence["settings"]["properties"].items():
+            words = setting["description"]
+            assert all(sign in words for suffix, sign in units.items() if name.endswith(suffix)), (name, words)
+            bounded = {"minimum", "exclusiveMinimum", "anyOf", "minItems"} & set(setting)
+            assert bounded or setting["type"] == "boolean" or name == "max_pulse_width_us", (sequence["id"], name)
+    assert [segment["name"] for segment in found["default"]][:2] == ["rest", "prbs"]
+
+
+@pytest.mark.browser
+def test_the_documents_page_loads_from_this_machine_alone(browser: Any, service: Service) -> None:
+    for page in open_tab(browser, service, signed_in=False):
+        page.goto(f"{service.url}/docs")
+        page.locator(".opblock").first.wait_for()
+        assert page.locator(".opblock").count() > 40
+        page.locator(".opblock-summary-path").filter(has_text="/v1/sequences").click()
+        page.locator(".opblock-body").first.wait_for()
+        assert [url for url in page.requests if not url.startswith((service.url, "data:"))] == []
+        assert page.errors == []

@@ -1,0 +1,124 @@
+"""What each verb prints with `--json` holds to its published schema, key by key; the schemas are served and printed."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import httpx
+import jsonschema_rs
+import pytest
+
+from api import schemas
+from api.cli import main
+from api.cli.commands.test import through
+from api.store import Store
+from api.workers.pool import WORKER
+from identify.model import SCHEMA_VERSION
+from identify.paper import table1
+from tests.api.conftest import TOKEN, run_service
+from tests.api.test_worker import made_up_csv
+
+ALL = {name: schemas.load(name) for name in schemas.NAMES}
+REGISTRY = jsonschema_rs.Registry([(schema["$id"], schema) for schema in ALL.values()])
+
+
+def unmet(name: str, document: dict[str, Any]) -> list[str]:
+    """What a document lacks of its schema, and which of its keys at the top the schema does not know."""
+    check = jsonschema_rs.validator_for(schemas.load(name), registry=REGISTRY)
+    unknown = sorted(set(document) - set(schemas.load(name)["properties"]))
+    return [f"{list(error.instance_path)}: {error.message[:200]}" for error in check.iter_errors(document)] + unknown
+
+
+@pytest.fixture(scope="module")
+def record(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return made_up_csv(tmp_path_factory.mktemp("schemas") / "record.csv")
+
+
+@pytest.fixture(scope="module")
+def model(record: Path) -> Path:
+    path = record.parent / "MODEL.json"
+    assert main.run(["fit", str(record), "-o", str(path)]) == 0
+    return path
+
+
+@pytest.mark.parametrize("verb", ["fit", "predict", "compare", "diagnose", "improve", "effects", "doctor"])
+def test_a_verbs_json_holds_to_its_schema(
+    verb: str, record: Path, model: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = {
+        "fit": [record], "predict": [model, record, "-o", record.with_name("out.csv")], "compare": [model, record],
+        "diagnose": [record], "improve": [record], "effects": [], "doctor": ["--data", record.parent],
+    }[verb]  # fmt: skip
+    capsys.readouterr()
+    assert main.run([verb, *map(str, given), "--json"]) == 0
+    assert unmet(verb, json.loads(capsys.readouterr().out)) == []
+
+
+def test_audits_json_holds_to_its_schema(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    Store(f"sqlite:///{tmp_path}/stimrig.db").close()
+    assert main.run(["audit", "verify", "--data", str(tmp_path), "--json"]) == 0
+    assert unmet("audit", json.loads(capsys.readouterr().out)) == []
+
+
+def test_table1_holds_to_its_schema() -> None:
+    assert unmet("table1", table1.run(1, noise_levels_nm=(table1.NOISE_NM[0],))) == []
+
+
+def test_the_emulators_line_holds_to_its_schema() -> None:
+    with subprocess.Popen([sys.executable, "-m", "hardware_sim"], stdout=subprocess.PIPE, text=True) as emulator:
+        assert emulator.stdout is not None
+        try:
+            assert unmet("emulate", json.loads(emulator.stdout.readline())) == []
+        finally:
+            emulator.send_signal(signal.SIGTERM)
+
+
+def test_a_tests_json_holds_to_its_schema(tmp_path: Path, short_dir: Path) -> None:
+    for service in run_service(tmp_path, short_dir, WORKER):
+        found = through(service.url, TOKEN, "P017")
+        found.pop("recording")
+    assert unmet("test", found) == []
+    files = dict.fromkeys(("recording", "model", "report", "logs"), "/somewhere")
+    assert (
+        unmet("demo", {**found, "cpu_percent": {"emulator": 1.0, "rig": None}, "files": files, "seconds": 45.0}) == []
+    )
+
+
+def test_each_schema_is_sound_and_named_with_its_version() -> None:
+    for name, schema in ALL.items():
+        jsonschema_rs.meta.validate(schema)
+        assert schema["$id"].startswith(f"urn:stimrig:schema:{name}:1.")
+    assert ALL["model"]["$id"].endswith(f":{SCHEMA_VERSION}")
+
+
+def test_a_schema_is_printed_by_its_name_and_by_its_verb(capsys: pytest.CaptureFixture[str]) -> None:
+    for asked, name in (("model", "model"), ("fit", "model"), ("diagnose", "diagnosis")):
+        assert main.run(["schema", asked]) == 0
+        assert json.loads(capsys.readouterr().out) == ALL[name]
+    assert main.run(["schema"]) == 0
+    assert capsys.readouterr().out.split() == [schema["$id"] for schema in ALL.values()]
+    assert main.run(["schema", "colour"]) == 2
+    assert "colour: no such schema. Give one of audit, " in capsys.readouterr().err
+
+
+def test_schemas_are_served_to_anybody(client: httpx.Client) -> None:
+    nobody = {"Authorization": ""}
+    listed = client.get("/v1/schemas", headers=nobody).json()["schemas"]
+    assert listed == {name: schema["$id"] for name, schema in ALL.items()}
+    answer = client.get("/v1/schemas/model", headers=nobody)
+    assert answer.headers["content-type"] == "application/schema+json" and answer.json() == ALL["model"]
+    assert client.get("/v1/schemas/colour").status_code == 404
+
+
+def test_every_verb_with_json_has_a_schema() -> None:
+    told = {
+        verb for verb in main.VERBS
+        if "as_json" in (Path(main.commands.__path__[0]) / f"{verb}.py").read_text()
+    }  # fmt: skip
+    assert len(told) > 9
+    assert [verb for verb in told if schemas.OF_VERB.get(verb, verb) not in schemas.NAMES] == []
