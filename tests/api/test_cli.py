@@ -14,6 +14,8 @@ import pytest
 from api.cli import main, terminal
 from tests.api.test_worker import made_up_csv
 
+pytestmark = pytest.mark.slow
+
 GOOD = ["time_s,pulse_width_us,torque_nm,segment"] + [
     f"{k / 40},{100 * (k // 20 % 2)},{k % 7 / 10},prbs" for k in range(400)
 ]
