@@ -14,6 +14,8 @@ import pytest
 from api.cli import main, terminal
 from tests.api.test_worker import made_up_csv
 
+pytestmark = pytest.mark.slow
+
 GOOD = ["time_s,pulse_width_us,torque_nm,segment"] + [
     f"{k / 40},{100 * (k // 20 % 2)},{k % 7 / 10},prbs" for k in range(400)
 ]
@@ -203,7 +205,7 @@ def test_a_model_that_cannot_be_criticised_on_this_record_is_refused(
     words = refused(capsys, verb, str(record), "--model", str(other))
     assert "other.json" in words and "25 pulses a second" in words
     assert main.run(["fit", str(record), "--method", "narx", "-o", str(boxes)]) == 0
-    assert "effects do not stand on a model of narx" in refused(capsys, verb, str(record), "--model", str(boxes))
+    assert "effects cannot be added to a model of narx" in refused(capsys, verb, str(record), "--model", str(boxes))
 
 
 def test_progress_tells_share_and_time_left_after_a_second(

@@ -12,6 +12,8 @@ import pytest
 from identify import effects
 from identify.effects import own_file
 
+pytestmark = pytest.mark.slow
+
 PAGE = Path(__file__).parents[2] / "docs" / "add-an-effect.md"
 
 
