@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from api.cli.launcher import Services
+from api.client.rest import Client
 from api.settings import Settings
 from bench.stamp import written_by
 from examples import ilc_controller as ilc
@@ -40,13 +41,11 @@ def case(emulate: str, speed: float, trials: int, work: Any, widest_us: float = 
         settings = Settings(data_dir=Path(folder))
         settings.port = 0
         with Services(settings, [*emulate.split(), "--speed", f"{speed:g}", "--rate-hz", "400"], TOKEN) as services:
-            service = Patient(services.url, TOKEN, "ILC")
-            http = service.http
+            service = Patient(Client(services.url, TOKEN), "ILC")
+            client = service.client
             profile = {"current_ma": 20.0, "max_pulse_width_us": widest_us, "max_torque_nm": 30.0}
-            ilc.checked(http.post("/v1/participants", json={"code": "ILC", "profile": profile}))
-            location = ilc.checked(http.post("/v1/tests", json={"participant": "ILC"})).headers["location"]
-            while not (test := http.get(location).json())["done"]:
-                time.sleep(0.2)
+            client.make_participant("ILC", profile)
+            test = client.run_test("ILC")
             approve(service, test["model_id"])
             return work(service, test, trials)
 
@@ -61,17 +60,17 @@ class Patient(ilc.Service):
         for _ in range(10):
             try:
                 return super().play(widths_us)
-            except ilc.HaltedError as error:
+            except (ilc.HaltedError, ilc.ServiceError) as error:
                 print(f"  repeated: {error}", file=sys.stderr)
                 self.repeated += 1
                 time.sleep(2)
-                self.http.post("/v1/rearm")
+                self.client.post("/v1/rearm")
         raise SystemExit("the rig does not stay up")
 
 
 def approve(service: ilc.Service, model_id: str) -> None:
     """The person's part."""
-    ilc.checked(service.http.post(f"/v1/models/{model_id}/approve", json={"reason": "bench"}))
+    service.client.approve(model_id, "bench")
 
 
 def one_run(
@@ -101,7 +100,7 @@ def ramp_deconvolution(service: ilc.Service, test: dict[str, Any]) -> dict[str, 
     """The same record, identified as rigs do today."""
     with tempfile.TemporaryDirectory() as folder:
         data, model = Path(folder) / "first.h5", Path(folder) / "MODEL.json"
-        data.write_bytes(ilc.checked(service.http.get(test["recording_url"])).content)
+        data.write_bytes(service.client.recording(test["recording_id"]))
         command = [
             sys.executable,
             "-m",
@@ -126,8 +125,8 @@ def before(service: Patient, _test: dict[str, Any], trials: int, peak_nm: float)
 
 def after(service: Patient, test: dict[str, Any], trials: int, peak_nm: float, effects: list[str]) -> dict[str, Any]:
     """With what was hidden added, on a muscle from its beginning: what tires would burden a second run."""
-    body = {"effects": effects, "force": True, "reason": "the bench knows what was hidden"}
-    version = ilc.checked(service.http.post(f"/v1/models/{test['model_id']}/effects", json=body)).json()
+    why = "the bench knows what was hidden"
+    version = service.client.add_effects(test["model_id"], effects, force=True, reason=why)
     approve(service, version["id"])
     reference = ilc.Reference.reach(peak_nm)
     done = ilc.learn(service, service.fetch(), reference, "norm-optimal", trials)
@@ -198,7 +197,7 @@ def page(cases: dict[str, dict[str, Any]], speed: float, seconds: float) -> str:
     lines = [
         "# Learning with the model",
         "",
-        f"{written_by('python -m bench.ilc')} `examples/ilc_controller.py` speaks HTTP only; the rig is "
+        f"{written_by('python -m bench.ilc')} `examples/ilc_controller.py` uses the REST client alone; the rig is "
         f"emulated, at {speed:g} times the speed of the world; "
         f"{seconds:.0f} s in all, load average {load}.",
         "",

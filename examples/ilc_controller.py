@@ -1,11 +1,11 @@
-"""An iterative learning controller that knows the service by HTTP alone: fetch, plan, play, measure, learn.
+"""An iterative learning controller: fetch the approved model, plan, play, measure, learn.
 
     STIMRIG_TOKEN=… python examples/ilc_controller.py --url http://127.0.0.1:8000 --participant P017 --svg ilc.svg
 
 It fetches the approved MODEL.json, plans the pulse widths of a trial for a reference torque by inverting the
 recruitment curve f and the linear dynamics G, plays them through `POST /v1/tests` (kind `sequence`: the rig's gate
-checks every pulse), reads the torque back from the recording, and corrects the next trial. Imports nothing of
-stimrig.
+checks every pulse), reads the torque back from the recording, and corrects the next trial. Of this software it uses
+`stimrig.Client` alone, which speaks HTTP; docs/api.md tells the routes to those who write one in another language.
 
 Two laws, both on the demanded torque w before f⁻¹, e the tracking error of a trial:
 
@@ -31,8 +31,10 @@ from functools import partial
 from typing import Any
 
 import h5py
-import httpx
 import numpy as np
+
+from stimrig import Client
+from stimrig.errors import Conflict, Invalid, ServiceError
 
 PULSE_RATE_HZ = 40.0
 BEFORE_S, AFTER_S = 1.0, 1.0
@@ -164,18 +166,16 @@ LAWS = {"norm-optimal": norm_optimal, "phase-lead": phase_lead}
 
 
 class Service:
-    """The few routes a controller needs."""
+    """What a controller asks of the service for one participant."""
 
-    def __init__(self, url: str, token: str, participant: str) -> None:
-        self.http = httpx.Client(base_url=url, headers={"Authorization": f"Bearer {token}"}, timeout=60)
-        self.participant, self.etag, self.model = participant, "", {}
+    def __init__(self, client: Client, participant: str) -> None:
+        self.client, self.participant = client, participant
+        self.known: Any = None
 
     def fetch(self) -> dict[str, Any]:
-        """The approved model; asked for by its ETag, so that an unchanged one isn't sent again."""
-        answer = self.http.get(f"/v1/participants/{self.participant}/model", headers={"If-None-Match": self.etag})
-        if answer.status_code != 304:
-            self.model, self.etag = checked(answer).json(), answer.headers["etag"]
-        return self.model
+        """The approved model. It is sent again only if it has changed (ETag)."""
+        self.known = self.client.approved_model(self.participant, self.known)
+        return self.known.document
 
     def play(self, widths_us: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Play a trial; its torque above rest in each pulse's period, N·m, and the widths sent, µs, both (N,)."""
@@ -184,40 +184,29 @@ class Service:
             {"name": "trial", "sequence": "widths", "settings": {"pulse_width_us": widths_us.tolist()}},
             {"name": "rest", "sequence": "rest", "settings": {"duration_s": AFTER_S}},
         ]
-        body = {"participant": self.participant, "kind": "sequence", "segments": segments}
+        for test in self.client.follow(self.start(segments)):
+            if test["recording_id"]:
+                return measured(self.client.recording(test["recording_id"]), widths_us.size)
+        raise HaltedError(f"the trial ended as {test['state']}: {test['reason']}")
+
+    def start(self, segments: list[dict[str, Any]]) -> str:
+        """Start a trial as soon as the rig has rested; the id of its test."""
         patience = time.monotonic() + 90
-        while (answer := self.http.post("/v1/tests", json=body)).status_code in (409, 422) and "rest" in answer.text:
-            if time.monotonic() > patience:
-                break
+        while True:
+            try:
+                return self.client.start_test(self.participant, kind="sequence", segments=segments)["id"]
+            except (Conflict, Invalid) as error:
+                if "rest" not in error.detail or time.monotonic() > patience:
+                    raise
             time.sleep(0.3)  # the gate asks for a rest between tests
-        location = checked(answer).headers["location"]
-        while not (test := checked(self.http.get(location)).json())["recording_id"]:
-            if test["done"]:
-                raise HaltedError(f"the trial ended as {test['state']}: {test['reason']}")
-            time.sleep(0.1)
-        return measured(checked(self.http.get(test["recording_url"])).content, widths_us.size)
 
     def predict(self, model_id: str, widths_us: np.ndarray) -> np.ndarray:
         """What the model says a trial would give, N·m in each pulse's period, shape (N,)."""
-        body = {"pulse_width_us": widths_us.tolist()}
-        answer = checked(self.http.post(f"/v1/models/{model_id}/prediction", json=body))
-        return np.array(answer.json()["torque_nm"])
+        return np.array(self.client.predict(model_id, widths_us.tolist()))
 
 
 class HaltedError(Exception):
     """The rig stopped, or refuses: a person has to look. The controller does nothing more."""
-
-
-def checked(answer: httpx.Response) -> httpx.Response:
-    """The answer, or the problem's own words raised."""
-    if answer.is_success:
-        return answer
-    try:
-        problem = answer.json()
-        words = f"{problem['title']}: {problem['detail']}"
-    except ValueError:
-        words = answer.text[:200]
-    raise HaltedError(f"{answer.request.method} {answer.request.url.path}: {words}")
 
 
 def measured(recording: bytes, size: int) -> tuple[np.ndarray, np.ndarray]:
@@ -333,7 +322,7 @@ def main() -> None:
     parser.add_argument("--svg", help="draw here")
     options = parser.parse_args()
     token = os.environ.get("STIMRIG_TOKEN") or sys.exit("set STIMRIG_TOKEN: read-model, read-live and run-test")
-    service = Service(options.url, token, options.participant)
+    service = Service(Client(options.url, token), options.participant)
     model = service.fetch()
     reference = Reference.reach(options.peak_nm or 0.6 * float(model["recruitment"]["inverse"]["torque_nm"][-1]))
     laws = list(LAWS) if options.law == "both" else [options.law]
@@ -349,5 +338,5 @@ def main() -> None:
 if __name__ == "__main__":
     try:
         main()
-    except HaltedError as error:
+    except (HaltedError, ServiceError) as error:
         sys.exit(str(error))

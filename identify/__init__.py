@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from identify.criticism import compare
     from identify.diagnosis import diagnose
+    from identify.diagnosis.experiment import Experiment, next_experiment
     from identify.diagnosis.improvement import improve
     from identify.errors import (
         BadModel,
@@ -38,6 +39,8 @@ _PLACES = {
     "Improvement": "identify.results",
     "compare": "identify.criticism",
     "diagnose": "identify.diagnosis",
+    "next_experiment": "identify.diagnosis.experiment",
+    "Experiment": "identify.diagnosis.experiment",
     "improve": "identify.diagnosis.improvement",
     "BadModel": "identify.errors",
     "BadRecord": "identify.errors",
@@ -55,6 +58,7 @@ __all__ = [
     "Cancelled",
     "Comparison",
     "Diagnosis",
+    "Experiment",
     "IdentifyError",
     "Improvement",
     "Model",
@@ -64,6 +68,7 @@ __all__ = [
     "diagnose",
     "fit",
     "improve",
+    "next_experiment",
     "predict",
     "read",
 ]

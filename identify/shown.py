@@ -6,9 +6,8 @@ import html
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any
-
-import numpy as np
 
 from identify.errors import BadRequest
 
@@ -130,8 +129,9 @@ def quantity(value: Any, unit: str) -> str:
 
     The unit "1" of a pure number is left out.
     """
-    if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not math.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, Real) or not math.isfinite(value):
         return NONE
+    value = float(value)
     digits = f"{value:.1f}" if unit == "%" else f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
     return digits if unit in ("", "1") else f"{digits} {unit}"
 

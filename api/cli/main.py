@@ -19,7 +19,6 @@ from typer.exceptions import TyperException
 
 from api.cli import commands
 from api.cli.errors import CommandError
-from api.cli.terminal import clear_progress
 from api.client.errors import Forbidden, Invalid, NotFound, ServiceError, Unauthorized, Unreachable
 from api.errors import ApiError, SettingsError
 from api.version import software_version
@@ -77,7 +76,6 @@ def run(arguments: list[str] | None = None) -> int:
         sys.stdout.flush()
         return code if isinstance(code, int) else 0
     except (KeyboardInterrupt, typer.Abort):
-        clear_progress()
         print("stimrig: interrupted", file=sys.stderr)
         return 130
     except BrokenPipeError:
@@ -90,7 +88,6 @@ def run(arguments: list[str] | None = None) -> int:
 def _one_line(verb: str, error: Exception) -> int:
     """The error's line, and the exit code it stands for."""
     name = f"stimrig {verb}" if verb in VERBS else "stimrig"
-    clear_progress()
     if isinstance(error, TyperException):
         message = error.format_message().strip()
         if not message or message.startswith("Usage:"):  # no verb was given: the help itself, not in one line

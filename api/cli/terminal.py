@@ -6,8 +6,7 @@ import contextlib
 import json
 import math
 import sys
-import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,12 +15,6 @@ import typer
 from api.cli.errors import InputError
 
 LARGEST_MODEL_BYTES = 32 * 2**20
-PATIENCE_S = 1.0
-"""What takes no longer shows no progress."""
-LEAST_PACE = 0.05
-"""Share from which the time that passed says how long it takes."""
-CLEARED = "\r\x1b[K"
-
 
 DATA_HELP = (
     "sealed recording (HDF5); CSV file with the columns time_s,pulse_width_us,torque_nm,segment; or another tool's "
@@ -201,38 +194,6 @@ def table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
     widths = [max(len(row[index]) for row in cells) for index in range(len(cells[0]))]
     lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in cells]
     return [lines[0], "  ".join("-" * width for width in widths), *lines[1:]]
-
-
-def progress_line() -> Callable[[float, str], None]:
-    """A line on standard error where a person looks at it: how far, how long yet; gone once all is done.
-
-    What ends within a second shows none.
-    """
-    shown, begun_s = sys.stderr.isatty(), time.monotonic()
-
-    def progress(fraction: float, text: str = "") -> None:
-        passed_s = time.monotonic() - begun_s
-        if not shown or passed_s < PATIENCE_S:
-            return
-        line = "" if fraction >= 1 else progress_words(fraction, passed_s, text)
-        print(f"{CLEARED}{line}", end="", file=sys.stderr, flush=True)
-
-    return progress
-
-
-def progress_words(fraction: float, passed_s: float, text: str) -> str:
-    """The share that is done, the time that its pace leaves, and what is being done."""
-    left = ""
-    if fraction >= LEAST_PACE:
-        left_s = round(passed_s * (1.0 - fraction) / fraction)
-        left = f"about {left_s // 60} min {left_s % 60} s left" if left_s >= 60 else f"about {left_s} s left"
-    return f"{100 * fraction:3.0f} %  {left:22}  {text[:60]}".rstrip()
-
-
-def clear_progress() -> None:
-    """Take a progress line away before something else is said on standard error."""
-    if sys.stderr.isatty():
-        print(CLEARED, end="", file=sys.stderr, flush=True)
 
 
 def model_report(document: dict[str, Any]) -> list[str]:

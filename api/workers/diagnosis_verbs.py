@@ -90,11 +90,10 @@ def smooth(record: Any, values: Any) -> Any:
 
 def experiment(missing: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
     """The test that separates the first effect with rivals from them; None where no effect has any."""
-    for entry in missing:
-        if entry.get("confused_with") and entry.get("next_experiment_plan"):
-            rivals = [entry["effect"], entry["confused_with"][0]]
-            return {"rivals": rivals, **entry["next_experiment_plan"], "effect": entry["effect"]}
-    return None
+    from identify.diagnosis.experiment import planned
+
+    found = planned(missing)
+    return found and {**found.to_dict(), "effect": found.rivals[0]}
 
 
 def improve(data: str, progress: Progress, force: Sequence[str] = (), model_json: str | None = None) -> dict[str, Any]:

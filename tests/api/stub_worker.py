@@ -123,6 +123,8 @@ def answer(verb: str, arguments: dict[str, Any], say: Any) -> dict[str, Any]:
     if verb == "improve":
         say(progress=0.5, text="adding fatigue")
         return {"result": improvement(arguments.get("model_json"))}
+    if verb == "forecast":
+        return {"result": {"torque_nm": [width / 100 for width in arguments["pulse_width_us"]]}}
     if verb == "join":
         Path(arguments["out"]).write_text("\n".join(arguments["parts"]))
         return {"result": {"file_sha256": "0" * 64}}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import subprocess
 import sys
@@ -11,7 +12,8 @@ from typing import Any
 
 import pytest
 
-from api.cli import main, terminal
+from api.cli import main
+from api.progress_bar import progress_bar
 from tests.api.test_worker import made_up_csv
 
 pytestmark = pytest.mark.slow
@@ -208,22 +210,27 @@ def test_a_model_that_cannot_be_criticised_on_this_record_is_refused(
     assert "effects cannot be added to a model of narx" in refused(capsys, verb, str(record), "--model", str(boxes))
 
 
-def test_progress_tells_share_and_time_left_after_a_second(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    now_s = [0.0]
-    monkeypatch.setattr("api.cli.terminal.time.monotonic", lambda: now_s[0])
-    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
-    progress = terminal.progress_line()
-    for now_s[0], share in ((0.9, 0.1), (10.0, 0.25), (20.0, 0.02), (100.0, 0.5), (110.0, 1.0)):
-        progress(share, "tried tremor")
-    lines = capsys.readouterr().err.split(terminal.CLEARED)[1:]
-    assert [" ".join(line.split()) for line in lines] == [
-        "25 % about 30 s left tried tremor", "2 % tried tremor", "50 % about 1 min 40 s left tried tremor", "",
-    ]  # fmt: skip
-    monkeypatch.setattr("sys.stderr.isatty", lambda: False)
-    terminal.progress_line()(0.5, "into a file")
-    assert capsys.readouterr().err == ""
+def test_progress_tells_share_and_text_to_who_looks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("api.progress_bar.PATIENCE_S", 0.0)
+    for looks in (True, False):
+        shown = io.StringIO()
+        shown.isatty = lambda looks=looks: looks
+        monkeypatch.setattr("sys.stderr", shown)
+        with progress_bar() as progress:
+            for share in (0.25, 0.5):
+                progress(share, "tried tremor")
+        lines = [" ".join(line.split()) for line in shown.getvalue().split("\r")]
+        assert any(line.startswith("50 %") and line.endswith("left tried tremor") for line in lines) == looks
+        assert lines[-1] == "", "nothing stays behind it"
+
+
+def test_work_that_is_done_within_a_second_shows_no_bar(monkeypatch: pytest.MonkeyPatch) -> None:
+    shown = io.StringIO()
+    shown.isatty = lambda: True
+    monkeypatch.setattr("sys.stderr", shown)
+    with progress_bar() as progress:
+        progress(0.5, "tried tremor")
+    assert "tried" not in shown.getvalue()
 
 
 def test_unforeseen_error_is_one_line_and_a_log(

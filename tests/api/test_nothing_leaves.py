@@ -11,7 +11,7 @@ from urllib.parse import urlsplit
 import pytest
 
 import identify
-from api.charts import notebook
+import stimrig
 from api.charts.config import CHART_CONFIG
 from api.web.pages.report_file import comparison_html, improvement_html
 from api.workers.verbs import curves, thinned
@@ -133,7 +133,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ]}  # fmt: skip
     improved = improvement_html(found, LINK, None, against, against, drawn["segments"])
     (folder / "improve.html").write_text(improved)
-    (folder / "notebook.html").write_text(f"<!doctype html><body>{notebook.plot(model, read)._repr_html_()}")
+    (folder / "notebook.html").write_text(f"<!doctype html><body>{stimrig.plot(model, read)._repr_html_()}")
     return folder
 
 
@@ -164,7 +164,7 @@ def test_each_way_of_showing_a_notebooks_figure_is_without_the_upload() -> None:
     import plotly.io as pio
 
     step = {"added": None, "rms_nm": 1.0, "held_out_rms_nm": 2.0}
-    figure = notebook.plot(identify.Improvement(0.1, "nothing_missing", steps=(step,), models=(), refused=()))
+    figure = stimrig.plot(identify.Improvement(0.1, "nothing_missing", steps=(step,), models=(), refused=()))
     html = figure.to_html(include_plotlyjs=False, config={"showSendToCloud": True})
     assert '"showSendToCloud": false' in html and '"modeBarButtons": [["toImage"]' in html
     for renderer in ("colab", "plotly_mimetype"):

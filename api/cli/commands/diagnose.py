@@ -6,7 +6,8 @@ from typing import Any
 
 import typer
 
-from api.cli.terminal import ColumnMap, Data, HeldModel, Json, load_held, number, percent, progress_line, say, say_json
+from api.cli.terminal import ColumnMap, Data, HeldModel, Json, load_held, number, percent, say, say_json
+from api.progress_bar import progress_bar
 from api.structure import in_words, worded
 
 VERDICTS = {
@@ -34,9 +35,8 @@ def diagnose(
     import identify
 
     record, model, structure = load_held(model_json, data, columns)
-    progress = progress_line()
-    found = {"structure": structure, **identify.diagnose(record, model, progress).to_dict()}
-    progress(1.0, "done")
+    with progress_bar() as progress:
+        found = {"structure": structure, **identify.diagnose(record, model, progress).to_dict()}
     if as_json:
         say_json(found)
         return

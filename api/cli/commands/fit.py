@@ -14,11 +14,11 @@ from api.cli.terminal import (
     load_record,
     model_report,
     names,
-    progress_line,
     say,
     say_json,
     write_model,
 )
+from api.progress_bar import progress_bar
 
 
 def register(app: typer.Typer) -> None:
@@ -53,9 +53,10 @@ def fit(
     import identify
 
     record = load_record(data, columns)
-    model = identify.fit(
-        record, method=method, effects=names(effects), fit_on=names(fit_on) or None, progress=progress_line()
-    )
+    with progress_bar() as progress:
+        model = identify.fit(
+            record, method=method, effects=names(effects), fit_on=names(fit_on) or None, progress=progress
+        )
     if output is not None:
         write_model(output, model)
     if as_json:

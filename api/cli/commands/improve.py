@@ -16,13 +16,13 @@ from api.cli.terminal import (
     Json,
     load_held,
     number,
-    progress_line,
     say,
     say_json,
     table,
     write,
     write_model,
 )
+from api.progress_bar import progress_bar
 from api.structure import in_words
 
 FEW = 3
@@ -51,9 +51,8 @@ def improve(
     import identify
 
     record, model, structure = load_held(model_json, data, columns)
-    progress = progress_line()
-    improved = identify.improve(record, progress=progress, model=model)
-    progress(1.0, "done")
+    with progress_bar() as progress:
+        improved = identify.improve(record, progress=progress, model=model)
     found, models = {"structure": structure, **improved.to_dict()}, improved.models
     del found["models"]
     if output is not None:
@@ -86,7 +85,8 @@ def report(
     before, after = (thinned(identify.compare(model, record).to_dict()) for model in (models[0], models[-1]))
     labels = [str(record.segment_names[index]) for index in record.segment]
     segments = runs(labels, np.asarray(record.time_s))
-    missing = diagnosis(str(data), progress_line(), None if held is None else held.to_json(), columns)
+    with progress_bar() as progress:
+        missing = diagnosis(str(data), progress, None if held is None else held.to_json(), columns)
     return improvement_html(found, data.name, missing, before, after, segments)
 
 

@@ -6,7 +6,8 @@ from typing import Annotated, Any
 
 import typer
 
-from api.cli.terminal import Json, number, progress_line, say, say_json, table
+from api.cli.terminal import Json, number, say, say_json, table
+from api.progress_bar import progress_bar
 
 
 def register(app: typer.Typer) -> None:
@@ -21,7 +22,8 @@ def table1(
     """Best-fit rates at each noise level, ours beside the paper's."""
     from identify.paper import table1 as table_one
 
-    found = table_one.run(trials, progress_line())
+    with progress_bar() as progress:
+        found = table_one.run(trials, progress)
     if as_json:
         say_json(found)
         return

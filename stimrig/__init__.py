@@ -1,0 +1,75 @@
+"""Identify an electrically stimulated muscle, see where the model fails, learn what is missing.
+
+    import stimrig
+
+    record = stimrig.read("first.h5")
+    model = stimrig.fit(record)
+    model.plot(record)
+
+docs/python.md shows every name. Names are loaded when they are first used, so that `import stimrig` is fast.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from identify.shown import register_plotter
+from stimrig import errors
+
+if TYPE_CHECKING:
+    from api.charts.figures import plot
+    from api.client.rest import Client
+    from identify import Model, Record, compare, next_experiment, predict, read
+    from identify.effects import library as effects
+    from stimrig.with_progress import diagnose, fit, improve
+
+_PLACES = {
+    "read": ("identify.records.read", "read"),
+    "Record": ("identify.records.record", "Record"),
+    "Model": ("identify.model", "Model"),
+    "fit": ("stimrig.with_progress", "fit"),
+    "predict": ("identify.simulation.predict", "predict"),
+    "compare": ("identify.criticism", "compare"),
+    "diagnose": ("stimrig.with_progress", "diagnose"),
+    "improve": ("stimrig.with_progress", "improve"),
+    "next_experiment": ("identify.diagnosis.experiment", "next_experiment"),
+    "effects": ("identify.effects", "library"),
+    "plot": ("api.charts.figures", "plot"),
+    "Client": ("api.client.rest", "Client"),
+}
+
+__all__ = [
+    "Client",
+    "Model",
+    "Record",
+    "compare",
+    "diagnose",
+    "effects",
+    "errors",
+    "fit",
+    "improve",
+    "next_experiment",
+    "plot",
+    "predict",
+    "read",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _PLACES:
+        raise AttributeError(f"module 'stimrig' has no attribute {name!r}")
+    module, attribute = _PLACES[name]
+    return getattr(import_module(module), attribute)
+
+
+def __dir__() -> list[str]:
+    return __all__
+
+
+def _draw(result: Any, record: Any) -> Any:
+    """What `model.plot(record)` calls; the plotting library is loaded by the first figure."""
+    return import_module("api.charts.figures").plot(result, record)
+
+
+register_plotter(_draw)

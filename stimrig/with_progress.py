@@ -1,0 +1,59 @@
+"""`fit`, `diagnose` and `improve` of `identify`, with a progress bar in notebooks and terminals.
+
+`progress` is True (a bar, if the work takes longer than a second), False (none), or a function of one's own that takes
+a share of 0 to 1 and a line of text. All other parameters, results and errors are those of `identify`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import identify
+from api.progress_bar import progress_bar
+
+Tell = Callable[[float, str], None]
+Progress = Tell | bool
+
+
+def fit(
+    record: identify.Record,
+    method: str = "maximum-likelihood",
+    effects: Sequence[str] = (),
+    fit_on: Sequence[str] | None = None,
+    progress: Progress = True,
+    **options: Any,
+) -> identify.Model:
+    """Fit a model to a record; see `identify.fit`. `progress`: a bar, none, or a function."""
+    with _telling(progress) as tell:
+        return identify.fit(record, method, effects, fit_on, tell, **options)
+
+
+def diagnose(
+    record: identify.Record, model: identify.Model | None = None, progress: Progress = True
+) -> identify.Diagnosis:
+    """What is missing in a model of a record; see `identify.diagnose`. `progress`: a bar, none, or a function."""
+    with _telling(progress) as tell:
+        return identify.diagnose(record, model, tell)
+
+
+def improve(
+    record: identify.Record,
+    progress: Progress = True,
+    max_effects: int | None = None,
+    force: Sequence[str] = (),
+    model: identify.Model | None = None,
+) -> identify.Improvement:
+    """Add what is missing, one effect at a time; see `identify.improve`. `progress`: a bar, none, or a function."""
+    with _telling(progress) as tell:
+        return identify.improve(record, tell, max_effects, force, model)
+
+
+@contextmanager
+def _telling(progress: Progress) -> Iterator[Tell]:
+    if callable(progress):
+        yield progress
+    else:
+        with progress_bar(progress) as tell:
+            yield tell
