@@ -16,6 +16,8 @@ from api.cli import main
 from api.progress_bar import progress_bar
 from tests.api.test_worker import made_up_csv
 
+pytestmark = pytest.mark.slow
+
 GOOD = ["time_s,pulse_width_us,torque_nm,segment"] + [
     f"{k / 40},{100 * (k // 20 % 2)},{k % 7 / 10},prbs" for k in range(400)
 ]

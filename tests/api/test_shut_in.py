@@ -28,6 +28,8 @@ from tests.api.test_problems import problem
 from tests.api.test_worker import made_up_csv, with_pool
 from tests.harness import hostile_files, hostile_shapes
 
+pytestmark = pytest.mark.slow
+
 SECRET = "the-administrators-token"
 ROOT = Path(__file__).parents[2]
 

@@ -15,6 +15,8 @@ from tests.api.conftest import STUB, Service, run_service, run_test
 from tests.api.test_access import csrf, signed_in
 from tests.api.test_one_service import command
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def site(tmp_path: Path, short_dir: Path) -> Iterator[Service]:

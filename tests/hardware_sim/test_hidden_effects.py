@@ -22,6 +22,8 @@ from hardware_sim.patients.hidden.effect_free_fit import EffectFreeFit
 from hardware_sim.patients.hidden.kernels import Formulation, NotSuited
 from hardware_sim.patients.hidden.scenario import BANDS, combine, excess_nm, simulate
 
+pytestmark = pytest.mark.slow
+
 CONTRACT = {
     "fatigue",
     "potentiation",
@@ -113,7 +115,6 @@ DRAWN = [(strength, seed) for strength in BANDS for seed in (DEVELOPMENT, KEPT_B
 ALWAYS = {("weak", KEPT_BACK), ("strong", DEVELOPMENT)}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("strength", "seed"),
     [pytest.param(*drawn, marks=[] if drawn in ALWAYS else [pytest.mark.campaign]) for drawn in DRAWN],

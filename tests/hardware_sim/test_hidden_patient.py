@@ -14,6 +14,8 @@ from hardware_sim.patients.hidden.draw import Scenario, draw_scenario
 from hardware_sim.patients.hidden.live import HiddenMuscle
 from hardware_sim.patients.hidden.scenario import simulate
 
+pytestmark = pytest.mark.slow
+
 RATE_HZ = 1600
 
 

@@ -76,6 +76,18 @@ def test_every_command_of_the_page_does_what_it_says(place: Path) -> None:
     assert (place / "predicted.csv").stat().st_size > 1000
 
 
+@pytest.mark.parametrize("seed", range(3011, 3015))
+def test_it_is_found_on_other_records_that_have_it(place: Path, seed: int) -> None:
+    """The emulator's own amplifiers: period, phase and shape are drawn by the seed. No seed was looked at before."""
+    record = hidden_records.generate("sensor_gain_swing", "strong", seed=seed, rate_hz=100)
+    hidden_records.write_csv(record, place / f"{seed}.csv")
+    found = json.loads(run(["diagnose", f"{seed}.csv", "--json"], place, "my_effects"))
+    first, true = found["missing"][0], record["truth"]["parameters"]["sensor_gain_swing"]
+    assert first["effect"] == "sensor_gain_swing"
+    assert first["parameters"]["period_s"]["value"] == pytest.approx(true["period_s"], rel=0.02)
+    assert first["rms_after_nm"] < 0.5 * first["rms_before_nm"]
+
+
 def test_a_mistake_in_the_file_is_one_line(place: Path) -> None:
     (place / "broken").mkdir(exist_ok=True)
     (place / "broken" / "mine.py").write_text("EFFEKT = 1\n")

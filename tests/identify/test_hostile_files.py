@@ -16,6 +16,8 @@ from identify.records.hdf5 import StrictFile
 from identify.strict_json import BadJson, parse
 from tests.harness import hostile_shapes as shapes
 
+pytestmark = pytest.mark.slow
+
 
 def told(path: Path) -> str:
     """The line in which a file is refused; empty where it is taken."""
@@ -27,7 +29,6 @@ def told(path: Path) -> str:
     return ""
 
 
-@pytest.mark.slow
 def test_every_shape_of_recording_is_refused_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "secret.txt").write_bytes(shapes.SECRET)
     (tmp_path / "other.h5").write_bytes(shapes.good())
@@ -68,7 +69,6 @@ def test_every_shape_of_table_is_refused_in_one_line(tmp_path: Path, hostile: sh
     assert bool(told(path)) == hostile.refused
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("filling", [b"\n", b"1,", b'"a\n"', b"nan,nan,nan,prbs\n", b"0.0,0,0,prbs\n"])
 def test_memory_follows_what_a_table_holds(tmp_path: Path, filling: bytes) -> None:
     path = tmp_path / "upload.csv"

@@ -20,6 +20,8 @@ from identify.records.mat_file import BadMat, variables
 from identify.records.record import Record
 from tests.harness.patients import Patient, make_record
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def record() -> Record:

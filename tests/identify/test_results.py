@@ -19,6 +19,8 @@ from identify.methods import methods
 from identify.shown import Sheet, estimate, fit_words, one_line, probability, quantity, register_plotter
 from tests.identify import hidden_muscles
 
+pytestmark = pytest.mark.slow
+
 FOLDER = Path(__file__).parents[2] / "api" / "schemas"
 SCHEMAS = {path.stem: json.loads(path.read_text("utf-8")) for path in sorted(FOLDER.glob("*.json"))}
 RESULTS = ("comparison", "diagnosis", "improvement", "model")
@@ -83,7 +85,6 @@ def described(schema: dict[str, Any], place: str = "") -> Iterator[tuple[str, st
         yield from described(part, name)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", RESULTS)
 def test_every_key_of_a_real_result_is_described_and_none_is_missing(results, name):
     assert errors(name, results[name].to_dict()) == []
@@ -94,7 +95,6 @@ def test_models_with_effects_and_of_each_method_keep_to_the_schema(results, reco
     assert [found for model in models if (found := errors("model", model.to_dict()))] == []
 
 
-@pytest.mark.slow
 def test_nothing_missing_and_nothing_held_out_keep_to_the_schema():
     bare = hidden_muscles.record(seed=13, rate_hz=100, validate=False)
     model = identify.fit(bare)
@@ -103,7 +103,6 @@ def test_nothing_missing_and_nothing_held_out_keep_to_the_schema():
     assert found.verdict == "nothing_missing" and errors("diagnosis", found.to_dict()) == []
 
 
-@pytest.mark.slow
 def test_rivals_and_the_test_between_them_keep_to_the_schema(record, monkeypatch):
     """Every effect that was tried is made a rival, so that there is a test to plan."""
     monkeypatch.setattr(import_module("identify.diagnosis.result"), "RIVAL", 0.0)

@@ -15,6 +15,8 @@ from identify.effects import registry
 from identify.effects.base import Form, Scene
 from tests.identify import hidden_muscles
 
+pytestmark = pytest.mark.slow
+
 SETTINGS = {"scale_nm": 7.0, "noise_sd_nm": 0.04, "zero_nm": 0.0, "sign": 1.0, "reference_s": 0.0}
 SPOILED = (0.0, float("nan"), float("inf"), 1e9, -1e9, -1.0, 1e-12)
 

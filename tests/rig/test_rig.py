@@ -24,6 +24,8 @@ from rig.errors import BusyError, DeviceError, LatchedError, PlanError, RefusedE
 from rig.messages import CalibrateStartRequest, PreviewRequest, Profile, SegmentPlan
 from tests.rig.live import LiveRig
 
+pytestmark = pytest.mark.slow
+
 Make = Callable[..., LiveRig]
 
 

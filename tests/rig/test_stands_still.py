@@ -9,6 +9,8 @@ import pytest
 from rig.messages import SegmentPlan
 from tests.rig.fakes import VirtualRig
 
+pytestmark = pytest.mark.slow
+
 
 def rig_with_noise(folder: Path, on_s: float, repeats: int = 1, ceiling_nm: float = 5.0) -> VirtualRig:
     """Torque rises to 6 N·m in each hold, above the ceiling."""

@@ -79,6 +79,17 @@ def test_malformed_requests_are_answered_not_fatal(shared: tuple[Bench, RigClien
     assert client.status()["state"] == "ready"
 
 
+def test_sequences_and_the_default_test_are_told(shared: tuple[Bench, RigClient]):
+    _bench, client = shared
+    body = client.ask("sequences")["body"]
+    told = {sequence["id"]: sequence["settings"]["properties"] for sequence in body["sequences"]}
+    assert (
+        told["prbs"]["bits"]["maximum"] == 12 and "comfort maximum" in told["ramp"]["max_pulse_width_us"]["description"]
+    )
+    same = [client.ask("preview", plan=default_plan("p", segments=given))["body"] for given in (None, body["default"])]
+    assert same[0] == same[1] and same[0]["duration_s"] > 30
+
+
 def test_preview_gives_duration_and_dose(shared: tuple[Bench, RigClient]):
     _bench, client = shared
     table = {"pulse_width_us": [0.0, 100.0, 300.0], "torque_nm": [0.0, 0.0, 8.0]}
