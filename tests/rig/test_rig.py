@@ -24,7 +24,7 @@ from rig.errors import BusyError, DeviceError, LatchedError, PlanError, RefusedE
 from rig.messages import CalibrateStartRequest, PreviewRequest, Profile, SegmentPlan
 from tests.rig.live import LiveRig
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.wire  # the rig, its devices and the clock in threads, in real time
 
 Make = Callable[..., LiveRig]
 
