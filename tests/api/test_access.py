@@ -78,7 +78,7 @@ def test_every_v1_route_is_closed_to_strangers(service: Service) -> None:
         assert len(paths) > 20
         for path, methods in paths.items():
             for method in methods:
-                if path.startswith("/v1"):
+                if path.startswith("/v1") and not path.startswith("/v1/schemas"):  # published: they hold no data
                     assert nobody.request(method.upper(), re.sub(r"\{.*?\}", "x", path)).status_code == 401, path
 
 

@@ -65,7 +65,7 @@ def test_a_form_without_a_reason_decides_nothing(service: Service) -> None:
     model = a_model(service, "C2")["model_id"]
     with signed_in(service) as browser:
         refused = browser.post(f"/models/{model}/approve", data={"csrf": csrf(browser), "reason": "  "})
-    assert refused.status_code == 422 and "wants a reason" in refused.text
+    assert refused.status_code == 422 and "needs a reason" in refused.text
     with service.client() as http:
         assert http.get(f"/v1/models/{model}").json()["decision"] is None
 

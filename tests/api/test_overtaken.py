@@ -52,7 +52,7 @@ def test_a_start_that_a_stop_has_overtaken_is_not_played_after_a_rearm(
         assert client.post("/v1/rearm").status_code == 200
         held.free.set()
         answer = asked.result()
-    assert answer.status_code == 409 and "stop came" in answer.json()["title"]
+    assert answer.status_code == 409 and "cancelled by a stop" in answer.json()["title"]
     assert service.rig.starts == 0
     assert client.post("/v1/tests", json={"participant": participant}).status_code == 202
 

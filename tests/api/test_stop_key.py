@@ -130,9 +130,10 @@ def test_stimrig_test_stops_on_a_key(
     def watched(client: httpx.Client, participant: str, watch: Any, **more: Any) -> dict[str, Any]:
         """A key as soon as the rig plays."""
 
-        def look() -> None:
+        def look() -> list[str]:
             if service.rig.state == "running" and not pressed:
                 pressed.append(os.write(keyboard, b"q"))
+            return []
 
         return real(client, participant, look, **more)
 

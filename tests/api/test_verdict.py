@@ -46,7 +46,7 @@ def test_not_usable_is_said_in_each_place(tmp_path: Path, short_dir: Path, capsy
     data = record_csv(tmp_path / "noise.csv", follows=False)
     printed, report = said(capsys, "fit", data, "-o", tmp_path / "MODEL.json"), tmp_path / "report.html"
     stored = json.loads((tmp_path / "MODEL.json").read_text())["quality"]
-    assert stored["verdict"] == "not usable" and stored["words"].startswith("Do not rely on it, since ")
+    assert stored["verdict"] == "not usable" and stored["words"].startswith("Do not use this model: ")
     assert f"not usable: {stored['words']}" in printed
     assert json.loads(said(capsys, "fit", data, "--json"))["quality"] == stored
     assert stored["words"] in said(capsys, "compare", tmp_path / "MODEL.json", data, "--html", report)

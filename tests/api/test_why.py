@@ -360,7 +360,7 @@ def test_browser_asks_for_html(service: Service) -> None:
 
 def test_real_worker_finds_what_is_missing_and_the_page_shows_it(tmp_path: Path) -> None:
     """identify's own answers carry what page and routes build on."""
-    from api.web.responses import ComparisonOut, DiagnosisOut
+    from api.web.responses.models import ComparisonOut, DiagnosisOut
     from api.workers import diagnosis_verbs
     from api.workers.verbs import comparison, fit
 

@@ -360,7 +360,7 @@ def test_a_pulse_that_is_later_acts_whole_but_later():
 
 
 def test_the_other_limit_is_a_drive_that_stands_until_it_changes(monkeypatch):
-    monkeypatch.setattr(pulse_grid, "STANDS", 1.0)
+    monkeypatch.setattr(pulse_grid, "FUSED", 1.0)
     drive = np.random.default_rng(0).random(40)
     assert grid_of({10: 0.4}).held(drive)[10] == pytest.approx(0.6 * drive[10] + 0.4 * drive[9])
 
@@ -430,7 +430,7 @@ def test_what_is_doubted_is_not_counted():
     assert against.rms_nm < 0.025
     assert against.held_out["rms_nm"] < 0.025
     assert all(row["rms_nm"] is None or row["rms_nm"] < 0.05 for rows in against.by.values() for row in rows)
-    assert against.left_out == "3.0 s are left out: what was applied is not known there."
+    assert against.left_out == "3.0 s are left out: the stimulation there is not known."
     assert against.left_out in against.plain
     assert compare(clean, record).left_out == ""
 
@@ -442,7 +442,7 @@ def test_it_is_said_how_much_was_left_out(tmp_path):
     late = int(np.sum(true["late_s"] > 0.005)) + int(np.sum(true["dropped"]))
     said = int(words.split()[0])
     assert abs(said - late) <= 3
-    assert words.endswith("pulses came late or were lost; when each was felt is known, and nothing is left out.")
+    assert words.endswith("pulses came late or were lost; the time of each is known, so nothing is left out.")
     seal(tmp_path / "r.h5", seed=1, sync=False)
     record = read(tmp_path / "r.h5")
     words = compare(identify.fit(record), record).left_out

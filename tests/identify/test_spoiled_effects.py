@@ -85,7 +85,7 @@ def test_a_fit_writes_the_settings_that_are_read_and_no_more(record):
 
 
 def test_a_parameter_that_is_missing_is_told(plain):
-    with pytest.raises(identify.BadModel, match=r"effects\.0\.parameters\.recovery_s: key is missing"):
+    with pytest.raises(identify.BadModel, match=r"effects\.0\.parameters\.recovery_s: the key is missing"):
         identify.Model.from_dict(with_effect(plain, "fatigue", "fitness", {"depth": 0.3, "onset_s": 20.0}))
 
 
