@@ -261,7 +261,11 @@ class FakeRig:
 
     async def _on_rearm(self, request: Any, writer: Any) -> dict[str, Any]:
         if not self.device_back:
-            raise m_refusal("disconnected", "A device does not answer", "load cell: no torque comes; check its cable")
+            raise m_refusal(
+                "disconnected",
+                "A device does not answer",
+                "load cell: connected, but no torque arrives; check its cable and start frames",
+            )
         self.become("ready")
         return self.status().model_dump()
 

@@ -161,7 +161,7 @@ def test_a_reconnect_in_vain_says_why_and_can_be_tried_again(tab: Any, service: 
     service.rig_thread.become("disconnected", SILENT_CELL)
     service.rig.device_back = False
     tab.get_by_role("button", name="Reconnect").click()
-    tab.get_by_text("no torque arrives").wait_for()
+    tab.get_by_text("no torque arrives; check its cable").wait_for()
     service.rig.device_back = True
     tab.get_by_role("button", name="Reconnect").click()
     says(tab, "No stimulation ready")

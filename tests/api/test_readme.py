@@ -41,6 +41,7 @@ def test_links_and_pictures_are_there() -> None:
 
 
 @pytest.mark.wire
+@pytest.mark.realtime
 @pytest.mark.slow
 def test_commands_do_what_they_are_said_to(tmp_path: Path) -> None:
     commands = blocks("sh")

@@ -20,6 +20,7 @@ PAIRS = [
 ]
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize(("stimulator", "cell", "transport"), PAIRS)
 def test_a_pair_behaves(make_bench: Callable[..., Bench], stimulator: str, cell: str, transport: str):
     # at the speed of the world: a backlog of text frames is read hardly faster than twice that
