@@ -25,11 +25,6 @@ class FixedShape:
         """Pulse width beyond which the curve is held, µs."""
         return self.curve.basis.largest_us
 
-    @property
-    def roughness(self) -> np.ndarray:
-        """The shape is given: no penalty."""
-        return np.zeros((1, 1))
-
     def design(self, pulse_width_us: np.ndarray, derivative: int = 0) -> np.ndarray:
         """Shape (..., 1)."""
         return (self.curve.basis.design(np.asarray(pulse_width_us, float), derivative) @ self.curve.coefficients_nm)[

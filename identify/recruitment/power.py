@@ -32,14 +32,6 @@ class PowerBasis:
         """Pulse width beyond which the curve is held, µs."""
         return self.scale_us
 
-    @property
-    def roughness(self) -> np.ndarray:
-        """∫ f''² from 0 to the scale, shape (size, size), µs⁻³."""
-        p = np.arange(1, self.order + 1, dtype=float)
-        lead = p * (p - 1)
-        power = np.maximum(p[:, None] + p[None, :] - 3, 1)
-        return lead[:, None] * lead[None, :] / power / self.scale_us**3
-
     def design(self, pulse_width_us: np.ndarray, derivative: int = 0) -> np.ndarray:
         """Powers (or a derivative) at pulse widths of any shape; shape (..., order)."""
         u = np.clip(np.asarray(pulse_width_us, float), 0.0, self.scale_us) / self.scale_us

@@ -30,11 +30,6 @@ class SigmoidBasis:
         """Number of coefficients."""
         return 1
 
-    @property
-    def roughness(self) -> np.ndarray:
-        """The form is smooth as it is: no penalty."""
-        return np.zeros((1, 1))
-
     def design(self, pulse_width_us: np.ndarray, derivative: int = 0) -> np.ndarray:
         """Shape (..., 1); derivatives by the closed form, up to the second."""
         u = np.asarray(pulse_width_us, float)

@@ -21,7 +21,6 @@ from identify.recruitment.curve import Basis
 from identify.simulation.setup import Setup
 
 _NONE = np.zeros((0, 1))
-SHARED = True
 
 
 @dataclass(frozen=True)
@@ -321,7 +320,7 @@ class _StagePass:
                 begin,
                 setup.scale_nm,
                 setup.grid.step_s,
-                SHARED,
+                True,  # rows that differ in their drive alone use the transitions of row 0
             )
             for part, slower in branches
         ]
