@@ -15,7 +15,7 @@ from identify.records.text import Row, is_number
 
 BLOCK = 4096
 CUT = "Every row needs every column; was the file cut off?"
-MISSING = {"", "nan", "na", "n/a", "#n/a", "null", "none", "-", "--"}
+MISSING = {"", "nan", "na", "n/a", "n.a.", "#n/a", "#nv", "null", "none", "-", "--"}
 """What tools write where they have no number."""
 
 
