@@ -144,7 +144,18 @@ def columns(header: Sequence[str], given: Given, units_row: Sequence[str], place
             columns[target] = Column(index)
         elif (column := _with_unit(plain[index], target, index, below, given.get(target), place)) is not None:
             columns[target] = column
+    _refuse_shared(plain, columns, place)
     return columns
+
+
+def _refuse_shared(cells: Sequence[str], columns: Mapping[str, Column], place: str) -> None:
+    """One column cannot be two things: a torque taken for a pulse width would fit well and mean nothing."""
+    owner: dict[int, str] = {}
+    for target, column in columns.items():
+        if column.index in owner:
+            message = f"column {_short(cells[column.index])} is asked for twice, as {owner[column.index]} and {target}"
+            raise BadRecord(message, place=place, fix="Name another column for one of them with --map.")
+        owner[column.index] = target
 
 
 def _with_unit(name: str, target: str, index: int, below: str, asked: Asked | None, place: str) -> Column | None:

@@ -71,9 +71,9 @@ def _scope(top: Mapping[str, Variable], given: Given, name: str) -> tuple[str, M
         inside = {target: replace(asked, text=asked.text.removeprefix(f"{title}.")) for target, asked in given.items()}
         if fields and columns.complete(columns.places(list(fields), inside)):
             scopes.append((title, fields, inside))
-    if len(scopes) > 1:
-        both = " and ".join(title for title, *_ in scopes[:2])
-        raise BadRecord(f"records in {both}", place=name, fix="Save each in a file of its own.")
+        if len(scopes) > 1:  # at once: each struct that is opened holds its unpacked bytes
+            both = " and ".join(title for title, *_ in scopes)
+            raise BadRecord(f"records in {both}", place=name, fix="Save each in a file of its own.")
     if not scopes:
         raise _nothing(top, given, name)
     return scopes[0]

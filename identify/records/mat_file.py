@@ -159,13 +159,15 @@ def variables(content: bytes, name: str) -> dict[str, Variable]:
         raise BadRecord(what, place=name, fix=FIX)
     view, place = memoryview(content), HEADER_BYTES
     found: dict[str, Variable] = {}
+    elements = 0
     try:
         while place + 8 <= len(view):
             tag, body, place = _element(view, place, order)
             title, variable = _listed(tag, body, order)
             if title:
                 found[title] = variable
-            if len(found) > MOST_VARIABLES:
+            elements += 1  # those without a name, or with one that was there before, count too
+            if elements > MOST_VARIABLES:
                 raise BadMat(f"more than {MOST_VARIABLES} variables")
     except BadMat as error:
         raise BadRecord(f"a damaged MAT file ({error})", place=name, fix=FIX) from error

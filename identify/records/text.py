@@ -215,7 +215,8 @@ def _no_header(before: list[str], given: Given, name: str) -> BadRecord:
         columns.columns(cells, given, [], f"{name}, line {number}")
     except BadRecord as error:
         return error
-    raise AssertionError("a header that could not be found can be read")
+    fix = "Put one line with the columns' names before the numbers, or name each column with --map."
+    return BadRecord("no numbers follow the header", place=f"{name}, line {number}", fix=fix)
 
 
 def _is_word(cell: str) -> bool:

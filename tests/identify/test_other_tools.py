@@ -312,3 +312,18 @@ def test_joined_records_keep_what_was_said_of_their_parts(tmp_path: Path) -> Non
     record = identify.read(path)
     joined = join([record, record], [0.0, 100.0])
     assert joined.notes == ("data.csv: semicolons between cells, decimal commas",)
+
+
+@pytest.mark.parametrize(
+    ("text", "given", "words"),
+    [
+        ("time_s,pulse_width_us,torque_nm\n0,0,0\n", "torque_nm=pulse_width_us:Nm", "is asked for twice"),
+        ("a,b\n" + "1,2\n" * 200, "time_s=a:s pulse_width_us=b torque_nm=b", "line 1"),
+        ("a,b,c\n" + "d,e,f\n" * 200, "time_s=#1:s pulse_width_us=#2 torque_nm=#3:Nm", "no numbers follow"),
+    ],
+)
+def test_columns_that_make_no_record_are_refused_in_one_line(tmp_path, text, given, words) -> None:
+    (tmp_path / "odd.csv").write_text(text)
+    with pytest.raises(identify.BadRecord, match=words) as refused:
+        identify.read(tmp_path / "odd.csv", map=given.split())
+    assert "\n" not in str(refused.value)
