@@ -101,7 +101,7 @@ def test_held_out_rows_change_nothing_of_a_fit():
     np.testing.assert_array_equal(one.theta, two.theta)
 
 
-def test_warming_up_touches_every_compiled_part():
+def test_warming_up_runs_to_its_end():
     from identify.diagnosis.warm_up import warm
 
     warm()
