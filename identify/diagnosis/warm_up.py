@@ -1,4 +1,4 @@
-"""Compile what nearly every fit and diagnosis uses, or load it from the cache, before the first request needs it."""
+"""Compile what nearly every fit and diagnosis uses, or load it from the cache, before a request needs it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from identify.simulation.problem import Problem
 
 
 def warm() -> None:
-    """Compile (or load from the cache), by a fit with effects of four seconds of artificial data; rare parts are left."""
+    """Compile (or load from the cache), by fitting four seconds of artificial data; rare parts are left out."""
     time_s = np.arange(400) / 100.0
     width = np.where((np.floor(time_s * 4) % 2) == 1, 200.0, 0.0)
     torque = np.convolve(width / 100.0, np.exp(-np.arange(40) / 10.0) / 10.0)[:400]
