@@ -115,7 +115,7 @@ def generate(
     def noise_nm(count: int) -> Floats:
         return draw_noise(noise, rng, count, rate_hz, noise_sd_nm, rho, slow_sd_nm)
 
-    record = _sampled(scenario, sequence, rate_hz, sampled_late_s, noise_nm)
+    record = sampled(scenario, sequence, rate_hz, sampled_late_s, noise_nm)
     conditions = {"kind": noise, "sd_nm": noise_sd_nm}
     if noise == "ar1":
         conditions["rho_40hz"] = round(rho, 5)
@@ -125,7 +125,7 @@ def generate(
     return record | {"truth": scenario.truth(noise_sd_nm) | about}
 
 
-def _sampled(
+def sampled(
     scenario: Scenario, design: Design, rate_hz: float, late_s: float, noise_nm: Callable[[int], Floats]
 ) -> dict[str, Any]:
     """The columns of a record of this design, without its unrecorded rows."""

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from identify.criticism import compare
     from identify.diagnosis import diagnose
+    from identify.diagnosis.carrying import carry
     from identify.diagnosis.experiment import Experiment, next_experiment
     from identify.diagnosis.improvement import improve
     from identify.errors import (
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     from identify.model import Model
     from identify.records.read import read
     from identify.records.record import Record
-    from identify.results import Comparison, Diagnosis, Improvement
+    from identify.results import Carried, Comparison, Diagnosis, Improvement
     from identify.simulation.predict import predict
 
 _PLACES = {
@@ -34,10 +35,12 @@ _PLACES = {
     "fit": "identify.fitting",
     "predict": "identify.simulation.predict",
     "Model": "identify.model",
+    "Carried": "identify.results",
     "Comparison": "identify.results",
     "Diagnosis": "identify.results",
     "Improvement": "identify.results",
     "compare": "identify.criticism",
+    "carry": "identify.diagnosis.carrying",
     "diagnose": "identify.diagnosis",
     "next_experiment": "identify.diagnosis.experiment",
     "Experiment": "identify.diagnosis.experiment",
@@ -56,6 +59,7 @@ __all__ = [
     "BadRecord",
     "BadRequest",
     "Cancelled",
+    "Carried",
     "Comparison",
     "Diagnosis",
     "Experiment",
@@ -64,6 +68,7 @@ __all__ = [
     "Model",
     "NotIdentifiable",
     "Record",
+    "carry",
     "compare",
     "diagnose",
     "fit",

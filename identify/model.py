@@ -13,6 +13,7 @@ from identify.dynamics.linear import Discrete, Linear, SecondOrder, linear_from_
 from identify.errors import BadModel
 from identify.json_values import json_value
 from identify.recruitment.curve import Curve, basis_from_dict
+from identify.recruitment.landmarks import landmarks
 from identify.shown import Sheet, Shown, estimate, fit_words, held_out_label, quantity
 from identify.strict_json import BadJson, parse
 
@@ -133,6 +134,17 @@ class Model(Shown):
     def _sheet(self) -> Sheet:
         return _words(self)
 
+    def figures(self) -> dict[str, dict[str, Any]]:
+        """Threshold, plateau, saturation, and of a second-order block its parameters: `value`, `sd` and `unit` of each.
+
+        An `sd` is None if the model has no covariance.
+        """
+        found = landmarks(self.recruitment, _curve_covariance(self))
+        if isinstance(self.linear, SecondOrder):
+            for name, unit in (("time_constant_s", "s"), ("damping", "1"), ("delay_s", "s")):
+                found[name] = {"value": getattr(self.linear, name), "sd": _sd(self, name), "unit": unit}
+        return found
+
     def to_dict(self) -> dict[str, Any]:
         """MODEL.json as a dict of lists, numbers and texts."""
         width, torque = self.recruitment.table()
@@ -171,6 +183,7 @@ class Model(Shown):
                     if covariance is None
                     else {"names": covariance.names, "values": covariance.values, "matrix": covariance.matrix},
                     "bands": self.bands,
+                    "figures": self.figures(),
                 },
                 "effects": self.effects,
                 "fit": self.fit,
@@ -319,14 +332,15 @@ def _words(model: Model) -> Sheet:
     fit, known = model.fit, model.valid_for
     named = ", ".join(str(effect["id"]) for effect in model.effects) or "no effects"
     width_us, torque_nm = model.recruitment.table()
-    top = int(np.argmax(np.abs(torque_nm)))
-    largest = estimate(float(torque_nm[top]), _curve_sd(model, float(width_us[top])), "N·m")
+    top_us = float(width_us[np.argmax(np.abs(torque_nm))])
+    plateau = model.figures()["plateau_nm"]
+    largest = estimate(plateau["value"], plateau["sd"], "N·m")
     rows = [
         ("fit", fit_words(fit)),
         (held_out_label(fit), fit_words(fit, "held_out_")),
         ("noise", f"{quantity(model.noise.white_sd_nm, 'N·m')} white, sd of a sample"),
         ("dynamics", _dynamics(model)),
-        ("recruitment", f"largest {largest}, at {quantity(float(width_us[top]), 'µs')}"),
+        ("recruitment", f"largest {largest}, at {quantity(top_us, 'µs')}"),
         ("baseline", estimate(model.baseline_nm, _sd(model, "baseline_nm"), "N·m")),
         *[(str(effect["id"]), _parameters(effect.get("parameters", {}))) for effect in model.effects],
     ]
@@ -348,15 +362,14 @@ def _sd(model: Model, name: str, factor: float = 1.0) -> float | None:
     return factor * known.sd(name) if known is not None and name in known.names else None
 
 
-def _curve_sd(model: Model, width_us: float) -> float | None:
-    """Standard deviation of the recruitment curve at a pulse width, N·m; None if the model has none."""
-    known, basis = model.covariance, model.recruitment.basis
-    places = [place for place in range(basis.size) if known and f"recruitment_{place}_nm" in known.names]
-    if known is None or len(places) < basis.size:
+def _curve_covariance(model: Model) -> np.ndarray | None:
+    """Covariance of the recruitment curve's coefficients, N²·m²; None if the model has none."""
+    known = model.covariance
+    names = [f"recruitment_{place}_nm" for place in range(model.recruitment.basis.size)]
+    if known is None or not set(names) <= set(known.names):
         return None
-    rows = [known.names.index(f"recruitment_{place}_nm") for place in places]
-    design = basis.design(np.array([width_us]))[0]
-    return float(np.sqrt(max(design @ known.matrix[np.ix_(rows, rows)] @ design, 0.0)))
+    rows = [known.names.index(name) for name in names]
+    return known.matrix[np.ix_(rows, rows)]
 
 
 def _dynamics(model: Model) -> str:

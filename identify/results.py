@@ -1,4 +1,4 @@
-"""The results of `compare`, `diagnose` and `improve`. Their fields are the keys of `--json`; api/schemas defines each.
+"""The results of `compare`, `diagnose`, `improve`, `carry`. Fields are the keys of `--json`; api/schemas defines them.
 
 Rows of tables are dicts with the keys of the schema. `to_dict()` gives JSON values. `print` shows about ten lines,
 `repr` one line, and a notebook a table.
@@ -243,6 +243,62 @@ class Improvement(_Result):
         added = ", ".join(str(step["added"]) for step in self.steps[1:]) or "no effect"
         before, after = (torque(step, "held_out_rms_nm") for step in (self.steps[0], self.steps[-1]))
         return Sheet(f"Improvement: {added} added, held-out rms from {before} to {after}", tuple(rows))
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class Carried(_Result):
+    """The structure of an earlier model on a new record, beside the plain structure.
+
+    Parameters
+    ----------
+    carried_from : str
+        Id of the earlier model.
+    offered : str
+        "carried" or "plain": the better of the two.
+    why, reason : str
+        Why, as one word for programs and as a sentence.
+    still_needed, no_longer_needed, undecided : tuple of str
+        Effects of the earlier model that the record asks for, those that it does not, and those that it cannot judge
+        since something else is missing. All are empty if the structure could not be carried over at all.
+    effects : tuple of dict
+        Effects of the earlier model: `effect`, `name`, `form` (in the new model; None without it), `needed` (None:
+        undecided), `log_evidence_gain` (None if it was not compared), `required`, `why`, `reason`.
+    figures : tuple of dict
+        For each of `models`: `fit_percent`, `ceiling_percent`, `held_out_fit_percent`, `rms_nm`, `held_out_rms_nm`,
+        `held_out_by`.
+    models : tuple of Model
+        The plain model, then the one with the effects that are still needed, if there are any.
+    """
+
+    carried_from: str
+    offered: str
+    why: str
+    reason: str
+    still_needed: tuple[str, ...]
+    no_longer_needed: tuple[str, ...]
+    undecided: tuple[str, ...]
+    effects: tuple[Row, ...]
+    figures: tuple[Row, ...]
+    models: tuple[Model, ...]
+
+    @property
+    def model(self) -> Model:
+        """The model that is offered."""
+        return self.models[-1 if self.offered == "carried" else 0]
+
+    def finding(self) -> dict[str, Any]:
+        """What was found, as `to_dict()`, without the models."""
+        found = self.to_dict()
+        del found["models"]
+        return found
+
+    def _sheet(self) -> Sheet:
+        rows = [("offered", f"{_held(self.model)}. {self.reason}")]
+        words = {True: "still needed", False: "no longer needed", None: "left out, undecided"}
+        rows += [(str(row["effect"]), f"{words[row['needed']]}. {row['reason']}") for row in self.effects]
+        names = ("plain", "carried")
+        rows += [(name, both_words(figures)) for name, figures in zip(names, self.figures, strict=False)]
+        return Sheet(f"Structure carried over from {self.carried_from[:8]}: {self.offered} offered", tuple(rows))
 
 
 def _held(model: Model) -> str:

@@ -106,6 +106,21 @@ HARD_LIMITS: dict[str, Limit] = {
             "own rule",
         ),
         Limit(
+            "calibration_known_step_us", 1.0, 40.0, "µs",
+            "a large step may be wider where the participant's last calibration marked more than it reaches",
+            "own rule: at 20 mA 0.8 µC, within calibration_rise_uc",
+        ),
+        Limit(
+            "calibration_rise_uc", 0.0, 1.0, "µC",
+            "no train's pulses carry this much more charge than those of the train before it",
+            "own rule: calibration_step_us at 40 mA; a higher current gets narrower steps",
+        ),
+        Limit(
+            "calibration_first_uc", 0.0, 2.0, "µC",
+            "the first train of a participant who is known: below what was felt last time, and never a strong pulse",
+            "own rule: 100 µs at 20 mA, a usual sensory threshold",
+        ),
+        Limit(
             "calibration_train_s", 0.1, 2.0, "s",
             "long enough to be felt, short enough to be bearable if one step is too strong",
             "own rule",

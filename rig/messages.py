@@ -23,7 +23,8 @@ RigState = Literal[
 
 Threshold = Literal["sensory", "motor", "comfort"]
 
-Direction = Literal["up", "repeat", "down"]
+Direction = Literal["up", "fine", "repeat", "down"]
+"""`fine`: up by the fine step, whatever `up` would do."""
 
 TestOutcome = Literal["completed", "stopped", "fault"]
 
@@ -147,7 +148,11 @@ class CalibrateStartRequest(Message):
     participant: str
     by: str
     current_ma: float = Field(20.0, description="fixed current of all pulses, mA")
-    step_us: float = Field(10.0, description="increase of the pulse width per step, µs")
+    step_us: float = Field(10.0, description="increase of the pulse width per (fine) step, µs")
+    large_steps: bool = Field(
+        False, description="large steps that become fine near a mark; the rig decides their width"
+    )
+    last: Profile | None = Field(None, description="what the participant's last calibration found; with large_steps")
     train_s: float = Field(1.0, description="length of each pulse train, s")
     pulse_rate_hz: float = 40.0
     max_pulse_width_us: float | None = Field(None, description="widest pulse allowed, µs; None: the hard limits")
@@ -155,7 +160,7 @@ class CalibrateStartRequest(Message):
 
 
 class CalibrateStepRequest(Message):
-    """Play one train: one step wider, one step narrower, or the same again. Reply: `Status`, at once (state arming).
+    """Play one train: wider, narrower, or the same again. Reply: `Status`, at once (state arming).
 
     The train has ended when the state is `calibrating` again. A fault or a stop latches and ends the calibration.
     """
@@ -163,6 +168,9 @@ class CalibrateStepRequest(Message):
     kind: Literal["calibrate-step"] = "calibrate-step"
     id: int = 0
     direction: Direction = "up"
+    shown_us: float | None = Field(
+        None, description="width that a person was shown; refused if another one would be sent. None: not shown"
+    )
 
 
 class CalibrateMarkRequest(Message):
@@ -234,6 +242,10 @@ class CalibrationStatus(Message):
     step_us: float
     train_s: float
     max_torque_nm: float
+    large_steps: bool = Field(False, description="steps are large where no mark is near")
+    last_us: dict[Threshold, float] = Field(
+        default_factory=dict, description="marks of the last calibration that the steps go by, µs; empty: none"
+    )
     pulse_width_us: float = Field(description="width of the last train, µs; 0 before the first")
     ceiling_us: float = Field(description="widest pulse that the limits and a marked comfort maximum allow, µs")
     ceiling_owner: str = Field(description="who set that bound")
@@ -336,6 +348,8 @@ class LiveEvent(Message):
     torque_age_s: float
     lost_samples: int
     dropped_pulses: int
+    sent_pulses: int = Field(0, description="pulses sent so far")
+    charge_uc: float = Field(0.0, description="their charge, one phase, µC")
 
 
 class FinishedEvent(Message):

@@ -22,13 +22,14 @@ if TYPE_CHECKING:
     from api.client.rest import Client
     from identify import Model, Record, compare, next_experiment, predict, read
     from identify.effects import library as effects
-    from stimrig.with_progress import diagnose, fit, improve
+    from stimrig.with_progress import carry, diagnose, fit, improve
 
 _PLACES = {
     "read": ("identify.records.read", "read"),
     "Record": ("identify.records.record", "Record"),
     "Model": ("identify.model", "Model"),
     "fit": ("stimrig.with_progress", "fit"),
+    "carry": ("stimrig.with_progress", "carry"),
     "predict": ("identify.simulation.predict", "predict"),
     "compare": ("identify.criticism", "compare"),
     "diagnose": ("stimrig.with_progress", "diagnose"),
@@ -43,6 +44,7 @@ __all__ = [
     "Client",
     "Model",
     "Record",
+    "carry",
     "compare",
     "diagnose",
     "effects",

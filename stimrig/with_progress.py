@@ -1,4 +1,4 @@
-"""`fit`, `diagnose` and `improve` of `identify`, with a progress bar in notebooks and terminals.
+"""`fit`, `carry`, `diagnose` and `improve` of `identify`, with a progress bar in notebooks and terminals.
 
 `progress` is True (a bar, if the work takes longer than a second), False (none), or a function of one's own that takes
 a share of 0 to 1 and a line of text. All other parameters, results and errors are those of `identify`.
@@ -28,6 +28,12 @@ def fit(
     """Fit a model to a record; see `identify.fit`. `progress`: a bar, none, or a function."""
     with _telling(progress) as tell:
         return identify.fit(record, method, effects, fit_on, tell, **options)
+
+
+def carry(record: identify.Record, model: identify.Model, progress: Progress = True) -> identify.Carried:
+    """Fit the structure of an earlier model, too; see `identify.carry`. `progress`: a bar, none, or a function."""
+    with _telling(progress) as tell:
+        return identify.carry(record, model, tell)
 
 
 def diagnose(

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from identify.caution import OPEN
 from identify.criticism.where import worst_places
 from identify.diagnosis.search import EffectSearch
 from identify.diagnosis.steps import Step, steps
@@ -152,7 +153,7 @@ def _plain(
         f"{noise:.3g} N·m allows {base['ceiling_percent']:.1f} % at most. On rows that were not fitted its error is "
         f"{base['held_out_rms_nm']:.3g} N·m."
     ]
-    if verdict.kind == "nothing_missing":
+    if verdict.kind == "nothing_missing" and verdict.probability >= OPEN:
         lines.append("Nothing is missing: the remaining error looks like noise, both at work and at rest.")
     if verdict.kind == "unexplained_structure":
         lines.append(

@@ -162,8 +162,8 @@ def search_effects(
             _exchange(search)
     if len(search.added) > 1:
         for effect in search.added:
-            without = _without(search.last, effect)
-            search.losses[effect] = search.last.log_evidence - (without.log_evidence if without else 0.0)
+            without = without_effect(search.last, effect)
+            search.losses[effect] = search.last.log_evidence - without.log_evidence
     return search
 
 
@@ -259,13 +259,11 @@ def _exchange(search: EffectSearch) -> None:
     last = search.last
     for index, effect in enumerate(list(search.added[:-1])):
         rivals = [c for c in search.rounds[index] if c.effect.id not in search.added][:2]
-        without = _without(last, effect)
-        if without is not None and without.log_evidence > search.last.log_evidence - 1.0:
+        without = without_effect(last, effect)
+        if without.log_evidence > search.last.log_evidence - 1.0:
             search.added.remove(effect)
             _rebuild(search, without)
             return
-        if without is None:
-            continue
         for rival in rivals:
             if rival.gain < 0.5 * search.rounds[index][0].gain:
                 continue
@@ -313,7 +311,7 @@ def _part(last: Fitted, before: Fitted, kept: list[str]) -> Fitted:
     return solve(problem, start_from(problem, last, {}), noise)
 
 
-def _without(fitted: Fitted, effect: str) -> Fitted | None:
+def without_effect(fitted: Fitted, effect: str) -> Fitted:
     """The model refitted without one of its effects."""
     noise = fitted.noise
     others = [(e, f) for e, f in fitted.effects if e != effect]

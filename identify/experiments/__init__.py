@@ -74,12 +74,13 @@ def plan(record: Record, fits: dict[str, Fitted]) -> dict[str, Any]:
 
 def _text(best: dict[str, Any], names: list[str]) -> str:
     those = " from ".join(get(name).name.lower() for name in names[:2])
-    lead = f"{best['words']} ({best['duration_s']:.0f} s) "
-    if best["expected_log_evidence"] >= ENOUGH:
-        return lead + f"should separate {those}: expected log evidence {best['expected_log_evidence']:.0f}."
+    test = f"{best['words']} ({best['duration_s']:.0f} s)"
+    gain = best["expected_log_evidence"]
+    if gain >= ENOUGH:
+        return f"{test} should separate {those}: expected log evidence {gain:.0f}."
     return (
-        lead + f"is the best test to separate {those}, but it may not be enough: expected log evidence "
-        f"{best['expected_log_evidence']:.1f}; at least {ENOUGH:g} is required."
+        f"{test} is the best test to separate {those}, but it may not be enough: expected log evidence {gain:.1f}; "
+        f"at least {ENOUGH:g} is required."
     )
 
 

@@ -151,6 +151,16 @@ class TestRun:
         """Number of pulses dropped so far."""
         return self._gate.dropped
 
+    @property
+    def sent(self) -> int:
+        """Number of pulses sent so far."""
+        return len(self._gate.lateness_s)
+
+    @property
+    def charge_uc(self) -> float:
+        """Charge of the pulses sent so far, one phase, µC."""
+        return self._gate.charge_uc
+
     def sender_age_s(self) -> float:
         """Real seconds since the sender last asked for a health check; 0 while it has nothing to send."""
         asked_s = self._asked_s

@@ -35,18 +35,21 @@ class Calibrating(Playing):
             self._change(following)
         return self.status()
 
-    def calibrate_step(self, direction: str) -> Status:
+    def calibrate_step(self, direction: str, shown_us: float | None = None) -> Status:
         """Play one train: a step up, a step down, or the same again; returns when it has started.
 
         Raises
         ------
         PlanError, BusyError, RefusedError
-            No calibration is open; a train is playing; above a limit or the marked comfort maximum; its day is over.
+            No calibration is open, or another width was shown; a train is playing; above a limit or the marked comfort
+            maximum; its day is over.
         """
         with self._lock:
             calibration = self._open_calibration()
             calibration.check_day(self._clock.unix_s())
-            request = calibration.train(calibration.next_width_us(direction))
+            width_us = calibration.next_width_us(direction)
+            calibration.check_shown(width_us, shown_us)
+            request = calibration.train(width_us)
             test = plan.build(request, calibration.table)
             self._rest.check(test, calibration.rest)
             self._store.check_room(request.test_id)

@@ -15,6 +15,7 @@ from datetime import UTC, datetime, timedelta
 
 from rig import limits
 from rig.clock import utc_text
+from rig.control.calibration_steps import rule_of
 from rig.errors import PlanError, RefusedError
 from rig.limits import FINEST, Limit, Steps
 from rig.messages import (
@@ -30,7 +31,7 @@ from rig.messages import (
 )
 
 ORDER: tuple[Threshold, ...] = ("sensory", "motor", "comfort")
-STEPS: tuple[Direction, ...] = ("up", "repeat", "down")
+STEPS: tuple[Direction, ...] = ("up", "fine", "repeat", "down")
 REST_S = 0.25
 """Rest before and after each train, s: shows the torque at rest, and its fall."""
 CLOCK_SLIP_S = 300.0
@@ -57,7 +58,8 @@ class Calibration:
     Raises
     ------
     RefusedError
-        Step, train, current or rate outside the limits, or too small to stimulate.
+        Step, train, current or rate outside the limits, or too small to stimulate; or the current is so high that
+        even the shortest pulse is too strong to begin with.
     """
 
     def __init__(
@@ -88,14 +90,29 @@ class Calibration:
         most_us = table["pulse_width_us"].hi if request.max_pulse_width_us is None else request.max_pulse_width_us
         wanted = Profile(current_ma=request.current_ma, max_pulse_width_us=most_us, max_torque_nm=request.max_torque_nm)
         self.table = limits.for_profile(table, wanted, OWNER)
+        self._rule = rule_of(request, self.table)
+        self._check_shortest()
         self._width_us = 0.0
+        self._left_us: set[float] = set()
         self._marks_us: dict[Threshold, float] = {}
         self._trains: list[CalibrationTrain] = []
         self._charge_uc = 0.0
         self.recordings: list[str] = []
 
+    def _check_shortest(self) -> None:
+        """Raise RefusedError where already the stimulator's shortest pulse is more than the first train may be."""
+        shortest_us, rise_uc = self._steps.shortest_us, self.table["calibration_rise_uc"].hi
+        charge_uc = shortest_us * self._steps.current(self.request.current_ma) * 1e-3
+        if charge_uc <= rise_uc or shortest_us <= self._rule.first_us:
+            return
+        most_ma = self._steps.current(rise_uc / shortest_us * 1e3)
+        raise RefusedError(
+            f"calibration: at {self.request.current_ma:g} mA the stimulator's shortest pulse, {shortest_us:g} µs, is "
+            f"{charge_uc:g} µC, too strong for a first train; choose {most_ma:g} mA or less"
+        )
+
     def next_width_us(self, direction: str) -> float:
-        """Width of the train that is asked for.
+        """Width of the train that is asked for, as the stimulator sends it: the next step begins there.
 
         Raises
         ------
@@ -104,16 +121,45 @@ class Calibration:
         PlanError
             There is no lower step.
         """
-        change_us = {"up": self.request.step_us, "down": -self.request.step_us}.get(direction, 0.0)
-        width_us = self._width_us + change_us
-        if self._width_us == 0 and direction == "up":
-            width_us = max(width_us, self._steps.shortest_us)  # below it nothing would be sent, and nothing felt
+        ceiling = self._ceiling()
+        width_us = self._asked_us(direction)
+        if width_us > self._width_us:
+            width_us = self._up_to(width_us, ceiling.hi)
         if self._steps.width_us(width_us) == 0:
             raise PlanError(f"calibration: no step below {self._width_us:g} µs; step up instead")
-        refusal = limits.check(self._ceiling(), width_us)
+        refusal = limits.check(ceiling, width_us)
         if refusal is not None:
             raise RefusedError(f"calibration: {refusal}")
+        return float(self._steps.width_us(width_us))
+
+    def check_shown(self, width_us: float, shown_us: float | None) -> None:
+        """Raise PlanError if a person was shown another width than the one that would be sent now."""
+        sent_us = self._steps.width_us(width_us)
+        if shown_us is not None and not (shown_us == sent_us):
+            raise PlanError(
+                f"calibration: the page showed {shown_us:g} µs, but {sent_us} µs would be sent now; nothing was sent, "
+                "look again"
+            )
+
+    def _asked_us(self, direction: str) -> float:
+        """Where a step leads by the rule of the steps, before the limits."""
+        width_us = self._width_us
+        if direction == "up":
+            waiting = next(iter(self._missing()), None)
+            return self._rule.up(width_us, waiting, min((w for w in self._left_us if w > width_us), default=None))
+        if direction == "fine":
+            return self._rule.fine(width_us)
+        if direction == "down":
+            played = (train.pulse_width_us for train in self._trains if train.pulses)
+            return self._rule.down(width_us, max((w for w in played if w < width_us), default=None))
         return width_us
+
+    def _up_to(self, width_us: float, most_us: float) -> float:
+        """A step up that ends at the highest allowed width instead of above it, and is no train of no pulses."""
+        if self._width_us == 0:
+            width_us = max(width_us, self._steps.shortest_us)  # below it nothing would be sent, and nothing felt
+        is_wider = self._steps.width_us(most_us) > self._steps.width_us(self._width_us)
+        return min(width_us, most_us) if self.request.large_steps and is_wider else width_us
 
     def check_day(self, unix_s: float) -> None:
         """Raise RefusedError if the day of the calibration is over."""
@@ -152,10 +198,16 @@ class Calibration:
         )
 
     def played(self, width_us: float, torque_rise_nm: float | None, finished: FinishedEvent) -> None:
-        """Record a train that has ended."""
-        self._width_us = width_us
-        self._charge_uc += float(finished.summary.get("charge_uc", 0.0))
+        """Record a train that has ended. One of which no pulse was sent moves nothing: the next step begins as before.
+
+        A computer that stands still for a moment drops the pulses that are late by then, perhaps all of a short train.
+        """
         pulses = int(finished.summary.get("pulses", 0))
+        if pulses > 0:
+            if width_us < self._width_us:
+                self._left_us.add(self._width_us)
+            self._width_us = width_us
+        self._charge_uc += float(finished.summary.get("charge_uc", 0.0))
         number = len(self._trains) + 1
         self._trains.append(
             CalibrationTrain(number=number, pulse_width_us=width_us, pulses=pulses, torque_rise_nm=torque_rise_nm)
@@ -169,10 +221,16 @@ class Calibration:
         Raises
         ------
         PlanError
-            No train was played yet, or the order sensory <= motor <= comfort would be broken.
+            No train was played yet, nothing of the last one was sent, or the order sensory <= motor <= comfort would be
+            broken.
         """
         if not self._trains:
             raise PlanError("calibration: no train was played yet; step up first, then mark")
+        if self._trains[-1].pulses == 0:
+            raise PlanError(
+                f"calibration: no pulse of train {self._trains[-1].number} was sent, the computer was busy; step "
+                "again, then mark"
+            )
         marks: dict[Threshold, float] = {**self._marks_us, threshold: self._width_us}
         known = [(name, marks[name]) for name in ORDER if name in marks]
         for (low, low_us), (high, high_us) in itertools.pairwise(known):
@@ -181,6 +239,7 @@ class Calibration:
                     f"calibration: {low} at {low_us:g} µs is above {high} at {high_us:g} µs; mark {high} again first"
                 )
         self._marks_us = marks
+        self._left_us.clear()
 
     def profile(self, unix_s: float) -> Profile:
         """The profile, valid until the end of the day. Raises PlanError (a threshold is not marked) or RefusedError."""
@@ -205,9 +264,11 @@ class Calibration:
             participant=request.participant,
             by=request.by,
             current_ma=request.current_ma,
-            step_us=request.step_us,
+            step_us=self._rule.fine_us,
             train_s=request.train_s,
             max_torque_nm=request.max_torque_nm,
+            large_steps=request.large_steps,
+            last_us=dict(self._rule.last_us),
             pulse_width_us=self._width_us,
             ceiling_us=ceiling.hi,
             ceiling_owner=ceiling.owner,

@@ -54,6 +54,8 @@ def live_event(
         torque_age_s=max(0.0, receiver.age_s(now_s)),
         lost_samples=receiver.counts.lost_samples,
         dropped_pulses=run.dropped if run else 0,
+        sent_pulses=run.sent if run else 0,
+        charge_uc=run.charge_uc if run else 0.0,
     )
 
 

@@ -202,7 +202,7 @@ class Server:
             case "calibrate-start":
                 return self.rig.calibrate(request)
             case "calibrate-step":
-                return self.rig.calibrate_step(request.direction)
+                return self.rig.calibrate_step(request.direction, request.shown_us)
             case "calibrate-mark":
                 return self.rig.calibrate_mark(request.threshold)
             case "calibrate-finish":

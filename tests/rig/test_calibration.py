@@ -76,7 +76,7 @@ def test_never_above_the_request_the_rig_or_the_hard_limits():
     with pytest.raises(RefusedError, match=r"pulse_width_us 50 µs is outside 0 … 45 \(calibration request, over by 5"):
         calibration.next_width_us("up")
     heavy = opened(current_ma=100.0, step_us=25.0, train_s=0.1)
-    play(heavy, *["up"] * 16)
+    play(heavy, *["up"] * 40)  # 10 µs each: no step adds more than 1 µC
     with pytest.raises(RefusedError, match="charge_per_phase_uc"):
         heavy.next_width_us("up")
     assert heavy.status().ceiling_us == pytest.approx(400.0)
@@ -145,14 +145,14 @@ def test_what_each_step_would_send_is_told_before():
         calibration_id="c1", participant="P01", by="therapist", step_us=10.5, max_pulse_width_us=45.0
     )
     calibration = Calibration(request, HARD_LIMITS, NOON_S, Steps(shortest_us=20.0))
-    assert calibration.status().next_us == {"up": 20.0}
+    assert calibration.status().next_us == {"up": 20.0, "fine": 20.0}
     play(calibration, "up")
-    assert calibration.status().next_us == {"up": 30.0, "repeat": 20.0}
+    assert calibration.status().next_us == {"up": 30.0, "fine": 30.0, "repeat": 20.0}
     play(calibration, "up", "up")
-    assert calibration.status().next_us == {"repeat": 41.0, "down": 30.0}
+    assert calibration.status().next_us == {"repeat": 40.0, "down": 29.0}
     calibration.mark("comfort")
     play(calibration, "down")
-    assert calibration.status().next_us == {"up": 41.0, "repeat": 30.0, "down": 20.0}
+    assert calibration.status().next_us == {"up": 39.0, "fine": 39.0, "repeat": 29.0}
 
 
 def test_midnight_ends_an_open_calibration_and_says_so():

@@ -9,7 +9,7 @@ import pytest
 from rig.acquire import health
 from rig.journal import Kind
 from rig.messages import SegmentPlan
-from tests.rig.fakes import VirtualRig
+from tests.rig.fakes import ON_A_BUSY_DISK, VirtualRig
 
 WORDS = {
     "torque": "stale",
@@ -33,7 +33,7 @@ def test_through_a_rest_the_device_is_fed_at_every_pulses_time(tmp_path: Path):
 @pytest.mark.parametrize("fault", WORDS)
 def test_without_a_proof_nothing_is_fed(tmp_path: Path, fault: str):
     hold = [SegmentPlan(name="hold", sequence="steps", settings={"on_s": 4.0, "off_s": 0.0, "repeats": 1})]
-    rig = VirtualRig(tmp_path, hold, watch=health.DEFAULT_WATCH)
+    rig = VirtualRig(tmp_path, hold)
     at: list[float] = []
     disk = health.Disk.__dict__["age_s"], health.MIN_FREE_BYTES
 
@@ -44,7 +44,7 @@ def test_without_a_proof_nothing_is_fed(tmp_path: Path, fault: str):
         elif fault == "ack":
             rig.stimulator.ack_delay_s = None
         elif fault == "disk slow":
-            health.Disk.age_s = lambda _: 3.1  # pyright: ignore[reportAttributeAccessIssue]
+            health.Disk.age_s = lambda _: ON_A_BUSY_DISK.stale_disk_s + 0.1  # pyright: ignore[reportAttributeAccessIssue]
         elif fault == "disk full":
             health.MIN_FREE_BYTES = 2**62
         else:

@@ -14,6 +14,7 @@ from rig.errors import RefusedError
 from rig.limits import HARD_LIMITS, Admitted, Refusal, admit
 from rig.messages import Profile, Status, TestPlan
 from rig.signals import Pulse
+from tests.harness.calibration_fuzz import fuzz_calibrations
 from tests.harness.limits_fuzz import fuzz, fuzz_plans
 
 anything = st.one_of(
@@ -109,6 +110,9 @@ def test_the_hard_limits_are_those_that_were_agreed_on():
             ("rest_between_tests_s", 1, inf, "s"),
             ("rest_between_trains_s", 0.5, inf, "s"),
             ("calibration_step_us", 1, 25, "µs"),
+            ("calibration_known_step_us", 1, 40, "µs"),
+            ("calibration_rise_uc", 0, 1, "µC"),
+            ("calibration_first_uc", 0, 2, "µC"),
             ("calibration_train_s", 0.1, 2, "s"),
         )
     }
@@ -216,6 +220,14 @@ def test_mad_requests_at_the_gate_are_not_felt():
     assert found.outside == 0, found.example
     assert found.felt == found.sent > 10_000  # it is no wall
     assert found.refused_profiles > 10
+
+
+@pytest.mark.slow
+def test_a_calibration_pressed_in_any_order_is_felt_within_its_steps():
+    """On a seed of its own; `python -m bench.rig_fuzz` presses more."""
+    found = fuzz_calibrations(6, seed=20)
+    assert found.outside == 0, found.example
+    assert found.sent > 50 and found.felt > 200
 
 
 def test_no_mad_plan_is_admitted_with_anything_outside():

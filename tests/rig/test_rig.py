@@ -59,7 +59,9 @@ def test_from_ready_to_ready_with_a_sealed_file(make: Make):
     assert finished is not None
     assert (finished.outcome, finished.reason) == ("completed", "")
     assert finished in live.events
-    busy = re.compile(r"acknowledgements came late|alignment's error is \d")  # of a busy machine, no fault of the rig's
+    busy = re.compile(
+        r"acknowledgements came late|error of their alignment is \d"
+    )  # of a busy machine, no fault of the rig's
     assert [words for words in finished.summary["warnings"] if not busy.search(words)] == []
     with h5py.File(str(finished.recording_path)) as file:
         assert file.attrs["test_id"] == "one"
@@ -187,7 +189,7 @@ def test_a_cell_that_sticks_right_before_the_test_is_a_fault(make: Make):
 
 def test_half_the_rate_is_a_fault(make: Make):
     live = make(rate=0.5)
-    live.rig.start(live.plan("one", hold_s=3.0))
+    live.rig.start(live.plan("one", hold_s=20.0))  # long beside a standstill of a busy machine
     assert float(live.wait("latched").split()[2]) == pytest.approx(800, rel=0.03)
     assert "samples/s arrive" in live.rig.status().reason
 

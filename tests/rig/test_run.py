@@ -123,6 +123,16 @@ def test_a_stop_is_confirmed_by_the_torque_falling(tmp_path: Path):
     assert rig.stimulator.sent[-1][0] <= rig.halt.time_s
 
 
+@pytest.mark.parametrize(("said", "kept"), [("ou\0ch", "ou\N{REPLACEMENT CHARACTER}ch"), ("ou\ud800ch", "ou?ch")])
+def test_a_reason_that_no_file_can_hold_leaves_no_test_unsealed(tmp_path: Path, said: str, kept: str):
+    rig = VirtualRig(tmp_path)
+    rig.at(1.0, lambda: rig.halt.set("stopped", said))
+    rig.execute()
+    sealed = archive.seal(assembly.assemble(journal.read(rig.path)), tmp_path)
+    with h5py.File(sealed.path) as file:
+        assert file.attrs["reason"] == kept
+
+
 def test_a_stop_among_the_first_pulses_says_no_more_than_the_torque_does(tmp_path: Path):
     hold = [SegmentPlan(name="hold", sequence="steps", settings={"on_s": 3.0, "off_s": 0.0})]
     rig = VirtualRig(tmp_path, hold)

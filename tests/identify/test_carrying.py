@@ -1,0 +1,83 @@
+"""The structure of an earlier session on a new record of the same muscle: what is still needed, and what is offered."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import identify
+from identify.records.record import Record
+from tests.identify import hidden_muscles
+
+
+def again(hidden: str) -> Record:
+    """Another test of the muscle: other pulses and noise, another zero, sign and scale of the load cell."""
+    made = hidden_muscles.record(hidden, seed=8)
+    names = np.array(made.segment_names)[made.segment]
+    return Record.from_arrays(made.time_s, made.pulse_width_us, 3.0 - 0.4 * made.torque_nm, names)
+
+
+@pytest.fixture(scope="module")
+def earlier() -> identify.Model:
+    return identify.fit(hidden_muscles.record("fatigue", seed=7), effects=["fatigue"])
+
+
+def test_effect_that_is_still_there_stays_in_its_form(earlier: identify.Model) -> None:
+    told: list[str] = []
+    found = identify.carry(again("fatigue"), earlier, lambda _share, text: told.append(text))
+    assert (found.offered, found.still_needed, found.no_longer_needed) == ("carried", ("fatigue",), ())
+    assert found.model.effects[0]["form"] == earlier.effects[0]["form"]
+    assert found.model.extra["parent"] == found.models[0].model_id
+    assert found.models[1].fit["held_out_rms_nm"] < found.models[0].fit["held_out_rms_nm"]
+    assert "still needed" in str(found) and found.carried_from == earlier.model_id
+    assert any("fatigue" in text for text in told)
+
+
+def test_effect_that_is_gone_is_dropped_and_the_plain_model_offered(earlier: identify.Model) -> None:
+    found = identify.carry(again(""), earlier)
+    assert (found.offered, found.why, found.still_needed) == ("plain", "nothing-needed", ())
+    assert found.no_longer_needed == ("fatigue",) and found.model.effects == () and len(found.models) == 1
+
+
+def test_verdict_on_an_effect_is_that_of_the_diagnosis(earlier: identify.Model) -> None:
+    """What is still needed is missing without it, and what is dropped is not."""
+    for hidden in ("fatigue", ""):
+        record = again(hidden)
+        found = identify.carry(record, earlier)
+        missing = [entry["effect"] for entry in identify.diagnose(record).missing]
+        assert ("fatigue" in missing) == ("fatigue" in found.still_needed)
+        assert "fatigue" not in [entry["effect"] for entry in identify.diagnose(record, found.model).missing]
+
+
+def test_effect_beside_something_else_that_is_missing_is_not_told_as_gone() -> None:
+    earlier = identify.fit(hidden_muscles.record("baseline_drift", seed=7), effects=["baseline_drift"])
+    found = identify.carry(again("asymmetric_relaxation"), earlier)
+    assert found.offered == "plain" and found.undecided == ("baseline_drift",) and found.no_longer_needed == ()
+
+
+@pytest.mark.parametrize(
+    ("change", "why", "words"),
+    [
+        ({"effects": ({"id": "my_effect", "form": ""},)}, "not-installed", "my_effect, which is not installed here"),
+        ({"effects": ()}, "plain-before", "plain structure as well"),
+        ({"method": "two-stage"}, "other-method", "two-stage"),
+    ],
+)
+def test_structure_that_cannot_be_carried_over_leaves_the_plain_model(
+    earlier: identify.Model, change: dict[str, Any], why: str, words: str
+) -> None:
+    found = identify.carry(again("fatigue"), replace(earlier, **change))
+    assert (found.offered, found.why, found.effects) == ("plain", why, ()) and words in found.reason
+    assert found.model.effects == ()
+
+
+def test_cancelled_when_the_caller_says_so(earlier: identify.Model) -> None:
+    def stop(share: float, _text: str) -> None:
+        if share > 0.5:
+            raise identify.Cancelled("stop")
+
+    with pytest.raises(identify.Cancelled):
+        identify.carry(again("fatigue"), earlier, stop)
