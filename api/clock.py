@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import time
 from contextvars import ContextVar
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 
 
 class Clock:
@@ -22,10 +24,18 @@ class Clock:
         """Now, as an ISO 8601 label."""
         return utc_label(self.unix_s())
 
+    def start_of_day_utc(self) -> str:
+        """The last midnight where the service stands, as an ISO 8601 label in UTC."""
+        return self._midnight_utc(0)
+
     def end_of_day_utc(self) -> str:
         """The next midnight where the service stands, as an ISO 8601 label in UTC."""
-        today = datetime.fromtimestamp(self.unix_s()).astimezone()
-        midnight = datetime.combine(today.date() + timedelta(days=1), datetime.min.time())
+        return self._midnight_utc(1)
+
+    def _midnight_utc(self, days: int) -> str:
+        """The midnight at which today began, or so many days later."""
+        today = datetime.fromtimestamp(self.unix_s()).astimezone().date()
+        midnight = datetime.combine(today + timedelta(days=days), datetime.min.time())
         return utc_label(midnight.astimezone().timestamp())
 
 
@@ -37,6 +47,26 @@ def utc_label(unix_s: float) -> str:
 def unix_of(label: str) -> float:
     """Seconds since 1970 of an ISO 8601 label."""
     return datetime.fromisoformat(label.replace("Z", "+00:00")).timestamp()
+
+
+def local_day(label: str) -> str:
+    """A UTC label's day where the service stands: 2026-11-21."""
+    return datetime.fromtimestamp(unix_of(label)).astimezone().date().isoformat()
+
+
+def set_zone(name: str) -> None:
+    """Let this process show times, and end its days, as in this time zone."""
+    os.environ["TZ"] = name
+    time.tzset()
+
+
+def zone_name() -> str:
+    """What the time zone is called in which times are shown, as Europe/Berlin; empty where the machine does not say."""
+    if named := os.environ.get("TZ", "").removeprefix(":"):
+        return named
+    _, mark, name = os.path.realpath("/etc/localtime").partition("/zoneinfo/")
+    written = Path("/etc/timezone")
+    return name if mark else written.read_text("utf-8").strip() if written.is_file() else ""
 
 
 asked_s: ContextVar[float] = ContextVar("asked_s")

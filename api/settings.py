@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 from typing import Annotated, Any
+from zoneinfo import available_timezones
 
 from pydantic import Field, SecretStr, ValidationError, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
@@ -35,6 +36,10 @@ class Settings(BaseSettings):
     emulated: bool = Field(default=False, description="True: no person is connected, an emulator stands in for the rig")
     workers: Annotated[int, Field(ge=1, le=16)] = 2
     session_hours: Annotated[float, Field(gt=0, le=24)] = 12.0
+    idle_lock_min: Annotated[float, Field(ge=0, le=720)] = Field(
+        default=10.0, description="a session locks after so many minutes without a person's action; 0: never"
+    )
+    time_zone: str | None = Field(default=None, description="as Europe/Berlin; default: the machine's")
     secure_cookies: bool = Field(default=False, description="True behind a TLS proxy: cookies over HTTPS only")
     tls_proxy: bool = Field(default=False, description="True: a TLS proxy stands in front; needed to leave loopback")
     max_upload_mb: Annotated[float, Field(gt=0)] = 64.0
@@ -61,6 +66,14 @@ class Settings(BaseSettings):
         if odd is not None:
             raise ValueError(f"{odd} is no effect's id (see `stimrig effects`); give ids, separated by commas")
         return tuple(dict.fromkeys(named))
+
+    @field_validator("time_zone")
+    @classmethod
+    def _known_zone(cls, given: str | None) -> str | None:
+        """A zone that this machine knows."""
+        if given and given not in available_timezones():
+            raise ValueError("no such time zone on this machine; take one like Europe/Berlin or UTC")
+        return given or None
 
     @property
     def database(self) -> str:

@@ -8,13 +8,35 @@ from __future__ import annotations
 
 from typing import Any
 
+from api.language import lazy
+
 CHART_CONFIG: dict[str, Any] = {
     "responsive": True,
     "displaylogo": False,
     "showSendToCloud": False,
     "plotlyServerURL": "",
-    "modeBarButtons": [["toImage"], ["zoom2d", "pan2d"], ["zoomIn2d", "zoomOut2d", "resetScale2d"]],
+    "modeBarButtons": [["toImage"], ["zoom2d", "pan2d", "resetScale2d"]],
+    "displayModeBar": True,
 }
+
+
+PAGE_CONFIG: dict[str, Any] = {
+    **CHART_CONFIG,
+    "locale": "page",
+    "locales": {
+        "page": {
+            "format": {},
+            "dictionary": {
+                "Download plot as a PNG": lazy("Save as a picture"),
+                "Download plot": lazy("Save as a picture"),
+                "Zoom": lazy("Zoom: draw a box"),
+                "Pan": lazy("Move"),
+                "Reset axes": lazy("Show all again"),
+            },
+        }
+    },
+}
+"""On a page: the buttons' words in its language."""
 
 
 def said(words: str) -> str:

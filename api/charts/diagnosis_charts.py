@@ -1,13 +1,27 @@
-"""Figures of "Why does it fail?": the residual with its worst places, signatures, the falling error."""
+"""Figures of what is missing: the residual with its worst places, signatures, the falling error."""
 
 from __future__ import annotations
 
 from typing import Any
 
+from api.charts import hover
 from api.charts.config import said
-from api.charts.model_charts import BAND, INK, MEASURED, MODEL, STIMULUS, axis, layout, line, segment_marks
+from api.charts.model_charts import (
+    INK,
+    MEASURED,
+    MODEL,
+    NOISE,
+    TOOLBAR_PX,
+    axis,
+    layout,
+    line,
+    segment_marks,
+    segment_name,
+)
+from api.charts.palette import role
+from api.language import _, localised
 
-MARK, MARK_LINE = "rgba(179,18,29,.10)", "#b3121d"
+MARK, MARK_LINE, FLOOR = role("worst-band"), role("worst"), role("limit")
 
 
 def residual(
@@ -17,21 +31,25 @@ def residual(
     series = comparison["series"]
     time_s, band = series["time_s"], series.get("noise_band_nm") or 0.0
     shapes, labels = segment_marks(segments)
-    shapes.append(_box(time_s[0], time_s[-1], -band, band, BAND, yref="y"))
+    shapes.append(_box(time_s[0], time_s[-1], -band, band, NOISE, yref="y"))
     for place in places:
         shapes.append(_box(place["start_s"], place["end_s"], 0, 1, MARK))
         labels.append({
             "xref": "x", "yref": "paper", "x": (place["start_s"] + place["end_s"]) / 2, "y": 0.985, "yanchor": "top",
-            "text": f"<b>{place['number']}</b>", "showarrow": False, "font": {"size": 12, "color": "#fff"},
+            "text": f"<b>{place['number']}</b>", "showarrow": False, "font": {"size": 12, "color": role("on-worst")},
             "bgcolor": MARK_LINE, "borderpad": 3, "name": "place",
         })  # fmt: skip
-    data = [line(time_s, series["residual_nm"], "measured − model", INK, 0.9)]
+    words = _("measured − model")
+    names = hover.segments_at(time_s, segments, segment_name)
+    data = [line(time_s, series["residual_nm"], words, INK, 0.9,
+                 **hover.says(words, hover.RESIDUAL + hover.BESIDE, names))]  # fmt: skip
     return {
         "data": data,
         "layout": layout(
             height=320, shapes=shapes, annotations=labels, showlegend=False,
-            margin={"l": 64, "r": 16, "t": 30, "b": 48},
-            xaxis=axis("Time (s)", range=[time_s[0], time_s[-1]]), yaxis=axis("Measured − model (N·m)"),
+            margin={"l": 64, "r": TOOLBAR_PX, "t": 30, "b": 48},
+            xaxis=axis(_("Time (s)"), range=[time_s[0], time_s[-1]], **hover.AT_TIME),
+            yaxis=axis(_("Measured − model (N·m)")),
         ),
     }  # fmt: skip
 
@@ -44,11 +62,18 @@ def _box(x0: float, x1: float, y0: float, y1: float, fill: str, yref: str = "pap
 def signature(time_s: list[float], found: dict[str, list[float]]) -> dict[str, Any]:
     """What is left without an effect, and what adding it explains of that."""
     data = [
-        line(time_s, found["seen_nm"], "seen: left without it", MEASURED, 1.8),
-        line(time_s, found["expected_nm"], "expected: what it explains", MODEL, 1.8),
-    ]
-    x, y = axis("Time (s)", range=[time_s[0], time_s[-1]]), axis("Torque (N·m)")
-    return {"data": data, "layout": layout(height=250, xaxis=x, yaxis=y, margin={"l": 56, "r": 10, "t": 30, "b": 42})}
+        line(time_s, found["seen_nm"], _("seen: left without it"), MEASURED, 1.8,
+             **hover.says(_("seen"), hover.RESIDUAL)),
+        line(time_s, found["expected_nm"], _("expected: what it explains"), MODEL, 1.8,
+             **hover.says(_("expected"), hover.RESIDUAL)),
+    ]  # fmt: skip
+    x = axis(_("Time (s)"), range=[time_s[0], time_s[-1]], **hover.AT_TIME)
+    margin = {"l": 56, "r": TOOLBAR_PX, "t": 30, "b": 42}
+    return {"data": data, "layout": layout(height=250, xaxis=x, yaxis=axis(_("Torque (N·m)")), margin=margin)}
+
+
+NAMED_LETTERS = 60
+"""Letters of the versions' names up to which they stand below their chart on a tablet."""
 
 
 def falling(rows: list[dict[str, Any]]) -> dict[str, Any]:
@@ -57,20 +82,29 @@ def falling(rows: list[dict[str, Any]]) -> dict[str, Any]:
     sizes = [13 if row["current"] else 8 for row in rows]
     noise = next((row["noise_sd_nm"] for row in reversed(rows) if row.get("noise_sd_nm")), None)
     held = [row["held_out_rms_nm"] for row in rows]
-    data = [line(names, [row["rms_nm"] for row in rows], "rows used to fit", MEASURED, 2.0,
-                 mode="lines+markers", marker={"size": sizes})]  # fmt: skip
+    data = [_fall(names, [row["rms_nm"] for row in rows], _("rows used to fit"), MEASURED, sizes, "circle")]
     if any(value is not None for value in held):
-        data.append(line(names, held, "rows not used to fit", MODEL, 2.6, mode="lines+markers", marker={"size": sizes}))
+        data.append(_fall(names, held, _("rows not used to fit"), MODEL, sizes, "diamond"))
     shapes, labels = [], []
     if noise:
         shapes.append({"type": "line", "xref": "paper", "x0": 0, "x1": 1, "y0": noise, "y1": noise,
-                       "line": {"color": STIMULUS, "width": 1.6, "dash": "dash"}})  # fmt: skip
-        labels.append({"xref": "paper", "x": 0, "y": noise, "text": f"noise {noise:.3f} N·m", "showarrow": False,
-                       "yanchor": "bottom", "xanchor": "left", "name": "noise",
-                       "font": {"color": STIMULUS}})  # fmt: skip
+                       "line": {"color": FLOOR, "width": 1.6, "dash": "dash"}})  # fmt: skip
+        words = _("noise %(size)s N·m", size=localised(f"{noise:.3f}"))
+        labels.append({"xref": "paper", "x": 0, "y": noise, "text": words, "showarrow": False,
+                       "yanchor": "bottom", "xanchor": "left", "name": "noise", "font": {"color": FLOOR}})  # fmt: skip
     x = axis("", type="category", range=[-0.4, len(rows) - 0.6])
-    y = axis("Error, rms (N·m)", rangemode="tozero")
+    if sum(map(len, names)) > NAMED_LETTERS:  # they would be cut off; the table below names each number
+        x |= {"tickvals": names, "ticktext": [f"{number}." for number in range(1, len(rows) + 1)]}
+    y = axis(_("Error, rms (N·m)"), rangemode="tozero")
     return {"data": data, "layout": layout(height=320, shapes=shapes, annotations=labels, xaxis=x, yaxis=y)}
+
+
+def _fall(
+    names: list[str], values: list[float | None], words: str, colour: str, sizes: list[int], symbol: str
+) -> dict[str, Any]:
+    marker = {"size": sizes, "symbol": symbol, "color": colour}
+    return line(names, values, words, colour, 2.2, mode="lines+markers", marker=marker,
+                **hover.says(words, "%{y:.3f} N·m"))  # fmt: skip
 
 
 def of_why(

@@ -6,6 +6,7 @@ from typing import Any
 
 from api.charts import diagnosis_charts, model_charts
 from api.charts.local_figure import LocalFigure
+from api.charts.palette import in_light
 from api.models import explanation
 from api.workers.verbs import curves, runs, thinned
 from identify import BadRequest, Comparison, Improvement, Model, Record, compare
@@ -35,12 +36,12 @@ def plot(what: Any, record: Record | None = None) -> LocalFigure:
         It is none of these, or a model without a record.
     """
     if isinstance(what, Model) and record is not None:
-        return LocalFigure(_model(what, record))
+        return LocalFigure(in_light(_model(what, record)))
     if isinstance(what, Comparison):
-        return LocalFigure(_residual(what.to_dict()))
+        return LocalFigure(in_light(_residual(what.to_dict())))
     if isinstance(what, Improvement):
         found = {**what.to_dict(), "models": []}
-        return LocalFigure(diagnosis_charts.falling(explanation.of_steps(found)))
+        return LocalFigure(in_light(diagnosis_charts.falling(explanation.of_steps(found))))
     message = "plot takes a model and its record, a comparison, or what improve found: plot(model, record)"
     raise BadRequest(message, place="plot")
 

@@ -10,6 +10,8 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
+from api.charts.hover import on
+
 WINDOW_S = 0.6
 """A slope is taken over this long; a pulse width that jumps or turns within it has no direction."""
 FASTEST_US_PER_S = 200.0
@@ -81,15 +83,6 @@ def collected(sums: dict[tuple[str, int], list[float]], curve: dict[str, Any]) -
             continue
         points = found.setdefault(way, {"pulse_width_us": [], "torque_nm": []})
         points["pulse_width_us"].append(round(width / count, 2))
-        points["torque_nm"].append(round(on(curve, width / count) + more / count, 4))
+        on_curve = on(width / count, curve["pulse_width_us"], curve["torque_nm"])
+        points["torque_nm"].append(round(on_curve + more / count, 4))
     return found
-
-
-def on(curve: dict[str, Any], width_us: float) -> float:
-    """The curve at a pulse width, by linear interpolation; N·m."""
-    x, y = curve["pulse_width_us"], curve["torque_nm"]
-    for index in range(1, len(x)):
-        if width_us <= x[index]:
-            share = (width_us - x[index - 1]) / (x[index] - x[index - 1])
-            return y[index - 1] + share * (y[index] - y[index - 1])
-    return y[-1]

@@ -10,13 +10,20 @@ from typing import Any
 
 from markupsafe import Markup, escape
 
+from api.charts.palette import painted_light, role
+from api.language import localised
+
 LEFT, RIGHT, TOP, BOTTOM = 62.0, 14.0, 40.0, 42.0
 FONT = "system-ui, 'DejaVu Sans', sans-serif"
-INK, DIM, GRID_COLOUR = "#1b2733", "#52606d", "#e3e8ec"
+INK, DIM, GRID_COLOUR, EDGE = (role(name) for name in ("ink", "dim", "grid", "cursor"))
+STROKES = {"dash": "6 4", "dot": "2 3", "dashdot": "7 3 2 3"}
 LEGEND_GAP = 16.0
+WIDE_LETTER = 7.0
 
 
-def svg(figure: dict[str, Any], width: float = 720.0, height: float | None = None, label: str = "") -> Markup:
+def svg(
+    figure: dict[str, Any], width: float = 720.0, height: float | None = None, label: str = "", on_paper: bool = False
+) -> Markup:
     """A figure as an SVG element.
 
     Parameters
@@ -27,6 +34,8 @@ def svg(figure: dict[str, Any], width: float = 720.0, height: float | None = Non
         px; default height: the layout's.
     label : str
         For who cannot see it.
+    on_paper : bool
+        With the light colours in it; else the page's style sheet colours it.
     """
     plane = Plane(figure, width, height or figure["layout"].get("height", 340))
     parts = [*plane.frame(), *plane.boxes(), *plane.traces(), *plane.labels(), *plane.legend()]
@@ -34,7 +43,8 @@ def svg(figure: dict[str, Any], width: float = 720.0, height: float | None = Non
         f'<svg xmlns="http://www.w3.org/2000/svg" class="still" viewBox="0 0 {width:g} {plane.height:g}" role="img" '
         f'aria-label="{escape(label)}" font-family="{FONT}" font-size="11.5">'
     )
-    return Markup(head + "".join(parts) + "</svg>")
+    drawn = head + "".join(parts) + "</svg>"
+    return Markup(painted_light(drawn) if on_paper else drawn)
 
 
 class Plane:
@@ -104,7 +114,7 @@ class Plane:
             for at, words in zip((10, 24), [lines[0], *("(" + rest for rest in lines[1:])], strict=False):
                 parts.append(text(at, middle, words, INK, "middle", f' transform="rotate(-90 {at} {middle:.1f})"'))
         floor = self.height - BOTTOM
-        parts.append(stroke(LEFT, floor, self.width - RIGHT, floor, "#9aa5b1"))
+        parts.append(stroke(LEFT, floor, self.width - RIGHT, floor, EDGE))
         low, high = self.x_range
         marks: list[tuple[float, str]] = [(number, words) for number, words in enumerate(self.categories)]
         marks = marks or [(value, plain(value)) for value in ticks(low, high, max(3, round(self.width / 90)))]
@@ -147,7 +157,7 @@ class Plane:
             elif "lines" in trace.get("mode", "lines") and line.get("width", 1):
                 parts.append(
                     f'<path d="{path}" fill="none" stroke="{line["color"]}" stroke-width="{line["width"]:g}" '
-                    'stroke-linejoin="round"/>'
+                    f'stroke-linejoin="round"{dashed(line.get("dash"))}/>'
                 )
             if "markers" in trace.get("mode", ""):
                 parts += [symbol(point, trace, line["color"]) for point in points if point]
@@ -165,7 +175,9 @@ class Plane:
             y = foot - note["y"] * (foot - TOP) - 4 if paper else self.y(note["y"], "y") - 5
             words = note["text"].replace("<b>", "").replace("</b>", "")
             number = note.get("name") == "place"
-            colour = "#b3121d" if number else (note.get("font") or {}).get("color", DIM)
+            if at is not None:  # a long name near the end of the test stays on the paper
+                x = max(LEFT, min(x, self.width - 0.5 * WIDE_LETTER * len(words)))
+            colour = role("worst") if number else (note.get("font") or {}).get("color", DIM)
             parts.append(text(x, y + (16 if number else 0), words, colour, "start" if at is None else "middle"))
         return parts
 
@@ -174,7 +186,12 @@ class Plane:
         shown = [t for t in self.data if t.get("name") and t.get("showlegend", self.layout.get("showlegend", True))]
         if len(shown) < 2:
             return []
-        wide = [LEGEND_GAP + 19 + 6.1 * len(trace["name"]) for trace in shown]
+        letters = sum(len(trace["name"]) for trace in shown)
+        free = self.width - 4.0 - 19 * len(shown)
+        small = free < WIDE_LETTER * letters + 0.5 * LEGEND_GAP * len(shown)
+        letter, more = (0.87 * WIDE_LETTER, ' font-size="10"') if small else (WIDE_LETTER, "")
+        gap = min(LEGEND_GAP, max(0.0, (free - letter * letters) / len(shown)))
+        wide = [gap + 19 + letter * len(trace["name"]) for trace in shown]
         parts, x = [], LEFT if LEFT + sum(wide) < self.width else 4.0
         for trace, room in zip(shown, wide, strict=True):
             colour = trace.get("fillcolor") or trace["line"]["color"]
@@ -182,7 +199,7 @@ class Plane:
                 parts.append(symbol((x + 8, 10.0), trace, colour))
             else:
                 parts.append(f'<rect x="{x:.1f}" y="6" width="14" height="8" rx="2" fill="{colour}"/>')
-            parts.append(text(x + 19, 14, trace["name"], INK, "start"))
+            parts.append(text(x + 19, 14, trace["name"], INK, "start", more))
             x += room
         return parts
 
@@ -206,7 +223,7 @@ def ticks(low: float, high: float, count: int) -> list[float]:
 
 def plain(value: float) -> str:
     """A tick's number."""
-    return f"{round(value, 9):g}".replace("-", "−")
+    return localised(f"{round(value, 9):g}".replace("-", "−"))
 
 
 def way(points: list[tuple[float, float] | None], steps: bool) -> str:
@@ -227,6 +244,11 @@ def stroke(x0: float, y0: float, x1: float, y1: float, colour: str, more: str = 
     return f'<line x1="{x0:.1f}" y1="{y0:.1f}" x2="{x1:.1f}" y2="{y1:.1f}" stroke="{colour}"{more}/>'
 
 
+def dashed(kind: str | None) -> str:
+    """A trace's dash."""
+    return f' stroke-dasharray="{STROKES[kind]}"' if kind in STROKES else ""
+
+
 def text(x: float, y: float, words: str, colour: str, anchor: str, more: str = "") -> str:
     """Words."""
     return f'<text x="{x:.1f}" y="{y:.1f}" fill="{colour}" text-anchor="{anchor}"{more}>{escape(words)}</text>'
@@ -239,4 +261,4 @@ def symbol(point: tuple[float, float], trace: dict[str, Any], colour: str) -> st
         return f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4" fill="{colour}"/>'
     sign = -1 if kind == "triangle-up" else 1
     corners = f"{x - 4:.1f},{y - sign * 3:.1f} {x + 4:.1f},{y - sign * 3:.1f} {x:.1f},{y + sign * 4:.1f}"
-    return f'<polygon points="{corners}" fill="#fff" stroke="{colour}" stroke-width="1.5"/>'
+    return f'<polygon points="{corners}" fill="{role("chart")}" stroke="{colour}" stroke-width="1.5"/>'

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from api.cli.errors import ReportedError
-from api.cli.terminal import model_report, number
+from api.cli.terminal import carried_lines, model_report, number
 from api.client.documents import SessionTest
 from api.client.errors import Unreachable
 from api.client.rest import Client
@@ -93,5 +93,6 @@ def report_lines(test: Mapping[str, Any], model: dict[str, Any]) -> list[str]:
         f"clocks         aligned by {aligned.get('method')}, error {number(aligned.get('error_ms'), 4)} ms",
         *(f"in doubt       {words}" for words in summary.get("warnings") or []),
         *model_report(model),
+        *carried_lines((test.get("fit") or {}).get("carried")),
         f"served         {number(summary.get('last_sample_to_model_s'), 2)} s from the last sample to the stored model",
     ]

@@ -127,7 +127,7 @@ async def _stop(rig: RigClient) -> str:
         if (await rig.ask(StatusRequest(), STATUS_S)).get("state") in IDLE:
             return NOTHING
     try:
-        evidence = StopEvidence.model_validate(await rig.ask(StopRequest(reason=REASON, by=BY), STOP_S))
+        evidence = await rig.ask_for(StopEvidence, StopRequest(reason=REASON, by=BY), STOP_S)
     except ApiError as error:
         return f"{DOUBT} {error.title}: {error.detail}"
     return CONFIRMED if evidence.confirmed else f"{DOUBT} The rig says: {evidence.detail}"

@@ -6,7 +6,7 @@ import contextlib
 import json
 import math
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -194,6 +194,20 @@ def table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
     widths = [max(len(row[index]) for row in cells) for index in range(len(cells[0]))]
     lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in cells]
     return [lines[0], "  ".join("-" * width for width in widths), *lines[1:]]
+
+
+def carried_lines(found: Mapping[str, Any] | None) -> list[str]:
+    """What a record said of the structure of an earlier model; nothing where none was carried over."""
+    if not found:
+        return []
+    needed = {True: "still needed", False: "no longer needed", None: "left out, undecided"}
+    earlier = found.get("from_model_id") or found["carried_from"]
+    lines = [
+        f"from model {earlier}; offered: the {found['offered']} structure",
+        found["reason"],
+        *(f"{needed[row['needed']]}: {row['effect']}. {row['reason']}" for row in found["effects"]),
+    ]
+    return [f"{'' if number else 'carried over':15}{line}" for number, line in enumerate(lines)]
 
 
 def model_report(document: dict[str, Any]) -> list[str]:

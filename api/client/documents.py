@@ -16,6 +16,24 @@ class Participant(TypedDict):
     profile: dict[str, Any]
     created_utc: str
     created_by: str
+    side: Literal["left", "right"] | None
+    muscle: str | None
+    archived_utc: str | None
+
+
+class Note(TypedDict):
+    """A note on a session, or at a time in a test."""
+
+    id: str
+    participant: str
+    test_id: str | None
+    at_s: float | None
+    kind: str
+    text: str
+    by: str
+    at_utc: str
+    struck_by: str | None
+    struck_utc: str | None
 
 
 class Version(TypedDict):
@@ -26,6 +44,8 @@ class Version(TypedDict):
     recording_id: str
     parent_id: str | None
     added_effect: str | None
+    carried_from_id: str | None
+    carried: dict[str, Any] | None
     method: str
     effects: list[str]
     fit_percent: float | None
@@ -34,12 +54,25 @@ class Version(TypedDict):
     rms_nm: float | None
     held_out_rms_nm: float | None
     noise_sd_nm: float | None
+    figures: dict[str, dict[str, Any]]
     verdict: Literal["usable", "usable with care", "not usable", "unknown"]
     words: str
     reasons: list[str]
     decision: Literal["approved", "rejected"] | None
     served: bool
     created_utc: str
+
+
+class Trend(TypedDict):
+    """A participant's sessions, oldest first, and what changed from the last approved one to the newest.
+
+    Each session has `at_utc`, `model_id`, `approved`, `notes`, and `figures` with `value`, `sd`, `uncertainty` and
+    `unit`. `changes` is None where there is nothing to compare with.
+    """
+
+    participant: str
+    sessions: list[dict[str, Any]]
+    changes: dict[str, Any] | None
 
 
 class SessionTest(TypedDict):
@@ -62,6 +95,9 @@ class SessionTest(TypedDict):
     progress: float
     identification: dict[str, Any] | None
     requested_by: str
+    ran_by: str
+    side: Literal["left", "right"] | None
+    muscle: str | None
     requested_utc: str
     finished_utc: str | None
     planned: dict[str, Any]

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from api.client.connection import Connection
-from api.client.documents import ApprovedModel, Job, Version
+from api.client.documents import ApprovedModel, Job, Trend, Version
 from api.client.errors import NotCompleted, ServiceError, refused
 
 POLL_S = 0.1
@@ -21,6 +21,14 @@ class Models(Connection):
     def versions(self, participant: str) -> list[Version]:
         """Model versions of a participant, newest first."""
         return self.get(f"/v1/participants/{participant}/models")
+
+    def trend(self, participant: str) -> Trend:
+        """Sessions of a participant, oldest first: figures with their uncertainty, and what changed."""
+        return self.get(f"/v1/participants/{participant}/trend")
+
+    def trend_csv(self, participant: str) -> bytes:
+        """The same as a CSV file."""
+        return self.request("GET", f"/v1/participants/{participant}/trend.csv").content
 
     def version(self, model_id: str) -> Version:
         """One model version."""

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from api.client.documents import Participant, SessionTest
+from api.client.documents import Note, Participant, SessionTest
 from api.client.errors import NotCompleted, NotFound
 from api.client.models import POLL_S, Models
 
@@ -44,6 +44,10 @@ class Client(Models):
         """Stop stimulation. Returns only if the rig confirms that stimulation has stopped."""
         return self.post("/v1/stop", json={"reason": reason} if reason else {})
 
+    def lock(self) -> None:
+        """Lock the session of a person at once. A token has none to lock: `Conflict`."""
+        self.request("POST", "/v1/sessions/lock")
+
     def effects(self) -> list[dict[str, Any]]:
         """The library of effects of the service."""
         return self.get("/v1/effects")["effects"]
@@ -54,17 +58,61 @@ class Client(Models):
 
     # ---- participants
 
-    def participants(self) -> list[Participant]:
-        """All participants."""
-        return self.get("/v1/participants")
+    def participants(self, q: str = "", archived: bool | None = None) -> list[Participant]:
+        """All participants, most recent first. `q`: a part of the code; `archived`: only those that are, or are not."""
+        given = {"q": q or None, "archived": archived}
+        return self.get("/v1/participants", params={key: value for key, value in given.items() if value is not None})
 
     def participant(self, code: str) -> Participant:
         """One participant with its limits."""
         return self.get(f"/v1/participants/{code}")
 
-    def make_participant(self, code: str, profile: dict[str, float] | None = None) -> Participant:
-        """Make a participant: a code, never a name. `profile`: current_ma, max_pulse_width_us, max_torque_nm."""
-        return self.post("/v1/participants", json={"code": code} | ({"profile": profile} if profile else {}))
+    def make_participant(
+        self, code: str, profile: dict[str, float] | None = None, side: str | None = None, muscle: str | None = None
+    ) -> Participant:
+        """Make a participant: a code, never a name.
+
+        Parameters
+        ----------
+        code : str
+            Letters, digits, - and _.
+        profile : dict, optional
+            current_ma, max_pulse_width_us, max_torque_nm.
+        side : str, optional
+            "left" or "right".
+        muscle : str, optional
+            As "biceps brachii".
+        """
+        more = {"profile": profile, "side": side, "muscle": muscle}
+        return self.post(
+            "/v1/participants", json={"code": code, **{key: value for key, value in more.items() if value}}
+        )
+
+    def set_muscle(self, code: str, side: str | None, muscle: str | None) -> Participant:
+        """Say which side and which muscle is stimulated; refused where a calibration would be lost by it."""
+        return self.request("PUT", f"/v1/participants/{code}/muscle", json={"side": side, "muscle": muscle}).json()
+
+    def archive(self, code: str) -> Participant:
+        """Put a participant into the archive: no test starts any more, and nothing is deleted."""
+        return self.post(f"/v1/participants/{code}/archive")
+
+    def unarchive(self, code: str) -> Participant:
+        """Take a participant out of the archive."""
+        return self.post(f"/v1/participants/{code}/unarchive")
+
+    # ---- notes
+
+    def notes(self, participant: str) -> list[Note]:
+        """The notes of a participant, newest first, the struck ones among them."""
+        return self.get(f"/v1/participants/{participant}/notes")
+
+    def add_note(self, participant: str, kind: str, text: str = "", **more: Any) -> Note:
+        """Write a note. `more`: `test_id`, and the time in that test as `at_s`, or `now=True` while it runs."""
+        return self.post(f"/v1/participants/{participant}/notes", json={"kind": kind, "text": text, **more})
+
+    def strike_note(self, participant: str, note_id: str) -> Note:
+        """Mark a note as wrong; it stays readable."""
+        return self.post(f"/v1/participants/{participant}/notes/{note_id}/strike")
 
     def ensure_participant(self, code: str) -> Participant:
         """The participant; makes it if there is none (two requests)."""
@@ -132,6 +180,14 @@ class Client(Models):
             reason = test["reason"] or "no reason was given"
             raise NotCompleted("", f"the test ended as {test['state']}", reason, document=test)
         return test
+
+    def set_ran_by(self, test_id: str, name: str | None) -> SessionTest:
+        """Say who ran a test at the rig; None: who asked for it."""
+        return self.request("PUT", f"/v1/tests/{test_id}/ran-by", json={"ran_by": name}).json()
+
+    def keep_plain(self, test_id: str) -> SessionTest:
+        """End the fit of last session's structure after a test: the plain model is offered. Refused when none runs."""
+        return self.post(f"/v1/tests/{test_id}/keep-plain")
 
     # ---- recordings
 

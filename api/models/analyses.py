@@ -13,9 +13,9 @@ from typing import Any
 
 from api.clock import Clock
 from api.errors import ApiError, NotFoundError
-from api.models import effect_evidence
+from api.models import effect_evidence, stored
+from api.models.carried_structure import CarriedStructure
 from api.models.registry import Versions
-from api.models.starting_effects import StartingEffects
 from api.settings import Settings
 from api.store import Store, audit, uploads
 from api.store.tables import Analysis, Model, Recording
@@ -31,12 +31,12 @@ HALF_DONE = 0.5
 
 def is_plain(model: Model) -> bool:
     """Whether a version's structure is the plain one: no effects around f(u) and a G of second order."""
-    return not model.effects and "time_constant_s" in json.loads(model.document)["linear"]
+    return not model.effects and "time_constant_s" in stored.read(model)["linear"]
 
 
 def structure_of(model: Model) -> list[str]:
     """The effects of a version, each `id:form` or, where no form is named, `id`."""
-    held = json.loads(model.document).get("effects") or []
+    held = stored.read(model).get("effects") or []
     return [f"{effect['id']}:{effect.get('form') or ''}".removesuffix(":") for effect in held]
 
 
@@ -46,7 +46,7 @@ class Analyses:
     def __init__(self, store: Store, clock: Clock, pool: Pool, versions: Versions, settings: Settings) -> None:
         self.store, self.clock, self.pool, self.versions = store, clock, pool, versions
         self.settings = settings
-        self.starting_effects = StartingEffects(store, pool, settings)
+        self.carried_structure = CarriedStructure(versions, pool, settings)
         self.running: dict[tuple[str, str], Call] = {}
         """Begun and not kept yet."""
         self._kept_count = 0
@@ -61,7 +61,7 @@ class Analyses:
 
     async def comparison(self, model: Model, recording_id: str | None = None) -> dict[str, Any]:
         """Measurement against model; with another recording's id, the model against that one."""
-        given = {"model_json": model.document.decode()}
+        given = {"model_json": stored.text(model)}
         if recording_id in (None, model.recording_id):
             return await self._kept(model, "comparison", given)
         digest = hashlib.sha256(str(recording_id).encode()).hexdigest()[:16]
@@ -69,7 +69,7 @@ class Analyses:
 
     async def curves(self, model: Model) -> dict[str, Any]:
         """Measured, predicted and commanded curves, thinned to what a screen shows."""
-        return await self._kept(model, "curves", {"model_json": model.document.decode()})
+        return await self._kept(model, "curves", {"model_json": stored.text(model)})
 
     async def diagnosis(self, model: Model, on_call: OnCall | None = None) -> dict[str, Any]:
         """What is missing in the model's own structure; that of the plain one is shared by all that have it."""
@@ -80,7 +80,7 @@ class Analyses:
         """With which version a diagnosis is kept, under which name, and what the worker is given for it."""
         if is_plain(model):
             return self.first_version(model), "diagnosis", {}
-        return model, OWN_DIAGNOSIS, {"model_json": model.document.decode()}
+        return model, OWN_DIAGNOSIS, {"model_json": stored.text(model)}
 
     def first_version(self, model: Model) -> Model:
         """The first version made from the model's recording: what is found of its plain structure is kept with it."""
@@ -99,11 +99,13 @@ class Analyses:
 
     async def diagnose_ahead(self, model: Model) -> None:
         """Diagnose before anybody asks, with low priority; a new test ends it, and nobody is told."""
-        place, kind, given = await asyncio.to_thread(self._criticised, model)
         try:
+            place, kind, given = await asyncio.to_thread(self._criticised, model)
             await self._kept(place, kind, given, verb="diagnosis", background=True)
         except ApiError as error:
             log.info("diagnosis of %s in the background: %s", model.id, error.title)
+        except Exception:  # nobody waits for it: the log is where it is told
+            log.exception("diagnosis of %s in the background", model.id)
 
     def known(self, model_id: str, kind: str) -> dict[str, Any] | None:
         """A finding if it has been made."""
@@ -233,7 +235,7 @@ class Analyses:
         """
         path = await asyncio.to_thread(self.path, model.recording_id)
         plain = await asyncio.to_thread(is_plain, model)
-        given: dict[str, Any] = {} if plain else {"model_json": model.document.decode()}
+        given: dict[str, Any] = {} if plain else {"model_json": stored.text(model)}
         call = self.pool.submit("improve", data=path, **given)
         if on_call is not None:
             on_call(call)

@@ -44,6 +44,7 @@ def refusal(diagnosis: dict[str, Any], present: Sequence[str], effect: str) -> s
     better = [entry for entry in diagnosis.get("missing") or [] if entry["effect"] != effect]
     if better and rows[0]["log_evidence_gain"] > 6:
         names = " and ".join((entry.get("name") or entry["effect"]).lower() for entry in better)
-        beside = f"with it in the model, {effect} gains too little (log evidence {gain:+.1f})."
+        name = ((diagnosis.get("library") or {}).get(effect) or {}).get("name", effect).lower()
+        beside = f"with it in the model, {name} gains too little (log evidence {gain:+.1f})."
         return f"{names} explains the same error better; {beside}"
     return f"the evidence is too weak (log evidence {gain:+.1f}): what it explains looks like noise."

@@ -5,15 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from api.structure import in_words, worded
-from identify.caution import caution
+from api.clinical_words import segment_words
+from api.effect_words import effect_words, effects_words, parameter_words, within, without_unit
+from api.language import _, lazy, localised, ngettext, plain
+from api.structure import worded
+from identify.caution import caution, only_open
 
-SPLITS = {
-    "segment": "By segment",
-    "level": "By level of pulse width",
-    "direction": "By direction of pulse width",
-    "time": "By time since the start",
-    "frequency": "By frequency",
+SPLITS: dict[str, Any] = {
+    "segment": lazy("By part of the test"),
+    "level": lazy("By level of pulse width"),
+    "direction": lazy("By direction of pulse width"),
+    "time": lazy("By time since the start"),
+    "frequency": lazy("By frequency"),
 }
 NOISE_LIKE = 1.3
 """Held-out error over noise up to which what is left passes for noise."""
@@ -22,7 +25,9 @@ LEAST_SHARE = 0.005
 """Octaves above the last one with a larger share are not shown."""
 
 
-def view(diagnosis: dict[str, Any], comparison: dict[str, Any] | None, effects: Sequence[str]) -> dict[str, Any]:
+def view(
+    diagnosis: dict[str, Any], comparison: dict[str, Any] | None, effects: Sequence[str], leaves_structure: bool = False
+) -> dict[str, Any]:
     """What the section holds.
 
     Parameters
@@ -33,6 +38,8 @@ def view(diagnosis: dict[str, Any], comparison: dict[str, Any] | None, effects: 
         `identify.compare` of the model that is looked at.
     effects : sequence of str
         Effects that this model holds already.
+    leaves_structure : bool
+        The model's own check says that what it leaves over is not only noise: the page must not say that it is.
     """
     library = diagnosis.get("library") or {}
     missing = [entry for entry in diagnosis["missing"] if entry["effect"] not in effects]
@@ -41,9 +48,10 @@ def view(diagnosis: dict[str, Any], comparison: dict[str, Any] | None, effects: 
     if experiment and experiment["effect"] in effects:
         experiment = None
     return {
-        **headline(diagnosis, missing, comparison, effects),
+        **headline(diagnosis, missing, comparison, effects, leaves_structure),
         "missing": [card(entry, library) for entry in missing],
-        "structure": in_words(diagnosis.get("structure") or []),
+        "likely": [name_of(entry["effect"], library) for entry in missing if likely(entry)],
+        "structure": effects_words(diagnosis.get("structure") or []) or _("plain"),
         "present": [{"id": effect, "name": name_of(effect, library)} for effect in effects],
         "places": [place(entry, number) for number, entry in enumerate(places, start=1)],
         "splits": splits(comparison),
@@ -56,48 +64,76 @@ def view(diagnosis: dict[str, Any], comparison: dict[str, Any] | None, effects: 
 
 
 def headline(
-    diagnosis: dict[str, Any], missing: list[dict[str, Any]], comparison: dict[str, Any] | None, effects: Sequence[str]
+    diagnosis: dict[str, Any],
+    missing: list[dict[str, Any]],
+    comparison: dict[str, Any] | None,
+    effects: Sequence[str],
+    leaves_structure: bool = False,
 ) -> dict[str, str]:
     """The verdict on this model: kind, title, sentence."""
-    times = times_noise(comparison)
-    beside = "" if times is None else f" Its error{_on(comparison)} is {times:.1f} times the noise."
+    beside = _beside(comparison)
     if diagnosis["verdict"] == "unexplained_structure":
         where = diagnosis.get("where") or []
-        sits = f" It sits mostly here: {where[0]['text']}." if where else ""
-        words = f"The error depends on what the muscle does, so it is not measurement noise.{sits}{beside}"
-        return {
-            "kind": "unexplained",
-            "title": "The error has structure that no effect of the library explains",
-            "words": words,
-        }
+        sits = " " + _("It sits mostly here: %(place)s.", place=place(where[0], 1)["words"]) if where else ""
+        words = _("The error depends on what the muscle does, so it is not measurement noise.")
+        title = _("The error has structure that no effect of the library explains")
+        return {"kind": "unexplained", "title": title, "words": words + sits + beside}
     if missing:
-        names = " and ".join((entry.get("name") or entry["effect"]).lower() for entry in missing)
-        many = len(missing) > 1
-        sure = " possibly" if max(entry.get("probability") or 1.0 for entry in missing) <= LIKELY else ""
-        title = f"{len(missing)} effects are" if many else "An effect is"
-        title = f"{title}{sure} missing in this model"
-        return {"kind": "missing", "title": title, "words": f"The recording gives evidence for {names}.{beside}"}
-    more = " more" if effects else ""
-    poor = caution(diagnosis)
-    if poor:
-        title = "This recording cannot tell whether something is missing"
-        return {"kind": "unsure", "title": title, "words": poor}
-    if times is not None and times > NOISE_LIKE:
-        title = f"No{more} effect of the library has enough evidence in this recording"
-        return {
-            "kind": "unsure",
-            "title": title,
-            "words": f"Some error is left, but the evidence for each effect of the library is too weak.{beside}",
-        }
-    return {
-        "kind": "nothing",
-        "title": f"Nothing{more} is missing: what is left is noise",
-        "words": f"No effect of the library explains more than noise would.{beside}",
-    }
+        names = _(" and ").join(plain(entry.get("name") or entry["effect"]) for entry in missing)
+        words = _("The recording gives evidence for: %(names)s.", names=names) + beside
+        return {"kind": "missing", "title": _missing(missing), "words": words}
+    return _nothing(diagnosis, comparison, effects, beside, leaves_structure)
 
 
-def _on(comparison: dict[str, Any] | None) -> str:
-    return " on rows not used to fit" if comparison and comparison.get("held_out") else ""
+def _missing(missing: list[dict[str, Any]]) -> str:
+    """How many effects are missing, and how sure that is."""
+    many = len(missing)
+    if not any(map(likely, missing)):
+        return ngettext(
+            "An effect is possibly missing in this model", "%(num)s effects are possibly missing in this model", many
+        )
+    return ngettext("An effect is missing in this model", "%(num)s effects are missing in this model", many)
+
+
+def _nothing(
+    diagnosis: dict[str, Any],
+    comparison: dict[str, Any] | None,
+    effects: Sequence[str],
+    beside: str,
+    leaves_structure: bool,
+) -> dict[str, str]:
+    """The verdict where no effect is asked for: nothing is missing, or the recording cannot tell."""
+    times = times_noise(comparison)
+    title = _("This recording cannot tell whether something is missing")
+    if best := only_open(diagnosis):
+        words = _("%(name)s explains too little to be named, and too much to be excluded. A longer test can decide.",
+                  name=plain(name_of(best["effect"], diagnosis.get("library") or {})))  # fmt: skip
+        return {"kind": "unsure", "title": title, "words": words + beside}
+    if caution(diagnosis):
+        words = _("It is too short or too poor to show it. Record random pulses, a ramp and a check (segments prbs, "
+                  "ramp, validate).")  # fmt: skip
+        return {"kind": "unsure", "title": title, "words": words + beside}
+    if leaves_structure or (times is not None and times > NOISE_LIKE):
+        title = _("No effect of the library has enough evidence in this recording")
+        if effects:
+            title = _("No more effect of the library has enough evidence in this recording")
+        words = _("Some error is left, but the evidence for each effect of the library is too weak.")
+        return {"kind": "unsure", "title": title, "words": words + beside}
+    title = _("Nothing more is missing: what is left is noise") if effects else _(
+        "Nothing is missing: what is left is noise")  # fmt: skip
+    return {"kind": "nothing", "title": title,
+            "words": _("No effect of the library explains more than noise would.") + beside}  # fmt: skip
+
+
+def _beside(comparison: dict[str, Any] | None) -> str:
+    """The error in parts of the noise, as a sentence with a space before it; empty where it is not known."""
+    times = times_noise(comparison)
+    if times is None:
+        return ""
+    many = localised(f"{times:.1f}")
+    if comparison and comparison.get("held_out"):
+        return " " + _("On pulses not used for fitting its error is %(times)s times the noise.", times=many)
+    return " " + _("Its error is %(times)s times the noise.", times=many)
 
 
 def times_noise(comparison: dict[str, Any] | None) -> float | None:
@@ -110,48 +146,84 @@ def times_noise(comparison: dict[str, Any] | None) -> float | None:
 
 def name_of(effect: str, library: dict[str, Any]) -> str:
     """An effect's name for people."""
-    return (library.get(effect) or {}).get("name") or effect.replace("_", " ").capitalize()
+    return (library.get(effect) or {}).get("name") or effect_words(effect)
+
+
+def _in_a_sentence(effect: str, library: dict[str, Any]) -> str:
+    known = (library.get(effect) or {}).get("name")
+    return plain(known.lower()) if known else within(effect)
 
 
 def card(entry: dict[str, Any], library: dict[str, Any]) -> dict[str, Any]:
     """One effect that is missing."""
     known = library.get(entry["effect"]) or {}
-    probability = entry.get("probability")
-    sure = "" if probability is None else "very probably" if probability > SURE else "probably"
-    if probability is not None and probability <= LIKELY:
-        sure = "possibly"
+    rows = ((_("pulses used for fitting"), ""), (_("pulses not used for fitting"), "held_out_"))
     errors = [
-        (label, entry.get(f"{prefix}rms_before_nm"), entry.get(f"{prefix}rms_after_nm"))
-        for label, prefix in (("rows used to fit", ""), ("rows not used to fit", "held_out_"))
+        (label, entry.get(f"{prefix}rms_before_nm"), entry.get(f"{prefix}rms_after_nm")) for label, prefix in rows
     ]
     return {
         **entry,
         "id": entry["effect"],
         "name": entry.get("name") or name_of(entry["effect"], library),
-        "sure": sure,
+        "sure_words": how_sure(entry.get("probability")),
         "plain": entry.get("plain") or known.get("plain") or "",
         "signature": known.get("signature") or "",
         "equation": entry.get("equation") or known.get("equation") or "",
         "source": known.get("source") or "",
         "next_experiment": worded(entry.get("next_experiment") or ""),
-        "rivals": [name_of(rival, library).lower() for rival in entry.get("confused_with") or []],
+        "rivals": [_in_a_sentence(rival, library) for rival in entry.get("confused_with") or []],
         "errors": [error for error in errors if error[1] is not None],
         "most_nm": max([value for _, *pair in errors for value in pair if value is not None], default=1.0),
-        "parameters": {name.rsplit("_", 1)[0] if _ends_in_unit(name) else name: value
-                       for name, value in (entry.get("parameters") or {}).items()},
+        "parameters": _labelled(entry.get("parameters") or {}, known),
     }  # fmt: skip
 
 
-def _ends_in_unit(name: str) -> bool:
-    return name.endswith(("_s", "_us", "_nm", "_hz", "_rad", "_ms"))
+def likely(entry: dict[str, Any]) -> bool:
+    """Whether an effect is more than possibly missing: only such a one is advised to be added."""
+    probability = entry.get("probability")
+    return probability is None or probability > LIKELY
+
+
+def how_sure(probability: float | None) -> str:
+    """A probability that an effect is missing, in words and as a number."""
+    if probability is None:
+        return ""
+    percent = "> 99 %" if probability > 0.99 else f"{100 * probability:.0f} %"
+    if probability > SURE:
+        return _("very probably missing · %(percent)s", percent=percent)
+    if probability > LIKELY:
+        return _("probably missing · %(percent)s", percent=percent)
+    return _("possibly missing · %(percent)s", percent=percent)
+
+
+def _labelled(parameters: dict[str, Any], known: dict[str, Any]) -> dict[str, Any]:
+    """Each parameter with what it is, and its name without the unit, as the equation has it."""
+    about = {one["name"]: one.get("about") or "" for form in known.get("forms") or [] for one in form["parameters"]}
+    return {
+        name: {**value, "label": plain(about.get(name, "")) or parameter_words(name), "symbol": without_unit(name)}
+        for name, value in parameters.items()
+    }
 
 
 def place(entry: dict[str, Any], number: int) -> dict[str, Any]:
     """One of the worst places, with its number in the chart."""
     low, high = entry["pulse_width_us"]
-    words = entry.get("text") or f"{entry['segment']}, {low:.0f}-{high:.0f} µs"
-    head, _, tail = words.rpartition(", ")
-    return {**entry, "number": number, "words": head or tail, "percent": 100 * entry["share_of_excess"]}
+    span = f"{low:.0f} µs" if high - low < 0.5 else f"{low:.0f}–{high:.0f} µs"
+    segment = segment_words(entry["segment"])
+    ways = {
+        "rising": _("%(segment)s, pulse width rising, %(span)s", segment=segment, span=span),
+        "falling": _("%(segment)s, pulse width falling, %(span)s", segment=segment, span=span),
+    }
+    words = ways.get(entry.get("direction") or "", f"{segment}, {span}")
+    text = entry.get("text") or ""
+    what = text.partition(": ")[2].rpartition(", ")[0]
+    return {
+        **entry,
+        "number": number,
+        "text": text,
+        "words": f"{words}: {plain(what)}" if what else words,
+        "percent": 100 * entry["share_of_excess"],
+    }
 
 
 def splits(comparison: dict[str, Any] | None) -> list[dict[str, Any]]:
@@ -163,7 +235,10 @@ def splits(comparison: dict[str, Any] | None) -> list[dict[str, Any]]:
         while kind == "frequency" and len(rows) > 1 and rows[-1]["share_of_excess"] < LEAST_SHARE:
             rows.pop()
         if rows:
-            found.append({"title": title, "rows": rows, "most": max(row["share_of_excess"] for row in rows) or 1.0})
+            told = segment_words if kind == "segment" else plain
+            rows = [{**row, "words": told(row["label"])} for row in rows]
+            most = max(row["share_of_excess"] for row in rows) or 1.0
+            found.append({"title": str(title), "rows": rows, "most": most})
     return found
 
 
@@ -172,8 +247,11 @@ def tidy_experiment(found: dict[str, Any], library: dict[str, Any]) -> dict[str,
     return {
         **found,
         "text": worded(found["text"]),
-        "names": [name_of(rival, library).lower() for rival in found["rivals"]],
-        "shown": [f"{segment['sequence']} {_seconds(segment['settings'])}".strip() for segment in found["segments"]],
+        "names": [_in_a_sentence(rival, library) for rival in found["rivals"]],
+        "shown": [
+            f"{segment_words(segment['sequence'])} {_seconds(segment['settings'])}".strip()
+            for segment in found["segments"]
+        ],
     }
 
 
@@ -181,7 +259,7 @@ def _seconds(settings: dict[str, Any]) -> str:
     parts = [f"{value:g} s" for key, value in settings.items() if key.endswith("_s")]
     width = settings.get("max_pulse_width_us")
     times = f" × {settings['repeats']}" if settings.get("repeats", 1) != 1 else ""
-    return " + ".join(parts) + times + (f" to {width:g} µs" if width else "")
+    return localised(" + ".join(parts)) + times + (" " + _("to %(width)s µs", width=f"{width:g}") if width else "")
 
 
 def others(diagnosis: dict[str, Any], effects: Sequence[str], library: dict[str, Any]) -> list[dict[str, Any]]:
@@ -217,9 +295,9 @@ def versions(rows: Sequence[dict[str, Any]], current: str) -> list[dict[str, Any
 def label(row: dict[str, Any]) -> str:
     """What a version is, beside the one that it was made from."""
     if row["added_effect"]:
-        return f"+ {row['added_effect'].replace('_', ' ')}"
-    begun_with = ", ".join(row.get("effects") or []).replace("_", " ")
-    return f"with {begun_with}" if begun_with else "base model"
+        return f"+ {effects_words(row['added_effect'].split(','))}"
+    begun_with = effects_words(row.get("effects") or [])
+    return _("with %(effects)s", effects=begun_with) if begun_with else _("base model")
 
 
 def of_steps(found: dict[str, Any]) -> list[dict[str, Any]]:

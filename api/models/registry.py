@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
 
 from sqlalchemy import select
+from sqlalchemy.orm import defer
 
 from api.clock import Clock
 from api.errors import ApiError, NotFoundError
-from api.models import summary
+from api.models import headline, reasons, stored, summary
 from api.store import Store, audit
 from api.store.tables import Approval, Model
 
+log = logging.getLogger("stimrig.models")
 LATEST = "9999"
 """Sorts after every label of time: an approval from before approvals expired."""
 
@@ -23,6 +27,7 @@ LATEST = "9999"
 class Served:
     """What the controller fetches: the bytes and their tag."""
 
+    model_id: str
     body: bytes
     etag: str
     expires_utc: str
@@ -38,6 +43,7 @@ class Versions:
         self.store, self.clock = store, clock
         self._served: dict[str, Served] = {}
         self._read: dict[str, dict[str, Any]] = {}
+        self._damaged: set[str] = set()
 
     def add(
         self,
@@ -47,6 +53,9 @@ class Versions:
         by: str,
         parent_id: str | None = None,
         added_effect: str | None = None,
+        *,
+        carried_from_id: str | None = None,
+        carried: dict[str, Any] | None = None,
     ) -> Model:
         """Store a new version."""
         document = json.loads(model_json)
@@ -58,9 +67,11 @@ class Versions:
             recording_id=recording_id,
             parent_id=parent_id,
             added_effect=added_effect,
+            carried_from_id=carried_from_id,
+            carried=carried,
             method=str(document.get("method", "")),
             effects=[str(effect["id"]) for effect in document.get("effects") or []],
-            fit={**summary.figures(document), **summary.quality(document)},
+            fit={**summary.figures(document), **summary.quality(document), "figures": headline.of(document)},
             document=body,
             etag=hashlib.sha256(body).hexdigest(),
             created_utc=now,
@@ -77,6 +88,13 @@ class Versions:
             audit.write(session, now, by, "store model", row.id, recording=recording_id, effects=row.effects)
         return row
 
+    def note_carried(self, model_id: str, carried: dict[str, Any], carried_from_id: str | None) -> None:
+        """Keep beside a plain version what its recording said of the structure of an earlier session."""
+        with self.store.write() as session:
+            row = session.get(Model, model_id)
+            assert row is not None
+            row.carried, row.carried_from_id = carried, carried_from_id
+
     def get(self, model_id: str) -> Model:
         """A version by its id."""
         row = self.store.get(Model, model_id)
@@ -84,9 +102,19 @@ class Versions:
             raise NotFoundError("model", model_id, "GET /v1/participants/{code}/models lists a participant's.")
         return row
 
-    def of(self, participant: str) -> list[Model]:
-        """A participant's versions, newest first."""
-        return self.store.all(Model, Model.participant == participant, order=Model.created_utc.desc())
+    def of(self, participant: str) -> list[dict[str, Any]]:
+        """A participant's versions as clients see them, newest first.
+
+        Three queries, and no model is read whole but those from before a verdict was kept beside them.
+        """
+        query = select(Model).options(defer(Model.document)).where(Model.participant == participant)
+        decided = select(Approval).where(Approval.participant == participant).order_by(Approval.id)
+        with self.store.read() as session:
+            rows = list(session.scalars(query.order_by(Model.created_utc.desc())))
+            newest = {decision.model_id: decision for decision in session.scalars(decided)}
+        holding = self.approved(participant)
+        rows = [row if "verdict" in row.fit else self.get(row.id) for row in rows]
+        return [self._told(row, newest.get(row.id), holding) for row in rows]
 
     def child_with(self, parent: Model, effects: list[str]) -> Model | None:
         """A version of the same recording, made from `parent`, that holds exactly these effects."""
@@ -107,6 +135,8 @@ class Versions:
     def undo(self, model_id: str, by: str, reason: str) -> Model:
         """Go back to the version this one was made from: this one is rejected, and where it was in use, that one is.
 
+        One that is not usable comes into use by nobody's silence: then the controller gets what was approved before.
+
         Raises
         ------
         ApiError
@@ -119,13 +149,23 @@ class Versions:
         holding = self.approved(row.participant)
         words = f"undone: {reason}" if reason else "undone"
         self.decide(row.id, False, by, words)
-        if holding is not None and holding.model_id == row.id:
-            self.decide(row.parent_id, True, by, words)
-        return self.get(row.parent_id)
+        parent = self.get(row.parent_id)
+        if holding is not None and holding.model_id == row.id and self.quality(parent)["verdict"] not in reasons.POOR:
+            self.decide(parent.id, True, by, words)
+        return parent
 
     def decide(self, model_id: str, approved: bool, by: str, reason: str) -> Approval:
-        """Approve or reject a version; only a person does this."""
+        """Approve or reject a version; only a person does this.
+
+        Raises
+        ------
+        ApiError
+            422: it is not usable, and nobody says why the controller may have it all the same. 500: it is damaged.
+        """
         row = self.get(model_id)
+        if approved:
+            stored.whole(row)
+            reasons.refuse_without(self.quality(row)["verdict"], reason)
         now = self.clock.utc()
         decision = Approval(model_id=row.id, participant=row.participant, approved=approved, reason=reason)
         decision.by, decision.at_utc = by, now
@@ -142,20 +182,38 @@ class Versions:
         return found[0] if found else None
 
     def approved(self, participant: str) -> Approval | None:
-        """The approval that holds for a participant today: the newest on a version not rejected since."""
+        """The approval that holds for a participant today."""
+        return self.all_approved([participant]).get(participant)
+
+    def all_approved(self, participants: Collection[str]) -> dict[str, Approval]:
+        """The same for many participants at once, in one query."""
         now = self.clock.utc()
-        query = select(Approval).where(Approval.participant == participant).order_by(Approval.id.desc())
+        found = self._last_approvals(participants)
+        return {code: row for code, row in found.items() if row.expires_utc is None or row.expires_utc > now}
+
+    def last_approved(self, participant: str) -> Model | None:
+        """The version approved last, whether or not that still holds."""
+        last = self.last_approval(participant)
+        return None if last is None else self.get(last.model_id)
+
+    def last_approval(self, participant: str) -> Approval | None:
+        """The newest approval of a version that was not rejected since; its day may be over."""
+        return self._last_approvals([participant]).get(participant)
+
+    def _last_approvals(self, participants: Collection[str]) -> dict[str, Approval]:
+        query = select(Approval).where(Approval.participant.in_(participants)).order_by(Approval.id.desc())
         rejected: set[str] = set()
+        newest: dict[str, Approval] = {}
         with self.store.read() as session:
             for decision in session.scalars(query):
                 if not decision.approved:
                     rejected.add(decision.model_id)
                 elif decision.model_id not in rejected:
-                    return decision if decision.expires_utc is None or decision.expires_utc > now else None
-        return None
+                    newest.setdefault(decision.participant, decision)
+        return newest
 
     def served(self, participant: str) -> Served | None:
-        """What the controller gets, or None where nothing is approved."""
+        """What the controller gets, or None where nothing is approved. Raises ApiError (500) where that is damaged."""
         found = self._served.get(participant)
         if found is not None and found.expires_utc <= self.clock.utc():
             del self._served[participant]
@@ -167,22 +225,40 @@ class Versions:
                     return None
                 row = self.get(approval.model_id)
                 found = self._served[participant] = Served(
-                    row.document, f'"{row.etag}"', approval.expires_utc or LATEST
+                    row.id, stored.whole(row), f'"{row.etag}"', approval.expires_utc or LATEST
                 )
         return found
+
+    def recruitment(self, participant: str) -> dict[str, list[float]] | None:
+        """Recruitment curve of the approved model; None where nothing is approved, or where that cannot be read."""
+        try:
+            served = self.served(participant)
+        except ApiError as error:
+            if error.detail not in self._damaged:  # told once, not at every look
+                self._damaged.add(error.detail)
+                log.warning("%s Without it no torque-time is estimated.", error.detail)
+            return None
+        if served is None:
+            return None
+        curve = json.loads(served.body)["recruitment"]
+        return {name: curve[name] for name in ("pulse_width_us", "torque_nm")}
 
     def quality(self, row: Model) -> dict[str, Any]:
         """The verdict stored in the model; kept beside its figures, but for those stored before it was."""
         if "verdict" in row.fit:
             return {key: row.fit[key] for key in ("verdict", "words", "reasons")}
         if row.etag not in self._read:
-            self._read[row.etag] = summary.quality(json.loads(row.document))
+            try:
+                self._read[row.etag] = summary.quality(json.loads(row.document))
+            except (ValueError, TypeError, AttributeError):  # unknown; that it is damaged its own page says
+                self._read[row.etag] = summary.quality({})
         return self._read[row.etag]
 
     def document(self, row: Model) -> dict[str, Any]:
         """A version as clients see it, without the model itself."""
-        decision = self.decision(row.id)
-        holding = self.approved(row.participant)
+        return self._told(row, self.decision(row.id), self.approved(row.participant))
+
+    def _told(self, row: Model, decision: Approval | None, holding: Approval | None) -> dict[str, Any]:
         return {
             "id": row.id,
             "model_id": row.id,
@@ -190,6 +266,8 @@ class Versions:
             "recording_id": row.recording_id,
             "parent_id": row.parent_id,
             "added_effect": row.added_effect,
+            "carried_from_id": row.carried_from_id,
+            "carried": row.carried,
             "method": row.method,
             "effects": row.effects,
             **row.fit,

@@ -118,7 +118,7 @@ def validity(document: dict[str, Any]) -> str | None:
         named.append("pulse widths of {:.0f}–{:.0f} µs".format(*known["pulse_width_us"]))
     if known.get("torque_nm"):
         largest = max(known["torque_nm"], key=abs)
-        named.append(f"torques {'up' if largest >= 0 else 'down'} to {largest:.1f} N·m")
+        named.append(f"torques up to {largest:.1f} N·m" if largest >= 0 else f"torques down to {largest:.1f} N·m")
     if known.get("pulse_rate_hz"):
         named.append("{:.0f}–{:.0f} pulses/s".format(*known["pulse_rate_hz"]))
     return f"Valid for {', '.join(named)}." if named else None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import hmac
 from typing import Any
 
 from fastapi import Request
@@ -11,7 +12,8 @@ from sqlalchemy.orm import Session
 
 from api.clock import Clock
 from api.errors import ApiError, NotFoundError
-from api.people.auth import Auth, Principal, Scope, unauthorized
+from api.people import names
+from api.people.auth import Auth, Principal, Scope, digest, unauthorized
 from api.people.pace import Guesses, place_of
 from api.people.passwords import Passwords
 from api.store import Store, audit
@@ -43,10 +45,12 @@ class People:
     def _add(self, name: str, hashed: str, scopes: list[Scope], by: str) -> User:
         now = self.clock.utc()
         with self.store.write() as session:
-            if session.get(User, name) is not None:
-                raise ApiError(409, "exists", "The name is taken", f"User {name!r} exists. Take another name.")
+            taken = _of_name(session, name)
+            if taken is not None:
+                raise ApiError(409, "exists", "The name is taken", f"User {taken.name!r} exists. Take another name.")
             token = self.auth.token_of_person(session, name, scopes)
-            row = User(name=name, password_hash=hashed, token_hash=token.hash, created_utc=now, changed_utc=now)
+            row = User(name=name, folded_name=names.folded(name), password_hash=hashed, token_hash=token.hash)
+            row.created_utc = row.changed_utc = now
             session.add(row)
             audit.write(session, now, by, "add user", name, scopes=token.scopes)
         return row
@@ -61,6 +65,7 @@ class People:
         """
         place = place_of(address)
         row, known = await asyncio.to_thread(self._look_up, name, place)
+        name = row.name if row else names.folded(name)
         with self.passwords.room(known) as lane:
             self.guesses.password(name, place, known)
             right = await self.passwords.verify(lane, row.password_hash if row else None, password)
@@ -78,7 +83,8 @@ class People:
 
     def _look_up(self, name: str, place: str) -> tuple[User | None, bool]:
         with self.store.read() as session:
-            return session.get(User, name), session.get(KnownPlace, (name, place)) is not None
+            row = _of_name(session, name)
+            return row, row is not None and session.get(KnownPlace, (row.name, place)) is not None
 
     def _remember(self, name: str, place: str) -> None:
         with self.store.write() as session:
@@ -114,6 +120,32 @@ class People:
         self.guesses.confirmation_was_right(held)
         await asyncio.to_thread(self._confirm, held)
 
+    async def unlock(self, principal: Principal, secret: str) -> None:
+        """Go on in a locked session, by its person's password or by the token that it was opened with.
+
+        Raises
+        ------
+        ApiError
+            401 it is not the right one; 429 too many tries.
+        """
+        held = principal.page_session
+        if held is None or not principal.locked:
+            return
+        by_token = principal.session_hash is None
+        row: User | None = None if by_token else await asyncio.to_thread(self.store.get, User, principal.name)
+        with self.passwords.room(known=True) as lane:
+            self.guesses.confirmation(held.hash)
+            if by_token:
+                right = hmac.compare_digest(digest(secret), held.token_hash)
+            else:
+                right = await self.passwords.verify(lane, row.password_hash if row else None, secret)
+        if not right:
+            await asyncio.to_thread(self._note, principal.name, "unlock refused")
+            title = "The token does not match" if by_token else "The password does not match"
+            raise unauthorized("The page stays locked. Enter it again.", "wrong-password", title)
+        self.guesses.confirmation_was_right(held.hash)
+        await asyncio.to_thread(self.auth.idle.unlock, held.hash, principal.name)
+
     def _confirm(self, session_hash: str) -> None:
         with self.store.write() as session:
             session.merge(Confirmation(session_hash=session_hash, at_unix_s=self.clock.unix_s()))
@@ -139,13 +171,23 @@ class People:
             )
             raise ApiError(403, "confirm-password", "Please confirm with your password", detail)
 
+    async def is_confirmed(self, session_hash: str | None) -> bool:
+        """Whether the password need not be asked for: a token's holder has none, or it was given and not used yet."""
+        if session_hash is None:
+            return True
+        row: Confirmation | None = await asyncio.to_thread(self.store.get, Confirmation, session_hash)
+        return row is not None and self._holds(row)
+
+    def _holds(self, row: Confirmation) -> bool:
+        return 0 <= self.clock.unix_s() - row.at_unix_s <= CONFIRMED_S
+
     def _use_confirmation(self, session_hash: str) -> bool:
         with self.store.write() as session:
             row = session.get(Confirmation, session_hash)
             if row is None:
                 return False
             session.delete(row)
-            return 0 <= self.clock.unix_s() - row.at_unix_s <= CONFIRMED_S
+            return self._holds(row)
 
     async def change_password(self, name: str, password: str, who: Principal) -> str | None:
         """A new password. The person's sessions end; the one that made the change goes on under a new cookie, if any.
@@ -161,16 +203,16 @@ class People:
         with self.store.write() as session:
             row = _found(session, name)
             row.password_hash, row.changed_utc = hashed, self.clock.utc()
-            session.execute(delete(KnownPlace).where(KnownPlace.name == name))
+            session.execute(delete(KnownPlace).where(KnownPlace.name == row.name))
             cookie = self.auth.end_sessions(session, row.token_hash, but=who.session_hash)
-            audit.write(session, self.clock.utc(), who.name, "change password", "page", of=name)
+            audit.write(session, self.clock.utc(), who.name, "change password", "page", of=row.name)
         return cookie
 
     def remove(self, name: str, by: str) -> None:
         """Let nobody sign in under this name any more; the name stays taken, as the audit trail speaks of it."""
         with self.store.write() as session:
             row = _found(session, name)
-            session.execute(delete(KnownPlace).where(KnownPlace.name == name))
+            session.execute(delete(KnownPlace).where(KnownPlace.name == row.name))
             self.auth.end_sessions(session, row.token_hash)
         self.auth.revoke(row.token_hash[:16], by)
 
@@ -198,8 +240,14 @@ class People:
             audit.write(session, self.clock.utc(), who, action, "page", **detail)
 
 
+def _of_name(session: Session, name: str) -> User | None:
+    """The person of a name as it was typed; the exact one first, as names from before were told apart by case."""
+    same = select(User).where(User.folded_name == names.folded(name)).order_by(User.name).limit(1)
+    return session.get(User, name) or session.scalars(same).first()
+
+
 def _found(session: Session, name: str) -> User:
-    row = session.get(User, name)
+    row = _of_name(session, name)
     if row is None:
         raise NotFoundError("user", name, "GET /v1/users lists them.")
     return row

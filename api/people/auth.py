@@ -13,11 +13,14 @@ from starlette.requests import HTTPConnection
 
 from api.clock import Clock
 from api.errors import ApiError
+from api.people.idle_lock import IdleLock
 from api.people.pace import Guesses, place_of
 from api.store import Store, audit
 from api.store.tables import Confirmation, PageSession, Token
 
 COOKIE = "stimrig_session"
+LOCKED = ("locked", "This page is locked")
+"""Code and title of the problem that a locked session meets."""
 
 
 class Scope(StrEnum):
@@ -49,12 +52,18 @@ class Principal:
         The session's CSRF token; None for a bearer token.
     session_hash : str or None
         The session of a person with a password; None for tokens, which have none to ask for again.
+    page_session : PageSession or None
+        The browser's session, however it was opened; None for a bearer token.
+    locked : bool
+        Whether that session waits to be unlocked: then it may press stop, and nothing else.
     """
 
     name: str
     scopes: frozenset[str]
     csrf: str | None = None
     session_hash: str | None = None
+    page_session: PageSession | None = None
+    locked: bool = False
 
     def may(self, scope: Scope) -> bool:
         """Whether the scope is held."""
@@ -73,8 +82,11 @@ class Principal:
 class Auth:
     """Issues and checks tokens and sessions; keeps only hashes."""
 
-    def __init__(self, store: Store, clock: Clock, guesses: Guesses, session_hours: float = 12.0) -> None:
+    def __init__(
+        self, store: Store, clock: Clock, guesses: Guesses, idle: IdleLock, session_hours: float = 12.0
+    ) -> None:
         self.store, self.clock, self.guesses, self.session_s = store, clock, guesses, session_hours * 3600
+        self.idle = idle
         self._known: dict[str, Token] = {}
 
     def issue(self, name: str, scopes: list[Scope], by: str, *, text: str | None = None, origin: str = "issued",
@@ -88,7 +100,7 @@ class Auth:
             row.expires_utc, row.revoked = expires_utc, False
             session.merge(row)
             audit.write(session, now, by, "issue token", name, scopes=row.scopes)
-        self._known.clear()
+        self._known = {}
         return text
 
     def revoke(self, token_id: str, by: str) -> bool:
@@ -98,7 +110,7 @@ class Auth:
             for row in found:
                 row.revoked = True
                 audit.write(session, self.clock.utc(), by, "revoke token", row.name)
-        self._known.clear()
+        self._known = {}
         return bool(found)
 
     def first_administrator(self, configured: str | None) -> str | None:
@@ -119,7 +131,7 @@ class Auth:
         with self.store.write() as session:
             for token in session.scalars(select(Token).where(Token.origin == "settings", Token.hash != keep)):
                 token.revoked = True
-        self._known.clear()
+        self._known = {}
 
     def bearer(self, text: str, address: str = "", *, forgive_age: bool = False) -> Principal:
         """The holder of a bearer token; `forgive_age` lets one that ran out still press stop.
@@ -141,11 +153,12 @@ class Auth:
 
     def _token(self, token_hash: str) -> Token | None:
         """A token's row; kept in memory, since a controller asks often, and forgotten at every change."""
-        found = self._known.get(token_hash)
+        known = self._known  # a change puts a new one in its place: what was read before it is not kept after it
+        found = known.get(token_hash)
         if found is None:
             found = self.store.get(Token, token_hash)
             if found is not None:
-                self._known[token_hash] = found
+                known[token_hash] = found
         return found
 
     def _principal(self, token: Token | None, csrf: str | None = None, *, forgive_age: bool = False) -> Principal:
@@ -204,19 +217,36 @@ class Auth:
             if row is not None:
                 session.delete(row)
 
-    def cookie(self, cookie: str, *, forgive_age: bool = False) -> Principal:
-        """The holder of a page session; `forgive_age` lets a session that ran out still press stop."""
+    def cookie(self, cookie: str, *, forgive_age: bool = False, forgive_lock: bool = False) -> Principal:
+        """The holder of a page session.
+
+        Parameters
+        ----------
+        cookie : str
+            Its text.
+        forgive_age : bool
+            A session that ran out, or that is locked, still presses stop.
+        forgive_lock : bool
+            One that is locked may be unlocked, or ended.
+        """
         row = self.store.get(PageSession, digest(cookie))
         if row is None or (row.expires_unix_s <= self.clock.unix_s() and not forgive_age):
             raise unauthorized("The session has ended. Sign in again.")
+        locked = self.idle.locked(row)
+        if locked and not (forgive_age or forgive_lock):
+            raise unauthorized(
+                "Enter the password on the page /locked, or send it to POST /v1/sessions/unlock.", *LOCKED
+            )
         token = self._token(row.token_hash)
-        principal = self._principal(token, row.csrf, forgive_age=forgive_age)
+        principal = replace(self._principal(token, row.csrf, forgive_age=forgive_age), page_session=row, locked=locked)
         if token is None or token.origin != "user":
             return principal
         more = {Scope.REARM} if principal.may(Scope.RUN_TEST) else set()
         return replace(principal, session_hash=row.hash, scopes=principal.scopes | more)
 
-    def identify(self, connection: HTTPConnection, *, forgive_age: bool = False) -> Principal:
+    def identify(
+        self, connection: HTTPConnection, *, forgive_age: bool = False, forgive_lock: bool = False
+    ) -> Principal:
         """Who stands behind a request or a WebSocket."""
         header = connection.headers.get("authorization", "")
         if header:
@@ -227,7 +257,7 @@ class Auth:
             return self.bearer(text.strip(), address, forgive_age=forgive_age)
         cookie = connection.cookies.get(COOKIE)
         if cookie:
-            return self.cookie(cookie, forgive_age=forgive_age)
+            return self.cookie(cookie, forgive_age=forgive_age, forgive_lock=forgive_lock)
         raise unauthorized("Send `Authorization: Bearer <token>`, or sign in on the page.")
 
 

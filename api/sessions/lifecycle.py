@@ -14,7 +14,7 @@ from api.models.analyses import Analyses
 from api.models.registry import Versions
 from api.sessions.rig_client import RigClient
 from api.store import Store, audit
-from api.store.tables import Recording, Test
+from api.store.tables import Model, Recording, Test
 from api.workers.pool import Call, Pool
 from rig.messages import FinishedEvent
 
@@ -58,6 +58,12 @@ class Lifecycle:
         if "state" in fields:
             log.info("test %s", row.state, extra={"test_id": test_id})
         return row
+
+    def fail(self, test_id: str, error: Exception) -> None:
+        """End a test that is still open: something unexpected went wrong with it."""
+        row = self.store.get(Test, test_id)
+        if row is not None and row.state in OPEN_STATES:
+            self.update(test_id, state="failed", reason=" ".join(str(error).split()) or type(error).__name__)
 
     def take_recording(self, event: FinishedEvent) -> Test | None:
         """Write down how a test ended and where its recording lies; None where that had been done."""
@@ -104,22 +110,17 @@ class Lifecycle:
         def take(call: Call) -> None:
             self.calls[test_id] = call
 
+        how: dict[str, Any] = {"urgent": True, "on_progress": lambda _job: self.on_progress(test_id)}
         try:
-            found, warning = await self.analyses.starting_effects.fit(
-                row.participant, recording.path, take, urgent=True, on_progress=lambda _job: self.on_progress(test_id)
-            )
+            model = await self._first_version(row, recording, parent, take, how)
+            model = await self.analyses.carried_structure.carry(model, recording.path, take, **how)
         except ApiError as error:
             reason = f"identification: {error.detail or error.title}"
             await asyncio.to_thread(self.update, test_id, state="failed", reason=reason)
             return
         finally:
             self.calls.pop(test_id, None)
-        model = await asyncio.to_thread(
-            self.versions.add, found["json"], row.participant, recording.id, f"test {test_id}", parent
-        )
-        summary = dict(row.summary)
-        if warning:
-            summary["warnings"] = [*(summary.get("warnings") or []), warning]
+        summary = dict((await asyncio.to_thread(self.store.get, Test, test_id)).summary)
         if last_sample_unix_s is not None:
             summary["last_sample_to_model_s"] = round(self.clock.unix_s() - last_sample_unix_s, 3)
         await asyncio.to_thread(self.update, test_id, state="completed", model_id=model.id, summary=summary)
@@ -127,8 +128,34 @@ class Lifecycle:
         self._ahead.add(ahead)
         ahead.add_done_callback(self._ahead.discard)
 
+    async def _first_version(
+        self, row: Test, recording: Recording, parent: str | None, take: Callable[[Call], None], how: dict[str, Any]
+    ) -> Model:
+        """The first version of a test's recording, named by the test at once: it is there whatever comes after it."""
+        if row.model_id is not None:
+            return await asyncio.to_thread(self.versions.get, row.model_id)
+        found, warning = await self.analyses.carried_structure.fit(row.participant, recording.path, take, **how)
+        by = f"test {row.id}"
+        model = await asyncio.to_thread(self.versions.add, found["json"], row.participant, recording.id, by, parent)
+        summary = dict(row.summary)
+        if warning:
+            summary["warnings"] = [*(summary.get("warnings") or []), warning]
+        await asyncio.to_thread(self.update, row.id, model_id=model.id, summary=summary)
+        return model
+
+    def keep_plain(self, test_id: str) -> bool:
+        """End the fit of the last session's structure after a test; whether one was under way."""
+        call = self.calls.get(test_id)
+        if call is None or call.verb != "carry":
+            return False
+        self.pool.cancel(call)
+        return True
+
     async def _record_of(self, row: Test) -> tuple[Recording, str | None]:
         """What is identified: the test's recording, or that joined to the one of the model it was made to judge."""
+        if row.model_id is not None:  # the service was restarted after its first version
+            first = await asyncio.to_thread(self.versions.get, row.model_id)
+            return await asyncio.to_thread(self.store.get, Recording, first.recording_id), first.parent_id
         recording: Recording = await asyncio.to_thread(self.store.get, Recording, row.recording_id)
         joins = row.plan.get("joins")
         if joins is None:

@@ -2,12 +2,48 @@
 
 from __future__ import annotations
 
+import unicodedata
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, StringConstraints, WithJsonSchema, field_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    StrictBool,
+    StringConstraints,
+    WithJsonSchema,
+    field_validator,
+    model_validator,
+)
 
+from api.people import names
 from api.sessions.profiles import LIMITS
 
+LONGEST_NOTE = 500
+Side = Literal["left", "right"]
+NoteKind = Literal["electrodes", "side", "posture", "medication", "spasm", "other"]
+
+
+def _plain(text: str) -> str:
+    """A text in one line: composed (NFC), without signs that steer a display and are not seen."""
+    plain = unicodedata.normalize("NFC", text).strip()
+    odd = next((sign for sign in plain if unicodedata.category(sign) in UNSEEN), None)
+    if odd is not None:
+        raise ValueError(f"the character U+{ord(odd):04X} cannot stand in it; write one line of plain text")
+    return plain
+
+
+UNSEEN = ("Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp")
+"""Kinds of characters: control and format (writing direction among them), and what is no character."""
+Muscle = Annotated[
+    str,
+    StringConstraints(min_length=1, max_length=60),
+    AfterValidator(_plain),
+    Field(description="the muscle that is stimulated", examples=["biceps brachii"]),
+]
+PersonName = Annotated[str, StringConstraints(min_length=1, max_length=320), AfterValidator(names.written)]
 Code = Annotated[
     str,
     StringConstraints(pattern=r"^[A-Za-z0-9_-]{1,32}$"),
@@ -100,6 +136,7 @@ class TestIn(Body):
     max_torque_nm: FiniteFloat | None = Field(
         None, ge=LIMITS["max_torque_nm"].least, description="for this test alone, if tighter, N·m"
     )
+    ran_by: PersonName | None = Field(None, description="who runs it at the rig, if that is not who asks for it")
     joins: Annotated[str, StringConstraints(max_length=64)] | None = Field(
         None, description="a model: the new recording is joined to that model's, and both are judged together"
     )
@@ -109,7 +146,11 @@ class CalibrationIn(Body):
     """How a guided calibration goes: one current, small steps, short trains."""
 
     current_ma: CurrentMa | None = Field(None, description="of every pulse, mA; None: the participant's own")
-    step_us: Annotated[FiniteFloat, Field(ge=1, le=25, description="how much wider a step up is, µs")] = 10.0
+    step_us: Annotated[FiniteFloat, Field(ge=1, le=25, description="how much wider a (fine) step up is, µs")] = 10.0
+    large_steps: StrictBool = Field(
+        False, description="large steps that become fine near a mark, by the participant's last calibration; the rig "
+        "decides how large"
+    )  # fmt: skip
     train_s: Annotated[FiniteFloat, Field(ge=0.1, le=2, description="length of a train, s")] = 1.0
     max_pulse_width_us: WidthUs | None = Field(None, description="never wider, µs; None: the rig's limits alone")
     max_torque_nm: TorqueNm | None = Field(
@@ -120,7 +161,10 @@ class CalibrationIn(Body):
 class StepIn(Body):
     """One train."""
 
-    direction: Literal["up", "down", "repeat"] = "up"
+    direction: Literal["up", "fine", "down", "repeat"] = "up"
+    shown_us: Annotated[
+        FiniteFloat | None, Field(description="the width that a person was shown; another one is not sent, µs")
+    ] = None
 
 
 class MarkIn(Body):
@@ -133,6 +177,38 @@ class FinishIn(Body):
     """The end of a calibration."""
 
     discard: bool = False
+
+
+class NoteIn(Body):
+    """A note on a participant's session, on a test, or at a time in a test."""
+
+    kind: NoteKind
+    text: Annotated[
+        str,
+        StringConstraints(max_length=LONGEST_NOTE),
+        AfterValidator(_plain),
+        Field(description="one line; no names of people"),
+    ] = ""
+    test_id: Annotated[str, StringConstraints(max_length=40)] | None = Field(None, description="the test it is on")
+    at_s: FiniteFloat | None = Field(None, ge=0, description="time in that test, from its start, s")
+    now: bool = Field(False, description="at the time where the test stands, which runs")
+
+    @model_validator(mode="after")
+    def _whole(self) -> NoteIn:
+        if self.test_id is None and (self.at_s is not None or self.now):
+            raise ValueError("a time is in a test: send test_id, too")
+        if self.now and self.at_s is not None:
+            raise ValueError("send at_s or now, not both")
+        if self.kind == "other" and not self.text:
+            raise ValueError("say in a few words what it is: text")
+        return self
+
+
+class MuscleIn(Body):
+    """Which side and which muscle is stimulated; null where nobody has said."""
+
+    side: Side | None = None
+    muscle: Muscle | None = None
 
 
 class StopIn(Body):

@@ -10,9 +10,9 @@ import logging
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from api.clock import Clock
 from api.errors import ApiError, from_rig
@@ -38,6 +38,7 @@ LINE_LIMIT = 32 * 1024 * 1024
 RECONNECT_S = 0.25
 STATUS_EVERY_S = 1.0
 
+M = TypeVar("M", bound=BaseModel)
 AnyEvent = StateEvent | LiveEvent | FinishedEvent
 _events: TypeAdapter[AnyEvent] = TypeAdapter(Event)
 
@@ -102,7 +103,8 @@ class RigClient:
         self._waiting[message.id] = future
         try:
             self._writer.write(line_of(message))
-            return await asyncio.wait_for(future, timeout_s)
+            async with asyncio.timeout(timeout_s):  # not wait_for: in Python 3.11 it may lose a cancellation
+                return await future
         except TimeoutError:
             raise no_rig(f"It did not answer within {timeout_s:g} s.") from None
         except OSError as error:
@@ -118,28 +120,36 @@ class RigClient:
             raise from_rig(problem) if problem else no_rig("It refused without a reason.")
         return reply.body
 
+    async def ask_for(self, answer: type[M], message: Any, timeout_s: float | None = None) -> M:
+        """Ask the rig; its answer of that kind. Raises as `ask`, and 503 where it sent something else."""
+        body = await self.ask(message, timeout_s)
+        try:
+            return answer.model_validate(body)
+        except ValidationError as error:
+            raise no_rig("It closed the connection, or sent something that is no answer.") from error
+
     async def fresh_status(self) -> Status:
         """Ask for the state now."""
-        self.status = Status.model_validate(await self.ask(StatusRequest()))
+        self.status = await self.ask_for(Status, StatusRequest())
         return self.status
 
     async def _request_apart(self, message: Any, timeout_s: float) -> Reply:
         """Ask on a connection of its own; a stop at the rig's own door for stops, which nothing else can fill."""
         if self.path is None:
             raise no_rig("This service was started without one.")
-        door = stop_socket(self.path)
-        path = door if isinstance(message, StopRequest) and door.exists() else self.path
         request = line_of(message)
         try:
             async with asyncio.timeout(timeout_s):
-                reader, writer = await asyncio.open_unix_connection(str(path), limit=LINE_LIMIT)
+                reader, writer = await _opened(self.path, isinstance(message, StopRequest))
                 try:
                     writer.write(request)
                     line = await reader.readline()
                     return Reply.model_validate_json(line)
                 finally:
                     writer.close()
-        except (OSError, TimeoutError, ValidationError) as error:
+        except ValueError as error:  # no answer at all, another's words, or a line without an end
+            raise no_rig("It closed the connection, or sent something that is no answer.") from error
+        except OSError as error:  # a time that ran out is one, too
             raise no_rig(str(error) or "It did not answer in time.") from error
 
     async def _stay_connected(self, path: Path) -> None:
@@ -168,12 +178,10 @@ class RigClient:
             self._tell_link()
 
     def _tell_link(self) -> None:
-        for listener in list(self.link_listeners):
-            listener(self.connected)
+        tell_all(self.link_listeners, self.connected)
 
     def _tell(self, event: AnyEvent) -> None:
-        for listener in list(self.listeners):
-            listener(event)
+        tell_all(self.listeners, event)
 
     async def _listen(self, reader: asyncio.StreamReader) -> None:
         assert self._writer is not None
@@ -196,8 +204,7 @@ class RigClient:
                 status = await self.fresh_status()
                 if status.state != before:  # a change that no event told
                     self._tell(StateEvent(status=status))
-                for listener in list(self.poll_listeners):
-                    listener(status)
+                tell_all(self.poll_listeners, status)
             except ApiError:
                 continue  # its age tells
             except Exception:
@@ -218,6 +225,23 @@ class RigClient:
         future = self._waiting.get(reply.id)
         if future is not None and not future.done():
             future.set_result(reply)
+
+
+async def _opened(path: Path, stops: bool) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+    """A connection to the rig; for a stop at the door for stops, or at the other where that one does not open."""
+    if stops:
+        with contextlib.suppress(OSError):
+            return await asyncio.open_unix_connection(str(stop_socket(path)), limit=LINE_LIMIT)
+    return await asyncio.open_unix_connection(str(path), limit=LINE_LIMIT)
+
+
+def tell_all(listeners: list[Callable[[Any], None]], news: Any) -> None:
+    """Tell each listener; an error in one is logged and keeps the news from nobody else, nor breaks the link."""
+    for listener in list(listeners):
+        try:
+            listener(news)
+        except Exception:
+            log.exception("news of the rig could not be taken")
 
 
 def line_of(message: Any) -> bytes:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import logging
 import math
 import secrets
+from collections.abc import Coroutine
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,8 @@ from api.errors import ApiError, NotFoundError
 from api.logs import current_test
 from api.models.analyses import Analyses
 from api.models.registry import Versions
-from api.sessions import profiles
+from api.people import names
+from api.sessions import document, profiles
 from api.sessions.lifecycle import OPEN_STATES, Lifecycle
 from api.sessions.limits import limits_of
 from api.sessions.live import Hub
@@ -46,6 +47,8 @@ NOT_CONFIRMED = "The stop is not confirmed"
 HALTED = ("latched", "uncertain", "disconnected")
 START_S = 10.0
 """From the request to the command to the rig: nobody waits with a hand on the button for longer."""
+ANSWER_S = 15.0
+"""So long the rig may take to answer a start."""
 PREVIEW_S = 35.0
 """More than the rig takes for one before it says that the computer is too busy."""
 MISSED_POLLS = 3
@@ -62,7 +65,6 @@ class Current:
     test_id: str
     participant: str
     by: str
-    finished: asyncio.Event = field(default_factory=asyncio.Event)
     started: bool = False
     """The rig has said that it plays."""
     ending: bool = False
@@ -77,6 +79,8 @@ class Seen:
 
     profile_version: str
     preview: dict[str, Any]
+    side: str | None = None
+    muscle: str | None = None
 
     def same(self, preview: dict[str, Any]) -> bool:
         """Whether the rig would play what was shown; the torque it is estimated to give may be known better by now."""
@@ -97,7 +101,7 @@ class Runner:
         self._lock = asyncio.Lock()
         self._halted_s = -math.inf
         self._notes = ThreadPoolExecutor(2, "notes-of-stops")
-        self._tasks: set[asyncio.Task[Any]] = set()
+        self._tasks: set[asyncio.Task[None]] = set()
         rig.listeners.append(self._on_event)
         rig.link_listeners.append(self._on_link)
         rig.poll_listeners.append(self._on_poll)
@@ -127,6 +131,11 @@ class Runner:
             self.refuse_second()
             return await self._start(body, await self._participant(body), by, seen)
 
+    def plays(self, test_id: str | None) -> bool:
+        """Whether the rig plays this test now."""
+        current = self.current
+        return current is not None and current.test_id == test_id and current.started and not current.ending
+
     def refuse_second(self) -> None:
         """409 while a test runs, its holder named."""
         if self.current is not None:
@@ -136,11 +145,14 @@ class Runner:
         participant = await asyncio.to_thread(self.store.get, Participant, body.participant)
         if participant is None:
             raise NotFoundError("participant", body.participant, "POST /v1/participants makes one.")
+        refuse_archived(participant)
         return participant
 
     async def _start(self, body: TestIn, participant: Participant, by: str, seen: Seen | None) -> Test:
         if seen is not None and seen.profile_version != profiles.version(participant.profile):
             raise not_what_was_seen(f"The limits of {participant.code} were changed meanwhile.")
+        if seen is not None and (seen.side, seen.muscle) != (participant.side, participant.muscle):
+            raise not_what_was_seen(f"Side or muscle of {participant.code} was changed meanwhile.")
         plan = self._plan(body, participant)
         if body.joins is not None:
             await asyncio.to_thread(self._check_joins, body)
@@ -151,14 +163,18 @@ class Runner:
             preview = await self._previewed(plan)
             if seen is not None and not seen.same(preview):
                 raise not_what_was_seen("The rig would now play something else: it was set up anew.")
-            row = await asyncio.to_thread(self._write_intent, plan, preview, by, body.joins)
+            row = await asyncio.to_thread(self._write_intent, plan, preview, by, body, participant)
             self.hub.begin(plan.test_id)
             await self._command(plan, body, profiles.version(participant.profile))
             current.started = True
         except BaseException:
             self.current = None
             raise
-        return await asyncio.to_thread(self.lifecycle.update, row.id, state="running")
+        try:
+            return await asyncio.to_thread(self.lifecycle.update, row.id, state="running")
+        except Exception:  # who asked is told that it failed: then nothing of it plays on
+            await self._stop_quietly(f"start of {plan.test_id} could not be written down")
+            raise
 
     async def _command(self, plan: TestPlan, body: TestIn, version: str) -> None:
         try:
@@ -167,16 +183,20 @@ class Runner:
             self._refuse_overtaken(
                 asked_s.get(self.clock.monotonic_s())
             )  # nothing is waited for between this and the command
-            await self.rig.ask(StartRequest(plan=plan), timeout_s=15.0)
+            await self.rig.ask(StartRequest(plan=plan), timeout_s=ANSWER_S)
         except ApiError as error:
+            if error.code == "rig-unreachable":  # it may have heard us all the same
+                await self._stop_quietly(f"start of {plan.test_id} was not answered")
             await asyncio.to_thread(
                 self.lifecycle.update, plan.test_id, state="refused", reason=error.detail or error.title
             )
-            if error.code == "rig-unreachable":  # it may have heard us all the same
-                await self._stop_quietly(f"start of {plan.test_id} was not answered")
             status = self.rig.status
             if error.code == "rig-busy" and status is not None:
                 error.extra["holder"] = {"test_id": status.test_id, "participant": status.participant}
+            raise
+        except Exception as error:  # whatever it was: no test stays open that never began
+            await self._stop_quietly(f"start of {plan.test_id} failed")
+            await asyncio.to_thread(self.lifecycle.fail, plan.test_id, error)
             raise
 
     def _refuse_overtaken(self, since_s: float) -> None:
@@ -218,11 +238,14 @@ class Runner:
         stamp = self.clock.utc()[:19].replace("-", "").replace(":", "")
         return f"T{stamp}-{secrets.token_hex(3)}"
 
-    def _write_intent(self, plan: TestPlan, preview: dict[str, Any], by: str, joins: str | None) -> Test:
+    def _write_intent(
+        self, plan: TestPlan, preview: dict[str, Any], by: str, body: TestIn, participant: Participant
+    ) -> Test:
         now = self.clock.utc()
         row = Test(id=plan.test_id, participant=plan.participant, kind=plan.kind, state="requested")
-        row.plan, row.summary, row.reason = {**plan.model_dump(), "preview": preview, "joins": joins}, {}, ""
-        row.requested_by, row.requested_utc = by, now
+        kept = {"joins": body.joins, "side": participant.side, "muscle": participant.muscle}  # as they are now
+        row.plan, row.summary, row.reason = {**plan.model_dump(), "preview": preview, **kept}, {}, ""
+        row.requested_by, row.requested_utc, row.ran_by = by, now, other_than(by, body.ran_by)
         with self.store.write() as session:
             session.add(row)
             audit.write(session, now, by, "start test", plan.test_id, participant=plan.participant, kind=plan.kind)
@@ -239,11 +262,8 @@ class Runner:
 
     def _recruitment(self, participant: str) -> RecruitmentTable | None:
         """The approved model's recruitment curve, to estimate the torque-time of a plan with."""
-        served = self.versions.served(participant)
-        if served is None:
-            return None
-        curve = json.loads(served.body)["recruitment"]
-        return RecruitmentTable(pulse_width_us=curve["pulse_width_us"], torque_nm=curve["torque_nm"])
+        curve = self.versions.recruitment(participant)
+        return None if curve is None else RecruitmentTable(**curve)
 
     async def stop(self, reason: str, by: str) -> StopEvidence:
         """Stop the rig; the audit entry comes after, so that nothing delays the command.
@@ -256,9 +276,8 @@ class Runner:
         self._halted_s = self.clock.monotonic_s()
         subject = self.current.test_id if self.current else "rig"
         try:
-            evidence = StopEvidence.model_validate(
-                await self.rig.ask(StopRequest(reason=reason or "stop pressed", by=by), timeout_s=8.0)
-            )
+            request = StopRequest(reason=reason or "stop pressed", by=by)
+            evidence = await self.rig.ask_for(StopEvidence, request, timeout_s=8.0)
         except ApiError as error:
             await self._note(by, "stop failed", subject, detail=error.detail)
             error.title, error.detail = NOT_CONFIRMED, f"{EMERGENCY} {error.title}: {error.detail}"
@@ -288,7 +307,7 @@ class Runner:
         if isinstance(event, LiveEvent):
             self.hub.live(event)
         elif isinstance(event, FinishedEvent):
-            self._spawn(self._finish(event))
+            self._follow(event.test_id, self._finish(event))
         else:
             if event.status.state in HALTED:
                 self._halted_s = self.clock.monotonic_s()
@@ -301,7 +320,7 @@ class Runner:
             return  # a start under way learns by itself what became of it
         if not current.ending and status.test_id != current.test_id:
             current.ending = True
-            self._spawn(self._recover(current.test_id, "the rig's process ended during the test"))
+            self._follow(current.test_id, self._recover(current.test_id, "the rig's process ended during the test"))
 
     def _on_poll(self, status: Status) -> None:
         """A test whose end was lost on the way must not hold the rig for ever."""
@@ -311,40 +330,52 @@ class Runner:
         current.missed = 0 if status.test_id == current.test_id else current.missed + 1
         if current.missed >= MISSED_POLLS:
             current.ending = True
-            self._spawn(self._recover(current.test_id, f"the rig is {status.state} and no longer plays this test"))
+            self._follow(
+                current.test_id,
+                self._recover(current.test_id, f"the rig is {status.state} and no longer plays this test"),
+            )
 
-    def _spawn(self, work: Any) -> asyncio.Task[Any]:
-        task = asyncio.create_task(work)
+    def _follow(self, test_id: str, work: Coroutine[Any, Any, None]) -> None:
+        """Do what leads a test to its last state, in the background and under the one guard."""
+        task = asyncio.create_task(self._guarded(test_id, work))
         self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
-        return task
+        task.add_done_callback(self._ended)
+
+    def _ended(self, task: asyncio.Task[None]) -> None:
+        self._tasks.discard(task)
+        if not task.cancelled() and (error := task.exception()) is not None:
+            log.error("the end of a test could not be written down", exc_info=error)
+
+    async def _guarded(self, test_id: str, work: Coroutine[Any, Any, None]) -> None:
+        """Follow a test to its last state: an unexpected error is told as its reason, and the rig is let go.
+
+        Where the state cannot be written either, the next start of the service takes the test up.
+        """
+        current_test.set(test_id)
+        try:
+            await work
+        except Exception as error:
+            log.exception("the test could not be taken over", extra={"test_id": test_id})
+            await asyncio.to_thread(self.lifecycle.fail, test_id, error)
+        finally:
+            self._release(test_id)
+            self.announce(test_id)
 
     async def _finish(self, event: FinishedEvent) -> None:
         """Take over a finished test: store the recording, identify, store the model."""
-        current_test.set(event.test_id)
         if self.current is not None and self.current.test_id == event.test_id:
             self.current.ending = True
-        try:
-            row = await asyncio.to_thread(self.lifecycle.take_recording, event)
-            if row is None:
-                return
-            self.announce(row.id)
-            if row.state == "identifying":
-                self._release(event.test_id)
-                await self.lifecycle.identify(row.id, event.last_sample_unix_s)
-        except Exception as error:
-            log.exception("the test could not be taken over", extra={"test_id": event.test_id})
-            await asyncio.to_thread(
-                self.lifecycle.update, event.test_id, state="failed", reason=" ".join(str(error).split())
-            )
-        finally:
+        row = await asyncio.to_thread(self.lifecycle.take_recording, event)
+        if row is None:
+            return
+        self.announce(row.id)
+        if row.state == "identifying":
             self._release(event.test_id)
-            self.announce(event.test_id)
+            await self.lifecycle.identify(row.id, event.last_sample_unix_s)
 
     def _release(self, test_id: str) -> None:
         """The rig is free again; the identification goes on beside it."""
         if self.current is not None and self.current.test_id == test_id:
-            self.current.finished.set()
             self.current = None
 
     # ---- after a restart ------------------------------------------------------------------------------------
@@ -361,18 +392,15 @@ class Runner:
                 self.current = Current(row.id, row.participant, row.requested_by, started=True)
                 self.hub.begin(row.id)
             else:
-                self._spawn(self._recover(row.id, "the service was restarted during the test"))
+                self._follow(row.id, self._recover(row.id, "the service was restarted during the test"))
 
     async def _recover(self, test_id: str, why: str) -> None:
         """A test whose end was not heard: its recording, if the rig sealed one, is adopted."""
-        current_test.set(test_id)
         row: Test = await asyncio.to_thread(self.store.get, Test, test_id)
         if row.recording_id is not None:
             await self.lifecycle.identify(test_id)
         else:
             await self._finish(await self.lifecycle.missed_end(test_id, why))
-        self._release(test_id)
-        self.announce(test_id)
 
     # ---- what clients see -----------------------------------------------------------------------------------
 
@@ -384,39 +412,7 @@ class Runner:
 
     def document(self, row: Test) -> dict[str, Any]:
         """A test as clients see it."""
-        planned = {key: value for key, value in row.plan.get("preview", {}).items() if key != "pulse_width_us"}
-        running = row.state in ("requested", "running")
-        start = (0.0, planned.get("duration_s", 0.0), None)
-        end = (row.summary.get("duration_s", 0.0), row.summary.get("duration_s", 0.0), None)
-        elapsed_s, duration_s, segment = (self.hub.position(row.id) or start) if running else end
-        call, rig = self.lifecycle.calls.get(row.id), self.rig.status
-        sealing = running and rig is not None and rig.test_id == row.id and rig.state == "sealing"
-        model = self.versions.get(row.model_id) if row.model_id else None
-        return {
-            "id": row.id,
-            "participant": row.participant,
-            "kind": row.kind,
-            "state": "sealing" if sealing else row.state,
-            "done": row.state not in OPEN_STATES,
-            "reason": row.reason,
-            "segment": segment,
-            "elapsed_s": elapsed_s,
-            "duration_s": duration_s,
-            "time_left_s": max(0.0, duration_s - elapsed_s),
-            "progress": min(1.0, elapsed_s / duration_s) if duration_s else 0.0,
-            "identification": call.document() if call else None,
-            "requested_by": row.requested_by,
-            "requested_utc": row.requested_utc,
-            "finished_utc": row.finished_utc,
-            "planned": planned,
-            "recording_id": row.recording_id,
-            "recording_url": f"/v1/recordings/{row.recording_id}" if row.recording_id else None,
-            "joins": row.plan.get("joins"),
-            "model_id": row.model_id,
-            "model_url": f"/v1/models/{row.model_id}" if row.model_id else None,
-            "summary": row.summary,
-            "fit": self.versions.document(model) if model else None,
-        }
+        return document.of(row, self.hub, self.lifecycle)
 
     async def close(self) -> None:
         """Leave what runs to the next start of the service."""
@@ -424,6 +420,21 @@ class Runner:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
         await asyncio.to_thread(self._notes.shutdown)
+
+
+def other_than(asker: str, ran_by: str | None) -> str | None:
+    """Who ran a test, where that was not who asked for it."""
+    return ran_by if ran_by and names.folded(ran_by) != names.folded(asker) else None
+
+
+def refuse_archived(participant: Participant) -> None:
+    """409: nothing is begun with a participant in the archive."""
+    if participant.archived_utc is not None:
+        detail = (
+            f"{participant.code} is in the archive. Take it out first: on its page, or by "
+            f"POST /v1/participants/{participant.code}/unarchive. Nothing was started."
+        )
+        raise ApiError(409, "archived", "This participant is archived", detail)
 
 
 def not_what_was_seen(why: str) -> ApiError:

@@ -35,7 +35,8 @@ class StopRights:
 
     def give(self, name: str, test_id: str | None) -> str:
         """A right for the page of `name`, which shows this test or none."""
-        words = json.dumps([name, test_id, round(self.clock.unix_s())], separators=(",", ":")).encode()
+        said = [name, test_id, round(self.clock.unix_s())]
+        words = json.dumps(said, separators=(",", ":"), ensure_ascii=False).encode()
         return f"{_text(words)}.{_text(self._sign(words))}"
 
     def holder(self, text: str | None, running: Collection[str | None] = ()) -> str | None:

@@ -22,6 +22,9 @@ class Participant(Table):
     profile: Mapped[dict[str, Any]] = mapped_column(JSON, default=dict)
     created_utc: Mapped[str] = mapped_column(String(32))
     created_by: Mapped[str] = mapped_column(String(80))
+    side: Mapped[str | None] = mapped_column(String(8), default=None)
+    muscle: Mapped[str | None] = mapped_column(String(60), default=None)
+    archived_utc: Mapped[str | None] = mapped_column(String(32), default=None)
 
 
 class Test(Table):
@@ -41,6 +44,25 @@ class Test(Table):
     requested_by: Mapped[str] = mapped_column(String(80))
     requested_utc: Mapped[str] = mapped_column(String(32), index=True)
     finished_utc: Mapped[str | None] = mapped_column(String(32), default=None)
+    ran_by: Mapped[str | None] = mapped_column(String(80), default=None)
+    """Who ran it at the rig, if that was somebody else than `requested_by`."""
+
+
+class Note(Table):
+    """What a person noted about a session, or at a time in a test; struck, but never deleted."""
+
+    __tablename__ = "notes"
+    id: Mapped[str] = mapped_column(String(40), primary_key=True)
+    participant: Mapped[str] = mapped_column(ForeignKey("participants.code"), index=True)
+    test_id: Mapped[str | None] = mapped_column(ForeignKey("tests.id"), default=None, index=True)
+    at_s: Mapped[float | None] = mapped_column(Float, default=None)
+    """From the start of the test's signals."""
+    kind: Mapped[str] = mapped_column(String(20))
+    text: Mapped[str] = mapped_column(Text, default="")
+    by: Mapped[str] = mapped_column(String(80))
+    at_utc: Mapped[str] = mapped_column(String(32))
+    struck_by: Mapped[str | None] = mapped_column(String(80), default=None)
+    struck_utc: Mapped[str | None] = mapped_column(String(32), default=None)
 
 
 class Recording(Table):
@@ -65,6 +87,10 @@ class Model(Table):
     recording_id: Mapped[str] = mapped_column(ForeignKey("recordings.id"), index=True)
     parent_id: Mapped[str | None] = mapped_column(String(64), default=None)
     added_effect: Mapped[str | None] = mapped_column(String(64), default=None)
+    carried_from_id: Mapped[str | None] = mapped_column(String(64), default=None)
+    """The model of an earlier session whose structure this one was fitted with."""
+    carried: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True), default=None)
+    """What the new record said of that structure."""
     method: Mapped[str] = mapped_column(String(40))
     effects: Mapped[list[str]] = mapped_column(JSON, default=list)
     fit: Mapped[dict[str, Any]] = mapped_column(JSON, default=dict)
@@ -121,6 +147,9 @@ class PageSession(Table):
     csrf: Mapped[str] = mapped_column(String(64))
     created_unix_s: Mapped[float] = mapped_column(Float)
     expires_unix_s: Mapped[float] = mapped_column(Float)
+    acted_unix_s: Mapped[float | None] = mapped_column(Float, default=None)
+    """When a person last did something in it; None: not since it was opened."""
+    locked_unix_s: Mapped[float | None] = mapped_column(Float, default=None)
 
 
 class User(Table):
@@ -128,6 +157,8 @@ class User(Table):
 
     __tablename__ = "users"
     name: Mapped[str] = mapped_column(String(80), primary_key=True)
+    folded_name: Mapped[str | None] = mapped_column(String(320), default=None, index=True)
+    """The name as two people must not share it: without its case."""
     password_hash: Mapped[str] = mapped_column(String(200))
     token_hash: Mapped[str] = mapped_column(ForeignKey("tokens.hash"))
     created_utc: Mapped[str] = mapped_column(String(32))

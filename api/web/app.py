@@ -16,15 +16,16 @@ from api.web import openapi, pages, problems, routes, strict_body
 from api.web.body_limit import BodyLimit
 from api.web.dependencies import Context, build
 from api.web.headers import Headers
+from api.web.page_language import PageLanguage
 from api.workers.pool import WORKER
 
 
 class Service(FastAPI):
-    """The application, with its headers outermost: an unexpected error's answer has them, too."""
+    """The application, with its headers and language outermost: an unexpected error's answer has them, too."""
 
     def build_middleware_stack(self) -> ASGIApp:
-        """Starlette's, within the headers."""
-        return Headers(super().build_middleware_stack())
+        """Starlette's, within the headers and the language."""
+        return Headers(PageLanguage(super().build_middleware_stack()))
 
 
 def create_app(

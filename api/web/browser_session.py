@@ -27,7 +27,7 @@ def set_cookie(context: Context, answer: Response, cookie: str) -> None:
 
 def local(target: str) -> str:
     """An address on this host, or the first page."""
-    plain = target.startswith("/") and not target.startswith(("//", "/\\"))
+    plain = target.startswith("/") and not target.startswith("//") and target.isprintable() and "\\" not in target
     return target if plain else "/"
 
 

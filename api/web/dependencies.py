@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import logging
 import shutil
 import time
 from dataclasses import dataclass, field
@@ -10,15 +12,19 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from fastapi import Depends, Request, Security
+from sqlalchemy.exc import SQLAlchemyError
 from starlette.requests import HTTPConnection
 
 from api import owner_only
-from api.clock import Clock
+from api.clock import Clock, set_zone
 from api.models.analyses import Analyses
 from api.models.registry import Versions
+from api.models.trend import Trend
 from api.people.accounts import People
 from api.people.auth import Auth, Principal, Scope
+from api.people.idle_lock import FLUSH_S, IdleLock
 from api.people.pace import Guesses
+from api.sessions.notes import Notes
 from api.sessions.questions import Questions
 from api.sessions.rig_client import RigClient
 from api.sessions.runner import Runner
@@ -28,12 +34,14 @@ from api.settings import Settings
 from api.store import Store, uploads
 from api.store.lock import ServiceLock
 from api.store.tables import Recording
-from api.web.guards import anyone_signed_in, require
+from api.web.guards import anyone_even_locked, anyone_signed_in, require
 from api.web.openapi import problem
 from api.web.stop_guard import Press, anyone_who_may_stop
 from api.workers.pool import WORKER, Pool
 from api.workers.process import Places
 from api.workers.tracker import Jobs
+
+log = logging.getLogger("stimrig.api")
 
 
 @dataclass
@@ -51,15 +59,18 @@ class Context:
     versions: Versions
     runner: Runner
     analyses: Analyses
+    trend: Trend
     jobs: Jobs
     lock: ServiceLock
     questions: Questions
+    notes: Notes
     drawn_token: str | None = None
     limits_turn: asyncio.Lock = field(default_factory=asyncio.Lock)
     """Who changes a participant's limits, and who lets a calibration send by them, take turns: once a change is
     answered nothing begins with what was before."""
     stops: StopLog = field(default_factory=StopLog)
     started_s: float = field(default_factory=time.monotonic)
+    flushing: asyncio.Task[None] | None = None
 
     async def open(self) -> None:
         """Connect, warm the workers, take up what a restart left open."""
@@ -71,9 +82,22 @@ class Context:
                 break
             await asyncio.sleep(0.05)
         await self.runner.resume()
+        self.flushing = asyncio.create_task(self._flush())
+
+    async def _flush(self) -> None:
+        while True:
+            await asyncio.sleep(FLUSH_S)
+            try:
+                await asyncio.to_thread(self.auth.idle.flush)
+            except SQLAlchemyError:  # the next time has it all
+                log.exception("the times of people's last actions could not be written down")
 
     async def close(self) -> None:
         """Let everything go."""
+        if self.flushing is not None:
+            self.flushing.cancel()
+            with contextlib.suppress(SQLAlchemyError):
+                await asyncio.to_thread(self.auth.idle.flush)
         await self.runner.close()
         await self.jobs.close()
         await self.pool.close()
@@ -105,9 +129,12 @@ def build(
 
 def _build(settings: Settings, clock: Clock, worker: tuple[str, ...], lock: ServiceLock) -> Context:
     make_folders(settings)
+    if settings.time_zone:
+        set_zone(settings.time_zone)
     store = Store(settings.database)
     guesses = Guesses(clock)
-    auth = Auth(store, clock, guesses, settings.session_hours)
+    idle = IdleLock(store, clock, settings.idle_lock_min)
+    auth = Auth(store, clock, guesses, idle, settings.session_hours)
     configured = settings.admin_token.get_secret_value() if settings.admin_token else None
     drawn = auth.first_administrator(configured)
     rig = RigClient(settings.rig_socket, clock)
@@ -120,8 +147,8 @@ def _build(settings: Settings, clock: Clock, worker: tuple[str, ...], lock: Serv
     rights = StopRights(owner_only.key(settings.data_dir / "stop-right.key"), clock)
     questions = Questions(clock)
     return Context(
-        settings, clock, store, auth, people, rights, rig, pool, versions, runner, analyses, jobs, lock,
-        questions, drawn
+        settings, clock, store, auth, people, rights, rig, pool, versions, runner, analyses,
+        Trend(store, clock, pool), jobs, lock, questions, Notes(store, clock), drawn
     )  # fmt: skip
 
 
@@ -153,6 +180,7 @@ async def from_request(request: Request) -> Context:
 
 Ctx = Annotated[Context, Depends(from_request)]
 Anyone = Annotated[Principal, Depends(anyone_signed_in)]
+EvenLocked = Annotated[Principal, Depends(anyone_even_locked)]
 MayStop = Annotated[Press, Depends(anyone_who_may_stop)]
 LiveReader = Annotated[Principal, Security(require(Scope.READ_LIVE), scopes=[Scope.READ_LIVE])]
 Tester = Annotated[Principal, Security(require(Scope.RUN_TEST), scopes=[Scope.RUN_TEST])]

@@ -13,6 +13,8 @@ from api.errors import ApiError
 from api.people.auth import COOKIE, Principal, Scope
 
 SAFE_METHODS = {"GET", "HEAD", "OPTIONS"}
+POLLED = ("/rig/", "/jobs/now/", "/v1/jobs/")
+"""What pages ask for again and again by themselves."""
 BEARER = HTTPBearer(scheme_name="token", description="a token, or a controller's key", auto_error=False)
 SESSION = APIKeyCookie(
     name=COOKIE, scheme_name="session", auto_error=False,
@@ -27,7 +29,7 @@ def require(scope: Scope) -> Callable[..., Awaitable[Principal]]:
     """A dependency: the principal, if the scope is held and a session's form carries its CSRF token."""
 
     async def check(request: Request, _token: Token, _session: Session) -> Principal:
-        principal = request.app.state.context.auth.identify(request)
+        principal = identified(request)
         if not principal.may(scope):
             detail = f"This needs the scope {scope}; {principal.name} holds {', '.join(sorted(principal.scopes))}."
             raise ApiError(403, "forbidden", "Not allowed", detail)
@@ -40,9 +42,33 @@ def require(scope: Scope) -> Callable[..., Awaitable[Principal]]:
     return check
 
 
+def identified(request: Request) -> Principal:
+    """Who asks; where it is a person's own doing, the session is not idle."""
+    auth = request.app.state.context.auth
+    principal = auth.identify(request)
+    if principal.page_session is not None and by_a_person(request):
+        auth.idle.acted(principal.page_session.hash)
+    return principal
+
+
+def by_a_person(request: Request) -> bool:
+    """Whether a person did something, as far as a request tells: what scripts read by themselves is nobody's action."""
+    if request.method not in SAFE_METHODS:
+        return True
+    by_script = request.headers.get("sec-fetch-dest") == "empty"
+    return not by_script and not request.url.path.startswith(POLLED)
+
+
 async def anyone_signed_in(request: Request, _token: Token, _session: Session) -> Principal:
     """A dependency: anyone with a valid token or session."""
-    principal = request.app.state.context.auth.identify(request)
+    principal = identified(request)
+    await check_csrf(request, principal)
+    return principal
+
+
+async def anyone_even_locked(request: Request, _token: Token, _session: Session) -> Principal:
+    """A dependency: anyone with a valid token or session, which may be locked: to unlock it, or to sign out."""
+    principal = request.app.state.context.auth.identify(request, forgive_lock=True)
     await check_csrf(request, principal)
     return principal
 

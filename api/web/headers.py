@@ -5,6 +5,8 @@ from __future__ import annotations
 from starlette.datastructures import MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from api import language
+
 PAGE_POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; "
     "connect-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
@@ -52,6 +54,10 @@ class Headers:
                 page = headers.get("content-type", "").startswith("text/html")
                 for name, value in (PAGE if page else DATA).items():
                     headers.setdefault(name, value)
+                if page:
+                    headers.setdefault("Content-Language", language.code())
+                    headers.add_vary_header("Accept-Language")
+                    headers.add_vary_header("Cookie")
             await send(message)
 
         await self.app(scope, receive, told)

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import Field, StringConstraints
 
-from api.sessions.requests import FIRST_PROFILE, Body, Code, FirstProfileIn
+from api.sessions.requests import FIRST_PROFILE, Body, Code, FirstProfileIn, Muscle, PersonName, Side
 
 
 class ParticipantIn(Body):
@@ -14,6 +14,14 @@ class ParticipantIn(Body):
 
     code: Code
     profile: FirstProfileIn = Field(default=FIRST_PROFILE)
+    side: Side | None = None
+    muscle: Muscle | None = None
+
+
+class RanByIn(Body):
+    """Who ran a test at the rig."""
+
+    ran_by: PersonName | None = Field(None, description="null: who asked for it")
 
 
 class DecisionIn(Body):

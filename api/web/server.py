@@ -18,7 +18,7 @@ from starlette.types import ASGIApp
 
 from api import logs
 from api.errors import ApiError, SettingsError
-from api.models import starting_effects
+from api.models import carried_structure
 from api.settings import Settings
 from api.store.lock import ServiceLock
 from api.web.app import create_app
@@ -37,7 +37,7 @@ def main() -> int:
         listener = bind(settings.host, settings.port)
         url = address_of(listener)
         lock.tell(url)
-        asyncio.run(starting_effects.refuse_unknown(settings))  # before a first token is drawn: it is told only once
+        asyncio.run(carried_structure.refuse_unknown(settings))  # before a first token is drawn: it is told only once
         app = create_app(settings, lock=lock)
     except (ApiError, SettingsError, OSError) as error:
         print(f"stimrig: {error}", file=sys.stderr)

@@ -10,7 +10,6 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-from api.errors import ApiError
 from api.logs import current_test
 from api.workers.process import WORKER, Call, Places, Worker, cancelled
 
@@ -118,7 +117,7 @@ class Pool:
             log.info("%s done in %.1f s", call.verb, call.elapsed_s)
             if not call.result.done():
                 call.result.set_result(result)
-        except (ApiError, OSError, ValueError) as error:
+        except Exception as error:  # whatever it is: who waits for the call must hear of its end
             if call.state != "cancelled":
                 call.state = "failed"
             self.failed_count += 1

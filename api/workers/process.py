@@ -31,6 +31,7 @@ PASSED_ON = (
 """All of the service's environment that a worker gets: no token, no setting of the service, nothing unexpected."""
 PROCESSOR_S = {
     "fit": 300.0,
+    "carry": 300.0,
     "effects": 60.0,
     "export_csv": 120.0,
     "plain_csv": 120.0,

@@ -42,6 +42,23 @@ def fit(
     return {"json": model.to_json(), "model": model.to_dict(), "notes": list(record.notes)}
 
 
+def figures(progress: Progress, model_json: str) -> dict[str, Any]:
+    """Threshold, plateau and dynamics with their standard deviations, of a model from before these were stored."""
+    import identify
+
+    progress(0.1, "reading the model")
+    return clean({"figures": identify.Model.from_json(model_json).figures()})
+
+
+def carry(data: str, progress: Progress, model_json: str) -> dict[str, Any]:
+    """The structure of an earlier model on a new recording: the finding, and the carried model where there is one."""
+    import identify
+
+    record = identify.read(Path(data))
+    found = identify.carry(record, identify.Model.from_json(model_json), progress)
+    return {"json": found.models[1].to_json() if len(found.models) > 1 else None, "found": clean(found.finding())}
+
+
 def drawn(data: str, progress: Progress, model_json: str) -> dict[str, Any]:
     """The curves a page draws: measured, predicted, commanded, and the step response."""
     import identify
@@ -220,8 +237,10 @@ def find_recording(progress: Progress, folder: str, test_id: str) -> dict[str, A
 
 VERBS: dict[str, Callable[..., dict[str, Any]]] = {
     "fit": fit,
+    "carry": carry,
     "comparison": comparison,
     "curves": drawn,
+    "figures": figures,
     "diagnosis": diagnosis,
     "improve": improve,
     "join": joined,

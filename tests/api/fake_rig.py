@@ -75,7 +75,8 @@ class FakeRig:
         self.segment: str | None = None
         self.confirms_stop = True
         self.calibration: m.CalibrationStatus | None = None
-        self.mute = False
+        self.asked: m.CalibrateStartRequest | None = None
+        self.mute = self.ignores_starts = False
         self.starts = 0
         self.stopped_by: str | None = None
         self.loses_ends = False
@@ -144,6 +145,8 @@ class FakeRig:
                 if self.mute:
                     continue
                 request = REQUESTS.validate_json(line)
+                if self.ignores_starts and isinstance(request, m.StartRequest):
+                    continue
                 reply = await self._answer(request, writer)
                 writer.write(reply.model_dump_json().encode() + b"\n")
         self._writers.discard(writer)
@@ -203,7 +206,7 @@ class FakeRig:
     async def _on_calibrate_start(self, request: Any, writer: Any) -> dict[str, Any]:
         if self.state != "ready":
             raise m_refusal("busy" if self.state == "running" else self.state, "Not now", f"the rig is {self.state}")
-        self.state = "calibrating"
+        self.state, self.asked = "calibrating", request
         self.calibration = m.CalibrationStatus(
             calibration_id=request.calibration_id, participant=request.participant, by=request.by,
             current_ma=request.current_ma, step_us=request.step_us, train_s=request.train_s,
@@ -215,7 +218,10 @@ class FakeRig:
     async def _on_calibrate_step(self, request: Any, writer: Any) -> dict[str, Any]:
         known = self.calibration
         assert known is not None
-        width_us = known.pulse_width_us + {"up": 1, "down": -1, "repeat": 0}[request.direction] * known.step_us
+        steps = {"up": 1, "fine": 0.5, "down": -1, "repeat": 0}
+        width_us = known.pulse_width_us + steps[request.direction] * known.step_us
+        if request.shown_us not in (None, width_us):
+            raise m_refusal("bad-plan", "Not what was shown", f"{width_us:g} µs would be sent; nothing was sent.")
         if width_us > known.ceiling_us:
             raise m_refusal("refused", "Above a limit", f"{width_us:g} µs is above the hard limit of 45 µs by 5 µs")
         train = m.CalibrationTrain(number=len(known.trains) + 1, pulse_width_us=width_us, pulses=40, torque_rise_nm=0.1)
@@ -311,6 +317,8 @@ class FakeRig:
                 torque_min_nm=[min(p) for p in pieces], torque_max_nm=[max(p) for p in pieces],
                 pulse_time_s=[k / PULSE_RATE_HZ for k in range(first, last)], pulse_width_us=widths[first:last],
                 torque_age_s=0.004, lost_samples=0, dropped_pulses=0,
+                sent_pulses=sum(1 for width in widths[:last] if width),
+                charge_uc=sum(widths[:last]) * plan.profile.current_ma / 1000,
             )
         )  # fmt: skip
 
@@ -341,7 +349,7 @@ class FakeRig:
 
 def told_next(known: m.CalibrationStatus) -> m.CalibrationStatus:
     """With the widths that each step would send."""
-    widths = {"up": known.pulse_width_us + known.step_us}
+    widths = {"up": known.pulse_width_us + known.step_us, "fine": known.pulse_width_us + known.step_us / 2}
     if known.trains:
         widths |= {"repeat": known.pulse_width_us, "down": known.pulse_width_us - known.step_us}
     found = {name: width for name, width in widths.items() if 1 <= width <= known.ceiling_us}

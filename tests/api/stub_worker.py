@@ -95,6 +95,29 @@ def improvement(model_json: str | None = None) -> dict[str, Any]:
     return {"verdict": "effect_missing", "noise_sd_nm": 0.04, "steps": steps, "models": models, "refused": []}
 
 
+def carried(folder: Path, earlier: dict[str, Any], say: Any) -> dict[str, Any]:
+    """Threshold drift is never needed again; the other effects always are."""
+    if (folder / "does-not-carry").exists():
+        return {"error": {"expected": True, "detail": (folder / "does-not-carry").read_text(), "place": ""}}
+    say(progress=0.3, text="fitting last session's structure")
+    while (folder / "carrying-slowly").exists():
+        time.sleep(0.05)
+    held = [effect["id"] for effect in earlier["effects"]]
+    needed = [effect for effect in held if effect != "threshold_drift"]
+    rows = [
+        {"effect": effect, "name": effect.capitalize(), "needed": effect in needed, "log_evidence_gain": 30.0,
+         "required": 4.5, "why": "asked-for", "reason": "made up"}
+        for effect in held
+    ]  # fmt: skip
+    found = {
+        "carried_from": earlier["model_id"], "offered": "carried" if needed else "plain",
+        "why": "better" if needed else "nothing-needed" if held else "plain-before", "reason": "A reason of the stub.",
+        "still_needed": needed, "no_longer_needed": [effect for effect in held if effect not in needed],
+        "undecided": [], "effects": rows, "figures": [],
+    }  # fmt: skip
+    return {"result": {"json": json.dumps(model(needed)) if needed else None, "found": found}}
+
+
 def answer(verb: str, arguments: dict[str, Any], say: Any) -> dict[str, Any]:
     if verb == "fit":
         say(progress=0.5, text="identifying")
@@ -110,13 +133,15 @@ def answer(verb: str, arguments: dict[str, Any], say: Any) -> dict[str, Any]:
             time.sleep(0.05)
         document = model([effect.partition(":")[0] for effect in arguments.get("effects", [])])
         return {"result": {"json": json.dumps(document), "model": document, "notes": []}}
+    if verb == "carry":
+        return carried(Path(arguments["data"]).parent, json.loads(arguments["model_json"]), say)
     if verb == "comparison":
         return {"result": comparison()}
     if verb == "curves":
         return {"result": curves()}
     if verb == "diagnosis":
         slow = Path(arguments["data"]).parent / "slow"
-        say(progress=float(slow.read_text()) if slow.exists() else 0.5, text="trying fatigue")
+        say(progress=float(slow.read_text()) if slow.exists() else 0.5, text="tried fatigue")
         if slow.exists():
             time.sleep(60)
         return {"result": diagnosis(arguments.get("model_json"))}

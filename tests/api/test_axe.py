@@ -87,7 +87,7 @@ def test_pages_without_a_test(browser: Any, tab: Any, service: Service) -> None:
         visit(tab, service, path)
     tab.goto(service.url + "/participants/X1/calibration")
     tab.get_by_role("button", name="Begin the calibration").click()
-    tab.get_by_role("button", name="Wider").wait_for()
+    tab.locator("#step-up").wait_for()
     examined(tab, "calibration")
     tab.get_by_role("button", name="Discard").click()
     for stranger in open_tab(browser, service, signed_in=False):
@@ -130,12 +130,16 @@ def test_a_model_and_what_is_made_of_it(tab: Any, service: Service) -> None:
         second = run_test(http, "X3")
 
     def drawn() -> None:
-        tab.get_by_role("heading", name="Fatigue").wait_for()
+        tab.get_by_role("link", name="Fatigue").wait_for()
+        tab.locator("[data-figure=overview] .main-svg").first.wait_for()
+
+    def opened() -> None:
+        tab.evaluate("document.querySelectorAll('details').forEach((part) => { part.open = true; })")
         for figure in ("comparison", "recruitment", "step", "residual"):
             tab.locator(f"[data-figure={figure}] .main-svg").first.wait_for()
 
     visit(tab, service, f"/models/{first['model_id']}", drawn)
-    tab.evaluate("document.querySelectorAll('details').forEach((part) => { part.open = true; })")
+    opened()
     examined(tab, "model, all open")
     tab.get_by_role("button", name="Add this effect").click()
     tab.locator("[data-figure=falling] .main-svg").first.wait_for()
@@ -145,6 +149,56 @@ def test_a_model_and_what_is_made_of_it(tab: Any, service: Service) -> None:
     both = f"/compare?model={first['model_id']}&model={second['model_id']}"
     visit(tab, service, both, lambda: tab.locator("[data-figure=step] .main-svg").first.wait_for())
     visit(tab, service, "/participants/X3")
+
+
+def test_in_the_dark(browser: Any, service: Service) -> None:
+    """The main pages, their notices and their states, where the system is dark."""
+    with service.client() as http:
+        http.post("/v1/participants", json={"code": "X5"})
+        done = run_test(http, "X5")
+    model = f"/models/{done['model_id']}"
+
+    def opened() -> None:
+        page.evaluate("document.querySelectorAll('details').forEach((part) => { part.open = true; })")
+        page.locator("[data-figure=comparison] .main-svg").first.wait_for()
+
+    for page in open_tab(browser, service, color_scheme="dark"):
+        for path, ready in (("/", None), ("/participants/X5", None), (model, opened), (f"/tests/{done['id']}", None)):
+            visit(page, service, path, ready)
+        assert page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(17, 22, 27)"
+        page.goto(service.url + "/participants/X5/calibration")
+        page.get_by_role("button", name="Begin the calibration").click()
+        page.get_by_role("button", name="Discard").wait_for()
+        examined(page, "calibration")
+        service.rig.speed = 0.7
+        page.get_by_role("button", name="Discard").click()
+        page.wait_for_url("**/participants/X5")
+        start(page)
+        page.locator("#age", has_text="ms").wait_for()
+        examined(page, "live")
+        service.rig.confirms_stop = False
+        page.get_by_role("button", name="Stop stimulation").click()
+        page.get_by_role("heading", name="The stop is not confirmed").wait_for()
+        examined(page, "not confirmed")
+        service.rig.speed = 8.0
+
+
+def test_in_german(tab: Any, service: Service) -> None:
+    """The longest pages in the language with the longer words."""
+    with service.client() as http:
+        http.post("/v1/participants", json={"code": "X6"})
+        done = run_test(http, "X6")
+
+    def opened() -> None:
+        tab.get_by_role("link", name="Ermüdung").wait_for()
+        tab.evaluate("document.querySelectorAll('details').forEach((part) => { part.open = true; })")
+        tab.locator("[data-figure=comparison] .main-svg").first.wait_for()
+
+    tab.context.add_cookies([{"name": "stimrig_language", "value": "de", "url": service.url}])
+    visit(tab, service, f"/models/{done['model_id']}", opened)
+    for path in ("/participants/X6", f"/tests/{done['id']}", "/participants/X6/trend"):
+        visit(tab, service, path)
+    assert tab.locator("html").get_attribute("lang") == "de"
 
 
 def test_a_diagnosis_under_way(tab: Any, service: Service) -> None:

@@ -76,6 +76,13 @@ def test_sequence_is_played_and_nothing_is_identified(client: httpx.Client, serv
     assert client.get(document["recording_url"]).status_code == 200
 
 
+def sight(service: Service, token: dict[str, str]) -> dict[str, str]:
+    """What the page's forms send: the calibration that it shows, and how many trains."""
+    found = service.rig.calibration
+    assert found is not None
+    return {**token, "calibration": found.calibration_id, "trains": str(len(found.trains))}
+
+
 def test_whole_calibration_by_plain_forms(service: Service, participant: str) -> None:
     page = "/participants/P017/calibration"
     with signed_in(service) as browser:
@@ -84,11 +91,13 @@ def test_whole_calibration_by_plain_forms(service: Service, participant: str) ->
         assert browser.post(page, data={**token, "current_ma": "x", "step_us": "10"}).status_code == 422
         assert browser.post(page, data={**token, "current_ma": "20", "step_us": "10"}).status_code == 303
         for threshold in ("sensory", "motor", "comfort"):
-            browser.post(f"{page}/step/up", data=token)
-            browser.post(f"{page}/mark/{threshold}", data=token)
+            browser.post(f"{page}/step/up", data=sight(service, token))
+            browser.post(f"{page}/mark/{threshold}", data=sight(service, token))
         assert "Still to be marked" not in browser.get(page).text
         assert browser.post(f"{page}/step/sideways", data=token).status_code == 422
-        led = browser.post(f"{page}/finish", data=token)
+        for what in ("step/up", "mark/comfort", "finish", "discard"):
+            assert browser.post(f"{page}/{what}", data=token).status_code == 409, "a form that shows no calibration"
+        led = browser.post(f"{page}/finish", data=sight(service, token))
         assert led.headers["location"] == "/participants/P017"
         assert "felt at 10 µs, moves at 20 µs" in browser.get("/participants/P017").text
 
@@ -191,18 +200,17 @@ def test_the_page_says_that_it_goes_no_further(client: httpx.Client, service: Se
     with signed_in(service) as browser:
         token = {"csrf": csrf(browser)}
         browser.post(page, data={**token, "current_ma": "20", "step_us": "10"})
-        browser.post(f"{page}/step/up", data=token)
+        browser.post(f"{page}/step/up", data=sight(service, token))
         assert "A calibration is open." in browser.get("/participants/P017").text
         assert client.put(PROFILE, json=LOWER).status_code == 200
         shown = browser.get(page).text
         assert "P017 now has other limits (5 mA, 60 µs, 5 N·m)" in shown
         buttons = [part.split("<")[0] for part in shown.split("<button")[1:] if "/calibration/" in part.split(">")[0]]
-        assert len(buttons) == 8 and [b for b in buttons if "disabled" not in b] == [
+        assert len(buttons) == 9 and [b for b in buttons if "disabled" not in b] == [
             next(b for b in buttons if "/discard" in b)
         ]
-        assert browser.post(f"{page}/step/up", data=token).status_code == 409
-        assert browser.post(f"{page}/finish", data=token).status_code == 409
-        assert browser.post(f"{page}/discard", data=token).status_code == 303
+        for what, answer in (("step/up", 409), ("finish", 409), ("discard", 303)):
+            assert browser.post(f"{page}/{what}", data=sight(service, token)).status_code == answer
 
 
 def test_a_question_about_a_calibration_is_bound_to_the_limits_it_showed(
@@ -229,3 +237,18 @@ def test_lowered_during_a_test_says_that_it_holds_from_the_next_one(
     client.post("/v1/stop")
     wait_done(client, started)
     assert client.put(PROFILE, json=LOWER).json()["meanwhile"] == ""
+
+
+def test_a_page_of_another_calibration_marks_nothing(client: httpx.Client, service: Service, participant: str) -> None:
+    """As many trains were sent in both: the count alone does not tell a page of the discarded one."""
+    client.post(WHERE, json={"current_ma": 18, "step_us": 5})
+    stale = client.post(f"{WHERE}/step", json={"direction": "up"}).json()["calibration_id"]
+    client.post(f"{WHERE}/finish", json={"discard": True})
+    client.post(WHERE, json={"current_ma": 18, "step_us": 15})
+    known = client.post(f"{WHERE}/step", json={"direction": "up"}).json()["calibration_id"]
+    with signed_in(service) as browser:
+        for seen in (stale, known):
+            form = {"csrf": csrf(browser), "trains": "1", "calibration": seen}
+            browser.post("/participants/P017/calibration/mark/sensory", data=form)
+            assert bool(client.get(WHERE).json()["marks_us"]) == (seen == known)
+    client.post(f"{WHERE}/finish", json={"discard": True})

@@ -34,29 +34,28 @@ def a_model(service: Service, code: str) -> dict[str, Any]:
         return run_test(http, code)
 
 
-def test_approval_wants_reason_and_password_and_says_what_is_wrong(tab: Any, service: Service) -> None:
+def test_approval_wants_the_password_a_rejection_a_reason_and_says_what_is_wrong(tab: Any, service: Service) -> None:
     model = a_model(service, "C1")["model_id"]
     tab.goto(f"{service.url}/models/{model}")
     tab.get_by_role("button", name="Approve").click()
-    assert tab.url.endswith(model), "the browser asks for the reason first"
-    tab.get_by_label("Reason").fill("follows the measurement")
+    assert tab.url.endswith(model), "the browser asks for the password first"
     tab.get_by_label("Your password, once more").first.fill("not my password")
     tab.get_by_role("button", name="Approve").click()
     tab.get_by_role("heading", name="The password does not match").wait_for()
     tab.get_by_role("link", name="Back to the model").click()
     assert tab.get_by_text("Not approved yet").is_visible()
-    tab.get_by_label("Reason").fill("follows the measurement")
     tab.get_by_label("Your password, once more").first.fill(PASSWORD)
     tab.get_by_role("button", name="Approve").click()
     tab.get_by_text(f"Approved by {NAME}").wait_for()
-    tab.get_by_label("Withdraw it from the controller, because").fill("electrode slipped")
+    tab.get_by_text("Withdraw it from the controller").click()
+    tab.get_by_label("Reason").fill("electrode slipped")
     tab.get_by_label("Your password, once more").first.fill(PASSWORD)
     tab.get_by_role("button", name="Reject").click()
     tab.get_by_text("electrode slipped").wait_for()
     with service.client() as http:
         assert http.get("/v1/participants/C1/model").status_code == 404
         deeds = [(e["who"], e["action"], e["detail"].get("reason")) for e in http.get("/v1/audit").json()["entries"]]
-    assert (NAME, "approve", "follows the measurement") in deeds and (NAME, "reject", "electrode slipped") in deeds
+    assert (NAME, "approve", "") in deeds and (NAME, "reject", "electrode slipped") in deeds
 
 
 def test_a_form_without_a_reason_decides_nothing(service: Service) -> None:
@@ -64,7 +63,7 @@ def test_a_form_without_a_reason_decides_nothing(service: Service) -> None:
 
     model = a_model(service, "C2")["model_id"]
     with signed_in(service) as browser:
-        refused = browser.post(f"/models/{model}/approve", data={"csrf": csrf(browser), "reason": "  "})
+        refused = browser.post(f"/models/{model}/reject", data={"csrf": csrf(browser), "reason": "  "})
     assert refused.status_code == 422 and "needs a reason" in refused.text
     with service.client() as http:
         assert http.get(f"/v1/models/{model}").json()["decision"] is None

@@ -13,6 +13,7 @@ import pytest
 
 import identify
 from api.charts import model_charts, ramp_directions
+from api.charts.hover import on
 from api.charts.svg import svg, ticks
 from api.workers.pool import WORKER
 from api.workers.verbs import curves
@@ -89,8 +90,9 @@ def distance(found: dict[str, Any]) -> float:
 def test_both_directions_of_the_ramp_lie_on_the_curve_of_a_muscle_without_hysteresis() -> None:
     document, drawn = measured()
     found = ramp_directions.seen(document, drawn)
+    known = document["recruitment"]
     for points in found.values():
-        curve = [ramp_directions.on(document["recruitment"], width) for width in points["pulse_width_us"]]
+        curve = [on(width, known["pulse_width_us"], known["torque_nm"]) for width in points["pulse_width_us"]]
         assert np.abs(np.array(points["torque_nm"]) - curve).max() < 0.12
     assert abs(distance(found)) < 0.06
 

@@ -240,7 +240,8 @@ def test_each_step_says_what_it_sends_and_sends_nothing_else(tab: httpx.Client, 
     begin(tab, current_ma="9,5")
     page = tab.get(BEGIN).text
     assert "Wider: 10 µs at 9.5 mA" in page and "disabled>Again<" in page
-    seen = {"csrf": csrf(tab), "trains": "0"}
+    assert service.rig.calibration is not None
+    seen = {"csrf": csrf(tab), "trains": "0", "calibration": service.rig.calibration.calibration_id}
     assert tab.post(f"{BEGIN}/step/up", data=seen).status_code == 303
     assert "Wider: 20 µs at 9.5 mA" in tab.get(BEGIN).text
     late = tab.post(f"{BEGIN}/step/up", data=seen)
@@ -256,4 +257,6 @@ def test_every_button_that_stimulates_looks_like_it() -> None:
         count = len(re.findall(r"<button[^>]*class=\"[^\"]*stimulate", path.read_text("utf-8")))
         if count:
             with_class[path.name] = count
-    assert with_class == {"participant.html": 1, "calibration.html": 1, "question.html": 1, "why_section.html": 1}
+    assert with_class == {
+        "next.html": 1, "participant.html": 1, "calibration.html": 1, "question.html": 1, "why_details.html": 1,
+    }  # fmt: skip

@@ -41,22 +41,22 @@ def test_hidden_effect_is_found_added_and_approved_by_clicking(tab: Any, service
     tab.get_by_role("button", name="Upload and identify").click(timeout=PATIENCE_MS)
     tab.get_by_text("An effect is missing in this model").wait_for(timeout=PATIENCE_MS)
     first = tab.url.split("#")[0].split("?")[0]
-    tab.get_by_role("heading", name="Hysteresis of recruitment").wait_for()
+    tab.locator("#missing-recruitment_hysteresis").get_by_role("link", name="Hysteresis of recruitment").click()
     tab.locator("[data-figure=signature-recruitment_hysteresis] .main-svg").first.wait_for()
-    card = tab.locator("#effect-recruitment_hysteresis")
+    card = tab.locator("#missing-recruitment_hysteresis")
     assert "very probably missing" in card.inner_text()
+    tab.locator("summary", has_text="Where the error sits").click()
     assert tab.locator(".places li").count() >= 3, "the worst places are named"
     card.get_by_role("button", name="Add this effect").click()
     tab.locator("[data-figure=falling] .main-svg").first.wait_for(timeout=PATIENCE_MS)
     rows = tab.locator(".versions tbody tr")
-    assert rows.count() == 2 and rows.nth(1).inner_text().startswith("2. + recruitment hysteresis")
+    assert rows.count() == 2 and rows.nth(1).inner_text().startswith("2. + hysteresis of recruitment")
     assert error_of(rows.nth(1)) < 0.5 * error_of(rows.nth(0)), "the error falls to less than half on rows not seen"
     assert tab.url.split("#")[0] != first
     tab.get_by_role("link", name="Report").click()
     tab.get_by_role("heading", name="Muscle model of H1").wait_for()
-    assert tab.get_by_text("+ recruitment hysteresis").is_visible()
+    assert tab.get_by_text("+ hysteresis of recruitment").is_visible()
     tab.go_back()
-    tab.get_by_label("Reason").fill("follows the ramp both ways now")
     tab.get_by_label("Your password, once more").first.fill(PASSWORD)
     tab.get_by_role("button", name="Approve").click()
     tab.get_by_text("the controller gets this model").wait_for()

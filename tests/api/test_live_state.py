@@ -43,7 +43,7 @@ def every_page(service: Service, done: dict[str, Any]) -> list[str]:
     model = done["model_id"]
     paths = (
         "/", "/participants/E1", "/participants/E1/calibration", f"/tests/{done['id']}", f"/models/{model}?diagnose=0",
-        f"/compare?model={model}&model={model}", "/nothing-here", "/administration",
+        "/participants/E1/trend", "/nothing-here", "/administration",
     )  # fmt: skip
     return [service.url + path for path in paths]
 
@@ -71,7 +71,7 @@ def test_every_page_in_every_tab_follows_the_rig(tab: Any, service: Service, don
     assert start_button.count() == 0, "hidden while a test runs"
     pages[0].reload()
     row.get_by_text("running", exact=True).wait_for()
-    assert pages[1].get_by_role("link", name="the test of E1").get_attribute("href") == f"/tests/{test}"
+    assert pages[1].get_by_role("link", name="test of E1").get_attribute("href") == f"/tests/{test}"
     bring_to_rest(service)
     for page in pages:
         says(page, "No stimulation ready")

@@ -19,11 +19,17 @@ from alembic.runtime.migration import MigrationContext
 
 from api.errors import ApiError
 from api.store import Store, audit, migrations
-from api.store.tables import Approval, AuditEntry, Participant, Recording, Table
+from api.store.tables import Approval, AuditEntry, Participant, Recording, Table, User
 from tests.api.conftest import STUB, run_service, run_test
 
 ROOT = Path(__file__).parents[2]
 OLD = Path(__file__).parent / "databases"
+ADDED_SINCE = [
+    ("approvals", "expires_utc"), ("recordings", "warnings"), ("participants", "side"), ("participants", "muscle"),
+    ("participants", "archived_utc"), ("tests", "ran_by"), ("models", "carried_from_id"), ("models", "carried"),
+    ("page_sessions", "acted_unix_s"), ("page_sessions", "locked_unix_s"),
+]  # fmt: skip
+"""Columns that the tables of a first database did not have."""
 NEWER = "UPDATE alembic_version SET version_num = '0900'"
 
 
@@ -57,7 +63,7 @@ def test_a_new_database_is_at_the_newest_revision_and_holds_the_tables_of_today(
         assert database.execute("SELECT version_num FROM alembic_version").fetchone() == (migrations.NEWEST,)
 
 
-@pytest.mark.parametrize("name", ["unversioned", "2", "3", "4"])
+@pytest.mark.parametrize("name", ["unversioned", "2", "3", "4", "5"])
 def test_a_database_of_each_older_version_is_upgraded_and_keeps_its_rows(tmp_path: Path, name: str) -> None:
     path = old(tmp_path / "stimrig.db", name)
     for _ in range(2):  # the second time there is nothing to do
@@ -69,6 +75,12 @@ def test_a_database_of_each_older_version_is_upgraded_and_keeps_its_rows(tmp_pat
         entries = store.all(AuditEntry)
         assert len(entries) == 1 and audit.first_broken(entries) is None
         store.close()
+
+
+def test_the_names_of_people_who_are_there_are_folded(tmp_path: Path) -> None:
+    store = Store(f"sqlite:///{old(tmp_path / 'stimrig.db', '5')}")
+    assert [(row.name, row.folded_name) for row in store.all(User)] == [("Jörg  MÜLLER", "jörg müller")]
+    store.close()
 
 
 def test_what_an_unversioned_database_lacks_or_has_already_makes_no_difference(tmp_path: Path) -> None:
@@ -102,8 +114,8 @@ def test_a_service_goes_on_with_an_older_database(tmp_path: Path, short_dir: Pat
             http.post(f"/v1/models/{model}/approve", json={"reason": "good"})
     change(
         tmp_path / "stimrig.db", "DROP TABLE alembic_version", "DROP TABLE schema_version", "DROP TABLE confirmations",
-        "DROP TABLE known_places", "DROP TABLE users", "ALTER TABLE approvals DROP COLUMN expires_utc",
-        "ALTER TABLE recordings DROP COLUMN warnings",
+        "DROP TABLE known_places", "DROP TABLE users", "DROP TABLE notes",
+        *(f"ALTER TABLE {table} DROP COLUMN {column}" for table, column in ADDED_SINCE),
     )  # fmt: skip
     for service in run_service(tmp_path, short_dir, STUB):
         assert httpx.get(f"{service.url}/health", timeout=60).json()["database"] == "ok"

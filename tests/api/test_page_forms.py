@@ -15,7 +15,10 @@ from tests.api.conftest import STUB, TOKEN, Service, run_service, run_test
 HTML = {"Accept": "text/html"}
 NAMES = (
     "csrf", "code", "file", "reason", "effect", "force", "back", "name", "password", "token", "next", "role", "days",
-    "current_ma", "step_us", "max_pulse_width_us", "max_torque_nm", "version", "trains", "right",
+    "current_ma", "step_us", "max_pulse_width_us", "max_torque_nm", "version", "trains",
+    "calibration", "shown_us", "right",
+    "archived", "at", "colours", "kind", "language", "muscle", "now", "q", "ran_by", "secret", "side",
+    "test_id", "text", "username",
 )  # fmt: skip
 """Every field of every form; `test_no_field_is_forgotten` looks."""
 ODD = [
@@ -65,7 +68,14 @@ def known(service: Service) -> dict[str, str]:
         client.post("/v1/participants", json={"code": "P017"})
         test = run_test(client, "P017")
         client.post("/v1/participants/P017/calibration")
-    return {"code": "P017", "model_id": test["model_id"], "direction": "up", "threshold": "sensory", "job_id": "none"}
+    return {
+        "code": "P017",
+        "model_id": test["model_id"],
+        "direction": "up",
+        "threshold": "sensory",
+        "job_id": "none",
+        "test_id": test["id"],
+    }
 
 
 def posts() -> list[str]:

@@ -28,7 +28,8 @@ PASSWORD = "correct horse battery"
 OPEN_V1 = {("POST", "/v1/sessions"), ("GET", "/v1/schemas"), ("GET", "/v1/schemas/{name}")}
 OPEN_PAGES = {
     ("GET", "/"), ("GET", "/sign-in"), ("POST", "/sign-in"), ("GET", "/static/{name}"), ("GET", "/health"),
-    ("GET", "/metrics"), ("GET", "/rig/now"), ("GET", "/stopped/{key}"), ("GET", "/docs"),
+    ("GET", "/metrics"), ("GET", "/rig/now"), ("GET", "/stopped/{key}"), ("GET", "/docs"), ("POST", "/language"),
+    ("POST", "/colours"),
 }  # fmt: skip
 """Signing in is for those who are not yet signed in."""
 

@@ -9,6 +9,7 @@ from typing import Any
 import httpx
 import pytest
 
+from api.sessions import runner
 from tests.api.conftest import Service, run_test, wait_done
 
 GOOD_HEADER = "time_s,pulse_width_us,torque_nm,segment\n"
@@ -121,12 +122,17 @@ def test_rig_that_dies_in_a_test_ends_the_test(client: httpx.Client, service: Se
     assert client.get("/v1/rig").json()["holder"] is None
 
 
-def test_rig_that_does_not_answer_a_start_is_stopped(client: httpx.Client, service: Service, participant: str) -> None:
-    service.app.state.context.rig.patience_s = 0.5
-    service.rig.mute = True
-    problem(client.post("/v1/tests", json={"participant": participant}), 503)
-    service.rig.mute = False
+def test_rig_that_does_not_answer_a_start_is_stopped(
+    client: httpx.Client, service: Service, participant: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It may have heard the command: nothing plays on that nobody follows."""
+    monkeypatch.setattr(runner, "ANSWER_S", 0.5)
+    service.rig.ignores_starts = True
+    answer = problem(client.post("/v1/tests", json={"participant": participant}), 503)
+    assert answer["type"] == "/problems/rig-unreachable"
+    assert (service.rig.state, service.rig.reason) == ("latched", "stopped by service")
     assert client.get("/v1/rig").json()["holder"] is None
+    assert client.get("/v1/tests").json()[0]["state"] == "refused"
 
 
 def test_upload_of_another_tools_csv(client: httpx.Client, participant: str) -> None:

@@ -32,7 +32,7 @@ def stops(service: Service) -> int:
 def test_a_stopped_tests_page_shows_what_was_recorded(tab: Any, service: Service) -> None:
     participant(tab, service, f"W{time.time_ns() % 10**9}")
     start(tab)
-    tab.locator("#segment", has_text="prbs").wait_for(timeout=60_000)
+    tab.locator("#segment", has_text="Random pulses").wait_for(timeout=60_000)
     test_page = tab.url
     tab.get_by_role("button", name="Stop stimulation").click()
     tab.get_by_role("heading", name=re.compile(r"Stopped at \d\d:\d\d:\d\d")).wait_for()

@@ -29,7 +29,7 @@ def test_settings_name_effects_separated_by_commas(monkeypatch: pytest.MonkeyPat
     assert Settings().structure == ("fatigue", "threshold_drift")
 
 
-def test_first_model_of_a_new_participant_has_the_sites_structure_and_later_ones_keep_it(site: Service) -> None:
+def test_models_have_the_sites_structure_until_one_is_approved(site: Service) -> None:
     settings = site.app.state.context.settings
     with site.client() as client:
         client.post("/v1/participants", json={"code": "P1"})
@@ -40,12 +40,13 @@ def test_first_model_of_a_new_participant_has_the_sites_structure_and_later_ones
         assert "fatigue" not in [entry["effect"] for entry in own["missing"]]
         rows = client.post(f"/v1/models/{first['id']}/improve").json()["versions"]
         assert [row["parent_id"] for row in rows] == [None, first["id"]]
-        settings.structure = ()
+        client.post(f"/v1/models/{first['id']}/approve")
+        settings.structure = ("threshold_drift",)
         assert client.get(f"/v1/models/{run_test(client, 'P1')['model_id']}").json()["effects"] == ["fatigue", "tremor"]
         client.post("/v1/participants", json={"code": "P2"})
-        assert client.get(f"/v1/models/{run_test(client, 'P2')['model_id']}").json()["effects"] == []
+        assert run_test(client, "P2")["fit"]["effects"] == ["threshold_drift"]
         settings.structure = ("fatigue",)
-        assert client.get(f"/v1/models/{run_test(client, 'P2')['model_id']}").json()["effects"] == []
+        assert run_test(client, "P2")["fit"]["effects"] == ["fatigue"]
         client.post("/v1/participants", json={"code": "P3"})
         csv = "time_s,pulse_width_us,torque_nm,segment\n0,0,0,rest\n"
         taken = client.post("/v1/participants/P3/recordings", content=csv).json()

@@ -280,12 +280,29 @@ def test_verdict_on_this_model_in_words() -> None:
     assert shown("nothing_missing", [], [], 1.0)["title"] == "Nothing is missing: what is left is noise"
     assert shown("nothing_missing", [], [], 2.0)["kind"] == "unsure"
     strange = shown("unexplained_structure", [], [], 5)
-    assert strange["kind"] == "unexplained" and "falling ramp, 120-180 µs" in strange["words"]
+    assert strange["kind"] == "unexplained" and "Ramp, pulse width falling, 120–180 µs" in strange["words"]
+
+
+def test_a_page_that_says_that_structure_is_left_does_not_say_that_it_is_noise() -> None:
+    quiet = {"noise_sd_nm": 0.04, "rms_nm": 0.04}
+    diagnosis = {"verdict": "nothing_missing", "missing": [], "noise_sd_nm": 0.04, "where": []}
+    assert explanation.headline(diagnosis, [], quiet, [])["kind"] == "nothing"
+    checked = explanation.headline(diagnosis, [], quiet, [], leaves_structure=True)
+    assert checked["kind"] == "unsure" and checked["title"].startswith("No effect of the library has enough evidence")
+
+
+def test_only_what_is_likely_missing_is_advised() -> None:
+    """A person who adds whatever is possible ends with a model that is no better on new pulses."""
+    sure, perhaps = FATIGUE, {**FATIGUE, "effect": "tremor", "name": "Tremor", "probability": 0.45}
+    assert shown("effect_missing", [sure, perhaps], [], 6)["likely"] == ["Fatigue"]
+    found = shown("effect_missing", [perhaps], [], 6)
+    assert found["likely"] == [] and "possibly missing" in found["title"] and len(found["missing"]) == 1
 
 
 def test_place_is_named_without_repeating_its_share() -> None:
     found = explanation.place(PLACE, 3)
-    assert found["words"] == WORDS and found["percent"] == 31
+    assert found["words"] == "Ramp, pulse width falling, 120–180 µs: model too high by 0.4 N·m"
+    assert found["text"].startswith(WORDS) and found["percent"] == 31
 
 
 def test_page_shows_the_diagnosis_adds_by_a_form_and_shows_the_fall(service: Service, model: str) -> None:
@@ -293,11 +310,12 @@ def test_page_shows_the_diagnosis_adds_by_a_form_and_shows_the_fall(service: Ser
     with signed_in(service) as browser:
         text = browser.get(f"/models/{model}").text
         for words in (
-            "Why does it fail?",
+            "What is missing",
             "Fatigue",
             "93 %",
             "This recording cannot tell it apart from",
             "Run it now",
+            "Random pulses, pulse width falling, 0–300 µs",
             "falling prbs",
         ):
             assert words in text, words
@@ -381,4 +399,4 @@ def test_real_worker_finds_what_is_missing_and_the_page_shows_it(tmp_path: Path)
     assert 1000 < len(compared["series"]["time_s"]) <= 2400
     view = explanation.view(found, compared, [])
     assert [entry["effect"] for entry in view["missing"]] == ["asymmetric_relaxation"]
-    assert {split["title"] for split in view["splits"]} == set(explanation.SPLITS.values())
+    assert {split["title"] for split in view["splits"]} == {str(title) for title in explanation.SPLITS.values()}

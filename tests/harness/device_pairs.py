@@ -121,8 +121,8 @@ def says_nothing_when_killed(bench: Bench, client: RigClient) -> float:
     """The host's death ends stimulation at once: each pulse was a command. Then uncertain, asked, not resumed."""
     holding(bench, client, "killed")
     assert bench.rig is not None
-    died_s = time.monotonic()
     kill_hard(bench.rig)
+    died_s = time.monotonic()
     time.sleep(1.5 / bench.speed)  # longer than any device's own watchdog
     after = felt(bench)
     assert after[-1]["monotonic_s"] - died_s < 0.03

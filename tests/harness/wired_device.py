@@ -14,10 +14,12 @@ from hardware_sim.stimulators.sciencemode2 import encode as encode2
 from hardware_sim.timeline import Timeline
 from rig.clock import VirtualClock
 from rig.devices import p24, rehastim2
+from rig.errors import DeviceError
 from rig.signals import LateError
 from rig.wire import sciencemode2, sciencemode4
 from rig.wire.framing import Packet
 
+LOST = "stimulator: the line is gone"
 QUICK_S, STALL_S, STALLS = 0.0008, 0.3, 0.02
 """A byte's usual way, the longest stall, and how often one begins."""
 
@@ -39,7 +41,8 @@ class WiredDevice:
     It stands where the driver's own serial line does, and has the methods of one that the driver uses for pulses.
     """
 
-    def __init__(self, name: str, clock: VirtualClock, rng: np.random.Generator) -> None:
+    def __init__(self, name: str, clock: VirtualClock, rng: np.random.Generator, stalls: float = STALLS) -> None:
+        self._stalls, self._is_lost = stalls, False
         self.last_written_s = clock.now_s()
         self._clock, self._rng = clock, rng
         self._timeline, self._began_s = Timeline(), clock.now_s()
@@ -72,29 +75,41 @@ class WiredDevice:
         """As `PacketLine.tell`."""
         if latest_s is not None and not (self._clock.now_s() <= latest_s):
             raise LateError
+        if self._is_lost:
+            raise DeviceError(LOST)
         self._number = (self._number + 1) % self._numbers
         frame = make(self._number)
         self.last_written_s = self._clock.now_s()
         self._carry(0, lambda: self._receive(frame))
         return self._number
 
-    def ask(self, make: Callable[[int], bytes], _name: str, answer: int, _timeout_s: float) -> Packet:
+    def ask(self, make: Callable[[int], bytes], name: str, answer: int, _timeout_s: float) -> Packet:
         """As `PacketLine.ask`, with all the time it takes."""
         number = self.tell(make)
-        self._clock.wait(self._clock.now_s() + 2.5 * STALL_S)
-        return self._answered.pop((number, answer))
+        self._clock.wait(self._clock.now_s() + (2.5 * STALL_S if self._stalls else 10 * QUICK_S))
+        packet = self._answered.pop((number, answer), None)
+        if packet is None:
+            raise DeviceError(LOST if self._is_lost else f"stimulator: no answer to {name}")
+        return packet
 
     def discard(self) -> None:
         """What was written is in the line, not in this computer."""
 
     def on_lost(self, _: Callable[[str], None]) -> None:
-        """It is never lost."""
+        """`lose` is told to the rig by who calls it."""
+
+    def lose(self) -> None:
+        """Pull the plug: nothing more is written, and what the line holds does not arrive."""
+        self._is_lost = True
+
+    def close(self) -> None:
+        """Nothing to close."""
 
     def _carry(self, way: int, arrive: Callable[[], None]) -> None:
-        stalls = self._rng.random() < STALLS
+        stalls = self._rng.random() < self._stalls
         delay_s = self._rng.uniform(0.0, STALL_S if stalls else QUICK_S)
         self._arrives_s[way] = max(self._arrives_s[way], self._clock.now_s() + delay_s)
-        self._clock.call_at(self._arrives_s[way], arrive)
+        self._clock.call_at(self._arrives_s[way], lambda: None if self._is_lost else arrive())
 
     def _receive(self, frame: bytes) -> None:
         self._timeline.run_until(self._clock.now_s() - self._began_s)

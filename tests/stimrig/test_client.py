@@ -122,3 +122,13 @@ def test_documents_have_the_keys_of_the_openapi_document() -> None:
     pairs = {Version: VersionOut, Job: JobOut, SessionTest: TestOut, Participant: ParticipantOut}
     for document, model in pairs.items():
         assert set(document.__annotations__) == set(model.model_fields)
+
+
+def test_who_ran_a_test_and_what_is_not_under_way(client: Client) -> None:
+    test = client.run_test("P017")
+    assert client.set_ran_by(test["id"], "Jörg Müller")["ran_by"] == "Jörg Müller"
+    assert client.set_ran_by(test["id"], None)["ran_by"] == "administrator"
+    with pytest.raises(errors.Conflict, match="No structure is being carried over"):
+        client.keep_plain(test["id"])
+    with pytest.raises(errors.Conflict, match="nothing to lock"):
+        client.lock()

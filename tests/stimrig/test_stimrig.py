@@ -40,7 +40,7 @@ def test_importing_it_loads_no_library() -> None:
 
 
 def test_names_are_those_of_the_contract() -> None:
-    assert set(stimrig.__all__) == NAMES | {"errors"}
+    assert set(stimrig.__all__) == NAMES | {"carry", "errors"}
     assert all(callable(getattr(stimrig, name)) for name in NAMES)
     with pytest.raises(AttributeError, match="no attribute 'fitt'"):
         stimrig.fitt  # noqa: B018

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from rig import align, archive
+from rig.signals import PulseStatus
 from tests.harness.processes import Bench, RigClient, control, default_plan, short_plan
 
 pytestmark = pytest.mark.wire
@@ -44,7 +45,8 @@ def check_recording(bench: Bench, event: dict[str, Any]) -> None:
         sent = file["pulses/sent_pulse_width_us"][:]
         acknowledged = status == 0
         assert np.array_equal(status == 1, planned == 0)
-        assert np.mean(acknowledged[planned > 0]) > 0.98  # a busy machine may drop a late one
+        assert np.mean(acknowledged[planned > 0]) > 0.9  # a busy machine drops late ones, and does nothing else
+        assert set(status) <= {PulseStatus.ACKNOWLEDGED, PulseStatus.REST, PulseStatus.DROPPED}
         assert np.array_equal(sent[acknowledged], np.trunc(planned[acknowledged]))
         felt = fired(bench)
         assert [p["width_us"] for p in felt] == list(sent[acknowledged])

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
+from api.cli.errors import InputError
 from api.cli.terminal import (
     ColumnMap,
     Data,
     Json,
+    carried_lines,
+    load_model,
     load_record,
     model_report,
     names,
@@ -19,6 +22,8 @@ from api.cli.terminal import (
     write_model,
 )
 from api.progress_bar import progress_bar
+
+METHOD = "maximum-likelihood"
 
 
 def register(app: typer.Typer) -> None:
@@ -31,7 +36,7 @@ def fit(
     method: Annotated[
         str,
         typer.Option(help="maximum-likelihood, two-stage, ramp-deconvolution, separable-least-squares or narx"),
-    ] = "maximum-likelihood",
+    ] = METHOD,
     effects: Annotated[
         str,
         typer.Option(
@@ -45,6 +50,15 @@ def fit(
             help="segments to fit on, comma-separated, never `validate`; default: all others, or what the method needs"
         ),
     ] = "",
+    carry: Annotated[
+        Path | None,
+        typer.Option(
+            help="fit this earlier model's structure, too, with those of its effects that DATA asks for; the result is "
+            "the better one of it and the plain structure. Not with --method, --effects, --fit-on",
+            metavar="MODEL.json",
+            show_default=False,
+        ),
+    ] = None,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="write MODEL.json, or MODEL.mat")] = None,
     columns: ColumnMap = None,
     as_json: Json = False,
@@ -52,14 +66,23 @@ def fit(
     """Identify a model: recruitment curve, linear dynamics, effects. Says how well it fits and whether it is usable."""
     import identify
 
+    if carry is not None and (method != METHOD or effects or fit_on):
+        raise InputError("--carry takes the structure of its MODEL.json. Leave out --method, --effects and --fit-on.")
+    earlier = None if carry is None else load_model(carry)
     record = load_record(data, columns)
+    found: dict[str, Any] | None = None
     with progress_bar() as progress:
-        model = identify.fit(
-            record, method=method, effects=names(effects), fit_on=names(fit_on) or None, progress=progress
-        )
+        if earlier is None:
+            model = identify.fit(
+                record, method=method, effects=names(effects), fit_on=names(fit_on) or None, progress=progress
+            )
+        else:
+            carried = identify.carry(record, earlier, progress)
+            found = carried.finding()
+            model = carried.model.with_(extra=carried.model.extra | {"carried": found})
     if output is not None:
         write_model(output, model)
     if as_json:
         say_json(model.to_dict())
         return
-    say(*model_report(model.to_dict()), *([f"written to     {output}"] if output else []))
+    say(*model_report(model.to_dict()), *carried_lines(found), *([f"written to     {output}"] if output else []))

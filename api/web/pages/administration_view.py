@@ -9,10 +9,10 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Form, Request
 from fastapi.responses import PlainTextResponse, RedirectResponse, Response
 
+from api.language import lazy
 from api.people.auth import Scope
 from api.store import audit
 from api.store.tables import AuditEntry
-from api.structure import in_words
 from api.web.dependencies import Administrator, Context, Ctx
 from api.web.pages import typed
 from api.web.pages.checked import checked
@@ -28,11 +28,11 @@ ROLES = {
     "reader": [Scope.READ_LIVE, Scope.READ_MODEL],
     "administrator": [Scope.ADMINISTER],
 }
-MAY = {
-    "clinician": "runs tests, approves models",
-    "operator": "runs tests; approves nothing",
-    "reader": "looks on; may stop, like everyone",
-    "administrator": "everything",
+MAY: dict[str, Any] = {
+    "clinician": lazy("runs tests, approves models"),
+    "operator": lazy("runs tests; approves nothing"),
+    "reader": lazy("looks on; may stop, like everyone"),
+    "administrator": lazy("everything"),
 }
 
 
@@ -56,7 +56,7 @@ async def shown(request: Request, context: Context, key: dict[str, Any] | None =
         }
 
     found = await asyncio.to_thread(gather)
-    structure = in_words(context.settings.structure)
+    structure = context.settings.structure
     return page(
         request, "administration.html", **found, key=key, roles=MAY, now_utc=context.clock.utc(), structure=structure
     )

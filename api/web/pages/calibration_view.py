@@ -1,14 +1,19 @@
-"""The guided calibration on the page: plain forms, at the participant's pace; works with scripts off."""
+"""The guided calibration on the page: plain forms, at the participant's pace; works with scripts off.
+
+What goes wrong is said on the page itself, above the buttons, with the calibration as it stands now.
+"""
 
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Awaitable
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Form, Request
 from fastapi.responses import RedirectResponse, Response
 
 from api.errors import ApiError
+from api.language import lazy
 from api.sessions import profiles
 from api.sessions.questions import Question, Row
 from api.sessions.requests import CalibrationIn, MarkIn, StepIn
@@ -18,15 +23,23 @@ from api.web.pages import typed
 from api.web.pages.checked import checked
 from api.web.pages.render import page
 from api.web.routes import calibration, participants
+from api.web.routes.calibration import Shown
 from rig.messages import Status
 
 router = APIRouter(include_in_schema=False, prefix="/participants/{code}/calibration")
+Seen = Annotated[str, Form(alias="calibration")]
+"""Id of the calibration that the page shows; a form without it has shown none, and changes none."""
+Trains = Annotated[str, Form()]
+"""How many trains the page knows of."""
 DEFAULTS = CalibrationIn.model_validate({})
 MARKS = {
-    "sensory": ("It is felt", "the narrowest pulse the participant feels"),
-    "motor": ("The muscle moves", "the narrowest pulse at which the muscle visibly moves"),
-    "comfort": ("As strong as is comfortable", "no pulse of today's tests will be wider"),
+    "sensory": (lazy("It is felt"), lazy("the narrowest pulse the participant feels")),
+    "motor": (lazy("The muscle moves"), lazy("the narrowest pulse at which the muscle visibly moves")),
+    "comfort": (lazy("As strong as is comfortable"), lazy("no pulse of today's tests will be wider")),
 }
+LAST = {"sensory": "sensory_pulse_width_us", "motor": "motor_pulse_width_us", "comfort": "max_pulse_width_us"}
+FINE_US = (1.0, 25.0)
+"""The narrowest and the widest fine step where the rig has not said."""
 
 
 @router.get("")
@@ -37,9 +50,9 @@ async def show(request: Request, context: Ctx, _who: Tester, code: str) -> Respo
 
 async def shown(
     request: Request, context: Context, code: str, texts: dict[str, str] | None = None,
-    errors: dict[str, str] | None = None,
+    errors: dict[str, str] | None = None, problem: ApiError | None = None,
 ) -> Response:  # fmt: skip
-    """The page, with the form as it was sent where something was wrong with it."""
+    """The page, with the form as it was sent where something was wrong with it, and what just went wrong."""
     row = await asyncio.to_thread(participants.find, context, code)
     try:
         found: dict[str, Any] | None = await calibration.standing(context, code)
@@ -49,12 +62,38 @@ async def shown(
         found = None
     own = {"current_ma": typed.shown(row.profile["current_ma"]), "step_us": typed.shown(DEFAULTS.step_us)}
     limits = context.rig.status.limits if context.rig.status else {}
+    low_us, high_us = fine_range(context.rig.status)
+    status = problem.status if problem else 422 if errors else 200
     return page(
-        request, "calibration.html", 422 if errors else 200,
-        participant=row, found=found, marks=MARKS,
+        request, "calibration.html", status,
+        participant=row, found=found, marks=MARKS, last=last(row), problem=problem,
         texts=texts or own, errors=errors or {},
-        help={"current_ma": profiles.takes("current_ma", limits), "step_us": "1 to 25 µs"},
+        help={"current_ma": profiles.takes("current_ma", limits), "step_us": f"{low_us:g} to {high_us:g} µs"},
     )  # fmt: skip
+
+
+def last(row: Participant) -> dict[str, float]:
+    """Marks of the participant's last calibration, µs; empty where there is none."""
+    if row.profile.get("sensory_pulse_width_us") is None:
+        return {}
+    return {name: row.profile[field] for name, field in LAST.items()}
+
+
+def fine_range(status: Status | None) -> tuple[float, float]:
+    """The narrowest and the widest fine step of this rig, µs."""
+    bound = status.limits.get("calibration_step_us") if status else None
+    if bound is None or bound.lo is None or bound.hi is None:
+        return FINE_US
+    return bound.lo, bound.hi
+
+
+async def attempt(request: Request, context: Context, code: str, done: Awaitable[Any], leads: str) -> Response:
+    """Do it and go on; what the rig or the service refuses is said on the page."""
+    try:
+        await done
+    except ApiError as error:
+        return await shown(request, context, code, problem=error)
+    return RedirectResponse(leads, 303)
 
 
 @router.post("")
@@ -66,7 +105,7 @@ async def begin(request: Request, context: Ctx, who: Tester, code: str) -> Respo
     values, errors = read(texts, row, context.rig.status)
     if errors:
         return await shown(request, context, code, texts, errors)
-    body, seen = checked(CalibrationIn, **values), profiles.version(row.profile)
+    body, seen = checked(CalibrationIn, **values, large_steps=True), profiles.version(row.profile)
 
     async def open_it() -> str:
         await calibration.begin(context, code, body, who.name, seen)
@@ -74,7 +113,7 @@ async def begin(request: Request, context: Ctx, who: Tester, code: str) -> Respo
 
     doubts = profiles.jumps(row.profile, {**row.profile, "current_ma": values["current_ma"]})
     if not doubts:
-        return RedirectResponse(await open_it(), 303)
+        return await attempt(request, context, code, open_it(), address(code))
     current = f"{values['current_ma']:g} mA"
     question = Question(
         participant=code,
@@ -83,7 +122,7 @@ async def begin(request: Request, context: Ctx, who: Tester, code: str) -> Respo
         action=open_it,
         rows=[
             Row("Current of every pulse", current, f"{row.profile['current_ma']:g} mA"),
-            Row("One step", f"{values['step_us']:g} µs"),
+            Row("Fine step", f"{values['step_us']:g} µs"),
         ],
         warnings=doubts,
         back=address(code),
@@ -101,8 +140,9 @@ def read(
             values[name] = typed.number(text)
         except ValueError as error:
             errors[name] = str(error)
-    if "step_us" in values and not (1 <= values["step_us"] <= 25):
-        errors["step_us"] = f"{texts['step_us']!r} is not 1 to 25 µs"
+    low_us, high_us = fine_range(status)
+    if "step_us" in values and not (low_us <= values["step_us"] <= high_us):
+        errors["step_us"] = f"{texts['step_us']!r} is not {low_us:g} to {high_us:g} µs"
     current = {name: value for name, value in values.items() if name == "current_ma"}
     limits = {name: bound for name, bound in (status.limits if status else {}).items() if name == "current_ma"}
     for name, words in profiles.outside(current, row.profile, limits).items():
@@ -112,45 +152,44 @@ def read(
 
 @router.post("/step/{direction}")
 async def step(
-    context: Ctx, _who: Tester, code: str, direction: str, trains: Annotated[str | None, Form()] = None
-) -> Response:
-    """Play one train; `trains`, how many the page knew of, says whether the train is still the one on its button."""
-    wanted = checked(StepIn, direction=direction).direction
-    if trains is not None:
-        found = await calibration.standing(context, code)
-        if trains != str(len(found["trains"])):
-            detail = "Another train was sent after this page was shown. Nothing was sent now. Go back and check."
-            raise ApiError(409, "not-what-was-seen", "This page is out of date", detail)
-    await calibration.step(context, code, wanted)
-    return back(code)
+    request: Request, context: Ctx, _who: Tester, code: str, direction: str,
+    trains: Trains = "", seen: Seen = "",
+    shown_us: Annotated[float | None, Form()] = None,
+) -> Response:  # fmt: skip
+    """Play one train; `trains`, how many the page knew of, and the width on the button say whether both still hold."""
+    body = checked(StepIn, direction=direction, shown_us=shown_us)
+
+    done = calibration.step(context, code, body, Shown(seen, trains))
+    return await attempt(request, context, code, done, address(code))
 
 
 @router.post("/mark/{threshold}")
-async def mark(context: Ctx, who: Tester, code: str, threshold: str) -> Response:
+async def mark(
+    request: Request, context: Ctx, who: Tester, code: str, threshold: str,
+    trains: Trains = "", seen: Seen = "",
+) -> Response:  # fmt: skip
     """Mark the last train's width."""
-    await calibration.mark(context, code, checked(MarkIn, threshold=threshold).threshold, who.name)
-    return back(code)
+    wanted = checked(MarkIn, threshold=threshold).threshold
+    done = calibration.mark(context, code, wanted, who.name, Shown(seen, trains))
+    return await attempt(request, context, code, done, address(code))
 
 
 @router.post("/finish")
-async def finish(context: Ctx, who: Tester, code: str) -> Response:
+async def finish(
+    request: Request, context: Ctx, who: Tester, code: str, trains: Trains = "", seen: Seen = ""
+) -> Response:  # fmt: skip
     """Take over what was found."""
-    await calibration.finish(context, code, False, who.name)
-    return RedirectResponse(f"/participants/{code}", 303)
+    done = calibration.finish(context, code, False, who.name, Shown(seen, trains))
+    return await attempt(request, context, code, done, f"/participants/{code}")
 
 
 @router.post("/discard")
-async def discard(context: Ctx, who: Tester, code: str) -> Response:
-    """Leave everything as it was."""
-    await calibration.finish(context, code, True, who.name)
-    return RedirectResponse(f"/participants/{code}", 303)
+async def discard(request: Request, context: Ctx, who: Tester, code: str, seen: Seen = "") -> Response:
+    """Leave everything as it was; however many trains were sent."""
+    done = calibration.finish(context, code, True, who.name, Shown(seen))
+    return await attempt(request, context, code, done, f"/participants/{code}")
 
 
 def address(code: str) -> str:
     """The calibration's page."""
     return f"/participants/{code}/calibration"
-
-
-def back(code: str) -> Response:
-    """To the calibration's page."""
-    return RedirectResponse(address(code), 303)

@@ -1,88 +1,124 @@
-"""Any two models or sessions of a participant, side by side: curves, figures, each against the other's recording."""
+"""Two to six models or sessions of a participant, side by side: curves, figures, and how far each is from one."""
 
 from __future__ import annotations
 
 import asyncio
-import json
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import Response
 
-from api.charts.model_charts import MODEL, STIMULUS, axis, band, band_of, layout, line
+from api import language
+from api.charts import compare_charts
+from api.charts.compare_charts import MOST
 from api.errors import ApiError
-from api.models import summary
+from api.models import changes, stored, trend_words
+from api.models.trend import Session
 from api.store.tables import Model
 from api.web.dependencies import Context, Ctx, ModelReader
 from api.web.pages.render import page
 
 router = APIRouter(include_in_schema=False)
-COLOURS = (MODEL, STIMULUS)
-FILLS = ("rgba(11,107,117,.15)", "rgba(180,105,14,.15)")
 
 
 @router.get("/compare")
 async def compare(
-    request: Request, context: Ctx, _who: ModelReader, model: Annotated[list[str] | None, Query()] = None
+    request: Request,
+    context: Ctx,
+    _who: ModelReader,
+    model: Annotated[list[str] | None, Query()] = None,
+    reference: str = "",
 ) -> Response:
-    """Two models of one participant."""
-    if model is None or len(model) != 2:
-        detail = f"{len(model or [])} are chosen. Go back and choose two models of the participant."
-        raise ApiError(422, "two-models", "Choose two models to compare", detail)
-    rows = [await asyncio.to_thread(context.versions.get, model_id) for model_id in model]
-    if rows[0].participant != rows[1].participant:
-        detail = f"{rows[0].id} is of {rows[0].participant}, {rows[1].id} of {rows[1].participant}."
+    """Models of one participant, the oldest first; differences are to `reference`, or to the oldest."""
+    rows = await chosen(context, list(dict.fromkeys(model or [])))
+    participant = rows[0].participant
+    sessions = await context.trend.of_models(participant, [row.id for row in rows])
+    at = next((number for number, row in enumerate(rows) if row.id == reference), 0)
+    sides = await asyncio.gather(*(side(context, rows, number) for number in range(len(rows))))
+    names = [language.when(row.created_utc) for row in rows]
+    documents = [stored.read(row) for row in rows]
+    return page(
+        request,
+        "compare.html",
+        participant=participant,
+        sides=sides,
+        reference=at,
+        table=table(sessions, at),
+        doubts=[
+            (names[number], trend_words.doubted(sessions[at].state(), one.state()))
+            for number, one in enumerate(sessions)
+            if number != at
+        ],
+        figures={
+            "recruitment": compare_charts.recruitment(documents, names),
+            "step": compare_charts.step([one["curves"] for one in sides], names),
+        },
+    )
+
+
+async def chosen(context: Context, ids: list[str]) -> list[Model]:
+    """The models, the oldest first; 422 where they are too few, too many, or of different participants."""
+    if not 2 <= len(ids) <= MOST:
+        detail = f"{len(ids)} are chosen. Go back and choose 2 to {MOST} models of the participant."
+        raise ApiError(422, "two-models", "Choose two models or more to compare", detail)
+    rows = [await asyncio.to_thread(context.versions.get, model_id) for model_id in ids]
+    other = next((row for row in rows if row.participant != rows[0].participant), None)
+    if other is not None:
+        detail = f"{rows[0].id} is of {rows[0].participant}, {other.id} of {other.participant}."
         raise ApiError(422, "two-participants", "The models are of different participants", detail)
-    rows.sort(key=lambda row: row.created_utc)
-    sides = await asyncio.gather(*(side(context, row, other) for row, other in zip(rows, rows[::-1], strict=True)))
-    documents = [json.loads(row.document) for row in rows]
-    figures = {"recruitment": recruitment(documents), "step": step([side["curves"] for side in sides])}
-    return page(request, "compare.html", sides=sides, participant=rows[0].participant, figures=figures)
+    return sorted(rows, key=lambda row: row.created_utc)
 
 
-async def side(context: Context, row: Model, other: Model) -> dict[str, Any]:
-    """One model's figures, and its error on the other one's recording."""
-    document = json.loads(row.document)
+async def side(context: Context, rows: Sequence[Model], number: int) -> dict[str, Any]:
+    """One model; of two, also its error on the other one's recording."""
+    row = rows[number]
     found: dict[str, Any] = {
         "model": await asyncio.to_thread(context.versions.document, row),
-        "recruitment": summary.recruitment(document),
-        "dynamics": summary.dynamics(document),
+        "style": compare_charts.style(number),
         "curves": None,
         "elsewhere": None,
-        "same_recording": row.recording_id == other.recording_id,
+        "problem": None,
     }
     try:
         found["curves"] = await context.analyses.curves(row)
-        if not found["same_recording"]:
-            found["elsewhere"] = await context.analyses.comparison(row, other.recording_id)
+        if len(rows) == 2 and rows[0].recording_id != rows[1].recording_id:
+            found["elsewhere"] = await context.analyses.comparison(row, rows[1 - number].recording_id)
     except ApiError as error:
         found["problem"] = error
     return found
 
 
-def recruitment(documents: list[dict[str, Any]]) -> dict[str, Any]:
-    """Both recruitment curves with their bands."""
-    data: list[dict[str, Any]] = []
-    for document, name, colour, fill in zip(documents, ("earlier", "later"), COLOURS, FILLS, strict=True):
-        known = band_of(document, "recruitment")
-        if known:
-            pair = band(known["pulse_width_us"], known["whole_lower"], known["whole_upper"])
-            pair[1] |= {"fillcolor": fill, "name": "", "showlegend": False}
-            data += pair
-        curve = document["recruitment"]
-        data.append(line(curve["pulse_width_us"], curve["torque_nm"], name, colour, 2.4))
-    return {
-        "data": data,
-        "layout": layout(height=380, xaxis=axis("Pulse width (µs)"), yaxis=axis("Steady torque (N·m)")),
-    }
+def table(sessions: Sequence[Session], reference: int) -> list[dict[str, Any]]:
+    """The figures, a row each: the value of every model, and how far it is from the reference's."""
+    documents = [one.shown()["figures"] for one in sessions]
+    known = dict.fromkeys(name for figures in documents for name in figures)
+    order = [*(name for name in trend_words.NAMES if name in known), *(name for name in known if "." in name)]
+    return [row(name, sessions, documents, reference) for name in order]
 
 
-def step(curves: list[dict[str, Any] | None]) -> dict[str, Any]:
-    """Both step responses."""
-    data = [
-        line(found["step_response"]["time_s"], found["step_response"]["response"], name, colour, 2.4)
-        for found, name, colour in zip(curves, ("earlier", "later"), COLOURS, strict=True)
-        if found
-    ]
-    x, y = axis("Time (s)"), axis("Share of the final torque (1)")
-    return {"data": data, "layout": layout(height=380, xaxis=x, yaxis=y)}
+def row(
+    figure: str, sessions: Sequence[Session], documents: Sequence[dict[str, Any]], reference: int
+) -> dict[str, Any]:
+    """One figure of all models."""
+    unit = next(figures[figure]["unit"] for figures in documents if figure in figures)
+    name = trend_words.name_of(figure, unit)
+    cells = []
+    for number, figures in enumerate(documents):
+        one = figures.get(figure) or {"value": None, "uncertainty": None}
+        words = trend_words.with_uncertainty(one["value"], one["uncertainty"], name)
+        cell: dict[str, Any] = {"words": words, "where": one.get("where", ""), "difference": None, "beyond": False}
+        if number != reference:
+            cell |= apart(figure, sessions[reference], sessions[number], name)
+        cells.append(cell)
+    return {"name": name.words, "unit": "" if name.unit == "1" else name.unit, "cells": cells}
+
+
+def apart(figure: str, before: Session, now: Session, name: trend_words.Name) -> dict[str, Any]:
+    """A difference in words, and whether it is beyond twice its uncertainty."""
+    old, new = before.state(), now.state()
+    found = changes.difference(figure, old, new) if figure in changes.comparable(old, new) else None
+    if found is None:
+        return {"difference": None, "beyond": False}
+    words = trend_words.with_uncertainty(found["difference"], found["uncertainty"], name, sign=True)
+    return {"difference": words, "beyond": found["beyond"]}

@@ -1,43 +1,34 @@
-"""The templates, and how numbers and times are written in them: for pages of the service and for reports as files."""
+"""The templates, and how texts, numbers and times are written in them: for pages and for reports as files."""
 
 from __future__ import annotations
 
 import math
-from datetime import datetime
 from pathlib import Path
+from typing import Any
 
+from babel.support import LazyProxy
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from api.charts.config import CHART_CONFIG
+from api import clinical_words, effect_words, language
+from api.charts.config import PAGE_CONFIG
+from api.language import words
+from api.models.followed import followed
 
 HERE = Path(__file__).parent
 
 environment = Environment(
     loader=FileSystemLoader(HERE / "templates"), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
-    lstrip_blocks=True,
+    lstrip_blocks=True, extensions=["jinja2.ext.i18n"],
 )  # fmt: skip
+environment.policies["ext.i18n.trimmed"] = True
 
 
 def number(value: float | None, digits: int = 1, unit: str = "") -> str:
-    """A number for people; a dash where there is none."""
+    """A number for people, with the decimal sign of the page's language; a dash where there is none."""
     if value is None:
         return "–"
-    text = f"{value:.{digits}f}".replace("-", "−")
+    text = language.localised(f"{value:.{digits}f}".replace("-", "−"))
     return f"{text} {unit}" if unit else text
-
-
-def when(label: str | None) -> str:
-    """A UTC label in the machine's local time, to the minute."""
-    if not label:
-        return "–"
-    return datetime.fromisoformat(label.replace("Z", "+00:00")).astimezone().strftime("%d %b %Y, %H:%M")
-
-
-def clock(label: str | None) -> str:
-    """A UTC label as the time of day where this machine stands, to the second."""
-    if not label:
-        return "–"
-    return datetime.fromisoformat(label.replace("Z", "+00:00")).astimezone().strftime("%H:%M:%S")
 
 
 def figures(value: float | None) -> str:
@@ -48,11 +39,27 @@ def figures(value: float | None) -> str:
         return "0"
     digits = max(0, 2 - math.floor(math.log10(abs(value))))
     text = f"{value:.{digits}f}" if digits <= 6 else f"{value:.2g}"
-    return text.replace("-", "−")
+    return language.localised(text.replace("-", "−"))
 
 
-environment.filters["number"] = number
-environment.filters["figures"] = figures
-environment.filters["when"] = when
-environment.filters["clock"] = clock
-environment.globals["chart_config"] = CHART_CONFIG
+def in_words(value: Any) -> str:
+    """A table's words in the page's language, for scripts; nothing else is written that JSON does not know."""
+    if isinstance(value, LazyProxy):
+        return str(value)
+    raise TypeError(f"{type(value).__name__} has no place in JSON")
+
+
+texts: Any = environment  # the extension adds the method
+texts.install_gettext_callables(words.gettext, words.plural, newstyle=True)
+environment.filters.update({
+    "number": number, "followed": followed, "figures": figures, "when": language.when, "clock": language.clock,
+    "day": language.day, "until": language.until,
+    "translated": language.translated, "plain_words": language.plain, "localised": language.localised,
+    "segment_words": clinical_words.segment_words, "verdict_words": clinical_words.verdict_words,
+    "effect_words": effect_words.effect_words, "effects_words": effect_words.effects_words,
+    "decision_words": clinical_words.decision_words, "test_kind_words": clinical_words.test_kind_words,
+    "test_state_words": clinical_words.test_state_words,
+})  # fmt: skip
+environment.globals["chart_config"] = PAGE_CONFIG
+environment.policies["json.dumps_kwargs"] = {"sort_keys": True, "default": in_words}
+environment.globals["language"] = language

@@ -1,36 +1,57 @@
-"""The door: signing in and out, and the first page."""
+"""Signing in and out, and the first page."""
 
 from __future__ import annotations
 
 import asyncio
+from dataclasses import dataclass
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Form, Request
 from fastapi.responses import RedirectResponse, Response
 
 from api.errors import ApiError
-from api.people.auth import COOKIE, Scope
-from api.store.tables import Participant, Test
+from api.people.auth import COOKIE, LOCKED, Scope
+from api.sessions import directory
 from api.web.browser_session import local, same_origin, set_cookie
-from api.web.dependencies import Anyone, Context, Ctx
-from api.web.pages.render import page
+from api.web.dependencies import Context, Ctx, EvenLocked
+from api.web.guards import identified
+from api.web.pages.render import page, problem_page
 
 router = APIRouter(include_in_schema=False)
+SHOWN = 50
+"""So many participants are on the first page; a search, or one click, finds the others."""
 
 
 @router.get("/")
-async def home(request: Request, context: Ctx) -> Response:
+async def home(request: Request, context: Ctx, q: str = "", archived: str = "", all: str = "") -> Response:
     """Participants and the rig; the sign-in form for who is not signed in."""
     try:
-        who = context.auth.identify(request)
-    except ApiError:
-        return await door(request, context, "/")
-    may_test = who.may(Scope.RUN_TEST)
-    rows = await asyncio.to_thread(_overview, context) if may_test else []
-    return page(request, "home.html", rows=rows, may_test=may_test)
+        who = identified(request)
+    except ApiError as error:
+        return await sign_in_page(request, context, "/") if error.code != LOCKED[0] else problem_page(request, error)
+    asked = Asked(q[:80].strip(), archived == "1", all == "1")
+    listed = await asyncio.to_thread(_list, context, asked) if who.may(Scope.RUN_TEST) else None
+    return page(request, "home.html", asked=asked, listed=listed)
 
 
-async def door(
+@dataclass(frozen=True)
+class Asked:
+    """What the list is asked for: a part of the code, the archive, all of them."""
+
+    q: str = ""
+    archived: bool = False
+    all: bool = False
+
+
+def _list(context: Context, asked: Asked) -> dict[str, Any]:
+    found = directory.found(context.store, asked.q, asked.archived)
+    shown = [row for row, _last_utc in (found if asked.all else found[:SHOWN])]
+    count = directory.counts(context.store)
+    rows = directory.listed(context.store, context.versions, shown)
+    return {"rows": rows, "more": len(found) - len(rows), "count": count}
+
+
+async def sign_in_page(
     request: Request, context: Context, next: str, problem: ApiError | None = None, name: str = ""
 ) -> Response:
     """The sign-in form; with what went wrong, if anything did."""
@@ -41,26 +62,10 @@ async def door(
     return answer
 
 
-def _overview(context: Context) -> list[dict[str, Any]]:
-    rows = []
-    for participant in context.store.all(Participant, order=Participant.code):
-        tests = context.store.all(Test, Test.participant == participant.code, order=Test.requested_utc.desc(), limit=1)
-        models = context.versions.of(participant.code)
-        rows.append(
-            {
-                "code": participant.code,
-                "last": tests[0] if tests else None,
-                "newest": context.versions.document(models[0]) if models else None,
-                "approved": context.versions.approved(participant.code),
-            }
-        )
-    return rows
-
-
 @router.get("/sign-in")
 async def sign_in_form(request: Request, context: Ctx, next: str = "/") -> Response:
     """The form."""
-    return await door(request, context, next)
+    return await sign_in_page(request, context, next)
 
 
 @router.post("/sign-in")
@@ -76,16 +81,16 @@ async def sign_in(
         if token.strip():
             cookie = await asyncio.to_thread(context.auth.sign_in, token.strip(), address)
         else:
-            cookie = await context.people.sign_in(name.strip()[:80], password[:200], address)
+            cookie = await context.people.sign_in(name.strip()[:320], password[:200], address)
     except ApiError as error:
-        return await door(request, context, next, error, name[:80])
+        return await sign_in_page(request, context, next, error, name[:80])
     response = RedirectResponse(local(next), 303)
     set_cookie(context, response, cookie)
     return response
 
 
 @router.post("/sign-out")
-async def sign_out(request: Request, context: Ctx, _who: Anyone) -> Response:
+async def sign_out(request: Request, context: Ctx, _who: EvenLocked) -> Response:
     """End the session."""
     await asyncio.to_thread(context.auth.sign_out, request.cookies.get(COOKIE, ""))
     response = RedirectResponse("/", 303)

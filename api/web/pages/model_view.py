@@ -3,24 +3,25 @@
 from __future__ import annotations
 
 import asyncio
-import json
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Form, Request
 from fastapi.responses import RedirectResponse, Response
 
+from api import language
 from api.charts import diagnosis_charts, model_charts
+from api.charts.overview import LARGE, overview
 from api.errors import ApiError
-from api.models import explanation, summary
+from api.models import advice, carried_shown, explanation, next_step, stored, summary
 from api.people.auth import Scope
 from api.sessions.requests import TestIn
 from api.store.tables import Model
 from api.web.dependencies import Approver, Context, Ctx, ModelReader, Tester
-from api.web.pages import starting
+from api.web.pages import next_view, starting, trend_view
 from api.web.pages.checked import checked
 from api.web.pages.render import page
 from api.web.requests import EffectsIn
-from api.web.routes import criticism
+from api.web.routes import criticism, participants
 from api.workers.tracker import Job
 
 router = APIRouter(include_in_schema=False)
@@ -31,31 +32,52 @@ TITLES = {"diagnosis": "Diagnosing", "add-effects": "Adding the effect", "improv
 async def model(request: Request, context: Ctx, who: ModelReader, model_id: str, diagnose: int = -1) -> Response:
     """A model beside its measurement, and why it fails. `diagnose`: 1 begins a diagnosis anew, 0 begins none."""
     row = await asyncio.to_thread(context.versions.get, model_id)
-    document = json.loads(row.document)
+    document = stored.read(row)
     measured = await measurement(context, row)
     diagnosis = await looked_at(context, row, who.name, diagnose)
-    shown = await asyncio.to_thread(gather, context, row, measured, diagnosis)
+    found = advice.findings(document)
+    shown = await asyncio.to_thread(gather, context, row, measured, diagnosis, advice.leaves_structure(found))
     version = await asyncio.to_thread(context.versions.document, row)
+    why = shown["why"]
     return page(
         request,
         "model.html",
         model=version,
         document=document,
+        findings=found,
+        advice=advice.advice(version["verdict"], found, why["likely"] if why else []),
+        fit_words=advice.fit_sentence(document.get("fit") or {}),
+        step=await next_step_of(context, row, version, who.may(Scope.RUN_TEST)),
+        changes=await trend_view.changes_of(context, row),
+        ask_password=not await context.people.is_confirmed(who.session_hash),
         recruitment=summary.recruitment(document),
         dynamics=summary.dynamics(document),
         validity=summary.validity(document),
         problem=measured["problem"],
-        reasons=[
-            *version["reasons"][1:],
-            *await asyncio.to_thread(context.runner.lifecycle.warnings, row.recording_id),
-        ],
+        reasons=[] if found else version["reasons"],
+        warnings=await asyncio.to_thread(context.runner.lifecycle.warnings, row.recording_id),
         hdf5=not (await asyncio.to_thread(context.analyses.path, row.recording_id)).endswith(".csv"),
         now_utc=context.clock.utc(),
         may_test=who.may(Scope.RUN_TEST),
         may_approve=who.may(Scope.APPROVE_MODEL),
         **{key: value for key, value in shown.items() if key != "figures"},
-        figures={**model_charts.of_model(document, measured["curves"], measured["comparison"]), **shown["figures"]},
+        figures={**drawn(document, measured), **shown["figures"]},
     )
+
+
+def drawn(document: dict[str, Any], measured: dict[str, Any]) -> dict[str, Any]:
+    """The model's own figures; the first one low enough for the first screen."""
+    figures = model_charts.of_model(document, measured["curves"], measured["comparison"])
+    return figures | ({"overview": overview(figures[LARGE])} if LARGE in figures else {})
+
+
+async def next_step_of(context: Context, row: Model, version: dict[str, Any], may_test: bool) -> next_step.Step | None:
+    """What comes after the decision on this model; before it the verdict says what to do."""
+    if version["decision"] is None or not may_test:
+        return None
+    participant = await asyncio.to_thread(participants.find, context, row.participant)
+    step = await asyncio.to_thread(next_view.step, context, participant)
+    return None if (step.kind, step.subject) == ("look", row.id) else step
 
 
 async def measurement(context: Context, row: Model) -> dict[str, Any]:
@@ -85,10 +107,12 @@ async def looked_at(context: Context, row: Model, by: str, diagnose: int) -> dic
     return {"found": known, "job": newest}
 
 
-def gather(context: Context, row: Model, measured: dict[str, Any], diagnosis: dict[str, Any]) -> dict[str, Any]:
-    """What the section "Why does it fail?" shows."""
+def gather(
+    context: Context, row: Model, measured: dict[str, Any], diagnosis: dict[str, Any], leaves_structure: bool
+) -> dict[str, Any]:
+    """What is missing, and where the error sits."""
     found, comparison, job = diagnosis["found"], measured["comparison"], diagnosis["job"]
-    view = explanation.view(found, comparison, row.effects) if found else None
+    view = explanation.view(found, comparison, row.effects, leaves_structure) if found else None
     rows = explanation.versions(
         [context.versions.document(version) for version in context.versions.lineage(row)], row.id
     )
@@ -109,6 +133,7 @@ def gather(context: Context, row: Model, measured: dict[str, Any], diagnosis: di
         "splits": explanation.splits(comparison),
         "tests": view["tests"] if view else [],
         "versions": rows,
+        "carried": carried_shown.shown(context.versions, row, found),
         "figures": diagnosis_charts.of_why(comparison, segments, view, signatures, rows),
     }
 
@@ -119,7 +144,7 @@ async def cancel_diagnosis(context: Ctx, _who: Tester, model_id: str) -> Respons
     for job in list(context.jobs.all.values()):
         if (job.kind, job.subject) == ("diagnosis", model_id):
             context.jobs.cancel(job)
-    return RedirectResponse(f"/models/{model_id}?diagnose=0#why", 303)
+    return RedirectResponse(f"/models/{model_id}?diagnose=0", 303)
 
 
 @router.post("/models/{model_id}/effects")
@@ -148,7 +173,7 @@ async def improve(context: Ctx, who: Tester, model_id: str) -> Response:
 async def undo(context: Ctx, who: Approver, model_id: str) -> Response:
     """Back to the version before."""
     parent = await asyncio.to_thread(context.versions.undo, model_id, who.name, "")
-    return RedirectResponse(f"/models/{parent.id}#why", 303)
+    return RedirectResponse(f"/models/{parent.id}#versions", 303)
 
 
 @router.post("/models/{model_id}/experiment")
@@ -182,7 +207,14 @@ def result_page(job: Job) -> str | None:
     """The page on which the result is seen."""
     if job.result_url is None:
         return None
-    return job.result_url.removeprefix("/v1").removesuffix("/diagnosis") + "#why"
+    return job.result_url.removeprefix("/v1").removesuffix("/diagnosis")
+
+
+@router.get("/jobs/now/{job_id}")
+async def job_now(context: Ctx, _who: ModelReader, job_id: str) -> dict[str, Any]:
+    """How far long work is, in the words of the page's language: what a page that waits asks for again and again."""
+    found = context.jobs.get(job_id).document()
+    return {key: found[key] for key in ("progress", "time_left_s", "done")} | {"text": language.plain(found["text"])}
 
 
 @router.get("/jobs/{job_id}")

@@ -8,6 +8,7 @@ from typing import Any
 from fastapi import APIRouter, Request
 from fastapi.responses import RedirectResponse, Response
 
+from api.language import when
 from api.people.auth import Principal
 from api.sessions import profiles
 from api.sessions.questions import Question, Row
@@ -15,8 +16,7 @@ from api.sessions.requests import TestIn
 from api.store import audit
 from api.store.tables import Participant, Test
 from api.web.dependencies import Context, Ctx, Tester
-from api.web.pages import limits_form, starting
-from api.web.pages.environment import when
+from api.web.pages import limits_form, next_view, starting
 from api.web.pages.limits_form import LimitsForm
 from api.web.pages.render import page
 from api.web.routes import participants
@@ -41,12 +41,14 @@ async def shown(
         history = context.store.all(Test, Test.participant == code, order=Test.requested_utc.desc(), limit=200)
         return {
             "participant": row,
+            "notes": context.notes.of(code),
             "calibrated": starting.calibrated(context, row),
+            "step": next_view.step(context, row),
             "form": form or limits_form.fresh(row.profile),
             "meanwhile": participants.meanwhile(context, code),
             "fields": limits_form.fields(context.rig.status),
             "tests": [context.runner.document(test) for test in history],
-            "models": [context.versions.document(model) for model in context.versions.of(code)],
+            "models": context.versions.of(code),
         }
 
     return page(request, "participant.html", status, **await asyncio.to_thread(gather))

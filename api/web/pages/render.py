@@ -9,13 +9,16 @@ from fastapi import Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from sqlalchemy.exc import SQLAlchemyError
 
+from api import language
+from api.clock import zone_name
 from api.errors import ApiError
-from api.people.auth import Principal, Scope
+from api.people.auth import LOCKED, Principal, Scope
 from api.web.dependencies import Context
-from api.web.pages import rig_state
+from api.web.pages import colours, rig_state
 from api.web.pages.environment import environment
 
 environment.filters["what_to_check"] = rig_state.what_to_check
+environment.globals["colours_media"] = colours.MEDIA
 
 BACK = {"models": "Back to the model", "participants": "Back to the participant", "tests": "Back to the test"}
 
@@ -23,12 +26,20 @@ BACK = {"models": "Back to the model", "participants": "Back to the participant"
 def page(request: Request, template: str, status: int = 200, **values: Any) -> HTMLResponse:
     """A page, with the bar that every page has."""
     context = request.app.state.context
-    principal = known(request)
-    right = stop_right(request, principal)
+    looking = known(request)
+    right = stop_right(request, looking)
+    principal = None if looking is None or looking.locked else looking
     bar = {**bar_of(context, principal), "right": right, "version": request.app.version}
-    shown = {"bar": bar, "principal": principal, "here": here(request)}
+    shown = {"bar": bar, "principal": principal, "here": here(request), "zone": zone(context)}
+    shown["colours"] = colours.chosen(request)
     html = environment.get_template(template).render(request=request, **shown, **values)
     return HTMLResponse(html, status_code=status)
+
+
+def zone(context: Context) -> str:
+    """The time zone of all times on the page: Europe/Berlin (UTC+1)."""
+    name, offset = zone_name(), language.zone(context.clock.utc())
+    return offset if name in ("", offset, "Etc/UTC") else f"{name} ({offset})"
 
 
 def known(request: Request) -> Principal | None:
@@ -75,6 +86,8 @@ def here(request: Request) -> str:
 
 def problem_page(request: Request, problem: ApiError) -> Response:
     """A problem as a page that says what to do; the way to the door where nobody is signed in."""
+    if problem.code == LOCKED[0]:
+        return RedirectResponse(f"/locked?next={quote(here(request), safe='')}", 303)
     if problem.status == 401 and request.method == "GET":
         return RedirectResponse(f"/sign-in?next={quote(request.url.path)}", 303)
     response = page(request, "problem.html", problem.status, problem=problem, back=back_from(request.url.path))

@@ -5,27 +5,27 @@ from __future__ import annotations
 import hashlib
 from typing import Any
 
+from api.language import clock, lazy
 from api.people.auth import Principal
 from api.web.dependencies import Context
-from api.web.pages.environment import clock
 
 SILENT_S = 1.6
 """The rig answers once a second and sends its torque more often. After such a silence its state is unknown."""
 TORQUE_OLD_S = 1.0
 """An older torque is not shown as the torque of now."""
 
-WORDS: dict[str, tuple[str, str]] = {
-    "ready": ("No stimulation", "ready"),
-    "calibrating": ("No stimulation", "a calibration is open"),
-    "arming": ("Stimulating", "begins"),
-    "running": ("Stimulating", ""),
-    "stopping": ("Stopping", "not confirmed yet"),
-    "sealing": ("No stimulation", "saving the recording"),
-    "latched": ("Stopped", "re-arm to go on"),
-    "uncertain": ("Restarted", "re-arm to go on"),
-    "disconnected": ("Disconnected", "see below what to check"),
-    "unreachable": ("Unknown", "the rig cannot be reached"),
-    "silent": ("Unknown", "the rig does not answer"),
+WORDS: dict[str, tuple[Any, Any]] = {
+    "ready": (lazy("No stimulation"), lazy("ready")),
+    "calibrating": (lazy("No stimulation"), lazy("a calibration is open")),
+    "arming": (lazy("Stimulating"), lazy("begins")),
+    "running": (lazy("Stimulating"), ""),
+    "stopping": (lazy("Stopping"), lazy("not confirmed yet")),
+    "sealing": (lazy("No stimulation"), lazy("saving the recording")),
+    "latched": (lazy("Stopped"), lazy("needs re-arm")),
+    "uncertain": (lazy("Restarted"), lazy("needs re-arm")),
+    "disconnected": (lazy("Disconnected"), lazy("see below what to check")),
+    "unreachable": (lazy("Unknown"), lazy("the rig cannot be reached")),
+    "silent": (lazy("Unknown"), lazy("the rig does not answer")),
 }
 """For each state: whether stimulation is on, and one more thing to know."""
 
@@ -55,8 +55,8 @@ def now(context: Context, principal: Principal | None) -> dict[str, Any]:
     torque_nm, age_s = torque_now(context)
     shown: dict[str, Any] = {
         "state": state,
-        "flow": flow,
-        "more": more,
+        "flow": str(flow),
+        "more": str(more),
         "at": clock(context.clock.utc()),
         "emulated": context.settings.emulated,
         "ready": state == "ready",

@@ -7,6 +7,7 @@ from fastapi.responses import HTMLResponse, JSONResponse, Response
 from sqlalchemy.exc import SQLAlchemyError
 
 from api.errors import ApiError
+from api.people.auth import LOCKED
 from api.web.browser_session import local
 from api.web.dependencies import Anyone, Ctx
 from api.web.pages import rig_state
@@ -18,11 +19,20 @@ router = APIRouter(include_in_schema=False, prefix="/rig")
 @router.get("/now")
 async def rig_now(request: Request, context: Ctx) -> Response:
     """The state for the bar of every page, also of one whose session has ended."""
+    principal, locked = None, False
     try:
         principal = context.auth.identify(request)
-    except (ApiError, SQLAlchemyError):  # the state is told all the same
-        principal = None
-    return JSONResponse(rig_state.now(context, principal))
+    except ApiError as error:  # the state is told all the same
+        locked = error.code == LOCKED[0]
+    except SQLAlchemyError:
+        pass
+    return JSONResponse({**rig_state.now(context, principal), "signed_in": principal is not None, "locked": locked})
+
+
+@router.post("/acted")
+async def acted(_who: Anyone) -> Response:
+    """A person has typed or moved the pointer on a page: its session is not idle."""
+    return Response(status_code=204)
 
 
 @router.get("/notice")

@@ -6,20 +6,21 @@ import asyncio
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from api.clinical_words import test_kind_words
 from api.errors import ApiError
+from api.language import _, lazy, localised, translated, until, when
 from api.people.auth import Principal
 from api.sessions import profiles
 from api.sessions.questions import Question, Row
 from api.sessions.requests import TestIn
-from api.sessions.runner import Seen
+from api.sessions.runner import Seen, other_than, refuse_archived
 from api.store import audit
 from api.store.tables import Participant
 from api.web.dependencies import Context
-from api.web.pages.environment import number, when
+from api.web.pages.environment import environment, number
 from api.web.routes import participants
 
-NOBODY = "today nobody has tested which pulse widths are felt, move the arm and are comfortable"
-KINDS = {"pre-session": "pre-session test", "next-experiment": "next experiment"}
+NOBODY = lazy("today nobody has tested which pulse widths are felt, move the arm and are comfortable")
 
 
 @dataclass(frozen=True)
@@ -36,12 +37,15 @@ def calibrated(context: Context, row: Participant) -> Calibrated:
     state = profiles.calibration(row.profile, context.clock.utc())
     if state == "none":
         required = bool(context.rig.status and context.rig.status.require_calibration)
-        return Calibrated(state, "not calibrated", not required)
+        return Calibrated(state, _("not calibrated"), not required)
     with context.store.read() as session:
         entry = audit.newest(session, row.code, "finish calibration")
-    by = f" by {entry.who}" if entry else ""
-    end = "expired" if state == "expired" else "valid until"
-    words = f"found on {when(row.profile.get('set_at_utc'))}{by}, {end} {when(row.profile.get('expires_at_utc'))}"
+    said = {"time": when(row.profile.get("set_at_utc")), "end": until(row.profile.get("expires_at_utc"))}
+    said["name"] = entry.who if entry else "–"
+    if state == "expired":
+        words = _("found on %(time)s by %(name)s, expired %(end)s", **said)
+    else:
+        words = _("found on %(time)s by %(name)s, valid until %(end)s", **said)
     return Calibrated(state, words, state == "valid")
 
 
@@ -54,48 +58,75 @@ async def ask(context: Context, who: Principal, body: TestIn, back: str = "") ->
         409: a test runs, or a calibration is wanted first; what the rig refuses.
     """
     row = await asyncio.to_thread(participants.find, context, body.participant)
+    refuse_archived(row)
     context.runner.refuse_second()
     standing = await asyncio.to_thread(calibrated, context, row)
     if not standing.may_start:
         detail = f"{row.code}'s calibration: {standing.words}. This rig needs a calibration of today before a test."
         raise ApiError(409, "calibrate-first", "Calibrate first", detail)
-    seen = Seen(profiles.version(row.profile), await context.runner.preview(body))
+    preview = await context.runner.preview(body)
+    seen = Seen(profiles.version(row.profile), preview, row.side, row.muscle)
 
     async def action() -> str:
         test = await context.runner.start(body, who.name, seen)
         return f"/tests/{test.id}"
 
-    strength = f"{row.profile['current_ma']:g} mA, {number(widest_us(seen.preview), 0, 'µs')}"
+    strength = f"{current_words(row)}, {number(widest_us(preview), 0, 'µs')}"
     question = Question(
         participant=row.code,
-        title=f"Start the {KINDS.get(body.kind, body.kind)} of {row.code}?",
-        button=f"Start now: {strength}",
+        title=_("Start the %(kind)s of %(code)s?", kind=test_kind_words(body.kind), code=row.code),
+        button=_("Start now: %(strength)s", strength=strength),
         action=action,
-        rows=rows(row, seen.preview, standing, rig_words(context)),
-        warnings=[] if standing.state == "valid" else [f"{row.code} is not calibrated: {NOBODY}."],
+        rows=rows(row, preview, standing, other_than(who.name, body.ran_by) or who.name, rig_words(context)),
+        warnings=warnings(row, standing),
         stimulates=True,
         back=back,
     )
     return context.questions.ask(question, who)
 
 
-def rows(row: Participant, preview: dict[str, Any], standing: Calibrated, rig: str) -> list[Row]:
+def warnings(row: Participant, standing: Calibrated) -> list[str]:
+    """What deserves a second look."""
+    if standing.state == "valid":
+        return []
+    return [_("%(code)s is not calibrated: %(why)s.", code=row.code, why=NOBODY)]
+
+
+def rows(row: Participant, preview: dict[str, Any], standing: Calibrated, ran_by: str, rig: str) -> list[Row]:
     """What a person has to know before saying yes."""
     pulses = sum(width > 0 for width in preview["pulse_width_us"])
     torque_time = preview.get("torque_time_nms")
-    effort = "" if torque_time is None else f", about {number(torque_time, 0, 'N·m·s')} of torque"
+    dose = _("%(pulses)s pulses, %(charge)s", pulses=pulses, charge=number(preview["charge_uc"] / 1000, 2, "mC"))
+    if torque_time is not None:
+        dose += _(", about %(effort)s of torque", effort=number(torque_time, 0, "N·m·s"))
     profile = row.profile
+    widest, most = number(widest_us(preview), 0, "µs"), number(profile["max_pulse_width_us"], 0, "µs")
     return [
-        Row("Who", row.code),
-        Row("Current of every pulse", f"{profile['current_ma']:g} mA"),
-        Row("Widest pulse", f"{number(widest_us(preview), 0, 'µs')}, comfort maximum "
-                            f"{number(profile['max_pulse_width_us'], 0, 'µs')}"),
-        Row("How long", number(preview["duration_s"], 0, "s")),
-        Row("Dose", f"{pulses} pulses, {number(preview['charge_uc'] / 1000, 2, 'mC')}{effort}"),
-        Row("Stops at", number(profile["max_torque_nm"], 1, "N·m")),
-        Row("Calibration", standing.words),
-        Row("Rig", rig),
-    ]  # fmt: skip
+        Row(_("Who"), row.code),
+        Row(_("Side and muscle"), site_words(row.side, row.muscle)),
+        Row(_("Current of every pulse"), current_words(row)),
+        Row(_("Widest pulse"), _("%(widest)s, comfort maximum %(most)s", widest=widest, most=most)),
+        Row(_("How long"), number(preview["duration_s"], 0, "s")),
+        Row(_("Dose"), dose),
+        Row(_("Stops at"), number(profile["max_torque_nm"], 1, "N·m")),
+        Row(_("Calibration"), standing.words),
+        Row(_("Run by"), ran_by),
+        Row(_("Rig"), rig),
+    ]
+
+
+def site_words(side: str | None, muscle: str | None) -> str:
+    """Side and muscle as a person says them: left, biceps brachii. Muscles keep their Latin names."""
+    sides = {"left": _("left"), "right": _("right")}
+    return ", ".join(part for part in (sides.get(side or ""), muscle) if part) or _("not said")
+
+
+environment.globals["site_words"] = site_words
+
+
+def current_words(row: Participant) -> str:
+    """The current of every pulse."""
+    return localised(f"{row.profile['current_ma']:g} mA")
 
 
 def widest_us(preview: dict[str, Any]) -> float:
@@ -107,8 +138,9 @@ def rig_words(context: Context) -> str:
     """What the current comes from."""
     status = context.rig.status
     if status is None or not context.rig.connected:
-        return "cannot be reached"
+        return _("cannot be reached")
     stimulator = status.stimulator
     parts = [str(stimulator.get("device") or "stimulator unknown").upper(), str(stimulator.get("firmware") or "")]
-    emulated = ", emulated: no person is connected" if context.settings.emulated else ""
-    return f"{' '.join(part for part in parts if part)}, {status.state}{emulated}"
+    words = f"{' '.join(part for part in parts if part)}, {translated(status.state)}"
+    emulated = _("emulated: no person is connected")  # babel reads no call within an f-string
+    return f"{words}, {emulated}" if context.settings.emulated else words

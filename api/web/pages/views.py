@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import asyncio
-import json
 from typing import Any
 
 from fastapi import APIRouter, Request
-from fastapi.responses import Response
+from fastapi.responses import RedirectResponse, Response
 from markupsafe import Markup
 
 from api.charts import model_charts
 from api.charts.svg import svg
 from api.errors import ApiError
+from api.language import _, translated
+from api.models import stored
 from api.store.tables import Test
-from api.web.dependencies import Context, Ctx, LiveReader
+from api.web.dependencies import Context, Ctx, LiveReader, Tester
 from api.web.pages.model_view import measurement
 from api.web.pages.render import page
 from api.web.routes import tests
+from rig.messages import Status
 
 router = APIRouter(include_in_schema=False)
 
@@ -28,9 +30,37 @@ async def test(request: Request, context: Ctx, _who: LiveReader, test_id: str) -
     row = await asyncio.to_thread(tests.find, context, test_id)
     document = await asyncio.to_thread(context.runner.document, row)
     planned = (row.plan.get("preview") or {}).get("pulse_width_us") or []
-    data = {"test": document, "planned_us": planned, "pulse_rate_hz": row.plan.get("pulse_rate_hz", 40.0)}
+    bounds = limits_of(row, context.rig.status)
+    data = {
+        "test": document, "planned_us": planned, "pulse_rate_hz": row.plan.get("pulse_rate_hz", 40.0), "limits": bounds,
+    }  # fmt: skip
     shown: dict[str, Any] = await drawn(context, row) if document["done"] else {"drawn": None, "drawn_problem": None}
-    return page(request, "test.html", test=document, data=data, **shown)
+    notes = await asyncio.to_thread(context.notes.of_test, test_id)
+    return page(request, "test.html", test=document, data=data, limits=bounds, notes=notes, **shown)
+
+
+@router.post("/tests/{test_id}/keep-plain")
+async def keep_plain(context: Ctx, _who: Tester, test_id: str) -> Response:
+    """Wait no longer for last session's structure: on to the plain model, which is there already.
+
+    Where the fit ended just before the press there is nothing to end, and the test's page shows what came of it.
+    """
+    row = await asyncio.to_thread(tests.find, context, test_id)
+    plain = row.model_id if context.runner.lifecycle.keep_plain(test_id) else None
+    return RedirectResponse(f"/models/{plain}" if plain else f"/tests/{test_id}", 303)
+
+
+def limits_of(row: Test, status: Status | None) -> dict[str, float | None]:
+    """What the test was started with: its current, the torque that stops it, and the widest pulse."""
+    profile = row.plan.get("profile") or {}
+    rig = status.limits.get("torque_nm") if status else None
+    torque_nm = [profile.get("max_torque_nm"), row.plan.get("max_torque_nm"), rig.hi if rig else None]
+    width_us = [profile.get("max_pulse_width_us"), row.plan.get("max_pulse_width_us")]
+    return {
+        "current_ma": profile.get("current_ma"),
+        "torque_nm": min((value for value in torque_nm if value is not None), default=None),
+        "pulse_width_us": min((value for value in width_us if value is not None), default=None),
+    }
 
 
 async def drawn(context: Context, row: Test) -> dict[str, Any]:
@@ -51,8 +81,8 @@ async def measured(context: Context, model_id: str) -> Markup | None:
     found = await measurement(context, row)
     if found["curves"] is None:
         return None
-    figure = model_charts.of_model(json.loads(row.document), found["curves"], found["comparison"])["comparison"]
-    return svg(figure, 1160.0, 520.0, "Torque measured and predicted, what is left, and the pulse width, over time")
+    figure = model_charts.of_model(stored.read(row), found["curves"], found["comparison"])["comparison"]
+    return svg(figure, 1160.0, 520.0, _("Torque measured and predicted, what is left, and the pulse width, over time"))
 
 
 async def what_was_recorded(context: Context, row: Test) -> Markup:
@@ -60,5 +90,5 @@ async def what_was_recorded(context: Context, row: Test) -> Markup:
     path = await asyncio.to_thread(context.analyses.path, str(row.recording_id))
     found = await context.pool.submit("recorded", urgent=True, data=path).result
     plan_us = (row.plan.get("preview") or {}).get("pulse_width_us") or []
-    figure = model_charts.recorded(found, plan_us, row.plan.get("pulse_rate_hz", 40.0), row.state)
-    return svg(figure, 1160.0, 460.0, "Torque that was measured and pulses that were sent, over time")
+    figure = model_charts.recorded(found, plan_us, row.plan.get("pulse_rate_hz", 40.0), translated(row.state))
+    return svg(figure, 1160.0, 460.0, _("Torque that was measured and pulses that were sent, over time"))

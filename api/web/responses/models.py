@@ -9,6 +9,39 @@ from pydantic import Field, JsonValue
 from api.web.responses.base import Document, Problem, SegmentOut
 
 
+class ParameterOut(Document):
+    """An estimate: value and standard deviation in its unit."""
+
+    value: float | None
+    sd: float | None
+    unit: str = ""
+
+
+class CarriedEffect(Document):
+    """What a new recording says of an effect of the last approved model."""
+
+    effect: str
+    name: str
+    needed: bool | None = Field(description="null: undecided, since something else is missing")
+    log_evidence_gain: float | None = Field(description="with it less without it; null: not compared")
+    required: float = Field(description="log evidence that it must gain")
+    why: str = Field(description="the reason as one word")
+    reason: str
+
+
+class CarriedOut(Document):
+    """The structure of the last approved model on a new recording, beside the plain structure."""
+
+    from_model_id: str = Field(description="that model")
+    offered: Literal["carried", "plain"]
+    why: str = Field(description="the reason as one word")
+    reason: str
+    still_needed: list[str]
+    no_longer_needed: list[str]
+    undecided: list[str] = Field(description="left out; something else is missing that may hide them")
+    effects: list[CarriedEffect]
+
+
 class VersionOut(Document):
     """One model version."""
 
@@ -17,6 +50,10 @@ class VersionOut(Document):
     recording_id: str
     parent_id: str | None = Field(description="the version it was made from")
     added_effect: str | None = Field(description="what it holds more than that one")
+    carried_from_id: str | None = Field(
+        None, description="the model of an earlier session whose structure this version has"
+    )
+    carried: CarriedOut | None = Field(None, description="what the recording said of that structure")
     method: str
     effects: list[str]
     fit_percent: float | None
@@ -25,6 +62,9 @@ class VersionOut(Document):
     rms_nm: float | None
     held_out_rms_nm: float | None
     noise_sd_nm: float | None
+    figures: dict[str, ParameterOut] = Field(
+        {}, description="threshold, plateau, dynamics and effects; empty: stored before they were"
+    )
     verdict: Literal["usable", "usable with care", "not usable", "unknown"]
     words: str = Field(description="the verdict in one sentence")
     reasons: list[str] = Field(description="what speaks against the model, worst first")
@@ -76,12 +116,6 @@ class ComparisonOut(Document):
         default={}, description="curves for drawing, thinned, by name, and `noise_band_nm`, N·m"
     )
     plain: list[str] = Field([], description="in sentences")
-
-
-class ParameterOut(Document):
-    value: float | None
-    sd: float | None
-    unit: str = ""
 
 
 class MissingOut(Document):

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field
 
+from api.sessions.requests import NoteKind
 from api.web.responses.base import Document
 from rig.messages import CalibrationStatus, RigState
 
@@ -28,6 +31,24 @@ class ParticipantOut(Document):
     profile: ProfileOut
     created_utc: str
     created_by: str
+    side: Literal["left", "right"] | None = Field(None, description="of the body; null: nobody has said")
+    muscle: str | None = Field(None, description="the muscle that is stimulated")
+    archived_utc: str | None = Field(None, description="since when it is archived: no test starts, nothing is deleted")
+
+
+class NoteOut(Document):
+    """A note on a session, or at a time in a test."""
+
+    id: str
+    participant: str
+    test_id: str | None = Field(description="null: on the participant's session, not on a test")
+    at_s: float | None = Field(description="time in the test, from its start, s; null: on the whole of it")
+    kind: NoteKind
+    text: str
+    by: str
+    at_utc: str
+    struck_by: str | None = Field(description="who marked it as wrong; null: it stands")
+    struck_utc: str | None
 
 
 class ChangedOut(ParticipantOut):

@@ -117,8 +117,10 @@ class TestSummary(Document):
 class WorkOut(Document):
     """How far the identification is."""
 
+    verb: str = Field("fit", description="`fit`: the first model; `carry`: the structure of the last approved one")
     progress: float = Field(0.0, description="share that is done, 0 to 1")
     text: str = ""
+    time_left_s: float | None = Field(None, description="null: not known yet")
 
 
 class TestOut(Document):
@@ -140,6 +142,9 @@ class TestOut(Document):
     progress: float = Field(description="share that is done, 0 to 1")
     identification: WorkOut | None
     requested_by: str
+    ran_by: str = Field(description="who ran it at the rig")
+    side: Literal["left", "right"] | None = Field(description="of the body, when it was begun; null: nobody has said")
+    muscle: str | None = Field(description="the muscle that was stimulated, as it was called when the test was begun")
     requested_utc: str
     finished_utc: str | None
     planned: PlannedOut

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import secrets
+from dataclasses import dataclass
 from typing import Any
 
 from fastapi import APIRouter
@@ -11,6 +13,7 @@ from fastapi import APIRouter
 from api.errors import ApiError
 from api.sessions import profiles
 from api.sessions.requests import CalibrationIn, FinishIn, MarkIn, StepIn
+from api.sessions.runner import refuse_archived
 from api.store import audit
 from api.store.tables import Participant
 from api.web.dependencies import PROBLEM, Context, Ctx, Tester
@@ -24,6 +27,7 @@ from rig.messages import (
     CalibrateStepRequest,
     CalibrationResult,
     CalibrationStatus,
+    Profile,
     Status,
 )
 
@@ -39,6 +43,7 @@ async def begin(
     """
     async with context.limits_turn:
         row = await asyncio.to_thread(participants.find, context, code)
+        refuse_archived(row)
         context.runner.refuse_second()
         version = profiles.version(row.profile)
         if seen not in (None, version):
@@ -47,7 +52,10 @@ async def begin(
         identity = f"C{stamp}-{secrets.token_hex(3)}-{version}"
         asked = settings(body, row.profile)
         await asyncio.to_thread(note, context, by, "begin calibration", code, calibration=identity, **asked)
-        await context.rig.ask(CalibrateStartRequest(calibration_id=identity, participant=code, by=by, **asked))
+        last = Profile.model_validate(row.profile) if body.large_steps else None
+        await context.rig.ask(
+            CalibrateStartRequest(calibration_id=identity, participant=code, by=by, last=last, **asked)
+        )
         return await standing(context, code)
 
 
@@ -67,31 +75,63 @@ def settings(body: CalibrationIn, profile: dict[str, Any]) -> dict[str, Any]:
     return asked
 
 
-async def step(context: Context, code: str, direction: Any) -> dict[str, Any]:
-    """Play one train."""
+@dataclass(frozen=True)
+class Shown:
+    """What a page showed when a button on it was pressed; None: not said."""
+
+    calibration: str | None = None
+    """Its id."""
+    trains: str | None = None
+    """How many had been sent."""
+
+    def check(self, found: dict[str, Any]) -> None:
+        """Refuse what was pressed on a page that shows another calibration, or does not know of the last train.
+
+        Raises
+        ------
+        ApiError
+            409: it is another one, or another train was sent or is on its way.
+        """
+        same = self.calibration in (None, found["calibration_id"])
+        if same and (self.trains is None or (self.trains == str(len(found["trains"])) and not found["playing"])):
+            return
+        detail = "Another train was sent after this page was shown. Nothing was done now. Look at the last train first."
+        raise ApiError(409, "not-what-was-seen", "This page is out of date", detail)
+
+
+NOT_SAID = Shown()
+
+
+async def step(context: Context, code: str, body: StepIn, shown: Shown = NOT_SAID) -> dict[str, Any]:
+    """Play one train. Looking and playing are one turn: of two presses on the same sight one plays."""
     async with context.limits_turn:
-        await sound(context, code)
-        await context.rig.ask(CalibrateStepRequest(direction=direction))
+        shown.check(await sound(context, code))
+        await context.rig.ask(CalibrateStepRequest(direction=body.direction, shown_us=body.shown_us))
     return await standing(context, code)
 
 
-async def mark(context: Context, code: str, threshold: Any, by: str) -> dict[str, Any]:
-    """Mark the last train's width."""
-    found = await sound(context, code)
-    await context.rig.ask(CalibrateMarkRequest(threshold=threshold))
+async def mark(context: Context, code: str, threshold: Any, by: str, shown: Shown = NOT_SAID) -> dict[str, Any]:
+    """Mark the last train's width; no train comes between looking and marking."""
+    async with context.limits_turn:
+        found = await sound(context, code)
+        shown.check(found)
+        await context.rig.ask(CalibrateMarkRequest(threshold=threshold))
     await asyncio.to_thread(note, context, by, f"mark {threshold}", code, pulse_width_us=found["pulse_width_us"])
     return await standing(context, code)
 
 
-async def finish(context: Context, code: str, discard: bool, by: str) -> dict[str, Any]:
+async def finish(
+    context: Context, code: str, discard: bool, by: str, shown: Shown = NOT_SAID
+) -> dict[str, Any]:  # fmt: skip
     """Close it; unless discarded, what it found is the participant's profile for the day."""
     async with context.limits_turn:
         found = await (standing if discard else sound)(context, code)
-        reply = await context.rig.ask(CalibrateFinishRequest(by=by, discard=discard))
-        result = CalibrationResult.model_validate(reply)
-        await context.rig.fresh_status()
+        shown.check(found)
+        result = await context.rig.ask_for(CalibrationResult, CalibrateFinishRequest(by=by, discard=discard))
         version = profiles.of_calibration(found["calibration_id"])
         profile = await asyncio.to_thread(_store, context, code, result, by, version)
+        with contextlib.suppress(ApiError):  # the rig has let it go: what was found is stored whatever it says now
+            await context.rig.fresh_status()
     return {"profile": profile, "recordings": result.recordings}
 
 
@@ -178,8 +218,11 @@ async def calibration(context: Ctx, _who: Tester, code: str) -> dict[str, Any]:
 
 @router.post("/step", status_code=202, **answers(CalibrationOut, 202, "the train is on its way"))
 async def play_step(context: Ctx, _who: Tester, code: str, body: StepIn) -> dict[str, Any]:
-    """Play one train a step wider, a step narrower, or the same again; over when `playing` is false again."""
-    return await step(context, code, body.direction)
+    """Play one train: wider (`up`, or `fine` by a fine step), narrower, or the same again.
+
+    It is over when `playing` is false again.
+    """
+    return await step(context, code, body)
 
 
 @router.post("/mark", **answers(CalibrationOut))

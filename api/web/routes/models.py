@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-import json
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Header, Response
 
 from api.errors import ApiError
+from api.models import stored
 from api.web.dependencies import PROBLEM, Approver, Ctx, ModelReader
 from api.web.headers import entity_tags
 from api.web.requests import DecisionIn
@@ -60,14 +60,14 @@ def matches(if_none_match: str, etag: str) -> bool:
 def versions(context: Ctx, _who: ModelReader, code: str) -> list[dict[str, Any]]:
     """A participant's model versions, newest first, with their errors and what each added."""
     participants.find(context, code)
-    return [context.versions.document(row) for row in context.versions.of(code)]
+    return context.versions.of(code)
 
 
 @router.get("/models/{model_id}", response_model=None, responses={200: WITH_MODEL})
 def one_model(context: Ctx, _who: ModelReader, model_id: str) -> dict[str, Any]:
     """A version: its errors, its verdict, its lineage, and the model."""
     row = context.versions.get(model_id)
-    return {**context.versions.document(row), "model": json.loads(row.document)}
+    return {**context.versions.document(row), "model": stored.read(row)}
 
 
 @router.get("/models/{model_id}/file", response_class=Response, responses={200: published("model", "MODEL.json")})
@@ -75,7 +75,7 @@ def model_file(context: Ctx, _who: ModelReader, model_id: str) -> Response:
     """MODEL.json, as it was stored."""
     row = context.versions.get(model_id)
     headers = {"Content-Disposition": f'attachment; filename="{row.id}.json"', "ETag": f'"{row.etag}"'}
-    return Response(row.document, media_type="application/json", headers=headers)
+    return Response(stored.whole(row), media_type="application/json", headers=headers)
 
 
 @router.post("/models/{model_id}/approve", response_model=VersionOut)

@@ -92,7 +92,7 @@ class _Figures(Collector):
 
 
 def _approved(context: Context) -> int:
-    return sum(context.versions.served(code) is not None for code in context.store.all(Participant.code))
+    return len(context.versions.all_approved(context.store.all(Participant.code)))
 
 
 def _audit_entries(context: Context) -> int:

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Header, Query, Response
 
 from api.errors import ApiError, NotFoundError
-from api.sessions import profiles
+from api.sessions import directory, profiles
 from api.sessions.requests import ProfileIn
 from api.store import audit
 from api.store.tables import Participant, Test
@@ -40,9 +40,11 @@ def create(context: Context, body: ParticipantIn, by: str) -> Participant:
         if session.get(Participant, body.code) is not None:
             raise ApiError(409, "exists", "The code is taken", f"Participant {body.code!r} exists. Take another code.")
         row = Participant(code=body.code, profile=profile, created_utc=now, created_by=by)
+        row.side, row.muscle = body.side, body.muscle
         session.add(row)
         session.flush()
-        audit.write(session, now, by, "create participant", body.code, profile=row.profile)
+        said = {"side": row.side, "muscle": row.muscle}
+        audit.write(session, now, by, "create participant", body.code, profile=row.profile, **said)
     return row
 
 
@@ -154,9 +156,14 @@ def make_participant(context: Ctx, who: Tester, body: ParticipantIn, response: R
 
 
 @router.get("", **answers(list[ParticipantOut]))
-def list_participants(context: Ctx, _who: Tester) -> list[dict[str, Any]]:
-    """All participants, by code."""
-    return [row.as_dict() for row in context.store.all(Participant, order=Participant.code)]
+def list_participants(
+    context: Ctx,
+    _who: Tester,
+    q: Annotated[str, Query(max_length=80, description="a part of the code, in any case")] = "",
+    archived: Annotated[bool | None, Query(description="only those that are archived, or that are not")] = None,
+) -> list[dict[str, Any]]:
+    """All participants, or those that are looked for; who was last tested, or made, comes first."""
+    return [row.as_dict() for row, _last_utc in directory.found(context.store, q, archived)]
 
 
 @router.get("/{code}", **answers(ParticipantOut, headers={"ETag": TAG}))

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import asyncio
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Request
 from fastapi.responses import JSONResponse, RedirectResponse, Response
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 
 from api.clock import utc_label
-from api.errors import NotFoundError
+from api.errors import ApiError, NotFoundError
+from api.people import names
 from api.people.auth import COOKIE, Principal, Scope, unauthorized
 from api.web.browser_session import local, same_origin, set_cookie
-from api.web.dependencies import PROBLEM, Administrator, Anyone, Context, Ctx
+from api.web.dependencies import PROBLEM, Administrator, Anyone, Context, Ctx, EvenLocked
 from api.web.openapi import problem
 from api.web.responses.base import answers
 from api.web.responses.people import KeyOut, ListedUser, SessionOut, UserOut
@@ -20,7 +22,14 @@ from api.web.responses.people import KeyOut, ListedUser, SessionOut, UserOut
 router = APIRouter(prefix="/v1", tags=["people"], responses=PROBLEM)
 
 TOO_MANY: dict[int | str, dict[str, Any]] = {429: problem("too many wrong passwords: `Retry-After`")}
-Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_.@-]{1,80}$")]
+Name = Annotated[
+    str,
+    StringConstraints(min_length=1, max_length=320),
+    AfterValidator(names.written),
+    Field(
+        description="letters of any language, digits, spaces and . _ @ - ' , ( ), at most 80", examples=["Ada Çelik"]
+    ),
+]
 Password = Annotated[str, StringConstraints(min_length=10, max_length=200)]
 
 
@@ -41,7 +50,7 @@ class UserIn(_Body):
 class SignIn(_Body):
     """Name and password."""
 
-    name: Annotated[str, StringConstraints(min_length=1, max_length=80)]
+    name: Annotated[str, StringConstraints(min_length=1, max_length=320)]
     password: Annotated[str, StringConstraints(min_length=1, max_length=200)]
 
 
@@ -138,8 +147,22 @@ async def confirm(context: Ctx, who: Anyone, body: ConfirmIn) -> None:
     await context.people.confirm(who, body.password)
 
 
+@router.post("/sessions/lock", status_code=204)
+async def lock(context: Ctx, who: Anyone) -> None:
+    """Lock this session: until it is unlocked every request with it is refused, but for stop."""
+    if who.page_session is None:
+        raise ApiError(409, "no-session", "There is nothing to lock", "A token has no session.")
+    await asyncio.to_thread(context.auth.idle.lock, who.page_session.hash, who.name)
+
+
+@router.post("/sessions/unlock", status_code=204, responses=TOO_MANY)
+async def unlock(context: Ctx, who: EvenLocked, body: ConfirmIn) -> None:
+    """Unlock this session by its person's password, or by the token that it was opened with."""
+    await context.people.unlock(who, body.password)
+
+
 @router.delete("/sessions/current", status_code=204)
-def sign_out(context: Ctx, request: Request, _who: Anyone) -> None:
+def sign_out(context: Ctx, request: Request, _who: EvenLocked) -> None:
     """Sign out."""
     cookie = request.cookies.get(COOKIE)
     if cookie is None:

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter
 from pydantic import Field, FiniteFloat
 
+from api.models import stored
 from api.sessions.requests import Body
 from api.web.dependencies import PROBLEM, Ctx, ModelReader
 from api.web.responses.base import answers
@@ -30,7 +31,7 @@ async def prediction(context: Ctx, _who: ModelReader, model_id: str, body: Width
     """Mean torque the pulses give in each pulse's period, N·m, after a second of rest; effects included."""
     row = await asyncio.to_thread(context.versions.get, model_id)
     call = context.pool.submit(
-        "forecast", urgent=True, model_json=row.document.decode(), pulse_width_us=body.pulse_width_us,
+        "forecast", urgent=True, model_json=stored.text(row), pulse_width_us=body.pulse_width_us,
         pulse_rate_hz=body.pulse_rate_hz,
     )  # fmt: skip
     found = await call.result

@@ -126,7 +126,8 @@ async def take_in(
         raise
     warnings = [note for note in (*assumed, *found["notes"], warning) if note]
     row = await asyncio.shield(asyncio.to_thread(_store, context, code, whole, data, by, warnings))
-    return row, await asyncio.to_thread(context.versions.add, found["json"], code, row.id, by), warnings
+    plain = await asyncio.to_thread(context.versions.add, found["json"], code, row.id, by)
+    return row, await asyncio.shield(context.analyses.carried_structure.carry(plain, row.path)), warnings
 
 
 async def _with_our_columns(
@@ -148,7 +149,7 @@ async def _with_our_columns(
 async def _identified(context: Context, code: str, path: Path) -> tuple[dict[str, Any], str]:
     """The model of an upload, and what was left out of its structure."""
     with _about_the_upload(path):
-        return await context.analyses.starting_effects.fit(code, str(path))
+        return await context.analyses.carried_structure.fit(code, str(path))
 
 
 @contextlib.contextmanager

@@ -4,19 +4,31 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 from typing import Any
 from urllib.parse import urlsplit
 
 from fastapi import APIRouter, Response, WebSocket, WebSocketDisconnect
+from sqlalchemy.exc import SQLAlchemyError
 
+from api import language
 from api.errors import ApiError, NotFoundError
 from api.people.auth import Scope
 from api.sessions.requests import TestIn
+from api.sessions.runner import other_than
+from api.store import audit
 from api.store.tables import Test
+from api.web import page_language
 from api.web.dependencies import PROBLEM, Context, Ctx, LiveReader, Tester, of
+from api.web.requests import RanByIn
 from api.web.responses.base import answers
 from api.web.responses.rig import TestOut
 
+log = logging.getLogger("stimrig.live")
+LOOK_S = 1.0
+"""How often a live channel looks whether its session or token is still valid."""
+GOODBYE_S = 2.0
+"""So long it waits for a client that reads nothing to hear why it is closed."""
 router = APIRouter(prefix="/v1/tests", tags=["tests"], responses=PROBLEM)
 
 
@@ -49,63 +61,139 @@ def one_test(context: Ctx, _who: LiveReader, test_id: str) -> dict[str, Any]:
     return context.runner.document(find(context, test_id))
 
 
+@router.put("/{test_id}/ran-by", **answers(TestOut))
+def set_ran_by(context: Ctx, who: Tester, test_id: str, body: RanByIn) -> dict[str, Any]:
+    """Say who ran a test at the rig, where that was not who asked for it."""
+    return context.runner.document(change_ran_by(context, test_id, body, who.name))
+
+
+def change_ran_by(context: Context, test_id: str, body: RanByIn, by: str) -> Test:
+    """Write down who ran a test; 404 where there is none."""
+    with context.store.write() as session:
+        row = session.get(Test, test_id)
+        if row is None:
+            raise NotFoundError("test", test_id, "GET /v1/tests lists them.")
+        row.ran_by = other_than(row.requested_by, body.ran_by)
+        audit.write(session, context.clock.utc(), by, "set who ran it", test_id, ran_by=row.ran_by or row.requested_by)
+    return row
+
+
+@router.post("/{test_id}/keep-plain", **answers(TestOut))
+async def keep_plain(context: Ctx, _who: Tester, test_id: str) -> dict[str, Any]:
+    """End the fit of the last approved model's structure after a test: the plain model is offered."""
+    row = await asyncio.to_thread(find, context, test_id)
+    if not context.runner.lifecycle.keep_plain(test_id):
+        detail = f"{test_id} is {row.state}. This can be ended only while the last session's structure is fitted."
+        raise ApiError(409, "nothing-carried", "No structure is being carried over", detail)
+    return await asyncio.to_thread(context.runner.document, row)
+
+
 @router.websocket("/{test_id}/live")
 async def live(socket: WebSocket, test_id: str) -> None:
     """Live signals: `history` first, then `live` about 20 a second, `state`, `link`, and `test` at every turn.
 
-    The socket closes (1000) once the test has ended and its last `test` message was sent.
+    The socket closes (1000) once the test has ended and its last `test` message was sent; it closes (4401, after a
+    `problem`) within two seconds once its session or token is no longer valid.
     """
     context = of(socket)
     await socket.accept()
     try:
-        row = await asyncio.to_thread(_admit, socket, context, test_id)
+        await asyncio.to_thread(_admit, socket, context)
+        row = await asyncio.to_thread(find, context, test_id)
+        await _watched(socket, context, row)
     except ApiError as error:
-        await socket.send_json({"type": "problem", "problem": error.body(socket.url.path)})
-        await socket.close(4404 if error.status == 404 else 4401, error.title)
-        return
-    queue = context.runner.hub.open()
-    try:
-        await _pump(socket, context, row, queue)
+        with contextlib.suppress(WebSocketDisconnect, RuntimeError, TimeoutError):
+            async with asyncio.timeout(GOODBYE_S):
+                await socket.send_json({"type": "problem", "problem": error.body(socket.url.path)})
+                await socket.close(4404 if error.status == 404 else 4401, error.title)
     except (WebSocketDisconnect, RuntimeError):
         pass
-    finally:
-        context.runner.hub.close(queue)
 
 
-def _admit(socket: WebSocket, context: Context, test_id: str) -> Test:
+def _admit(socket: WebSocket, context: Context) -> None:
+    """Who may watch; a live view of a running test holds the session's lock off.
+
+    Raises
+    ------
+    ApiError
+        401: no valid token or session, or it is locked; 403: without the scope, or from another site's page.
+    """
     principal = context.auth.identify(socket)
     if not principal.may(Scope.READ_LIVE):
         raise ApiError(403, "forbidden", "Not allowed", f"This needs the scope {Scope.READ_LIVE}.")
     origin = socket.headers.get("origin")
     if principal.csrf is not None and origin and urlsplit(origin).netloc != socket.headers.get("host"):
         raise ApiError(403, "forbidden", "Not allowed", "The request came from a page of another site.")
-    return find(context, test_id)
+    if principal.page_session is not None:
+        context.auth.idle.watches(principal.page_session.hash)
+
+
+async def _watched(socket: WebSocket, context: Context, row: Test) -> None:
+    """Send until the test has ended or the page has gone. Raises ApiError once who watches no longer may."""
+    queue = context.runner.hub.open()
+    ends = [asyncio.create_task(work) for work in (_until_gone(socket), _until_refused(socket, context))]
+    sending = asyncio.create_task(_pump(socket, context, row, queue))
+    try:
+        await asyncio.wait([sending, *ends], return_when=asyncio.FIRST_COMPLETED)
+        for task in (*ends, sending):
+            if task.done():
+                task.result()
+        if sending.done():
+            await socket.close()
+    finally:
+        for task in (sending, *ends):
+            task.cancel()
+        await asyncio.gather(sending, *ends, return_exceptions=True)
+        context.runner.hub.close(queue)
 
 
 async def _pump(socket: WebSocket, context: Context, row: Test, queue: asyncio.Queue[dict[str, Any]]) -> None:
-    gone = asyncio.create_task(_until_gone(socket))
-    try:
-        history = queue.get_nowait()
-        if history["test_id"] == row.id:
-            await socket.send_json(history)
-        document = await asyncio.to_thread(lambda: context.runner.document(find(context, row.id)))
-        await socket.send_json({"type": "test", "test": document})
-        while not document["done"] and not gone.done():
-            try:
-                message = await asyncio.wait_for(queue.get(), 1.0)
-            except TimeoutError:
-                message = {"type": "idle", "rig_connected": context.rig.connected}
-            if message["type"] == "test":
-                if message["test"]["id"] != row.id:
-                    continue
-                document = message["test"]
-            if message["type"] == "live" and message["test_id"] != row.id:
+    history = queue.get_nowait()
+    if history["test_id"] == row.id:
+        await socket.send_json(history)
+    document = await asyncio.to_thread(lambda: context.runner.document(find(context, row.id)))
+    words = page_language.chosen(socket.headers)
+    await socket.send_json(_told(document, words))
+    while not document["done"]:
+        message = await _next(queue) or {"type": "idle", "rig_connected": context.rig.connected}
+        if message["type"] == "test":
+            if message["test"]["id"] != row.id:
                 continue
-            await socket.send_json(message)
-        with contextlib.suppress(RuntimeError):
-            await socket.close()
-    finally:
-        gone.cancel()
+            document, message = message["test"], _told(message["test"], words)
+        if message["type"] == "live" and message["test_id"] != row.id:
+            continue
+        await socket.send_json(message)
+
+
+async def _next(queue: asyncio.Queue[dict[str, Any]]) -> dict[str, Any] | None:
+    """The next message; None after a second without one.
+
+    Not by `asyncio.wait_for`: in Python 3.11 it takes a message that comes at the moment of a cancellation for an
+    answer, and the cancellation is lost. A channel that was to be closed then stayed open.
+    """
+    try:
+        async with asyncio.timeout(1.0):
+            return await queue.get()
+    except TimeoutError:
+        return None
+
+
+async def _until_refused(socket: WebSocket, context: Context) -> None:
+    """Look again and again whether who watches still may: after a sign-out, a lock or a revoked token nobody does."""
+    while True:
+        await asyncio.sleep(LOOK_S)
+        try:
+            await asyncio.to_thread(_admit, socket, context)
+        except SQLAlchemyError:  # a database that is busy or gone has refused nobody
+            log.warning("whether a live channel is still allowed could not be read")
+
+
+def _told(document: dict[str, Any], language_code: str) -> dict[str, Any]:
+    """How the test stands; `words`: what a page shows of it, in the language of the page."""
+    work = (document["identification"] or {}).get("text") or ""
+    with language.using(language_code):
+        words = {"reason": language.plain(document["reason"]), "work": language.plain(work)}
+    return {"type": "test", "test": document, "words": words}
 
 
 async def _until_gone(socket: WebSocket) -> None:

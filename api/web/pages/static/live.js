@@ -1,15 +1,18 @@
 // The live view of a test: its own drawing on two canvases, fed by a WebSocket.
 "use strict";
 const data = JSON.parse(document.getElementById("data").textContent);
+const words = JSON.parse(document.getElementById("words").textContent);
 const STALE_S = 0.5;
-const INK = "#1b2733", DIM = "#52606d", GRID = "#e6eaee", TORQUE = "#0b6b75", WIDTH = "#b4690e", PLAN = "#cfd6dc";
+const FONT = "system-ui, 'DejaVu Sans', sans-serif";
+let colours = {};
 const byId = (name) => document.getElementById(name);
 const state = {
   test: data.test, heard: 0, torqueAge: 0, connected: true, dirty: true, duration: (data.test.planned || {}).duration_s || data.test.duration_s || 0,
   time: [], low: [], high: [], pulseTime: [], width: [], elapsed: 0,
 };
 
-function minus(text) { return text.replace("-", "−"); }
+function shown(text) { return String(text).replace("-", "−").replace(".", words.decimal); }
+function segmentWords(name) { return words.segments[name] || name; }
 function say(name, text) { const box = byId(name); if (box.textContent !== text) box.textContent = text; }
 
 function take(message) {
@@ -22,7 +25,7 @@ function take(message) {
     if (message.test_id === state.test.id) addFrame(message);
     showNumbers(message);
   } else if (message.type === "test") {
-    showTest(message.test);
+    showTest(message.test, message.words);
   } else if (message.type === "link" || message.type === "idle") {
     state.connected = message.type === "link" ? message.connected : message.rig_connected;
   }
@@ -38,27 +41,45 @@ function addFrame(message) {
 
 function showNumbers(message) {
   const last = message.torque_max_nm.length - 1;
-  if (last >= 0) say("torque", minus(((message.torque_max_nm[last] + message.torque_min_nm[last]) / 2).toFixed(2)) + " N·m");
+  if (last >= 0) say("torque", shown(((message.torque_max_nm[last] + message.torque_min_nm[last]) / 2).toFixed(2)) + " N·m");
   if (message.pulse_width_us.length) say("width", message.pulse_width_us[message.pulse_width_us.length - 1].toFixed(0) + " µs");
   if (message.test_id !== state.test.id) return;
-  say("segment", message.segment || "–");
+  showSegment(message.segment);
+  say("dose", dose(message.charge_uc) + " · " + words.pulses.replace("{count}", message.sent_pulses));
   say("left", Math.max(0, Math.ceil(message.duration_s - message.elapsed_s)) + " s");
   say("lost", String(message.lost_samples));
   byId("progress").value = message.duration_s ? message.elapsed_s / message.duration_s : 0;
 }
 
+function dose(charge_uc) { return charge_uc < 1000 ? shown(charge_uc.toFixed(0)) + " µC" : shown((charge_uc / 1000).toFixed(2)) + " mC"; }
+
+let segment = null;
+function showSegment(name) {
+  say("segment", name ? segmentWords(name) : "–");
+  byId("segment").title = name || "";
+  if (segment && name && name !== segment) tone.segment();
+  segment = name;
+}
+
 let leaving = false;  // a form was sent, be it the stop: its answer is what comes next, not this page's own
-addEventListener("submit", () => { leaving = true; });
+addEventListener("submit", (event) => { leaving = leaving || !event.defaultPrevented; }); // a note is sent by a script: no answer comes
 addEventListener("pageshow", () => { leaving = false; });
 
-function showTest(test) {
+function showTest(test, told) {
   const wasOpen = !state.test.done;
   state.test = test;
   const tag = byId("state");
-  tag.textContent = test.state; tag.className = "tag tag-" + test.state;
+  tag.textContent = words.states[test.state] || test.state; tag.className = "tag tag-" + test.state;
   const job = test.identification;
-  if (test.state === "identifying") { say("left", "identifying"); say("segment", job ? job.text || job.state : "identifying"); byId("progress").value = 1; }
-  if (test.reason) { say("reason", test.reason); byId("reason").hidden = false; }
+  if (segment && test.state !== "running") { segment = null; tone.end(); }
+  if (test.state === "identifying") {
+    delete byId("live").dataset.stopKeys; // nothing is sent any more: Space is a key like any other
+    say("left", job && typeof job.time_left_s === "number" ? Math.ceil(job.time_left_s) + " s" : "–");
+    say("segment", words.identifying); byId("segment").title = told.work; byId("progress").value = job ? job.progress : 0;
+  }
+  const carrying = byId("keep-plain");
+  if (carrying) carrying.hidden = !(test.state === "identifying" && job && job.verb === "carry");
+  if (test.reason) { say("reason", told.reason); byId("reason").hidden = false; }
   if (test.done && wasOpen && !leaving) location.replace(test.model_id ? "/models/" + test.model_id : location.pathname);
 }
 
@@ -66,13 +87,12 @@ function age() {
   if (state.test.done) return;
   const since = state.heard ? (performance.now() - state.heard) / 1000 : null;
   const seconds = since === null ? null : since + state.torqueAge;
-  say("age", seconds === null ? "–" : seconds < 1 ? Math.round(seconds * 1000) + " ms" : seconds.toFixed(1) + " s");
+  say("age", seconds === null ? "–" : seconds < 1 ? Math.round(seconds * 1000) + " ms" : shown(seconds.toFixed(1)) + " s");
   const running = state.test.state === "running";
-  const stale = running && (!state.connected || !open || seconds === null || seconds > STALE_S);
+  const stale = refused || (running && (!state.connected || !open || seconds === null || seconds > STALE_S));
   byId("stale").hidden = !stale;
   byId("live").classList.toggle("is-stale", stale);
-  if (stale) say("stale", !open ? "No connection to the service. Display out of date: do not rely on it. If the stop button does not answer, use the emergency switch on the stimulator."
-    : !state.connected ? "The rig cannot be reached. Display out of date: do not rely on it; use the emergency switch on the stimulator if unsure." : "Display out of date. Do not rely on it; press Stop if unsure.");
+  if (stale) say("stale", refused ? words.signed_out : !open ? words.no_service : !state.connected ? words.no_rig : words.old);
 }
 
 // ---- drawing -----------------------------------------------------------------------------------
@@ -93,17 +113,17 @@ function frame(canvas, low, high, title, unit) {
   const span = Math.max(state.duration, 1);
   const x = (t) => area.left + (t / span) * (area.right - area.left);
   const y = (v) => area.bottom - ((v - low) / (high - low)) * (area.bottom - area.top);
-  pen.font = "13px system-ui, 'DejaVu Sans', sans-serif"; pen.fillStyle = DIM; pen.lineWidth = 1; pen.strokeStyle = GRID;
-  const ystep = nice(high - low, 5), xstep = nice(span, box.width < 520 ? 4 : 8);
+  pen.font = "13px " + FONT; pen.fillStyle = colours.dim; pen.lineWidth = 1; pen.strokeStyle = colours.grid;
+  const ystep = nice(high - low, box.height < 170 ? 3 : 5), xstep = nice(span, box.width < 520 ? 4 : 8);
   pen.textAlign = "right"; pen.textBaseline = "middle";
   for (let v = Math.ceil(low / ystep) * ystep; v <= high + 1e-9; v += ystep) {
     pen.beginPath(); pen.moveTo(area.left, y(v)); pen.lineTo(area.right, y(v)); pen.stroke();
-    pen.fillText(minus(String(+v.toFixed(6))), area.left - 8, y(v));
+    pen.fillText(shown(+v.toFixed(6)), area.left - 8, y(v));
   }
   pen.textAlign = "center"; pen.textBaseline = "top";
-  for (let t = 0; t <= span + 1e-9; t += xstep) pen.fillText(String(+t.toFixed(6)), x(t), area.bottom + 5);
-  pen.textAlign = "right"; pen.fillText("Time (s)", area.right, area.bottom + 20);
-  pen.textAlign = "left"; pen.fillStyle = INK; pen.font = "600 13px system-ui, 'DejaVu Sans', sans-serif"; pen.fillText(title + " (" + unit + ")", 4, 3);
+  for (let t = 0; t <= span + 1e-9; t += xstep) pen.fillText(shown(+t.toFixed(6)), x(t), area.bottom + 5);
+  pen.textAlign = "right"; pen.fillText(words.time, area.right, area.bottom + 20);
+  pen.textAlign = "left"; pen.fillStyle = colours.ink; pen.font = "600 13px " + FONT; pen.fillText(title + " (" + unit + ")", 4, 3);
   segments(pen, area, x);
   pen.beginPath(); pen.rect(area.left, 0, area.right - area.left + 2, area.bottom + 1); pen.clip();
   return { pen, x, y, area };
@@ -112,16 +132,27 @@ function frame(canvas, low, high, title, unit) {
 function segments(pen, area, x) {
   for (const part of (state.test.planned || {}).segments || []) {
     if (part.name !== "validate") continue;
-    pen.fillStyle = "rgba(180,105,14,.06)";
+    pen.fillStyle = colours["held-out"];
     pen.fillRect(x(part.start_s), area.top, x(part.end_s) - x(part.start_s), area.bottom - area.top);
   }
 }
 
+function limitLine({ pen, y, area }, value, text) {
+  pen.save();
+  pen.strokeStyle = pen.fillStyle = colours.limit; pen.lineWidth = 1.5; pen.setLineDash([7, 5]);
+  pen.beginPath(); pen.moveTo(area.left, y(value)); pen.lineTo(area.right, y(value)); pen.stroke();
+  pen.font = "600 12px " + FONT; pen.textAlign = "right"; pen.textBaseline = "top";
+  pen.fillText(text.replace("{limit}", shown(+value.toFixed(1))), area.right - 4, y(value) + 4);
+  pen.restore();
+}
+
 function drawTorque() {
-  let low = 0, high = 1;
+  const limit = data.limits.torque_nm;
+  let low = 0, high = limit || 1;
   for (let i = 0; i < state.time.length; i++) { if (state.low[i] < low) low = state.low[i]; if (state.high[i] > high) high = state.high[i]; }
   const room = (high - low) * 0.06;
-  const { pen, x, y, area } = frame(byId("torque-chart"), low - (low < 0 ? room : 0), high + room, "Elbow torque", "N·m");
+  const drawn = frame(byId("torque-chart"), low - (low < 0 ? room : 0), high + room, words.torque, "N·m");
+  const { pen, x, y, area } = drawn;
   const columns = new Map(); // one envelope a pixel: min and max, so that no peak is lost
   for (let i = 0; i < state.time.length; i++) {
     const column = Math.round(x(state.time[i])), known = columns.get(column);
@@ -129,7 +160,7 @@ function drawTorque() {
     else { if (state.low[i] < known[0]) known[0] = state.low[i]; if (state.high[i] > known[1]) known[1] = state.high[i]; }
   }
   const points = [...columns.entries()];
-  pen.fillStyle = "rgba(11,107,117,.25)"; pen.strokeStyle = TORQUE; pen.lineWidth = 1.6; pen.lineJoin = "round";
+  pen.fillStyle = colours["torque-band"]; pen.strokeStyle = colours.torque; pen.lineWidth = 1.6; pen.lineJoin = "round";
   pen.beginPath();
   points.forEach(([column, [, top]], i) => (i ? pen.lineTo(column, y(top)) : pen.moveTo(column, y(top))));
   points.reverse().forEach(([column, [bottom]]) => pen.lineTo(column, y(bottom)));
@@ -137,16 +168,21 @@ function drawTorque() {
   pen.beginPath();
   points.reverse().forEach(([column, [bottom, top]], i) => { const mid = y((bottom + top) / 2); if (i) pen.lineTo(column, mid); else pen.moveTo(column, mid); });
   pen.stroke();
+  if (limit) limitLine(drawn, limit, words.stops);
+  if (limit && low < -limit / 2) limitLine(drawn, -limit, words.stops);
   cursor(pen, x, area);
 }
 
 function drawWidth() {
-  let high = 100;
+  const limit = data.limits.pulse_width_us;
+  let high = limit || 100;
   for (const value of data.planned_us) if (value > high) high = value;
   for (const value of state.width) if (value > high) high = value;
-  const { pen, x, y, area } = frame(byId("width-chart"), 0, high * 1.08, "Pulse width", "µs");
-  stairs(pen, x, y, data.planned_us.map((_, i) => i / data.pulse_rate_hz), data.planned_us, PLAN, 1.2);
-  stairs(pen, x, y, state.pulseTime, state.width, WIDTH, 1.8);
+  const drawn = frame(byId("width-chart"), 0, high * 1.08, words.width, "µs");
+  const { pen, x, y, area } = drawn;
+  stairs(pen, x, y, data.planned_us.map((_, i) => i / data.pulse_rate_hz), data.planned_us, colours.plan, 1.2);
+  stairs(pen, x, y, state.pulseTime, state.width, colours.width, 1.8);
+  if (limit) limitLine(drawn, limit, words.comfort);
   cursor(pen, x, area);
 }
 
@@ -161,7 +197,7 @@ function stairs(pen, x, y, times, values, colour, width) {
 
 function cursor(pen, x, area) {
   if (state.test.done || !state.elapsed) return;
-  pen.strokeStyle = "#9aa5b1"; pen.lineWidth = 1; pen.beginPath();
+  pen.strokeStyle = colours.cursor; pen.lineWidth = 1; pen.beginPath();
   pen.moveTo(x(state.elapsed), area.top); pen.lineTo(x(state.elapsed), area.bottom); pen.stroke();
 }
 
@@ -169,9 +205,10 @@ function drawTrack() {
   const track = byId("track"), parts = (state.test.planned || {}).segments || [];
   track.replaceChildren(...parts.map((part) => {
     const box = document.createElement("span");
-    box.style.flexGrow = part.end_s - part.start_s; box.style.flexBasis = "0"; box.textContent = part.name === "rest" ? "" : part.name; box.className = "part part-" + part.name;
+    box.style.flexGrow = part.end_s - part.start_s; box.style.flexBasis = "0"; box.textContent = part.name === "rest" ? "" : segmentWords(part.name); box.title = part.name; box.className = "part part-" + part.name;
     return box;
   }));
+  for (const box of track.children) if (box.scrollWidth > box.clientWidth) box.textContent = box.textContent.split(" (")[0]; // what stands in brackets has no room
 }
 
 function draw() {
@@ -181,15 +218,38 @@ function draw() {
 
 // ---- the line to the service -------------------------------------------------------------------
 
-let open = false;
+const REFUSED = 4401; // the session has ended, or is locked: somebody may sign in again in another tab
+let open = false, refused = false;
 function connect() {
   const socket = new WebSocket(location.origin.replace(/^http/, "ws") + "/v1/tests/" + data.test.id + "/live");
-  socket.onopen = () => { open = true; };
-  socket.onmessage = (event) => take(JSON.parse(event.data));
-  socket.onclose = () => { open = false; if (!state.test.done) setTimeout(connect, 500); };
+  socket.onmessage = (event) => {
+    const message = JSON.parse(event.data);
+    if (message.type === "problem") return; // why it closes is in the code of its closing
+    open = true; refused = false;
+    take(message);
+  };
+  socket.onclose = (event) => { open = false; refused = event.code === REFUSED; if (!state.test.done) setTimeout(connect, refused ? 2000 : 500); };
 }
 
-addEventListener("resize", () => { state.dirty = true; });
+// ---- colours and the window --------------------------------------------------------------------
+
+function readColours() {
+  const style = getComputedStyle(document.documentElement);
+  for (const name of ["ink", "dim", "grid", "torque", "torque-band", "width", "plan", "limit", "cursor", "held-out"]) colours[name] = style.getPropertyValue("--" + name).trim();
+  state.dirty = true;
+}
+
+function fit() { // the charts take what the window has below the page's head
+  const live = byId("live");
+  live.style.setProperty("--above", Math.round(live.getBoundingClientRect().top + scrollY) + "px");
+  state.dirty = true;
+}
+
+addEventListener("resize", fit);
+addEventListener("colours", readColours);
+new ResizeObserver(fit).observe(document.getElementById("main"));
+readColours();
+fit();
 drawTrack();
 connect();
 setInterval(age, 100);

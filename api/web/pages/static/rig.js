@@ -2,6 +2,7 @@
 // The page asks (the service does not push): an answer is newer than its question, also after a laptop has slept.
 "use strict";
 {
+  const words = JSON.parse(document.getElementById("rig-words").textContent);
   const EVERY_MS = 500, PATIENCE_MS = 1500, OLD_MS = 2000, TORQUE_OLD_S = 1.0;
   const clock = () => [performance.now(), Date.now()]; // the first stands still while a machine sleeps, the second may be set
   const since = (then) => Math.max(performance.now() - then[0], Date.now() - then[1]);
@@ -11,6 +12,7 @@
   let known = null, asked = null, last = null, busy = false, fetching = "";
 
   const say = (name, text) => { for (const box of boxes(name)) if (box.textContent !== text) box.textContent = text; };
+  const figure = (value, digits) => value.toLocaleString(document.documentElement.lang, { minimumFractionDigits: digits, maximumFractionDigits: digits, useGrouping: false }).replace("-", "−");
   const old = () => since(asked || begun) > OLD_MS;
 
   function get(address) { // aborted in time, its body too; AbortSignal.timeout is missing in browsers before 2022
@@ -25,16 +27,17 @@
     const moment = last = clock();
     try {
       const answer = await get("/rig/now");
-      if (answer.ok) { known = await answer.json(); asked = moment; }
+      if (answer.ok) { known = await answer.json(); asked = moment; dispatchEvent(new CustomEvent("rig-now", { detail: known })); }
     } catch { /* what is shown grows old, and says so */ }
     busy = false;
     show();
   }
 
   function show() {
-    if (old()) return bar("unknown", "Unknown", "no answer from the service", false);
+    if (old()) return bar("unknown", words.unknown, words.silent, false);
     if (!known) return; // what the service wrote into the page stands, with its time
     bar(known.state, known.flow, known.more, known.ready);
+    document.dispatchEvent(new CustomEvent("rig", { detail: known })); // for scripts that follow what the rig does
     if (known.test !== undefined) test(known.test);
     if (known.notice !== undefined) renew(known.notice);
   }
@@ -47,18 +50,18 @@
   }
 
   function torque() {
-    if (old() || !known) return "unknown";
-    if (typeof known.torque_age_s !== "number") return "none yet";
+    if (old() || !known) return words.no_value;
+    if (typeof known.torque_age_s !== "number") return words.none;
     const age = known.torque_age_s + since(asked) / 1000;
-    if (known.torque_nm === null || age > TORQUE_OLD_S) return "no torque for " + age.toFixed(1) + " s";
-    return known.torque_nm.toFixed(2).replace("-", "−") + " N·m, " + age.toFixed(1) + " s old";
+    if (known.torque_nm === null || age > TORQUE_OLD_S) return words.no_torque.replace("{age}", figure(age, 1));
+    return words.torque.replace("{torque}", figure(known.torque_nm, 2)).replace("{age}", figure(age, 1));
   }
 
   function test(current) {
     for (const box of document.querySelectorAll("[data-when]")) box.hidden = (box.dataset.when === "busy") !== (current !== null);
     for (const tag of document.querySelectorAll("[data-running]")) {
       if (current && current.id === tag.dataset.running) continue;
-      tag.textContent = "ended"; tag.className = "tag"; delete tag.dataset.running; // how, the page says when it is loaded
+      tag.textContent = words.ended; tag.className = "tag"; delete tag.dataset.running; // how, the page says when it is loaded
     }
     if (!current) return;
     for (const link of boxes("test")) link.setAttribute("href", "/tests/" + current.id);

@@ -9,3 +9,4 @@ function take() {
 }
 addEventListener("hashchange", take);
 take();
+sessionStorage.clear(); // what somebody else had typed before the session ended

@@ -1,0 +1,214 @@
+"""Small pictures of a participant's figures over the sessions, one above another on the same time axis.
+
+They are SVG in the page's own colours: a dozen of them are there at once, and they follow the dark mode by themselves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any
+
+from markupsafe import Markup, escape
+
+from api import language
+from api.charts.svg import plain, ticks
+from api.clock import unix_of, utc_label
+from api.language import _
+from api.models import trend_words
+from api.models.changes import BEYOND
+from api.models.trend_words import UNBROKEN, Name
+
+WIDE, TALL = 400.0, 128.0
+LEFT, RIGHT, TOP, BOTTOM = 46.0, 12.0, 12.0, 20.0
+LEAST_SPAN = 0.08
+"""A picture spans at least this share of its values: what does not change looks as if it did not."""
+DAY_S = 86400.0
+AXIS_LABELS = 4
+
+Point = dict[str, Any]
+
+
+def panels(sessions: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The pictures: each `title`, `unit`, `latest` (in words), `svg`.
+
+    Parameters
+    ----------
+    sessions : sequence of dict
+        As `Session.shown` gives them, the oldest first.
+    """
+    names = dict.fromkeys(name for one in sessions for name in one["figures"])
+    first = [name for name in trend_words.NAMES if name not in trend_words.LAST]
+    effects = [name for name in names if "." in name]
+    shown = [*first, *effects, *trend_words.LAST]
+    return [panel(name, sessions) for name in shown if name in names]
+
+
+def panel(figure: str, sessions: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """One figure over the sessions."""
+    unit = next((one["figures"][figure]["unit"] for one in sessions if figure in one["figures"]), "1")
+    name = trend_words.name_of(figure, unit)
+    points = [point(one, figure, name) for one in sessions]
+    known = [one for one in points if one["value"] is not None]
+    return {
+        "title": name.words,
+        "unit": "" if name.unit == "1" else name.unit,
+        "latest": known[-1]["words"] if known else "–",
+        "svg": Plane(points, figure in ("threshold_us", "plateau_nm")).svg(f"{name.words}, {name.unit}"),
+    }
+
+
+def point(session: dict[str, Any], figure: str, name: Name) -> Point:
+    """A session's value in the unit that is shown, and what is said of it."""
+    found = session["figures"].get(figure) or {"value": None, "uncertainty": None}
+    value, uncertainty = found["value"], found["uncertainty"]
+    words = trend_words.with_uncertainty(value, uncertainty, name)
+    if value is not None and name.unit != "1":
+        words = f"{words}{UNBROKEN}{name.unit}"
+    return {
+        "at_s": unix_of(session["at_utc"]),
+        "value": None if value is None else value * name.factor,
+        "half": None if uncertainty is None else BEYOND * uncertainty * name.factor,
+        "current_ma": session["figures"]["current_ma"]["value"],
+        "approved": session["approved"],
+        "noted": bool(session["notes"]),
+        "words": words,
+        "tip": tip(session, f"{name.words} {words}", found.get("where") or ""),
+        "href": f"/models/{session['model_id']}",
+    }
+
+
+def tip(session: dict[str, Any], words: str, where: str = "") -> str:
+    """What stands beside the pointer, line by line."""
+    lines = [language.when(session["at_utc"]), words, *([where] if where else [])]
+    if session["approved"]:
+        lines.append(_("approved by %(name)s", name=session["approved_by"]))
+    else:
+        lines.append(_("not approved"))
+    lines += [f"{note['by']}: {note['text'][:120]}" for note in session["notes"][:4]]
+    return "\n".join(lines)
+
+
+class Plane:
+    """Where a figure's values lie in its picture."""
+
+    def __init__(self, points: list[Point], breaks: bool) -> None:
+        self.points, self.breaks = points, breaks
+        self.low, self.high = span(points)
+        self.first_s = min(one["at_s"] for one in points)
+        self.last_s = max(one["at_s"] for one in points)
+
+    def x(self, at_s: float) -> float:
+        """Time to paper; a single session stands in the middle."""
+        share = (at_s - self.first_s) / (self.last_s - self.first_s) if self.last_s > self.first_s else 0.5
+        return LEFT + 8 + share * (WIDE - LEFT - RIGHT - 16)
+
+    def y(self, value: float) -> float:
+        """Value to paper, within the frame."""
+        share = (value - self.low) / (self.high - self.low)
+        return TALL - BOTTOM - min(max(share, 0.0), 1.0) * (TALL - TOP - BOTTOM)
+
+    def svg(self, label: str) -> Markup:
+        """The picture."""
+        parts = [*self.frame(), *self.dates(), *self.bands(), *self.lines(), *self.marks(), *self.columns()]
+        head = f'<svg class="trend" viewBox="0 0 {WIDE:g} {TALL:g}" role="img" aria-label="{escape(label)}">'
+        return Markup(head + "".join(parts) + "</svg>")
+
+    def frame(self) -> list[str]:
+        """Grid and values."""
+        parts = []
+        for value in ticks(self.low, self.high, 4):
+            at = self.y(value)
+            parts.append(f'<path class="grid" d="M{LEFT:g} {at:.1f}H{WIDE - RIGHT:g}"/>')
+            words = escape(language.localised(plain(value)))
+            parts.append(f'<text class="y" x="{LEFT - 5:g}" y="{at + 4:.1f}">{words}</text>')
+        return parts
+
+    def dates(self) -> list[str]:
+        """A few days, or times of day where all was on one."""
+        if self.last_s == self.first_s:
+            marks = [self.first_s]
+        else:
+            step_s = (self.last_s - self.first_s) / (AXIS_LABELS - 1)
+            marks = [self.first_s + k * step_s for k in range(AXIS_LABELS)]
+        short = self.last_s - self.first_s < 2 * DAY_S and len(marks) > 1
+        parts = []
+        for number, at_s in enumerate(marks):
+            label = utc_label(at_s)
+            words = language.clock(label)[:5] if short else language.day(label, year=False)
+            anchor = "middle" if 0 < number < len(marks) - 1 or len(marks) == 1 else ("start", "end")[number > 0]
+            parts.append(
+                f'<text class="x" x="{self.x(at_s):.1f}" y="{TALL - 5:g}" text-anchor="{anchor}">{escape(words)}</text>'
+            )
+        return parts
+
+    def runs(self) -> list[list[Point]]:
+        """Points that a line joins: those with a value; of figures that depend on the current, at the same current."""
+        found: list[list[Point]] = []
+        before: Point | None = None
+        for one in self.points:
+            if one["value"] is None:
+                before = None
+                continue
+            apart = before is None or (self.breaks and before["current_ma"] != one["current_ma"])
+            if apart:
+                found.append([])
+            found[-1].append(one)
+            before = one
+        return found
+
+    def bands(self) -> list[str]:
+        """The uncertainty as a band along each line, and as a bar at each point."""
+        parts = []
+        for run in self.runs():
+            known = [one for one in run if one["half"] is not None]
+            edge = [(self.x(one["at_s"]), self.y(one["value"] + one["half"])) for one in known]
+            edge += [(self.x(one["at_s"]), self.y(one["value"] - one["half"])) for one in reversed(known)]
+            if len(known) > 1:
+                parts.append(f'<path class="band" d="M{"L".join(f"{x:.1f} {y:.1f}" for x, y in edge)}Z"/>')
+            for one in known:
+                top, foot = self.y(one["value"] + one["half"]), self.y(one["value"] - one["half"])
+                parts.append(f'<path class="bar" d="M{self.x(one["at_s"]):.1f} {top:.1f}V{foot:.1f}"/>')
+        return parts
+
+    def lines(self) -> list[str]:
+        """The lines."""
+        ways = [[f"{self.x(one['at_s']):.1f} {self.y(one['value']):.1f}" for one in run] for run in self.runs()]
+        return [f'<path class="line" d="M{"L".join(way)}"/>' for way in ways if len(way) > 1]
+
+    def marks(self) -> list[str]:
+        """A dot for each session, hollow where nothing is approved; a flag where something is noted."""
+        parts = []
+        for one in self.points:
+            x = self.x(one["at_s"])
+            if one["noted"]:
+                parts.append(f'<path class="flag" d="M{x - 4:.1f} 1h8l-4 7Z"/>')
+            if one["value"] is not None:
+                kind = "dot" if one["approved"] else "dot hollow"
+                parts.append(f'<circle class="{kind}" cx="{x:.1f}" cy="{self.y(one["value"]):.1f}" r="3.6"/>')
+        return parts
+
+    def columns(self) -> list[str]:
+        """What the pointer meets: a column for each session, as wide as the way to its neighbours."""
+        at = [self.x(one["at_s"]) for one in self.points]
+        edges = [LEFT, *((a + b) / 2 for a, b in pairwise(at)), WIDE - RIGHT]
+        return [
+            f'<rect class="column" x="{left:.1f}" y="0" width="{max(right - left, 0.5):.1f}" '
+            f'height="{TALL - BOTTOM:g}" data-session="{number}" data-href="{escape(one["href"])}" '
+            f'data-tip="{escape(one["tip"])}"/>'
+            for number, (one, left, right) in enumerate(zip(self.points, edges[:-1], edges[1:], strict=True))
+        ]
+
+
+def span(points: Sequence[Point]) -> tuple[float, float]:
+    """Least and largest that is shown: the values, and their bands as far as they do not dwarf them."""
+    values = [one["value"] for one in points if one["value"] is not None]
+    if not values:
+        return 0.0, 1.0
+    low, high = min(values), max(values)
+    room = max(high - low, LEAST_SPAN * max(abs(low), abs(high))) or 1.0
+    halves = [(one["value"] - one["half"], one["value"] + one["half"]) for one in points if one["half"] is not None]
+    foot = max(min((down for down, _up in halves), default=low), low - room)
+    top = min(max((up for _down, up in halves), default=high), high + room)
+    short = max(room - (max(top, high) - min(foot, low)), 0.0)
+    return min(foot, low) - short / 2 - 0.06 * room, max(top, high) + short / 2 + 0.06 * room

@@ -1,0 +1,18 @@
+"""The languages of the pages: one gettext catalogue for each, English in the source.
+
+What is stored and what `/v1` answers is English. A text is translated when a page shows it: the texts of the pages by
+`_`, sentences that other parts made (`identify`, the rig, problems) by `translated`.
+"""
+
+from __future__ import annotations
+
+from api.language.catalogues import CODES, DEFAULT, best, names
+from api.language.current import code, locale, using
+from api.language.numbers import clock, day, decimal, localised, separators, until, when, zone
+from api.language.translated import plain, translated
+from api.language.words import _, lazy, ngettext
+
+__all__ = [
+    "CODES", "DEFAULT", "_", "best", "clock", "code", "day", "decimal", "lazy", "locale", "localised", "names",
+    "ngettext", "plain", "separators", "translated", "until", "using", "when", "zone",
+]  # fmt: skip

@@ -1,0 +1,198 @@
+"""Which messages the pages show: read from the templates and the source, merged into each catalogue.
+
+``python -m api.language.extract`` renews the catalogues (``fr`` as an argument begins one); ``--check`` changes nothing
+and says what is missing.
+"""
+
+from __future__ import annotations
+
+import ast
+import io
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+from babel import localedata
+from babel.messages.catalog import Catalog
+from babel.messages.extract import extract_from_file
+from babel.messages.pofile import write_po
+
+from api.language.catalogues import CODES, DEFAULT, HERE, catalogue
+
+ROOT = HERE.parents[1]
+KEYWORDS = {"_": None, "gettext": None, "ngettext": (1, 2), "lazy": None}
+SENTENCES = (
+    "identify/caution.py", "identify/errors.py", "identify/criticism/*.py", "identify/diagnosis/*.py",
+    "identify/estimation/quality.py", "identify/effects/*.py", "identify/experiments/*.py", "identify/records/*.py",
+    "identify/fitting.py", "identify/dynamics/make_grid.py", "identify/estimation/rows.py",
+    "identify/estimation/effect_fit.py", "identify/estimation/pilot.py", "identify/methods/**/*.py",
+    "identify/simulation/predict.py",
+    "rig/acquire/*.py", "rig/control/*.py", "rig/devices/*.py", "rig/assembly.py", "rig/gate.py", "rig/journal.py",
+    "rig/limits.py", "rig/plan.py", "rig/sequences/*.py", "rig/trial.py", "api/models/*.py", "api/people/*.py",
+    "api/sessions/*.py", "api/web/*.py", "api/web/routes/*.py", "api/web/pages/*.py",
+    "api/workers/*.py", "api/errors.py",
+)  # fmt: skip
+"""Modules whose sentences reach a page without `_`, since what they make is stored, or answered in English."""
+FOR_PROGRAMMERS = {
+    "app.py", "openapi.py", "headers.py", "dependencies.py", "server.py", "static.py", "schemas.py", "own_file.py",
+    "hdf5_chunks.py", "confinement.py", "child.py", "docs.py",
+}  # fmt: skip
+"""Modules of those folders whose texts no page shows."""
+NAMED = {"Effect": ("name",), "Parameter": ("about",)}
+"""Calls with arguments that pages show although they may be a single word."""
+NOT_SHOWN = {
+    "Field",
+    "Query",
+    "Header",
+    "answers",
+    "published",
+    "problem",
+    "compile",
+    "getLogger",
+    "_",
+    "lazy",
+    "ngettext",
+}
+"""Calls whose texts no page shows: descriptions of the API, patterns, logs, and what is extracted already."""
+
+
+def messages() -> Iterator[str | tuple[str, ...]]:
+    """All messages of the source."""
+    for path in sorted((ROOT / "api").rglob("*.html")):
+        options = {"newstyle_gettext": "true", "trimmed": "true", "trim_blocks": "true", "lstrip_blocks": "true"}
+        yield from _marked("jinja2.ext:babel_extract", path, options)
+    for path in sorted((ROOT / "api").rglob("*.py")):
+        yield from _marked("python", path, {})
+    for pattern in SENTENCES:
+        for path in (path for path in sorted(ROOT.glob(pattern)) if path.name not in FOR_PROGRAMMERS):
+            yield from sentences(path.read_text(encoding="utf-8"))
+
+
+def _marked(method: str, path: Path, options: dict[str, str]) -> Iterator[str | tuple[str, ...]]:
+    for _, message, _, _ in extract_from_file(method, path, KEYWORDS, options=options):
+        yield message
+
+
+def sentences(source: str) -> Iterator[str]:
+    """The sentences of a module: texts of more than a word that are no docstring and go to no log."""
+    yield from _Sentences().of(ast.parse(source))
+
+
+class _Sentences(ast.NodeVisitor):
+    """Collects texts; an f-string becomes a message with named places."""
+
+    def __init__(self) -> None:
+        self.found: list[str] = []
+
+    def of(self, tree: ast.AST) -> list[str]:
+        self.visit(tree)
+        return self.found
+
+    def visit_Expr(self, node: ast.Expr) -> None:
+        if not isinstance(node.value, ast.Constant):  # a docstring
+            self.generic_visit(node)
+
+    def visit_Call(self, node: ast.Call) -> None:
+        name = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
+        owner = getattr(getattr(node.func, "value", None), "id", "")
+        if name not in NOT_SHOWN and owner not in ("log", "re", "audit"):
+            self.generic_visit(node)
+        if name in NAMED:
+            self.found += [text for part in node.keywords if part.arg in NAMED[name] and (text := _text(part.value))]
+
+    def visit_Constant(self, node: ast.Constant) -> None:
+        if isinstance(node.value, str) and _is_sentence(node.value):
+            self.found.append(node.value)
+
+    def visit_JoinedStr(self, node: ast.JoinedStr) -> None:
+        message = pattern_of(node)
+        if _is_sentence(re.sub(r"%\(\w+\)s", "", message)):
+            self.found.append(message)
+        for branch in (branch for part in ast.walk(node) if isinstance(part, ast.IfExp) for branch in _branches(part)):
+            self.found += [branch] if re.search("[A-Za-z]{2}", branch) else []
+
+
+def _text(node: ast.expr) -> str:
+    return node.value if isinstance(node, ast.Constant) and isinstance(node.value, str) else ""
+
+
+def _branches(choice: ast.IfExp) -> list[str]:
+    """The words of `'low' if error > 0 else 'high'`."""
+    return [_text(choice.body), _text(choice.orelse)]
+
+
+def _is_sentence(text: str) -> bool:
+    return bool(re.search(r"[A-Za-z]{2}.* .*[A-Za-z]{2}", text)) and not re.search(
+        r"\n|^[/<]|charset=|\w = |{:|\w' =", text
+    )
+
+
+def pattern_of(node: ast.JoinedStr) -> str:
+    """An f-string as a message: `f"{share:.0%} lower"` is ``%(share)s lower``."""
+    used: set[str] = set()
+    parts = []
+    for part in node.values:
+        if isinstance(part, ast.Constant):
+            parts.append(str(part.value).replace("%", "%%"))
+        elif isinstance(part, ast.FormattedValue):
+            parts.append(f"%({_name(part.value, used)})s")
+    return "".join(parts)
+
+
+def _name(value: ast.expr, used: set[str]) -> str:
+    known = getattr(value, "id", None) or getattr(value, "attr", None) or "value"
+    name = next(n for k in range(1, 99) if (n := known if k == 1 else f"{known}_{k}") not in used)
+    used.add(name)
+    return name
+
+
+def renewed(code: str) -> Catalog:
+    """The catalogue of a language with today's messages; translations that are there stay, unused ones go."""
+    begun = Catalog(locale=code, header_comment=f"# The pages in {code}; see docs/languages.md.")
+    known = catalogue(code) if code in CODES else begun
+    fresh = Catalog(locale=code, charset="utf-8", fuzzy=False, header_comment=known.header_comment)
+    for message in messages():
+        if message:
+            old = known.get(_first(message))
+            fresh.add(message, old.string if old is not None and not old.fuzzy else "")
+    fresh.creation_date = known.creation_date  # of the file: where no message changed, the file does not either
+    return fresh
+
+
+def missing(code: str) -> list[str]:
+    """Messages that have no translation, and those that nothing shows any more (with a minus sign before them)."""
+    fresh, known = renewed(code), catalogue(code)
+    lacking = [str(entry.id) for entry in fresh if entry.id and not _has(entry.string)]
+    gone = [f"- {entry.id}" for entry in known if entry.id and fresh.get(_first(entry.id)) is None]
+    return lacking + gone
+
+
+def _first(message: str | list[str] | tuple[str, ...]) -> str:
+    return message if isinstance(message, str) else message[0]
+
+
+def _has(translation: object) -> bool:
+    return all(translation) if isinstance(translation, tuple) else bool(translation)
+
+
+def main(arguments: list[str]) -> int:
+    """Renew the catalogues; or, with ``--check``, say what is missing."""
+    if "--check" in arguments:
+        lacking = {code: missing(code) for code in CODES if code != DEFAULT}
+        for code, entries in lacking.items():
+            print(*(f"{code}: {entry}" for entry in entries), sep="\n")
+        return int(any(lacking.values()))
+    unknown = [code for code in arguments if not re.fullmatch("[a-z]{2,3}", code) or not localedata.exists(code)]
+    if unknown:
+        print(f"{unknown[0]!r} is no language that babel knows: give a code like fr, without a region", file=sys.stderr)
+        return 2
+    for code in sorted({*CODES, *arguments} - {DEFAULT}):
+        written = io.BytesIO()  # the file is read while this is made
+        write_po(written, renewed(code), width=0, no_location=True, sort_output=True)
+        (HERE / f"{code}.po").write_bytes(written.getvalue())
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

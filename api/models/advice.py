@@ -1,0 +1,207 @@
+"""What a model's verdict means for the person who decides: what to do, what was found, what a controller would risk.
+
+`identify` judges (the gates in MODEL.json); here each gate that failed is said in a clinician's words, and identify's
+own sentence stays beside it as the technical term.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from api.language import _, lazy, plain
+from api.language import decimal as _decimal
+from api.models.followed import followed
+
+Act = Literal["approve", "add", "test", "fit"]
+
+
+@dataclass(frozen=True)
+class Gate:
+    """Texts of a check that failed.
+
+    Parameters
+    ----------
+    found : str
+        What was found.
+    look : str
+        What to do where the model is usable with care.
+    test : str
+        What to do where it is not usable.
+    risk : str
+        What the controller would do wrong.
+    """
+
+    found: Any
+    look: Any
+    test: Any
+    risk: Any
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A check that failed, in a clinician's words, and in identify's."""
+
+    gate: str
+    words: str
+    risk: str
+    technical: str
+    severe: bool
+
+
+@dataclass(frozen=True)
+class Advice:
+    """The sentence at the top of a model's page, and which button is the first one."""
+
+    act: Act
+    words: str
+
+
+GATES: dict[str, Gate] = {
+    "stable": Gate(
+        lazy("The dynamics are unstable: in the model the torque grows without end."),
+        lazy("Usable with care: look at the step response first."),
+        lazy("Not usable: test again with the arm held still and relaxed."),
+        lazy("The controller would expect torque that grows without end, and may switch between no and full pulses."),
+    ),
+    "converged": Gate(
+        lazy("The search for the muscle's speed did not come to its end."),
+        lazy("Usable with care: look at the step response first."),
+        lazy("Not usable: test again with the arm held still and relaxed."),
+        lazy("The speed of the muscle is not certain: the controller may react too early or too late."),
+    ),
+    "torque": Gate(
+        lazy("The pulses hardly change the torque, or the recruitment curve is far outside what was measured."),
+        lazy("Usable with care: look at the recruitment curve first."),
+        lazy("Not usable: test again with electrodes, current and load cell checked."),
+        lazy("The controller would set too wide pulses: the recruitment curve is not identified."),
+    ),
+    "monotone": Gate(
+        lazy("The recruitment curve falls at one place."),
+        lazy("Usable with care: look at the recruitment curve first."),
+        lazy("Not usable: test again with electrodes, current and load cell checked."),
+        lazy("The controller's pulse width jumps where the curve falls: two widths belong to one torque there."),
+    ),
+    "range": Gate(
+        lazy("Only a few pulse widths were measured; between them the recruitment curve is a guess."),
+        lazy("Usable with care: look at the recruitment curve first; a test with a ramp makes it sure."),
+        lazy("Not usable: test again with a ramp."),
+        lazy("The controller would set pulse widths that were never measured: the plateau is not identified."),
+    ),
+    "ceiling": Gate(
+        lazy("The model follows less of the torque than the sensor's noise would allow."),
+        lazy("Usable with care: look at where the error sits first."),
+        lazy("Not usable: test again with electrodes checked and the arm relaxed: the torque hardly follows."),
+        lazy("The model does not follow the torque: the controller's pulses would be too wide at one time and too "
+             "narrow at another."),
+    ),
+    "held_out": Gate(
+        lazy("The error on pulses not used for fitting is clearly larger than on the others."),
+        lazy("Usable with care: look at the check in the chart first."),
+        lazy("Not usable: test again with the arm held still and relaxed."),
+        lazy("On new pulses the controller would be further off than the fit says."),
+    ),
+    "gap": Gate(
+        lazy("On pulses not used for fitting the model follows less of the torque than the noise would allow."),
+        lazy("Usable with care: look at where the error sits first."),
+        lazy("Not usable: test again with the arm held still and relaxed, or add what is missing."),
+        lazy("The controller works with pulses that the model has not seen: its torque there would be far off."),
+    ),
+    "residual": Gate(
+        lazy("What the model leaves over is not only noise."),
+        lazy("Usable with care: look at where the error sits first."),
+        lazy("Not usable: test again with the arm held still and relaxed."),
+        lazy("The error follows a pattern, and the controller repeats it in each trial."),
+    ),
+    "sensor": Gate(
+        lazy("The load cell shows the same torque again and again: it clips, or it is not connected."),
+        lazy("Usable with care: look at the highest torques in the chart first; the load cell clips."),
+        lazy("Not usable: test again with the load cell checked."),
+        lazy("The controller would set too wide pulses: the plateau is not identified, as the load cell could not "
+             "show it."),
+    ),
+}  # fmt: skip
+"""Each check of `identify.estimation.quality`."""
+
+
+def findings(document: dict[str, Any]) -> list[Finding]:
+    """The checks that failed, those that make a model not usable first; empty for models without stored checks."""
+    gates = (document.get("quality") or {}).get("gates") or {}
+    failed = [(name, gate) for name, gate in gates.items() if not gate.get("passed", True)]
+    failed.sort(key=lambda pair: pair[1].get("severity") != "refuse")
+    return [
+        Finding(name, str(known.found), str(known.risk), gate.get("says", ""), gate.get("severity") == "refuse")
+        for name, gate in failed
+        if (known := GATES.get(name)) is not None
+    ]
+
+
+def leaves_structure(found: Sequence[Finding]) -> bool:
+    """Whether the model's own check says that what it leaves over is not only noise."""
+    return any(finding.gate == "residual" for finding in found)
+
+
+def advice(verdict: str, found: Sequence[Finding], missing: Sequence[str]) -> Advice:
+    """What to do with a model.
+
+    Parameters
+    ----------
+    verdict : str
+        identify's.
+    found : sequence of Finding
+        The checks that failed, the worst first.
+    missing : sequence of str
+        Names of effects that the diagnosis found likely to be missing.
+    """
+    effects = _(" and ").join(plain(name) for name in missing)
+    first = GATES[found[0].gate] if found else None
+    if verdict == "usable":
+        if missing:
+            return Advice("approve", _("Usable: approve it. %(effects)s may make it better.", effects=effects))
+        return Advice("approve", _("Usable: approve it."))
+    if verdict == "usable with care":
+        if missing:
+            return Advice("add", _("Usable with care: look at %(effects)s first, and add it.", effects=effects))
+        look = str(first.look) if first else _("Usable with care: look at where the error sits first.")
+        return Advice("approve", look)
+    if verdict == "not usable":
+        if missing and all(finding.gate in ("gap", "ceiling") for finding in found if finding.severe):
+            return Advice("add", _("Not usable as it is: add %(effects)s, or test again.", effects=effects))
+        again = _("Not usable: test again with electrodes, fixture and load cell checked.")
+        return Advice("test", str(first.test) if first else again)
+    return Advice("fit", _("There is no verdict on this model: test again, or fit the recording again."))
+
+
+def risks(document: dict[str, Any], found: Sequence[Finding]) -> list[str]:
+    """What a controller would risk with a model that is not usable, in sentences."""
+    error = error_percent(document)
+    said = list(dict.fromkeys(finding.risk for finding in found))
+    if error is not None:
+        said.append(_("On pulses not used for fitting the error is %(percent)s %% of the torque.", percent=error))
+    return said or [_("Nobody knows how far the torque will be from what the controller expects.")]
+
+
+def error_percent(document: dict[str, Any]) -> str | None:
+    """What the model leaves over of the torque on rows not used to fit, as a number in text."""
+    fit = (document.get("fit") or {}).get("held_out_fit_percent")
+    return None if fit is None else f"{100.0 - fit:.0f}"
+
+
+def fit_sentence(fit: dict[str, Any]) -> str:
+    """How much of the torque the model follows, and how much noise lets it: of pulses not used for fitting if any."""
+    found = followed(fit)
+    if found.percent is None:
+        return ""
+    if found.percent <= 0.0:
+        return _("%(where)s the model does not follow the torque at all.", where=found.where)
+    reached = _percent(found.percent)
+    follows = _("%(where)s the model follows %(reached)s %% of the torque", where=found.where, reached=reached)
+    if found.ceiling_percent is None:
+        return f"{follows}."
+    limit = _("sensor noise limits this to %(ceiling)s %%", ceiling=_percent(found.ceiling_percent))
+    return f"{follows}; {limit}."
+
+
+def _percent(value: float) -> str:
+    return f"{value:.1f}".replace(".", _decimal())

@@ -1,0 +1,134 @@
+"""What the model of a new recording begins with: the structure of the participant's last approved model.
+
+It is fitted beside the plain structure, and the better of the two is offered. A participant without an approved model
+begins with the effects that the site has set.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import Callable
+from typing import Any
+
+from api.errors import ApiError
+from api.models import stored
+from api.models.registry import Versions
+from api.settings import Settings
+from api.store.tables import Model
+from api.structure import in_words
+from api.workers.pool import Call, Pool
+from api.workers.process import WORKER, Places
+
+OnCall = Callable[[Call], None]
+
+
+class CarriedStructure:
+    """The fit after a test or an upload, in the structure that the participant has so far."""
+
+    def __init__(self, versions: Versions, pool: Pool, settings: Settings) -> None:
+        self.versions, self.pool, self.settings = versions, pool, settings
+
+    async def fit(
+        self, participant: str, path: str, on_call: OnCall | None = None, **how: Any
+    ) -> tuple[dict[str, Any], str]:
+        """The first model of a recording, and what had to be left out of its structure (empty where nothing had).
+
+        It is plain where a structure is carried over after it, and where nothing in the recording looks like an effect
+        of the site's: a test that a person went through gives a model.
+
+        Raises
+        ------
+        ApiError
+            The recording gives no model in the plain structure either.
+        """
+        earlier = await asyncio.to_thread(self.versions.last_approved, participant)
+        effects = list(self.settings.structure) if earlier is None else []
+        if effects:
+            try:
+                return await self._begun("fit", path, on_call, effects=effects, **how), ""
+            except ApiError as error:
+                if error.code != "data":
+                    raise
+                why = error.detail
+            warning = f"Fitted in the plain structure, not with {in_words(effects).replace('_', ' ')}: {why}"
+        else:
+            warning = ""
+        return await self._begun("fit", path, on_call, **how), warning
+
+    async def carry(self, plain: Model, path: str, on_call: OnCall | None = None, **how: Any) -> Model:
+        """The version that is offered: the plain one, or its child in the structure of the last approved model.
+
+        Whatever becomes of the carried structure, the plain model stays; what was found is kept with it, and with the
+        child.
+        """
+        earlier = await asyncio.to_thread(self.versions.last_approved, plain.participant)
+        if earlier is None or earlier.recording_id == plain.recording_id or plain.effects:
+            return plain
+        try:
+            found = await self._begun("carry", path, on_call, model_json=stored.text(earlier), **how)
+        except (ApiError, OSError, ValueError) as error:  # all that a call can end with
+            found = {"json": None, "found": _not_carried(error)}
+        return await asyncio.to_thread(self._store, found, plain, earlier)
+
+    async def _begun(self, verb: str, path: str, on_call: OnCall | None, **arguments: Any) -> dict[str, Any]:
+        call = self.pool.submit(verb, data=path, **arguments)
+        if on_call is not None:
+            on_call(call)
+        return await call.result
+
+    def _store(self, found: dict[str, Any], plain: Model, earlier: Model) -> Model:
+        """The finding kept with the plain version; the child, where there is one; and which of them is offered."""
+        finding = {**found["found"], "from_model_id": earlier.id}
+        finding.pop("carried_from", None)
+        self.versions.note_carried(plain.id, finding, earlier.id if finding["why"] == "plain-before" else None)
+        if found["json"] is None:
+            return self.versions.get(plain.id)
+        document = json.loads(found["json"])
+        document["extra"] = {**(document.get("extra") or {}), "parent": plain.id}
+        child = self.versions.add(
+            json.dumps(document), plain.participant, plain.recording_id, plain.created_by, plain.id,
+            ",".join(effect["id"] for effect in document["effects"]), carried_from_id=earlier.id, carried=finding,
+        )  # fmt: skip
+        return child if finding["offered"] == "carried" else self.versions.get(plain.id)
+
+
+def _not_carried(error: Exception) -> dict[str, Any]:
+    """The finding where the structure could not be fitted."""
+    why = error.code if isinstance(error, ApiError) else "failed"
+    told = [part for part in (error.title, error.detail) if part] if isinstance(error, ApiError) else [str(error)]
+    reason = "The structure of the last session was not fitted. " + " ".join(f"{part.rstrip('.')}." for part in told)
+    nothing: dict[str, Any] = {
+        "still_needed": [],
+        "no_longer_needed": [],
+        "undecided": [],
+        "effects": [],
+        "figures": [],
+    }
+    return {"offered": "plain", "why": why, "reason": reason, **nothing}
+
+
+async def refuse_unknown(settings: Settings, worker: tuple[str, ...] = WORKER) -> None:
+    """Refuse effects of the site's own that cannot be used, and a structure that names what is not in the library.
+
+    A worker reads the library.
+
+    Raises
+    ------
+    OSError
+        Which, and what there is; or why the library cannot be read.
+    """
+    if not settings.structure and not settings.effects_dir:
+        return
+    reads = [settings.effects_dir] if settings.effects_dir else []
+    pool = Pool(1, worker, Places(reads))
+    try:
+        found = await pool.submit("effects").result
+    except ApiError as error:
+        raise OSError(f"the library of effects cannot be read: {error}") from error
+    finally:
+        await pool.close()
+    known = sorted(entry["id"] for entry in found["effects"])
+    unknown = [effect for effect in settings.structure if effect not in known]
+    if unknown:
+        raise OSError(f"STIMRIG_STRUCTURE: no effect is called {', '.join(unknown)}. Take some of {', '.join(known)}.")

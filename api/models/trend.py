@@ -1,0 +1,239 @@
+"""A participant's sessions over time: one model for each, with its figures, conditions, notes and approval.
+
+A session is a day in the clinic: all that the rig recorded on that day, where the service stands. A recording of
+another tool is a session by itself. Of all versions of a session one is shown: the approved one; where none is
+approved, the newest one of its newest recording.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from sqlalchemy import Row, select
+
+from api.clock import Clock, local_day
+from api.errors import ApiError
+from api.models import changes, headline, stored
+from api.models.changes import State
+from api.models.followed import followed
+from api.store import Store
+from api.store.tables import Analysis, Approval, Model, Note, Recording, Test
+from api.workers.pool import Pool
+
+KEPT_AS = "headline"
+"""The name under which the figures are kept of a model that was stored before its row held them."""
+CONDITIONS = ("electrodes", "side", "posture")
+"""Kinds of notes that put a comparison in doubt where they differ."""
+OTHER_UNITS = {
+    "fit_percent": "%", "held_out_fit_percent": "%", "noise_sd_nm": "N·m", "charge_uc": "µC", "current_ma": "mA",
+}  # fmt: skip
+"""Figures without a standard deviation: of the fit, and of the tests of the session."""
+
+
+@dataclass
+class Session:
+    """A session and the model that stands for it; `key` is its day, or the id of a recording of another tool."""
+
+    key: str
+    at_utc: str
+    model: Any
+    versions: int
+    approval: Approval | None
+    current_ma: float | None
+    charge_uc: float | None
+    test_ids: tuple[str, ...]
+    notes: list[Note] = field(default_factory=list)
+    figures: dict[str, headline.Figure] = field(default_factory=dict)
+
+    def state(self) -> State:
+        """What is compared of it."""
+        kinds = {kind: " · ".join(note.text for note in self.notes if note.kind == kind) for kind in CONDITIONS}
+        structure = headline.structure(self.model.effects, self.figures)
+        noted = tuple((kind, text) for kind, text in kinds.items() if text)
+        return State(self.figures, self.model.method, structure, self.current_ma, noted)
+
+    def document(self) -> dict[str, Any]:
+        """As REST tells it."""
+        fit = self.model.fit
+        plain = {**fit, "charge_uc": self.charge_uc, "current_ma": self.current_ma}
+        figures = {name: {**one, "uncertainty": changes.uncertainty(name, one)} for name, one in self.figures.items()}
+        for name, unit in OTHER_UNITS.items():
+            figures[name] = {"value": plain.get(name), "sd": None, "uncertainty": None, "unit": unit}
+        approval = self.approval
+        return {
+            "at_utc": self.at_utc,
+            "model_id": self.model.id,
+            "recording_id": self.model.recording_id,
+            "test_ids": list(self.test_ids),
+            "versions": self.versions,
+            "approved": approval is not None,
+            "approved_by": approval.by if approval else None,
+            "approved_utc": approval.at_utc if approval else None,
+            "method": self.model.method,
+            "effects": self.model.effects,
+            "verdict": fit.get("verdict", "unknown"),
+            "figures": figures,
+            "notes": [
+                {"at_utc": note.at_utc, "kind": note.kind, "text": note.text, "by": note.by, "test_id": note.test_id,
+                 "at_s": note.at_s} for note in self.notes
+            ],
+        }  # fmt: skip
+
+    def shown(self) -> dict[str, Any]:
+        """As pages show it: `document`, with one fit, `follows_percent`; its `where` says on which pulses."""
+        document = self.document()
+        found = followed(self.model.fit)
+        one = {"value": found.percent, "sd": None, "uncertainty": None, "unit": "%", "where": found.where}
+        kept = {name: figure for name, figure in document["figures"].items() if not name.endswith("fit_percent")}
+        return {**document, "figures": {**kept, "follows_percent": one}}
+
+
+class Trend:
+    """Reads sessions; the figures of models from before they were stored are found once, by a worker."""
+
+    def __init__(self, store: Store, clock: Clock, pool: Pool) -> None:
+        self.store, self.clock, self.pool = store, clock, pool
+
+    async def sessions(self, participant: str) -> list[Session]:
+        """A participant's sessions, the oldest first."""
+        found, _models = await asyncio.to_thread(self._read, participant)
+        await self._complete(found)
+        return found
+
+    async def of_models(self, participant: str, model_ids: Sequence[str]) -> list[Session]:
+        """Of each model the session in which its recording was made, with this model for it."""
+        sessions, models = await asyncio.to_thread(self._read, participant)
+        found = [_with_model(sessions, models, model_id) for model_id in model_ids]
+        await self._complete(found)
+        return found
+
+    async def against(self, model: Model) -> tuple[Session, Session] | None:
+        """The last approved session before the model's, and the model's with that model; None where there is none."""
+        sessions, models = await asyncio.to_thread(self._read, model.participant)
+        own = _with_model(sessions, models, model.id)
+        before = [
+            one for one in sessions if one.at_utc < own.at_utc and one.approval is not None and one.key != own.key
+        ]
+        if not before:
+            return None
+        await self._complete([before[-1], own])
+        return before[-1], own
+
+    def _read(self, participant: str) -> tuple[list[Session], dict[str, Row[Any]]]:
+        """The sessions, and all models by their ids."""
+        with self.store.read() as session:
+            models = session.execute(_models(participant)).all()
+            tests = session.execute(_tests(participant)).all()
+            decisions = list(session.scalars(select(Approval).where(Approval.participant == participant)))
+            noted = (Note.participant == participant, Note.struck_utc.is_(None))
+            notes = list(session.scalars(select(Note).where(*noted).order_by(Note.at_utc)))
+        newest = {one.model_id: one for one in sorted(decisions, key=lambda one: one.id)}
+        groups: dict[str, list[Row[Any]]] = {}
+        for row in models:
+            groups.setdefault(_key(row), []).append(row)
+        found = [_session(key, rows, tests, newest) for key, rows in groups.items()]
+        found.sort(key=lambda one: one.at_utc)
+        _attach(notes, found)
+        return found, {row.id: row for row in models}
+
+    async def _complete(self, sessions: Iterable[Session]) -> None:
+        """The figures of each session's model: from its row, else kept from before, else found now."""
+        old = []
+        for one in sessions:
+            one.figures = one.model.fit.get("figures") or {}
+            if not one.figures:
+                old.append(one)
+        if not old:
+            return
+        known = await asyncio.to_thread(self._known, [one.model.id for one in old])
+        await asyncio.gather(*(self._found(one) for one in old if one.model.id not in known))
+        for one in old:
+            one.figures = known.get(one.model.id) or one.figures
+
+    def _known(self, ids: Sequence[str]) -> dict[str, dict[str, headline.Figure]]:
+        rows = self.store.all(Analysis, Analysis.kind == KEPT_AS, Analysis.model_id.in_(ids))
+        return {row.model_id: row.document for row in rows}
+
+    async def _found(self, one: Session) -> None:
+        """Read the model's whole document, once: without standard deviations where a worker cannot make them."""
+        row = await asyncio.to_thread(self.store.get, Model, one.model.id)
+        try:
+            document = stored.read(row)
+        except ApiError:  # it has no figures; that it is damaged its own page says
+            return
+        try:
+            made = await asyncio.shield(self.pool.submit("figures", model_json=row.document.decode()).result)
+            document["uncertainty"] = {**(document.get("uncertainty") or {}), "figures": made["figures"]}
+        except ApiError as error:
+            if error.status >= 500:  # not the document's fault: the next look tries again
+                one.figures = headline.of(document)
+                return
+        one.figures = headline.of(document)
+        await asyncio.to_thread(self._keep, row.id, one.figures)
+
+    def _keep(self, model_id: str, figures: dict[str, headline.Figure]) -> None:
+        with self.store.write() as session:
+            session.merge(Analysis(model_id=model_id, kind=KEPT_AS, document=figures, created_utc=self.clock.utc()))
+
+
+def _models(participant: str) -> Any:
+    """All versions without their documents, which are long."""
+    columns = (
+        Model.id, Model.recording_id, Model.method, Model.effects, Model.fit, Model.created_utc,
+        Recording.origin, Recording.created_utc.label("recorded_utc"), Recording.test_id,
+    )  # fmt: skip
+    return select(*columns).join(Recording, Recording.id == Model.recording_id).where(Model.participant == participant)
+
+
+def _tests(participant: str) -> Any:
+    """What each test's session needs of it."""
+    current_ma = Test.plan["profile"]["current_ma"].as_float().label("current_ma")
+    columns = (Test.id, Test.requested_utc, current_ma, Test.summary["charge_uc"].as_float().label("charge_uc"))
+    return select(*columns).where(Test.participant == participant).order_by(Test.requested_utc)
+
+
+def _with_model(sessions: list[Session], models: dict[str, Row[Any]], model_id: str) -> Session:
+    """A model's session, with this model for it."""
+    row = models[model_id]
+    return replace(next(one for one in sessions if one.key == _key(row)), model=row, figures={})
+
+
+def _key(row: Any) -> str:
+    """What a version's session is known by."""
+    return local_day(row.recorded_utc) if row.origin in ("rig", "joined") else row.recording_id
+
+
+def _session(key: str, rows: list[Row[Any]], tests: Sequence[Row[Any]], decided: dict[str, Approval]) -> Session:
+    approvals = [decided[row.id] for row in rows if row.id in decided and decided[row.id].approved]
+    approval = max(approvals, key=lambda one: one.id, default=None)
+    rejected = {row.id for row in rows if row.id in decided and not decided[row.id].approved}
+    left = [row for row in rows if row.id not in rejected] or rows
+    model = max(left, key=lambda row: (row.recorded_utc, row.created_utc))
+    if approval is not None:
+        model = next(row for row in rows if row.id == approval.model_id)
+    here = [test for test in tests if local_day(test.requested_utc) == key]
+    own = [test for test in here if test.id == model.test_id] or here  # a joined recording is of all its tests
+    charges = [test.charge_uc for test in here if test.charge_uc is not None]
+    return Session(
+        key=key,
+        at_utc=model.recorded_utc,
+        model=model,
+        versions=len(rows),
+        approval=approval,
+        current_ma=own[-1].current_ma if own else None,
+        charge_uc=sum(charges) if charges else None,
+        test_ids=tuple(test.id for test in here),
+    )
+
+
+def _attach(notes: list[Note], sessions: list[Session]) -> None:
+    """Each note to the session of its test, else to the last one of its day; what is noted elsewhere is left out."""
+    by_test = {test_id: one for one in sessions for test_id in one.test_ids}
+    by_day = {local_day(one.at_utc): one for one in sessions}
+    for note in notes:
+        one = by_test.get(note.test_id or "") or by_day.get(local_day(note.at_utc))
+        if one is not None:
+            one.notes.append(note)

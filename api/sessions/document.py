@@ -1,0 +1,49 @@
+"""A test as clients see it: by REST, over the live channel, on the pages."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from api.sessions.lifecycle import OPEN_STATES, Lifecycle
+from api.sessions.live import Hub
+from api.store.tables import Test
+
+
+def of(row: Test, hub: Hub, lifecycle: Lifecycle) -> dict[str, Any]:
+    """What became of it so far; while it runs also where it is, as the rig tells it."""
+    planned = {key: value for key, value in row.plan.get("preview", {}).items() if key != "pulse_width_us"}
+    running = row.state in ("requested", "running")
+    start = (0.0, planned.get("duration_s", 0.0), None)
+    end = (row.summary.get("duration_s", 0.0), row.summary.get("duration_s", 0.0), None)
+    elapsed_s, duration_s, segment = (hub.position(row.id) or start) if running else end
+    call, rig = lifecycle.calls.get(row.id), lifecycle.rig.status
+    sealing = running and rig is not None and rig.test_id == row.id and rig.state == "sealing"
+    model = lifecycle.versions.get(row.model_id) if row.model_id else None
+    return {
+        "id": row.id,
+        "participant": row.participant,
+        "kind": row.kind,
+        "state": "sealing" if sealing else row.state,
+        "done": row.state not in OPEN_STATES,
+        "reason": row.reason,
+        "segment": segment,
+        "elapsed_s": elapsed_s,
+        "duration_s": duration_s,
+        "time_left_s": max(0.0, duration_s - elapsed_s),
+        "progress": min(1.0, elapsed_s / duration_s) if duration_s else 0.0,
+        "identification": call.document() if call else None,
+        "requested_by": row.requested_by,
+        "ran_by": row.ran_by or row.requested_by,
+        "side": row.plan.get("side"),
+        "muscle": row.plan.get("muscle"),
+        "requested_utc": row.requested_utc,
+        "finished_utc": row.finished_utc,
+        "planned": planned,
+        "recording_id": row.recording_id,
+        "recording_url": f"/v1/recordings/{row.recording_id}" if row.recording_id else None,
+        "joins": row.plan.get("joins"),
+        "model_id": row.model_id,
+        "model_url": f"/v1/models/{row.model_id}" if row.model_id else None,
+        "summary": row.summary,
+        "fit": lifecycle.versions.document(model) if model else None,
+    }

@@ -1,0 +1,44 @@
+"""Notes on a session and at times in a test."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+from fastapi import APIRouter
+
+from api.sessions import notes
+from api.sessions.requests import NoteIn
+from api.store.tables import Note
+from api.web.dependencies import PROBLEM, Context, Ctx, Tester
+from api.web.responses.base import answers
+from api.web.responses.participants import NoteOut
+from api.web.routes import participants
+
+router = APIRouter(prefix="/v1/participants/{code}/notes", tags=["notes"], responses=PROBLEM)
+
+
+async def add(context: Context, code: str, body: NoteIn, by: str) -> Note:
+    """Write a note; one that is made now is at the place where the test stands."""
+    position = context.runner.hub.position(body.test_id) if body.test_id else None
+    now_s = position[0] if position and context.runner.plays(body.test_id) else None
+    return await asyncio.to_thread(context.notes.add, code, body, by, now_s)
+
+
+@router.get("", **answers(list[NoteOut]))
+def list_notes(context: Ctx, _who: Tester, code: str) -> list[dict[str, Any]]:
+    """A participant's notes, newest first, the struck ones among them."""
+    participants.find(context, code)
+    return [notes.document(note) for note in context.notes.of(code)]
+
+
+@router.post("", status_code=201, **answers(NoteOut, 201, "written"))
+async def write_note(context: Ctx, who: Tester, code: str, body: NoteIn) -> dict[str, Any]:
+    """Write a note on the participant's session, on a test (`test_id`), or at a time in it (`at_s`, or `now`)."""
+    return notes.document(await add(context, code, body, who.name))
+
+
+@router.post("/{note_id}/strike", **answers(NoteOut))
+def strike_note(context: Ctx, who: Tester, code: str, note_id: str) -> dict[str, Any]:
+    """Mark a note as wrong: it stays readable, with who struck it."""
+    return notes.document(context.notes.strike(code, note_id, who.name))

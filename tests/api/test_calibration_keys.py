@@ -1,0 +1,223 @@
+"""The calibration in a browser: one press of a key is one train, whatever else happens on the page."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.api.browser import open_tab
+from tests.api.conftest import STUB, Service, run_service
+
+pytestmark = pytest.mark.browser
+LAPTOP, TABLET = (1366, 768), (820, 1180)
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
+    yield from run_service(tmp_path_factory.mktemp("keys"), short_dir, STUB)
+
+
+@pytest.fixture
+def page(browser: Any, service: Service) -> Iterator[Any]:
+    """A tab with an open calibration of K1, nothing sent yet."""
+    with service.client() as http:
+        http.post("/v1/participants", json={"code": "K1"})
+    for tab in open_tab(browser, service):
+        tab.goto(f"{service.url}/participants/K1/calibration")
+        tab.get_by_role("button", name="Begin the calibration").click()
+        tab.locator("#step-up").wait_for()
+        yield tab
+        with service.client() as http:
+            http.post("/v1/participants/K1/calibration/finish", json={"discard": True})
+
+
+def widths(service: Service) -> list[float]:
+    assert service.rig.calibration is not None
+    return [train.pulse_width_us for train in service.rig.calibration.trains]
+
+
+def settled(page: Any, trains: int) -> None:
+    """Wait until the page knows of so many trains and takes the next press."""
+    page.wait_for_function(
+        """(n) => document.querySelector('[name=trains]').value == n
+             && !document.querySelector(n ? '#step-repeat' : '#step-up').disabled""",
+        arg=trains,
+    )
+
+
+def press(page: Any, key: str, trains: int) -> None:
+    page.keyboard.press(key)
+    settled(page, trains)
+
+
+def test_a_whole_calibration_by_keys(page: Any, service: Service) -> None:
+    for count, key in enumerate(["ArrowUp", "ArrowUp", "ArrowDown", "r", "ArrowRight"], 1):
+        press(page, key, count)
+    assert widths(service) == [10, 20, 10, 10, 15]
+    page.keyboard.press("Enter")
+    page.locator("#mark-motor.primary").wait_for()
+    press(page, "ArrowUp", 6)
+    page.keyboard.press("m")
+    page.locator("#mark-comfort.primary").wait_for()
+    press(page, "ArrowUp", 7)
+    page.keyboard.press("M")
+    page.locator("#finish.primary").wait_for()
+    page.keyboard.press("Enter")
+    page.wait_for_url("**/participants/K1")
+    with service.client() as http:
+        profile = http.get("/v1/participants/K1").json()["profile"]
+    assert [profile[f"{name}_pulse_width_us"] for name in ("sensory", "motor", "max")] == [15, 25, 35]
+    assert not page.errors
+
+
+def test_a_key_that_is_held_sends_one_train(page: Any, service: Service) -> None:
+    page.keyboard.down("ArrowUp")
+    for _ in range(5):
+        page.keyboard.down("ArrowUp")  # what a held key sends: keydown with repeat
+        page.wait_for_timeout(60)
+    page.keyboard.up("ArrowUp")
+    settled(page, 1)
+    assert widths(service) == [10]
+
+
+def test_nothing_is_kept_for_later(page: Any, service: Service) -> None:
+    """Presses while a train is asked for or played are forgotten."""
+    page.evaluate("""() => { for (const key of ['ArrowUp', 'r', 'ArrowUp', 'm'])
+        document.body.dispatchEvent(new KeyboardEvent('keydown', { key, bubbles: true })); }""")
+    settled(page, 1)
+    page.wait_for_timeout(600)
+    assert widths(service) == [10] and not service.rig.calibration.marks_us  # pyright: ignore[reportOptionalMemberAccess]
+
+
+def test_the_focus_stays_and_enter_marks_wherever_it_is(page: Any, service: Service) -> None:
+    page.locator("#step-up").click()
+    settled(page, 1)
+    assert page.evaluate("document.activeElement.id") == "step-up"
+    page.keyboard.press("Enter")  # never a second train by the button that has the focus
+    page.locator("#mark-motor.primary").wait_for()
+    assert widths(service) == [10] and page.evaluate("document.activeElement.id") == "step-up"
+    press(page, "ArrowUp", 2)
+    assert page.evaluate("document.activeElement.id") == "step-up"
+
+
+def test_a_key_in_a_field_sends_nothing(page: Any, service: Service) -> None:
+    page.evaluate("document.querySelector('main').insertAdjacentHTML('beforeend', '<input id=note>')")
+    page.locator("#note").focus()
+    page.keyboard.type("r m")
+    page.keyboard.press("ArrowUp")
+    page.wait_for_timeout(300)
+    assert widths(service) == [] and page.locator("#note").input_value() == "r m"
+    assert service.rig.state == "calibrating"
+    page.keyboard.press("Escape")
+    page.wait_for_url("**/stopped/**")
+    assert service.rig.state == "latched"
+
+
+@pytest.mark.parametrize("key", ["Escape", " "])
+@pytest.mark.parametrize("focus", ["", "#step-up", "#stop", "#discard"])
+def test_esc_and_space_stop_once_wherever_the_focus_is(page: Any, service: Service, key: str, focus: str) -> None:
+    press(page, "ArrowUp", 1)
+    if focus:
+        page.locator(focus).focus()
+    sent: list[str] = []
+    page.on("request", lambda request: sent.append(request.url) if request.method == "POST" else None)
+    page.keyboard.press(key)
+    page.wait_for_url("**/stopped/**")
+    assert [url.rsplit("/", 1)[1] for url in sent] == ["stop"] and service.rig.state == "latched"
+
+
+def test_a_stale_page_sends_nothing_and_says_so_in_place(page: Any, service: Service) -> None:
+    with service.client() as http:
+        http.post("/v1/participants/K1/calibration/step", json={"direction": "up"})
+    page.keyboard.press("ArrowUp")
+    page.get_by_text("This page is out of date").wait_for()
+    assert widths(service) == [10] and page.url.endswith("/calibration")
+    settled(page, 1)
+    press(page, "ArrowUp", 2)
+    assert widths(service) == [10, 20] and page.get_by_text("This page is out of date").count() == 0
+
+
+def test_another_width_than_the_one_on_the_button_is_not_sent(page: Any, service: Service) -> None:
+    page.evaluate("document.querySelector('#step-up').value = '12.0'")
+    page.keyboard.press("ArrowUp")
+    page.get_by_text("Not what was shown").wait_for()
+    assert widths(service) == []
+
+
+def test_what_the_rig_refuses_is_said_in_place(page: Any, service: Service) -> None:
+    press(page, "ArrowUp", 1)
+    page.keyboard.press("Enter")
+    page.locator("#mark-motor.primary").wait_for()
+    for count in (2, 3, 4):
+        press(page, "ArrowUp", count)
+    assert page.locator("#step-up").is_disabled(), "50 µs is above this rig's 45"
+    page.keyboard.press("ArrowUp")
+    page.wait_for_timeout(300)
+    assert widths(service) == [10, 20, 30, 40]
+    with service.client() as http:
+        http.post("/v1/participants/K1/calibration/finish", json={"discard": True})
+    page.keyboard.press("r")
+    page.get_by_role("button", name="Begin the calibration").wait_for()
+
+
+def test_a_service_that_does_not_answer_is_told_and_no_button_works(page: Any, service: Service) -> None:
+    page.route("**/calibration**", lambda route: route.abort())
+    page.keyboard.press("ArrowUp")
+    page.get_by_text("It is not known whether the train was sent").wait_for()
+    assert page.locator("#calibration button:not([disabled])").count() == 0
+    page.unroute("**/calibration**")
+    settled(page, 0)
+    press(page, "ArrowUp", 1)
+    assert widths(service) == [10]
+
+
+@pytest.mark.parametrize("size", [LAPTOP, TABLET])
+def test_everything_to_press_is_on_one_screen(page: Any, size: tuple[int, int]) -> None:
+    page.set_viewport_size({"width": size[0], "height": size[1]})
+    press(page, "ArrowUp", 1)
+    page.evaluate("scrollTo(0, 0)")
+    for name in (
+        "step-up",
+        "step-fine",
+        "step-repeat",
+        "step-down",
+        "mark-sensory",
+        "mark-comfort",
+        "finish",
+        "discard",
+    ):
+        box = page.locator(f"#{name}").bounding_box()
+        assert box["height"] >= 48 and box["y"] + box["height"] <= size[1], (name, box)
+    assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
+
+
+def test_last_times_marks_stand_beside_todays(page: Any, service: Service) -> None:
+    """And the first press of a known participant is the second click."""
+    for count, key in enumerate(["ArrowUp", "ArrowUp", "ArrowUp"], 1):
+        press(page, key, count)
+        page.keyboard.press("m")
+        page.wait_for_function("(n) => document.querySelectorAll('.marks b').length == n", arg=count)
+    page.keyboard.press("Enter")
+    page.wait_for_url("**/participants/K1")
+    page.goto(f"{service.url}/participants/K1/calibration")
+    assert "felt at 10 µs, moves at 20 µs, comfortable up to 30 µs" in page.locator("main").inner_text()
+    page.keyboard.press("Enter")  # the focus is on Begin
+    page.locator("#step-up").wait_for()
+    rows = page.locator(".marks tbody tr").all_inner_texts()
+    assert ["10 µs" in rows[0], "20 µs" in rows[1], "30 µs" in rows[2]] == [True] * 3
+    assert service.rig.asked.large_steps and service.rig.asked.last.sensory_pulse_width_us == 10
+
+
+def test_without_scripts_the_forms_do_the_same(browser: Any, service: Service) -> None:
+    for tab in open_tab(browser, service, java_script_enabled=False):
+        with service.client() as http:
+            http.post("/v1/participants", json={"code": "K2"})
+        tab.goto(f"{service.url}/participants/K2/calibration")
+        tab.get_by_role("button", name="Begin the calibration").click()
+        tab.get_by_role("button", name="Wider: 10 µs at 20 mA").click()
+        tab.get_by_role("button", name="Mark: It is felt").click()
+        assert widths(service) == [10] and service.rig.calibration.marks_us == {"sensory": 10}  # pyright: ignore[reportOptionalMemberAccess]
+        tab.get_by_role("button", name="Discard").click()

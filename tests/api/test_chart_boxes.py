@@ -1,0 +1,167 @@
+"""Charts in a real browser: nothing covers anything, colours follow at once, a finger scrolls the page."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.api.browser import open_tab
+from tests.api.conftest import STUB, Service, run_service, run_test
+
+pytestmark = pytest.mark.browser
+LAPTOP, TABLET = {"width": 1366, "height": 768}, {"width": 820, "height": 1180}
+
+COVERED = """() => [...document.querySelectorAll('.js-plotly-plot')].flatMap((chart) => {
+  const boxes = (names) => names.flatMap((name) => [...chart.querySelectorAll(name)].map((part) => {
+    const at = part.getBoundingClientRect();
+    return at.width && at.height ? { name, left: at.left, right: at.right, top: at.top, bottom: at.bottom } : null;
+  })).filter(Boolean);
+  const meet = (a, b) => a.left < b.right - 1 && b.left < a.right - 1 && a.top < b.bottom - 1 && b.top < a.bottom - 1;
+  const above = boxes(['.modebar-group', '.legend']), below = boxes(['.legend', '.annotation', '.nsewdrag',
+    '.g-xtitle', '.g-ytitle', '.g-y2title', '.g-y3title']);
+  return above.flatMap((one) => below.filter((other) => other.name !== one.name && meet(one, other))
+    .map((other) => [chart.dataset.figure, one.name, other.name])); })"""
+"""Toolbar over anything, legend over lines, titles or the segments' names."""
+
+LINE = """() => getComputedStyle(document.querySelector('[data-figure=step] .scatterlayer .js-line')).stroke"""
+NAMED = """(name) => { const probe = document.createElement('i'); probe.style.color = `var(--${name})`;
+  document.body.append(probe); const found = getComputedStyle(probe).color; probe.remove(); return found; }"""
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
+    yield from run_service(tmp_path_factory.mktemp("boxes"), short_dir, STUB)
+
+
+@pytest.fixture(scope="module")
+def model(service: Service) -> str:
+    with service.client() as http:
+        http.post("/v1/participants", json={"code": "B1"})
+        return run_test(http, "B1")["model_id"]
+
+
+def drawn(page: Any, service: Service, model: str) -> None:
+    page.goto(f"{service.url}/models/{model}?diagnose=1")
+    page.locator("[data-figure=signature-fatigue]").wait_for(state="attached")
+    page.evaluate("document.querySelectorAll('details').forEach((part) => { part.open = true; })")
+    for name in ("comparison", "recruitment", "step", "residual", "signature-fatigue"):
+        page.locator(f"[data-figure={name}] .modebar-btn").first.wait_for()
+
+
+def test_toolbar_legend_and_titles_leave_each_other_room(tab: Any, service: Service, model: str) -> None:
+    for size in (LAPTOP, TABLET):
+        tab.set_viewport_size(size)
+        drawn(tab, service, model)
+        assert tab.evaluate(COVERED) == [], size
+    words = tab.locator("[data-figure=step] .modebar-btn").evaluate_all("all => all.map((e) => e.dataset.title)")
+    assert words == ["Zoom: draw a box", "Move", "Show all again", "Save as a picture"]
+
+
+def test_switching_colours_recolours_what_is_drawn_and_keeps_the_page(tab: Any, service: Service, model: str) -> None:
+    tab.set_viewport_size(LAPTOP)
+    drawn(tab, service, model)
+    tab.evaluate("window.stays = true")
+    seen = {}
+    for words in ("Light", "Dark"):
+        tab.locator(".bar").get_by_role("button", name=words).click()
+        seen[words] = tab.evaluate(LINE)
+        assert seen[words] == tab.evaluate(NAMED, "model")
+    assert seen["Light"] != seen["Dark"] and tab.evaluate("window.stays")
+    tab.emulate_media(media="print")
+    assert tab.evaluate(NAMED, "card") == "rgb(255, 255, 255)", "paper is white"
+    tab.emulate_media(media="screen")
+    tab.evaluate("dispatchEvent(new Event('beforeprint'))")
+    assert tab.evaluate(LINE) == seen["Light"]
+    tab.evaluate("dispatchEvent(new Event('afterprint'))")
+    assert tab.evaluate(LINE) == seen["Dark"]
+    tab.reload()
+    assert tab.evaluate(NAMED, "card") != "rgb(255, 255, 255)", "the choice is kept"
+    assert tab.locator(".bar").get_by_role("button", name="Dark").get_attribute("aria-pressed") == "true"
+
+
+def test_as_the_system_follows_the_system_at_once(browser: Any, service: Service, model: str) -> None:
+    for page in open_tab(browser, service, color_scheme="dark"):
+        drawn(page, service, model)
+        dark = page.evaluate(LINE)
+        page.emulate_media(color_scheme="light")
+        page.wait_for_function(f"() => ({LINE})() !== '{dark}'")
+        assert page.evaluate(LINE) == page.evaluate(NAMED, "model")
+        page.emulate_media(color_scheme="dark")
+        page.wait_for_function(f"() => ({LINE})() === '{dark}'")
+
+
+def test_without_scripts_the_switch_is_a_form(browser: Any, service: Service) -> None:
+    for page in open_tab(browser, service, signed_in=False, java_script_enabled=False):
+        page.goto(service.url + "/sign-in")
+        page.locator(".bar").get_by_role("button", name="Dark").click()
+        assert page.url.endswith("/sign-in")
+        assert page.locator("#dark").get_attribute("media") == "screen"
+    with service.client(token=None) as http:
+        assert http.post("/colours", data={"colours": "pink"}).status_code == 422
+        away = http.post("/colours", data={"colours": "dark", "back": "//elsewhere.example"})
+        assert away.headers["location"] == "/"
+        assert (
+            http.post("/colours", data={"colours": "dark"}, headers={"Origin": "http://x.example"}).status_code == 403
+        )
+
+
+def test_the_pointer_reads_all_lines_in_the_pages_language(browser: Any, service: Service, model: str) -> None:
+    for page in open_tab(browser, service):
+        page.set_viewport_size(LAPTOP)
+        page.context.add_cookies([{"name": "stimrig_language", "value": "de", "url": service.url}])
+        drawn(page, service, model)
+        chart = page.locator("[data-figure=comparison]")
+        chart.scroll_into_view_if_needed()
+        plane = chart.locator(".nsewdrag").first
+        plane.hover(position={"x": 300, "y": 60})
+        plane.hover(position={"x": 310, "y": 60})
+        chart.locator(".hoverlayer .legend").wait_for()
+        told = chart.locator(".hoverlayer").text_content()
+        assert told.count("N·m") == 3 and told.count("µs") == 1 and "," in told and "." not in told, told
+        with page.expect_download() as saved:
+            page.locator("[data-figure=step] .modebar-btn").last.click()
+        assert saved.value.suggested_filename == f"{model}-step.png"
+
+
+AT_REST = """() => new Promise((done) => { let last = scrollY, frames = 0;
+  const look = () => { frames = scrollY === last ? frames + 1 : 0; last = scrollY;
+    frames < 30 ? requestAnimationFrame(look) : done(scrollY); };
+  look(); })"""
+"""Where the page stands once it has stood there for thirty pictures."""
+
+
+def swipe(page: Any, chart: Any) -> None:
+    """A finger from the middle of the chart upwards and a little to the side."""
+    box = chart.locator(".nsewdrag").first.bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] - 20
+    hand = page.context.new_cdp_session(page)
+    for step in range(12):
+        points = [{"x": x + 8 * step, "y": y - 20 * step}]
+        kind = "touchMove" if step else "touchStart"
+        hand.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+        page.wait_for_timeout(16)
+    hand.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+
+
+def test_a_finger_scrolls_the_page_and_zooms_when_asked(browser: Any, service: Service, model: str) -> None:
+    for page in open_tab(browser, service, has_touch=True, is_mobile=True):
+        page.set_viewport_size(TABLET)
+        drawn(page, service, model)
+        chart = page.locator("[data-figure=comparison]")
+        chart.scroll_into_view_if_needed()
+        before = page.evaluate(AT_REST)
+        swipe(page, chart)
+        assert page.evaluate(AT_REST) > before + 100
+        state = "() => document.querySelector('[data-figure=comparison]').layout.dragmode"
+        assert page.evaluate(state) is False
+        chart.locator(".modebar-btn[data-val=zoom]").click()
+        assert page.evaluate(state) == "zoom"
+        before = page.evaluate(AT_REST)
+        assert chart.locator(".nsewdrag").first.evaluate("(plane) => getComputedStyle(plane).touchAction") == "none"
+        swipe(page, chart)
+        assert page.evaluate(AT_REST) == before, "this finger draws a box"
+        page.wait_for_function(f"() => ({state})() === false")
+        assert chart.locator(".nsewdrag").first.evaluate("(plane) => getComputedStyle(plane).touchAction") == "auto"

@@ -1,0 +1,114 @@
+"""Damaged bytes of a stored model keep nobody from a test, and cost what is read off that model only."""
+
+from __future__ import annotations
+
+import json
+import logging
+from typing import Any
+
+import httpx
+import pytest
+
+from api.store.tables import Model
+from tests.api.conftest import Service, run_test, wait_done
+from tests.api.test_access import signed_in
+from tests.api.test_problems import problem
+
+ASKED = {"participant": "P017"}
+
+
+def uneven(body: bytes) -> bytes:
+    document = json.loads(body)
+    document["recruitment"]["torque_nm"].pop()
+    return json.dumps(document).encode()
+
+
+def without_curve(body: bytes) -> bytes:
+    return json.dumps({key: value for key, value in json.loads(body).items() if key != "recruitment"}).encode()
+
+
+DAMAGE = {
+    "no JSON": lambda body: body[: len(body) // 2],
+    "no text": lambda body: b"\xff\xfe" + body,
+    "a list": lambda _body: b"[]",
+    "no recruitment": without_curve,
+    "uneven": uneven,
+    "one digit": lambda body: body.replace(b"1", b"2", 1),
+    "not finite": lambda body: body.replace(b'"torque_nm": [0.0', b'"torque_nm": [NaN'),
+}
+
+
+@pytest.fixture
+def model_id(client: httpx.Client, participant: str) -> str:
+    """An approved model of the participant."""
+    made = run_test(client, participant)["model_id"]
+    assert client.post(f"/v1/models/{made}/approve").status_code == 200
+    return made
+
+
+def damage(service: Service, model_id: str, how: str) -> None:
+    context = service.app.state.context
+    with context.store.write() as session:
+        row = session.get(Model, model_id)
+        spoilt = DAMAGE[how](row.document)
+        assert spoilt != row.document
+        row.document = spoilt
+    context.versions._served.clear()
+
+
+@pytest.mark.parametrize("how", DAMAGE)
+def test_a_test_is_previewed_and_started_without_the_estimate(
+    client: httpx.Client, service: Service, model_id: str, how: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    damage(service, model_id, how)
+    with caplog.at_level(logging.WARNING, logger="stimrig.models"):
+        preview = client.post("/v1/preview", json=ASKED)
+        assert preview.status_code == 200 and preview.json()["torque_time_nms"] is None
+        started = client.post("/v1/tests", json=ASKED)
+        assert started.status_code == 202 and started.json()["planned"]["torque_time_nms"] is None
+    (warning,) = [record.getMessage() for record in caplog.records if record.name == "stimrig.models"]
+    assert warning.startswith(f"{model_id} is no longer what was stored")
+    assert warning.endswith("no torque-time is estimated.")
+    assert wait_done(client, started.json()["id"])["state"] == "completed"
+
+
+@pytest.mark.parametrize("how", ["no JSON", "uneven"])
+def test_everything_that_is_not_read_off_it_is_there(
+    client: httpx.Client, service: Service, model_id: str, how: str
+) -> None:
+    test_id = client.get("/v1/tests").json()[0]["id"]
+    with service.app.state.context.store.write() as session:  # one from before verdict and figures were kept beside it
+        row = session.get(Model, model_id)
+        row.fit = {key: value for key, value in row.fit.items() if key not in ("verdict", "figures")}
+    damage(service, model_id, how)
+    for path in ("tests", "participants/P017", "participants/P017/models", "participants/P017/trend"):
+        assert client.get(f"/v1/{path}").status_code == 200, path
+    verdict = client.get(f"/v1/tests/{test_id}").json()["fit"]["verdict"]
+    assert verdict == ("unknown" if how == "no JSON" else "usable"), "the verdict needs no curve"
+    with signed_in(service) as browser:
+        for path in ("/", "/participants/P017", "/participants/P017/next", "/participants/P017/trend",
+                     f"/tests/{test_id}"):  # fmt: skip
+            assert browser.get(path).status_code == 200, path
+        for path in (f"/models/{model_id}", f"/models/{model_id}/report"):
+            page = browser.get(path, headers={"Connection": "close"})
+            assert page.status_code == 500 and "The stored model is damaged" in page.text and model_id in page.text
+    for path in ("", "/comparison", "/diagnosis"):
+        told: Any = problem(client.get(f"/v1/models/{model_id}{path}"), 500)
+        assert told["type"] == "/problems/model-damaged" and "from a backup" in told["detail"]
+    assert run_test(client, "P017")["state"] == "completed", "the next test has a model of its own"
+
+
+def test_a_damaged_model_reaches_no_controller_and_is_not_approved(
+    client: httpx.Client, service: Service, model_id: str
+) -> None:
+    """A bit that has turned on the disk must not set anybody's stimulation."""
+    damage(service, model_id, "one digit")
+    for answer in (
+        client.get("/v1/participants/P017/model"),
+        client.get(f"/v1/models/{model_id}/file"),
+        client.post(f"/v1/models/{model_id}/approve", json={"reason": "again"}),
+    ):
+        assert problem(answer, 500)["type"] == "/problems/model-damaged"
+    assert client.get("/metrics").status_code == 200
+    assert client.post(f"/v1/models/{model_id}/reject", json={"reason": "damaged"}).status_code == 200
+    assert problem(client.get("/v1/participants/P017/model"), 404)["type"] == "/problems/no-approved-model"

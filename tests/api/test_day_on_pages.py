@@ -1,0 +1,216 @@
+"""A day with people on the pages: the list is searched, notes are written, the page locks and comes back as it was."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.api.browser import NAME, PASSWORD, participant, start
+from tests.api.conftest import STUB, Service, run_service, run_test
+from tests.api.test_axe import examined
+
+pytestmark = pytest.mark.browser
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
+    yield from run_service(tmp_path_factory.mktemp("day"), short_dir, STUB)
+
+
+def make(service: Service, *codes: str, **more: Any) -> None:
+    with service.client() as http:
+        for code in codes:
+            http.post("/v1/participants", json={"code": code, **more})
+
+
+def lock(page: Any) -> None:
+    page.get_by_role("button", name="Lock", exact=True).click()
+    page.get_by_role("heading", name="Locked").wait_for()
+
+
+def unlock(page: Any) -> None:
+    page.get_by_label("Password").fill(PASSWORD)
+    page.get_by_role("button", name="Unlock").click()
+
+
+def test_the_list_follows_what_is_typed(tab: Any, service: Service) -> None:
+    make(service, "Q1", "Q2", "R1")
+    tab.goto(service.url + "/")
+    tab.get_by_label("Find a participant").press_sequentially("q")
+    tab.get_by_role("link", name="R1", exact=True).wait_for(state="detached")
+    assert tab.get_by_role("link", name="Q2", exact=True).is_visible() and tab.url.endswith("q=q")
+    tab.get_by_label("Find a participant").fill("<b>")
+    tab.get_by_text("No code holds “<b>”.").wait_for()
+    examined(tab, "nobody found")
+    assert tab.errors == []
+
+
+def test_the_archive_on_the_pages(tab: Any, service: Service) -> None:
+    make(service, "Z1", side="left")
+    tab.goto(service.url + "/participants/Z1")
+    tab.get_by_role("button", name="Put into the archive").click()
+    tab.get_by_role("heading", name="Participants").wait_for()
+    assert tab.get_by_role("link", name="Z1", exact=True).count() == 0
+    tab.get_by_role("link", name=re.compile("Archive")).click()
+    tab.get_by_role("link", name="Z1", exact=True).wait_for()
+    examined(tab, "the archive")
+    tab.get_by_role("link", name="Z1", exact=True).click()
+    tab.get_by_text("In the archive since").wait_for()
+    examined(tab, "an archived participant")
+    assert tab.get_by_role("button", name="Start the pre-session test").count() == 0
+    tab.get_by_role("button", name="Take out of the archive").first.click()
+    tab.get_by_text("In the archive since").wait_for(state="detached")
+
+
+def test_side_and_muscle_are_asked_for_and_seen_before_current_flows(tab: Any, service: Service) -> None:
+    tab.goto(service.url + "/")
+    tab.get_by_label("Code").fill("Y1")
+    tab.get_by_label("Side").select_option("right")
+    tab.get_by_label("Muscle").fill("triceps brachii")
+    tab.get_by_role("button", name="Create").click()
+    tab.get_by_role("heading", name="Y1").wait_for()
+    tab.get_by_role("button", name="Start the pre-session test").first.click()
+    tab.get_by_role("row", name="Side and muscle right, triceps brachii").wait_for()
+    assert tab.get_by_role("row", name=f"Run by {NAME}").is_visible()
+
+
+def test_a_question_whose_side_was_changed_starts_nothing(tab: Any, service: Service) -> None:
+    make(service, "Y2", side="left")
+    tab.goto(service.url + "/participants/Y2")
+    tab.get_by_role("button", name="Start the pre-session test").first.click()
+    tab.get_by_role("button", name="Start now").wait_for()
+    with service.client() as http:
+        http.put("/v1/participants/Y2/muscle", json={"side": "right"})
+        tab.get_by_role("button", name="Start now").click()
+        tab.get_by_text("Side or muscle of Y2 was changed meanwhile").wait_for()
+        assert http.get("/v1/participants/Y2/tests").json() == []
+
+
+def test_a_note_is_shown_as_it_was_written_and_struck_with_a_click(tab: Any, service: Service) -> None:
+    participant(tab, service, "W1")
+    notes = tab.locator("#notes")
+    notes.get_by_label("About").select_option("electrodes")
+    notes.get_by_label("Note", exact=True).fill("<script>x</script> 2 cm distal")
+    notes.get_by_role("button", name="Write it down").click()
+    notes.get_by_text("<script>x</script> 2 cm distal").wait_for()
+    examined(tab, "a note")
+    notes.get_by_role("button", name="Strike").click()
+    notes.get_by_text("struck by Ada").wait_for()
+    notes.get_by_label("About").select_option("other")
+    notes.get_by_label("Note", exact=True).fill("two\u202elines")
+    notes.get_by_role("button", name="Write it down").click()
+    tab.get_by_text("U+202E cannot stand in it").wait_for()
+    assert tab.errors == [] or all("422" in words for words in tab.errors)
+
+
+def test_a_note_while_the_test_runs_does_not_leave_its_page(tab: Any, service: Service) -> None:
+    service.rig.speed = 1.0
+    participant(tab, service, "W2")
+    start(tab)
+    tab.evaluate("window.same = true")
+    tab.locator("#age", has_text="ms").wait_for()
+    tab.get_by_label("Note (may be left empty)").fill("left hand")
+    tab.get_by_role("button", name="Spasm").click()
+    tab.locator("#notes-written").get_by_text("left hand").wait_for()
+    assert tab.evaluate("window.same") and tab.get_by_label("Note (may be left empty)").input_value() == ""
+    assert re.search(r"\d+\.\d s", tab.locator("#notes-written").inner_text())
+    tab.get_by_role("button", name="Other").click()
+    tab.locator("#notes-written [role=alert]").wait_for()
+    examined(tab, "notes of a running test")
+    tab.get_by_role("button", name="Stop stimulation").click()
+    tab.get_by_role("link", name="See what was recorded").click()
+    tab.get_by_label("Time in the test (s)").fill("0,4")
+    tab.get_by_label("About").select_option("posture")
+    tab.get_by_role("button", name="Write it down").click()
+    tab.locator("#notes-written li", has_text="Posture").get_by_text("0.4 s").wait_for()
+    tab.get_by_label("Run by").fill("Jörg Müller")
+    tab.get_by_role("button", name="Save").click()
+    tab.wait_for_function("document.getElementById('ran-by').value === 'Jörg Müller'")
+    examined(tab, "notes of a test that is over")
+    service.rig.speed = 30.0
+
+
+def test_the_page_comes_back_as_it_was_and_both_tabs_with_it(tab: Any, service: Service) -> None:
+    make(service, "V1")
+    tab.goto(service.url + "/participants/V1?x=1")
+    tab.locator("#notes").get_by_label("Note", exact=True).fill("half a sentence")
+    other = tab.context.new_page()
+    other.goto(service.url + "/")
+    lock(other)
+    tab.get_by_role("heading", name="Locked").wait_for()
+    assert "V1" not in tab.locator("body").inner_text()
+    examined(tab, "locked")
+    tab.get_by_label("Password").fill("not the password")
+    tab.get_by_role("button", name="Unlock").click()
+    tab.get_by_text("does not match").wait_for()
+    examined(tab, "still locked")
+    unlock(tab)
+    tab.wait_for_url("**/participants/V1?x=1")
+    assert tab.locator("#notes").get_by_label("Note", exact=True).input_value() == "half a sentence"
+    other.wait_for_url(service.url + "/")
+    other.close()
+
+
+def test_what_was_typed_is_not_shown_to_the_next_person(tab: Any, service: Service) -> None:
+    make(service, "V2")
+    with service.client() as http:
+        http.post("/v1/users", json={"name": "Eve Two", "password": PASSWORD})
+    tab.goto(service.url + "/participants/V2")
+    tab.locator("#notes").get_by_label("Note", exact=True).fill("half a sentence")
+    lock(tab)
+    tab.locator("#leave").get_by_role("button", name="Sign out").click()
+    tab.get_by_label("Name", exact=True).fill("eve two")
+    tab.get_by_label("Password").fill(PASSWORD)
+    tab.get_by_role("button", name="Sign in", exact=True).click()
+    tab.get_by_role("heading", name="Participants").wait_for()
+    tab.goto(service.url + "/participants/V2")
+    assert tab.locator("#notes").get_by_label("Note", exact=True).input_value() == ""
+    assert "half" not in tab.evaluate("JSON.stringify({...sessionStorage})")
+
+
+def test_a_locked_page_stops_a_test_that_was_not_touched(tab: Any, service: Service) -> None:
+    service.rig.speed = 1.0
+    participant(tab, service, "V3")
+    start(tab)
+    lock(tab)
+    assert service.rig.state == "running"
+    tab.get_by_role("button", name="Stop stimulation").click()
+    tab.get_by_text("The rig confirms").wait_for()
+    assert tab.get_by_role("link", name="See what was recorded").count() == 0, "locked: nothing about the test"
+    service.rig.speed = 30.0
+
+
+def test_a_persons_hand_is_told_and_a_scripts_is_not(tab: Any, service: Service) -> None:
+    tab.goto(service.url + "/")
+    tab.evaluate("document.dispatchEvent(new KeyboardEvent('keydown', {bubbles: true}))")
+    tab.clock.install()
+    tab.goto(service.url + "/")
+    tab.evaluate("document.dispatchEvent(new KeyboardEvent('keydown', {bubbles: true}))")
+    tab.clock.run_for(30_000)
+    assert not [url for url in tab.requests if url.endswith("/rig/acted")]
+    with tab.expect_request("**/rig/acted"):
+        tab.keyboard.press("Shift")
+        tab.clock.run_for(30_000)
+
+
+def test_the_report_names_the_session_and_has_a_place_to_sign(tab: Any, service: Service) -> None:
+    make(service, "U1", side="left", muscle="biceps brachii")
+    with service.client() as http:
+        done = run_test(http, "U1")
+        for number in range(14):
+            note = {"kind": "spasm", "text": f"note {number}", "test_id": done["id"], "at_s": number}
+            struck = http.post("/v1/participants/U1/notes", json=note).json()
+        http.post(f"/v1/participants/U1/notes/{struck['id']}/strike")
+        http.post(f"/v1/models/{done['model_id']}/approve", json={"reason": "follows the ramp"})
+    tab.goto(f"{service.url}/models/{done['model_id']}/report")
+    text = tab.locator("main").inner_text()
+    for words in ("left, biceps brachii", "20.0 mA", "30.0 N·m", "administrator", "follows the ramp", "not calibrated"):
+        assert words in text, words
+    assert "note 11" in text and "note 12" not in text and "note 13" not in text and "1 more note" in text
+    assert [box.inner_text() for box in tab.locator(".sign div").all()] == ["Name", "Date", "Signature"]
+    assert len(re.findall(rb"/Type\s*/Page\b", tab.pdf(prefer_css_page_size=True))) <= 2
+    examined(tab, "report", stop=False)

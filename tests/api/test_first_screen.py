@@ -1,0 +1,176 @@
+"""What stands in the first screen of a model's page, measured in the browser; what is folded, and how it opens."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.api.browser import bring_to_rest
+from tests.api.conftest import STUB, Service, run_service, run_test
+
+pytestmark = pytest.mark.browser
+LAPTOP, TABLET = (1366, 768), (820, 1180)
+FIRST = {
+    "verdict": ".verdict-words h2",
+    "approve": "button:text-is('Approve')",
+    "chart": "[data-figure=overview]",
+    "missing": ".missing li",
+    "add": ".missing button",
+}
+"""What a person needs to decide, without scrolling."""
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
+    yield from run_service(tmp_path_factory.mktemp("first"), short_dir, STUB, speed=8.0, emulated=True)
+
+
+@pytest.fixture(scope="module")
+def model(service: Service) -> str:
+    with service.client() as http:
+        http.post("/v1/participants", json={"code": "F1"})
+        return run_test(http, "F1")["model_id"]
+
+
+def show(tab: Any, address: str, size: tuple[int, int]) -> None:
+    tab.set_viewport_size({"width": size[0], "height": size[1]})
+    tab.goto(address)
+    tab.locator("[data-figure=overview] .main-svg").first.wait_for()
+
+
+@pytest.mark.parametrize("size", [LAPTOP, TABLET], ids=["laptop", "tablet"])
+def test_verdict_chart_and_missing_effect_stand_in_the_first_screen(
+    tab: Any, service: Service, model: str, size: tuple[int, int]
+) -> None:
+    show(tab, f"{service.url}/models/{model}", size)
+    tab.locator(".missing li").wait_for()
+    assert tab.get_by_text("Emulated rig").is_visible(), "with the strip that takes the most room"
+    for what, place in FIRST.items():
+        box = tab.locator(place).first.bounding_box()
+        assert box["y"] >= 0 and box["y"] + box["height"] <= size[1], (what, box)
+    assert tab.evaluate("scrollY") == 0
+    assert tab.locator(".first-screen .primary").count() == 1, "one button is the first one"
+
+
+@pytest.mark.parametrize("size", [LAPTOP, TABLET], ids=["laptop", "tablet"])
+def test_a_diagnosis_under_way_moves_nothing(tab: Any, service: Service, size: tuple[int, int]) -> None:
+    marker = service.data / "recordings" / "slow"
+    marker.write_text("0.4")
+    try:
+        with service.client() as http:
+            http.post("/v1/participants", json={"code": "F2"})
+            slow = run_test(http, "F2")["model_id"]
+        show(tab, f"{service.url}/models/{slow}", size)
+        meter = tab.locator("#why progress")
+        meter.wait_for()
+        box = meter.bounding_box()
+        assert box["y"] + box["height"] <= size[1]
+        before = [tab.locator(place).bounding_box() for place in (".verdict", "#torque")]
+    finally:
+        marker.unlink()
+        tab.get_by_role("button", name="Cancel").click()
+        tab.get_by_role("link", name="Diagnose now").wait_for()
+    tab.get_by_role("link", name="Diagnose now").click()
+    tab.locator(".missing li").wait_for()
+    tab.locator("[data-figure=overview] .main-svg").first.wait_for()
+    tab.evaluate("scrollTo(0, 0)")
+    assert [tab.locator(place).bounding_box() for place in (".verdict", "#torque")] == before
+
+
+def test_a_folded_chart_is_drawn_as_wide_as_its_box_when_it_is_opened(tab: Any, service: Service, model: str) -> None:
+    show(tab, f"{service.url}/models/{model}", LAPTOP)
+    folded = tab.locator("#curves [data-figure=recruitment]")
+    assert not folded.is_visible() and folded.locator(".main-svg").count() == 0
+    tab.locator("#curves > summary").click()
+    folded.locator(".main-svg").first.wait_for()
+    assert folded.locator(".main-svg").first.bounding_box()["width"] > 300
+    tab.locator("#curves > summary").click()
+    tab.locator("#curves > summary").click()
+    assert folded.locator(".plot-container").count() == 1, "drawn once"
+
+
+def test_a_link_to_a_folded_part_opens_it(tab: Any, service: Service, model: str) -> None:
+    show(tab, f"{service.url}/models/{model}", LAPTOP)
+    link = tab.locator(".missing").get_by_role("link", name="Fatigue")
+    link.click()
+    tab.locator("#effect-fatigue [data-figure=signature-fatigue] .main-svg").first.wait_for()
+    tab.locator("#effect-fatigue > summary").click()
+    assert not tab.locator("#effect-fatigue .effect-body").is_visible()
+    link.click()
+    tab.locator("#effect-fatigue .effect-body").wait_for()
+    tab.goto(f"{service.url}/models/{model}?again#experiment")
+    tab.get_by_role("button", name="Run it now").wait_for()
+
+
+def test_paper_shows_all_with_its_charts(tab: Any, service: Service, model: str) -> None:
+    show(tab, f"{service.url}/models/{model}", LAPTOP)
+    tab.evaluate("dispatchEvent(new Event('beforeprint'))")
+    assert tab.locator("details:not([open])").count() == 0
+    for figure in ("recruitment", "step", "comparison", "residual"):
+        tab.locator(f"[data-figure={figure}] .main-svg").first.wait_for()
+    tab.evaluate("dispatchEvent(new Event('afterprint'))")
+    assert not tab.locator("#curves").evaluate("part => part.open")
+
+
+def test_what_is_folded_is_reached_by_keys(tab: Any, service: Service, model: str) -> None:
+    show(tab, f"{service.url}/models/{model}", LAPTOP)
+    tab.locator("#curves > summary").focus()
+    tab.keyboard.press("Enter")
+    tab.locator("#curves [data-figure=step] .main-svg").first.wait_for()
+
+
+def test_the_line_follows_the_rig_and_takes_nothing_away(tab: Any, service: Service) -> None:
+    with service.client() as http:
+        http.post("/v1/participants", json={"code": "F3"})
+        tab.goto(service.url + "/participants/F3")
+        tab.get_by_text("Calibrate for today").wait_for()
+        service.rig.speed = 0.5
+        http.post("/v1/tests", json={"participant": "F3"})
+        tab.get_by_text("The test is running.").wait_for()
+        assert tab.get_by_role("link", name="Go to the test").is_visible()
+        bring_to_rest(service)
+        tab.get_by_text("The last test was stopped.").wait_for()
+        tab.get_by_label("Current of every pulse").fill("19")
+        http.post("/v1/tests", json={"participant": "F3"})
+        tab.get_by_role("button", name="Show it").wait_for()
+        assert tab.get_by_label("Current of every pulse").input_value() == "19"
+    service.rig.speed = 8.0
+
+
+def test_a_model_that_is_not_usable_wants_a_reason_that_is_one(tab: Any, service: Service, model: str) -> None:
+    poor = make_poor(service, model)
+    show(tab, f"{service.url}/models/{poor}", LAPTOP)
+    assert tab.get_by_role("button", name="Approve").count() == 0, "not by the first button"
+    assert tab.locator(".first-screen .primary").inner_text() == "Test again"
+    tab.get_by_role("link", name="Approve it all the same").click()
+    tab.get_by_text("the recruitment curve is not identified").wait_for()
+    assert tab.get_by_text("the error is 31 % of the torque").is_visible()
+    for words, taken in (("asdf asdf asdf", False), ("only the delay is used today", True)):
+        tab.get_by_label("Why may the controller").fill(words)
+        tab.get_by_label("Your password, once more").fill("correct horse battery")
+        tab.get_by_role("button", name="Approve it all the same").click()
+        if not taken:
+            tab.get_by_text("This is not a reason yet.").wait_for()
+            assert tab.get_by_label("Why may the controller").input_value() == words
+    tab.get_by_text("Done. The controller has today's model until 23:59.").wait_for()
+    with service.client() as http:
+        assert http.get(f"/v1/models/{poor}").json()["decision_reason"] == "only the delay is used today"
+
+
+def make_poor(service: Service, model: str) -> str:
+    """A version of the same recording that identify would call not usable."""
+    context = service.app.state.context
+    row = context.versions.get(model)
+    document = json.loads(row.document) | {"model_id": f"M-poor{time.time_ns()}"}
+    says = "stimulation hardly changes the torque: check electrodes, current and load cell"
+    document["fit"] = document["fit"] | {"held_out_fit_percent": 69.0}
+    document["quality"] = {
+        "verdict": "not usable", "words": f"Do not use this model: {says}.", "reasons": [says],
+        "gates": {"torque": {"passed": False, "severity": "refuse", "says": says}},
+    }  # fmt: skip
+    return context.versions.add(json.dumps(document), row.participant, row.recording_id, "a test").id

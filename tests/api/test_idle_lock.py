@@ -1,0 +1,229 @@
+"""A session that nobody touches locks: pages ask for the password, stop works, a test goes on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+import httpx
+import pytest
+
+from api.clock import Clock
+from api.people.idle_lock import IdleLock
+from api.people.pace import Pace
+from tests.api.browser import PASSWORD
+from tests.api.conftest import STUB, TOKEN, Service, run_service, wait_done
+
+HTML = {"Accept": "text/html"}
+SCRIPT = {"Sec-Fetch-Dest": "empty", "Sec-Fetch-Mode": "cors"}
+
+
+class SetClock(Clock):
+    """Stands still, ahead of when it was made: no busy machine lets a session grow idle."""
+
+    def __init__(self) -> None:
+        self.made_s, self.ahead_s = super().unix_s(), 0.0
+
+    def unix_s(self) -> float:
+        return self.made_s + self.ahead_s
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
+    for service in run_service(tmp_path_factory.mktemp("idle"), short_dir, STUB, idle_lock_min=10):
+        with service.client() as http:
+            for name in ("Ada", "Jörg Müller"):
+                assert http.post("/v1/users", json={"name": name, "password": PASSWORD}).status_code == 201
+            http.post("/v1/participants", json={"code": "L1"})
+        yield service
+
+
+@pytest.fixture
+def clock(service: Service) -> SetClock:
+    found = SetClock()
+    service.app.state.context.auth.idle.clock = found
+    return found
+
+
+@contextmanager
+def signed_in(service: Service, name: str = "Ada") -> Iterator[httpx.Client]:
+    with service.client(token=None) as http:
+        answer = http.post("/v1/sessions", json={"name": name, "password": PASSWORD})
+        assert answer.status_code == 201, answer.text
+        http.headers["X-CSRF-Token"] = answer.json()["csrf"]
+        yield http
+
+
+def locked(http: httpx.Client) -> bool:
+    """Asked as a script asks, which is nobody's action."""
+    said = http.get("/rig/now").json()
+    assert said["locked"] != said["signed_in"]
+    return said["locked"]
+
+
+def test_it_locks_after_ten_minutes_and_not_before(service: Service, clock: SetClock) -> None:
+    with signed_in(service) as http:
+        clock.ahead_s = 599
+        assert not locked(http)
+        clock.ahead_s = 900
+        assert locked(http)
+        refused = http.get("/v1/rig")
+        assert refused.status_code == 401
+        assert refused.json()["type"] == "/problems/locked"
+        assert "participant" not in http.get("/rig/now").text, "nothing about a participant"
+        page = http.get("/participants/L1?x=1", headers=HTML)
+        assert page.status_code == 303
+        assert parse_qs(urlsplit(page.headers["location"]).query) == {"next": ["/participants/L1?x=1"]}
+        assert http.post("/v1/sessions/unlock", json={"password": PASSWORD}).status_code == 204
+        assert http.get("/v1/rig").status_code == 200
+
+
+@pytest.mark.parametrize(
+    ("path", "headers"),
+    [
+        ("/rig/now", {}),
+        ("/rig/notice", {}),
+        ("/v1/jobs/none", {}),
+        ("/jobs/now/none", {}),
+        ("/", {**SCRIPT, **HTML}),
+        ("/v1/rig", SCRIPT),
+    ],
+)
+def test_what_scripts_read_by_themselves_keeps_no_session_open(
+    service: Service, clock: SetClock, path: str, headers: dict[str, str]
+) -> None:
+    with signed_in(service) as http:
+        for clock.ahead_s in (300.0, 590.0):
+            http.get(path, headers=headers)
+        clock.ahead_s = 900.0
+        assert locked(http)
+
+
+def test_an_action_on_any_tab_keeps_all_of_them_open(service: Service, clock: SetClock) -> None:
+    with signed_in(service) as http, service.client(token=None, cookies=http.cookies) as other:
+        clock.ahead_s = 590.0
+        assert http.post("/rig/acted").status_code == 204
+        clock.ahead_s = 1180.0
+        assert not locked(other)
+        assert other.get("/", headers=HTML).status_code == 200
+        clock.ahead_s = 1770.0
+        assert not locked(http)
+        clock.ahead_s = 1790.0
+        assert locked(http) and locked(other)
+
+
+def test_what_is_sent_from_a_locked_page_does_nothing_and_needs_its_own_token(
+    service: Service, clock: SetClock
+) -> None:
+    with signed_in(service) as http:
+        clock.ahead_s = 900.0
+        assert http.post("/v1/participants", json={"code": "L9"}).status_code == 401
+        csrf = http.headers.pop("X-CSRF-Token")
+        assert http.post("/unlock", data={"secret": PASSWORD}, headers=HTML).status_code == 403
+        assert http.post("/v1/sessions/unlock", json={"password": PASSWORD}).status_code == 403
+        wrong = http.post("/unlock", data={"secret": "no", "csrf": csrf}, headers=HTML)
+        assert wrong.status_code == 401 and "Ada" in wrong.text and locked(http)
+        for target in (
+            "https://evil.example/",
+            "//evil.example",
+            "/\\evil.example",
+            "/\t/evil.example",
+            "javascript:x",
+        ):
+            http.get("/locked", params={"next": target}, headers=HTML)
+            back = http.post("/unlock", data={"secret": PASSWORD, "csrf": csrf, "next": target}, headers=HTML)
+            assert back.status_code == 303 and back.headers["location"] == "/", target
+    with service.client() as admin:
+        assert admin.get("/v1/participants/L9").status_code == 404
+
+
+def test_guesses_at_the_lock_are_held_to_a_pace(service: Service, clock: SetClock) -> None:
+    for pace in vars(service.app.state.context.people.guesses).values():
+        if isinstance(pace, Pace):
+            pace.clock = type("Still", (Clock,), {"monotonic_s": lambda _self: 1000.0})()
+    with signed_in(service, "Jörg Müller") as http:
+        http.post("/v1/sessions/lock")
+        tries = [http.post("/v1/sessions/unlock", json={"password": f"no {n}"}).status_code for n in range(6)]
+        assert tries == [401] * 5 + [429]
+        held = http.post("/v1/sessions/unlock", json={"password": PASSWORD})
+        assert held.status_code == 429 and int(held.headers["retry-after"]) > 0 and locked(http)
+        with signed_in(service) as other:
+            other.post("/v1/sessions/lock")
+            assert other.post("/v1/sessions/unlock", json={"password": PASSWORD}).status_code == 204, "others wait not"
+
+
+def test_the_red_button_works_on_a_locked_page(service: Service, clock: SetClock) -> None:
+    service.rig.speed = 1.0
+    with signed_in(service) as http:
+        test = http.post("/v1/tests", json={"participant": "L1"}).json()
+        http.post("/v1/sessions/lock")
+        page = http.get("/locked", headers=HTML).text
+        assert 'id="stop"' in page and "L1" not in page and "Ada" in page
+        assert service.rig.state == "running", "the test is not touched"
+        right = page.split('name="right" value="')[1].split('"')[0]
+        with service.client(token=None) as nobody:
+            assert nobody.post("/v1/stop", data={"right": right}).status_code == 200
+        assert locked(http)
+        with service.client() as admin:
+            assert wait_done(admin, test["id"])["state"] == "stopped"
+            admin.post("/v1/rearm")
+        assert http.post("/v1/stop").status_code == 200, "and by the session itself"
+    with service.client() as admin:
+        admin.post("/v1/rearm")
+
+
+def test_a_session_by_token_asks_for_the_token(service: Service, clock: SetClock) -> None:
+    with service.client(token=None) as http:
+        http.post("/sign-in", data={"token": TOKEN})
+        page = http.post("/lock", data={"csrf": csrf_of(http)}, headers=HTML)
+        assert page.status_code == 303 and locked(http)
+        form = http.get("/locked", headers=HTML).text
+        assert "Access token" in form
+        csrf = form.split('name="csrf" value="')[1].split('"')[0]
+        assert http.post("/unlock", data={"secret": PASSWORD, "csrf": csrf}, headers=HTML).status_code == 401
+        assert http.post("/unlock", data={"secret": TOKEN, "csrf": csrf}, headers=HTML).status_code == 303
+        assert not locked(http)
+
+
+def csrf_of(http: httpx.Client) -> str:
+    return http.get("/", headers=HTML).text.split('name="csrf" value="')[1].split('"')[0]
+
+
+def test_somebody_else_may_leave_for_the_one_who_is_gone(service: Service, clock: SetClock) -> None:
+    with signed_in(service) as http:
+        http.post("/v1/sessions/lock")
+        assert http.post("/sign-out", data={"csrf": http.headers["X-CSRF-Token"]}, headers=HTML).status_code == 303
+        assert http.get("/v1/rig").json()["type"] == "/problems/unauthorized"
+
+
+def test_a_lock_holds_over_a_restart(tmp_path: Path, short_dir: Path) -> None:
+    cookies: Any = None
+    for first in run_service(tmp_path, short_dir, STUB, idle_lock_min=10):
+        with first.client() as admin:
+            admin.post("/v1/users", json={"name": "Ada", "password": PASSWORD})
+        with signed_in(first) as http:
+            http.post("/v1/sessions/lock")
+            cookies = dict(http.cookies)
+    for second in run_service(tmp_path, short_dir, STUB, idle_lock_min=10):
+        with second.client(token=None, cookies=cookies) as http:
+            assert locked(http)
+
+
+def test_actions_are_written_down_once_and_what_comes_meanwhile_is_kept(service: Service) -> None:
+    context = service.app.state.context
+    clock = SetClock()
+    idle = IdleLock(context.store, clock, 10)
+    with signed_in(service) as http:
+        row = context.auth.cookie(http.cookies["stimrig_session"]).page_session
+        clock.ahead_s = 500.0
+        idle.acted(row.hash)
+        idle.flush()
+        clock.ahead_s = 1000.0
+        again = IdleLock(context.store, clock, 10)  # as after a restart
+        assert not again.locked(context.store.get(type(row), row.hash))
+        clock.ahead_s = 1200.0
+        assert again.locked(context.store.get(type(row), row.hash))
+        assert not IdleLock(context.store, clock, 0).locked(context.store.get(type(row), row.hash)), "0: never"

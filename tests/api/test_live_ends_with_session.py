@@ -1,0 +1,172 @@
+"""The live channel is open as long as its session or token is valid, and no longer; the others' stay open."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import ClientConnection, connect
+
+from api.people.auth import COOKIE, digest
+from api.store.tables import PageSession, Token
+from api.web.routes.tests import _next
+from tests.api.browser import PASSWORD
+from tests.api.conftest import STUB, TOKEN, Service, run_service
+from tests.api.test_idle_lock import signed_in
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
+    for service in run_service(tmp_path_factory.mktemp("watch"), short_dir, STUB, speed=0.02, idle_lock_min=10):
+        with service.client() as admin:
+            for name in ("Ada", "Grace"):
+                assert admin.post("/v1/users", json={"name": name, "password": PASSWORD}).status_code == 201
+            admin.post("/v1/participants", json={"code": "P017"})
+        yield service
+
+
+@pytest.fixture(scope="module")
+def test_id(service: Service) -> str:
+    """A test that outlasts this module."""
+    with service.client() as admin:
+        return admin.post("/v1/tests", json={"participant": "P017"}).json()["id"]
+
+
+@contextmanager
+def watching(service: Service, test_id: str, headers: dict[str, str]) -> Iterator[ClientConnection]:
+    url = service.url.replace("http", "ws") + f"/v1/tests/{test_id}/live"
+    with connect(url, additional_headers=headers, open_timeout=60) as socket:
+        assert json.loads(socket.recv(20))["type"] == "history"
+        yield socket
+
+
+def cookie(http: httpx.Client) -> dict[str, str]:
+    return {"Cookie": f"{COOKIE}={http.cookies[COOKIE]}"}
+
+
+def last(socket: ClientConnection) -> dict[str, Any]:
+    """What it says until it is closed by the service; the last of it."""
+    message: dict[str, Any] = {}
+    try:
+        end_s = time.monotonic() + 20  # as much as 400 frames take
+        while time.monotonic() < end_s:
+            message = json.loads(socket.recv(20))
+    except ConnectionClosed as closed:
+        assert closed.rcvd is not None and closed.rcvd.code == 4401
+        return message
+    raise AssertionError("it goes on")
+
+
+def goes_on(socket: ClientConnection) -> None:
+    """All that has come, and a frame after it."""
+    for _ in range(60):
+        assert json.loads(socket.recv(20))["type"] in ("test", "live", "idle", "state")
+
+
+def sign_out(http: httpx.Client, _service: Service) -> None:
+    assert http.delete("/v1/sessions/current").status_code == 204
+
+
+def lock(http: httpx.Client, _service: Service) -> None:
+    assert http.post("/v1/sessions/lock").status_code == 204
+
+
+def removed(_http: httpx.Client, service: Service) -> None:
+    with service.client() as admin:
+        assert admin.delete("/v1/users/Grace").status_code == 204
+
+
+def run_out(http: httpx.Client, service: Service) -> None:
+    with service.app.state.context.store.write() as session:
+        session.get(PageSession, digest(http.cookies[COOKIE])).expires_unix_s = 1.0
+
+
+@pytest.mark.parametrize(
+    ("how", "problem"),
+    [(sign_out, "unauthorized"), (lock, "locked"), (run_out, "unauthorized"), (removed, "unauthorized")],
+)
+def test_it_closes_with_its_session_and_with_no_other(
+    service: Service, test_id: str, how: Callable[[httpx.Client, Service], None], problem: str
+) -> None:
+    with (
+        signed_in(service, "Grace") as hers,
+        signed_in(service, "Ada") as other,
+        watching(service, test_id, cookie(hers)) as socket,
+        watching(service, test_id, cookie(other)) as others,
+        watching(service, test_id, {"Authorization": f"Bearer {TOKEN}"}) as program,
+    ):
+        how(hers, service)
+        said = last(socket)
+        assert said["type"] == "problem" and said["problem"]["type"] == f"/problems/{problem}"
+        goes_on(others)
+        goes_on(program)
+
+
+@pytest.mark.parametrize("how", ["revoked", "expired", "scope"])
+def test_it_closes_with_its_token_and_with_no_other(service: Service, test_id: str, how: str) -> None:
+    text, other = service.token("bench", "read-live"), service.token("bench", "read-live")
+    context = service.app.state.context
+    with (
+        watching(service, test_id, {"Authorization": f"Bearer {text}"}) as socket,
+        watching(service, test_id, {"Authorization": f"Bearer {other}"}) as others,
+    ):
+        if how == "revoked":
+            with service.client() as admin:
+                assert admin.delete(f"/v1/tokens/{digest(text)[:16]}").status_code == 204
+        else:
+            with context.store.write() as session:
+                row = session.get(Token, digest(text))
+                if how == "expired":
+                    row.expires_utc = "2020-01-01T00:00:00Z"
+                else:
+                    row.scopes = ["read-model"]
+            context.auth._known.clear()
+        said = last(socket)
+        assert said["problem"]["status"] == (403 if how == "scope" else 401)
+        goes_on(others)
+
+
+def test_a_new_password_ends_the_old_cookies_channel_and_the_new_one_watches(service: Service, test_id: str) -> None:
+    with signed_in(service, "Ada") as http, watching(service, test_id, cookie(http)) as socket:
+        with service.client() as admin:
+            assert admin.put("/v1/users/Ada/password", json={"password": PASSWORD}).status_code == 204
+        assert last(socket)["problem"]["status"] == 401
+    with signed_in(service, "Ada") as http, watching(service, test_id, cookie(http)) as socket:
+        goes_on(socket)
+
+
+@pytest.mark.parametrize("turns", range(4))
+def test_a_message_at_the_moment_of_closing_does_not_keep_the_channel_open(turns: int) -> None:
+    async def closed() -> bool:
+        queue: asyncio.Queue[dict[str, Any]] = asyncio.Queue()
+
+        async def pump() -> None:
+            while True:
+                await _next(queue)
+
+        task = asyncio.create_task(pump())
+        await asyncio.sleep(0.01)
+        queue.put_nowait({"type": "live"})
+        for _ in range(turns):
+            await asyncio.sleep(0)
+        task.cancel()
+        return bool((await asyncio.wait([task], timeout=5))[0])
+
+    assert asyncio.run(closed())
+
+
+def test_the_stop_button_of_a_page_whose_channel_was_closed_still_stops(service: Service, test_id: str) -> None:
+    right = service.app.state.context.stop_rights.give("Ada", test_id)
+    with signed_in(service, "Ada") as http, watching(service, test_id, cookie(http)) as socket:
+        sign_out(http, service)
+        last(socket)
+    with service.client(token=None) as nobody:
+        assert nobody.post("/v1/stop", json={}, headers={"X-Stop-Right": right}).status_code == 200

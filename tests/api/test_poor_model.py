@@ -1,0 +1,159 @@
+"""A model that is not usable reaches a controller only with a reason that is one; a usable one with none."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import httpx
+import pytest
+
+from api.models import advice, reasons
+from identify.estimation import quality
+from tests.api.conftest import Service, run_test
+from tests.api.test_access import csrf, signed_in
+from tests.api.test_first_screen import make_poor
+
+NONE = ["", " ", ".", "ok", "asdf", "......", "xxxxxxxxxxxx", "asdf asdf asdf", "a b c", "aaaa bbbb cccc dddd",
+        "1234 5678 9012", "ja ja ja ja", "ok ok ok", "test test test test"]  # fmt: skip
+SOME = ["only the delay is used today", "Nur die Verzögerung wird heute gebraucht", "plateau measured twice, same",
+        "Engineer Kim watches every trial"]  # fmt: skip
+
+
+@pytest.mark.parametrize("text", NONE)
+def test_no_reason(text: str) -> None:
+    assert not reasons.is_reason(text)
+
+
+@pytest.mark.parametrize("text", SOME)
+def test_a_reason(text: str) -> None:
+    assert reasons.is_reason(text)
+
+
+def test_the_api_wants_a_reason_for_a_model_that_is_not_usable(
+    client: httpx.Client, service: Service, participant: str
+) -> None:
+    model = run_test(client, participant)["model_id"]
+    poor = make_poor(service, model)
+    for body in (None, {}, {"reason": "ok"}, {"reason": "asdf asdf asdf"}):
+        refused = client.post(f"/v1/models/{poor}/approve", json=body)
+        assert refused.status_code == 422 and refused.json()["type"] == "/problems/reason-needed", body
+        assert "Write in a few words why" in refused.json()["detail"]
+    assert client.get("/v1/participants/P017/model").status_code == 404
+    assert client.get(f"/v1/models/{poor}").json()["decision"] is None
+    assert client.post(f"/v1/models/{poor}/approve", json={"reason": SOME[0]}).json()["served"]
+    assert client.post(f"/v1/models/{poor}/reject").json()["decision"] == "rejected", "to reject needs none"
+    assert client.post(f"/v1/models/{model}/approve").json()["served"], "nor does a usable one"
+
+
+def test_undo_brings_no_model_into_use_that_is_not_usable(
+    client: httpx.Client, service: Service, participant: str
+) -> None:
+    poor = make_poor(service, run_test(client, participant)["model_id"])
+    better = client.post(f"/v1/models/{poor}/effects", json={"effects": ["fatigue"]}).json()["id"]
+    client.post(f"/v1/models/{better}/approve")
+    assert client.post(f"/v1/models/{better}/undo").json()["id"] == poor
+    assert client.get("/v1/participants/P017/model").status_code == 404
+
+
+def test_the_form_asks_again_and_writes_nothing_down(client: httpx.Client, service: Service, participant: str) -> None:
+    model = run_test(client, participant)["model_id"]
+    poor = make_poor(service, model)
+    with signed_in(service) as browser:
+        assert browser.get(f"/models/{model}/approve").headers["location"] == f"/models/{model}", "no question needed"
+        question = browser.get(f"/models/{poor}/approve")
+        assert question.status_code == 200 and "What the controller would risk" in question.text
+        again = browser.post(f"/models/{poor}/approve", data={"csrf": csrf(browser), "reason": "ok <b>"})
+        assert again.status_code == 422 and "not a reason yet" in again.text and "ok &lt;b&gt;" in again.text
+        assert client.get(f"/v1/models/{poor}").json()["decision"] is None
+        taken = browser.post(f"/models/{poor}/approve", data={"csrf": csrf(browser), "reason": SOME[0]})
+        assert taken.status_code == 303
+    assert client.get(f"/v1/models/{poor}").json()["served"]
+
+
+# ---- words --------------------------------------------------------------------------------------------------
+
+
+def test_each_gate_of_identify_has_words() -> None:
+    """A new gate without words would be silent on the page."""
+    import inspect
+
+    source = inspect.getsource(quality.quality)
+    assert all(f'"{name}": ' in source for name in advice.GATES)
+    assert source.count(": _") - source.count("-> ") >= len(advice.GATES) - 1
+
+
+def found(*gates: tuple[str, str]) -> list[advice.Finding]:
+    stored = {name: {"passed": False, "severity": severity, "says": name} for name, severity in gates}
+    return advice.findings({"quality": {"gates": {"range": {"passed": True}, **stored}}})
+
+
+@pytest.mark.parametrize(
+    ("verdict", "gates", "missing", "act", "words"),
+    [
+        ("usable", [], [], "approve", "Usable: approve it."),
+        ("usable", [], ["Fatigue"], "approve", "Usable: approve it. Fatigue may make it better."),
+        ("usable with care", [("ceiling", "care")], [], "approve", "look at where the error sits first"),
+        ("usable with care", [("sensor", "care")], [], "approve", "look at the highest torques"),
+        ("usable with care", [("gap", "care")], ["Fatigue"], "add", "look at Fatigue first, and add it"),
+        ("usable with care", [], [], "approve", "look at where the error sits first"),
+        ("not usable", [("torque", "refuse")], [], "test", "test again with electrodes, current and load cell"),
+        ("not usable", [("gap", "refuse"), ("range", "care")], ["Fatigue"], "add", "add Fatigue, or test again"),
+        ("not usable", [("torque", "refuse"), ("gap", "refuse")], ["Fatigue"], "test", "test again with electrodes"),
+        ("not usable", [], [], "test", "test again"),
+        ("unknown", [], [], "fit", "There is no verdict"),
+    ],
+)
+def test_the_verdict_says_what_to_do(
+    verdict: str, gates: list[tuple[str, str]], missing: list[str], act: str, words: str
+) -> None:
+    said = advice.advice(verdict, found(*gates), missing)
+    assert said.act == act and words in said.words
+
+
+def test_the_worst_finding_comes_first_and_risks_are_said_once() -> None:
+    rows = found(("range", "care"), ("torque", "refuse"), ("sensor", "care"))
+    assert [row.gate for row in rows] == ["torque", "range", "sensor"]
+    said = advice.risks({"fit": {"held_out_fit_percent": 69.0}}, rows)
+    assert any("too wide pulses" in words for words in said) and len(set(said)) == len(said)
+    assert said[-1] == "On pulses not used for fitting the error is 31 % of the torque."
+    assert advice.risks({}, []), "never nothing"
+
+
+@pytest.mark.parametrize(
+    ("fit", "words"),
+    [
+        (
+            {"held_out_fit_percent": 96.2, "held_out_ceiling_percent": 96.3, "held_out_by": "validate"},
+            "On pulses not used for fitting the model follows 96.2 % of the torque; sensor noise limits this to "
+            "96.3 %.",
+        ),
+        ({"held_out_fit_percent": 90.0}, "On pulses not used for fitting the model follows 90.0 % of the torque."),
+        (
+            {"held_out_fit_percent": 90.0, "held_out_by": "cross-validation"},
+            "On parts of the recording that were left out in turn the model follows 90.0 % of the torque.",
+        ),
+        (
+            {"fit_percent": 88.0, "ceiling_percent": 89.0, "held_out_rms_nm": 0.1},
+            "On the pulses that it was fitted to the model follows 88.0 % of the torque; sensor noise limits this to "
+            "89.0 %.",
+        ),
+        ({"held_out_fit_percent": -5.0}, "On pulses not used for fitting the model does not follow the torque at all."),
+        ({}, ""),
+    ],
+)
+def test_fit_and_ceiling_in_one_sentence(fit: dict[str, Any], words: str) -> None:
+    assert advice.fit_sentence(fit) == words
+
+
+def test_segments_in_a_clinicians_words() -> None:
+    from api.charts.model_charts import segment_marks
+    from api.clinical_words import segment_words
+
+    names = ["rest", "prbs", "ramp", "validate", "my <own>"]
+    assert [segment_words(name) for name in names] == [
+        "Rest", "Random pulses", "Ramp", "Check (not used for fitting)", "my <own>"
+    ]  # fmt: skip
+    marks = segment_marks([{"name": name, "start_s": 0.0, "end_s": 1.0} for name in names])[1]
+    assert [mark["text"] for mark in marks] == [
+        "Random pulses", "Ramp", "Check (not used for fitting)", "my ‹own›"
+    ]  # fmt: skip
