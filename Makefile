@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 export PYTHONUNBUFFERED = 1
 FAST := not wire and not browser and not service and not slow
 
-.PHONY: demo test check fast lint types serve bench faults soak campaigns mutation lock clean help setup setup-test
+.PHONY: demo test check fast lint types serve bench faults soak campaigns mutation words lock clean help setup setup-test
 
 help:
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -61,6 +61,9 @@ $(VENV)/.test: requirements/test.txt pyproject.toml deploy/setup.sh
 
 $(VENV)-bench/.bench: requirements/bench.txt pyproject.toml deploy/setup.sh
 	@bash deploy/setup.sh bench
+
+words: setup ## renew the catalogues of the pages' languages; LANGUAGE=fr begins one (docs/languages.md)
+	@$(BIN)/python -m api.language.extract $(LANGUAGE)
 
 lock: ## resolve the locked lists anew (needs uv; for maintainers)
 	@bash deploy/lock.sh

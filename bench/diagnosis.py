@@ -28,6 +28,7 @@ from identify.diagnosis.verdict import STRUCTURE
 from identify.effects import registry
 from identify.records.join import join
 from identify.records.record import Record
+from tests.harness.carried_sessions import as_record
 
 SETS = ("single", "nothing", "outside", "two", "slow", "rates", "kept")
 JOINED_AFTER_S = 60.0
@@ -45,18 +46,6 @@ PAIRS = (
     "mains_hum+fatigue",
     "recruitment_hysteresis+series_compliance",
 )
-
-
-def as_record(made: dict[str, Any]) -> Record:
-    """A generated record as the diagnosis takes it."""
-    return Record.from_arrays(
-        made["time_s"],
-        made["pulse_width_us"],
-        made["torque_nm"],
-        made["segment"],
-        angle_rad=made.get("angle_rad"),
-        velocity_rad_s=made.get("velocity_rad_s"),
-    )
 
 
 def as_joined(made: dict[str, Any], kind: str, seed: int) -> tuple[Record, dict[str, Any]]:

@@ -21,7 +21,7 @@ from hardware_sim import hidden_records
 IMAGES = Path(__file__).parents[1] / "docs" / "img"
 TOKEN = "bench-of-the-pictures-of-the-page"
 NAME, PASSWORD = "Ada", "correct horse battery"
-WIDTH, MARGIN, COLOURS = 1200, 14, 128
+WIDTH, HEIGHT, MARGIN, COLOURS = 1366, 768, 14, 128
 
 
 def prepared(url: str, folder: Path) -> str:
@@ -47,23 +47,26 @@ def keep(name: str, content: bytes) -> None:
 
 
 def photograph(page: Page, url: str, model: str) -> None:
-    """Sign in, open the model, keep its upper part and the section below it."""
+    """Sign in, open the model, keep its first screen, then the missing effect and where the error sits."""
     page.goto(f"{url}/sign-in")
     page.fill("input[name=name]", NAME)
     page.fill("input[name=password]", PASSWORD)
     page.press("input[name=password]", "Enter")
     page.wait_for_url(f"{url}/")
     page.goto(f"{url}/models/{model}")
-    page.wait_for_selector("#why .js-plotly-plot .main-svg")
+    page.wait_for_selector(".why-head")
+    page.wait_for_selector("#torque .js-plotly-plot .main-svg")
     page.wait_for_timeout(1500)
+    keep("page", page.screenshot())
+    page.evaluate("for (const name of ['.effect', '#error']) document.querySelector(name).open = true")
+    page.wait_for_selector("#error .js-plotly-plot .main-svg")
+    page.wait_for_timeout(1500)
+    whole = Image.open(io.BytesIO(page.screenshot(full_page=True)))
     place = "document.querySelector('{}').getBoundingClientRect().{} + scrollY"
-    top, bottom = (page.evaluate(place.format(*asked)) for asked in (("#why", "top"), (".card.effect", "bottom")))
-    whole = page.screenshot(full_page=True)
-    picture = Image.open(io.BytesIO(whole))
-    for name, upper, lower in (("page", 0, top), ("why", top - MARGIN, bottom + MARGIN)):
-        part = io.BytesIO()
-        picture.crop((0, int(upper), picture.width, int(lower))).save(part, "PNG")
-        keep(name, part.getvalue())
+    upper, lower = (page.evaluate(place.format(*asked)) for asked in ((".effect", "top"), ("#error", "bottom")))
+    part = io.BytesIO()
+    whole.crop((0, int(upper - MARGIN), whole.width, int(lower + MARGIN))).save(part, "PNG")
+    keep("why", part.getvalue())
 
 
 def main() -> None:
@@ -75,7 +78,7 @@ def main() -> None:
             model = prepared(services.url, Path(folder))
             chromium = os.environ.get("CHROMIUM", "/usr/bin/chromium")
             browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox", "--disable-gpu"])
-            page = browser.new_page(viewport={"width": WIDTH, "height": 900}, locale="en-GB")
+            page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT}, locale="en-GB")
             photograph(page, services.url, model)
             browser.close()
 
