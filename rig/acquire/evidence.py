@@ -14,7 +14,8 @@ NEAR_REST_NM = 0.5
 AROUND_S = 0.05
 """Real seconds over which the median of the torque is taken."""
 SILENT_S = 0.4
-"""Real seconds to wait for any torque. The wait is longer while a backlog is read: only torque after it counts."""
+"""Real seconds without any sample after which none is waited for. While a backlog is read the wait is longer: only
+torque after it counts."""
 ATTEMPTS = 2
 
 
@@ -47,13 +48,15 @@ def watch_decay(
     if rest_nm is None:
         return False, "there is no torque signal to confirm the stop"
     above_nm = 0.0 if at_stop_nm is None else at_stop_nm - rest_nm  # if unknown, the torque must come close to rest
-    deadline_s, silent_s = clock.now_s() + DECAY_S, clock.now_s() + SILENT_S * clock.speed
+    began_s = clock.now_s()
+    deadline_s = began_s + DECAY_S
     while True:
         # torque from a backlog is old, perhaps from the rest before the test: it does not count
         now_nm = receiver.torque_around(AROUND_S * clock.speed) if receiver.settled() else None
         if now_nm is None:
-            reading = receiver.age_s(clock.now_s()) <= AROUND_S * clock.speed
-            if clock.now_s() >= (deadline_s if reading else silent_s):
+            now_s = clock.now_s()
+            silent_s = min(receiver.age_s(now_s), now_s - began_s)
+            if now_s >= deadline_s or silent_s >= SILENT_S * clock.speed:
                 return False, "there is no torque signal to confirm the stop"
             clock.wait(clock.now_s() + 0.01 * clock.speed)
             continue

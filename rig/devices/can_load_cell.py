@@ -11,10 +11,11 @@ import math
 import re
 import socket
 import time
-from typing import Any
+from typing import Any, cast
 
 import can
 import numpy as np
+from can.interfaces.slcan import slcanBus
 from pydantic import Field, field_validator
 
 from rig.clock import Clock
@@ -22,6 +23,7 @@ from rig.devices import DeviceSettings
 from rig.errors import ConfigError, DeviceError, WireError
 from rig.signals import SAMPLE, TorqueBlock
 from rig.wire import dbc
+from rig.wire.read_ahead import ReadAhead
 
 KIND = "load_cell"
 
@@ -105,6 +107,8 @@ class CanLoadCell:
                 raise DeviceError(f"load_cell.bus: {self._place()} cannot be opened: {_line(error)}") from None
         if self._bus is None:
             raise DeviceError(f"load_cell.bus: {self._place()} cannot be opened: {_line(last)}")
+        if isinstance(self._bus, slcanBus):
+            self._bus.serialPortOrig = cast("Any", ReadAhead(self._bus.serialPortOrig))
         # Timestamps of these interfaces are the sender's or the kernel's, of the others the host's at reading.
         self._stamped = bus.get("interface") in ("socketcand", "socketcan", "pcan", "kvaser", "ixxat", "vector")
         self._send(self._settings.start_frames)

@@ -234,8 +234,8 @@ def test_a_rest_is_measured_again_at_the_first_pulse(tmp_path: Path):
 class Heard:
     """A receiver of which the torque is always the same, after a backlog of `settles_s`."""
 
-    def __init__(self, torque_nm: float, settles_s: float = 0.0, silent: bool = False) -> None:
-        self._torque_nm, self._settles_s, self._silent = torque_nm, settles_s, silent
+    def __init__(self, torque_nm: float, settles_s: float = 0.0, silent: bool = False, each_s: float = 0.001) -> None:
+        self._torque_nm, self._settles_s, self._silent, self._each_s = torque_nm, settles_s, silent, each_s
         self.asked_s: list[float] = []
 
     def torque_around(self, _duration_s: float) -> float:
@@ -243,7 +243,7 @@ class Heard:
 
     def age_s(self, now_s: float) -> float:
         self.asked_s.append(now_s)
-        return float("inf") if self._silent else 0.001
+        return float("inf") if self._silent else (now_s - self.asked_s[0]) % self._each_s
 
     def settled(self) -> bool:
         return self.waited_s() >= self._settles_s
@@ -291,3 +291,11 @@ def test_a_stop_waits_while_a_backlog_is_read_and_not_where_nothing_comes(tmp_pa
         endless = Heard(0.0, settles_s=np.inf, silent=silent)
         assert not watched(folder, endless, 8.0)[0]
         assert endless.waited_s() == pytest.approx(longest_s, abs=0.05)
+
+
+@pytest.mark.slow
+def test_a_stop_waits_where_samples_come_in_bursts(tmp_path: Path):
+    """A reader that a busy machine lets run each 0.2 s only is not a cable that is out."""
+    bursts = Heard(0.0, settles_s=1.5, each_s=0.2)
+    assert watched(tmp_path, bursts, 8.0)[0]
+    assert bursts.waited_s() == pytest.approx(1.5, abs=0.1)
