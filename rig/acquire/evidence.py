@@ -13,6 +13,8 @@ DECAY_S = 3.0
 NEAR_REST_NM = 0.5
 AROUND_S = 0.05
 """Real seconds over which the median of the torque is taken."""
+POLL_S = 0.01
+"""Real seconds between two looks at the torque. A machine that stood still between them has waited no longer."""
 SILENT_S = 0.4
 """Real seconds without any sample after which none is waited for. While a backlog is read the wait is longer: only
 torque after it counts."""
@@ -48,23 +50,23 @@ def watch_decay(
     if rest_nm is None:
         return False, "there is no torque signal to confirm the stop"
     above_nm = 0.0 if at_stop_nm is None else at_stop_nm - rest_nm  # if unknown, the torque must come close to rest
-    began_s = clock.now_s()
-    deadline_s = began_s + DECAY_S
+    waited_s = quiet_s = 0.0
+    looked_s = clock.now_s()
     while True:
         # torque from a backlog is old, perhaps from the rest before the test: it does not count
         now_nm = receiver.torque_around(AROUND_S * clock.speed) if receiver.settled() else None
-        if now_nm is None:
-            now_s = clock.now_s()
-            silent_s = min(receiver.age_s(now_s), now_s - began_s)
-            if now_s >= deadline_s or silent_s >= SILENT_S * clock.speed:
-                return False, "there is no torque signal to confirm the stop"
-            clock.wait(clock.now_s() + 0.01 * clock.speed)
-            continue
-        if abs(now_nm - rest_nm) <= max(NEAR_REST_NM, 0.5 * abs(above_nm)):
+        if now_nm is not None and abs(now_nm - rest_nm) <= max(NEAR_REST_NM, 0.5 * abs(above_nm)):
             return True, _near_rest(at_stop_nm, abs(above_nm), now_nm)
-        if clock.now_s() >= deadline_s:
+        if waited_s >= DECAY_S and now_nm is not None:
             return False, f"torque is still {now_nm:.2f} N·m {DECAY_S:g} s after the stop"
-        clock.wait(clock.now_s() + 0.01 * clock.speed)
+        if waited_s >= DECAY_S or quiet_s >= SILENT_S * clock.speed:
+            return False, "there is no torque signal to confirm the stop"
+        clock.wait(clock.now_s() + POLL_S * clock.speed)
+        now_s = clock.now_s()
+        step_s = min(now_s - looked_s, POLL_S * clock.speed)
+        waited_s += step_s
+        quiet_s = 0.0 if receiver.age_s(now_s) <= now_s - looked_s else quiet_s + step_s
+        looked_s = now_s
 
 
 def _near_rest(at_stop_nm: float | None, above_nm: float, now_nm: float) -> str:

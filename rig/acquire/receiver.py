@@ -27,8 +27,8 @@ log = logging.getLogger("rig.receiver")
 
 READ_TIMEOUT_S = 0.02
 SILENCE_S = 1.0
-"""Real seconds without a sample after which the cell counts as gone. Its bus is closed, since some drivers then use a
-whole processor."""
+"""Real seconds of reading without a sample after which the cell counts as gone. Its bus is closed, since some drivers
+then use a whole processor. A machine that stood still did not read: each reading counts for its own time at most."""
 LIVE_BLOCKS = 4000
 SETTLING_S = 0.1
 BACKLOG_RATE = 1.6
@@ -247,18 +247,18 @@ class Receiver:
             self._lose(f"load cell: internal: {type(error).__name__}: {error}")
 
     def _read_all(self) -> None:
-        last_heard_s = self._clock.now_s()
+        silent_s = 0.0
         while not self._closing.is_set():
+            began_s = self._clock.now_s()
             try:
                 block = self._cell.read(READ_TIMEOUT_S)
             except DeviceError as error:
                 self._lose(str(error))
                 return
-            now_s = self._clock.now_s()
-            if len(block):
-                last_heard_s = now_s
+            read_s = min(self._clock.now_s() - began_s, READ_TIMEOUT_S * self._clock.speed)
+            silent_s = 0.0 if len(block) else silent_s + read_s
             self.take(block)
-            if now_s - last_heard_s > SILENCE_S * self._clock.speed:
+            if silent_s > SILENCE_S * self._clock.speed:
                 self._lose(f"load cell: silent for {SILENCE_S:g} s; check its cable and supply")
                 return
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rig.acquire.receiver import CounterUnwrapper, Receiver
+from rig.acquire.receiver import READ_TIMEOUT_S, SILENCE_S, CounterUnwrapper, Receiver
 from rig.clock import VirtualClock
 from rig.journal import Journal
 from rig.signals import SAMPLE, TorqueBlock
@@ -62,3 +63,22 @@ def test_what_is_told_of_the_newest_sample():
     assert receiver.age_s(clock.now_s()) == 0.25
     assert receiver.torque_around(1.0) == 3.5
     assert receiver.last_torque_nm == 3.5
+
+
+class SilentCell(FakeCell):
+    """One that gives nothing; its first reading lasts for as long as a machine stood still."""
+
+    readings = 0
+
+    def read(self, timeout_s: float) -> TorqueBlock:
+        self.readings += 1
+        self.clock.advance(2 * SILENCE_S if self.readings == 1 else timeout_s)
+        return TorqueBlock(np.zeros(0, SAMPLE))
+
+
+def test_a_cell_is_silent_after_a_second_of_reading_not_of_standing_still():
+    clock, reasons = VirtualClock(), []
+    cell = SilentCell(clock, FakeStimulator(clock))
+    Receiver(cell, clock, reasons.append)._run()
+    assert reasons == ["load cell: silent for 1 s; check its cable and supply"]
+    assert cell.readings == pytest.approx(SILENCE_S / READ_TIMEOUT_S, abs=2)

@@ -299,3 +299,27 @@ def test_a_stop_waits_where_samples_come_in_bursts(tmp_path: Path):
     bursts = Heard(0.0, settles_s=1.5, each_s=0.2)
     assert watched(tmp_path, bursts, 8.0)[0]
     assert bursts.waited_s() == pytest.approx(1.5, abs=0.1)
+
+
+class HeardAfter(Heard):
+    """Nothing came between 0.05 s and 0.9 s, and everything came afterwards."""
+
+    def age_s(self, now_s: float) -> float:
+        super().age_s(now_s)
+        return self.waited_s() - 0.05 if 0.05 <= self.waited_s() < 0.9 else 0.001
+
+
+@pytest.mark.slow
+def test_a_stop_waits_for_the_torque_of_a_machine_that_stood_still(tmp_path: Path):
+    """Nobody looked while it stood still: that is no silence of the cell."""
+    rig = VirtualRig(tmp_path)
+    rig.execute()
+    began_s, wait = rig.clock.now_s(), rig.clock.wait
+
+    def stand_still_once(until_s: float) -> bool:
+        return wait(began_s + 0.85 if began_s + 0.05 < until_s < began_s + 0.85 else until_s)
+
+    rig.clock.wait = stand_still_once  # pyright: ignore[reportAttributeAccessIssue]
+    heard = HeardAfter(0.0, settles_s=0.9)
+    assert watch_decay(rig.gate, heard, rig.clock, 0.0, 8.0)[0]  # pyright: ignore[reportArgumentType]
+    assert heard.waited_s() == pytest.approx(0.9, abs=0.05)
