@@ -86,13 +86,14 @@ def headline(
 
 
 def _missing(missing: list[dict[str, Any]]) -> str:
-    """How many effects are missing, and how sure that is."""
-    many = len(missing)
-    if not any(map(likely, missing)):
+    """How many effects are missing, and how sure that is. Beside a likely one, what is only possible does not count."""
+    sure = sum(map(likely, missing))
+    if not sure:
+        many = len(missing)
         return ngettext(
             "An effect is possibly missing in this model", "%(num)s effects are possibly missing in this model", many
         )
-    return ngettext("An effect is missing in this model", "%(num)s effects are missing in this model", many)
+    return ngettext("An effect is missing in this model", "%(num)s effects are missing in this model", sure)
 
 
 def _nothing(

@@ -82,6 +82,30 @@ def test_switching_colours_recolours_what_is_drawn_and_keeps_the_page(tab: Any, 
     assert tab.locator(".bar").get_by_role("button", name="Dark").get_attribute("aria-pressed") == "true"
 
 
+RANGE = "() => document.querySelector('[data-figure=comparison]').layout.xaxis.range.map((s) => +s.toFixed(3))"
+
+
+def test_other_colours_keep_the_view(tab: Any, service: Service, model: str) -> None:
+    tab.set_viewport_size(LAPTOP)
+    drawn(tab, service, model)
+    chart = tab.locator("[data-figure=comparison]")
+    chart.scroll_into_view_if_needed()
+    plane, whole = chart.locator(".nsewdrag").first, tab.evaluate(RANGE)
+    box = plane.bounding_box()
+    tab.mouse.move(box["x"] + 100, box["y"] + 20)
+    tab.mouse.down()
+    tab.mouse.move(box["x"] + 300, box["y"] + 25, steps=5)
+    tab.mouse.up()
+    near = tab.evaluate(RANGE)
+    assert near != whole
+    for view in (near, whole):
+        for words in ("Light", "Dark"):
+            tab.locator(".bar").get_by_role("button", name=words).click()
+            assert tab.evaluate(RANGE) == view
+        chart.locator(".modebar-btn[data-title='Show all again']").click()
+        assert tab.evaluate(RANGE) == whole
+
+
 def test_as_the_system_follows_the_system_at_once(browser: Any, service: Service, model: str) -> None:
     for page in open_tab(browser, service, color_scheme="dark"):
         drawn(page, service, model)

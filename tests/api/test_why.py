@@ -294,7 +294,8 @@ def test_a_page_that_says_that_structure_is_left_does_not_say_that_it_is_noise()
 def test_only_what_is_likely_missing_is_advised() -> None:
     """A person who adds whatever is possible ends with a model that is no better on new pulses."""
     sure, perhaps = FATIGUE, {**FATIGUE, "effect": "tremor", "name": "Tremor", "probability": 0.45}
-    assert shown("effect_missing", [sure, perhaps], [], 6)["likely"] == ["Fatigue"]
+    both = shown("effect_missing", [sure, perhaps], [], 6)
+    assert both["likely"] == ["Fatigue"] and both["title"] == "An effect is missing in this model"
     found = shown("effect_missing", [perhaps], [], 6)
     assert found["likely"] == [] and "possibly missing" in found["title"] and len(found["missing"]) == 1
 

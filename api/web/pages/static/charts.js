@@ -4,14 +4,15 @@ const drawChart = (() => {
   const NAMED = /^var\((--[\w-]+)\)$/;
   const coarse = matchMedia("(pointer: coarse)");
   const drawn = new Map();
+  let drawings = 0;
 
-  // The value of each var(--name): Plotly knows no style sheets.
+  // A copy with the value of each var(--name): Plotly knows no style sheets, and writes into what it is given.
   function coloured(part, style) {
     if (typeof part === "string") {
       const name = NAMED.exec(part);
       return name ? style.getPropertyValue(name[1]).trim() : part;
     }
-    if (Array.isArray(part)) return typeof part[0] === "number" || part[0] === null ? part : part.map((entry) => coloured(entry, style));
+    if (Array.isArray(part)) return typeof part[0] === "number" || part[0] === null ? part.slice() : part.map((entry) => coloured(entry, style));
     if (part === null || typeof part !== "object") return part;
     return Object.fromEntries(Object.entries(part).map(([key, value]) => [key, coloured(value, style)]));
   }
@@ -29,10 +30,10 @@ const drawChart = (() => {
   }
 
   function paint(box) {
-    const { data, layout, settings } = drawn.get(box), style = getComputedStyle(document.documentElement);
+    const { data, layout, settings, uirevision } = drawn.get(box), style = getComputedStyle(document.documentElement);
     const how = { ...settings, toImageButtonOptions: { filename: filename(box), scale: 2 } };
     const dragmode = box.layout ? box.layout.dragmode : coarse.matches ? false : "zoom";
-    return Plotly.react(box, coloured(data, style), { ...coloured(layout, style), separators: separators(), dragmode }, how);
+    return Plotly.react(box, coloured(data, style), { ...coloured(layout, style), separators: separators(), dragmode, uirevision }, how);
   }
 
   // A finger scrolls the page; the zoom button takes it for one zoom. The style says so to the browser beforehand: a
@@ -47,7 +48,7 @@ const drawChart = (() => {
   addEventListener("colours", () => { for (const box of drawn.keys()) paint(box); });
 
   return (box, data, layout, settings) => {
-    drawn.set(box, { data, layout, settings });
+    drawn.set(box, { data, layout, settings, uirevision: ++drawings });  // other colours keep the view, other data do not
     paint(box);
     if (coarse.matches) forFingers(box);
   };
