@@ -4,7 +4,6 @@ const drawChart = (() => {
   const NAMED = /^var\((--[\w-]+)\)$/;
   const coarse = matchMedia("(pointer: coarse)");
   const drawn = new Map();
-  let drawings = 0;
 
   // A copy with the value of each var(--name): Plotly knows no style sheets, and writes into what it is given.
   function coloured(part, style) {
@@ -30,10 +29,10 @@ const drawChart = (() => {
   }
 
   function paint(box) {
-    const { data, layout, settings, uirevision } = drawn.get(box), style = getComputedStyle(document.documentElement);
+    const { data, layout, settings } = drawn.get(box), style = getComputedStyle(document.documentElement);
     const how = { ...settings, toImageButtonOptions: { filename: filename(box), scale: 2 } };
     const dragmode = box.layout ? box.layout.dragmode : coarse.matches ? false : "zoom";
-    return Plotly.react(box, coloured(data, style), { ...coloured(layout, style), separators: separators(), dragmode, uirevision }, how);
+    return Plotly.react(box, coloured(data, style), { ...coloured(layout, style), separators: separators(), dragmode }, how);
   }
 
   // A finger scrolls the page; the zoom button takes it for one zoom. The style says so to the browser beforehand: a
@@ -48,7 +47,7 @@ const drawChart = (() => {
   addEventListener("colours", () => { for (const box of drawn.keys()) paint(box); });
 
   return (box, data, layout, settings) => {
-    drawn.set(box, { data, layout, settings, uirevision: ++drawings });  // other colours keep the view, other data do not
+    drawn.set(box, { data, layout, settings });
     paint(box);
     if (coarse.matches) forFingers(box);
   };
