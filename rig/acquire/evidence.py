@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from rig.acquire.receiver import Receiver
 from rig.clock import Clock
 from rig.errors import DeviceError
@@ -18,6 +20,9 @@ POLL_S = 0.01
 SILENT_S = 0.4
 """Real seconds without any sample after which none is waited for. While a backlog is read the wait is longer: only
 torque after it counts."""
+LONGEST_S = 5.0
+"""Rig seconds after which no torque is waited for, whatever the machine did meanwhile."""
+NO_SIGNAL = "there is no torque signal to confirm the stop"
 ATTEMPTS = 2
 
 
@@ -48,19 +53,22 @@ def watch_decay(
     if gate.last_pulse_s is None:
         return True, "no pulse had been sent"
     if rest_nm is None:
-        return False, "there is no torque signal to confirm the stop"
+        return False, NO_SIGNAL
+    if at_stop_nm is not None and not math.isfinite(at_stop_nm):
+        at_stop_nm = None
     above_nm = 0.0 if at_stop_nm is None else at_stop_nm - rest_nm  # if unknown, the torque must come close to rest
     waited_s = quiet_s = 0.0
-    looked_s = clock.now_s()
+    began_s = looked_s = clock.now_s()
     while True:
         # torque from a backlog is old, perhaps from the rest before the test: it does not count
         now_nm = receiver.torque_around(AROUND_S * clock.speed) if receiver.settled() else None
         if now_nm is not None and abs(now_nm - rest_nm) <= max(NEAR_REST_NM, 0.5 * abs(above_nm)):
             return True, _near_rest(at_stop_nm, abs(above_nm), now_nm)
-        if waited_s >= DECAY_S and now_nm is not None:
-            return False, f"torque is still {now_nm:.2f} N·m {DECAY_S:g} s after the stop"
-        if waited_s >= DECAY_S or quiet_s >= SILENT_S * clock.speed:
-            return False, "there is no torque signal to confirm the stop"
+        since_s = looked_s - began_s
+        if now_nm is not None and since_s >= DECAY_S:
+            return False, f"torque is still {now_nm:.2f} N·m {since_s:.0f} s after the stop"
+        if waited_s >= max(DECAY_S, SILENT_S * clock.speed) or quiet_s >= SILENT_S * clock.speed or since_s > LONGEST_S:
+            return False, NO_SIGNAL
         clock.wait(clock.now_s() + POLL_S * clock.speed)
         now_s = clock.now_s()
         step_s = min(now_s - looked_s, POLL_S * clock.speed)

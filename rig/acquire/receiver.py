@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.acquire.plausibility import PlausibilityCheck
+from rig.acquire.plausibility import RATE_TOLERANCE, PlausibilityCheck
 from rig.clock import Clock
 from rig.devices import LoadCell
 from rig.errors import DeviceError, JournalError
@@ -28,10 +28,16 @@ log = logging.getLogger("rig.receiver")
 READ_TIMEOUT_S = 0.02
 SILENCE_S = 1.0
 """Real seconds of reading without a sample after which the cell counts as gone. Its bus is closed, since some drivers
-then use a whole processor. A machine that stood still did not read: each reading counts for its own time at most."""
+then use a whole processor."""
+LONGEST_READ_S = 0.25
+"""Real seconds for which one reading counts at most: a machine that stood still did not read."""
 LIVE_BLOCKS = 4000
 SETTLING_S = 0.1
 BACKLOG_RATE = 1.6
+BEHIND_S = 0.1
+"""Real seconds by which the newest sample may be later than the promptest one of the last `PROMPT_S` real seconds. A
+reader that was kept from reading, or that is too slow, is behind: what it reads now was torque long ago."""
+PROMPT_S = 5.0
 JUMP_ALLOWANCE_S = 0.5
 """A counter that is further ahead of the host's clock than this has jumped, so its samples have no reliable time."""
 
@@ -83,7 +89,7 @@ class Receiver:
         self._plausibility: PlausibilityCheck | None = None
         self._on_fault: Callable[[str], None] = lambda _: None
         self._previous: tuple[int, float] | None = None
-        self._rate: deque[tuple[float, int]] = deque(maxlen=2000)
+        self._rate: deque[tuple[float, int, float]] = deque(maxlen=2000)
         self._total = 0
         self.counts = Recorded()
         self.last_s: float | None = None
@@ -142,15 +148,32 @@ class Receiver:
         return np.inf if last_s is None else now_s - last_s
 
     def settled(self) -> bool:
-        """Whether samples arrive at the cell's own rate, not faster.
+        """Whether what arrives is of now: at the cell's own rate, not faster, and not behind.
 
-        If they arrive faster, old samples from a buffer are being read: after a pause of host or adapter.
+        If samples arrive faster, old ones from a buffer are being read: after a pause of host or adapter.
         """
         since_s = self._clock.now_s() - SETTLING_S * self._clock.speed
         rate = [entry for entry in tuple(self._rate) if entry[0] >= since_s]
         if len(rate) < 2 or rate[-1][0] - rate[0][0] < 0.5 * SETTLING_S * self._clock.speed:
             return False
-        return (rate[-1][1] - rate[0][1]) / (rate[-1][0] - rate[0][0]) <= BACKLOG_RATE * self.nominal_rate_hz
+        rate_hz = (rate[-1][1] - rate[0][1]) / (rate[-1][0] - rate[0][0])
+        return rate_hz <= BACKLOG_RATE * self.nominal_rate_hz and self.behind_s() <= BEHIND_S * self._clock.speed
+
+    def behind_s(self) -> float:
+        """How much later the newest sample came than the promptest one of the last seconds, rig seconds; at least 0.
+
+        Its number says when it was due. A cell may be slower than its nominal rate by `RATE_TOLERANCE`.
+        """
+        rate = tuple(self._rate)
+        if not rate:
+            return 0.0
+        now_s, _, delay_s = rate[-1]
+        since_s = now_s - PROMPT_S * self._clock.speed
+        return max(
+            delay_s - then_delay_s - RATE_TOLERANCE * (now_s - then_s)
+            for then_s, _, then_delay_s in rate
+            if then_s >= since_s
+        )
 
     def torque_around(self, duration_s: float) -> float | None:
         """Median of the torque over the last `duration_s`, N·m; None if there is none."""
@@ -222,7 +245,8 @@ class Receiver:
         self.last_torque_nm = float(samples["torque_nm"][-1])
         self.recent.append((self.last_s, float(np.mean(samples["torque_nm"]))))
         self._total += len(samples)
-        self._rate.append((self.last_s, self._total))
+        number = self._total if self._unwrapper is None else int(samples["counter"][-1])
+        self._rate.append((self.last_s, self._total, self.last_s - number / self.nominal_rate_hz))
         self.live.append(samples)
 
     def _check(self, torque_nm: NDArray[np.float64]) -> None:
@@ -255,7 +279,7 @@ class Receiver:
             except DeviceError as error:
                 self._lose(str(error))
                 return
-            read_s = min(self._clock.now_s() - began_s, READ_TIMEOUT_S * self._clock.speed)
+            read_s = min(self._clock.now_s() - began_s, LONGEST_READ_S * self._clock.speed)
             silent_s = 0.0 if len(block) else silent_s + read_s
             self.take(block)
             if silent_s > SILENCE_S * self._clock.speed:

@@ -15,6 +15,7 @@ from typing import Any, cast
 
 import can
 import numpy as np
+import serial
 from can.interfaces.slcan import slcanBus
 from pydantic import Field, field_validator
 
@@ -107,7 +108,7 @@ class CanLoadCell:
                 raise DeviceError(f"load_cell.bus: {self._place()} cannot be opened: {_line(error)}") from None
         if self._bus is None:
             raise DeviceError(f"load_cell.bus: {self._place()} cannot be opened: {_line(last)}")
-        if isinstance(self._bus, slcanBus):
+        if isinstance(self._bus, slcanBus) and isinstance(self._bus.serialPortOrig, serial.Serial):
             self._bus.serialPortOrig = cast("Any", ReadAhead(self._bus.serialPortOrig))
         # Timestamps of these interfaces are the sender's or the kernel's, of the others the host's at reading.
         self._stamped = bus.get("interface") in ("socketcand", "socketcan", "pcan", "kvaser", "ixxat", "vector")

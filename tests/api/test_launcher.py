@@ -94,7 +94,7 @@ def test_killed_service_comes_back_at_the_same_place_with_everything(tmp_path: P
         while not (document := http.get(f"/v1/tests/{test_id}").json())["done"]:
             assert time.monotonic() < end, document
             time.sleep(0.1)
-        assert document["state"] == "completed" and document["model_id"]
+        assert document["state"] == "completed" and document["model_id"], document
 
 
 def test_everything_dies_with_the_launcher(tmp_path: Path) -> None:

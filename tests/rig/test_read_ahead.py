@@ -9,6 +9,7 @@ import struct
 import tty
 from collections.abc import Iterator
 
+import numpy as np
 import pytest
 import serial
 
@@ -79,11 +80,25 @@ def test_a_cell_on_slcan_gives_every_frame_and_sends_its_own(line: tuple[int, st
     bus = {"interface": "slcan", "channel": path}
     cell = CanLoadCell(Settings(device="can_load_cell", bus=bus, start_frames=["000#0100"]), MonotonicClock())
     cell.open()
-    assert os.read(ours, 100) == b"O\rt00020100\r"
+    said = b""
+    while len(said) < len(opened := b"O\rt00020100\r"):
+        said += os.read(ours, 100)
+    assert said == opened
     os.write(ours, b"".join(frame(0.25 * i, i) for i in range(FRAMES)))
-    samples = [sample for _ in range(200) for sample in cell.read(0.01).samples]
+    samples: list[np.void] = []
+    while len(samples) < FRAMES:
+        samples += list(cell.read(0.05).samples)
     assert [s["counter"] for s in samples] == list(range(FRAMES))
     assert [s["torque_nm"] for s in samples] == [0.25 * i for i in range(FRAMES)]
+    cell.close()
+
+
+def test_a_port_that_is_no_serial_line_is_left_as_it_is():
+    """A socket says only whether anything waits, not how much."""
+    bus = {"interface": "slcan", "channel": "loop://"}
+    cell = CanLoadCell(Settings(device="can_load_cell", bus=bus), MonotonicClock())
+    cell.open()
+    assert not isinstance(cell._bus.serialPortOrig, ReadAhead)  # pyright: ignore
     cell.close()
 
 
