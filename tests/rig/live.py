@@ -25,7 +25,7 @@ from rig.signals import SAMPLE, Ack, LateError, TorqueBlock
 
 RATE_HZ = 1600.0
 SPEED = 4.0
-LINE = {"stimulator": "/dev/pts/gone", "can": {"interface": "virtual"}, "speed": SPEED}
+LINE = {"stimulator": "/dev/pts/gone", "can": {"interface": "virtual"}}
 
 
 class LiveStimulator:
@@ -135,14 +135,21 @@ class LiveCell:
 class LiveRig:
     """A `Rig` on both, and every event that it published."""
 
-    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch, rate: float = 1.0, armed: bool = False) -> None:
-        self.clock = MonotonicClock(SPEED)
+    def __init__(
+        self,
+        folder: Path,
+        monkeypatch: pytest.MonkeyPatch,
+        rate: float = 1.0,
+        armed: bool = False,
+        speed: float = SPEED,
+    ) -> None:
+        self.clock = MonotonicClock(speed)
         self.stimulator = LiveStimulator(self.clock)
         self.cell = LiveCell(self.clock, self.stimulator)
         made = {"stimulator": self.stimulator, "load_cell": self.cell}
         found = SimpleNamespace(find=lambda kind, _: SimpleNamespace(create=lambda _settings, _clock: made[kind]))
         monkeypatch.setattr(pair, "devices", found)
-        self.config = config.for_emulator(json.dumps(LINE), data_dir=folder, socket=folder / "s")
+        self.config = config.for_emulator(json.dumps({**LINE, "speed": speed}), data_dir=folder, socket=folder / "s")
         self.cell.rate, self.stimulator.armed = rate, armed
         self.events: list[Event] = []
         self.rig = Rig(self.config, self.clock, self.events.append)

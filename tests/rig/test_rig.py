@@ -22,7 +22,7 @@ from rig.control.building import previewed
 from rig.control.calibration import end_of_day_s
 from rig.errors import BusyError, DeviceError, LatchedError, PlanError, RefusedError, UncertainError
 from rig.messages import CalibrateStartRequest, PreviewRequest, Profile, SegmentPlan
-from tests.rig.live import LiveRig
+from tests.rig.live import SPEED, LiveRig
 
 pytestmark = pytest.mark.wire  # the rig, its devices and the clock in threads, in real time
 
@@ -33,8 +33,8 @@ Make = Callable[..., LiveRig]
 def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Make]:
     made: list[LiveRig] = []
 
-    def of(rate: float = 1.0, armed: bool = False) -> LiveRig:
-        made.append(LiveRig(tmp_path, monkeypatch, rate, armed))
+    def of(rate: float = 1.0, armed: bool = False, speed: float = SPEED) -> LiveRig:
+        made.append(LiveRig(tmp_path, monkeypatch, rate, armed, speed))
         return made[-1]
 
     yield of
@@ -43,7 +43,7 @@ def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Make]:
 
 
 def test_from_ready_to_ready_with_a_sealed_file(make: Make):
-    live = make()
+    live = make(speed=1.0)  # times are judged: a standstill is short beside this test
     assert live.rig.start(live.plan("one")).state in ("arming", "running")
     live.wait("running")
     with pytest.raises(BusyError, match="test one of participant P"):
@@ -60,7 +60,7 @@ def test_from_ready_to_ready_with_a_sealed_file(make: Make):
     assert (finished.outcome, finished.reason) == ("completed", "")
     assert finished in live.events
     busy = re.compile(
-        r"acknowledgements came late|error of their alignment is \d"
+        r"acknowledgements came late|error of their alignment is (\d|unknown)"
     )  # of a busy machine, no fault of the rig's
     assert [words for words in finished.summary["warnings"] if not busy.search(words)] == []
     with h5py.File(str(finished.recording_path)) as file:
@@ -188,7 +188,7 @@ def test_a_cell_that_sticks_right_before_the_test_is_a_fault(make: Make):
 
 
 def test_half_the_rate_is_a_fault(make: Make):
-    live = make(rate=0.5)
+    live = make(rate=0.5, speed=1.0)  # times are judged: a standstill is short beside this test
     live.rig.start(live.plan("one", hold_s=20.0))  # long beside a standstill of a busy machine
     assert float(live.wait("latched").split()[2]) == pytest.approx(800, rel=0.03)
     assert "samples/s arrive" in live.rig.status().reason
@@ -302,7 +302,7 @@ def test_a_damaged_journal_is_sealed_and_kept(make: Make, tmp_path: Path):
 
 
 def test_a_wall_clock_that_jumps_in_a_test_changes_nothing(make: Make, monkeypatch: pytest.MonkeyPatch):
-    live = make()
+    live = make(speed=1.0)  # times are judged: a standstill is short beside this test
     now = time.time
     live.rig.start(live.plan("one"))
     live.wait_pulses(10)
