@@ -125,8 +125,8 @@ def test_progress_is_told_and_can_stop_it():
 
 
 def test_a_converter_that_holds_its_readings_is_structure_not_physics():
-    record = hidden_muscles.record(seed=81)
-    held = record.with_torque(record.torque_nm[(np.arange(record.time_s.size) // 12) * 12])
+    record = hidden_muscles.record(seed=81, rate_hz=100)
+    held = record.with_torque(record.torque_nm[(np.arange(record.time_s.size) // 6) * 6])
     assert diagnose(held).verdict == "unexplained_structure"
 
 
