@@ -28,8 +28,9 @@ CASES = (
 def test_a_stalled_line_lets_go_one_pulse_at_most(stimulator: str):
     found = stalls([Case(stimulator, *case) for case in CASES], seed=11)
     assert [case.wrong for case in found] == [[]] * len(CASES), found
-    assert all(case.felt > 0 for case in found if case.phase != "arming")
-    assert any(case.dropped for case in found)  # else nothing was stalled
+    played = [case for case in found if case.phase != "arming" and "stale" not in case.reason]  # 0.1 s: a busy machine
+    assert len(played) >= 3 and all(case.felt > 0 for case in played), found
+    assert any(case.dropped for case in found), found  # else nothing was stalled
 
 
 def test_a_line_that_doubles_a_command_is_not_gone_on_with(make_bench: Callable[..., Bench]):
