@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rig import align, journal
+from rig import align, journal, laid
 from rig.clock import utc_text
 from rig.errors import RecordingError
 from rig.journal import JournalContents, Kind
@@ -66,9 +66,7 @@ def _assembled(contents: JournalContents, outcome: str, reason: str) -> Recordin
     _refuse_empty(contents)
     notes = _damage(contents)
     header = contents.first_json(Kind.HEADER) or _header_of_blocks(contents, notes)
-    planned = next((np.frombuffer(p, "<f8") for k, p in contents.blocks if k == Kind.PLAN), None)
-    if planned is None:
-        planned = _plan_of_intents(contents, notes)
+    planned, segments = laid.planned(contents, header, notes)
     rate_hz = float(header["plan"]["pulse_rate_hz"])
     begun, t0_s, unix_s = _start(contents, header, rate_hz)
     end = contents.first_json(Kind.END) or {"outcome": outcome, "reason": reason, "time_s": _last_time(contents)}
@@ -81,10 +79,9 @@ def _assembled(contents: JournalContents, outcome: str, reason: str) -> Recordin
     pulse_times = np.sort(written_s[np.isfinite(written_s)])
     torque, alignment, measured_hz = _torque(contents, t0_s, end_s, pulse_times, float(header["sample_rate_hz"]))
     columns.update(torque)
-    names = [s["name"] for s in header["segments"] if s["start"] / rate_hz < played_s]
-    columns["segments/start_s"] = np.array([s["start"] / rate_hz for s in header["segments"][: len(names)]])
-    ends = np.array([s["end"] / rate_hz for s in header["segments"][: len(names)]])
-    columns["segments/end_s"] = np.minimum(ends, max(played_s, 0.0))
+    segments = [s for s in segments if s.start / rate_hz < played_s]
+    columns["segments/start_s"] = np.array([s.start / rate_hz for s in segments])
+    columns["segments/end_s"] = np.minimum([s.end / rate_hz for s in segments], max(played_s, 0.0))
     attributes = {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
@@ -95,6 +92,7 @@ def _assembled(contents: JournalContents, outcome: str, reason: str) -> Recordin
         "created_utc": utc_text(unix_s),
         "outcome": end["outcome"],
         "reason": end["reason"],
+        **_ending(contents, header, end),
         "software": header["software"],
         "configuration": json.dumps({"rig": header["configuration"], "plan": header["plan"]}),
         "pulse_rate_hz": rate_hz,
@@ -106,7 +104,17 @@ def _assembled(contents: JournalContents, outcome: str, reason: str) -> Recordin
         "journal_note": "; ".join(notes),
     }
     events = [json.loads(payload) for kind, payload in contents.blocks if kind == Kind.EVENT]
-    return Recording(columns, names, attributes, alignment, events)
+    return Recording(columns, [s.name for s in segments], attributes, alignment, events)
+
+
+def _ending(contents: JournalContents, header: dict[str, Any], end: dict[str, Any]) -> dict[str, Any]:
+    """Attributes of a test that may have been extended while it played."""
+    completed = end["outcome"] == "completed"
+    return {
+        "adaptive": int(bool(header["plan"].get("adaptive"))),
+        "ended_by": end.get("ended_by", "plan") if completed else end["outcome"],
+        "laid": json.dumps([block.described() for block in laid.blocks(contents)]),
+    }
 
 
 def _refuse_empty(contents: JournalContents) -> None:
@@ -133,7 +141,7 @@ def _damage(contents: JournalContents) -> list[str]:
 
 def _header_of_blocks(contents: JournalContents, notes: list[str]) -> dict[str, Any]:
     """A header inferred from the blocks, if both copies are damaged."""
-    intents = _intents(contents)
+    intents = laid.intents(contents)
     rate_hz = LIKELY_RATE_HZ
     if len(intents) > 1 and intents[-1][0] > intents[0][0]:
         rate_hz = round((intents[-1][0] - intents[0][0]) / (intents[-1][2] - intents[0][2]), 6)
@@ -162,30 +170,12 @@ def _header_of_blocks(contents: JournalContents, notes: list[str]) -> dict[str, 
     }
 
 
-def _plan_of_intents(contents: JournalContents, notes: list[str]) -> NDArray[np.float64]:
-    """The widths that were sent, if both copies of the plan are damaged."""
-    known = [journal.SKIPPED.unpack(p)[0] for k, p in contents.blocks if k in (Kind.WRITTEN, Kind.SKIPPED)]
-    known += [journal.ACKED.unpack_from(p)[0] for k, p in contents.blocks if k == Kind.ACKED]
-    intents = _intents(contents)
-    known += [intent[0] for intent in intents]
-    notes.append("both copies of the plan are lost: the widths that were sent are used as planned widths")
-    planned = np.zeros(max(known, default=-1) + 1)
-    for index, _, _, width_us, _ in intents:
-        planned[index] = width_us
-    return planned
-
-
-def _intents(contents: JournalContents) -> list[tuple[int, float, float, float, float]]:
-    """Index, time, due time, width and current of each pulse that was to be sent."""
-    return [journal.INTENT.unpack(payload) for kind, payload in contents.blocks if kind == Kind.INTENT]
-
-
 def _start(contents: JournalContents, header: dict[str, Any], rate_hz: float) -> tuple[bool, float, float]:
     """Whether the test began; start of the test's clock on the rig's clock, s; the same time as UTC."""
     started = contents.first_json(Kind.START)
     if started is not None:
         return True, float(started["t0_s"]), float(started["unix_s"])
-    intents = _intents(contents)
+    intents = laid.intents(contents)
     t0_s = float(header["time_s"])
     if intents:
         t0_s = float(np.median([due_s - index / rate_hz for index, _, due_s, _, _ in intents]))
@@ -203,7 +193,7 @@ def _sample_rate(contents: JournalContents) -> float:
 
 
 def _first_time(contents: JournalContents) -> float:
-    times = [intent[1] for intent in _intents(contents)[:1]]
+    times = [intent[1] for intent in laid.intents(contents)[:1]]
     times += [float(np.frombuffer(p, SAMPLE)["host_time_s"][0]) for k, p in contents.blocks if k == Kind.TORQUE][:1]
     return min(times, default=0.0)
 

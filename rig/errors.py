@@ -41,6 +41,13 @@ class BusyError(RigError):
     title = "The rig is busy"
 
 
+class TooLateError(RigError):
+    """An answer to something that has passed: a boundary that was laid meanwhile, a test that is ending."""
+
+    code = "late"
+    title = "Too late"
+
+
 class LatchedError(RigError):
     """Stopped after a fault or a stop, and no person has re-armed yet."""
 

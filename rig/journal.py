@@ -18,13 +18,17 @@ import zlib
 from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from rig.errors import JournalError, RecordingError
 
 MAGIC = b"STIMRIG\x01"
 _BLOCK = struct.Struct("<4sBxHII")
 """Mark, kind, (spare), sequence number (16 bits), length, CRC-32 over the fields before it and the payload."""
+_LENGTH = struct.Struct("<I")
 _MARK = b"\xa5BLK"
 _CRC_AT = 12
 MAX_PAYLOAD = 64 * 1024 * 1024
@@ -57,6 +61,50 @@ class Kind(IntEnum):
     EVENT = 9
     END = 10
     SPACER = 11
+    LAID = 12
+
+
+LaidBy = Literal["plan", "extension", "end"]
+
+
+class Segment(NamedTuple):
+    """A segment as indices of its pulses, end exclusive, and who laid it."""
+
+    name: str
+    start: int
+    end: int
+    by: LaidBy
+
+
+@dataclass(frozen=True, slots=True)
+class LaidBlock:
+    """A segment that an adaptive test laid after its start; from `segment.start` it replaces what was laid before."""
+
+    segment: Segment
+    sequence: str
+    settings: dict[str, Any]
+    time_s: float
+    pulse_width_us: NDArray[np.float64]
+
+    def described(self) -> dict[str, Any]:
+        """All but the widths."""
+        return {
+            **self.segment._asdict(), "sequence": self.sequence, "settings": self.settings, "time_s": self.time_s
+        }  # fmt: skip
+
+    def to_bytes(self) -> bytes:
+        """Payload of a `Kind.LAID` block."""
+        described = json.dumps(self.described()).encode()
+        return _LENGTH.pack(len(described)) + described + self.pulse_width_us.astype("<f8").tobytes()
+
+    @staticmethod
+    def of_bytes(payload: bytes) -> LaidBlock:
+        """The block of a payload."""
+        start = _LENGTH.size + _LENGTH.unpack_from(payload)[0]
+        content = json.loads(payload[_LENGTH.size : start])
+        segment = Segment(content["name"], content["start"], content["end"], content["by"])
+        widths_us = np.frombuffer(payload, "<f8", offset=start)
+        return LaidBlock(segment, content["sequence"], content["settings"], content["time_s"], widths_us)
 
 
 class Journal:

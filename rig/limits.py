@@ -271,6 +271,8 @@ def for_plan(table: dict[str, Limit], request: TestPlan) -> dict[str, Limit]:
         if not (request.max_torque_nm > 0):
             raise RefusedError(f"{owner}: max_torque_nm {request.max_torque_nm:g} N·m must be above 0")
         table = tightened(table, "torque_nm", request.max_torque_nm, owner, lo=-request.max_torque_nm)
+    if request.adaptive is not None:
+        table = tightened(table, "duration_s", request.adaptive.max_duration_s, owner)
     return table
 
 

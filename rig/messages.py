@@ -72,8 +72,21 @@ class Profile(Message):
     rest_between_tests_s: float | None = Field(default=None, description="shortest rest after a test's last pulse, s")
 
 
+class AdaptivePlan(Message):
+    """Bounds of a test that a client extends while it plays; they hold for the whole test, beside all other limits."""
+
+    max_duration_s: float = Field(gt=0, allow_inf_nan=False, description="longest test, its safe end included, s")
+    max_torque_time_nms: float = Field(
+        gt=0, allow_inf_nan=False, description="measured torque-time at which stimulation ends, N·m·s"
+    )
+
+
 class TestPlan(Message):
-    """A whole pre-session test."""
+    """A whole pre-session test.
+
+    With `adaptive` the segments are a fixed plan to fall back on. Its first segment always plays. At each later
+    boundary the segments play that a client has added by then (`ExtendRequest`), else the fixed plan's next one.
+    """
 
     __test__ = False  # keeps pytest from collecting it
 
@@ -85,6 +98,7 @@ class TestPlan(Message):
     pulse_rate_hz: float = 40.0
     max_pulse_width_us: float | None = Field(default=None, description="for this test only, if tighter, µs")
     max_torque_nm: float | None = Field(default=None, description="for this test only, if tighter, N·m")
+    adaptive: AdaptivePlan | None = Field(default=None, description="the test may be extended while it plays")
 
 
 class RecruitmentTable(Message):
@@ -102,6 +116,7 @@ class StatusRequest(Message):
 class SubscribeRequest(Message):
     kind: Literal["subscribe"] = "subscribe"
     id: int = 0
+    samples: bool = Field(False, description="live events also carry every torque sample")
 
 
 class PreviewRequest(Message):
@@ -124,6 +139,31 @@ class StartRequest(Message):
     kind: Literal["start"] = "start"
     id: int = 0
     plan: TestPlan
+    key: str = Field("", description="of an adaptive test: only who knows it may extend it; it is stored nowhere")
+
+
+class ExtendRequest(Message):
+    """Add segments to the running adaptive test, behind everything that is laid. Reply: `Extended`.
+
+    They pass the checks of a plan, as a part of the whole test. All are laid, or none.
+    """
+
+    kind: Literal["extend"] = "extend"
+    id: int = 0
+    test_id: str
+    key: str = Field(description="of the test's start")
+    after: int = Field(description="`LiveEvent.laid` that the client saw; refused as late if more was laid since")
+    segments: list[SegmentPlan]
+
+
+class EnoughRequest(Message):
+    """End the running adaptive test well, with its safe end; anyone may ask, like for a stop. Reply: `Extended`."""
+
+    kind: Literal["enough"] = "enough"
+    id: int = 0
+    test_id: str
+    by: str = ""
+    at_once: bool = Field(False, description="at the next pulse; else where the segment that plays ends")
 
 
 class StopRequest(Message):
@@ -196,6 +236,8 @@ Request = Annotated[
     | PreviewRequest
     | SequencesRequest
     | StartRequest
+    | ExtendRequest
+    | EnoughRequest
     | StopRequest
     | RearmRequest
     | CalibrateStartRequest
@@ -209,7 +251,7 @@ Request = Annotated[
 class Problem(Message):
     """Why a request was refused. `code` is stable; the text is for people and says how to correct it."""
 
-    code: str = Field(description="busy, latched, uncertain, refused, bad-plan, disconnected, internal, …")
+    code: str = Field(description="busy, late, latched, uncertain, refused, bad-plan, disconnected, internal, …")
     title: str
     detail: str
 
@@ -220,7 +262,8 @@ class Reply(Message):
     problem: Problem | None = None
     body: dict[str, Any] = Field(default_factory=dict)
     """status, subscribe, start, rearm, calibrate-start, -step and -mark: a `Status`; preview: a `Preview`;
-    sequences: a `Sequences`; stop: a `StopEvidence`; calibrate-finish: a `CalibrationResult`."""
+    sequences: a `Sequences`; stop: a `StopEvidence`; calibrate-finish: a `CalibrationResult`; extend and enough: an
+    `Extended`."""
 
 
 class CalibrationTrain(Message):
@@ -327,6 +370,35 @@ class StopEvidence(Message):
     )
 
 
+class LaidSegment(Message):
+    """A segment that was played or will be."""
+
+    name: str
+    start_s: float
+    end_s: float
+    by: Literal["plan", "extension", "end"] = Field(description="end: the rest with which an adaptive test ends")
+
+
+class Extended(Message):
+    """What is laid of an adaptive test, and what its bounds leave."""
+
+    test_id: str
+    laid: int = Field(description="pulses that are laid, those of width 0 included")
+    boundary_s: float = Field(description="where they end on the test's clock, s")
+    ended_by: str = Field(description="why nothing will follow: plan, enough, limit, torque_time; empty: more may")
+    duration_left_s: float
+    charge_left_uc: float
+    torque_time_left_nms: float = Field(description="of what was measured until now")
+
+
+class TorqueSamples(Message):
+    """Every torque sample since the last live event, as it arrived: not aligned, zero offset not removed."""
+
+    host_time_s: list[float] = Field(description="when the host received it, test's clock")
+    counter: list[int] = Field(description="the cell's counter, unwrapped; -1: it has none. A gap: samples were lost")
+    torque_nm: list[float | None] = Field(description="None: no number came")
+
+
 class StateEvent(Message):
     event: Literal["state"] = "state"
     status: Status
@@ -339,7 +411,7 @@ class LiveEvent(Message):
     test_id: str | None
     segment: str | None
     elapsed_s: float
-    duration_s: float
+    duration_s: float = Field(description="of an adaptive test: the longest that it may take")
     time_s: list[float] = Field(description="start of each bin on the test's clock, s")
     torque_min_nm: list[float]
     torque_max_nm: list[float]
@@ -350,6 +422,12 @@ class LiveEvent(Message):
     dropped_pulses: int
     sent_pulses: int = Field(0, description="pulses sent so far")
     charge_uc: float = Field(0.0, description="their charge, one phase, µC")
+    torque_time_nms: float = Field(0.0, description="torque above rest times time since the first pulse, N·m·s")
+    laid: int = Field(0, description="pulses that are laid; of a test that is not adaptive all of them")
+    boundary_s: float = Field(0.0, description="where they end on the test's clock, s")
+    ended_by: str = Field("", description="why nothing will be laid any more; empty: more may be (see `Extended`)")
+    laid_segments: list[LaidSegment] = Field(default_factory=list, description="all that are laid; adaptive tests only")
+    samples: TorqueSamples | None = Field(None, description="for who subscribed with `samples`")
 
 
 class FinishedEvent(Message):
@@ -364,9 +442,8 @@ class FinishedEvent(Message):
     summary: dict[str, Any] = Field(
         default_factory=dict,
         description="duration_s, samples, lost_samples, pulses, dropped_pulses, lateness_ms {median, p99, max}, "
-        "ack_delay_ms {median, p99, max}, "
-        "charge_uc, alignment {method, error_ms}, sample_rate_hz, torque_peak_nm, cpu_percent, warnings (sentences "
-        "for people about possible errors)",
+        "ack_delay_ms {median, p99, max}, charge_uc, torque_time_nms, ended_by, alignment {method, error_ms}, "
+        "sample_rate_hz, torque_peak_nm, cpu_percent, warnings (sentences for people about possible errors)",
     )
 
 

@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rig import sequences
-from rig.errors import PlanError, RefusedError
-from rig.limits import Limit, Refusal, Steps, admit, check
+from rig import pieces, sequences
+from rig.errors import PlanError
+from rig.limits import Limit, Steps, check
 from rig.messages import Preview, RecruitmentTable, SegmentPlan, Sequences, TestPlan
-from rig.signals import Pulse
-
-MAX_SEGMENTS = 200
-MAX_WIDTH_SETTING = "max_pulse_width_us"
-"""If the plan does not give this setting of a sequence, it is the comfort maximum, or the request's limit if lower."""
+from rig.pieces import MAX_SEGMENTS, MAX_WIDTH_SETTING, Piece
 
 
 def default_segments() -> list[SegmentPlan]:
@@ -66,15 +61,21 @@ class PlannedTest:
     ----------
     pulse_width_us
         Width for each pulse, µs, shape (P,); pulse i is due i / pulse_rate_hz after the start.
+    pieces
+        Its segments, built; of an adaptive test those of its fixed plan, of which only the first is certain.
+    longest_s
+        The longest that the test may take, s: its length, or the bound of an adaptive test.
     """
 
     plan: TestPlan
     pulse_width_us: NDArray[np.float64]
     segments: tuple[PlannedSegment, ...]
+    pieces: tuple[Piece, ...]
+    longest_s: float
 
     @property
     def duration_s(self) -> float:
-        """Length of the test, s."""
+        """Length of the test, s; of an adaptive test that of its fixed plan."""
         return len(self.pulse_width_us) / self.plan.pulse_rate_hz
 
     @property
@@ -82,10 +83,14 @@ class PlannedTest:
         """Charge of one phase summed over the pulses, µC."""
         return sequences.dose_uc(self.pulse_width_us, self.plan.profile.current_ma)
 
-    def segment_at(self, time_s: float) -> str | None:
-        """Name of the segment at a time on the test's clock, None outside."""
-        index = int(np.floor(time_s * self.plan.pulse_rate_hz + 1e-9))
-        return next((s.name for s in self.segments if s.start <= index < s.end), None)
+    @property
+    def first_pulse(self) -> int | None:
+        """Index of the earliest pulse that may stimulate; None: there is none."""
+        first = np.flatnonzero(self.pulse_width_us)
+        if self.plan.adaptive is None:
+            return int(first[0]) if len(first) else None
+        extended = self.segments[0].end  # the first segment that a client adds may begin here
+        return min(int(first[0]), extended) if len(first) else extended
 
 
 def build(plan: TestPlan, table: dict[str, Limit]) -> PlannedTest:
@@ -105,18 +110,33 @@ def build(plan: TestPlan, table: dict[str, Limit]) -> PlannedTest:
     RefusedError
         The plan would break a limit: names the limit, the pulse and the excess.
     """
-    _refuse(check(table["pulse_rate_hz"], plan.pulse_rate_hz), "plan")
+    pieces.refuse(check(table["pulse_rate_hz"], plan.pulse_rate_hz), "plan")
     chosen = default_segments() if plan.segments is None else plan.segments
-    segments = _laid_out(chosen, plan, table)
-    parts: list[NDArray[np.float64]] = []
-    for number, segment in enumerate(chosen, start=1):
-        with _named(number, segment):
-            parts.append(sequences.build(segment.sequence, _settings(segment, plan), plan.pulse_rate_hz))
-    test = PlannedTest(plan, np.concatenate(parts), segments)
-    _check(test, table)
-    for segment, of in zip(segments, chosen, strict=True):
-        _check_rise(test.pulse_width_us, segment, of, table)
-    return test
+    if not chosen:
+        raise PlanError("plan.segments is empty; leave it out for the default test, or give at least one segment")
+    if len(chosen) > MAX_SEGMENTS:
+        raise PlanError(f"plan.segments: {len(chosen)} segments, at most {MAX_SEGMENTS}; combine some of them")
+    built = pieces.build(chosen, plan, table["duration_s"])
+    pieces.check_all(built, plan, table)
+    widths_us = np.concatenate([piece.pulse_width_us for piece in built])
+    longest_s = len(widths_us) / plan.pulse_rate_hz
+    if plan.adaptive is not None:
+        _check_end(widths_us, plan, table)
+        longest_s = table["duration_s"].hi
+    return PlannedTest(plan, widths_us, laid_out(built), built, longest_s)
+
+
+def _check_end(widths_us: NDArray[np.float64], plan: TestPlan, table: dict[str, Limit]) -> None:
+    """The fixed plan of an adaptive test must fit into its bounds with its safe end: it plays if nobody extends."""
+    whole = len(widths_us) + pieces.safe_end(widths_us, plan.pulse_rate_hz)
+    pieces.refuse(check(table["duration_s"], whole / plan.pulse_rate_hz), "plan, with its safe end")
+
+
+def laid_out(built: Sequence[Piece], start: int = 0) -> tuple[PlannedSegment, ...]:
+    """Start and end of each piece, the first of which begins at pulse `start`."""
+    ends = (start + np.cumsum([len(piece.pulse_width_us) for piece in built])).tolist()
+    starts = [start, *ends[:-1]]
+    return tuple(PlannedSegment(piece.of.name, *at) for piece, *at in zip(built, starts, ends, strict=True))
 
 
 def check_steps(test: PlannedTest, steps: Steps) -> None:
@@ -127,76 +147,6 @@ def check_steps(test: PlannedTest, steps: Steps) -> None:
             f"plan: {widest_us:g} µs at {current_ma:g} mA would stimulate nothing: this stimulator's smallest pulse is "
             f"{steps.shortest_us:g} µs and {steps.current_ma:g} mA"
         )
-
-
-def _laid_out(chosen: list[SegmentPlan], plan: TestPlan, table: dict[str, Limit]) -> tuple[PlannedSegment, ...]:
-    """Start and end of each segment, computed without building it: too long a plan is refused before that."""
-    if not chosen:
-        raise PlanError("plan.segments is empty; leave it out for the default test, or give at least one segment")
-    if len(chosen) > MAX_SEGMENTS:
-        raise PlanError(f"plan.segments: {len(chosen)} segments, at most {MAX_SEGMENTS}; combine some of them")
-    segments: list[PlannedSegment] = []
-    start = 0
-    for number, segment in enumerate(chosen, start=1):
-        with _named(number, segment):
-            count = sequences.pulse_count(segment.sequence, _settings(segment, plan), plan.pulse_rate_hz)
-            if count < 1:
-                raise PlanError(f"too short for one pulse at {plan.pulse_rate_hz:g} pulses/s; lengthen it")
-        segments.append(PlannedSegment(segment.name, start, start + count))
-        start += count
-        _refuse(check(table["duration_s"], start / plan.pulse_rate_hz), f"plan, up to segment {number}")
-    return tuple(segments)
-
-
-@contextlib.contextmanager
-def _named(number: int, segment: SegmentPlan) -> Iterator[None]:
-    """Add the segment's number and name to a PlanError."""
-    try:
-        yield
-    except PlanError as error:
-        raise PlanError(f"segment {number} ({segment.name}): {error}") from None
-
-
-def _settings(segment: SegmentPlan, plan: TestPlan) -> dict[str, object]:
-    settings = dict(segment.settings)
-    if MAX_WIDTH_SETTING in sequences.find(segment.sequence).Settings.model_fields:
-        comfort_us, asked_us = plan.profile.max_pulse_width_us, plan.max_pulse_width_us
-        settings.setdefault(MAX_WIDTH_SETTING, comfort_us if asked_us is None else min(comfort_us, asked_us))
-    return settings
-
-
-def _check(test: PlannedTest, table: dict[str, Limit]) -> None:
-    current_ma, rate_hz = test.plan.profile.current_ma, test.plan.pulse_rate_hz
-    for width_us in np.unique(test.pulse_width_us):
-        verdict = admit(Pulse(float(width_us), current_ma), table)
-        if isinstance(verdict, Refusal):
-            same = (test.pulse_width_us == width_us) | np.isnan(test.pulse_width_us) & np.isnan(width_us)
-            first = int(np.argmax(same))
-            segment = next(s for s in test.segments if s.start <= first < s.end)
-            raise RefusedError(f"segment {segment.name}, pulse {first - segment.start + 1}: {verdict}")
-    charge_uc = test.pulse_width_us * current_ma * 1e-3
-    window = min(max(1, round(rate_hz)), len(charge_uc))
-    worst_uc = float(np.max(np.convolve(charge_uc, np.ones(window), "valid")))
-    _refuse(check(table["charge_per_second_uc"], worst_uc), "plan")
-    _refuse(check(table["charge_per_test_uc"], test.charge_uc), "plan")
-
-
-def _check_rise(
-    widths_us: NDArray[np.float64], segment: PlannedSegment, of: SegmentPlan, table: dict[str, Limit]
-) -> None:
-    """The width must not rise faster than the limit, unless the sequence jumps by design."""
-    if sequences.jumps(of.sequence, of.settings):
-        return
-    before_us = widths_us[segment.start - 1] if segment.start else 0.0
-    rises_us = np.diff(widths_us[segment.start : segment.end], prepend=before_us)
-    first = int(np.argmax(rises_us))
-    refusal = check(table["width_rise_us"], float(rises_us[first]))
-    _refuse(refusal, f"segment {segment.name}, pulse {first + 1}")
-
-
-def _refuse(refusal: Refusal | None, place: str) -> None:
-    if refusal is not None:
-        raise RefusedError(f"{place}: {refusal}")
 
 
 def preview(test: PlannedTest, recruitment: RecruitmentTable | None = None) -> Preview:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.acquire.plausibility import RATE_TOLERANCE, PlausibilityCheck
+from rig.acquire.torque_time import TorqueTime
 from rig.clock import Clock
 from rig.devices import LoadCell
 from rig.errors import DeviceError, JournalError
@@ -97,6 +98,7 @@ class Receiver:
         self.last_torque_nm: float | None = None
         self.peak_nm = 0.0
         self.range_nm = (np.inf, -np.inf)
+        self.torque_time = TorqueTime()
         self.live: deque[NDArray[Any]] = deque(maxlen=LIVE_BLOCKS)
         self.recent: deque[tuple[float, float]] = deque(maxlen=400)
 
@@ -131,7 +133,7 @@ class Receiver:
     ) -> None:
         """From now on write every sample to the journal and check it; faults are reported at once."""
         with self._lock:
-            self._plausibility = plausibility
+            self._plausibility, self.torque_time = plausibility, TorqueTime()
             self._journal, self._limits_nm, self._on_fault = journal, limits_nm, on_fault
             self.counts, self.peak_nm, self.range_nm = Recorded(), 0.0, (np.inf, -np.inf)
 
@@ -243,7 +245,9 @@ class Receiver:
         self.last_s = float(samples["host_time_s"][-1])
         self.last_unix_s = self._clock.unix_s()
         self.last_torque_nm = float(samples["torque_nm"][-1])
-        self.recent.append((self.last_s, float(np.mean(samples["torque_nm"]))))
+        mean_nm = float(np.mean(samples["torque_nm"]))
+        self.recent.append((self.last_s, mean_nm))
+        self.torque_time.add(self.last_s, mean_nm)
         self._total += len(samples)
         number = self._total if self._unwrapper is None else int(samples["counter"][-1])
         self._rate.append((self.last_s, self._total, self.last_s - number / self.nominal_rate_hz))

@@ -29,6 +29,7 @@ from rig.journal import Journal, Kind
 from rig.limits import Limit
 from rig.messages import StopEvidence, TestOutcome
 from rig.plan import PlannedTest
+from rig.score import Score
 from rig.signals import Pulse, Recorded
 
 log = logging.getLogger("rig.run")
@@ -59,6 +60,8 @@ class RunResult:
     last_pulse_s: float | None = None
     cpu_percent: float = 0.0
     duration_s: float = 0.0
+    torque_time_nms: float = 0.0
+    ended_by: str = ""
     last_sample_unix_s: float | None = None
 
 
@@ -68,7 +71,7 @@ class TestRun:
     Parameters
     ----------
     test, table
-        The pulses to play, and the limits narrowed by the participant's profile.
+        What to play, and the limits narrowed by the participant's profile.
     journal
         Already contains header and plan.
     halt
@@ -88,7 +91,8 @@ class TestRun:
         halt: Halt,
         watch: Watch = DEFAULT_WATCH,
     ) -> None:
-        self.test = test
+        self.plan = test.plan
+        self.score = Score(test, table, journal, clock)
         self.halt = halt
         self.started = threading.Event()
         self.t0_s: float | None = None
@@ -144,7 +148,7 @@ class TestRun:
 
     def segment(self) -> str | None:
         """Name of the current segment; None before the start and after the end."""
-        return None if self.t0_s is None else self.test.segment_at(self.elapsed_s())
+        return None if self.t0_s is None else self.score.segment_at(self.elapsed_s())
 
     @property
     def dropped(self) -> int:
@@ -160,6 +164,16 @@ class TestRun:
     def charge_uc(self) -> float:
         """Charge of the pulses sent so far, one phase, µC."""
         return self._gate.charge_uc
+
+    @property
+    def torque_time_nms(self) -> float:
+        """Torque above rest times time since the first pulse, N·m·s."""
+        return self._receiver.torque_time.nms
+
+    @property
+    def ended_by(self) -> str:
+        """What ended it: stopped, fault, or why nothing more was laid."""
+        return self.halt.cause or self.score.ended_by
 
     def sender_age_s(self) -> float:
         """Real seconds since the sender last asked for a health check; 0 while it has nothing to send."""
@@ -196,18 +210,19 @@ class TestRun:
         return True
 
     def _play(self) -> None:
-        clock, plan = self._clock, self.test.plan
-        period_s = 1 / plan.pulse_rate_hz
+        clock, current_ma = self._clock, self.plan.profile.current_ma
+        period_s = 1 / self.plan.pulse_rate_hz
         t0_s = clock.now_s() + LEAD_S * clock.speed
         self._journal.append_json(Kind.START, {"t0_s": t0_s, "unix_s": clock.unix_s() + LEAD_S})
         self.t0_s = t0_s
         self.started.set()
         late_s = self._watch.late_pulse_periods * period_s
-        first = int(np.argmax(self.test.pulse_width_us > 0))
-        for index, width_us in enumerate(self.test.pulse_width_us.tolist()):
+        index, resting = 0, True
+        while (width_us := self.score.pulse(index, self.torque_time_nms)) is not None:
             due_s = t0_s + index * period_s
-            if index == first:
-                self._rest_nm = self._receiver.torque_around(0.1 * clock.speed)  # before the first pulse: at rest
+            if resting and width_us > 0:
+                resting = False
+                self._at_rest()
             if clock.wait(due_s, self.halt.event):
                 return
             self._asked_s = clock.now_s()
@@ -216,12 +231,19 @@ class TestRun:
                 self._fault(wrong)
                 return
             self._gate.feed()
-            self._gate.fire(index, Pulse(width_us, plan.profile.current_ma), due_s, due_s + late_s)
-        clock.wait(t0_s + self.test.duration_s, self.halt.event)
+            self._gate.fire(index, Pulse(width_us, current_ma), due_s, due_s + late_s)
+            index += 1
+        clock.wait(t0_s + index * period_s, self.halt.event)
+
+    def _at_rest(self) -> None:
+        """Right before the first pulse: what torque is rest, and no torque-time yet."""
+        self._rest_nm = self._receiver.torque_around(0.1 * self._clock.speed)
+        self._receiver.torque_time.begin(self._rest_nm or 0.0, self._clock.now_s())
 
     def _stop(self) -> StopEvidence:
         """Stop the device, ask its state, watch the torque fall, end the journal."""
         self._asked_s = None
+        self.score.close("it has ended")
         clock, cause = self._clock, self.halt.cause
         at_stop_nm = self._receiver.torque_around(AROUND_S * clock.speed)
         device = stop_device(self._gate)
@@ -237,7 +259,7 @@ class TestRun:
         else:
             torque = watch_decay(self._gate, self._receiver, clock, self._rest_nm, at_stop_nm)
         now_s, last_s = clock.now_s(), self._gate.last_pulse_s
-        planned_end_s = (self.t0_s or now_s) + self.test.duration_s
+        planned_end_s = (self.t0_s or now_s) + self.score.duration_s
         self._end_journal(cause, planned_end_s if cause is None else now_s)
         may_follow = self._gate.on_its_way is not None
         return evidence(device, torque, None if last_s is None else now_s - last_s, may_follow)
@@ -252,6 +274,7 @@ class TestRun:
             "reason": self.halt.reason if cause else "",
             "time_s": end_s,
             "stimulation_end_s": stimulation_end_s,
+            "ended_by": self.ended_by,
         }
         self._gate.release()
         self._counts = self._receiver.release()
@@ -278,6 +301,8 @@ class TestRun:
             last_pulse_s=self._gate.last_pulse_s,
             cpu_percent=cpu_percent,
             duration_s=self._duration_s,
+            torque_time_nms=self.torque_time_nms,
+            ended_by=self.ended_by,
             last_sample_unix_s=self._receiver.last_unix_s,
         )
 

@@ -19,7 +19,7 @@ from rig.messages import Preview, PreviewRequest, Reply
 def previewed(request: PreviewRequest, table: dict[str, Limit], unix_s: float, speed: float = 1.0) -> Preview:
     """Duration, dose and pulses of a plan. Raises PlanError, RefusedError."""
     test = plan.build(request.plan, limits.for_plan(table, request.plan))
-    check_profile(request.plan.profile, unix_s, required=False, duration_s=test.duration_s / speed)
+    check_profile(request.plan.profile, unix_s, required=False, duration_s=test.longest_s / speed)
     return plan.preview(test, request.recruitment)
 
 

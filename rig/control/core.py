@@ -99,7 +99,7 @@ class Core:
             participant=trial.participant,
             segment=run.segment() if run else None,
             elapsed_s=elapsed_s,
-            duration_s=run.test.duration_s if run else 0.0,
+            duration_s=run.score.longest_s if run else 0.0,
             stimulator=self._pair.identity["stimulator"],
             load_cell=cell,
             torque_age_s=receiver.age_s(self._clock.now_s()) if receiver and seen else None,
@@ -129,14 +129,14 @@ class Core:
             return "the torque receiver's thread has ended"
         return None
 
-    def live(self) -> LiveEvent | None:
-        """Torque and pulses since the last call; None if there is no new torque."""
+    def live(self, samples: bool = False) -> LiveEvent | None:
+        """Torque and pulses since the last call, every sample if asked for; None if there is no new torque."""
         with self._lock:
             run, receiver, now_s = self._run, self._pair.receiver, self._clock.now_s()
             if receiver is None:
                 return None
             origin_s = run.t0_s if run and run.t0_s is not None else self._born_s
-            event = live_event(receiver, run, origin_s, now_s, self._next_live_pulse)
+            event = live_event(receiver, run, origin_s, now_s, self._next_live_pulse, samples)
             if event is not None:
                 self._next_live_pulse += len(event.pulse_time_s)
             return event

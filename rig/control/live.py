@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from rig.acquire.receiver import Receiver
 from rig.acquire.run import TestRun
-from rig.messages import LiveEvent
+from rig.messages import LiveEvent, TorqueSamples
 
 BIN_S = 0.01
 
 
 def live_event(
-    receiver: Receiver, run: TestRun | None, origin_s: float, now_s: float, first_pulse: int
+    receiver: Receiver, run: TestRun | None, origin_s: float, now_s: float, first_pulse: int, samples: bool = False
 ) -> LiveEvent | None:
     """The newest torque as minimum and maximum of bins of 10 ms, or None if there is none.
 
@@ -24,38 +28,65 @@ def live_event(
         Rig time that counts as zero: the test's start, or the rig's when idle.
     first_pulse
         Index of the first pulse that earlier events did not contain.
+    samples
+        Whether every sample is wanted, too.
     """
     blocks = []
     while receiver.live:
         blocks.append(receiver.live.popleft())
     if not blocks:
         return None
-    samples = np.concatenate(blocks)
-    time_s = samples["host_time_s"] - origin_s
-    bins = np.floor(time_s / BIN_S)
+    found = np.concatenate(blocks)
+    bins = np.floor((found["host_time_s"] - origin_s) / BIN_S)
     starts = np.concatenate([[0], np.flatnonzero(np.diff(bins) > 0) + 1])
-    torque_nm = samples["torque_nm"]
-    pulses = range(0)
-    if run is not None and run.t0_s is not None:
-        reached = int(np.floor((now_s - run.t0_s) * run.test.plan.pulse_rate_hz)) + 1
-        pulses = range(first_pulse, max(first_pulse, min(reached, len(run.test.pulse_width_us))))
-    rate_hz = run.test.plan.pulse_rate_hz if run else 1.0
-    elapsed_s = run.elapsed_s() if run else 0.0
+    torque_nm = found["torque_nm"]
     return LiveEvent(
-        test_id=run.test.plan.test_id if run else None,
-        segment=run.segment() if run else None,
-        elapsed_s=elapsed_s,
-        duration_s=run.test.duration_s if run else 0.0,
         time_s=np.round(bins[starts] * BIN_S, 4).tolist(),
         torque_min_nm=_finite(np.fmin.reduceat(torque_nm, starts)),
         torque_max_nm=_finite(np.fmax.reduceat(torque_nm, starts)),
-        pulse_time_s=[i / rate_hz for i in pulses],
-        pulse_width_us=[float(run.test.pulse_width_us[i]) for i in pulses] if run else [],
         torque_age_s=max(0.0, receiver.age_s(now_s)),
         lost_samples=receiver.counts.lost_samples,
-        dropped_pulses=run.dropped if run else 0,
-        sent_pulses=run.sent if run else 0,
-        charge_uc=run.charge_uc if run else 0.0,
+        samples=_samples(found, origin_s) if samples else None,
+        **(_idle() if run is None else _of_run(run, now_s, first_pulse)),
+    )
+
+
+def _idle() -> dict[str, Any]:
+    return {
+        "test_id": None, "segment": None, "elapsed_s": 0.0, "duration_s": 0.0, "pulse_time_s": [],
+        "pulse_width_us": [], "dropped_pulses": 0,
+    }  # fmt: skip
+
+
+def _of_run(run: TestRun, now_s: float, first_pulse: int) -> dict[str, Any]:
+    """What the test has sent, and what is laid of it."""
+    rate_hz, laid = run.plan.pulse_rate_hz, run.score.laid
+    reached = 0 if run.t0_s is None else int(np.floor((now_s - run.t0_s) * rate_hz)) + 1
+    pulses = range(first_pulse, max(first_pulse, min(reached, len(laid))))
+    return {
+        "test_id": run.plan.test_id,
+        "segment": run.segment(),
+        "elapsed_s": run.elapsed_s(),
+        "duration_s": run.score.longest_s,
+        "pulse_time_s": [index / rate_hz for index in pulses],
+        "pulse_width_us": laid.pulse_width_us[pulses.start : pulses.stop].tolist(),
+        "dropped_pulses": run.dropped,
+        "sent_pulses": run.sent,
+        "charge_uc": run.charge_uc,
+        "torque_time_nms": float(np.nan_to_num(run.torque_time_nms)),
+        "laid": len(laid),
+        "boundary_s": len(laid) / rate_hz,
+        "ended_by": run.ended_by,
+        "laid_segments": run.score.segments() if run.score.adaptive else [],
+    }
+
+
+def _samples(found: NDArray[Any], origin_s: float) -> TorqueSamples:
+    torque_nm = found["torque_nm"].round(6).tolist()
+    return TorqueSamples(
+        host_time_s=(found["host_time_s"] - origin_s).round(6).tolist(),
+        counter=found["counter"].tolist(),
+        torque_nm=[value if math.isfinite(value) else None for value in torque_nm],
     )
 
 

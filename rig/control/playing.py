@@ -55,7 +55,7 @@ class Playing(Core):
             self._remember_pulse(result)
             with self._lock:
                 self._change(self._trial.ended())
-            finished = self._store.finish(run.journal_path, run.test.plan.test_id, result)
+            finished = self._store.finish(run.journal_path, run.plan.test_id, result)
         except Exception as error:  # a bug in this program: stay stopped, keep the journal for the next start
             log.exception("the test could not be ended properly")
             self._broken(f"internal: {type(error).__name__}: {error}")
@@ -64,7 +64,7 @@ class Playing(Core):
             self._run = None
             train = self._trial.calibrating
             if train and self._calibration is not None:
-                self._calibration.played(run.test.plan.profile.max_pulse_width_us, result.rise_nm, finished)
+                self._calibration.played(run.plan.profile.max_pulse_width_us, result.rise_nm, finished)
             if not train:
                 self.finished = finished
             if finished.recording_path is None and run.t0_s is not None:  # only a journal: needs a person

@@ -66,11 +66,11 @@ class Rest:
             self.pulse_at(self._clock.now_s())
 
     def check(self, test: PlannedTest, limit: limits.Limit) -> None:
-        """Raise RefusedError if the first planned pulse follows the last one too soon."""
-        planned = test.pulse_width_us > 0
-        if self.last_pulse_s is None or not planned.any():
+        """Raise RefusedError if the earliest pulse follows the last one too soon."""
+        first = test.first_pulse
+        if self.last_pulse_s is None or first is None:
             return
-        first_s = float(planned.argmax()) / test.plan.pulse_rate_hz + LEAD_S * self._clock.speed
+        first_s = first / test.plan.pulse_rate_hz + LEAD_S * self._clock.speed
         rest_s = self._clock.now_s() + first_s - self.last_pulse_s
         refusal = limits.check(limit, rest_s)
         if refusal is not None:

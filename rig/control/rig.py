@@ -6,8 +6,8 @@ import logging
 from dataclasses import replace
 
 from rig import limits, plan
-from rig.control.calibrating import Calibrating
 from rig.control.calibration import check_profile
+from rig.control.extending import Extending, check_key
 from rig.control.playing import check_names
 from rig.errors import DeviceError
 from rig.messages import Status, StopEvidence, TestPlan
@@ -19,7 +19,7 @@ STOP_TIMEOUT_S = 6.0
 """Real seconds to wait for the evidence of a stop, including the fall of the torque."""
 
 
-class Rig(Calibrating):
+class Rig(Extending):
     """Owns the devices. All methods may be called from any thread.
 
     Parameters
@@ -66,8 +66,8 @@ class Rig(Calibrating):
         self._pair.disconnect()
         self._folder_lock.close()
 
-    def start(self, request: TestPlan) -> Status:
-        """Start a test in its own thread.
+    def start(self, request: TestPlan, key: str = "") -> Status:
+        """Start a test in its own thread; `key` is what extensions of an adaptive test must know.
 
         Raises
         ------
@@ -82,13 +82,15 @@ class Rig(Calibrating):
         with self._lock:
             self._trial.may_start()
             check_names("plan", test_id=request.test_id, participant=request.participant)
+            check_key(request, key)
             table = limits.for_plan(self._table, request)
             test = plan.build(request, table)
-            now_s, duration_s = self._clock.unix_s(), test.duration_s / self._clock.speed
-            check_profile(request.profile, now_s, self._require_calibration, duration_s)
+            now_s, longest_s = self._clock.unix_s(), test.longest_s / self._clock.speed
+            check_profile(request.profile, now_s, self._require_calibration, longest_s)
             plan.check_steps(test, self._pair.steps)
             self._rest.check(test, table["rest_between_tests_s"])
             self._store.check_room(request.test_id)
+            self._key = key
             self._launch(test, table, self._trial.start(request.test_id, request.participant))
         return self.status()
 

@@ -69,12 +69,16 @@ class RecordingStore:
         return shutil.disk_usage(self._config.data_dir).free
 
     def begin(self, test: PlannedTest, identity: dict[str, Any]) -> Journal:
-        """Create a journal with its header and plan, synced to the disk. Raises JournalError."""
+        """Create a journal with its header and plan, synced to the disk. Raises JournalError.
+
+        Of an adaptive test only the first segment is certain.
+        """
+        certain = test.segments if test.plan.adaptive is None else test.segments[:1]
         book = Journal(self.journals / f"{test.plan.test_id}.journal")
         header = {
             "recording_id": uuid.uuid4().hex,
             "plan": test.plan.model_dump(mode="json"),
-            "segments": [{"name": s.name, "start": s.start, "end": s.end} for s in test.segments],
+            "segments": [{"name": s.name, "start": s.start, "end": s.end, "by": "plan"} for s in certain],
             "current_ma": test.plan.profile.current_ma,
             "sample_rate_hz": self._config.load_cell.model_dump().get("sample_rate_hz", 0.0),
             "software": software(),
@@ -82,7 +86,7 @@ class RecordingStore:
             "time_s": self._clock.now_s(),
             "unix_s": self._clock.unix_s(),
         }
-        book.begin(header, test.pulse_width_us.astype("<f8").tobytes())
+        book.begin(header, test.pulse_width_us[: certain[-1].end].astype("<f8").tobytes())
         return book
 
     def finish(self, path: Path, test_id: str, result: RunResult) -> FinishedEvent:
@@ -100,7 +104,9 @@ class RecordingStore:
             "lateness_ms": spread_ms([s / self._clock.speed for s in result.lateness_s]),
             "ack_delay_ms": spread_ms([s / self._clock.speed for s in result.ack_delay_s]),
             "charge_uc": result.charge_uc,
+            "torque_time_nms": result.torque_time_nms,
             "torque_peak_nm": result.peak_nm,
+            "ended_by": result.ended_by,
             "cpu_percent": round(result.cpu_percent, 2),
             "stop": result.evidence.model_dump(),
         }

@@ -46,7 +46,8 @@ class Server:
     def __init__(self) -> None:
         self.rig: Rig | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
-        self._subscribers: set[asyncio.StreamWriter] = set()
+        self._subscribers: dict[asyncio.StreamWriter, bool] = {}
+        """Who gets events, and whether with every torque sample."""
         self._tasks: set[asyncio.Task[None]] = set()
         self._connections = Connections(MAX_SILENT, MAX_ACTIVE)
         self._server: asyncio.Server | None = None
@@ -100,21 +101,23 @@ class Server:
         assert self.rig is not None
         while True:
             await asyncio.sleep(LIVE_PERIOD_S)
-            event = self.rig.live()
+            event = self.rig.live(samples=any(self._subscribers.values()))
             if event is not None:
                 self._send_all(event)
 
     def _send_all(self, event: Event) -> None:
         if not self._subscribers:
             return
-        line = to_line(event)
-        for writer in tuple(self._subscribers):
+        full = to_line(event)
+        with_samples = isinstance(event, LiveEvent) and event.samples is not None
+        plain = to_line(event.model_copy(update={"samples": None})) if with_samples else full
+        for writer, samples in tuple(self._subscribers.items()):
             waiting = writer.transport.get_write_buffer_size()
             if waiting > DEAD_BYTES:
-                self._subscribers.discard(writer)
+                self._subscribers.pop(writer, None)
                 writer.transport.abort()
             elif waiting < SLOW_BYTES or not isinstance(event, LiveEvent):
-                writer.write(line)
+                writer.write(full if samples else plain)
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         pending: set[asyncio.Task[None]] = set()
@@ -133,7 +136,7 @@ class Server:
         except ConnectionError as error:
             log.warning("client disconnected: %s", error)
         finally:
-            self._subscribers.discard(writer)
+            self._subscribers.pop(writer, None)
             self._connections.leave(writer.transport)
             await asyncio.gather(*pending, return_exceptions=True)
             writer.close()
@@ -187,14 +190,18 @@ class Server:
             reply = internal_error(request.id, error)
         _write(writer, to_line(reply))
         if request.kind == "subscribe" and reply.ok and self.rig is not None:
-            self._subscribers.add(writer)
+            self._subscribers[writer] = request.samples
             _write(writer, to_line(StateEvent(status=self.rig.status())))
 
     def _do(self, request: Any) -> BaseModel:
         assert self.rig is not None
         match request.kind:
             case "start":
-                return self.rig.start(request.plan)
+                return self.rig.start(request.plan, request.key)
+            case "extend":
+                return self.rig.extend(request)
+            case "enough":
+                return self.rig.enough(request)
             case "sequences":
                 return plan.library()
             case "rearm":

@@ -20,7 +20,7 @@ from rig.errors import DeviceError
 from rig.gate import Gate
 from rig.journal import Journal, Kind
 from rig.limits import Admitted, Steps
-from rig.messages import Profile, SegmentPlan, TestPlan
+from rig.messages import AdaptivePlan, Profile, SegmentPlan, TestPlan
 from rig.signals import SAMPLE, Ack, LateError, TorqueBlock
 
 RATE_HZ = 1600.0
@@ -175,7 +175,12 @@ class VirtualRig:
     """Gate, receiver and run on fakes and a virtual clock."""
 
     def __init__(
-        self, folder: Path, segments: list[SegmentPlan] | None = None, watch: Watch = ON_A_BUSY_DISK, **profile: float
+        self,
+        folder: Path,
+        segments: list[SegmentPlan] | None = None,
+        watch: Watch = ON_A_BUSY_DISK,
+        adaptive: AdaptivePlan | None = None,
+        **profile: float,
     ) -> None:
         self.clock = VirtualClock()
         self.stimulator = FakeStimulator(self.clock)
@@ -192,14 +197,16 @@ class VirtualRig:
             SegmentPlan(name="ramp", sequence="ramp", settings={"up_s": 1.0, "down_s": 1.0}),
             SegmentPlan(name="rest", sequence="rest", settings={"duration_s": 0.5}),
         ]
-        self.plan = TestPlan(test_id="t", participant="P", profile=Profile(**profile), segments=segments)
-        self.table = limits.for_profile(limits.HARD_LIMITS, self.plan.profile)
+        self.plan = TestPlan(
+            test_id="t", participant="P", profile=Profile(**profile), segments=segments, adaptive=adaptive
+        )
+        self.table = limits.for_plan(limits.HARD_LIMITS, self.plan)
         self.test = plan.build(self.plan, self.table)
         self.path = folder / "t.journal"
         self.journal = Journal(self.path)
-        self.journal.append_json(Kind.HEADER, header(self.test, self.clock))
-        self.journal.append(Kind.PLAN, self.test.pulse_width_us.astype("<f8").tobytes())
         self.run = TestRun(self.test, self.table, self.journal, self.gate, self.receiver, self.clock, self.halt, watch)
+        self.journal.append_json(Kind.HEADER, header(self.run, self.clock))
+        self.journal.append(Kind.PLAN, self.run.score.laid.pulse_width_us.astype("<f8").tobytes())
 
     def at(self, time_s: float, action: Callable[[], object]) -> None:
         """Do something at a time on the test's clock (its start: torque settled, then the lead)."""
@@ -207,17 +214,17 @@ class VirtualRig:
 
     def execute(self) -> RunResult:
         """Play the test."""
-        self.cell.feed(self.receiver, self.clock.now_s() + self.test.duration_s + 8)
+        self.cell.feed(self.receiver, self.clock.now_s() + self.test.longest_s + 8)
         return self.run.execute()
 
 
-def header(test: plan.PlannedTest, clock: VirtualClock) -> dict[str, Any]:
+def header(run: TestRun, clock: VirtualClock) -> dict[str, Any]:
     """A journal's header as the rig writes it."""
     return {
         "recording_id": "0" * 32,
-        "plan": test.plan.model_dump(mode="json"),
-        "segments": [{"name": s.name, "start": s.start, "end": s.end} for s in test.segments],
-        "current_ma": test.plan.profile.current_ma,
+        "plan": run.plan.model_dump(mode="json"),
+        "segments": [segment._asdict() for segment in run.score.laid.segments],
+        "current_ma": run.plan.profile.current_ma,
         "sample_rate_hz": RATE_HZ,
         "software": "stimrig test",
         "configuration": {},

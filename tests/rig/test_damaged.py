@@ -35,7 +35,7 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> tuple[bytes, int, float]
     rig.journal.close()
     rig.path.unlink()
     book = Journal(rig.path)
-    book.begin(header(rig.test, rig.clock), rig.test.pulse_width_us.astype("<f8").tobytes())
+    book.begin(header(rig.run, rig.clock), rig.test.pulse_width_us.astype("<f8").tobytes())
     rig.journal = rig.run._journal = book
     assert rig.execute().outcome == "completed"
     felt = [pulse for _, pulse in rig.stimulator.sent]

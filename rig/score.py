@@ -1,0 +1,273 @@
+"""What is laid out to be played. It grows while it plays, if the test is adaptive; what is laid is never changed.
+
+The sender asks for one pulse after the other. Shortly before it reaches the end of what is laid, the fixed plan's next
+segment is laid, unless a client has laid others by then. So the test never waits, whatever a client does. Each segment
+is in the journal before its first pulse can be played. If a limit of the whole test leaves no room, the test ends well:
+a second without stimulation, and nothing after it.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig import journal as jn
+from rig import pieces
+from rig.clock import Clock
+from rig.errors import BusyError, PlanError, RefusedError, TooLateError
+from rig.journal import Journal, Kind
+from rig.limits import Limit, check, tightened
+from rig.messages import Extended, LaidSegment, SegmentPlan
+from rig.pieces import Piece
+from rig.plan import PlannedTest
+
+AHEAD = 2
+"""Pulse periods before the end of what is laid: then the fixed plan's next segment is laid, and a client is late."""
+MAX_EXTENSION_SEGMENTS = 8
+MAX_EXTENSION_S = 30.0
+MAX_CHECKED = 20
+"""Extensions that are checked while the test plays towards one boundary; each takes time beside the sender."""
+MAX_NAME = 60
+SAFE_END = SegmentPlan(name="rest", sequence="rest", settings={})
+
+
+@dataclass(frozen=True, slots=True)
+class Laid:
+    """Everything that is laid: widths in µs, shape (n,), and the segments."""
+
+    pulse_width_us: NDArray[np.float64]
+    segments: tuple[jn.Segment, ...]
+
+    def __len__(self) -> int:
+        return len(self.pulse_width_us)
+
+    def cut(self, end: int) -> Laid:
+        """The part before pulse `end`."""
+        kept = (s._replace(end=min(s.end, end)) for s in self.segments if s.start < end)
+        return Laid(self.pulse_width_us[:end], tuple(kept))
+
+    def with_piece(self, piece: Piece, by: jn.LaidBy) -> Laid:
+        """It, and a piece after it."""
+        end = len(self) + len(piece.pulse_width_us)
+        added = jn.Segment(piece.of.name, len(self), end, by)
+        return Laid(np.concatenate([self.pulse_width_us, piece.pulse_width_us]), (*self.segments, added))
+
+
+class Score:
+    """The pulses of one test.
+
+    Parameters
+    ----------
+    test, table
+        The checked plan, and the limits that hold for the whole test.
+    journal
+        Gets each segment of an adaptive test that is laid after the start.
+    """
+
+    def __init__(self, test: PlannedTest, table: dict[str, Limit], journal: Journal, clock: Clock) -> None:
+        self.plan, self.adaptive, self.longest_s = test.plan, test.plan.adaptive, test.longest_s
+        self.ended_by = "" if self.adaptive else "plan"
+        """Why nothing more will be laid; empty: more may be."""
+        self._table, self._journal, self._clock = table, journal, clock
+        self._lock = threading.Lock()
+        self._checking = threading.Lock()
+        at_start = test.pieces[:1] if self.adaptive else test.pieces
+        self._fixed = deque(test.pieces[len(at_start) :])
+        self.laid = Laid(pieces.NOTHING, ())
+        for piece in at_start:
+            self.laid = self.laid.with_piece(piece, "plan")
+        self._reached = -1
+        self._end_at: int | None = None
+        self._checked = 0
+        self._closed = ""
+
+    @property
+    def duration_s(self) -> float:
+        """Length of what is laid, s."""
+        return len(self.laid) / self.plan.pulse_rate_hz
+
+    def segment_at(self, time_s: float) -> str | None:
+        """Name of the segment at a time on the test's clock, None outside."""
+        index = int(np.floor(time_s * self.plan.pulse_rate_hz + 1e-9))
+        return next((s.name for s in self.laid.segments if s.start <= index < s.end), None)
+
+    def segments(self) -> list[LaidSegment]:
+        """All that are laid, for clients."""
+        rate_hz = self.plan.pulse_rate_hz
+        return [
+            LaidSegment(name=s.name, start_s=s.start / rate_hz, end_s=s.end / rate_hz, by=s.by)
+            for s in self.laid.segments
+        ]
+
+    def pulse(self, index: int, torque_time_nms: float) -> float | None:
+        """Width of the next pulse, µs; None after the last. Only the sender asks, in order.
+
+        Parameters
+        ----------
+        index
+            One more than the last time.
+        torque_time_nms
+            Measured until now.
+
+        Raises
+        ------
+        JournalError
+            What was to be laid could not be written.
+        """
+        with self._lock:
+            if self.adaptive is not None:
+                bound_nms = self.adaptive.max_torque_time_nms
+                if not (torque_time_nms < bound_nms):
+                    self._end("torque_time", f"torque-time {torque_time_nms:.1f} of {bound_nms:g} N·m·s", cut=index)
+                elif index + AHEAD > len(self.laid) and not self.ended_by:
+                    self._go_on()
+            self._reached = index
+            return float(self.laid.pulse_width_us[index]) if index < len(self.laid) else None
+
+    def extend(self, after: int, chosen: Sequence[SegmentPlan]) -> None:
+        """Lay segments behind everything that is laid: all of them, or none.
+
+        Parameters
+        ----------
+        after
+            Length of what was laid when the client decided.
+
+        Raises
+        ------
+        TooLateError
+            More was laid meanwhile, or the test is ending.
+        BusyError
+            Too many extensions at the same time, or for one boundary.
+        PlanError, RefusedError
+            As for a plan.
+        JournalError
+            It could not be written.
+        """
+        with self._lock:
+            self._may_grow(after)
+            if self._checked >= MAX_CHECKED:
+                raise BusyError(f"extend: {MAX_CHECKED} extensions were checked for this boundary; wait for the next")
+            self._checked += 1
+        if not self._checking.acquire(blocking=False):
+            raise BusyError("extend: another extension is being checked; send one after the other")
+        try:
+            built = self._built(chosen, after)
+            self._check(built)
+        finally:
+            self._checking.release()
+        with self._lock:  # only briefly: the sender needs it
+            self._may_grow(after)
+            for piece in built:
+                self._lay(piece, "extension")
+
+    def enough(self, by: str, at_once: bool) -> None:
+        """End well: at the next pulse, or where the segment that plays ends. A second call may only end it sooner.
+
+        Raises
+        ------
+        PlanError
+            The test is not adaptive.
+        TooLateError, JournalError
+            It has ended; it could not be written.
+        """
+        if self.adaptive is None:
+            raise PlanError("enough: this test has a fixed plan; stop it, or let it play to its end")
+        with self._lock:
+            self._may_change()
+            playing = next((s.end for s in self.laid.segments if s.end > self._reached + 1), len(self.laid))
+            self._end("enough", by, self._reached + 1 if at_once else playing)
+
+    def close(self, reason: str) -> None:
+        """Nothing may be laid any more: the sender has ended, and the journal is about to be closed."""
+        with self._lock:
+            self._closed = reason
+
+    def left(self, torque_time_nms: float) -> Extended:
+        """What is laid, and what the bounds leave of an adaptive test."""
+        assert self.adaptive is not None
+        laid, rate_hz = self.laid, self.plan.pulse_rate_hz
+        charge_uc = float(np.sum(laid.pulse_width_us)) * self.plan.profile.current_ma * 1e-3
+        return Extended(
+            test_id=self.plan.test_id,
+            laid=len(laid),
+            boundary_s=len(laid) / rate_hz,
+            ended_by=self.ended_by,
+            duration_left_s=max(0.0, self.longest_s - len(laid) / rate_hz),
+            charge_left_uc=max(0.0, self._table["charge_per_test_uc"].hi - charge_uc),
+            torque_time_left_nms=max(0.0, self.adaptive.max_torque_time_nms - torque_time_nms),
+        )
+
+    def _may_change(self) -> None:
+        if self._closed:
+            raise TooLateError(f"test {self.plan.test_id}: {self._closed}")
+
+    def _may_grow(self, after: int) -> None:
+        self._may_change()
+        if self.ended_by:
+            raise TooLateError(f"test {self.plan.test_id} is ending ({self.ended_by}); nothing more is laid")
+        if after != len(self.laid):
+            raise TooLateError(f"extend.after: {after}, but {len(self.laid)} pulses are laid; look again, then decide")
+
+    def _built(self, chosen: Sequence[SegmentPlan], before: int) -> tuple[Piece, ...]:
+        most = min(MAX_EXTENSION_SEGMENTS, pieces.MAX_SEGMENTS - len(self.laid.segments) - len(self._fixed) - 1)
+        if not (1 <= len(chosen) <= most):
+            raise PlanError(f"extend.segments: {len(chosen)} segments; give 1 to {most}")
+        for number, segment in enumerate(chosen, start=1):
+            if not (1 <= len(segment.name) <= MAX_NAME and segment.name.isprintable()):
+                raise PlanError(f"extend.segments: name {number} must have 1 to {MAX_NAME} printable characters")
+        longest_s = before / self.plan.pulse_rate_hz + MAX_EXTENSION_S
+        table = tightened(self._table, "duration_s", longest_s, f"at most {MAX_EXTENSION_S:g} s an extension")
+        return pieces.build(chosen, self.plan, table["duration_s"], before)
+
+    def _check(self, added: Sequence[Piece]) -> None:
+        """Check pieces as a part of the whole, for which a safe end must be left. Raises RefusedError."""
+        before_us = self.laid.pulse_width_us
+        pieces.check_all(added, self.plan, self._table, before_us)
+        whole_us = np.concatenate([before_us, *(piece.pulse_width_us for piece in added)])
+        rate_hz = self.plan.pulse_rate_hz
+        whole_s = (len(whole_us) + pieces.safe_end(whole_us, rate_hz)) / rate_hz
+        pieces.refuse(check(self._table["duration_s"], whole_s), "plan, with its safe end")
+
+    def _go_on(self) -> None:
+        """Lay the fixed plan's next segment, or end."""
+        if not self._fixed:
+            self._end("plan", "the fixed plan is played", len(self.laid))
+            return
+        piece = self._fixed.popleft()
+        try:
+            self._check([piece])
+        except RefusedError as error:
+            self._end("limit", f"next of the fixed plan: {error}", len(self.laid))
+        else:
+            self._lay(piece, "plan")
+
+    def _end(self, by: str, reason: str, cut: int) -> None:
+        """Keep what is laid before pulse `cut`, and rest after it; nothing if the test rests by then anyway."""
+        if self._end_at is not None and cut >= self._end_at:
+            return
+        event = {"event": "ended", "by": by, "reason": reason, "index": cut, "time_s": self._clock.now_s()}
+        self._journal.append_json(Kind.EVENT, event)
+        kept = self.laid.cut(cut)
+        missing = pieces.safe_end(kept.pulse_width_us, self.plan.pulse_rate_hz)
+        if missing or len(kept) < len(self.laid):
+            self._lay(Piece(SAFE_END, np.zeros(missing), jumps=False), "end", kept)
+        self.ended_by, self._end_at = by, len(kept)
+
+    def _lay(self, piece: Piece, by: jn.LaidBy, before: Laid | None = None) -> None:
+        """Write a piece to the journal, then show it to the sender."""
+        before = self.laid if before is None else before
+        following = before.with_piece(piece, by) if len(piece.pulse_width_us) else before
+        block = jn.LaidBlock(
+            jn.Segment(piece.of.name, len(before), len(following), by),
+            piece.of.sequence,
+            piece.of.settings,
+            self._clock.now_s(),
+            piece.pulse_width_us,
+        )
+        self._journal.append(Kind.LAID, block.to_bytes())
+        self.laid, self._checked = following, 0
