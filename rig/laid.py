@@ -5,6 +5,8 @@ A lost block is replaced by the intents: they hold the widths that were sent.
 
 from __future__ import annotations
 
+import json
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -30,19 +32,28 @@ def blocks(contents: JournalContents) -> list[LaidBlock]:
 def planned(contents: JournalContents, header: dict[str, Any], notes: list[str]) -> tuple[Floats, list[Segment]]:
     """Planned width of each pulse, µs, shape (n,), and the segments; notes say what was inferred."""
     plan = next((np.frombuffer(p, "<f8") for k, p in contents.blocks if k == Kind.PLAN), None)
-    laid = blocks(contents)
     if plan is None:
         notes.append("both copies of the plan are lost: the widths that were sent are used as planned widths")
     widths_us = np.empty(0) if plan is None else plan
     segments = [Segment(s["name"], s["start"], s["end"], s.get("by", "plan")) for s in header["segments"]]
     sent_us = _sent(contents) if plan is None or header["plan"].get("adaptive") else np.empty(0)
-    for block in laid:
-        start = block.segment.start
-        widths_us = np.concatenate([_filled(widths_us, sent_us, start, notes, plan is None), block.pulse_width_us])
-        segments = [s._replace(end=min(s.end, start)) for s in segments if s.start < start]
-        if block.segment.end > start:
+    for cut, block in _growth(contents):
+        widths_us = _filled(widths_us, sent_us, cut, notes, plan is None)
+        segments = [s._replace(end=min(s.end, cut)) for s in segments if s.start < cut]
+        if block is not None and block.segment.end > cut:
+            widths_us = np.concatenate([widths_us, block.pulse_width_us])
             segments.append(block.segment)
     return _filled(widths_us, sent_us, max(len(widths_us), len(sent_us)), notes, plan is None), segments
+
+
+def _growth(contents: JournalContents) -> Iterator[tuple[int, LaidBlock | None]]:
+    """Pulses up to which all stayed as it was, and what was laid after them; None: only the end was written."""
+    for kind, payload in contents.blocks:
+        if kind == Kind.LAID:
+            block = LaidBlock.of_bytes(payload)
+            yield block.segment.start, block
+        elif kind == Kind.EVENT and (event := json.loads(payload))["event"] == "ended":
+            yield event["index"], None
 
 
 def _filled(widths_us: Floats, sent_us: Floats, end: int, notes: list[str], told: bool) -> Floats:

@@ -180,6 +180,7 @@ class VirtualRig:
         segments: list[SegmentPlan] | None = None,
         watch: Watch = ON_A_BUSY_DISK,
         adaptive: AdaptivePlan | None = None,
+        base: dict[str, limits.Limit] = limits.HARD_LIMITS,
         **profile: float,
     ) -> None:
         self.clock = VirtualClock()
@@ -200,7 +201,7 @@ class VirtualRig:
         self.plan = TestPlan(
             test_id="t", participant="P", profile=Profile(**profile), segments=segments, adaptive=adaptive
         )
-        self.table = limits.for_plan(limits.HARD_LIMITS, self.plan)
+        self.table = limits.for_plan(base, self.plan)
         self.test = plan.build(self.plan, self.table)
         self.path = folder / "t.journal"
         self.journal = Journal(self.path)

@@ -1,0 +1,456 @@
+"""A test that is extended while it plays: what plays, what is refused, how it ends and what is kept of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+from rig import archive, assembly, journal, limits, plan
+from rig.errors import BusyError, JournalError, PlanError, RefusedError, RigError, TooLateError
+from rig.journal import Kind, LaidBlock
+from rig.messages import AdaptivePlan, SegmentPlan
+from rig.score import AHEAD, MAX_CHECKED, MAX_EXTENSION_S, MAX_EXTENSION_SEGMENTS
+from tests.rig.fakes import VirtualRig
+
+RATE_HZ = 40.0
+
+
+def rest(duration_s: float) -> SegmentPlan:
+    return SegmentPlan(name="rest", sequence="rest", settings={"duration_s": duration_s})
+
+
+def hold(name: str = "hold", on_s: float = 1.0, **settings: float) -> SegmentPlan:
+    return SegmentPlan(name=name, sequence="steps", settings={"on_s": on_s, "off_s": 0.0, "repeats": 1, **settings})
+
+
+FIXED = [rest(0.5), hold("first"), SegmentPlan(name="ramp", sequence="ramp", settings={"up_s": 0.5, "down_s": 0.5})]
+
+
+def adaptive(
+    folder: Path, max_duration_s: float = 10.0, max_nms: float = 1e4, fixed: list[SegmentPlan] = FIXED, **more: Any
+) -> VirtualRig:
+    bounds = AdaptivePlan(max_duration_s=max_duration_s, max_torque_time_nms=max_nms)
+    return VirtualRig(folder, fixed, adaptive=bounds, **more)
+
+
+def refusals(rig: VirtualRig, *requests: Callable[[], object]) -> list[RigError]:
+    """What the requests raise, in order."""
+    found: list[RigError] = []
+    for request in requests:
+        with pytest.raises(RigError) as told:
+            request()
+        found.append(told.value)
+    return found
+
+
+def sealed(rig: VirtualRig) -> assembly.Recording:
+    return assembly.assemble(journal.read(rig.path))
+
+
+def widths_sent(rig: VirtualRig) -> list[int]:
+    return [pulse.pulse_width_us for _, pulse in rig.stimulator.sent]
+
+
+def test_if_nobody_extends_it_the_fixed_plan_plays_and_a_second_without_pulses(tmp_path: Path):
+    rig = adaptive(tmp_path)
+    result = rig.execute()
+    assert (result.outcome, result.ended_by, result.duration_s) == ("completed", "plan", pytest.approx(3.475))
+    (tmp_path / "fixed").mkdir()
+    same = VirtualRig(tmp_path / "fixed", FIXED)
+    assert same.execute().ended_by == "plan"
+    assert widths_sent(rig) == widths_sent(same)
+    recording = sealed(rig)
+    assert recording.names == ["rest", "first", "ramp", "rest"]
+    assert recording.columns["segments/start_s"].tolist() == [0.0, 0.5, 1.5, 2.5]
+    planned_us = recording.columns["pulses/pulse_width_us"]
+    assert np.array_equal(planned_us[: len(same.test.pulse_width_us)], same.test.pulse_width_us)
+    assert np.flatnonzero(planned_us)[-1] == len(planned_us) - 1 - RATE_HZ
+    assert (recording.attributes["adaptive"], recording.attributes["ended_by"]) == (1, "plan")
+    assert sealed(same).attributes["adaptive"] == 0
+
+
+def test_what_is_added_plays_at_its_boundary_and_the_fixed_plan_goes_on_after_it(tmp_path: Path):
+    rig = adaptive(tmp_path)
+    added = [hold("low", max_pulse_width_us=100.0), SegmentPlan(name="validate", sequence="multilevel",
+             settings={"duration_s": 1.0, "seed": 3})]  # fmt: skip
+    rig.at(0.2, lambda: rig.run.score.extend(20, added))
+    result = rig.execute()
+    recording = sealed(rig)
+    assert recording.names == ["rest", "low", "validate", "first", "ramp", "rest"]
+    assert recording.columns["segments/start_s"].tolist() == [0.0, 0.5, 1.5, 2.5, 3.5, 4.5]
+    sent_us = recording.columns["pulses/sent_pulse_width_us"]
+    assert np.all(sent_us[20:60] == 100) and np.all(sent_us[100:140] == 300)
+    assert result.duration_s == pytest.approx(len(sent_us) / RATE_HZ)
+    times = np.array([time_s for time_s, _ in rig.stimulator.sent])
+    assert np.allclose((times - times[0]) * RATE_HZ, np.round((times - times[0]) * RATE_HZ))
+    assert '"by": "extension"' in recording.attributes["laid"] and '"seed": 3' in recording.attributes["laid"]
+
+
+def test_each_segment_is_in_the_journal_before_its_first_pulse(tmp_path: Path):
+    rig = adaptive(tmp_path)
+    rig.at(0.2, lambda: rig.run.score.extend(20, [hold("added")]))
+    rig.at(1.7, lambda: rig.run.score.enough("me", at_once=True))
+    rig.execute()
+    laid_to, seen = 20, []
+    for kind, payload in journal.read(rig.path).blocks:
+        if kind == Kind.LAID:
+            block = LaidBlock.of_bytes(payload)
+            assert len(block.pulse_width_us) == block.segment.end - block.segment.start
+            laid_to = block.segment.end
+            seen.append(block.segment.by)
+        elif kind == Kind.INTENT:
+            assert journal.INTENT.unpack(payload)[0] < laid_to
+    assert seen == ["extension", "plan", "end"]
+
+
+def test_an_answer_to_an_old_boundary_is_refused_and_so_is_the_same_one_twice(tmp_path: Path):
+    rig = adaptive(tmp_path)
+    score, found = rig.run.score, []
+    rig.at(0.2, lambda: score.extend(20, [hold("once")]))
+    rig.at(0.21, lambda: found.extend(refusals(rig, lambda: score.extend(20, [hold("again")]))))
+    rig.at(2.0, lambda: found.extend(refusals(rig, lambda: score.extend(60, [hold("late")]))))
+    rig.execute()
+    assert all(isinstance(error, TooLateError) for error in found) and len(found) == 2
+    assert "60 pulses are laid" in str(found[0]) and "100 pulses are laid" in str(found[1])
+    assert sealed(rig).names == ["rest", "once", "first", "ramp", "rest"]
+
+
+@pytest.mark.parametrize("early", [True, False])
+def test_the_boundary_is_decided_two_periods_before_it(tmp_path: Path, early: bool):
+    rig = adaptive(tmp_path)
+    at_s = 0.5 - AHEAD / RATE_HZ + (-0.001 if early else 0.001)
+    errors: list[RigError] = []
+
+    def extend() -> None:
+        try:
+            rig.run.score.extend(20, [hold("added")])
+        except TooLateError as error:
+            errors.append(error)
+
+    rig.at(at_s, extend)
+    rig.execute()
+    assert (sealed(rig).names[1], len(errors)) == (("added", 0) if early else ("first", 1))
+
+
+def test_before_the_first_pulse_it_can_be_extended_as_well(tmp_path: Path):
+    rig = adaptive(tmp_path)
+    rig.run.score.extend(20, [hold("added")])
+    rig.execute()
+    assert sealed(rig).names == ["rest", "added", "first", "ramp", "rest"]
+
+
+WRONG: dict[str, tuple[list[SegmentPlan], type[RigError], str]] = {
+    "nothing": ([], PlanError, "0 segments; give 1 to 8"),
+    "too many": ([rest(0.1)] * (MAX_EXTENSION_SEGMENTS + 1), PlanError, "9 segments"),
+    "ten thousand": ([rest(0.1)] * 10_000, PlanError, "10000 segments"),
+    "too long": ([rest(MAX_EXTENSION_S), rest(1.0)], RefusedError, "at most 30 s an extension"),
+    "an hour": ([SegmentPlan(name="x", sequence="prbs", settings={"chips": 100_000})], RefusedError, "30 s"),
+    "wide": ([hold(max_pulse_width_us=281.0)], RefusedError, "hold, pulse 1: pulse_width_us 281 .*profile"),
+    "NaN": ([SegmentPlan(name="x", sequence="widths", settings={"pulse_width_us": [math.nan]})], PlanError, "finite"),
+    "infinite": ([SegmentPlan(name="x", sequence="sweep", settings={"to_pulse_width_us": math.inf})], PlanError, "fin"),
+    "negative": ([SegmentPlan(name="x", sequence="widths", settings={"pulse_width_us": [-1.0]})], RefusedError, "-1"),
+    "a text": ([SegmentPlan(name="x", sequence="rest", settings={"duration_s": "1"})], PlanError, "duration_s"),
+    "no such sequence": ([SegmentPlan(name="x", sequence="os", settings={})], PlanError, "unknown"),
+    "no pulse": ([rest(0.001)], PlanError, "too short for one pulse"),
+    "one wrong of two": ([rest(0.5), hold(max_pulse_width_us=1e9)], RefusedError, "1e\\+09"),
+    "a sudden rise": (
+        [SegmentPlan(name="x", sequence="sweep", settings={"from_pulse_width_us": 60.0})], RefusedError, "rise_us 60"
+    ),
+    "no name": ([SegmentPlan(name="", sequence="rest")], PlanError, "name 1"),
+    "a long name": ([SegmentPlan(name="x" * 61, sequence="rest")], PlanError, "name 1"),
+    "a name with a NUL": ([SegmentPlan(name="a\0b", sequence="rest")], PlanError, "name 1"),
+    "a name with a line's end": ([SegmentPlan(name="a\nb", sequence="rest")], PlanError, "name 1"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_wrong_extension_is_refused_and_lays_nothing(tmp_path: Path, name: str):
+    segments, kind, words = WRONG[name]
+    rig = adaptive(tmp_path, 60.0, max_pulse_width_us=280.0)
+    with pytest.raises(kind, match=words):
+        rig.run.score.extend(20, segments)
+    assert len(rig.run.score.laid) == 20
+    assert Kind.LAID not in {kind for kind, _ in journal.read(rig.path).blocks}
+
+
+def test_names_of_a_plan_may_come_again_as_they_may_within_a_plan(tmp_path: Path):
+    rig = adaptive(tmp_path)
+    rig.run.score.extend(20, [hold("first", 0.5), hold("validate", 0.5), hold("validate", 0.5)])
+    rig.execute()
+    recording = sealed(rig)
+    assert recording.names == ["rest", "first", "validate", "validate", "first", "ramp", "rest"]
+    assert np.all(recording.columns["segments/end_s"][:-1] == recording.columns["segments/start_s"][1:])
+
+
+def test_the_dose_is_that_of_the_whole_test(tmp_path: Path):
+    """3 s at 6 µC are 720 µC: the third second is refused, and the fixed plan's next is not played after the second."""
+    base = limits.tightened(limits.HARD_LIMITS, "charge_per_test_uc", 600.0, "rig file")
+    rig = adaptive(tmp_path, base=base, fixed=[rest(0.5), hold("first"), hold("second")])
+    rig.run.score.extend(20, [hold("added")])
+    with pytest.raises(RefusedError, match=r"charge_per_test_uc 720 .*rig file"):
+        rig.run.score.extend(60, [hold("two more"), hold("seconds")])
+    result = rig.execute()
+    assert (result.ended_by, result.charge_uc) == ("limit", 480.0)
+    assert sealed(rig).names == ["rest", "added", "first", "rest"]
+    told = next(event for event in sealed(rig).events if event["event"] == "ended")
+    assert "charge_per_test_uc 720" in told["reason"]
+
+
+def test_the_charge_of_a_second_holds_across_a_boundary(tmp_path: Path):
+    base = limits.tightened(limits.HARD_LIMITS, "charge_per_second_uc", 150.0, "rig file")
+    half = [rest(1.0), hold("first", on_s=0.5)]
+    rig = adaptive(tmp_path, base=base, fixed=half)
+    rig.run.score.extend(40, [hold("a", on_s=0.5)])
+    with pytest.raises(RefusedError, match="charge_per_second_uc 240"):
+        rig.run.score.extend(60, [hold("b", on_s=0.5)])
+    rig.run.score.extend(60, [rest(1.0), hold("c", on_s=0.5)])
+    assert rig.execute().ended_by == "limit"  # the fixed plan's half second would follow one without a pause
+    assert sealed(rig).names == ["rest", "a", "rest", "c", "rest"]
+
+
+def test_the_rise_is_counted_from_the_last_pulse_that_is_laid(tmp_path: Path):
+    rig = adaptive(tmp_path)
+    down = {"from_pulse_width_us": 300.0, "to_pulse_width_us": 120.0}
+    rig.run.score.extend(20, [hold("up"), SegmentPlan(name="down", sequence="sweep", settings=down)])
+    up = {"from_pulse_width_us": 170.0, "to_pulse_width_us": 300.0}
+    rig.run.score.extend(100, [SegmentPlan(name="on", sequence="sweep", settings=up)])
+    again = {"from_pulse_width_us": 120.0, "to_pulse_width_us": 171.0}
+    rig.run.score.extend(140, [SegmentPlan(name="down", sequence="sweep", settings=again)])
+    wide = {"from_pulse_width_us": 222.0, "to_pulse_width_us": 222.0}
+    with pytest.raises(RefusedError, match="width_rise_us 51"):
+        rig.run.score.extend(180, [SegmentPlan(name="on", sequence="sweep", settings=wide)])
+
+
+def test_the_bound_of_the_whole_test_holds_with_its_safe_end(tmp_path: Path):
+    rig = adaptive(tmp_path, max_duration_s=10.0)
+    with pytest.raises(RefusedError, match=r"duration_s 10\.025 .*request"):
+        rig.run.score.extend(20, [rest(9.525)])
+    with pytest.raises(RefusedError, match=r"with its safe end: duration_s 10\.1"):
+        rig.run.score.extend(20, [hold(on_s=8.6)])
+    rig.run.score.extend(20, [hold(on_s=8.5)])
+    assert rig.run.score.left(0.0).duration_left_s == pytest.approx(1.0)
+
+
+def test_however_often_it_is_extended_it_ends_within_its_bound(tmp_path: Path):
+    rig = adaptive(tmp_path, max_duration_s=8.0)
+    score = rig.run.score
+
+    def add() -> None:
+        if not score.ended_by:
+            try:
+                score.extend(len(score.laid), [hold("more", on_s=0.5, off_s=0.2)])
+            except (RefusedError, BusyError):
+                return
+
+    for tenth in range(100):
+        rig.at(tenth / 10, add)
+    result = rig.execute()
+    assert (result.outcome, result.ended_by) == ("completed", "limit")
+    assert 6.0 < result.duration_s <= 8.0
+    recording = sealed(rig)
+    assert len(recording.columns["pulses/pulse_width_us"]) <= 8.0 * RATE_HZ
+    assert np.all(recording.columns["pulses/pulse_width_us"][-40:] == 0)
+
+
+def test_a_fixed_plan_that_does_not_fit_its_own_bound_is_refused_before_the_first_pulse(tmp_path: Path):
+    with pytest.raises(RefusedError, match=r"with its safe end: duration_s 3\.475 s is outside 0 … 3\.4"):
+        adaptive(tmp_path, max_duration_s=3.4)
+    (tmp_path / "rested").mkdir()
+    assert adaptive(tmp_path / "rested", max_duration_s=3.475).test.longest_s == 3.475
+    for wrong in (math.nan, math.inf, 0.0, -1.0):
+        with pytest.raises(ValueError, match=r"greater than 0|finite number"):
+            AdaptivePlan(max_duration_s=wrong, max_torque_time_nms=1.0)
+        with pytest.raises(ValueError, match=r"greater than 0|finite number"):
+            AdaptivePlan(max_duration_s=1.0, max_torque_time_nms=wrong)
+
+
+@pytest.mark.parametrize("pending", ["", "enough", "laid"])
+def test_the_measured_torque_time_ends_it_within_a_pulse(tmp_path: Path, pending: str):
+    """Neither what is laid far ahead nor an end that waits for its boundary plays on over the bound."""
+    rig = adaptive(tmp_path, max_nms=5.0, fixed=[rest(0.5), hold("long", on_s=3.0), hold("more", on_s=3.0)])
+    if pending == "enough":
+        rig.at(0.6, lambda: rig.run.score.enough("me", at_once=False))
+    if pending == "laid":
+        rig.at(0.6, lambda: rig.run.score.extend(140, [hold("ahead", on_s=3.0)]))
+    at_end: list[float] = []
+    rig.stimulator.on_send = lambda _: at_end.append(rig.run.torque_time_nms)
+    result = rig.execute()
+    assert (result.outcome, result.ended_by) == ("completed", "torque_time")
+    a_pulse_nms = 6.0 / RATE_HZ
+    assert at_end[-1] < 5.0 + a_pulse_nms
+    assert 5.0 < result.torque_time_nms < 5.0 + 2 * a_pulse_nms + 6.0 * 0.1  # the torque falls within 0.1 s
+    recording = sealed(rig)
+    assert recording.names == ["rest", "long", "rest"]
+    assert result.duration_s == pytest.approx(recording.columns["segments/start_s"][-1] + 1.0, abs=1e-6)
+
+
+def test_the_torque_time_is_counted_from_rest_and_through_lost_samples(tmp_path: Path):
+    rig = adaptive(tmp_path, fixed=[rest(0.5), hold("first", on_s=2.0), rest(2.0)])
+    rig.cell.add_nm = -3.0
+    rig.at(1.5, lambda: setattr(rig.cell, "skip", 100))
+    result = rig.execute()
+    assert result.outcome == "completed"
+    assert result.torque_time_nms == pytest.approx(6.0 * 2.0, rel=0.05)
+
+
+@pytest.mark.parametrize(("at_once", "names", "pulses"), [(True, ["rest", "first", "rest"], 30), (False, None, 40)])
+def test_enough_ends_it_well(tmp_path: Path, at_once: bool, names: list[str] | None, pulses: int):
+    rig = adaptive(tmp_path)
+    rig.at(0.6, lambda: rig.run.score.extend(60, [hold("never played")]))
+    rig.at(1.21, lambda: rig.run.score.enough("P1's nurse", at_once))
+    result = rig.execute()
+    assert (result.outcome, result.ended_by, result.evidence.confirmed) == ("completed", "enough", True)
+    assert len(rig.stimulator.sent) == pulses
+    recording = sealed(rig)
+    assert recording.names == (names or ["rest", "first", "rest"])
+    assert result.duration_s == pytest.approx(0.5 + pulses / RATE_HZ + 1.0)
+    assert len(recording.columns["pulses/status"]) == 20 + pulses + 40
+    told = next(event for event in recording.events if event["event"] == "ended")
+    assert (told["by"], told["reason"], told["index"]) == ("enough", "P1's nurse", 20 + pulses)
+
+
+def test_enough_twice_may_only_end_it_sooner(tmp_path: Path):
+    rig = adaptive(tmp_path)
+    score = rig.run.score
+    for at_s, at_once in ((0.7, False), (0.8, False), (1.0, True), (1.1, True), (1.2, False)):
+        rig.at(at_s, lambda at_once=at_once: score.enough("me", at_once))
+    found: list[RigError] = []
+    rig.at(1.3, lambda: found.extend(refusals(rig, lambda: score.extend(len(score.laid), [hold()]))))
+    result = rig.execute()
+    assert result.duration_s == pytest.approx(0.5 + len(rig.stimulator.sent) / RATE_HZ + 1.0)
+    assert 19 <= len(rig.stimulator.sent) <= 21
+    assert "is ending (enough)" in str(found[0])
+    assert [event["event"] for event in sealed(rig).events].count("ended") == 2
+
+
+def test_enough_before_the_first_pulse_sends_none(tmp_path: Path):
+    rig = adaptive(tmp_path)
+    rig.run.score.enough("me", at_once=True)
+    result = rig.execute()
+    assert (result.outcome, rig.stimulator.sent, result.duration_s) == ("completed", [], pytest.approx(1.0))
+    assert sealed(rig).names == ["rest"]
+
+
+def test_a_fixed_test_is_neither_extended_nor_ended_early(tmp_path: Path):
+    rig = VirtualRig(tmp_path, FIXED)
+    extended, ended = refusals(
+        rig,
+        lambda: rig.run.score.extend(len(rig.run.score.laid), [hold()]),
+        lambda: rig.run.score.enough("me", at_once=True),
+    )
+    assert isinstance(extended, TooLateError) and isinstance(ended, PlanError)
+
+
+@pytest.mark.parametrize("cause", ["stopped", "fault"])
+def test_a_stop_is_a_stop(tmp_path: Path, cause: Any):
+    """During the fall of the torque and after it nothing is laid, and no pulse follows."""
+    rig = adaptive(tmp_path)
+    score, found = rig.run.score, []
+    rig.at(0.3, lambda: score.extend(20, [hold("added", on_s=3.0)]))
+    rig.at(1.0, lambda: rig.halt.set(cause, "that hurts"))
+    for at_s in (1.001, 1.01, 1.05):
+        rig.at(at_s, lambda: found.extend(refusals(
+            rig, lambda: score.extend(len(score.laid), [hold()]), lambda: score.enough("me", True)
+        )))  # fmt: skip
+    result = rig.execute()
+    size = rig.path.stat().st_size
+    found += refusals(rig, lambda: score.extend(len(score.laid), [hold()]), lambda: score.enough("me", False))
+    assert (result.outcome, result.ended_by, len(found)) == (cause, cause, 8)
+    assert all(isinstance(error, TooLateError) for error in found)
+    assert rig.stimulator.sent[-1][0] <= rig.halt.time_s
+    recording = sealed(rig)
+    assert (recording.names, recording.attributes["ended_by"]) == (["rest", "added"], cause)
+    assert rig.path.stat().st_size == size
+
+
+def test_only_so_many_are_checked_for_one_boundary(tmp_path: Path):
+    rig = adaptive(tmp_path)
+    score = rig.run.score
+    wrong = [hold(max_pulse_width_us=1000.0)]
+    found = refusals(rig, *[lambda: score.extend(20, wrong)] * (MAX_CHECKED + 3), lambda: score.extend(20, [hold()]))
+    assert [type(error) for error in found] == [RefusedError] * MAX_CHECKED + [BusyError] * 4
+    refusals(rig, *[lambda: score.extend(19, wrong)] * 100)
+    rig.at(0.7, lambda: score.extend(60, [hold("added")]))  # the next boundary
+    rig.execute()
+    assert sealed(rig).names == ["rest", "first", "added", "ramp", "rest"]
+
+
+def test_a_disk_that_takes_no_segment_ends_it_as_a_fault(tmp_path: Path):
+    rig = adaptive(tmp_path)
+    rig.at(0.2, lambda: setattr(rig.journal, "_failure", "disk full"))
+    rig.at(0.3, lambda: refusals(rig, lambda: rig.run.score.extend(20, [hold()])))
+    result = rig.execute()
+    assert (result.outcome, result.reason, rig.stimulator.sent) == ("fault", "disk full", [])
+    (tmp_path / "2").mkdir()
+    rig = adaptive(tmp_path / "2")
+    rig.journal._failure = "disk full"
+    with pytest.raises(JournalError):
+        rig.run.score.extend(20, [hold()])
+    assert len(rig.run.score.laid) == 20
+
+
+def test_the_clock_on_the_wall_changes_nothing(tmp_path: Path):
+    rig = adaptive(tmp_path)
+    rig.at(0.1, lambda: setattr(rig.clock, "_unix_offset_s", rig.clock._unix_offset_s + 86_400))
+    rig.at(0.2, lambda: rig.run.score.extend(20, [hold("added")]))
+    rig.at(0.9, lambda: setattr(rig.clock, "_unix_offset_s", -1e9))
+    assert rig.execute().duration_s == pytest.approx(4.475)
+
+
+def test_the_earliest_pulse_is_that_of_an_extension(tmp_path: Path):
+    """The rest between two tests is judged by it, although the fixed plan would begin later."""
+    rig = adaptive(tmp_path, fixed=[rest(0.5), rest(2.0), hold("first")])
+    assert rig.test.first_pulse == 20
+    assert plan.build(rig.plan.model_copy(update={"adaptive": None}), rig.table).first_pulse == 100
+
+
+def test_the_sealed_file_holds_the_true_sequence(tmp_path: Path):
+    rig = adaptive(tmp_path)
+    rig.at(0.2, lambda: rig.run.score.extend(20, [hold("added")]))
+    rig.at(1.0, lambda: rig.run.score.enough("me", at_once=True))
+    rig.execute()
+    file_path = archive.seal(sealed(rig), tmp_path).path
+    with h5py.File(file_path) as file:
+        assert list(file["segments/name"].asstr()[:]) == ["rest", "added", "rest"]
+        assert (file.attrs["adaptive"], file.attrs["ended_by"]) == (1, "enough")
+        assert file["segments/end_s"][1] == file["segments/start_s"][2]
+        sent, planned = file["pulses/sent_pulse_width_us"][:], file["pulses/pulse_width_us"][:]
+        assert np.array_equal(sent, planned)
+        assert np.count_nonzero(sent) == len(rig.stimulator.sent)
+
+
+@pytest.mark.slow
+def test_a_journal_cut_anywhere_or_without_a_laid_block_loses_no_pulse(tmp_path: Path):
+    rig = adaptive(tmp_path)
+    rig.at(0.2, lambda: rig.run.score.extend(20, [hold("added", max_pulse_width_us=150.0)]))
+    rig.at(1.8, lambda: rig.run.score.enough("me", at_once=True))
+    rig.execute()
+    whole = rig.path.read_bytes()
+    copy = tmp_path / "copy.journal"
+    for end in np.linspace(9000, len(whole), 40).astype(int):
+        copy.write_bytes(whole[:end])
+        contents = journal.read(copy)
+        columns = assembly.assemble(contents).columns
+        intents = sum(kind == Kind.INTENT for kind, _ in contents.blocks)
+        assert np.sum(np.nan_to_num(columns["pulses/current_ma"]) > 0) == intents
+        assert np.sum(np.nan_to_num(columns["pulses/sent_pulse_width_us"]) > 0) == intents
+    at = [place for place in range(len(whole)) if whole.startswith(journal._MARK + bytes([Kind.LAID]), place)]
+    assert len(at) == 3
+    for lost in ([0], [1], [2], [0, 1], [0, 1, 2]):
+        spoiled = bytearray(whole)
+        for number in lost:
+            spoiled[at[number] + 20] ^= 255
+        copy.write_bytes(spoiled)
+        recording = assembly.assemble(journal.read(copy))
+        sent = recording.columns["pulses/sent_pulse_width_us"]
+        assert np.nan_to_num(sent)[np.nan_to_num(sent) > 0].tolist() == widths_sent(rig)
+        assert "journal is damaged" in recording.attributes["journal_note"]
+        if 0 in lost:
+            assert "which segments pulses 21 to" in recording.attributes["journal_note"]
+            assert "added" not in recording.names
