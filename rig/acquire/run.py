@@ -243,7 +243,6 @@ class TestRun:
     def _stop(self) -> StopEvidence:
         """Stop the device, ask its state, watch the torque fall, end the journal."""
         self._asked_s = None
-        self.score.close("it has ended")
         clock, cause = self._clock, self.halt.cause
         at_stop_nm = self._receiver.torque_around(AROUND_S * clock.speed)
         device = stop_device(self._gate)
@@ -265,6 +264,7 @@ class TestRun:
         return evidence(device, torque, None if last_s is None else now_s - last_s, may_follow)
 
     def _end_journal(self, cause: Cause | None, end_s: float) -> None:
+        self.score.close("it has ended")
         self._outcome = cause or "completed"
         stimulation_end_s = end_s if cause is None else self.halt.time_s
         if self.t0_s is not None:
