@@ -84,7 +84,7 @@ class Score:
         self._reached = -1
         self._end_at: int | None = None
         self._checked = 0
-        self._closed = ""
+        self._shut = False
 
     @property
     def duration_s(self) -> float:
@@ -182,10 +182,14 @@ class Score:
             playing = next((s.end for s in self.laid.segments if s.end > self._reached + 1), len(self.laid))
             self._end("enough", by, self._reached + 1 if at_once else playing)
 
-    def close(self, reason: str) -> None:
-        """Nothing may be laid any more: the sender has ended, and the journal is about to be closed."""
+    def shut(self) -> None:
+        """From now on every request is refused. Waits for nothing: whoever halts the test calls it."""
+        self._shut = True
+
+    def close(self) -> None:
+        """As `shut`, and nothing is being written any more: the journal may be closed."""
         with self._lock:
-            self._closed = reason
+            self._shut = True
 
     def left(self, torque_time_nms: float) -> Extended:
         """What is laid, and what the bounds leave of an adaptive test."""
@@ -203,8 +207,8 @@ class Score:
         )
 
     def _may_change(self) -> None:
-        if self._closed:
-            raise TooLateError(f"test {self.plan.test_id}: {self._closed}")
+        if self._shut:
+            raise TooLateError(f"test {self.plan.test_id} is being ended")
 
     def _may_grow(self, after: int) -> None:
         self._may_change()

@@ -109,6 +109,7 @@ class TestRun:
         self._duration_s = 0.0
         self._counts = Recorded()
         halt.on_set(gate.shut)
+        halt.on_set(self.score.shut)
 
     def execute(self) -> RunResult:
         """Play the test to its end or its halt; never raises for a fault, the result says it."""
@@ -264,7 +265,7 @@ class TestRun:
         return evidence(device, torque, None if last_s is None else now_s - last_s, may_follow)
 
     def _end_journal(self, cause: Cause | None, end_s: float) -> None:
-        self.score.close("it has ended")
+        self.score.close()
         self._outcome = cause or "completed"
         stimulation_end_s = end_s if cause is None else self.halt.time_s
         if self.t0_s is not None:

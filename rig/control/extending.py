@@ -50,14 +50,12 @@ class Extending(Calibrating):
         return run.score.left(run.torque_time_nms)
 
     def _running(self, test_id: str) -> TestRun:
-        """The adaptive test of that id, which no stop and no fault is ending."""
+        """The adaptive test of that id, if it is the one that plays."""
         run = self._run
         if run is None or run.plan.test_id != test_id:
             raise TooLateError(f"test {test_id!r} is not running")
         if run.plan.adaptive is None:
             raise PlanError(f"test {test_id} has a fixed plan; it can only be stopped")
-        if run.halt.cause is not None:
-            raise TooLateError(f"test {test_id} is being ended: {run.halt.reason}")
         return run
 
 

@@ -454,3 +454,68 @@ def test_a_journal_cut_anywhere_or_without_a_laid_block_loses_no_pulse(tmp_path:
         if 0 in lost:
             assert "which segments pulses 21 to" in recording.attributes["journal_note"]
             assert "added" not in recording.names
+
+
+def mad_segment(rng: np.random.Generator) -> SegmentPlan:
+    """One of the library's segments, most of them within the limits."""
+    wide = float(rng.choice([80.0, 200.0, 280.0, 280.5, 281.0, 400.0, 1e9, -1.0], p=[0.3, 0.3, 0.2, *[0.04] * 5]))
+    long_s = float(rng.choice([0.001, 0.025, 0.3, 1.0, 5.0, 31.0], p=[0.05, 0.1, 0.4, 0.35, 0.05, 0.05]))
+    jumps = bool(rng.random() < 0.7)
+    kinds: list[tuple[str, dict[str, Any]]] = [
+        ("rest", {"duration_s": long_s}),
+        ("steps", {"on_s": long_s, "off_s": 0.1, "repeats": 1, "max_pulse_width_us": wide}),
+        ("ramp", {"up_s": long_s, "down_s": 0.1, "max_pulse_width_us": wide}),
+        ("sweep", {"from_pulse_width_us": wide, "to_pulse_width_us": 100.0, "duration_s": long_s, "jumps": jumps}),
+        ("widths", {"pulse_width_us": [wide] * int(rng.integers(1, 30)), "jumps": jumps}),
+        ("prbs", {"bits": int(rng.integers(2, 5)), "clock_pulses": 1, "max_pulse_width_us": wide}),
+    ]
+    sequence, settings = kinds[int(rng.integers(len(kinds)))]
+    return SegmentPlan(name=f"s{rng.integers(100)}", sequence=sequence, settings=settings)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(6))
+def test_whatever_strangers_send_the_whole_test_stays_within_its_limits(tmp_path: Path, seed: int):
+    """Right and wrong extensions at random times, some ends among them; judged by arithmetic of its own."""
+    rng = np.random.default_rng(1300 + seed)
+    base = limits.tightened(limits.HARD_LIMITS, "charge_per_test_uc", 900.0, "rig file")
+    base = limits.tightened(base, "charge_per_second_uc", 180.0, "rig file")
+    pause = [rest(0.3), hold("a", 0.5, max_pulse_width_us=200.0), rest(0.5), hold("b", 0.5, max_pulse_width_us=150.0)]
+    rig = adaptive(tmp_path, 12.0, 60.0, pause, base=base, max_pulse_width_us=280.0)
+    score, counts, shown = rig.run.score, {"laid": 0, "refused": 0}, [rig.run.score.laid]
+
+    def ask() -> None:
+        before = score.laid
+        after = len(before) + int(rng.choice([0, 0, 0, 0, 1, -1, 40]))
+        try:
+            score.extend(after, [mad_segment(rng) for _ in range(rng.integers(0, 4))])
+        except RigError:
+            counts["refused"] += 1
+            assert score.laid is before
+        else:
+            counts["laid"] += 1
+            assert np.array_equal(score.laid.pulse_width_us[: len(before)], before.pulse_width_us)
+            assert score.laid.segments[: len(before.segments)] == before.segments
+        shown.append(score.laid)
+
+    for at_s in np.sort(rng.uniform(-0.1, 12.0, 250)):
+        rig.at(float(at_s), ask)
+    if seed % 2:
+        rig.at(
+            float(rng.uniform(3.0, 6.0)), lambda: None if score.ended_by else score.enough("me", bool(seed % 4 == 1))
+        )
+    result = rig.execute()
+    assert result.outcome == "completed", result.reason
+    assert counts["laid"] > 3 and counts["refused"] > 10
+    times = np.array([time_s for time_s, _ in rig.stimulator.sent])
+    sent_us = np.array(widths_sent(rig), dtype=float)
+    assert sent_us.max() <= 280
+    assert sent_us.sum() * 20e-3 <= 900
+    for time_s in times:
+        assert sent_us[(times >= time_s) & (times < time_s + 1 - 1e-6)].sum() * 20e-3 <= 180 + 1e-9
+    recording = sealed(rig)
+    planned_us = recording.columns["pulses/pulse_width_us"]
+    assert len(planned_us) / RATE_HZ <= 12.0
+    assert np.all(planned_us[-40:] == 0)
+    assert np.array_equal(np.floor(planned_us[planned_us >= 1]), sent_us)
+    assert len(recording.names) <= 200
