@@ -1,0 +1,122 @@
+"""A recruitment curve that never falls and lies near a known shape, as far as the data allow: a prior for short tests.
+
+A recruitment curve is the sum of the motor units whose thresholds a pulse exceeds. So it is described by the density
+of those thresholds: the steps between neighbouring coefficients of its spline, which are positive. The logarithm of a
+step is that of a shape with three parameters (gain, middle, width) plus a deviation, a Gaussian process along the pulse
+width. How large deviations are is estimated from the data (`DEVIATIONS`). Between two tested widths the curve stays
+between its values there, and may do anything that the deviation allows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from identify.recruitment.spline import SplineBasis
+
+KNOTS = 61
+DEVIATIONS = (0.05, 0.35, 0.9, 1.8, 3.5)
+"""Standard deviations of the log density's deviation from the shape. 0.05 is the shape itself; with 3.5 the density
+changes by a factor of 30 from place to place: a jump, a gap between two groups of motor units, or single large
+units."""
+SMOOTH_SHARE = 0.6
+"""Share of the deviation's variance that is smooth; the rest is rough."""
+SMOOTH_LENGTH, ROUGH_LENGTH = 0.8, 0.25
+"""Lengths over which the two parts change, relative to the rise from 10 to 90 %."""
+LEAST_STEP = 1e-9
+"""A step is at least this share of the gain, so that its logarithm exists."""
+NUDGE = 1e-4
+
+Shape = Callable[[np.ndarray], np.ndarray]
+
+
+def logistic(x: np.ndarray) -> np.ndarray:
+    """The paper's sigmoid in standard units: its steepness is 1 at the middle 0."""
+    return 0.5 * (1.0 + np.tanh(0.5 * x))
+
+
+LOGISTIC_RISE = 4.394
+"""Distance from 10 to 90 % of `logistic`."""
+
+
+@dataclass(frozen=True)
+class NearShape:
+    """The prior of a curve on a spline basis.
+
+    Parameters
+    ----------
+    basis : SplineBasis
+        Of the curve; its coefficients are the running sums of the steps.
+    shape : callable
+        The shape in standard units, from 0 to 1: `logistic`, or an earlier curve.
+    mean : ndarray, shape (3,)
+        Of log gain (N·m), middle (µs) and log width (µs).
+    precision : ndarray, shape (3, 3)
+        Of those three.
+    plateau : tuple of float
+        Mean and standard deviation of the log of the plateau, N·m: the sum of all steps, with their deviations.
+    rise_us : float
+        Rise from 10 to 90 %, µs: the scale of the deviation.
+    deviations : tuple of float
+        Standard deviations of the log density's deviation that are averaged over.
+    """
+
+    basis: SplineBasis
+    shape: Shape
+    mean: np.ndarray
+    precision: np.ndarray
+    plateau: tuple[float, float]
+    rise_us: float
+    deviations: tuple[float, ...] = DEVIATIONS
+
+    @cached_property
+    def places_us(self) -> np.ndarray:
+        """Where the spline's coefficients are (Greville's abscissae), with 0 first, shape (n + 1,)."""
+        padded = np.r_[[0.0] * 3, self.basis.knots_us, [self.basis.largest_us] * 3]
+        return np.convolve(padded[1:-1], np.ones(3) / 3.0, mode="valid")
+
+    def log_steps(self, three: np.ndarray) -> np.ndarray:
+        """Logarithms of the steps of the shape itself, shape (..., n), for (log gain, middle, log width)."""
+        gain, middle, width = three[..., :1], three[..., 1:2], np.exp(three[..., 2:3])
+        share = self.shape((self.places_us - middle) / width)
+        return gain + np.log(np.diff(share, axis=-1) + LEAST_STEP)
+
+    def slopes(self, three: np.ndarray) -> np.ndarray:
+        """Derivatives of `log_steps` by the three parameters, shape (n, 3)."""
+        nudge = NUDGE * np.array([1.0, np.exp(three[2]), 1.0])
+        near = self.log_steps(three + np.diag(nudge)) - self.log_steps(three - np.diag(nudge))
+        return near.T / (2.0 * nudge)
+
+    @cached_property
+    def root(self) -> np.ndarray:
+        """A root of the deviation's covariance for a standard deviation of 1, shape (n, n)."""
+        at = 0.5 * (self.places_us[1:] + self.places_us[:-1])
+        away = np.abs(at[:, None] - at[None, :]) / self.rise_us
+        smooth = np.sqrt(3.0) * away / SMOOTH_LENGTH
+        covariance = SMOOTH_SHARE * (1.0 + smooth) * np.exp(-smooth)
+        covariance += (1.0 - SMOOTH_SHARE) * np.exp(-away / ROUGH_LENGTH)
+        return np.linalg.cholesky(covariance + 1e-9 * np.eye(at.size))
+
+
+def dense_knots(largest_us: float, middle_us: float, rise_us: float, count: int = KNOTS) -> np.ndarray:
+    """Knots from 0 to the largest width, a third of them even, the others denser where the curve rises."""
+    u = np.linspace(0.0, largest_us, 601)
+    dense = 1.0 / (1.0 + ((u - middle_us) / (0.8 * rise_us)) ** 2)
+    density = 1.0 / 3.0 / largest_us + 2.0 / 3.0 * dense / np.trapezoid(dense, u)
+    mass = np.r_[0.0, np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(u))]
+    knots = np.interp(np.linspace(0.0, mass[-1], count), mass, u)
+    knots[0], knots[-1] = 0.0, largest_us
+    return knots
+
+
+PLATEAU_LOG_SD = 0.4
+"""A plateau is hardly ever more than twice the largest torque that was seen."""
+
+
+def new_person(largest_us: float, scale_nm: float) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and precision of (log gain, middle, log width) of somebody who was never tested."""
+    mean = np.array([np.log(scale_nm), 0.45 * largest_us, np.log(largest_us / 20.0)])
+    return mean, np.diag(1.0 / np.array([1.0, 0.35 * largest_us, 1.0]) ** 2)
