@@ -1,13 +1,14 @@
 """Posterior of a curve that never falls, for linearised dynamics: modes, evidence of each deviation, and draws.
 
-The data enter as a quadratic form, so no draw needs the record. Unknowns are z = (log gain, middle, log width, standard
-deviates of the curve's deviation, further parameters in which the prediction is linear). The draws start from Laplace's
-approximation at the mode of each size of the deviation, and Hamiltonian steps then make them draws of the posterior
-itself (Neal 2011): where little is known, the posterior of a curve is far from normal.
+The data enter as a quadratic form, so nothing here needs the record. Unknowns are z = (log gain, middle, log width,
+standard deviates of the curve's deviation, further parameters in which the prediction is linear). Draws follow Laplace's
+approximation, but linearised in the steps and not in their logarithms: the prediction is linear in the steps, so every
+draw fits the data as well as it should.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -122,11 +123,12 @@ class CurvePosterior:
         """The mode nearest to a start, by damped Gauss-Newton steps."""
         value, damping = float(self.value(z, deviation)), 1e-4
         for _ in range(STEPS):
-            gradient, information = self._bent(z, deviation)
-            moved, root = None, None
+            gradient, information, by_z = self._bent(z, deviation)
+            moved = None
             while damping < 1e8:
-                step, root = _solve(information, gradient, damping)
-                step = step / max(float(np.max(np.abs(self._log_change(z, step, deviation)))) / LARGEST_LOG, 1.0)
+                step = _solve(information, gradient, damping)[0]
+                # What is negligible may change as it likes.
+                step = step / max(float(np.max(np.abs(by_z @ step[: 3 + self.n]))) / LARGEST_LOG, 1.0)
                 trial = float(self.value(z + step, deviation))
                 if trial > value - 1e-9:
                     moved = step
@@ -137,109 +139,63 @@ class CurvePosterior:
             gain, z, value, damping = trial - value, z + moved, trial, max(damping / 8.0, 1e-7)
             if gain < ENOUGH:
                 break
-        _, information = self._bent(z, deviation)
-        _, root = _solve(information, np.zeros(z.size), 1e-9)
+        root = _solve(self._bent(z, deviation)[1], np.zeros(z.size), 1e-9)[1]
         evidence = value + 0.5 * float(np.linalg.slogdet(self.precision)[1]) - float(np.sum(np.log(np.diag(root))))
         return Mode(deviation, z, evidence, root)
 
-    def _log_change(self, z: np.ndarray, step: np.ndarray, deviation: float) -> np.ndarray:
-        linear = self.prior.slopes(z[:3]) @ step[:3] + deviation * (self.prior.root @ step[3 : 3 + self.n])
-        # What is negligible may change as it likes.
-        log_steps = self.prior.log_steps(z[:3]) + deviation * (self.prior.root @ z[3 : 3 + self.n])
-        return np.where(log_steps + linear > log_steps.max() - 9.0, linear, 0.0)
+    def _slopes(self, z: np.ndarray, deviation: float) -> tuple[np.ndarray, np.ndarray]:
+        """Logs of the steps, shape (n,), and their derivatives by z's first entries, shape (n, 3 + n)."""
+        log_steps, (by_middle, by_width) = self.prior.log_steps_and_slopes(z[:3])
+        shaped = deviation * self.prior.root
+        slopes = np.concatenate([np.ones((self.n, 1)), by_middle[:, None], by_width[:, None], shaped], axis=1)
+        return log_steps + shaped @ z[3 : 3 + self.n], slopes
 
-    def _bent(self, z: np.ndarray, deviation: float) -> tuple[np.ndarray, np.ndarray]:
-        """Gradient and information (positive definite) of the log posterior."""
-        x = self.unknown_to_linear(z, deviation)
+    def _bent(self, z: np.ndarray, deviation: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Gradient and information (positive definite) of the log posterior, and slopes of the logs that matter."""
         n = self.n
+        log_steps, by_z = self._slopes(z, deviation)
+        x = np.r_[np.exp(log_steps), z[self.others]]
         pull = self.data.moment - self.data.gram @ x
         slopes = np.zeros((x.size, z.size))
-        slopes[:n, :3] = x[:n, None] * self.prior.slopes(z[:3])
-        slopes[:n, 3 : 3 + n] = x[:n, None] * (deviation * self.prior.root)
+        slopes[:n, : 3 + n] = x[:n, None] * by_z
         slopes[n:, self.others] = np.eye(x.size - n)
         beyond, total = self._beyond(x)
         per_sd = slopes[:n].sum(axis=0) / (total * self.prior.plateau[1])
         gradient = slopes.T @ pull - self.precision @ (z - self.mean) - beyond * per_sd
-        return gradient, slopes.T @ self.data.gram @ slopes + self.precision + np.outer(per_sd, per_sd)
+        information = slopes.T @ self.data.gram @ slopes + self.precision + np.outer(per_sd, per_sd)
+        return gradient, information, by_z[log_steps > log_steps.max() - 9.0]
 
-    def modes(self, z: np.ndarray) -> list[Mode]:
-        """The mode for each size of the deviation, each started from the one before."""
-        found = []
-        for deviation in self.prior.deviations:
-            if found:
+    def modes(self, z: np.ndarray, near: Sequence[Mode] = ()) -> list[Mode]:
+        """The mode for each size of the deviation, each started from the one before, or from `near`."""
+        found: list[Mode] = []
+        for index, deviation in enumerate(self.prior.deviations):
+            if near:
+                z = np.r_[near[index].z[: 3 + self.n], z[3 + self.n :]]
+            elif found:
                 z = z.copy()
                 z[3 : 3 + self.n] *= found[-1].deviation / deviation
             found.append(self.mode(z, deviation))
             z = found[-1].z
         return found
 
-    def draws(self, modes: list[Mode], weights: np.ndarray, count: int, rounds: int, seed: int) -> np.ndarray:
+    def draws(self, modes: Sequence[Mode], weights: np.ndarray, count: int, seed: int) -> np.ndarray:
         """Draws of x from the posterior averaged over the modes, shape (count, N); always the same for the same data."""
         rng = np.random.default_rng(seed)
         share = (np.arange(count) + 0.5) / count
         which = np.minimum(np.searchsorted(np.cumsum(weights) / np.sum(weights), share), len(modes) - 1)
         x = np.empty((count, self.data.moment.size))
         for index in np.unique(which):
-            rows = which == index
-            x[rows] = self._moved(modes[index], int(rows.sum()), rounds, rng)
+            mode, rows = modes[index], which == index
+            normal = rng.standard_normal((int(rows.sum()), mode.z.size))
+            x[rows] = self.linear_of(self.prior, mode) + self._moved(mode, normal)
         return x
 
-    def _moved(self, mode: Mode, count: int, rounds: int, rng: np.random.Generator) -> np.ndarray:
-        """Draws for one mode: Laplace's, then Hamiltonian steps in the coordinates in which that is a unit normal."""
-        size = mode.z.size
-        lift = solve_triangular(mode.root, np.eye(size), lower=True)  # z = mode + lift.T @ q
-        q = rng.standard_normal((count, size))
-        for _ in range(rounds):
-            q = self._hamiltonian(mode, lift, q, rng)
-        return self.unknown_to_linear(mode.z + q @ lift, mode.deviation)
-
-    def _hamiltonian(self, mode: Mode, lift: np.ndarray, q: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        step, many = rng.uniform(0.16, 0.28), 7
-        speed = rng.standard_normal(q.shape)
-        value, gradient = self._value_and_gradient(mode, lift, q)
-        energy, at, moving = value - 0.5 * np.sum(speed**2, axis=1), q, speed
-        new = value
-        for _ in range(many):
-            moving = moving + 0.5 * step * gradient
-            at = at + step * moving
-            new, gradient = self._value_and_gradient(mode, lift, at)
-            moving = moving + 0.5 * step * gradient
-        with np.errstate(invalid="ignore"):
-            gain = new - 0.5 * np.sum(moving**2, axis=1) - energy
-        taken = np.log(rng.random(len(q))) < np.nan_to_num(gain, nan=-np.inf)
-        self.accepted = float(np.mean(taken))
-        return np.where(taken[:, None], at, q)
-
-    def _value_and_gradient(self, mode: Mode, lift: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        z, n, sd = mode.z + q @ lift, self.n, mode.deviation
-        x = self.unknown_to_linear(z, sd)
-        pulled = x @ self.data.gram
-        away = z - self.mean
-        stiff = away @ self.precision
-        fit = np.sum((pulled - 2.0 * self.data.moment) * x, axis=1) + self.data.energy
-        beyond, total = self._beyond(x)
-        value = -0.5 * fit - 0.5 * np.sum(stiff * away, axis=1) - 0.5 * beyond**2
-        pull = self.data.moment - pulled
-        per_log = (pull[:, :n] - (beyond / (total * self.prior.plateau[1]))[:, None]) * x[:, :n]
-        slope = np.empty_like(z)
-        slope[:, 3 : 3 + n] = sd * (per_log @ self.prior.root)
-        slope[:, self.others] = pull[:, n:]
-        slope[:, :3] = np.sum(per_log[:, :, None] * self._slopes(z[:, :3]), axis=1)
-        return value, (slope - stiff) @ lift.T
-
-    def _slopes(self, three: np.ndarray) -> np.ndarray:
-        """Derivatives of the log steps by the three, for many, shape (S, n, 3)."""
-        found = np.ones((len(three), self.n, 3))
-        for column, nudge in ((1, 1e-4 * np.exp(three[:, 2])), (2, np.full(len(three), 1e-4))):
-            up, down = three.copy(), three.copy()
-            up[:, column] += nudge
-            down[:, column] -= nudge
-            found[:, :, column] = (self.prior.log_steps(up) - self.prior.log_steps(down)) / (2.0 * nudge[:, None])
-        return found
-
-    def with_data(self, data: Quadratic) -> CurvePosterior:
-        """The same prior with other data."""
-        return CurvePosterior(self.prior, data)
+    def _moved(self, mode: Mode, normal: np.ndarray) -> np.ndarray:
+        """Changes of x by unit normals, with Laplace's covariance."""
+        lift = solve_triangular(mode.root, normal.T, lower=True, trans=1).T
+        log_steps, by_z = self._slopes(mode.z, mode.deviation)
+        steps = np.exp(log_steps) * (lift[:, : 3 + self.n] @ by_z.T)
+        return np.concatenate([steps, lift[:, self.others]], axis=1)
 
 
 def _solve(matrix: np.ndarray, right: np.ndarray, damping: float) -> tuple[np.ndarray, np.ndarray]:

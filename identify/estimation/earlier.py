@@ -18,7 +18,7 @@ from identify.model import Model
 from identify.recruitment.near_shape import NearShape, dense_knots
 from identify.recruitment.spline import SplineBasis
 
-EARLIER_DEVIATIONS = (0.03, 0.15, 0.5, 1.5)
+EARLIER_DEVIATIONS = (0.04, 0.25, 0.8, 2.2)
 """As `DEVIATIONS`, from the earlier curve: the posterior decides how far the shape itself changed."""
 
 
@@ -145,12 +145,18 @@ class Earlier:
         gain, low, middle, high = self._marks
         return np.array([np.log(gain), middle, np.log(max(high - low, 1.0))])
 
-    def shape(self, x: np.ndarray) -> np.ndarray:
-        """The last curve in standard units: from 0 to 1, 0 at the middle, 1 long from 10 to 90 %."""
+    @cached_property
+    def _standard(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The last curve in standard units (0 at the middle, 1 long from 10 to 90 %): places, values and slopes."""
         gain, low, middle, high = self._marks
         u, torque = self.model.recruitment.table()
-        rising = np.maximum.accumulate(np.abs(torque)) / gain
-        return np.interp(middle + x * max(high - low, 1.0), u, rising)
+        x, value = (u - middle) / max(high - low, 1.0), np.maximum.accumulate(np.abs(torque)) / gain
+        return x, value, np.gradient(value, x)
+
+    def shape(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Value and slope of the last curve in standard units."""
+        at, value, slope = self._standard
+        return np.interp(x, at, value), np.interp(x, at, slope, left=0.0, right=0.0)
 
     def curve_prior(self, largest_us: float) -> NearShape:
         """The prior of this session's curve."""

@@ -20,12 +20,12 @@ from identify.noise.level import NoiseLevel, profile, whitened
 from identify.recruitment.near_shape import LOGISTIC_RISE, PLATEAU_LOG_SD, NearShape, dense_knots, logistic, new_person
 from identify.recruitment.spline import SplineBasis
 
-DRAWS, ROUNDS = 192, 2
+DRAWS = 400
 OUTER = 8
 """Largest number of times that the dynamics are linearised anew."""
 SETTLED = 0.05
 """The dynamics have settled when they move by less than this share of their standard deviation."""
-MIDDLING = 2
+MIDDLING = 1
 """Index of the size of the deviation with which the dynamics are searched."""
 STARTS_S = (0.08, 0.2, 0.45)
 CORRELATED = 6.0
@@ -68,6 +68,8 @@ class Short:
         Log gain, middle and log width at the most probable mode.
     likely : ndarray, shape (n + E,)
         Steps of the curve, baselines and initial states at the most probable mode.
+    rise_us : float
+        Rise from 10 to 90 % for which the knots were made, µs.
     """
 
     grid: Grid
@@ -84,6 +86,7 @@ class Short:
     residual_nm: np.ndarray
     three: np.ndarray
     likely: np.ndarray
+    rise_us: float
 
     @cached_property
     def mean_nm(self) -> np.ndarray:
@@ -112,7 +115,6 @@ def fit_short(
     last: Earlier | None = None,
     before: Short | None = None,
     draws: int = DRAWS,
-    rounds: int = ROUNDS,
 ) -> Short:
     """Fit a short record.
 
@@ -126,8 +128,8 @@ def fit_short(
         What is known of this person from the last session.
     before : Short, optional
         The fit to a shorter part of the same record: the search starts there.
-    draws, rounds : int
-        Number of draws, and of Hamiltonian trajectories for each.
+    draws : int
+        Number of draws.
 
     Raises
     ------
@@ -135,30 +137,32 @@ def fit_short(
         No solution is found.
     """
     sign = before.sign if before is not None else _sign(grid, rows)
-    first_sd = grid.noise_sd_nm / np.sqrt(max(float(np.median(grid.count[rows])), 1.0))
     scale = max(float(np.percentile(np.abs(grid.torque_nm[rows] - np.median(grid.torque_nm[rows][:8])), 98)), 1e-9)
-    noise = NoiseLevel(0.0, 0.0, max(first_sd, 1e-4 * scale))
     largest = float(np.max(grid.pulse_width_us)) if last is None else max(last.largest_us, float(np.max(grid.pulse_width_us)))
     if before is not None:
         largest = max(largest, before.basis.largest_us)
-    work = _Work(grid, rows, sign, scale, largest, last)
+    work = _Work(grid, rows, sign, scale, largest, last, before)
     if before is not None:
-        start = _Start(before.linear, before.three, noise)
+        start = _Start(before.linear, before.three, before.noise)
     elif last is not None:
-        start = _Start(last.linear, last.mean, noise)
+        start = _Start(last.linear, last.mean, work.quiet())
     else:
-        start = min((work.scan(t, noise) for t in STARTS_S), key=lambda found: found[0])[1]
-    return work.fit(start, draws, rounds)
+        start = min((work.scan(t, work.quiet()) for t in STARTS_S), key=lambda found: found[0])[1]
+    return work.fit(start, draws)
 
 
 class _Work:
     """One record and one prior."""
 
     def __init__(
-        self, grid: Grid, rows: np.ndarray, sign: float, scale: float, largest_us: float, last: Earlier | None
+        self, grid: Grid, rows: np.ndarray, sign: float, scale: float, largest_us: float, last: Earlier | None,
+        before: Short | None,
     ) -> None:
         self.grid, self.rows, self.sign, self.scale, self.last = grid, rows, sign, scale, last
         self.largest_us = largest_us
+        self.near = before
+        each = max(float(np.median(grid.count[rows])), 1.0)
+        self.first_sd_nm = max(grid.noise_sd_nm / np.sqrt(each), 1e-4 * scale)
         runs = grid.stretches(rows)
         self.stretches = np.array([r.start for r in runs], np.int64), np.array([r.stop for r in runs], np.int64)
         states = grid.starts.size
@@ -173,6 +177,10 @@ class _Work:
         self.others_mean = np.r_[np.full(grid.begins.size, float(np.median(sign * quiet))), np.zeros(2 * states)]
         self.others_precision = np.diag(1.0 / sd**2)
 
+    def quiet(self) -> NoiseLevel:
+        """The noise of an interval's mean if it is only that of the samples."""
+        return NoiseLevel(0.0, 0.0, self.first_sd_nm)
+
     def prior(self, three: np.ndarray) -> NearShape:
         """The prior of the curve on knots that suit a shape."""
         if self.last is not None:
@@ -180,9 +188,21 @@ class _Work:
         rise = float(np.clip(LOGISTIC_RISE * np.exp(three[2]), 0.02 * self.largest_us, 0.8 * self.largest_us))
         middle = float(np.clip(three[1], 0.0, self.largest_us))
         basis = SplineBasis(dense_knots(self.largest_us, middle, rise))
+        if self._alike(middle, rise):
+            assert self.near is not None
+            basis, rise = self.near.basis, self.near.rise_us
+        else:
+            self.near = None
         mean, precision = new_person(self.largest_us, self.scale)
         plateau = float(np.log(self.scale)) + 0.1, PLATEAU_LOG_SD
         return NearShape(basis, logistic, mean, precision, plateau, rise)
+
+    def _alike(self, middle: float, rise: float) -> bool:
+        """Whether the knots of the fit before this one still suit the curve."""
+        near = self.near
+        if near is None or near.basis.largest_us != self.largest_us:
+            return False
+        return 0.75 < rise / near.rise_us < 1.33 and abs(middle - near.three[1]) < 0.25 * near.rise_us
 
     def scan(self, time_constant_s: float, noise: NoiseLevel) -> tuple[float, _Start]:
         """The best shape for given dynamics from a coarse grid, with its cost."""
@@ -232,37 +252,38 @@ class _Work:
         products = white @ white.T
         return Quadratic(products[:-1, :-1], products[:-1, -1], float(products[-1, -1]), mean, precision)
 
-    def fit(self, start: _Start, draws: int, rounds: int) -> Short:
+    def fit(self, start: _Start, draws: int) -> Short:
         """The whole fit, from a start."""
         linear, noise, prior = start.linear, start.noise, self.prior(start.three)
         n, extras = prior.basis.size, self.others_mean.size
         data = self._data(prior.basis, linear, noise, None)
         flat = CurvePosterior(prior, data)
-        deviation = prior.deviations[MIDDLING]
-        found = flat.mode(flat.start(start.three), deviation)
-        z = np.r_[found.z, np.zeros(3)]
-        x = flat.unknown_to_linear(found.z, deviation)
-        posterior, renewed = flat, False
+        near = [] if self.near is None else list(self.near.modes)
+        chosen = MIDDLING if self.near is None else int(np.argmax(self.near.weights))
+        flat = CurvePosterior(prior, data)
+        z = near[chosen].z[: 3 + n + extras] if near else flat.start(start.three)
+        found = flat.mode(z, prior.deviations[chosen])
+        weights = np.zeros(0)
         for turn in range(OUTER):
+            x = CurvePosterior.linear_of(prior, found)
             posterior = CurvePosterior(prior, self._data(prior.basis, linear, noise, x))
-            found = posterior.mode(z, deviation)
-            z, x = found.z.copy(), posterior.unknown_to_linear(found.z, deviation)
-            moved = x[n + extras :]
-            linear_next = self._bounded(linear, moved)
-            size = float(np.max(np.abs(moved) / self._sd(found)))
-            x, linear = x[: n + extras], linear_next
-            z[-3:] = 0.0
-            if turn and size < SETTLED:
-                if renewed:
-                    break
-                noise, renewed = self._noise(prior.basis, linear, x, noise), True
-        posterior = CurvePosterior(prior, self._data(prior.basis, linear, noise, x))
-        modes = posterior.modes(np.r_[posterior.start(z[:3])[: 3 + n], z[3 + n :]] if prior.deviations[0] < 0.1 else z)
-        weights = np.array([mode.log_evidence for mode in modes])
-        weights = np.exp(weights - weights.max())
-        weights = weights / weights.sum()
-        drawn = posterior.draws(modes, weights, draws, rounds, seed=draws)
-        return self._short(prior, linear, noise, modes, weights, drawn)
+            found = posterior.mode(np.r_[found.z[: 3 + n + extras], np.zeros(3)], prior.deviations[chosen])
+            x = CurvePosterior.linear_of(prior, found)
+            settled = bool(np.max(np.abs(x[n + extras :]) / self._sd(found)) < SETTLED)
+            linear = self._bounded(linear, x[n + extras :])
+            x = x[: n + extras]
+            if not (settled or turn == OUTER - 3):
+                continue
+            noise = self._noise(prior.basis, linear, x, noise)
+            posterior = CurvePosterior(prior, self._data(prior.basis, linear, noise, x))
+            near = posterior.modes(np.r_[found.z[: 3 + n + extras], np.zeros(3)], near)
+            weights = _probabilities(near)
+            if int(np.argmax(weights)) == chosen:
+                break
+            chosen = int(np.argmax(weights))
+            found, linear = near[chosen], self._bounded(linear, near[chosen].z[-3:])
+        drawn = posterior.draws(near, weights, draws, seed=draws)
+        return self._short(prior, linear, noise, near, weights, drawn)
 
     def _sd(self, mode: Mode) -> np.ndarray:
         inverse = np.linalg.solve(mode.root, np.eye(mode.z.size)[:, -3:])
@@ -285,13 +306,11 @@ class _Work:
     def _noise(self, basis: SplineBasis, linear: SecondOrder, x: np.ndarray, near: NoiseLevel) -> NoiseLevel:
         """The noise of the residual; at least that of the samples, and correlated only where that is plain."""
         residual = self._residual(basis, linear, x)
-        white = profile(residual, self.stretches, NoiseLevel(0.0, 0.0, near.sd_nm), False)
         sd = float(np.sqrt(np.mean(residual[self.rows] ** 2)))
-        own = NoiseLevel(0.0, 0.0, max(sd, near.sd_nm))
-        wide, likelihood = profile(residual, self.stretches, NoiseLevel(0.5, 0.5, near.sd_nm), True)
-        flat = -0.5 * self.rows.sum() * (np.log(2 * np.pi * sd * sd) + 1.0)
-        del white
-        return replace(wide, sd_nm=max(wide.sd_nm, near.sd_nm)) if likelihood > flat + CORRELATED else own
+        own = NoiseLevel(0.0, 0.0, max(sd, self.first_sd_nm))
+        slow, likelihood = profile(residual, self.stretches, NoiseLevel(0.5, 0.5, near.sd_nm), True)
+        flat = -0.5 * float(self.rows.sum()) * (np.log(2 * np.pi * sd * sd) + 1.0)
+        return replace(slow, sd_nm=max(slow.sd_nm, own.sd_nm)) if likelihood > flat + CORRELATED else own
 
     def _short(
         self,
@@ -331,7 +350,14 @@ class _Work:
             residual_nm=self._residual(prior.basis, centre, best[: n + extras]),
             three=likely.z[:3],
             likely=best[: n + extras],
+            rise_us=prior.rise_us,
         )
+
+
+def _probabilities(modes: list[Mode]) -> np.ndarray:
+    weights = np.array([mode.log_evidence for mode in modes])
+    weights = np.exp(weights - weights.max())
+    return weights / weights.sum()
 
 
 def _sign(grid: Grid, rows: np.ndarray) -> float:

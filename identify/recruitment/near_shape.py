@@ -18,9 +18,9 @@ import numpy as np
 from identify.recruitment.spline import SplineBasis
 
 KNOTS = 61
-DEVIATIONS = (0.05, 0.35, 0.9, 1.8, 3.5)
-"""Standard deviations of the log density's deviation from the shape. 0.05 is the shape itself; with 3.5 the density
-changes by a factor of 30 from place to place: a jump, a gap between two groups of motor units, or single large
+DEVIATIONS = (0.05, 0.4, 1.1, 2.6)
+"""Standard deviations of the log density's deviation from the shape. 0.05 is the shape itself; with 2.6 the density
+changes by a factor of 13 from place to place: a jump, a gap between two groups of motor units, or single large
 units."""
 SMOOTH_SHARE = 0.6
 """Share of the deviation's variance that is smooth; the rest is rough."""
@@ -28,14 +28,15 @@ SMOOTH_LENGTH, ROUGH_LENGTH = 0.8, 0.25
 """Lengths over which the two parts change, relative to the rise from 10 to 90 %."""
 LEAST_STEP = 1e-9
 """A step is at least this share of the gain, so that its logarithm exists."""
-NUDGE = 1e-4
 
-Shape = Callable[[np.ndarray], np.ndarray]
+Shape = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+"""A shape in standard units: its value, from 0 to 1, and its slope."""
 
 
-def logistic(x: np.ndarray) -> np.ndarray:
+def logistic(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The paper's sigmoid in standard units: its steepness is 1 at the middle 0."""
-    return 0.5 * (1.0 + np.tanh(0.5 * x))
+    value = 0.5 * (1.0 + np.tanh(0.5 * x))
+    return value, value * (1.0 - value)
 
 
 LOGISTIC_RISE = 4.394
@@ -80,15 +81,19 @@ class NearShape:
 
     def log_steps(self, three: np.ndarray) -> np.ndarray:
         """Logarithms of the steps of the shape itself, shape (..., n), for (log gain, middle, log width)."""
-        gain, middle, width = three[..., :1], three[..., 1:2], np.exp(three[..., 2:3])
-        share = self.shape((self.places_us - middle) / width)
-        return gain + np.log(np.diff(share, axis=-1) + LEAST_STEP)
+        share = self.shape((self.places_us - three[..., 1:2]) / np.exp(three[..., 2:3]))[0]
+        return three[..., :1] + np.log(share[..., 1:] - share[..., :-1] + LEAST_STEP)
 
-    def slopes(self, three: np.ndarray) -> np.ndarray:
-        """Derivatives of `log_steps` by the three parameters, shape (n, 3)."""
-        nudge = NUDGE * np.array([1.0, np.exp(three[2]), 1.0])
-        near = self.log_steps(three + np.diag(nudge)) - self.log_steps(three - np.diag(nudge))
-        return near.T / (2.0 * nudge)
+    def log_steps_and_slopes(self, three: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
+        """`log_steps`, and its derivatives by middle and log width, each of shape (..., n); that by log gain is 1."""
+        width = np.exp(three[..., 2:3])
+        x = (self.places_us - three[..., 1:2]) / width
+        share, slope = self.shape(x)
+        step = share[..., 1:] - share[..., :-1] + LEAST_STEP
+        turned = x * slope
+        by_middle = (slope[..., :-1] - slope[..., 1:]) / (width * step)
+        by_width = (turned[..., :-1] - turned[..., 1:]) / step
+        return three[..., :1] + np.log(step), (by_middle, by_width)
 
     @cached_property
     def root(self) -> np.ndarray:
