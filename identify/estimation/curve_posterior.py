@@ -49,12 +49,12 @@ class Quadratic:
 
 @dataclass(frozen=True)
 class Mode:
-    """The most probable unknowns for one size of the deviation.
+    """The most probable unknowns for one kind of deviation.
 
     Parameters
     ----------
-    deviation : float
-        Its standard deviation.
+    kind : int
+        Index of the kind of the curve's deviation.
     z : ndarray
         Unknowns.
     log_evidence : float
@@ -63,7 +63,7 @@ class Mode:
         Lower Cholesky root of the information at the mode.
     """
 
-    deviation: float
+    kind: int
     z: np.ndarray
     log_evidence: float
     root: np.ndarray
@@ -95,41 +95,36 @@ class CurvePosterior:
         """Unknowns at a shape, without deviation."""
         return np.r_[three, np.zeros(self.n), self.data.mean]
 
-    def unknown_to_linear(self, z: np.ndarray, deviation: np.ndarray | float) -> np.ndarray:
-        """x = (steps, further parameters) of unknowns, shape (..., N)."""
-        size = np.asarray(deviation)[..., None]
-        log_steps = self.prior.log_steps(z[..., :3]) + size * (z[..., 3 : 3 + self.n] @ self.prior.root.T)
-        return np.concatenate([np.exp(np.minimum(log_steps, 50.0)), z[..., self.others]], axis=-1)
-
     @classmethod
     def linear_of(cls, prior: NearShape, mode: Mode) -> np.ndarray:
         """x at a mode."""
-        log_steps = prior.log_steps(mode.z[:3]) + mode.deviation * (prior.root @ mode.z[3 : 3 + prior.basis.size])
+        log_steps = prior.log_steps(mode.z[:3]) + prior.roots[mode.kind] @ mode.z[3 : 3 + prior.basis.size]
         return np.r_[np.exp(log_steps), mode.z[3 + prior.basis.size :]]
 
-    def _beyond(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _beyond(self, x: np.ndarray) -> tuple[float, float]:
         """How far the log of the plateau is from what is expected, in standard deviations, and the plateau, N·m."""
         mean, sd = self.prior.plateau
-        total = np.sum(x[..., : self.n], axis=-1)
-        return (np.log(total) - mean) / sd, total
+        total = float(np.sum(x[: self.n]))
+        return (float(np.log(total)) - mean) / sd, total
 
-    def value(self, z: np.ndarray, deviation: np.ndarray | float) -> np.ndarray:
-        """Log posterior, up to a constant, shape (...)."""
-        x, away = self.unknown_to_linear(z, deviation), z - self.mean
-        fit = np.sum((x @ self.data.gram - 2.0 * self.data.moment) * x, axis=-1) + self.data.energy
-        return -0.5 * fit - 0.5 * np.sum((away @ self.precision) * away, axis=-1) - 0.5 * self._beyond(x)[0] ** 2
+    def value(self, z: np.ndarray, kind: int) -> float:
+        """Log posterior, up to a constant."""
+        log_steps = self.prior.log_steps(z[:3]) + self.prior.roots[kind] @ z[3 : 3 + self.n]
+        x, away = np.r_[np.exp(np.minimum(log_steps, 50.0)), z[self.others]], z - self.mean
+        fit = x @ (self.data.gram @ x - 2.0 * self.data.moment) + self.data.energy
+        return float(-0.5 * (fit + away @ self.precision @ away + self._beyond(x)[0] ** 2))
 
-    def mode(self, z: np.ndarray, deviation: float) -> Mode:
+    def mode(self, z: np.ndarray, kind: int) -> Mode:
         """The mode nearest to a start, by damped Gauss-Newton steps."""
-        value, damping = float(self.value(z, deviation)), 1e-4
+        value, damping, trial = self.value(z, kind), 1e-4, 0.0
         for _ in range(STEPS):
-            gradient, information, by_z = self._bent(z, deviation)
+            gradient, information, by_z = self._bent(z, kind)
             moved = None
             while damping < 1e8:
                 step = _solve(information, gradient, damping)[0]
                 # What is negligible may change as it likes.
                 step = step / max(float(np.max(np.abs(by_z @ step[: 3 + self.n]))) / LARGEST_LOG, 1.0)
-                trial = float(self.value(z + step, deviation))
+                trial = self.value(z + step, kind)
                 if trial > value - 1e-9:
                     moved = step
                     break
@@ -139,21 +134,21 @@ class CurvePosterior:
             gain, z, value, damping = trial - value, z + moved, trial, max(damping / 8.0, 1e-7)
             if gain < ENOUGH:
                 break
-        root = _solve(self._bent(z, deviation)[1], np.zeros(z.size), 1e-9)[1]
+        root = _solve(self._bent(z, kind)[1], np.zeros(z.size), 1e-9)[1]
         evidence = value + 0.5 * float(np.linalg.slogdet(self.precision)[1]) - float(np.sum(np.log(np.diag(root))))
-        return Mode(deviation, z, evidence, root)
+        return Mode(kind, z, evidence, root)
 
-    def _slopes(self, z: np.ndarray, deviation: float) -> tuple[np.ndarray, np.ndarray]:
+    def _slopes(self, z: np.ndarray, kind: int) -> tuple[np.ndarray, np.ndarray]:
         """Logs of the steps, shape (n,), and their derivatives by z's first entries, shape (n, 3 + n)."""
         log_steps, (by_middle, by_width) = self.prior.log_steps_and_slopes(z[:3])
-        shaped = deviation * self.prior.root
+        shaped = self.prior.roots[kind]
         slopes = np.concatenate([np.ones((self.n, 1)), by_middle[:, None], by_width[:, None], shaped], axis=1)
         return log_steps + shaped @ z[3 : 3 + self.n], slopes
 
-    def _bent(self, z: np.ndarray, deviation: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _bent(self, z: np.ndarray, kind: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Gradient and information (positive definite) of the log posterior, and slopes of the logs that matter."""
         n = self.n
-        log_steps, by_z = self._slopes(z, deviation)
+        log_steps, by_z = self._slopes(z, kind)
         x = np.r_[np.exp(log_steps), z[self.others]]
         pull = self.data.moment - self.data.gram @ x
         slopes = np.zeros((x.size, z.size))
@@ -166,15 +161,17 @@ class CurvePosterior:
         return gradient, information, by_z[log_steps > log_steps.max() - 9.0]
 
     def modes(self, z: np.ndarray, near: Sequence[Mode] = ()) -> list[Mode]:
-        """The mode for each size of the deviation, each started from the one before, or from `near`."""
+        """The mode for each kind of deviation, each started from the one before, or from `near`."""
         found: list[Mode] = []
-        for index, deviation in enumerate(self.prior.deviations):
+        for kind in range(len(self.prior.deviations)):
             if near:
-                z = np.r_[near[index].z[: 3 + self.n], z[3 + self.n :]]
+                z = np.r_[near[kind].z[: 3 + self.n], z[3 + self.n :]]
             elif found:
-                z = z.copy()
-                z[3 : 3 + self.n] *= found[-1].deviation / deviation
-            found.append(self.mode(z, deviation))
+                moved = self.prior.roots[kind - 1] @ z[3 : 3 + self.n]
+                own = solve_triangular(self.prior.roots[kind], moved, lower=True)
+                # What is rough in one kind may be all but impossible in another: its share is left out.
+                z = np.r_[z[:3], own if own @ own < self.n else np.zeros(self.n), z[3 + self.n :]]
+            found.append(self.mode(z, kind))
             z = found[-1].z
         return found
 
@@ -191,11 +188,14 @@ class CurvePosterior:
         return x
 
     def _moved(self, mode: Mode, normal: np.ndarray) -> np.ndarray:
-        """Changes of x by unit normals, with Laplace's covariance."""
-        lift = solve_triangular(mode.root, normal.T, lower=True, trans=1).T
-        log_steps, by_z = self._slopes(mode.z, mode.deviation)
-        steps = np.exp(log_steps) * (lift[:, : 3 + self.n] @ by_z.T)
-        return np.concatenate([steps, lift[:, self.others]], axis=1)
+        """Changes of x by unit normals, with Laplace's covariance in the steps."""
+        log_steps, by_z = self._slopes(mode.z, mode.kind)
+        size = self.prior.blurred(np.exp(log_steps))
+        slopes = np.zeros((self.n + self.data.mean.size, mode.z.size))
+        slopes[: self.n, : 3 + self.n] = size[:, None] * by_z
+        slopes[self.n :, self.others] = np.eye(self.data.mean.size)
+        root = _solve(slopes.T @ self.data.gram @ slopes + self.precision, np.zeros(mode.z.size), 1e-9)[1]
+        return solve_triangular(root, normal.T, lower=True, trans=1).T @ slopes.T
 
 
 def _solve(matrix: np.ndarray, right: np.ndarray, damping: float) -> tuple[np.ndarray, np.ndarray]:

@@ -26,7 +26,7 @@ OUTER = 8
 SETTLED = 0.05
 """The dynamics have settled when they move by less than this share of their standard deviation."""
 MIDDLING = 1
-"""Index of the size of the deviation with which the dynamics are searched."""
+"""Index of the kind of deviation with which the dynamics are searched."""
 STARTS_S = (0.08, 0.2, 0.45)
 CORRELATED = 6.0
 """Log likelihood by which correlated noise must explain the residual better before it is believed."""
@@ -57,7 +57,7 @@ class Short:
     others_nm : ndarray, shape (S, E)
         Draws of the baselines and initial states (torque, N·m, and rate, N·m/s).
     modes : tuple of Mode
-        One for each size of the curve's deviation from the known shape.
+        One for each kind of the curve's deviation from the known shape.
     weights : ndarray, shape (M,)
         Their probabilities.
     noise : NoiseLevel
@@ -262,12 +262,12 @@ class _Work:
         chosen = MIDDLING if self.near is None else int(np.argmax(self.near.weights))
         flat = CurvePosterior(prior, data)
         z = near[chosen].z[: 3 + n + extras] if near else flat.start(start.three)
-        found = flat.mode(z, prior.deviations[chosen])
+        found = flat.mode(z, chosen)
         weights = np.zeros(0)
         for turn in range(OUTER):
             x = CurvePosterior.linear_of(prior, found)
             posterior = CurvePosterior(prior, self._data(prior.basis, linear, noise, x))
-            found = posterior.mode(np.r_[found.z[: 3 + n + extras], np.zeros(3)], prior.deviations[chosen])
+            found = posterior.mode(np.r_[found.z[: 3 + n + extras], np.zeros(3)], chosen)
             x = CurvePosterior.linear_of(prior, found)
             settled = bool(np.max(np.abs(x[n + extras :]) / self._sd(found)) < SETTLED)
             linear = self._bounded(linear, x[n + extras :])

@@ -10,6 +10,9 @@ from identify.estimation.short_record import Short
 
 POINTS = 61
 LEVEL = 0.95
+EVEN = 0.6
+"""The band is at least about this share of its largest width everywhere: where a curve has a sudden bend, the draws
+know its place too well."""
 LEAST_SD = 1e-4
 """Standard deviations below this share of the plateau count as this share, so that a point that is known exactly (zero
 at zero width) does not decide."""
@@ -92,6 +95,7 @@ def knowledge(short: Short, points: int = POINTS) -> Knowledge:
 def whole_band(at: np.ndarray, draws: np.ndarray) -> Band:
     """The band about the mean in which 95 % of the drawn curves lie as a whole."""
     mean, sd = draws.mean(axis=0), np.maximum(draws.std(axis=0), LEAST_SD)
+    sd = np.hypot(sd, EVEN * sd.max())
     farthest = np.max(np.abs(draws - mean) / sd, axis=1)
     return Band(at, mean, float(np.quantile(farthest, LEVEL)) * sd)
 

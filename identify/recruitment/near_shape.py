@@ -18,14 +18,29 @@ import numpy as np
 from identify.recruitment.spline import SplineBasis
 
 KNOTS = 61
-DEVIATIONS = (0.05, 0.4, 1.1, 2.6)
-"""Standard deviations of the log density's deviation from the shape. 0.05 is the shape itself; with 2.6 the density
-changes by a factor of 13 from place to place: a jump, a gap between two groups of motor units, or single large
-units."""
-SMOOTH_SHARE = 0.6
-"""Share of the deviation's variance that is smooth; the rest is rough."""
-SMOOTH_LENGTH, ROUGH_LENGTH = 0.8, 0.25
+@dataclass(frozen=True)
+class Deviation:
+    """One kind of deviation of the log density from the shape.
+
+    Parameters
+    ----------
+    sd : float
+        Its standard deviation.
+    smooth_share : float
+        Share of its variance that is smooth; the rest is rough, as from single large units or at a sudden beginning.
+    """
+
+    sd: float
+    smooth_share: float
+
+
+DEVIATIONS = (Deviation(0.05, 1.0), Deviation(0.4, 0.8), Deviation(1.1, 0.8), Deviation(1.6, 0.0), Deviation(3.2, 0.2))
+"""The first is the shape itself. With the last the density changes by a factor of 25 from place to place: a jump, a gap
+between two groups of motor units, or single large units. Their probabilities come from the data."""
+SMOOTH_LENGTH, ROUGH_LENGTH = 0.8, 0.4
 """Lengths over which the two parts change, relative to the rise from 10 to 90 %."""
+BLUR = 0.12
+"""Distance, relative to the rise, over which a step may be as large as its neighbours."""
 LEAST_STEP = 1e-9
 """A step is at least this share of the gain, so that its logarithm exists."""
 
@@ -61,8 +76,8 @@ class NearShape:
         Mean and standard deviation of the log of the plateau, N·m: the sum of all steps, with their deviations.
     rise_us : float
         Rise from 10 to 90 %, µs: the scale of the deviation.
-    deviations : tuple of float
-        Standard deviations of the log density's deviation that are averaged over.
+    deviations : tuple of Deviation
+        Kinds of the log density's deviation that are averaged over.
     """
 
     basis: SplineBasis
@@ -71,7 +86,7 @@ class NearShape:
     precision: np.ndarray
     plateau: tuple[float, float]
     rise_us: float
-    deviations: tuple[float, ...] = DEVIATIONS
+    deviations: tuple[Deviation, ...] = DEVIATIONS
 
     @cached_property
     def places_us(self) -> np.ndarray:
@@ -96,14 +111,32 @@ class NearShape:
         return three[..., :1] + np.log(step), (by_middle, by_width)
 
     @cached_property
-    def root(self) -> np.ndarray:
-        """A root of the deviation's covariance for a standard deviation of 1, shape (n, n)."""
+    def roots(self) -> tuple[np.ndarray, ...]:
+        """A root of the covariance of each kind of deviation, shape (n, n)."""
         at = 0.5 * (self.places_us[1:] + self.places_us[:-1])
         away = np.abs(at[:, None] - at[None, :]) / self.rise_us
-        smooth = np.sqrt(3.0) * away / SMOOTH_LENGTH
-        covariance = SMOOTH_SHARE * (1.0 + smooth) * np.exp(-smooth)
-        covariance += (1.0 - SMOOTH_SHARE) * np.exp(-away / ROUGH_LENGTH)
-        return np.linalg.cholesky(covariance + 1e-9 * np.eye(at.size))
+        scaled = np.sqrt(3.0) * away / SMOOTH_LENGTH
+        smooth, rough = (1.0 + scaled) * np.exp(-scaled), np.exp(-away / ROUGH_LENGTH)
+        found = []
+        for kind in self.deviations:
+            covariance = kind.smooth_share * smooth + (1.0 - kind.smooth_share) * rough
+            found.append(kind.sd * np.linalg.cholesky(covariance + 1e-9 * np.eye(at.size)))
+        return tuple(found)
+
+    def blurred(self, steps: np.ndarray) -> np.ndarray:
+        """How large a step may be, judging by itself and by the density of its neighbours, shape (n,).
+
+        Beside a jump of the density a step is small, but where exactly the jump is is not known: the small steps there
+        may be as large as their neighbours.
+        """
+        return np.maximum(steps, self._blur @ steps)
+
+    @cached_property
+    def _blur(self) -> np.ndarray:
+        gaps = np.diff(self.places_us)
+        at = 0.5 * (self.places_us[1:] + self.places_us[:-1])
+        weight = np.exp(-0.5 * ((at[:, None] - at[None, :]) / (BLUR * self.rise_us)) ** 2) * gaps[None, :]
+        return gaps[:, None] * (weight / weight.sum(axis=1)[:, None]) / gaps[None, :]
 
 
 def dense_knots(largest_us: float, middle_us: float, rise_us: float, count: int = KNOTS) -> np.ndarray:
