@@ -1,4 +1,4 @@
-"""The draws of a short record's fit as one solved problem: their mean and covariance, for tests, bands and MODEL.json."""
+"""The draws of a short record's fit as one solved problem, for tests, bands and MODEL.json."""
 
 from __future__ import annotations
 
@@ -36,7 +36,15 @@ class Averaged(Fitted):
 
 
 def averaged(short: Short, mean_of_draws: bool = True) -> Averaged:
-    """The solved problem of a fit by draws, in the parameters of `simulation.problem`: their mean, or the most probable."""
+    """The solved problem of a fit by draws, in the parameters of `simulation.problem`.
+
+    Parameters
+    ----------
+    short : Short
+        The fit.
+    mean_of_draws : bool
+        The parameters are the mean of the draws; else the most probable ones.
+    """
     setup = _setup(short)
     draws = _parameters(short, setup)
     theta = draws.mean(axis=0) if mean_of_draws else _likely(short, setup)
@@ -47,7 +55,9 @@ def averaged(short: Short, mean_of_draws: bool = True) -> Averaged:
     information = gram(white)
     hessian = _inverse(np.cov(draws.T))
     at = first.coefficients
-    problem = Problem(setup.with_(roughness=_positive((hessian - information)[at, at])), [])
+    # The draws' centre is where data and prior balance: nothing pulls the curve away from it.
+    own = setup.with_(roughness=_positive((hessian - information)[at, at]), curve_nm=theta[at])
+    problem = Problem(own, [])
     residual = setup.target_nm - mean
     shown = float(np.trace(np.linalg.solve(hessian + 1e-12 * np.diag(np.diag(hessian)), information)))
     return Averaged(

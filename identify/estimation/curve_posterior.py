@@ -1,9 +1,9 @@
 """Posterior of a curve that never falls, for linearised dynamics: modes, evidence of each deviation, and draws.
 
 The data enter as a quadratic form, so nothing here needs the record. Unknowns are z = (log gain, middle, log width,
-standard deviates of the curve's deviation, further parameters in which the prediction is linear). Draws follow Laplace's
-approximation, but linearised in the steps and not in their logarithms: the prediction is linear in the steps, so every
-draw fits the data as well as it should.
+standard deviates of the curve's deviation, further parameters in which the prediction is linear). Draws follow the
+approximation of Laplace, but linearised in the steps and not in their logarithms: the prediction is linear in the
+steps, so every draw fits the data as well as it should.
 """
 
 from __future__ import annotations
@@ -176,7 +176,7 @@ class CurvePosterior:
         return found
 
     def draws(self, modes: Sequence[Mode], weights: np.ndarray, count: int, seed: int) -> np.ndarray:
-        """Draws of x from the posterior averaged over the modes, shape (count, N); always the same for the same data."""
+        """Draws of x, averaged over the modes, shape (count, N); always the same for the same data."""
         rng = np.random.default_rng(seed)
         share = (np.arange(count) + 0.5) / count
         which = np.minimum(np.searchsorted(np.cumsum(weights) / np.sum(weights), share), len(modes) - 1)
@@ -206,5 +206,3 @@ def _solve(matrix: np.ndarray, right: np.ndarray, damping: float) -> tuple[np.nd
     if failed:
         raise np.linalg.LinAlgError("the information is not positive definite")
     return lapack.dpotrs(root, right, lower=1)[0], root  # pyright: ignore[reportAttributeAccessIssue]
-
-

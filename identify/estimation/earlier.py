@@ -15,7 +15,7 @@ import numpy as np
 from identify.dynamics.linear import SecondOrder
 from identify.errors import BadRequest
 from identify.model import Model
-from identify.recruitment.near_shape import Deviation, NearShape, dense_knots
+from identify.recruitment.near_shape import KNOTS, Deviation, NearShape, dense_knots
 from identify.recruitment.spline import SplineBasis
 
 EARLIER_DEVIATIONS = (Deviation(0.05, 1.0), Deviation(0.3, 0.8), Deviation(0.9, 0.8), Deviation(2.2, 0.2))
@@ -158,11 +158,11 @@ class Earlier:
         at, value, slope = self._standard
         return np.interp(x, at, value), np.interp(x, at, slope, left=0.0, right=0.0)
 
-    def curve_prior(self, largest_us: float) -> NearShape:
+    def curve_prior(self, largest_us: float, knots: int = KNOTS) -> NearShape:
         """The prior of this session's curve."""
         _, low, middle, high = self._marks
         rise = max(high - low, 0.02 * largest_us)
-        basis = SplineBasis(dense_knots(largest_us, middle, rise))
+        basis = SplineBasis(dense_knots(largest_us, middle, rise, knots))
         sd = np.array([self.change.gain_log, self.change.middle_us, self.change.width_log])
         own = np.array([self._sd("plateau_nm") / self._marks[0], 0.0, 0.0])
         plateau = float(self.mean[0]), 2.0 * float(np.hypot(sd[0], own[0]))

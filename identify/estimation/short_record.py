@@ -17,7 +17,16 @@ from identify.estimation.curve_posterior import CurvePosterior, Mode, Quadratic
 from identify.estimation.earlier import Earlier
 from identify.estimation.projection import Projection
 from identify.noise.level import NoiseLevel, profile, whitened
-from identify.recruitment.near_shape import LOGISTIC_RISE, PLATEAU_LOG_SD, NearShape, dense_knots, logistic, new_person
+from identify.recruitment.near_shape import (
+    FINE_KNOTS,
+    KNOTS,
+    LOGISTIC_RISE,
+    PLATEAU_LOG_SD,
+    NearShape,
+    dense_knots,
+    logistic,
+    new_person,
+)
 from identify.recruitment.spline import SplineBasis
 
 DRAWS = 400
@@ -88,6 +97,11 @@ class Short:
     likely: np.ndarray
     rise_us: float
 
+    @property
+    def largest_us(self) -> float:
+        """Largest width of the curve, µs."""
+        return self.basis.largest_us
+
     @cached_property
     def mean_nm(self) -> np.ndarray:
         """Mean of the curve's coefficients, N·m."""
@@ -114,6 +128,7 @@ def fit_short(
     *,
     last: Earlier | None = None,
     before: Short | None = None,
+    fine: bool = False,
     draws: int = DRAWS,
 ) -> Short:
     """Fit a short record.
@@ -128,6 +143,8 @@ def fit_short(
         What is known of this person from the last session.
     before : Short, optional
         The fit to a shorter part of the same record: the search starts there.
+    fine : bool
+        Twice the knots, for a curve with a sudden bend.
     draws : int
         Number of draws.
 
@@ -138,10 +155,9 @@ def fit_short(
     """
     sign = before.sign if before is not None else _sign(grid, rows)
     scale = max(float(np.percentile(np.abs(grid.torque_nm[rows] - np.median(grid.torque_nm[rows][:8])), 98)), 1e-9)
-    largest = float(np.max(grid.pulse_width_us)) if last is None else max(last.largest_us, float(np.max(grid.pulse_width_us)))
-    if before is not None:
-        largest = max(largest, before.basis.largest_us)
-    work = _Work(grid, rows, sign, scale, largest, last, before)
+    known_us = [known.largest_us for known in (last, before) if known is not None]
+    largest = max([float(np.max(grid.pulse_width_us)), *known_us])
+    work = _Work(grid, rows, sign, scale, largest, last, before, fine)
     if before is not None:
         start = _Start(before.linear, before.three, before.noise)
     elif last is not None:
@@ -155,11 +171,19 @@ class _Work:
     """One record and one prior."""
 
     def __init__(
-        self, grid: Grid, rows: np.ndarray, sign: float, scale: float, largest_us: float, last: Earlier | None,
+        self,
+        grid: Grid,
+        rows: np.ndarray,
+        sign: float,
+        scale: float,
+        largest_us: float,
+        last: Earlier | None,
         before: Short | None,
+        fine: bool,
     ) -> None:
         self.grid, self.rows, self.sign, self.scale, self.last = grid, rows, sign, scale, last
         self.largest_us = largest_us
+        self.knots = FINE_KNOTS if fine else KNOTS
         self.near = before
         each = max(float(np.median(grid.count[rows])), 1.0)
         self.first_sd_nm = max(grid.noise_sd_nm / np.sqrt(each), 1e-4 * scale)
@@ -184,11 +208,13 @@ class _Work:
     def prior(self, three: np.ndarray) -> NearShape:
         """The prior of the curve on knots that suit a shape."""
         if self.last is not None:
-            return self.last.curve_prior(self.largest_us)
+            prior = self.last.curve_prior(self.largest_us, self.knots)
+            self.near = self.near if self._alike(prior.basis, float(self.last.mean[1]), prior.rise_us) else None
+            return prior
         rise = float(np.clip(LOGISTIC_RISE * np.exp(three[2]), 0.02 * self.largest_us, 0.8 * self.largest_us))
         middle = float(np.clip(three[1], 0.0, self.largest_us))
-        basis = SplineBasis(dense_knots(self.largest_us, middle, rise))
-        if self._alike(middle, rise):
+        basis = SplineBasis(dense_knots(self.largest_us, middle, rise, self.knots))
+        if self._alike(basis, middle, rise):
             assert self.near is not None
             basis, rise = self.near.basis, self.near.rise_us
         else:
@@ -197,10 +223,10 @@ class _Work:
         plateau = float(np.log(self.scale)) + 0.1, PLATEAU_LOG_SD
         return NearShape(basis, logistic, mean, precision, plateau, rise)
 
-    def _alike(self, middle: float, rise: float) -> bool:
+    def _alike(self, basis: SplineBasis, middle: float, rise: float) -> bool:
         """Whether the knots of the fit before this one still suit the curve."""
         near = self.near
-        if near is None or near.basis.largest_us != self.largest_us:
+        if near is None or near.basis.largest_us != self.largest_us or near.basis.size != basis.size:
             return False
         return 0.75 < rise / near.rise_us < 1.33 and abs(middle - near.three[1]) < 0.25 * near.rise_us
 
@@ -229,14 +255,12 @@ class _Work:
                     best = cost, np.array([np.log(found[0]), middle, np.log(width)])
         return best[0], _Start(linear, best[1], noise)
 
-    def _data(
-        self, basis: SplineBasis, linear: SecondOrder, noise: NoiseLevel, x: np.ndarray | None
-    ) -> Quadratic:
+    def _data(self, basis: SplineBasis, linear: SecondOrder, noise: NoiseLevel, x: np.ndarray | None) -> Quadratic:
         """The quadratic form at some dynamics; with the derivatives by the dynamics if a curve is given."""
         projection = Projection(self.grid, basis, np.zeros((basis.size, basis.size)), self.rows)
         columns = projection.columns(linear)
         n = basis.size
-        columns[:, :n] = np.cumsum(columns[:, n - 1 :: -1] if n == columns.shape[1] else columns[:, :n][:, ::-1], axis=1)[:, ::-1]
+        columns[:, :n] = np.cumsum(columns[:, :n][:, ::-1], axis=1)[:, ::-1]
         mean, precision = self.others_mean, self.others_precision
         if x is not None:
             coefficients = np.r_[np.cumsum(x[:n]), x[n : columns.shape[1]]]
@@ -257,7 +281,6 @@ class _Work:
         linear, noise, prior = start.linear, start.noise, self.prior(start.three)
         n, extras = prior.basis.size, self.others_mean.size
         data = self._data(prior.basis, linear, noise, None)
-        flat = CurvePosterior(prior, data)
         near = [] if self.near is None else list(self.near.modes)
         chosen = MIDDLING if self.near is None else int(np.argmax(self.near.weights))
         flat = CurvePosterior(prior, data)
@@ -293,9 +316,7 @@ class _Work:
         t = linear.time_constant_s * float(np.exp(np.clip(moved[0], -0.7, 0.7)))
         z = linear.damping * float(np.exp(np.clip(moved[1], -0.7, 0.7)))
         delay = float(np.clip(linear.delay_s + moved[2], *self.grid.delay_bounds_s))
-        return SecondOrder(
-            float(np.clip(t, *TIME_CONSTANT_BOUNDS_S)), float(np.clip(z, *DAMPING_BOUNDS)), delay
-        )
+        return SecondOrder(float(np.clip(t, *TIME_CONSTANT_BOUNDS_S)), float(np.clip(z, *DAMPING_BOUNDS)), delay)
 
     def _residual(self, basis: SplineBasis, linear: SecondOrder, x: np.ndarray) -> np.ndarray:
         projection = Projection(self.grid, basis, np.zeros((basis.size, basis.size)), self.rows)

@@ -13,6 +13,7 @@ from typing import Literal
 
 import numpy as np
 
+from identify.dynamics.pulse_grid import Grid
 from identify.errors import BadRequest, IdentifyError
 from identify.estimation.averaged import averaged
 from identify.estimation.earlier import Change, Earlier, learn_change
@@ -26,6 +27,7 @@ from identify.experiments.pieces import Piece, pieces
 from identify.experiments.target import Target
 from identify.model import Model
 from identify.records.record import Record
+from identify.recruitment.near_shape import KNOTS
 
 Kind = Literal["next", "enough", "misfit", "spent"]
 REST_S, RISE_S, TOP_S, FALL_S = 0.5, 1.0, 0.3, 0.5
@@ -140,11 +142,10 @@ def decide(
     try:
         grid, _ = prepare(record)
         with np.errstate(all="ignore"):
-            short = fit_short(grid, grid.fitted, last=last, before=before.short if before else None)
+            short, wrong = _fitted(grid, last, before.short if before else None)
     except (np.linalg.LinAlgError, IdentifyError) as error:
         return Decision("misfit", words=f"No model can be fitted ({error}): the rest of the fixed test is played.")
     known = knowledge(short)
-    wrong = _misfit(short, known)
     if wrong:
         return Decision("misfit", words=f"{wrong}: the rest of the fixed test is played.", knowledge=known, short=short)
     if known.curve.percent <= target.curve_percent and known.step.percent <= target.step_percent:
@@ -160,16 +161,29 @@ def _check(**numbers: float) -> None:
 
 def _opening(largest_us: float, rate: float, left_s: float, left_nm_s: float, last: Earlier | None) -> Decision:
     rise = largest_us * np.arange(1, round(RISE_S * rate) + 1) / round(RISE_S * rate)
-    widths = np.r_[np.zeros(round(REST_S * rate)), rise, np.full(round(TOP_S * rate), largest_us), np.zeros(round(FALL_S * rate))]
+    widths = np.r_[
+        np.zeros(round(REST_S * rate)), rise, np.full(round(TOP_S * rate), largest_us), np.zeros(round(FALL_S * rate))
+    ]
     dose = 0.0 if last is None else float(np.sum(np.abs(last.model.recruitment(widths))) / rate)
     if widths.size / rate > left_s or dose > left_nm_s:
         return Decision("spent", words="The dose or time that is left does not allow a first piece.")
     return Decision("next", (Piece("opening", widths).segment(1),), "A first look at the whole range.", None, dose)
 
 
-def _misfit(short: Short, known: Knowledge) -> str | None:
+def _fitted(grid: Grid, last: Earlier | None, before: Short | None) -> tuple[Short, str | None]:
+    """The fit, and why it does not describe the record; with more knots where the usual number leaves a residual."""
+    fine = before is not None and before.basis.knots_us.size > KNOTS
+    short = fit_short(grid, grid.fitted, last=last, before=before, fine=fine)
+    wrong = _misfit(short)
+    if wrong and not fine:
+        short = fit_short(grid, grid.fitted, last=last, before=short, fine=True)
+        wrong = _misfit(short)
+    return short, wrong
+
+
+def _misfit(short: Short) -> str | None:
     """Why the structure does not describe the record; None if it does, or if it is too early to say."""
-    if not np.isfinite(known.curve.percent) or not np.isfinite(known.step.percent):
+    if not np.all(np.isfinite(short.coefficients_nm)) or not np.all(np.isfinite(short.dynamics)):
         return "The estimate is not finite"
     if short.grid.size * short.grid.step_s < SETTLED_S:
         return None
@@ -183,7 +197,13 @@ def _misfit(short: Short, known: Knowledge) -> str | None:
 
 
 def _next(
-    short: Short, known: Knowledge, played: np.ndarray, target: Target, left_s: float, left_nm_s: float, largest_us: float
+    short: Short,
+    known: Knowledge,
+    played: np.ndarray,
+    target: Target,
+    left_s: float,
+    left_nm_s: float,
+    largest_us: float,
 ) -> Decision:
     rate = 1.0 / short.grid.step_s
     foresight = Foresight.of(short, played, target)
@@ -216,7 +236,9 @@ def _levels(short: Short, known: Knowledge, largest_us: float) -> np.ndarray:
 
 
 def _state(known: Knowledge) -> str:
-    return f"The curve is known within {known.curve.percent:.1f} %, the step response within {known.step.percent:.1f} %."
+    return (
+        f"The curve is known within {known.curve.percent:.1f} %, the step response within {known.step.percent:.1f} %."
+    )
 
 
 def _enough(known: Knowledge) -> str:

@@ -1,7 +1,8 @@
 """What pieces of a test would teach: the bands that are expected after each, from draws of what is known now.
 
 The draws' principal directions are few. The response to a piece is computed for the mean and for each direction, and
-the directions' covariance is updated as by a linear measurement; so hundreds of pieces are compared within milliseconds.
+the directions' covariance is updated as by a linear measurement; hundreds of pieces are so compared within
+milliseconds.
 """
 
 from __future__ import annotations

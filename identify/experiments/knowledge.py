@@ -88,7 +88,9 @@ def knowledge(short: Short, points: int = POINTS) -> Knowledge:
     curves = short.coefficients_nm @ short.basis.design(width).T / plateau
     time_s = np.linspace(0.0, min(short.linear.memory_s, 12.0), points)
     return Knowledge(
-        curve=whole_band(width, curves), step=whole_band(time_s, step_responses(short.dynamics, time_s)), plateau_nm=plateau
+        curve=whole_band(width, curves),
+        step=whole_band(time_s, step_responses(short.dynamics, time_s)),
+        plateau_nm=plateau,
     )
 
 

@@ -57,8 +57,8 @@ def pieces(levels_us: np.ndarray, pulse_rate_hz: float) -> list[Piece]:
     found = [Piece("hold", np.full(one, level)) for level in levels]
     for first, second in permutations(levels, 2):
         found.append(Piece("step", np.repeat([first, second], half)))
-        for size in (one, two):
-            found.append(Piece("ramp", first + (second - first) * np.arange(1, size + 1) / size))
+        ramps = [first + (second - first) * np.arange(1, size + 1) / size for size in (one, two)]
+        found += [Piece("ramp", ramp) for ramp in ramps]
         if first > second:
             found.append(Piece("prbs", np.repeat(np.where(CHIPS, first, second), chip)))
     return found

@@ -17,7 +17,10 @@ import numpy as np
 
 from identify.recruitment.spline import SplineBasis
 
-KNOTS = 61
+KNOTS, FINE_KNOTS = 61, 121
+"""The second where the first leave a residual: at a sudden bend, or in a muscle of few large units."""
+
+
 @dataclass(frozen=True)
 class Deviation:
     """One kind of deviation of the log density from the shape.
