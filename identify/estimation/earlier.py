@@ -7,7 +7,7 @@ change. By how much is learnt from a person's own models (`learn_change`).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -20,6 +20,10 @@ from identify.recruitment.spline import SplineBasis
 
 EARLIER_DEVIATIONS = (Deviation(0.05, 1.0), Deviation(0.3, 0.8), Deviation(0.9, 0.8), Deviation(2.2, 0.2))
 """As `DEVIATIONS`, from the earlier curve: the posterior decides how far the shape itself changed."""
+
+
+MOST_DOUBT = 1.5
+"""Largest standard deviation of the log of a step that is taken from the last model."""
 
 
 @dataclass(frozen=True)
@@ -167,7 +171,22 @@ class Earlier:
         own = np.array([self._sd("plateau_nm") / self._marks[0], 0.0, 0.0])
         plateau = float(self.mean[0]), 2.0 * float(np.hypot(sd[0], own[0]))
         precision = np.diag(1.0 / (sd**2 + own**2))
-        return NearShape(basis, self.shape, self.mean, precision, plateau, rise, EARLIER_DEVIATIONS)
+        prior = NearShape(basis, self.shape, self.mean, precision, plateau, rise, EARLIER_DEVIATIONS)
+        return replace(prior, doubt=self._doubt(prior))
+
+    def _doubt(self, prior: NearShape) -> np.ndarray | None:
+        """Covariance of the logs of the steps, from that of the last curve's coefficients."""
+        known = self.model.covariance
+        if known is None:
+            return None
+        own = self.model.recruitment.basis
+        chosen = [i for i, name in enumerate(known.names) if name.startswith("recruitment_")]
+        slopes = np.diff(own.design(np.minimum(prior.places_us, own.largest_us)), axis=0)
+        covariance = slopes @ known.matrix[np.ix_(chosen, chosen)] @ slopes.T
+        steps = np.exp(prior.log_steps(prior.mean))
+        size = np.maximum(prior.blurred(steps), np.sqrt(np.maximum(np.diag(covariance), 0.0)) / MOST_DOUBT)
+        size = np.maximum(size, 1e-9 * steps.sum())
+        return covariance / size[:, None] / size[None, :]
 
     def dynamics(self, delay_sd_s: float) -> tuple[np.ndarray, np.ndarray]:
         """Mean and precision of (log T, log ζ, delay)."""

@@ -81,6 +81,8 @@ class NearShape:
         Rise from 10 to 90 %, µs: the scale of the deviation.
     deviations : tuple of Deviation
         Kinds of the log density's deviation that are averaged over.
+    doubt : ndarray, shape (n, n), optional
+        Covariance of the logs of the steps of the shape itself, where the shape is an estimate.
     """
 
     basis: SplineBasis
@@ -90,6 +92,7 @@ class NearShape:
     plateau: tuple[float, float]
     rise_us: float
     deviations: tuple[Deviation, ...] = DEVIATIONS
+    doubt: np.ndarray | None = None
 
     @cached_property
     def places_us(self) -> np.ndarray:
@@ -123,7 +126,8 @@ class NearShape:
         found = []
         for kind in self.deviations:
             covariance = kind.smooth_share * smooth + (1.0 - kind.smooth_share) * rough
-            found.append(kind.sd * np.linalg.cholesky(covariance + 1e-9 * np.eye(at.size)))
+            covariance = kind.sd**2 * (covariance + 1e-9 * np.eye(at.size))
+            found.append(np.linalg.cholesky(covariance if self.doubt is None else covariance + self.doubt))
         return tuple(found)
 
     def blurred(self, steps: np.ndarray) -> np.ndarray:
