@@ -13,8 +13,11 @@ from identify.noise.level import profile, whitened
 from identify.simulation.problem import Problem
 from identify.simulation.setup import Setup
 
+LEAST_SD = 1e-5
+"""Standard deviation, as a share of the plateau, that is added to the curve's coefficients: below its threshold a curve
+is known so exactly that the covariance could not be inverted."""
 RIDGE = 1e-10
-"""Share of each variance that is added to the draws' covariance, so that it can be inverted."""
+"""Share of each variance that is added, for the same reason."""
 
 
 @dataclass(frozen=True)
@@ -53,8 +56,10 @@ def averaged(short: Short, mean_of_draws: bool = True) -> Averaged:
     assert slopes is not None
     white = whitened(slopes, setup.stretches, short.noise)
     information = gram(white)
-    hessian = _inverse(np.cov(draws.T))
     at = first.coefficients
+    covariance = np.cov(draws.T)
+    covariance[at, at] += (LEAST_SD * short.plateau_nm) ** 2 * np.eye(short.basis.size)
+    hessian = _inverse(covariance)
     # The draws' centre is where data and prior balance: nothing pulls the curve away from it.
     own = setup.with_(roughness=_positive((hessian - information)[at, at]), curve_nm=theta[at])
     problem = Problem(own, [])

@@ -30,7 +30,7 @@ from identify.recruitment.near_shape import (
 from identify.recruitment.spline import SplineBasis
 
 DRAWS = 400
-OUTER = 8
+OUTER = 10
 """Largest number of times that the dynamics are linearised anew."""
 SETTLED = 0.05
 """The dynamics have settled when they move by less than this share of their standard deviation."""
@@ -286,7 +286,7 @@ class _Work:
         flat = CurvePosterior(prior, data)
         z = near[chosen].z[: 3 + n + extras] if near else flat.start(start.three)
         found = flat.mode(z, chosen)
-        weights = np.zeros(0)
+        posterior, weights = flat, np.zeros(0)
         for turn in range(OUTER):
             x = CurvePosterior.linear_of(prior, found)
             posterior = CurvePosterior(prior, self._data(prior.basis, linear, noise, x))
@@ -295,16 +295,17 @@ class _Work:
             settled = bool(np.max(np.abs(x[n + extras :]) / self._sd(found)) < SETTLED)
             linear = self._bounded(linear, x[n + extras :])
             x = x[: n + extras]
-            if not (settled or turn == OUTER - 3):
+            if not (settled or turn == OUTER - 1):
                 continue
             noise = self._noise(prior.basis, linear, x, noise)
             posterior = CurvePosterior(prior, self._data(prior.basis, linear, noise, x))
             near = posterior.modes(np.r_[found.z[: 3 + n + extras], np.zeros(3)], near)
             weights = _probabilities(near)
-            if int(np.argmax(weights)) == chosen:
+            likely = int(np.argmax(weights))
+            if likely == chosen or turn == OUTER - 1:
                 break
-            chosen = int(np.argmax(weights))
-            found, linear = near[chosen], self._bounded(linear, near[chosen].z[-3:])
+            chosen, found = likely, near[likely]
+            linear = self._bounded(linear, found.z[-3:])
         drawn = posterior.draws(near, weights, draws, seed=draws)
         return self._short(prior, linear, noise, near, weights, drawn)
 
