@@ -21,6 +21,7 @@ from identify.estimation.prepare import to_fitted
 from identify.estimation.rows import fitted_rows
 from identify.methods.support.alternatives import monotone, power_series, sigmoid
 from identify.methods.support.common import flag, order_option
+from identify.methods.support.near_sigmoid import near_sigmoid
 from identify.methods.two_stage import general
 from identify.model import Model
 from identify.recruitment.knots import KNOTS
@@ -33,7 +34,8 @@ class MaximumLikelihood:
     summary = "Joint estimate of recruitment spline and second-order dynamics by variable projection on all segments."
     options: Mapping[str, str] = MappingProxyType(
         {
-            "recruitment": "spline (default, (8)), power-series (6) or sigmoid (30)",
+            "recruitment": "spline (default, (8)), power-series (6), sigmoid (30) or near-sigmoid, for short records",
+            "earlier": "with near-sigmoid: this person's last model, from which the curve is not expected to be far",
             "monotone": "true: the spline never falls (default: false)",
             "knots": "number of knots of the spline (default: 19, or 31 if the curve is steep)",
             "power": "order of the power series (default: by BIC)",
@@ -53,6 +55,8 @@ class MaximumLikelihood:
 
     def start(self, grid: Grid, rows: np.ndarray, options: Mapping[str, Any]) -> tuple[Fitted, list[str]]:
         """Fit the structure without effects, to which effects are added; with the reasons for its form."""
+        if options.get("recruitment") == "near-sigmoid" or "earlier" in options:
+            return near_sigmoid(grid, rows, options)
         delay_s = float(options["delay_s"]) if "delay_s" in options else None
         solution, _ = estimate(grid, rows, int(options["knots"]) if "knots" in options else None, delay_s)
         kind = str(options.get("recruitment", "spline"))
@@ -65,7 +69,9 @@ class MaximumLikelihood:
             reason = f"spline of {size} coefficients, smoothed to {solution.freedom:.1f} effective ones"
         else:
             raise BadRequest(
-                f"unknown recruitment {kind!r}", place="recruitment", fix="Give spline, power-series or sigmoid."
+                f"unknown recruitment {kind!r}",
+                place="recruitment",
+                fix="Give spline, power-series, sigmoid or near-sigmoid.",
             )
         if flag(options.get("monotone", False), "monotone"):
             return to_fitted(monotone(solution), most=0), [reason, "recruitment constrained to be monotone"]

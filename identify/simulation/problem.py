@@ -124,6 +124,7 @@ class Problem:
         scale = self.setup.scale_nm
         sd[list(self.baselines)] = 0.5 * scale
         sd[list(self.initials)] = np.tile([scale, 5.0 * scale], self.setup.starts.size)
+        mean[self.coefficients] = self.setup.curve_nm
         precision = np.diag(1.0 / sd**2)
         precision[self.coefficients, self.coefficients] = self.setup.penalty
         return mean, precision

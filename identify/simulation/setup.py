@@ -43,6 +43,8 @@ class Setup:
         Noise of each interval, divided by the mean noise: each part of a record has its own noise.
     reference_s : float
         Time at which the recruitment curve holds, if an effect makes it drift, s.
+    curve_nm : ndarray, shape (n,), or float
+        Prior mean of the curve's coefficients, N·m.
     """
 
     grid: Grid
@@ -57,6 +59,7 @@ class Setup:
     sign: float = 1.0
     spread: np.ndarray | float = 1.0
     reference_s: float = 0.0
+    curve_nm: np.ndarray | float = 0.0
 
     @cached_property
     def stretches(self) -> tuple[np.ndarray, np.ndarray]:

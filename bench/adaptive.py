@@ -1,0 +1,314 @@
+"""An adaptive test against fixed tests and other choosers, on the same simulated patients.
+
+    python -m bench.adaptive --patients 40 --seeds 80000 [--kinds sigmoid,shaped] [--hidden 20] [--json FILE]
+
+Each patient has noise of 0.05 N·m at 400 Hz, and every peer sees the same noise. Seeds from 50000 were developed on.
+Peers: the paper's test (PRBS and ramp with their rests, 29.7 s, without the held-out levels of the default test), a
+staircase, pieces of our library taken at random, a chooser as `optbayesexpt` (`bench.particles`), ours for a new
+person, and ours for a person who is known from one earlier session. A test whose structure fits badly goes on with the
+paper's test; its dose and time count. "Unseen" is the best fit to the clean torque of random levels.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import identify
+from bench.particles import HOLD, Particles
+from hardware_sim.patients.hidden.draw import draw_scenario, rng_of, still_effect_ids
+from identify.estimation.fit_statistics import best_fit_percent
+from identify.estimation.prepare import prepare
+from identify.experiments.adaptive import Target
+from identify.experiments.knowledge import Knowledge, step_responses, whole_band
+from identify.experiments.pieces import pieces
+from identify.model import Model
+from identify.records.record import Record
+from rig.plan import default_segments
+from rig.sequences import build
+from tests.harness.adaptive import Hidden, Muscle, Played, papers, play, recorded, shaped, sigmoid
+
+RATE_HZ, NOISE_NM = 400.0, 0.05
+TARGET = Target()
+LONGEST_S = 60.0
+KINDS: dict[str, Callable[[int], Muscle]] = {"sigmoid": sigmoid, "shaped": shaped}
+
+
+def paper_test(top_us: float) -> tuple[np.ndarray, list[str]]:
+    """Widths and names of the default test's PRBS and ramp with their rests."""
+    widths, names = [], []
+    for segment in default_segments()[:5]:
+        settings = dict(segment.settings)
+        if segment.sequence != "rest":
+            settings["max_pulse_width_us"] = top_us
+        own = build(segment.sequence, settings, 40.0)
+        widths.append(own)
+        names += [segment.name] * own.size
+    return np.concatenate(widths), names
+
+
+def staircase(top_us: float) -> tuple[np.ndarray, list[str]]:
+    """One second of rest and six levels up and down, one second each."""
+    up = np.arange(1, 7) / 6.0
+    widths = np.repeat(np.r_[0.0, up, up[-2::-1], 0.0] * top_us, 40)
+    return widths, ["staircase"] * widths.size
+
+
+def unseen_percent(muscle: Any, predict: Callable[[Record], np.ndarray], seed: int) -> float:
+    """Best fit to the clean torque of random levels, %."""
+    levels = np.random.default_rng([seed, 7]).uniform(0.0, muscle.top_us, 30)
+    widths = np.r_[np.zeros(40), np.repeat(levels, 20)]
+    record = recorded(muscle, widths, ["validate"] * widths.size, np.zeros(20000), RATE_HZ)
+    return best_fit_percent(record.torque_nm, predict(record))
+
+
+def row(
+    muscle: Any, widths: np.ndarray, covered: tuple[bool, bool, float], unseen: float, **more: Any
+) -> dict[str, Any]:
+    """One line of the results."""
+    dose = float(np.sum(muscle.curve(widths))) / 40.0
+    curve, step, band = covered
+    return {
+        "seconds": widths.size / 40.0,
+        "dose": dose,
+        "curve_covered": curve,
+        "step_covered": step,
+        "band_percent": band,
+        "unseen": unseen,
+    } | more
+
+
+def covered_by(known: Knowledge, muscle: Any) -> tuple[bool, bool, float]:
+    """Whether the bands contain both true curves, and the largest half-width of f's, %."""
+    away = np.abs(muscle.curve(known.curve.at) / known.plateau_nm - known.curve.value)
+    beside = np.abs(muscle.step(known.step.at) - known.step.value)
+    return bool(np.all(away <= known.curve.half)), bool(np.all(beside <= known.step.half)), known.curve.percent
+
+
+def covered_by_model(model: Model, muscle: Any) -> tuple[bool, bool, float]:
+    """The same of a model's own whole bands."""
+    curve, step = model.bands["recruitment"], model.bands["step_response"]
+    true = muscle.curve(np.asarray(curve["pulse_width_us"]))
+    slack = 1e-6 * float(np.max(true))
+    first = np.all((curve["whole_lower"] - slack <= true) & (true <= curve["whole_upper"] + slack))
+    true_step = muscle.step(np.asarray(step["time_s"]))
+    second = np.all((step["whole_lower"] - 1e-6 <= true_step) & (true_step <= step["whole_upper"] + 1e-6))
+    half = np.max(np.asarray(curve["whole_upper"]) - curve["value"])
+    return bool(first), bool(second), 100.0 * float(half / np.max(true))
+
+
+def fixed(muscle: Muscle, test: tuple[np.ndarray, list[str]], noise: np.ndarray, seed: int) -> dict[str, Any]:
+    """A fixed test with the default fit."""
+    model = identify.fit(recorded(muscle, *test, noise, RATE_HZ))
+    return row(muscle, test[0], covered_by_model(model, muscle), unseen_percent(muscle, model.predict, seed))
+
+
+def adaptive(
+    muscle: Muscle, noise: np.ndarray, seed: int, earlier: Model | None = None, random: bool = False
+) -> tuple[dict[str, Any], Model]:
+    """Our test, or its pieces at random; with the model that it leaves."""
+    spent: list[float] = []
+
+    def timed(call: Callable[[], Any]) -> Any:
+        began = time.process_time()
+        found = call()
+        spent.append(time.process_time() - began)
+        return found
+
+    rng = np.random.default_rng([seed, 9])
+
+    def by_chance(_decision: Any, _widths: np.ndarray) -> np.ndarray:
+        levels = np.r_[0.0, rng.uniform(0.0, muscle.top_us, 4), muscle.top_us]
+        own = pieces(levels, 40.0)
+        return own[int(rng.integers(len(own)))].pulse_width_us
+
+    known = {"earlier": earlier} if earlier is not None else {}
+    limits = {"left_s": LONGEST_S / 2.0, "left_nm_s": float(np.sum(muscle.curve(paper_test(muscle.top_us)[0]))) / 40.0}
+    made = play(muscle, noise, TARGET, timed=timed, choose=by_chance if random else None, **limits, **known)
+    result, model = finished(muscle, made, noise, seed, known)
+    return result | {"cpu_s": [round(s, 4) for s in spent[2:]]}, model
+
+
+def finished(
+    muscle: Any, made: Played, noise: np.ndarray, seed: int, known: dict[str, Model]
+) -> tuple[dict[str, Any], Model]:
+    """The row and the model of a test that ended; where the structure fits badly, the paper's test comes after it."""
+    assert made.record is not None
+    if made.decision.kind == "misfit":
+        widths, names = paper_test(muscle.top_us)
+        widths = np.r_[made.widths_us, widths]
+        model = identify.fit(recorded(muscle, widths, made.names + names, noise, RATE_HZ))
+        covered = covered_by_model(model, muscle)
+    else:
+        widths = made.widths_us
+        model = identify.fit(made.record, recruitment="near-sigmoid", **known)
+        assert made.decision.knowledge is not None
+        covered = covered_by(made.decision.knowledge, muscle)
+    unseen = unseen_percent(muscle, model.predict, seed)
+    return row(muscle, widths, covered, unseen, ended=made.decision.kind), model
+
+
+def chosen_by_particles(muscle: Muscle, noise: np.ndarray, seed: int) -> dict[str, Any]:
+    """The stand-in for `optbayesexpt`: it stops at the same target, or with the time of the paper's test."""
+    widths = np.r_[np.zeros(20), np.full(HOLD, muscle.top_us)]
+    cloud, known, size = None, None, 0
+    while widths.size < paper_test(muscle.top_us)[0].size:
+        record = recorded(muscle, widths, ["level"] * widths.size, noise, RATE_HZ)
+        torque = prepare(record)[0].torque_nm
+        if cloud is None:
+            cloud = Particles(muscle.top_us, float(np.max(torque)), NOISE_NM / np.sqrt(10.0), seed)
+        cloud.learn(widths, torque, widths.size - size)
+        size = widths.size
+        known = particle_bands(cloud.drawn(), muscle.top_us)
+        if known.curve.percent <= TARGET.curve_percent and known.step.percent <= TARGET.step_percent:
+            break
+        widths = np.r_[widths, np.full(HOLD, cloud.next_level(widths))]
+    assert cloud is not None and known is not None
+    gain, width, middle, slow, damping = cloud.drawn().mean(axis=0)
+    share = 1.0 / (1.0 + np.exp(-(np.arange(512.0) - middle) / np.exp(width)))
+    model = Muscle("", gain * (share - share[0]), muscle.top_us, float(np.exp(slow)), float(np.exp(damping)), 0.0)
+
+    def predicted(record: Record) -> np.ndarray:
+        return model.torque(record.pulse_width_us[:: round(RATE_HZ / 40.0)], RATE_HZ)
+
+    return row(muscle, widths, covered_by(known, muscle), unseen_percent(muscle, predicted, seed))
+
+
+def particle_bands(rows: np.ndarray, top_us: float) -> Knowledge:
+    """Bands of a cloud."""
+    u = np.linspace(0.0, top_us, 61)
+    share = 1.0 / (1.0 + np.exp(-(u[None, :] - rows[:, 2:3]) / np.exp(rows[:, 1:2])))
+    curves = rows[:, :1] * (share - share[:, :1])
+    plateau = float(curves[:, -1].mean())
+    time_s = np.linspace(0.0, 3.0, 61)
+    steps = step_responses(np.c_[np.exp(rows[:, 3:5]), np.zeros(len(rows))], time_s)
+    return Knowledge(whole_band(u, curves / plateau), whole_band(time_s, steps), plateau)
+
+
+def one(kind: str, seed: int) -> list[dict[str, Any]]:
+    """All peers on one patient."""
+    muscle = KINDS[kind](seed)
+    noise = np.random.default_rng([seed, 5]).standard_normal(int((LONGEST_S + 30.0) * RATE_HZ)) * NOISE_NM
+    other = np.random.default_rng([seed, 6]).standard_normal(noise.size) * NOISE_NM
+    ours = adaptive(muscle, noise, seed)[0]
+    day = muscle.another_day(np.random.default_rng([seed, 8]))
+    last = adaptive(day, other, seed)[1]
+    found = {
+        "paper": fixed(muscle, paper_test(muscle.top_us), noise, seed),
+        "staircase": fixed(muscle, staircase(muscle.top_us), noise, seed),
+        "random pieces": adaptive(muscle, noise, seed, random=True)[0],
+        "particles": chosen_by_particles(muscle, noise, seed),
+        "ours, new": ours,
+        "ours, known": adaptive(muscle, noise, seed, earlier=last)[0],
+    }
+    paper = found["paper"]
+    return [
+        line
+        | {"peer": peer, "kind": kind, "shape": muscle.name, "seed": seed}
+        | {"dose_share": line["dose"] / paper["dose"], "time_share": line["seconds"] / paper["seconds"]}
+        | {"unseen_gain": line["unseen"] - paper["unseen"]}
+        for peer, line in found.items()
+    ]
+
+
+def hidden(seed: int) -> dict[str, Any]:
+    """How an adaptive test of a muscle with one hidden effect ends."""
+    for attempt in range(20):
+        rng = rng_of(seed, "adaptive", str(attempt))
+        effect, strength = str(rng.choice(still_effect_ids())), str(rng.choice(["weak", "middle", "strong"]))
+        try:
+            muscle = Hidden(draw_scenario((effect,), strength, seed + attempt, noise_sd_nm=NOISE_NM))
+            break
+        except ValueError:
+            continue
+    else:
+        raise ValueError(f"seed {seed}: no muscle found")
+    noise = np.random.default_rng([seed, 5]).standard_normal(int(2 * LONGEST_S * RATE_HZ)) * NOISE_NM
+    dose = float(np.sum(muscle.curve(paper_test(muscle.top_us)[0]))) / 40.0
+    made = play(muscle, noise, TARGET, left_s=LONGEST_S / 2.0, left_nm_s=dose)
+    return {"seed": seed, "effect": effect, "strength": strength, "ended": made.decision.kind, "seconds": made.seconds}
+
+
+def of_papers_muscle(trials: int, seed: int) -> list[str]:
+    """The paper's muscle at 40 Hz with noise of 0.10 N·m and a target of 1 %."""
+    lines = []
+    for trial in range(seed, seed + trials):
+        muscle, rng = papers(), np.random.default_rng([trial, 5])
+        noise = rng.standard_normal(4000) * 0.10
+        limits = {"left_s": 30.0, "left_nm_s": 83.0}
+        made = play(muscle, noise, Target(4.0, 4.0), rate_hz=40.0, **limits)
+        assert made.record is not None
+        model = identify.fit(made.record, recruitment="near-sigmoid")
+        fit = unseen_percent(muscle, model.predict, trial)
+        lines.append(f"{made.decision.kind} {fit:.2f} % at {made.dose_nm_s(muscle):.1f} N·m·s in {made.seconds:.1f} s")
+    return lines
+
+
+def table(rows: list[dict[str, Any]]) -> list[str]:
+    """Medians and counts as lines of a table."""
+    lines = [
+        "| patients | test | n | unseen, % | against the paper's test, points | dose, N·m·s | dose | time, s | time "
+        "| f covered | step covered |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for kind in dict.fromkeys(line["kind"] for line in rows):
+        for peer in dict.fromkeys(line["peer"] for line in rows):
+            own = [line for line in rows if line["kind"] == kind and line["peer"] == peer]
+            if not own:
+                continue
+            mid = {key: float(np.median([line[key] for line in own])) for key in own[0] if _number(own[0][key])}
+            curve, step = (sum(line[key] for line in own) for key in ("curve_covered", "step_covered"))
+            lines.append(
+                f"| {kind} | {peer} | {len(own)} | {mid['unseen']:.2f} | {mid['unseen_gain']:+.2f} "
+                f"| {mid['dose']:.1f} | {100 * mid['dose_share']:.0f} % | {mid['seconds']:.1f} "
+                f"| {100 * mid['time_share']:.0f} % | {curve} ({100 * curve / len(own):.0f} %) "
+                f"| {step} ({100 * step / len(own):.0f} %) |"
+            )
+    ended = [line["ended"] for line in rows if line["peer"] == "ours, new"]
+    lines.append(f"\nOurs, new, ended: {', '.join(f'{e} {ended.count(e)}' for e in dict.fromkeys(ended))}.")
+    cpu = np.array([s for line in rows if line["peer"].startswith("ours") for s in line.get("cpu_s", [])])
+    if cpu.size:
+        half, most = np.quantile(cpu, [0.5, 0.99])
+        lines.append(f"`decide`: {1e3 * half:.0f} ms of processor time in the middle, p99 {1e3 * most:.0f} ms.")
+    return lines
+
+
+def _number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def main() -> int:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(prog="python -m bench.adaptive", description=__doc__)
+    parser.add_argument("--patients", type=int, default=150, help="of each kind")
+    parser.add_argument("--seeds", type=int, default=80_000, help="the first")
+    parser.add_argument("--kinds", default="sigmoid,shaped")
+    parser.add_argument("--hidden", type=int, default=0, help="patients with one hidden effect")
+    parser.add_argument("--paper", type=int, default=0, help="trials of the paper's muscle")
+    parser.add_argument("--json", type=Path, help="every row goes here, one a line")
+    settings = parser.parse_args()
+    warnings.filterwarnings("ignore", category=RuntimeWarning)
+    rows: list[dict[str, Any]] = []
+    for seed in range(settings.seeds, settings.seeds + settings.patients):
+        for kind in settings.kinds.split(","):
+            rows += one(kind, seed)
+            print(seed, kind, file=sys.stderr, flush=True)
+        if settings.json is not None:
+            settings.json.write_text("\n".join(json.dumps(line) for line in rows))
+    print(*(table(rows) if rows else []), sep="\n")
+    for seed in range(settings.seeds, settings.seeds + settings.hidden):
+        print(json.dumps(hidden(seed)), flush=True)
+    print(*of_papers_muscle(settings.paper, settings.seeds), sep="\n")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,123 @@
+"""The draws of a short record's fit as one solved problem, for tests, bands and MODEL.json."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from identify.estimation.gram import gram
+from identify.estimation.joint import Fitted
+from identify.estimation.short_record import Short
+from identify.noise.level import profile, whitened
+from identify.simulation.problem import Problem
+from identify.simulation.setup import Setup
+
+LEAST_SD = 1e-5
+"""Standard deviation, as a share of the plateau, that is added to the curve's coefficients: below its threshold a curve
+is known so exactly that the covariance could not be inverted."""
+RIDGE = 1e-10
+"""Share of each variance that is added, for the same reason."""
+
+
+@dataclass(frozen=True)
+class Averaged(Fitted):
+    """A solved problem whose parameters are the mean of draws.
+
+    Parameters
+    ----------
+    shown : float
+        Effective number of parameters that the data determine.
+    """
+
+    shown: float = 0.0
+
+    @property
+    def freedom(self) -> float:
+        """Effective number of parameters."""
+        return self.shown
+
+
+def averaged(short: Short, mean_of_draws: bool = True) -> Averaged:
+    """The solved problem of a fit by draws, in the parameters of `simulation.problem`.
+
+    Parameters
+    ----------
+    short : Short
+        The fit.
+    mean_of_draws : bool
+        The parameters are the mean of the draws; else the most probable ones.
+    """
+    setup = _setup(short)
+    draws = _parameters(short, setup)
+    theta = draws.mean(axis=0) if mean_of_draws else _likely(short, setup)
+    first = Problem(setup, [])
+    mean, slopes = first.run(np.clip(theta, first.lower, first.upper), derivatives=True)
+    assert slopes is not None
+    white = whitened(slopes, setup.stretches, short.noise)
+    information = gram(white)
+    at = first.coefficients
+    covariance = np.cov(draws.T)
+    covariance[at, at] += (LEAST_SD * short.plateau_nm) ** 2 * np.eye(short.basis.size)
+    hessian = _inverse(covariance)
+    # The draws' centre is where data and prior balance: nothing pulls the curve away from it.
+    own = setup.with_(roughness=_positive((hessian - information)[at, at]), curve_nm=theta[at])
+    problem = Problem(own, [])
+    residual = setup.target_nm - mean
+    shown = float(np.trace(np.linalg.solve(hessian + 1e-12 * np.diag(np.diag(hessian)), information)))
+    return Averaged(
+        problem=problem,
+        theta=np.clip(theta, first.lower, first.upper),
+        noise=short.noise,
+        log_likelihood=profile(residual, setup.stretches, short.noise, False)[1],
+        log_evidence=float(np.logaddexp.reduce([mode.log_evidence for mode in short.modes])),
+        residual_nm=residual,
+        slopes=slopes,
+        hessian=hessian,
+        shown=min(shown, float(theta.size)),
+    )
+
+
+def _setup(short: Short) -> Setup:
+    grid = short.grid
+    zero = short.sign * float(short.others_nm[:, 0].mean())
+    target = short.sign * (grid.torque_nm - zero)
+    return Setup(
+        grid=grid,
+        target_nm=target,
+        fitted=short.rows,
+        basis=short.basis,
+        roughness=np.zeros((short.basis.size, short.basis.size)),
+        scale_nm=max(float(np.percentile(np.abs(target[short.rows]), 99.5)), 1e-9),
+        noise_sd_nm=grid.noise_sd_nm,
+        delay_bounds_s=grid.delay_bounds_s,
+        zero_nm=zero,
+        sign=short.sign,
+    )
+
+
+def _parameters(short: Short, setup: Setup) -> np.ndarray:
+    """Draws in the order and on the scale of the problem's parameters, shape (S, P)."""
+    others = short.others_nm.copy()
+    others[:, : setup.begins.size] -= setup.sign * setup.zero_nm
+    return np.c_[np.log(short.dynamics[:, :2]), short.dynamics[:, 2], others, short.coefficients_nm]
+
+
+def _likely(short: Short, setup: Setup) -> np.ndarray:
+    others = short.likely[short.basis.size :].copy()
+    others[: setup.begins.size] -= setup.sign * setup.zero_nm
+    t, z = short.linear.core
+    return np.r_[np.log(t), np.log(z), short.linear.delay_s, others, np.cumsum(short.likely[: short.basis.size])]
+
+
+def _inverse(covariance: np.ndarray) -> np.ndarray:
+    size = np.sqrt(np.maximum(np.diag(covariance), 1e-18))
+    scaled = covariance / size[:, None] / size[None, :] + RIDGE * np.eye(size.size)
+    values, vectors = np.linalg.eigh(scaled)
+    inverse = (vectors / np.maximum(values, RIDGE)) @ vectors.T
+    return inverse / size[:, None] / size[None, :]
+
+
+def _positive(matrix: np.ndarray) -> np.ndarray:
+    values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
+    return (vectors * np.maximum(values, 0.0)) @ vectors.T

@@ -1,0 +1,47 @@
+"""The option `recruitment=near-sigmoid`: a curve that never falls, near a sigmoid or near the person's last curve."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from identify.dynamics.pulse_grid import Grid
+from identify.errors import BadRequest
+from identify.estimation.averaged import averaged
+from identify.estimation.earlier import Change, Earlier
+from identify.estimation.joint import Fitted
+from identify.estimation.short_record import Short, fit_short
+from identify.model import Model
+from identify.recruitment.near_shape import DEVIATIONS
+
+DRAWS = 1500
+OWN = {"recruitment", "earlier", "order"}
+
+
+def near_sigmoid(grid: Grid, rows: np.ndarray, options: Mapping[str, Any]) -> tuple[Fitted, list[str]]:
+    """The fit, and why the curve is as it is.
+
+    Raises
+    ------
+    BadRequest
+        Options that belong to another kind of curve, or an earlier model that is none.
+    """
+    others = sorted(set(options) - OWN)
+    if others or options.get("recruitment", "near-sigmoid") != "near-sigmoid":
+        against = ", ".join(others) or f"recruitment={options['recruitment']}"
+        raise BadRequest(f"not with {against}", place="recruitment", fix="Give near-sigmoid, and earlier or nothing.")
+    model = options.get("earlier")
+    if model is not None and not isinstance(model, Model):
+        raise BadRequest("not a model", place="earlier", fix="Give the person's last model, or none.")
+    last = None if model is None else Earlier(model, Change())
+    short = fit_short(grid, rows, last=last, fine=True, draws=DRAWS)
+    return averaged(short), [_why(short, last)]
+
+
+def _why(short: Short, last: Earlier | None) -> str:
+    near = "the last model's curve" if last else "a sigmoid"
+    kind = DEVIATIONS[int(np.argmax(short.weights))] if last is None else None
+    said = f", whose density of thresholds deviates by a factor of {np.exp(kind.sd):.1f}" if kind else ""
+    return f"a curve that never falls, near {near}{said}"

@@ -1,0 +1,161 @@
+"""An adaptive test: it stops when both curves are known, never where the structure fits badly, and keeps to limits."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+import identify
+from identify.errors import BadRequest
+from identify.estimation.earlier import USUAL, learn_change
+from identify.experiments.adaptive import Target, decide
+from identify.experiments.pieces import pieces
+from identify.experiments.reach import reach
+from identify.records.record import Record
+from rig.sequences import build
+from tests.harness.adaptive import Muscle, Played, play, recorded, shaped, sigmoid
+from tests.identify import hidden_muscles
+
+LIMITS = {"target": Target(), "left_s": 30.0, "left_nm_s": 100.0, "largest_us": 300.0}
+
+
+def noise(seed: int) -> np.ndarray:
+    return np.random.default_rng([seed, 77]).standard_normal(16_000) * 0.05
+
+
+def played(muscle: Muscle, seed: int, **known) -> Played:
+    return play(muscle, noise(seed), Target(), left_s=30.0, left_nm_s=1e3, **known)
+
+
+@dataclass
+class Tiring:
+    """A muscle that tires strongly while it is stimulated."""
+
+    top_us: float = 300.0
+
+    def curve(self, width_us):
+        return hidden_muscles.recruited(np.asarray(width_us, float))
+
+    def torque(self, widths_us, rate_hz):
+        clean = hidden_muscles.muscle(widths_us)[:: round(hidden_muscles.FINE_HZ / rate_hz)]
+        share = np.cumsum(clean) / rate_hz / 40.0
+        return clean * np.exp(-share)
+
+
+def test_the_rig_plays_every_piece_as_it_was_weighed():
+    for number, piece in enumerate(pieces(np.array([0.0, 60.04, 137.77, 300.0]), 40.0)):
+        segment = piece.segment(number)
+        widths = build(segment.sequence, segment.settings, 40.0)
+        np.testing.assert_allclose(widths, piece.pulse_width_us, atol=0.1)
+        assert widths.min() >= 0.0 and widths.max() <= 300.0
+        assert 0.9 <= widths.size / 40.0 <= 2.1
+
+
+def test_the_first_piece_begins_at_rest_and_keeps_to_the_largest_width():
+    decision = decide(None, [], **LIMITS)
+    widths = decision.segments[0].settings["pulse_width_us"]
+    assert decision.kind == "next" and max(widths) <= 300.0
+    assert not any(widths[:20])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("make", [sigmoid, shaped])
+def test_it_stops_when_both_curves_are_known(make):
+    muscle = make(51_003)
+    made = played(muscle, 51_003)
+    known = made.decision.knowledge
+    assert made.decision.kind == "enough" and known is not None
+    assert known.curve.percent <= 2.0 and known.step.percent <= 2.0
+    away = np.abs(muscle.curve(known.curve.at) / known.plateau_nm - known.curve.value)
+    assert np.max(away) <= 0.04
+    assert np.max(np.abs(muscle.step(known.step.at) - known.step.value)) <= 0.02
+    assert made.seconds < 20.0
+    assert max(max(s.settings["pulse_width_us"]) for d in made.decisions for s in d.segments) <= muscle.top_us
+    plain = made.decision.to_dict()
+    assert plain["kind"] == "enough" and plain["knowledge"]["curve_percent"] == known.curve.percent
+
+
+@pytest.mark.slow
+def test_a_known_person_needs_less():
+    muscle = shaped(51_004)
+    first = played(muscle.another_day(np.random.default_rng(3)), 51_005)
+    assert first.record is not None
+    model = identify.fit(first.record, recruitment="near-sigmoid")
+    new, known = played(muscle, 51_004), played(muscle, 51_004, earlier=model)
+    assert known.decision.kind == "enough"
+    assert known.dose_nm_s(muscle) < new.dose_nm_s(muscle)
+
+
+@pytest.mark.slow
+def test_a_structure_that_fits_badly_is_never_enough():
+    made = play(Tiring(), noise(51_006), Target(5.0, 5.0), left_s=30.0, left_nm_s=1e3, rate_hz=200.0)
+    assert made.decision.kind == "misfit"
+    assert "rest of the fixed test" in made.decision.words
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("run_away", [lambda t: 0.02 * np.exp(2.0 * t), lambda t: 3.0 * np.sin(20.0 * t)])
+def test_torque_that_runs_away_is_never_enough(run_away):
+    widths = np.r_[np.zeros(20), np.linspace(0.0, 300.0, 40), np.full(12, 300.0), np.zeros(20), np.full(100, 150.0)]
+    time_s = np.arange(widths.size * 10) / 400.0
+    torque = run_away(time_s) + noise(1)[: time_s.size]
+    decision = decide(Record.from_arrays(time_s, np.repeat(widths, 10), torque), widths, **LIMITS)
+    assert decision.kind == "misfit"
+
+
+@pytest.mark.slow
+def test_pulses_that_are_committed_beyond_the_record_count():
+    muscle = sigmoid(51_007)
+    opening = np.array(decide(None, [], **LIMITS).segments[0].settings["pulse_width_us"])
+    record = recorded(muscle, opening, ["opening"] * opening.size, noise(2))
+    decision = decide(record, np.r_[opening, np.full(40, 200.0)], **LIMITS)
+    assert decision.kind == "next" and decision.expected_dose_nm_s >= 0.0
+
+
+@pytest.mark.slow
+def test_nothing_is_played_beyond_what_is_left():
+    muscle = sigmoid(51_008)
+    opening = np.array(decide(None, [], **LIMITS).segments[0].settings["pulse_width_us"])
+    record = recorded(muscle, opening, ["opening"] * opening.size, noise(3))
+    for left in ({"left_s": 0.5}, {"left_s": 0.5, "left_nm_s": 0.0}):
+        assert decide(record, opening, **(LIMITS | left)).kind == "spent"
+    modest = decide(record, opening, **(LIMITS | {"left_nm_s": 0.5}))
+    assert modest.kind == "spent" or modest.expected_dose_nm_s <= 0.5
+    assert decide(None, [], **(LIMITS | {"left_s": 1.0})).kind == "spent"
+
+
+@pytest.mark.parametrize("wrong", [math.nan, math.inf, -1.0, True, "2"])
+def test_numbers_that_are_none_are_refused(wrong):
+    for name in ("left_s", "left_nm_s", "largest_us"):
+        with pytest.raises(BadRequest, match="is no positive number"):
+            decide(None, [], **(LIMITS | {name: wrong}))
+    for name in ("curve_percent", "step_percent"):
+        with pytest.raises(BadRequest, match="is no target"):
+            Target(**{name: wrong})
+
+
+@pytest.mark.slow
+def test_what_cannot_be_reached_is_said_before_the_first_pulse():
+    few = reach(target=Target(1.0, 1.0), left_s=5.0, left_nm_s=100.0, largest_us=300.0, plateau_nm=6.0)
+    assert not few.reachable and few.curve_percent > 1.0 and "out of reach" in few.words
+    assert few.seconds <= 5.0
+    none = reach(target=Target(), left_s=1.0, left_nm_s=100.0, largest_us=300.0, plateau_nm=6.0)
+    assert not none.reachable and none.seconds == 0.0
+    with pytest.raises(BadRequest, match="plateau_nm"):
+        reach(target=Target(), left_s=30.0, left_nm_s=100.0, largest_us=300.0, plateau_nm=math.nan)
+
+
+@pytest.mark.slow
+def test_change_between_sessions_is_learnt_from_own_models():
+    muscle = sigmoid(51_009)
+    record = played(muscle, 51_009).record
+    assert record is not None
+    model = identify.fit(record, recruitment="near-sigmoid")
+    assert learn_change([]) == USUAL == learn_change([model])
+    alike = learn_change([model] * 6)
+    assert alike.sessions == 6 and alike.gain_log < USUAL.gain_log and alike.middle_us < USUAL.middle_us
+    slower = model.with_(linear=type(model.linear)(3.0 * model.linear.time_constant_s, model.linear.damping))
+    assert learn_change([model, slower] * 3).time_constant_log > 3.0 * USUAL.time_constant_log
