@@ -212,6 +212,17 @@ class Versions:
                     newest.setdefault(decision.participant, decision)
         return newest
 
+    def all_approved_ones(self, participant: str) -> list[Model]:
+        """The versions that were approved and not rejected since, oldest first, the last one of each recording."""
+        decided = self.store.all(Approval, Approval.participant == participant, order=Approval.id)
+        newest = {decision.model_id: decision for decision in decided}
+        rows = [
+            self.get(decision.model_id)
+            for decision in decided
+            if decision is newest[decision.model_id] and decision.approved
+        ]
+        return list({row.recording_id: row for row in reversed(rows)}.values())[::-1]
+
     def served(self, participant: str) -> Served | None:
         """What the controller gets, or None where nothing is approved. Raises ApiError (500) where that is damaged."""
         found = self._served.get(participant)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
+from api.sessions.adaptive_tests import AdaptiveTests
 from api.sessions.lifecycle import OPEN_STATES, Lifecycle
 from api.sessions.live import Hub
 from api.store.tables import Test
 
 
-def of(row: Test, hub: Hub, lifecycle: Lifecycle) -> dict[str, Any]:
+def of(row: Test, hub: Hub, lifecycle: Lifecycle, adaptive: AdaptiveTests) -> dict[str, Any]:
     """What became of it so far; while it runs also where it is, as the rig tells it."""
     planned = {key: value for key, value in row.plan.get("preview", {}).items() if key != "pulse_width_us"}
     running = row.state in ("requested", "running")
@@ -44,6 +45,7 @@ def of(row: Test, hub: Hub, lifecycle: Lifecycle) -> dict[str, Any]:
         "joins": row.plan.get("joins"),
         "model_id": row.model_id,
         "model_url": f"/v1/models/{row.model_id}" if row.model_id else None,
-        "summary": row.summary,
+        "summary": {name: value for name, value in row.summary.items() if name != "adaptive"},
+        "adaptive": adaptive.document(row),
         "fit": lifecycle.versions.document(model) if model else None,
     }

@@ -12,6 +12,7 @@ from api.clock import Clock
 from api.errors import ApiError
 from api.models.analyses import Analyses
 from api.models.registry import Versions
+from api.sessions.adaptive_tests import AdaptiveTests
 from api.sessions.rig_client import RigClient
 from api.store import Store, audit
 from api.store.tables import Model, Recording, Test
@@ -36,11 +37,12 @@ class Lifecycle:
 
     def __init__(
         self, store: Store, clock: Clock, rig: RigClient, pool: Pool, versions: Versions,
-        analyses: Analyses, recordings_dir: Path,
+        analyses: Analyses, adaptive: AdaptiveTests, recordings_dir: Path,
         on_progress: Callable[[str], None],
     ) -> None:  # fmt: skip
         self.store, self.clock, self.rig, self.pool, self.versions = store, clock, rig, pool, versions
         self.analyses, self.recordings_dir, self.on_progress = analyses, recordings_dir, on_progress
+        self.adaptive = adaptive
         self.calls: dict[str, Call] = {}
         self._ahead: set[asyncio.Task[None]] = set()
 
@@ -79,7 +81,7 @@ class Lifecycle:
             identifies = event.outcome == "completed" and row.recording_id is not None and row.kind != SEQUENCE
             row.state = "identifying" if identifies else event.outcome
             row.reason = event.reason
-            row.summary = dict(event.summary)
+            row.summary = {**event.summary, **self.adaptive.outcome(row, event)}
             row.finished_utc = now = self.clock.utc()
             audit.write(session, now, "rig", f"test {event.outcome}", row.id, reason=event.reason)
         log.info("the rig: test %s", event.outcome, extra={"test_id": row.id})
@@ -112,7 +114,7 @@ class Lifecycle:
 
         how: dict[str, Any] = {"urgent": True, "on_progress": lambda _job: self.on_progress(test_id)}
         try:
-            model = await self._first_version(row, recording, parent, take, how)
+            model = await self._first_version(row, recording, parent, take, dict(how))
             model = await self.analyses.carried_structure.carry(model, recording.path, take, **how)
         except ApiError as error:
             reason = f"identification: {error.detail or error.title}"
@@ -134,6 +136,7 @@ class Lifecycle:
         """The first version of a test's recording, named by the test at once: it is there whatever comes after it."""
         if row.model_id is not None:
             return await asyncio.to_thread(self.versions.get, row.model_id)
+        how |= await asyncio.to_thread(self.adaptive.fit_options, row)
         found, warning = await self.analyses.carried_structure.fit(row.participant, recording.path, take, **how)
         by = f"test {row.id}"
         model = await asyncio.to_thread(self.versions.add, found["json"], row.participant, recording.id, by, parent)

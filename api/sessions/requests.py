@@ -118,6 +118,16 @@ class SegmentIn(Body):
     settings: Annotated[dict[str, Any], WithJsonSchema(SETTINGS)] = Field(default_factory=dict)
 
 
+Percent = Annotated[FiniteFloat, Field(ge=0.2, le=50.0)]
+
+
+class TargetIn(Body):
+    """What a test that stops itself must reach: half-widths of the 95 % bands of whole curves, %."""
+
+    curve_percent: Percent = Field(2.0, description="of the recruitment curve, % of its plateau")
+    step_percent: Percent = Field(2.0, description="of the response to a unit step, %")
+
+
 class TestIn(Body):
     """A test to be run now."""
 
@@ -140,6 +150,25 @@ class TestIn(Body):
     joins: Annotated[str, StringConstraints(max_length=64)] | None = Field(
         None, description="a model: the new recording is joined to that model's, and both are judged together"
     )
+    target: TargetIn = Field(TargetIn(), description="kind `adaptive`: what must be known before the test stops")
+    max_duration_s: FiniteFloat | None = Field(
+        None, ge=5, le=300, description="kind `adaptive`: the longest test, s; None: 45"
+    )
+    max_torque_time_nm_s: FiniteFloat | None = Field(
+        None, gt=0, le=10_000, description="kind `adaptive`: the largest torque-time, N·m·s; None: 12 s at the torque "
+        "that stops a test"
+    )  # fmt: skip
+    anyway: StrictBool = Field(False, description="kind `adaptive`: play it although the target is out of reach")
+
+    @model_validator(mode="after")
+    def _of_its_kind(self) -> TestIn:
+        own = {"target", "max_duration_s", "max_torque_time_nm_s", "anyway"}
+        sent = {name for name in self.model_fields_set if getattr(self, name) is not None}
+        wrong = sorted(sent & {"segments", "joins"} if self.kind == "adaptive" else sent & own)
+        if wrong:
+            which = "chooses its own segments" if self.kind == "adaptive" else "has a fixed plan"
+            raise ValueError(f"{', '.join(wrong)}: a test of the kind {self.kind} {which}; leave it out")
+        return self
 
 
 class CalibrationIn(Body):

@@ -14,20 +14,22 @@ from typing import Any
 
 from sqlalchemy.exc import SQLAlchemyError
 
-from api.clock import Clock, asked_s
+from api.clock import Clock, asked_s, thought_s
 from api.errors import ApiError, NotFoundError
 from api.logs import current_test
 from api.models.analyses import Analyses
 from api.models.registry import Versions
-from api.people import names
 from api.sessions import document, profiles
+from api.sessions.adaptive_tests import AdaptiveTests
 from api.sessions.lifecycle import OPEN_STATES, Lifecycle
 from api.sessions.limits import limits_of
 from api.sessions.live import Hub
+from api.sessions.refusals import Current, busy, not_what_was_seen, other_than, refuse_archived
 from api.sessions.requests import TestIn
 from api.sessions.rig_client import AnyEvent, RigClient
 from api.store import Store, audit
 from api.store.tables import Participant, Test
+from api.workers.adviser import Adviser
 from api.workers.pool import Pool
 from rig.messages import (
     FinishedEvent,
@@ -58,21 +60,6 @@ NOTE_S = 0.3
 EMERGENCY = "Use the stimulator's own emergency switch now."
 
 
-@dataclass
-class Current:
-    """The test the rig is busy with, or that is being identified."""
-
-    test_id: str
-    participant: str
-    by: str
-    started: bool = False
-    """The rig has said that it plays."""
-    ending: bool = False
-    """Its end has been heard."""
-    missed: int = 0
-    """How often in a row the rig, asked for its state, did not name it."""
-
-
 @dataclass(frozen=True)
 class Seen:
     """What a person was shown before saying yes; a test that would be another one is not started."""
@@ -84,7 +71,7 @@ class Seen:
 
     def same(self, preview: dict[str, Any]) -> bool:
         """Whether the rig would play what was shown; the torque it is estimated to give may be known better by now."""
-        return {**preview, "torque_time_nms": None} == {**self.preview, "torque_time_nms": None}
+        return {**self.preview, **preview, "torque_time_nms": None} == {**self.preview, "torque_time_nms": None}
 
 
 class Runner:
@@ -92,12 +79,15 @@ class Runner:
 
     def __init__(
         self, store: Store, clock: Clock, rig: RigClient, pool: Pool, versions: Versions, analyses: Analyses,
-        recordings_dir: Path,
+        adviser: Adviser, recordings_dir: Path,
     ) -> None:  # fmt: skip
         self.store, self.clock, self.rig, self.versions, self.pool = store, clock, rig, versions, pool
         self.hub = Hub(clock)
+        self.adaptive = AdaptiveTests(clock, rig, versions, adviser, self.hub.send)
         self.current: Current | None = None
-        self.lifecycle = Lifecycle(store, clock, rig, pool, versions, analyses, recordings_dir, self.announce)
+        self.lifecycle = Lifecycle(
+            store, clock, rig, pool, versions, analyses, self.adaptive, recordings_dir, self.announce
+        )
         self._lock = asyncio.Lock()
         self._halted_s = -math.inf
         self._notes = ThreadPoolExecutor(2, "notes-of-stops")
@@ -153,7 +143,7 @@ class Runner:
             raise not_what_was_seen(f"The limits of {participant.code} were changed meanwhile.")
         if seen is not None and (seen.side, seen.muscle) != (participant.side, participant.muscle):
             raise not_what_was_seen(f"Side or muscle of {participant.code} was changed meanwhile.")
-        plan = self._plan(body, participant)
+        plan = await self._plan(body, participant)
         if body.joins is not None:
             await asyncio.to_thread(self._check_joins, body)
         current = self.current = Current(plan.test_id, plan.participant, by)
@@ -169,6 +159,7 @@ class Runner:
             current.started = True
         except BaseException:
             self.current = None
+            self.adaptive.leave()
             raise
         try:
             return await asyncio.to_thread(self.lifecycle.update, row.id, state="running")
@@ -183,7 +174,7 @@ class Runner:
             self._refuse_overtaken(
                 asked_s.get(self.clock.monotonic_s())
             )  # nothing is waited for between this and the command
-            await self.rig.ask(StartRequest(plan=plan), timeout_s=ANSWER_S)
+            await self.rig.ask(StartRequest(plan=plan, key=self.adaptive.begin(plan)), timeout_s=ANSWER_S)
         except ApiError as error:
             if error.code == "rig-unreachable":  # it may have heard us all the same
                 await self._stop_quietly(f"start of {plan.test_id} was not answered")
@@ -204,7 +195,7 @@ class Runner:
         if self._halted_s >= since_s:
             detail = "Nothing was sent. Check the participant and the rig, re-arm the rig, and start again."
             raise ApiError(409, "stopped-meanwhile", "The start was cancelled by a stop", detail)
-        if not (self.clock.monotonic_s() - since_s <= START_S):
+        if not (self.clock.monotonic_s() - since_s - thought_s.get() <= START_S):
             detail = f"It could not begin within {START_S:g} s. Nothing was sent. Start again."
             raise ApiError(503, "too-late", "The start took too long", detail)
 
@@ -214,11 +205,11 @@ class Runner:
         except ApiError as error:
             log.warning("stop after a failed start: %s", error)
 
-    def _plan(self, body: TestIn, participant: Participant) -> TestPlan:
+    async def _plan(self, body: TestIn, participant: Participant) -> TestPlan:
         segments = None
         if body.segments is not None:
             segments = [SegmentPlan(**segment.model_dump()) for segment in body.segments]
-        return TestPlan(
+        plan = TestPlan(
             test_id=self._new_id(),
             participant=participant.code,
             kind=body.kind,
@@ -226,6 +217,7 @@ class Runner:
             pulse_rate_hz=body.pulse_rate_hz,
             **limits_of(body, participant.profile),
         )
+        return await self.adaptive.planned(body, plan, PREVIEW_S)
 
     def _check_joins(self, body: TestIn) -> None:
         """The model whose recording the new one is to be joined to is the participant's own."""
@@ -244,6 +236,7 @@ class Runner:
         now = self.clock.utc()
         row = Test(id=plan.test_id, participant=plan.participant, kind=plan.kind, state="requested")
         kept = {"joins": body.joins, "side": participant.side, "muscle": participant.muscle}  # as they are now
+        kept |= self.adaptive.intent(plan)
         row.plan, row.summary, row.reason = {**plan.model_dump(), "preview": preview, **kept}, {}, ""
         row.requested_by, row.requested_utc, row.ran_by = by, now, other_than(by, body.ran_by)
         with self.store.write() as session:
@@ -254,7 +247,8 @@ class Runner:
 
     async def preview(self, body: TestIn) -> dict[str, Any]:
         """A test's duration, dose and pulse widths; nothing is played."""
-        return await self._previewed(self._plan(body, await self._participant(body)))
+        plan = await self._plan(body, await self._participant(body))
+        return {**await self._previewed(plan), **self.adaptive.intent(plan)}
 
     async def _previewed(self, plan: TestPlan) -> dict[str, Any]:
         curve = await asyncio.to_thread(self._recruitment, plan.participant)
@@ -377,6 +371,7 @@ class Runner:
         """The rig is free again; the identification goes on beside it."""
         if self.current is not None and self.current.test_id == test_id:
             self.current = None
+            self.adaptive.leave()
 
     # ---- after a restart ------------------------------------------------------------------------------------
 
@@ -412,43 +407,12 @@ class Runner:
 
     def document(self, row: Test) -> dict[str, Any]:
         """A test as clients see it."""
-        return document.of(row, self.hub, self.lifecycle)
+        return document.of(row, self.hub, self.lifecycle, self.adaptive)
 
     async def close(self) -> None:
         """Leave what runs to the next start of the service."""
         for task in list(self._tasks):
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
+        await self.adaptive.close()
         await asyncio.to_thread(self._notes.shutdown)
-
-
-def other_than(asker: str, ran_by: str | None) -> str | None:
-    """Who ran a test, where that was not who asked for it."""
-    return ran_by if ran_by and names.folded(ran_by) != names.folded(asker) else None
-
-
-def refuse_archived(participant: Participant) -> None:
-    """409: nothing is begun with a participant in the archive."""
-    if participant.archived_utc is not None:
-        detail = (
-            f"{participant.code} is in the archive. Take it out first: on its page, or by "
-            f"POST /v1/participants/{participant.code}/unarchive. Nothing was started."
-        )
-        raise ApiError(409, "archived", "This participant is archived", detail)
-
-
-def not_what_was_seen(why: str) -> ApiError:
-    """409: a person said yes to something else."""
-    return ApiError(
-        409, "not-what-was-seen", "This page is out of date", f"{why} Nothing was started. Go back and check."
-    )
-
-
-def busy(current: Current) -> ApiError:
-    """409, naming the holder."""
-    detail = (
-        f"{current.test_id} for participant {current.participant}, started by {current.by}, uses the rig. "
-        "Wait for its end, or stop it."
-    )
-    holder = {"test_id": current.test_id, "participant": current.participant, "by": current.by}
-    return ApiError(409, "rig-busy", "Another test is running", detail, holder=holder)

@@ -37,6 +37,7 @@ from api.store.tables import Recording
 from api.web.guards import anyone_even_locked, anyone_signed_in, require
 from api.web.openapi import problem
 from api.web.stop_guard import Press, anyone_who_may_stop
+from api.workers.adviser import Adviser
 from api.workers.pool import WORKER, Pool
 from api.workers.process import Places
 from api.workers.tracker import Jobs
@@ -141,7 +142,8 @@ def _build(settings: Settings, clock: Clock, worker: tuple[str, ...], lock: Serv
     pool = Pool(settings.workers, worker, places(settings, store))
     versions = Versions(store, clock)
     analyses = Analyses(store, clock, pool, versions, settings)
-    runner = Runner(store, clock, rig, pool, versions, analyses, settings.recordings_dir)
+    adviser = Adviser(worker, pool.places)
+    runner = Runner(store, clock, rig, pool, versions, analyses, adviser, settings.recordings_dir)
     jobs = Jobs(pool)
     people = People(store, clock, auth, guesses)
     rights = StopRights(owner_only.key(settings.data_dir / "stop-right.key"), clock)

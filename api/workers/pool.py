@@ -32,9 +32,9 @@ class Pool:
     """
 
     def __init__(self, workers: int = 2, command: tuple[str, ...] = WORKER, places: Places | None = None) -> None:
-        places = places or Places()
-        self.workers = [Worker(command, places) for _ in range(workers)]
-        self.workers.append(Worker(command, places, background=True))
+        self.places = places or Places()
+        self.workers = [Worker(command, self.places) for _ in range(workers)]
+        self.workers.append(Worker(command, self.places, background=True))
         self.queue: deque[Call] = deque()
         self.done_count = 0
         self.failed_count = 0

@@ -37,6 +37,8 @@ PROCESSOR_S = {
     "plain_csv": 120.0,
     "find_recording": 120.0,
     "join": 120.0,
+    "adaptive_outlook": 60.0,
+    "adaptive_advise": 5.0,
 }
 LONGEST_PROCESSOR_S = 1200.0
 """What a call may compute; improving a long record takes minutes on a slow machine."""

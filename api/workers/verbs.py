@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from api.workers import adaptive_verbs
 from api.workers.diagnosis_verbs import diagnosis, improve, joined
 from api.workers.json_values import clean
 from api.workers.prediction import forecast
@@ -27,8 +28,13 @@ def fit(
     method: str = "maximum-likelihood",
     effects: tuple[str, ...] | list[str] = (),
     fit_on: list[str] | None = None,
+    recruitment: str | None = None,
+    models: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """Read a recording and identify; the model document as JSON text and as an object, and what was assumed."""
+    """Read a recording and identify; the model document as JSON text and as an object, and what was assumed.
+
+    With `recruitment` near-sigmoid, `models` are the person's approved ones, oldest first.
+    """
     import identify
 
     progress(0.05, "reading the recording")
@@ -38,7 +44,10 @@ def fit(
     def further(share: float, text: str = "") -> None:
         progress(0.2 + 0.8 * share, text)
 
-    model = identify.fit(record, method=method, effects=tuple(effects), fit_on=fit_on, progress=further)
+    options: dict[str, Any] = {} if recruitment is None else {"recruitment": recruitment}
+    if earlier := adaptive_verbs.known(models).get("earlier"):
+        options["earlier"] = earlier
+    model = identify.fit(record, method=method, effects=tuple(effects), fit_on=fit_on, progress=further, **options)
     return {"json": model.to_json(), "model": model.to_dict(), "notes": list(record.notes)}
 
 
@@ -251,4 +260,5 @@ VERBS: dict[str, Callable[..., dict[str, Any]]] = {
     "plain_csv": plain_csv,
     "find_recording": find_recording,
     "recorded": recorded,
+    **adaptive_verbs.VERBS,
 }

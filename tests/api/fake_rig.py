@@ -24,10 +24,10 @@ import numpy as np
 from pydantic import TypeAdapter
 
 from rig import messages as m
+from tests.api.fake_score import PULSE_RATE_HZ, FakeScore
 from tests.harness.muscle import Patient
 
 REQUESTS: TypeAdapter[Any] = TypeAdapter(m.Request)
-PULSE_RATE_HZ = 40.0
 FRAME_S = 0.05
 
 
@@ -93,7 +93,12 @@ class FakeRig:
             "charge_per_phase_uc": m.Bound(lo=0, hi=20, unit="µC", owner="rig file"),
         }
         self._stop = asyncio.Event()
-        self._writers: set[asyncio.StreamWriter] = set()
+        self._writers: dict[asyncio.StreamWriter, bool] = {}
+        """Who subscribed, and whether with samples."""
+        self.key = ""
+        self.score: FakeScore | None = None
+        self.last_segments: list[dict[str, Any]] = []
+        self.refuses_extensions = False
         self._play: asyncio.Task[None] | None = None
         self._server: asyncio.Server | None = None
 
@@ -149,7 +154,7 @@ class FakeRig:
                     continue
                 reply = await self._answer(request, writer)
                 writer.write(reply.model_dump_json().encode() + b"\n")
-        self._writers.discard(writer)
+        self._writers.pop(writer, None)
         writer.close()
 
     async def _answer(self, request: Any, writer: asyncio.StreamWriter) -> m.Reply:
@@ -164,7 +169,7 @@ class FakeRig:
         return self.status().model_dump()
 
     async def _on_subscribe(self, request: Any, writer: asyncio.StreamWriter) -> dict[str, Any]:
-        self._writers.add(writer)
+        self._writers[writer] = request.samples
         return self.status().model_dump()
 
     def _widths(self, plan: m.TestPlan) -> tuple[list[float], list[dict[str, Any]]]:
@@ -173,7 +178,11 @@ class FakeRig:
                 raise m_refusal(
                     "bad-plan", "No such sequence", f"{segment.sequence!r}; there are prbs, ramp, rest, widths."
                 )
-        return default_widths()
+        if plan.adaptive is None:
+            return default_widths()
+        score = FakeScore(plan, [], [])
+        score.go_on(1e9)
+        return score.widths, [{key: s[key] for key in ("name", "start_s", "end_s")} for s in score.segments]
 
     async def _on_preview(self, request: Any, writer: Any) -> dict[str, Any]:
         widths, segments = self._widths(request.plan)
@@ -198,10 +207,31 @@ class FakeRig:
             raise m_refusal(self.state, "The rig stands still", f"{self.reason}. Re-arm it.")
         self._widths(request.plan)
         self.starts += 1
-        self.plan, self.state, self.reason = request.plan, "running", ""
+        self.plan, self.state, self.reason, self.key = request.plan, "running", "", request.key
         self._stop.clear()
         self._play = asyncio.create_task(self._run(request.plan))
         return self.status().model_dump()
+
+    def _running(self, request: Any) -> FakeScore:
+        if self.score is None or self.plan is None or self.plan.test_id != request.test_id:
+            raise m_refusal("late", "Too late", f"test {request.test_id!r} is not running")
+        if self.score.adaptive is None:
+            raise m_refusal("bad-plan", "Not adaptive", f"test {request.test_id} has a fixed plan")
+        return self.score
+
+    async def _on_extend(self, request: Any, writer: Any) -> dict[str, Any]:
+        score = self._running(request)
+        if request.key != self.key:
+            raise m_refusal("bad-plan", "Wrong key", "extend.key: not the key")
+        if code := "refused" if self.refuses_extensions else score.extend(request.after, request.segments):
+            raise m_refusal(code, "Not laid", f"extend: {code}")
+        return score.told(request.test_id)
+
+    async def _on_enough(self, request: Any, writer: Any) -> dict[str, Any]:
+        score = self._running(request)
+        if not score.ended_by:
+            score.end("enough", self.elapsed_s if request.at_once else None)
+        return score.told(request.test_id)
 
     async def _on_calibrate_start(self, request: Any, writer: Any) -> dict[str, Any]:
         if self.state != "ready":
@@ -276,10 +306,13 @@ class FakeRig:
         return self.status().model_dump()
 
     def _send(self, event: Any) -> None:
-        line = event.model_dump_json().encode() + b"\n"
-        for writer in list(self._writers):
+        full = event.model_dump_json().encode() + b"\n"
+        plain = full
+        if getattr(event, "samples", None) is not None:
+            plain = event.model_copy(update={"samples": None}).model_dump_json().encode() + b"\n"
+        for writer, samples in list(self._writers.items()):
             with contextlib.suppress(ConnectionError, RuntimeError):
-                writer.write(line)
+                writer.write(full if samples else plain)
 
     async def _run(self, plan: m.TestPlan) -> None:
         try:
@@ -293,20 +326,27 @@ class FakeRig:
             )
 
     async def _played(self, plan: m.TestPlan) -> None:
-        widths, segments = default_widths()
-        torque = muscle(widths, self.rate_hz)
-        self.duration_s = len(widths) / PULSE_RATE_HZ
+        self.score = score = FakeScore(plan, *default_widths())
+        torque = muscle(score.widths, self.rate_hz)
+        self.duration_s = plan.adaptive.max_duration_s if plan.adaptive else score.end_s
         self._send(m.StateEvent(status=self.status()))
         began, sent = time.monotonic(), 0.0
-        while sent < self.duration_s and not self._stop.is_set():
+        while sent < score.end_s and not self._stop.is_set():
             await asyncio.sleep(FRAME_S)
-            until = min(self.duration_s, (time.monotonic() - began) * self.speed)
-            self._frame(plan, widths, torque, segments, sent, until)
+            now_s = (time.monotonic() - began) * self.speed
+            score.go_on(now_s)
+            if len(torque) != round(score.end_s * self.rate_hz):
+                torque = muscle(score.widths, self.rate_hz)
+            until = min(score.end_s, now_s)
+            self._frame(plan, score, torque, sent, until)
             sent = until
-        await self._end(plan, widths[: round(sent * PULSE_RATE_HZ)], torque[: round(sent * self.rate_hz)], segments)
+        self.last_segments = score.segments
+        widths = score.widths[: round(sent * PULSE_RATE_HZ)]
+        await self._end(plan, widths, torque[: round(sent * self.rate_hz)], score)
 
-    def _frame(self, plan: m.TestPlan, widths: Any, torque: Any, segments: Any, start: float, end: float) -> None:
+    def _frame(self, plan: m.TestPlan, score: FakeScore, torque: Any, start: float, end: float) -> None:
         self.elapsed_s = end
+        widths, segments = score.widths, score.segments
         self.segment = next((s["name"] for s in segments if s["start_s"] <= end < s["end_s"]), None)
         bins = [start + (end - start) * k / 4 for k in range(5)]
         pieces = [torque[round(a * self.rate_hz) : round(b * self.rate_hz)] or [0.0] for a, b in zip(bins, bins[1:])]  # noqa: B905, RUF007
@@ -318,17 +358,26 @@ class FakeRig:
                 pulse_time_s=[k / PULSE_RATE_HZ for k in range(first, last)], pulse_width_us=widths[first:last],
                 torque_age_s=0.004, lost_samples=0, dropped_pulses=0,
                 sent_pulses=sum(1 for width in widths[:last] if width),
-                charge_uc=sum(widths[:last]) * plan.profile.current_ma / 1000,
+                charge_uc=sum(widths[:last]) * plan.profile.current_ma / 1000, **score.live(),
+                torque_time_nms=sum(map(abs, torque[: round(end * self.rate_hz)])) / self.rate_hz,
+                samples=self._samples(torque, start, end),
             )
         )  # fmt: skip
 
-    async def _end(self, plan: m.TestPlan, widths: list[float], torque: list[float], segments: Any) -> None:
+    def _samples(self, torque: list[float], start: float, end: float) -> m.TorqueSamples:
+        counter = list(range(round(start * self.rate_hz), round(end * self.rate_hz)))
+        return m.TorqueSamples(
+            host_time_s=[k / self.rate_hz + 0.0005 * (k % 3) for k in counter], counter=counter,
+            torque_nm=[torque[k] for k in counter],
+        )  # fmt: skip
+
+    async def _end(self, plan: m.TestPlan, widths: list[float], torque: list[float], score: FakeScore) -> None:
         stopped = self._stop.is_set()
         outcome = "stopped" if stopped else "completed"
         self.reason = f"stopped by {self.stopped_by}" if stopped else ""
-        path, digest = write_recording(self.data, plan, widths, torque, segments, self.rate_hz, outcome)
+        path, digest = write_recording(self.data, plan, widths, torque, score.segments, self.rate_hz, outcome)
         self.state, self.segment = ("latched" if stopped else "ready"), None
-        self.plan = None
+        self.plan = self.score = None
         self._send(m.StateEvent(status=self.status()))
         if self.loses_ends:
             return
@@ -342,6 +391,7 @@ class FakeRig:
                     "lateness_ms": {"median": 0.08, "p99": 0.12, "max": 0.3}, "charge_uc": sum(widths) * 20 / 1000,
                     "alignment": {"method": "sync", "error_ms": 0.02}, "sample_rate_hz": self.rate_hz,
                     "torque_peak_nm": max(torque, default=0.0), "cpu_percent": 3.0, "warnings": self.warnings,
+                    "ended_by": "stopped" if stopped else score.ended_by,
                 },
             )
         )  # fmt: skip

@@ -118,6 +118,45 @@ def carried(folder: Path, earlier: dict[str, Any], say: Any) -> dict[str, Any]:
     return {"result": {"json": json.dumps(model(needed)) if needed else None, "found": found}}
 
 
+OPENING = [0.0] * 20 + [7.5 * k for k in range(1, 41)] + [0.0] * 20
+ADVISED: list[int] = []
+"""Answers since the test began."""
+
+
+def knowledge(percent: float) -> dict[str, Any]:
+    widths = [5.0 * k for k in range(61)]
+    torque = [max(0.0, (w - 60) / 40) for w in widths]
+    return {
+        "plateau_nm": 6.0, "curve_percent": percent, "step_percent": percent / 2,
+        "recruitment": {"pulse_width_us": widths, "torque_nm": torque, "lower_nm": [t - percent / 20 for t in torque],
+                        "upper_nm": [t + percent / 20 for t in torque]},
+        "step_response": {"time_s": [0.0, 1.0, 2.0], "value": [0.0, 0.8, 1.0], "lower": [0.0, 0.7, 0.9],
+                          "upper": [0.0, 0.9, 1.1]},
+    }  # fmt: skip
+
+
+def advised(arguments: dict[str, Any]) -> dict[str, Any]:
+    """Each answer halves the bands, from 8 %; the target of 45 % is one at which the worker dies, of 44 % one at which
+    it is slow, of 43 % one at which the structure fits badly."""
+    percent, target = 16.0 * 0.5 ** len(ADVISED), TARGET["curve_percent"]
+    if len(ADVISED) > 2 and target == 45.0:
+        sys.exit(9)
+    if len(ADVISED) > 2 and target == 44.0:
+        time.sleep(3)
+    kind = "next" if target >= 44.0 or percent > target else "misfit" if target == 43.0 else "enough"
+    widths = [100.0, 200.0] * 20
+    segments = [{"name": f"step {len(ADVISED)}", "sequence": "widths",
+                 "settings": {"pulse_width_us": widths, "jumps": True}}]  # fmt: skip
+    return {
+        "kind": kind, "segments": segments if kind == "next" else [], "expected_dose_nm_s": 2.0,
+        "words": f"The curve is known within {percent:.1f} %, the step response within {percent / 2:.1f} %.",
+        "knowledge": knowledge(percent), "least_known": {"pulse_width_us": 140.0, "time_s": 0.4},
+    }  # fmt: skip
+
+
+TARGET: dict[str, float] = {}
+
+
 def answer(verb: str, arguments: dict[str, Any], say: Any) -> dict[str, Any]:
     if verb == "fit":
         say(progress=0.5, text="identifying")
@@ -148,6 +187,21 @@ def answer(verb: str, arguments: dict[str, Any], say: Any) -> dict[str, Any]:
     if verb == "improve":
         say(progress=0.5, text="adding fatigue")
         return {"result": improvement(arguments.get("model_json"))}
+    if verb == "adaptive_outlook":
+        within = arguments["max_torque_time_nm_s"] >= 20.0
+        words = "The target should be reached in about 9 s with 20 N·m·s."
+        if not within:
+            words = "The target is probably out of reach: in about 4 s with 9 N·m·s the curve would be known within "
+            words += "6.0 % and the step response within 3.0 %."
+        reach = {"reachable": within, "curve_percent": 1.9 if within else 6.0, "step_percent": 3.0, "seconds": 9.0,
+                 "dose_nm_s": 20.0, "words": words}  # fmt: skip
+        return {"result": {"opening_us": OPENING, "reach": reach, "known": bool(arguments["models"])}}
+    if verb == "adaptive_begin":
+        ADVISED.clear()
+        TARGET.update(arguments["target"])
+    if verb == "adaptive_advise":
+        ADVISED.append(len(arguments["torque_nm"]))
+        return {"result": advised(arguments)}
     if verb == "forecast":
         return {"result": {"torque_nm": [width / 100 for width in arguments["pulse_width_us"]]}}
     if verb == "join":

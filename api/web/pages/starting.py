@@ -12,8 +12,9 @@ from api.language import _, lazy, localised, translated, until, when
 from api.people.auth import Principal
 from api.sessions import profiles
 from api.sessions.questions import Question, Row
+from api.sessions.refusals import other_than, refuse_archived
 from api.sessions.requests import TestIn
-from api.sessions.runner import Seen, other_than, refuse_archived
+from api.sessions.runner import Seen
 from api.store import audit
 from api.store.tables import Participant
 from api.web.dependencies import Context

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import Field
 
@@ -93,10 +93,23 @@ class PlannedOut(Document):
     segments: list[SpanOut] = Field([])
 
 
+class ReachOut(Document):
+    """What was said of an adaptive test's target before the first pulse."""
+
+    reachable: bool
+    curve_percent: float | None = Field(description="half-width of the curve's band at the end, %; null: none at all")
+    step_percent: float | None = Field(description="of the step response, %")
+    seconds: float = Field(description="what the test would take, s")
+    dose_nm_s: float = Field(description="its torque-time, N·m·s")
+    words: str
+    known: bool = Field(False, description="whether a model of an earlier session helps")
+
+
 class PreviewOut(PlannedOut):
     """A test that is not played."""
 
-    pulse_width_us: list[float] = Field(description="one for each pulse, µs")
+    pulse_width_us: list[float] = Field(description="one for each pulse, µs; of an adaptive test its fixed plan")
+    reach: ReachOut | None = Field(None, description="of an adaptive test: what it will probably reach")
 
 
 class TestSummary(Document):
@@ -121,6 +134,33 @@ class WorkOut(Document):
     progress: float = Field(0.0, description="share that is done, 0 to 1")
     text: str = ""
     time_left_s: float | None = Field(None, description="null: not known yet")
+
+
+class AdaptiveOut(Document):
+    """A test that stops itself: how much is known, what is left, why it ended."""
+
+    target: dict[str, float] | None = Field(description="`curve_percent`, `step_percent`")
+    max_duration_s: float | None
+    max_torque_time_nm_s: float | None
+    reach: ReachOut | None
+    state: Literal["choosing", "fixed", "ending", "ended"] = Field(description="`fixed`: the fixed plan plays on")
+    words: str = Field(description="the newest decision, in a sentence")
+    problem: str = Field(description="why the fixed plan plays on; empty while segments are chosen")
+    knowledge: dict[str, Any] | None = Field(description="both curves with their 95 % bands, and their half-widths, %")
+    least_known: dict[str, float] | None = Field(description="`pulse_width_us` and `time_s` where the bands are widest")
+    ended: str = Field(
+        description="`known-enough`, `enough` (a person said so), `dose`, `time`, `fixed-rest` (the fixed plan was "
+        "played to its end), `stopped` or `fault`; empty while it runs"
+    )  # fmt: skip
+    decisions: list[dict[str, Any]] = Field(description="each answer of the adviser, with the time it took")
+
+
+class LeftOut(Document):
+    """What is laid of a test that was told that enough is known."""
+
+    test_id: str
+    boundary_s: float = Field(description="where what is laid ends on the test's clock, s")
+    ended_by: str
 
 
 class TestOut(Document):
@@ -154,6 +194,7 @@ class TestOut(Document):
     model_id: str | None
     model_url: str | None
     summary: TestSummary
+    adaptive: AdaptiveOut | None = Field(description="of a test that stops itself; null for another")
     fit: VersionOut | None = Field(description="the model's version, once it is identified")
 
 

@@ -12,8 +12,8 @@ from fastapi import APIRouter
 
 from api.errors import ApiError
 from api.sessions import profiles
+from api.sessions.refusals import refuse_archived
 from api.sessions.requests import CalibrationIn, FinishIn, MarkIn, StepIn
-from api.sessions.runner import refuse_archived
 from api.store import audit
 from api.store.tables import Participant
 from api.web.dependencies import PROBLEM, Context, Ctx, Tester

@@ -14,15 +14,15 @@ from sqlalchemy.exc import SQLAlchemyError
 from api import language
 from api.errors import ApiError, NotFoundError
 from api.people.auth import Scope
+from api.sessions.refusals import other_than
 from api.sessions.requests import TestIn
-from api.sessions.runner import other_than
 from api.store import audit
 from api.store.tables import Test
 from api.web import page_language
 from api.web.dependencies import PROBLEM, Context, Ctx, LiveReader, Tester, of
 from api.web.requests import RanByIn
 from api.web.responses.base import answers
-from api.web.responses.rig import TestOut
+from api.web.responses.rig import LeftOut, TestOut
 
 log = logging.getLogger("stimrig.live")
 LOOK_S = 1.0
@@ -86,6 +86,13 @@ async def keep_plain(context: Ctx, _who: Tester, test_id: str) -> dict[str, Any]
         detail = f"{test_id} is {row.state}. This can be ended only while the last session's structure is fitted."
         raise ApiError(409, "nothing-carried", "No structure is being carried over", detail)
     return await asyncio.to_thread(context.runner.document, row)
+
+
+@router.post("/{test_id}/enough", **answers(LeftOut))
+async def enough(context: Ctx, who: Tester, test_id: str) -> dict[str, Any]:
+    """End a running adaptive test well, at the next pulse: its recording is identified like any other."""
+    row = await asyncio.to_thread(find, context, test_id)
+    return (await context.runner.adaptive.enough(row, who.name)).model_dump()
 
 
 @router.websocket("/{test_id}/live")
@@ -160,8 +167,10 @@ async def _pump(socket: WebSocket, context: Context, row: Test, queue: asyncio.Q
             if message["test"]["id"] != row.id:
                 continue
             document, message = message["test"], _told(message["test"], words)
-        if message["type"] == "live" and message["test_id"] != row.id:
+        if message["type"] in ("live", "adaptive") and message["test_id"] != row.id:
             continue
+        if message["type"] == "adaptive":
+            message = _in_words(message, words)
         await socket.send_json(message)
 
 
@@ -194,6 +203,12 @@ def _told(document: dict[str, Any], language_code: str) -> dict[str, Any]:
     with language.using(language_code):
         words = {"reason": language.plain(document["reason"]), "work": language.plain(work)}
     return {"type": "test", "test": document, "words": words}
+
+
+def _in_words(message: dict[str, Any], language_code: str) -> dict[str, Any]:
+    """How an adaptive test stands, its sentences in the language of the page."""
+    with language.using(language_code):
+        return {**message, **{name: language.plain(message[name]) for name in ("words", "problem")}}
 
 
 async def _until_gone(socket: WebSocket) -> None:

@@ -1,0 +1,213 @@
+"""Tests that stop themselves: what they can reach, their plan, who follows them, and what became of them."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hashlib
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import asdict
+from typing import Any
+
+from api.clock import Clock, thought_s
+from api.errors import ApiError
+from api.models import stored
+from api.models.registry import Versions
+from api.sessions import adaptive_plan
+from api.sessions.adaptive import Follower
+from api.sessions.adaptive_plan import ADAPTIVE
+from api.sessions.requests import TestIn
+from api.sessions.rig_client import RigClient
+from api.store.tables import Test
+from api.workers.adviser import Adviser
+from rig.messages import EnoughRequest, Extended, FinishedEvent, PreviewRequest, TestPlan
+
+KEPT = 20
+"""Outlooks that are remembered: the question before a test and its start need the same one."""
+MOST_MODELS = 10
+"""Sessions from which is learnt how much a person changes between two."""
+ENDS = {"torque_time": "dose", "limit": "time", "plan": "fixed-rest"}
+"""Why a test ended, by the rig's reason, where the service did not end it."""
+
+
+class AdaptiveTests:
+    """All of it; at most one test runs.
+
+    Parameters
+    ----------
+    tell : callable
+        Called with a message for the live channel.
+    """
+
+    def __init__(
+        self, clock: Clock, rig: RigClient, versions: Versions, adviser: Adviser, tell: Callable[[dict[str, Any]], None]
+    ) -> None:
+        self.clock, self.rig, self.versions, self.adviser, self.tell = clock, rig, versions, adviser, tell
+        self.follower: Follower | None = None
+        self._task: asyncio.Task[None] | None = None
+        self._outlooks: OrderedDict[str, dict[str, Any]] = OrderedDict()
+        self._hows: OrderedDict[str, tuple[dict[str, Any], dict[str, Any]]] = OrderedDict()
+
+    # ---- before ----------------------------------------------------------------------------------------------
+
+    async def planned(self, body: TestIn, plan: TestPlan, preview_s: float) -> TestPlan:
+        """The plan with its bounds and its fixed plan; as it is where the test is of another kind.
+
+        Raises
+        ------
+        ApiError
+            422: the target cannot be reached, and nobody said that the test is to be played anyway; what the rig
+            refuses. 500: the worker died.
+        """
+        if body.kind != ADAPTIVE:
+            return plan
+        began_s = self.clock.monotonic_s()
+        bounds = adaptive_plan.bounds_of(body, plan)
+        how = {
+            "target": body.target.model_dump(),
+            "max_duration_s": bounds.max_duration_s, "max_torque_time_nm_s": bounds.max_torque_time_nms,
+            "largest_us": adaptive_plan.largest_us(plan), "pulse_rate_hz": plan.pulse_rate_hz,
+            "models": await asyncio.to_thread(self._models, plan.participant),
+        }  # fmt: skip
+        torque_nm = min(t for t in (plan.profile.max_torque_nm, plan.max_torque_nm) if t is not None)
+        found = await self._outlook({**how, "max_torque_nm": torque_nm})
+        default = await self.rig.ask(PreviewRequest(plan=plan), timeout_s=preview_s)
+        segments = adaptive_plan.fixed_plan(found["opening_us"], default, plan.pulse_rate_hz, bounds)
+        if not found["reach"]["reachable"] and not body.anyway:
+            raise out_of_reach(found["reach"])
+        thought_s.set(thought_s.get() + self.clock.monotonic_s() - began_s)
+        _keep(self._hows, plan.test_id, (how, {**found["reach"], "known": found["known"]}))
+        return plan.model_copy(update={"segments": segments, "adaptive": bounds})
+
+    async def _outlook(self, wanted: dict[str, Any]) -> dict[str, Any]:
+        name = hashlib.sha256(repr(wanted).encode()).hexdigest()
+        if name not in self._outlooks:
+            if self._task is not None and not self._task.done():
+                detail = "What a test can reach is computed once the one that runs has ended."
+                raise ApiError(409, "rig-busy", "Another test is running", detail)
+            _keep(self._outlooks, name, await self.adviser.ask("adaptive_outlook", **wanted))
+        return self._outlooks[name]
+
+    def _models(self, participant: str) -> list[str]:
+        """The participant's approved models, oldest first; without those that are damaged."""
+        found = []
+        for row in self.versions.all_approved_ones(participant)[-MOST_MODELS:]:
+            with contextlib.suppress(ApiError):
+                found.append(stored.text(row))
+        return found
+
+    def intent(self, plan: TestPlan) -> dict[str, Any]:
+        """What is kept of a plan beside it: the target, and what was said of it; nothing of a test of another kind."""
+        if plan.adaptive is None:
+            return {}
+        how, reach = self._hows[plan.test_id]
+        return {"target": how["target"], "reach": reach}
+
+    # ---- while it plays --------------------------------------------------------------------------------------
+
+    def begin(self, plan: TestPlan) -> str:
+        """Follow a test that is about to start; the key with which it is started. Empty for another kind of test."""
+        if plan.adaptive is None:
+            return ""
+        how, reach = self._hows[plan.test_id]
+        self.leave()
+        self.follower = follower = Follower(plan, how, reach, self.rig, self.adviser, self.clock, self._tell)
+        self._task = asyncio.create_task(follower.run(self.rig.path), name="adaptive test")
+        return follower.key
+
+    def _tell(self) -> None:
+        follower = self.follower
+        if follower is not None:
+            self.tell({"type": "adaptive", "test_id": follower.plan.test_id, **self._view(follower)})
+
+    async def enough(self, row: Test, by: str) -> Extended:
+        """End a running test well: enough is known, or enough was borne.
+
+        Raises
+        ------
+        ApiError
+            409: it does not run, or is ending; 422: it has a fixed plan.
+        """
+        found = await self.rig.ask_for(Extended, EnoughRequest(test_id=row.id, by=by, at_once=True))
+        if (follower := self._of(row.id)) is not None:
+            follower.told.state, follower.told.ended = "ending", follower.told.ended or "enough"
+            self._tell()
+        return found
+
+    def leave(self) -> None:
+        """Follow no test any more."""
+        if self._task is not None:
+            self._task.cancel()
+        self._task, self.follower = None, None
+
+    async def close(self) -> None:
+        """Let everything go."""
+        task = self._task
+        self.leave()
+        if task is not None:
+            await asyncio.gather(task, return_exceptions=True)
+        await self.adviser.close()
+
+    # ---- what became of it -----------------------------------------------------------------------------------
+
+    def _of(self, test_id: str) -> Follower | None:
+        return self.follower if self.follower is not None and self.follower.plan.test_id == test_id else None
+
+    def outcome(self, row: Test, event: FinishedEvent) -> dict[str, Any]:
+        """What is kept of a test that stopped itself, by the name it has in the summary; nothing of another one."""
+        if row.kind != ADAPTIVE:
+            return {}
+        rigs, follower = str(event.summary.get("ended_by") or event.outcome), self._of(row.id)
+        told = self._view(follower) if follower is not None else unfollowed(row)
+        ended = told["ended"] if rigs == "enough" and told["ended"] else ENDS.get(rigs, rigs)
+        return {"adaptive": {**told, "state": "ended", "ended": ended}}
+
+    def fit_options(self, row: Test) -> dict[str, Any]:
+        """How the recording is fitted: a short one needs to know what a curve looks like, or looked like last time."""
+        ended = (row.summary.get("adaptive") or {}).get("ended")
+        if row.kind != ADAPTIVE or ended == "fixed-rest":
+            return {}
+        return {"recruitment": "near-sigmoid", "models": self._models(row.participant)}
+
+    def document(self, row: Test) -> dict[str, Any] | None:
+        """How the test stands or what became of it; None of a test of another kind."""
+        if row.kind != ADAPTIVE:
+            return None
+        if kept := row.summary.get("adaptive"):
+            return kept
+        follower = self._of(row.id)
+        return self._view(follower) if follower is not None else unfollowed(row)
+
+    def _view(self, follower: Follower) -> dict[str, Any]:
+        bounds = follower.plan.adaptive
+        assert bounds is not None
+        limits = {"max_duration_s": bounds.max_duration_s, "max_torque_time_nm_s": bounds.max_torque_time_nms}
+        return {**limits, **asdict(follower.told)}
+
+
+def unfollowed(row: Test) -> dict[str, Any]:
+    """Of a test that this service does not follow: it was restarted meanwhile, or the test never began."""
+    bounds = row.plan.get("adaptive") or {}
+    begun = row.state not in ("requested", "refused")
+    why = "The fixed plan plays on: the service was restarted during the test." if begun else ""
+    return {
+        "max_duration_s": bounds.get("max_duration_s"), "max_torque_time_nm_s": bounds.get("max_torque_time_nms"),
+        "target": row.plan.get("target"), "reach": row.plan.get("reach"), "state": "fixed", "words": "", "problem": why,
+        "knowledge": None, "least_known": None, "ended": "", "decisions": [],
+    }  # fmt: skip
+
+
+def out_of_reach(reach: dict[str, Any]) -> ApiError:
+    """422: said before the first pulse, with what can be reached."""
+    detail = (
+        f'{reach["words"]} Nothing was started. Allow more dose or time, ask for less, or send "anyway": true to play '
+        "it all the same."
+    )
+    return ApiError(422, "out-of-reach", "The target cannot be reached", detail, reach=reach)
+
+
+def _keep(store: OrderedDict[str, Any], name: str, value: Any) -> None:
+    store[name] = value
+    while len(store) > KEPT:
+        store.popitem(last=False)

@@ -1,0 +1,250 @@
+"""What the adviser's worker does: what an adaptive test can reach, and what to play next in one that runs.
+
+The test that runs stays in this process between two calls: a call brings only the samples that are new.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from api.workers.json_values import clean
+
+Progress = Callable[[float, str], None]
+NEW_PERSON_SHARE = 1 / 3
+"""Of the torque that stops a test: the guess of a new person's torque at the largest width."""
+EARLIEST = 0.02
+"""Share of the samples that arrive earliest: what comes later waited somewhere."""
+SAFE_END_S = 1.0
+"""Kept free behind the last piece for the rest with which the rig ends the test."""
+DIGITS = 4
+
+
+def outlook(
+    progress: Progress,
+    target: dict[str, float],
+    max_duration_s: float,
+    max_torque_time_nm_s: float,
+    largest_us: float,
+    max_torque_nm: float,
+    pulse_rate_hz: float,
+    models: Sequence[str] = (),
+) -> dict[str, Any]:
+    """The opening's pulse widths, and what the test will probably reach; `models`: approved ones, oldest first."""
+    from dataclasses import asdict
+
+    from identify.experiments.adaptive import decide
+    from identify.experiments.reach import reach
+    from identify.experiments.target import Target
+
+    progress(0.1, "playing the test on a simulated muscle")
+    left = {"target": Target(**target), "left_s": max_duration_s - SAFE_END_S, "left_nm_s": max_torque_time_nm_s}
+    top = {"largest_us": largest_us, "pulse_rate_hz": pulse_rate_hz}
+    opening = decide(None, (), **left, **top, **known(models))
+    widths = [width for segment in opening.segments for width in segment.settings["pulse_width_us"]]
+    found = reach(plateau_nm=NEW_PERSON_SHARE * max_torque_nm, **left, **top, **known(models))
+    return clean({"opening_us": widths, "reach": asdict(found), "known": bool(known(models))})
+
+
+def known(models: Sequence[str]) -> dict[str, Any]:
+    """The last model and how much the person changes between sessions; nothing of a new person.
+
+    A last model of another kind than the adaptive test fits is no help, and none is taken.
+    """
+    import identify
+    from identify.estimation.earlier import Earlier, learn_change
+
+    read = [identify.Model.from_json(text) for text in models]
+    if not read:
+        return {}
+    change = learn_change(read)
+    try:
+        Earlier(read[-1], change)
+    except identify.IdentifyError:
+        return {}
+    return {"earlier": read[-1], "change": change}
+
+
+def begin(
+    progress: Progress,
+    target: dict[str, float],
+    max_duration_s: float,
+    max_torque_time_nm_s: float,
+    largest_us: float,
+    pulse_rate_hz: float,
+    models: Sequence[str] = (),
+) -> dict[str, Any]:
+    """A test begins: what was known of another one is forgotten."""
+    progress(0.5, "beginning")
+    _running.clear()
+    _running.append(Running(target, max_duration_s, max_torque_time_nm_s, largest_us, pulse_rate_hz, known(models)))
+    return {}
+
+
+def advise(progress: Progress, **news: Any) -> dict[str, Any]:
+    """What to play after everything that is laid; see `Running.advise`."""
+    progress(0.1, "deciding")
+    return clean(_running[0].advise(**news))
+
+
+class Running:
+    """One adaptive test, as far as it was measured."""
+
+    def __init__(
+        self,
+        target: dict[str, float],
+        max_duration_s: float,
+        max_torque_time_nm_s: float,
+        largest_us: float,
+        pulse_rate_hz: float,
+        known: dict[str, Any],
+    ) -> None:
+        from identify.experiments.target import Target
+
+        self.target = Target(**target)
+        self.max_duration_s, self.max_torque_time_nm_s = max_duration_s, max_torque_time_nm_s
+        self.largest_us, self.rate_hz, self.known = largest_us, pulse_rate_hz, known
+        self.samples: tuple[list[float], list[int], list[float]] = ([], [], [])
+        self.before: Any = None
+
+    def advise(
+        self,
+        host_time_s: list[float],
+        counter: list[int],
+        torque_nm: list[float | None],
+        laid_us: list[float],
+        segments: list[tuple[str, int, int]],
+        torque_time_nm_s: float,
+        measured_s: float,
+    ) -> dict[str, Any]:
+        """The decision, and where the curves are known least.
+
+        Parameters
+        ----------
+        host_time_s, counter, torque_nm
+            Samples that are new, as the rig tells them.
+        laid_us, segments
+            Widths of all pulses that are laid, µs; name, first pulse and end of each segment.
+        torque_time_nm_s, measured_s
+            Torque-time that was measured, N·m·s, and until when, s.
+        """
+        from identify.experiments.adaptive import decide
+
+        for held, new in zip(self.samples, (host_time_s, counter, torque_nm), strict=True):
+            held.extend(new)  # pyright: ignore[reportArgumentType]
+        record = record_of(*self.samples, laid_us, segments, self.rate_hz)
+        committed_nm_s = self._expected(laid_us[round(measured_s * self.rate_hz) :])
+        found = decide(
+            record,
+            laid_us,
+            target=self.target,
+            left_s=max(0.0, self.max_duration_s - SAFE_END_S - len(laid_us) / self.rate_hz),
+            left_nm_s=max(0.0, self.max_torque_time_nm_s - torque_time_nm_s - committed_nm_s),
+            largest_us=self.largest_us,
+            pulse_rate_hz=self.rate_hz,
+            before=self.before,
+            **self.known,
+        )
+        self.before = found if found.short is not None else self.before
+        told = found.to_dict()
+        if found.knowledge is not None:
+            told["knowledge"] = rounded(told["knowledge"])
+            told["least_known"] = least_known(found.knowledge)
+        return told
+
+    def _expected(self, widths_us: list[float]) -> float:
+        """Torque-time of pulses that are laid and not yet measured, N·m·s, by the mean curve; 0 before there is one."""
+        import numpy as np
+
+        if self.before is None or self.before.knowledge is None:
+            return 0.0
+        curve = self.before.knowledge.curve
+        return float(np.sum(np.interp(widths_us, curve.at, curve.value))) * self._plateau_nm / self.rate_hz
+
+    @property
+    def _plateau_nm(self) -> float:
+        return self.before.knowledge.plateau_nm
+
+
+def record_of(
+    host_time_s: list[float],
+    counter: list[int],
+    torque_nm: list[float | None],
+    laid_us: list[float],
+    segments: list[tuple[str, int, int]],
+    rate_hz: float,
+) -> Any:
+    """The record of what was measured since the first pulse, for `decide`; None where there is nothing yet."""
+    import numpy as np
+
+    from identify.records.record import Pulses, Record
+
+    if len(host_time_s) < 2:
+        return None
+    time_s, torque = sample_times(host_time_s, counter), np.array(torque_nm, float)
+    slot = np.floor(time_s * rate_hz + 1e-9).astype(int)
+    inside = np.isfinite(torque) & (slot >= 0) & (slot < len(laid_us))
+    if not inside.any():
+        return None
+    widths = np.asarray(laid_us, float)
+    starts = np.array([start for _, start, _ in segments])
+    code = np.searchsorted(starts, slot[inside], side="right") - 1
+    due, none = np.arange(widths.size) / rate_hz, np.zeros(widths.size)
+    return Record.from_arrays(
+        time_s[inside],
+        widths[slot[inside]],
+        torque[inside],
+        code,
+        segment_names=[name for name, _, _ in segments],
+        pulses=Pulses(due, widths, none, none.astype(bool)),
+        pulse_rate_hz=rate_hz,
+    )
+
+
+def sample_times(host_time_s: list[float], counter: list[int]) -> Any:
+    """When the samples were taken, on the test's clock: evenly by the cell's counter, set by those that came earliest.
+
+    Samples arrive late and never early, so the line through their arrivals is drawn twice, the second time through
+    those below the first.
+    """
+    import numpy as np
+
+    host = np.array(host_time_s, float)
+    number = np.array(counter, float)
+    if number.min() < 0:  # the cell has none
+        number = np.arange(host.size, dtype=float)
+    number -= number[0]
+    slope, first = np.polyfit(number, host, 1)
+    early = host <= slope * number + first
+    if early.sum() > 2 and np.ptp(number[early]) > 0.5 * np.ptp(number):
+        slope = np.polyfit(number[early], host[early], 1)[0]
+    return slope * number + float(np.quantile(host - slope * number, EARLIEST))
+
+
+def least_known(knowledge: Any) -> dict[str, Any]:
+    """Where each curve is known least: pulse width, µs, and time after a step, s."""
+    import numpy as np
+
+    curve, step = knowledge.curve, knowledge.step
+    return {
+        "pulse_width_us": round(float(curve.at[int(np.argmax(curve.half))]), 1),
+        "time_s": round(float(step.at[int(np.argmax(step.half))]), 3),
+    }
+
+
+def rounded(value: Any) -> Any:
+    """Numbers short enough for a page, however deep they lie."""
+    if isinstance(value, dict):
+        return {key: rounded(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [rounded(item) for item in value]
+    return round(value, DIGITS) if isinstance(value, float) else value
+
+
+_running: list[Running] = []
+"""The test that runs; at most one."""
+VERBS: dict[str, Callable[..., dict[str, Any]]] = {
+    "adaptive_outlook": outlook,
+    "adaptive_begin": begin,
+    "adaptive_advise": advise,
+}

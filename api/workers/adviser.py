@@ -1,0 +1,47 @@
+"""The worker of adaptive tests: a process of its own that keeps the test that runs from one question to the next."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import logging
+from typing import Any
+
+from api.workers.process import WORKER, Call, Places, Worker
+
+log = logging.getLogger("stimrig.adviser")
+
+
+class Adviser:
+    """Answers one question at a time, beside the pool: nothing else keeps it busy.
+
+    It is started by the first question, the one of what a test can reach; so whoever runs no adaptive test has no
+    such process, and during a test it is warm.
+
+    Parameters
+    ----------
+    command : tuple of str
+        How to start the worker; tests put another in its place.
+    places : Places
+        The folders that it may reach.
+    """
+
+    def __init__(self, command: tuple[str, ...] = WORKER, places: Places | None = None) -> None:
+        self.worker = Worker(command, places or Places())
+        self._numbers = itertools.count(1)
+        self._turn = asyncio.Lock()
+
+    async def ask(self, verb: str, **arguments: Any) -> dict[str, Any]:
+        """Its answer.
+
+        Raises
+        ------
+        ApiError
+            The worker refused, took too long or died; the next question starts a new one, which knows of no test.
+        """
+        async with self._turn:
+            return await self.worker.run(Call(next(self._numbers), verb, arguments))
+
+    async def close(self) -> None:
+        """End the process."""
+        await self.worker.close()

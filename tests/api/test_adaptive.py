@@ -1,0 +1,184 @@
+"""Tests that stop themselves, through the service, on a fake rig with a made-up adviser."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from api.sessions.requests import TargetIn
+from identify.experiments.target import LEAST_PERCENT, MOST_PERCENT, Target
+from tests.api.conftest import STUB, Service, run_service, wait_done
+
+
+@pytest.fixture
+def service(tmp_path: Path, short_dir: Path) -> Iterator[Service]:
+    """Adaptive tests are decided in seconds of the rig: it plays at the speed of the world."""
+    yield from run_service(tmp_path, short_dir, STUB, speed=1.0)
+
+
+def start(client: httpx.Client, **more: Any) -> httpx.Response:
+    return client.post("/v1/tests", json={"participant": "P017", "kind": "adaptive", **more})
+
+
+def played(client: httpx.Client, **more: Any) -> dict[str, Any]:
+    started = start(client, **more)
+    assert started.status_code == 202, started.text
+    return wait_done(client, started.json()["id"])
+
+
+def wait_for(client: httpx.Client, test_id: str, what: Any, limit_s: float = 30.0) -> dict[str, Any]:
+    end = time.monotonic() + limit_s
+    while not what(document := client.get(f"/v1/tests/{test_id}").json()):
+        assert time.monotonic() < end, document
+        time.sleep(0.02)
+    return document
+
+
+def test_a_test_stops_itself_once_enough_is_known(client: httpx.Client, service: Service, participant: str) -> None:
+    document = played(client)
+    assert document["state"] == "completed" and document["model_id"]
+    told = document["adaptive"]
+    assert (told["state"], told["ended"], told["problem"]) == ("ended", "known-enough", "")
+    assert told["reach"]["reachable"] and not told["reach"]["known"]
+    assert told["knowledge"]["curve_percent"] <= told["target"]["curve_percent"] == 2.0
+    laid = [row for row in told["decisions"] if "sample_to_plan_ms" in row]
+    assert [row["kind"] for row in laid][-1] == "enough" and laid[0]["kind"] == "next"
+    assert document["summary"]["duration_s"] < 10
+    with service.app.state.context.store.read() as session:
+        from api.store.tables import Test
+
+        plan = session.get(Test, document["id"]).plan
+    assert plan["adaptive"] == {"max_duration_s": 45.0, "max_torque_time_nms": 360.0}
+    assert "key" not in plan and service.rig.key not in str(plan)
+
+
+def test_only_new_samples_are_sent_and_none_is_lost(client: httpx.Client, service: Service, participant: str) -> None:
+    asked: list[dict[str, Any]] = []
+    adviser = service.app.state.context.runner.adaptive.adviser
+    ask = adviser.ask
+
+    async def listening(verb: str, **arguments: Any) -> dict[str, Any]:
+        asked.append(arguments if verb == "adaptive_advise" else {})
+        return await ask(verb, **arguments)
+
+    adviser.ask = listening
+    played(client)
+    advised = [arguments for arguments in asked if arguments]
+    counters = [number for arguments in advised for number in arguments["counter"]]
+    assert counters == list(range(len(counters))) and len(counters) > 800
+    for arguments in advised:
+        assert len(arguments["laid_us"]) == arguments["segments"][-1][2]
+    assert advised[-1]["laid_us"][-40:] == [100.0, 200.0] * 20
+
+
+def test_enough_ends_it_well_at_any_time(client: httpx.Client, service: Service, participant: str) -> None:
+    test_id = start(client, target={"curve_percent": 0.2, "step_percent": 0.2}).json()["id"]
+    wait_for(client, test_id, lambda document: document["elapsed_s"] > 1)
+    answer = client.post(f"/v1/tests/{test_id}/enough")
+    assert answer.status_code == 200 and answer.json()["ended_by"] == "enough"
+    document = wait_done(client, test_id)
+    assert (document["state"], document["adaptive"]["ended"]) == ("completed", "enough")
+    assert document["summary"]["duration_s"] < 5
+    late = client.post(f"/v1/tests/{test_id}/enough")
+    assert late.status_code == 409 and late.json()["type"] == "/problems/rig-late"
+
+
+def test_a_fixed_test_knows_no_enough(client: httpx.Client, service: Service, participant: str) -> None:
+    test_id = client.post("/v1/tests", json={"participant": participant}).json()["id"]
+    assert client.post(f"/v1/tests/{test_id}/enough").status_code == 422
+    assert client.get(f"/v1/tests/{test_id}").json()["adaptive"] is None
+    client.post("/v1/stop")
+    assert client.post("/v1/tests/none/enough").status_code == 404
+
+
+@pytest.mark.parametrize(
+    ("percent", "why"), [(45.0, "The worker process died"), (43.0, "The curve is known within")], ids=["dies", "misfit"]
+)
+def test_the_fixed_plan_plays_on_and_it_is_told(
+    client: httpx.Client, service: Service, participant: str, percent: float, why: str
+) -> None:
+    service.rig.speed = 1.5
+    document = played(client, target={"curve_percent": percent}, max_duration_s=11)
+    told = document["adaptive"]
+    assert document["state"] == "completed" and told["ended"] == "fixed-rest"
+    assert told["problem"].startswith("The fixed plan plays on") and why in told["problem"]
+    assert document["summary"]["duration_s"] > 8
+
+
+def test_a_late_answer_falls_away_and_the_next_boundary_is_decided(
+    client: httpx.Client, service: Service, participant: str
+) -> None:
+    document = played(client, target={"curve_percent": 44.0}, max_duration_s=13)
+    told = document["adaptive"]
+    assert document["state"] == "completed" and told["problem"] == ""
+    assert any(row.get("late") for row in told["decisions"])
+    assert {s["by"] for s in service.rig.last_segments} >= {"plan", "extension"}
+    assert any(s["name"] == "prbs" for s in service.rig.last_segments)
+
+
+def test_what_the_rig_refuses_is_not_played(client: httpx.Client, service: Service, participant: str) -> None:
+    service.rig.refuses_extensions = True
+    document = played(client, target={"curve_percent": 4.0}, max_duration_s=11)
+    told = document["adaptive"]
+    assert any("refused" in row for row in told["decisions"]) and told["ended"] == "known-enough"
+    assert all(s["by"] != "extension" for s in service.rig.last_segments)
+
+
+def test_a_stop_stops_it_like_any_test(client: httpx.Client, service: Service, participant: str) -> None:
+    test_id = start(client).json()["id"]
+    wait_for(client, test_id, lambda document: document["elapsed_s"] > 1)
+    assert client.post("/v1/stop").status_code == 200
+    document = wait_done(client, test_id)
+    assert (document["state"], document["adaptive"]["ended"]) == ("stopped", "stopped")
+
+
+def test_out_of_reach_is_said_before_the_first_pulse(client: httpx.Client, service: Service, participant: str) -> None:
+    refused = start(client, max_torque_time_nm_s=10.0)
+    assert refused.status_code == 422 and refused.json()["type"] == "/problems/out-of-reach"
+    assert "6.0 %" in refused.json()["detail"] and refused.json()["reach"]["curve_percent"] == 6.0
+    assert service.rig.starts == 0
+    assert start(client, max_torque_time_nm_s=10.0, anyway=True).status_code == 202
+    client.post("/v1/stop")
+
+
+@pytest.mark.parametrize(
+    ("more", "place"),
+    [
+        ({"target": {"curve_percent": -1}}, "target.curve_percent"),
+        ({"target": {"curve_percent": "2"}}, "target.curve_percent"),
+        ({"target": {"step_percent": True}}, "target.step_percent"),
+        ({"target": {"curve": 2}}, "target.curve"),
+        ({"max_duration_s": 0}, "max_duration_s"),
+        ({"max_torque_time_nm_s": -3}, "max_torque_time_nm_s"),
+        ({"kind": "pre-session", "target": {"curve_percent": 2}}, ""),
+        ({"segments": [{"name": "a", "sequence": "rest"}]}, ""),
+    ],
+)
+def test_what_is_no_target_is_refused_by_its_place(
+    client: httpx.Client, participant: str, more: dict[str, Any], place: str
+) -> None:
+    refused = start(client, **more)
+    assert refused.status_code == 422
+    assert refused.json()["errors"][0]["field"].endswith(place), refused.json()
+
+
+def test_nan_is_no_target(client: httpx.Client, participant: str) -> None:
+    for number in ("NaN", "Infinity", "1e999"):
+        body = f'{{"participant": "P017", "kind": "adaptive", "target": {{"curve_percent": {number}}}}}'
+        answer = client.post("/v1/tests", content=body, headers={"Content-Type": "application/json"})
+        assert answer.status_code in (400, 422), answer.text
+
+
+def test_the_bounds_of_a_target_are_those_of_identify() -> None:
+    assert TargetIn().model_dump() == {"curve_percent": Target().curve_percent, "step_percent": Target().step_percent}
+    for name in TargetIn.model_fields:
+        TargetIn.model_validate({name: LEAST_PERCENT})
+        TargetIn.model_validate({name: MOST_PERCENT})
+        for outside in (0.99 * LEAST_PERCENT, 1.01 * MOST_PERCENT):
+            with pytest.raises(ValueError, match=name):
+                TargetIn.model_validate({name: outside})
