@@ -13,8 +13,8 @@ from api.client.errors import Unreachable
 from api.client.rest import Client
 
 
-def run_test(client: Client, participant: str, events: Callable[[], list[str]] = list) -> SessionTest:
-    """Run the default pre-session test and show its progress.
+def run_test(client: Client, participant: str, events: Callable[[], list[str]] = list, **more: Any) -> SessionTest:
+    """Run a test, the default pre-session test unless `more` says otherwise, and show its progress.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ def run_test(client: Client, participant: str, events: Callable[[], list[str]] =
 
     client.ensure_participant(participant)
     try:
-        return client.run_test(participant, watch)
+        return client.run_test(participant, watch, **more)
     except Unreachable as error:
         for event in events():
             raise ReportedError(event) from error
@@ -60,6 +60,9 @@ class Progress:
         if document["state"] == "identifying":
             segment = (document.get("identification") or {}).get("text") or "identifying"
             words = f"identification: {segment}"
+        elif (told := document.get("adaptive")) and document["state"] == "running":
+            segment = told["problem"] or told["words"] or "a first look at the muscle"
+            words = f"{document['elapsed_s']:4.1f} s  {number(told['torque_time_nm_s'], 1)} N·m·s  {segment}"
         else:
             segment = document.get("segment") or document["state"]
             words = f"{segment:10} {100 * document['progress']:3.0f} %  {document['time_left_s']:4.0f} s left"
@@ -69,6 +72,29 @@ class Progress:
         elif segment != self.last and not document["done"]:
             print(f"  {words}", file=sys.stderr, flush=True)
         self.last = segment
+
+
+ENDED = {
+    "known-enough": "enough is known",
+    "enough": "a person said that it is enough",
+    "dose": "the dose is used up",
+    "time": "the time is used up",
+    "fixed-rest": "the rest of the fixed test was played",
+}
+
+
+def adaptive_lines(told: Mapping[str, Any] | None) -> list[str]:
+    """Why a test that stops itself ended, and what it reached; nothing of another one."""
+    if not told:
+        return []
+    known, target = told["knowledge"] or {}, told["target"] or {}
+    reached = ", ".join(
+        f"{words} within {number(known.get(name), 1)} % (asked: {number(target.get(name), 1)} %)"
+        for name, words in (("curve_percent", "curve"), ("step_percent", "step response"))
+    )
+    dose = f"{number(told['torque_time_nm_s'], 1)} of at most {number(told['max_torque_time_nm_s'], 1)} N·m·s"
+    lines = [f"stopped        {ENDED.get(told['ended'], told['ended'])}; {dose}", f"known          {reached}"]
+    return [*lines, *([f"in doubt       {told['problem']}"] if told["problem"] else [])]
 
 
 def report_lines(test: Mapping[str, Any], model: dict[str, Any]) -> list[str]:
@@ -92,6 +118,7 @@ def report_lines(test: Mapping[str, Any], model: dict[str, Any]) -> list[str]:
         f"{number(late.get('median'), 3)}, p99 {number(late.get('p99'), 3)}, max {number(late.get('max'), 3)} ms",
         f"clocks         aligned by {aligned.get('method')}, error {number(aligned.get('error_ms'), 4)} ms",
         *(f"in doubt       {words}" for words in summary.get("warnings") or []),
+        *adaptive_lines(test.get("adaptive")),
         *model_report(model),
         *carried_lines((test.get("fit") or {}).get("carried")),
         f"served         {number(summary.get('last_sample_to_model_s'), 2)} s from the last sample to the stored model",

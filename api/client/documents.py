@@ -79,7 +79,7 @@ class SessionTest(TypedDict):
     """A test: how far it is; when `done`, its recording, its model and its summary.
 
     `recording_id` and `recording_url` are text once the recording is sealed, `model_id` and `model_url` once a model is
-    identified; None before.
+    identified; None before. `adaptive`: of a test that stops itself, what is known by now, and why it ended.
     """
 
     id: str
@@ -107,6 +107,7 @@ class SessionTest(TypedDict):
     model_id: Any
     model_url: Any
     summary: dict[str, Any]
+    adaptive: dict[str, Any] | None
     fit: Version | None
 
 

@@ -11,6 +11,9 @@ from api.client.documents import Note, Participant, SessionTest
 from api.client.errors import NotCompleted, NotFound
 from api.client.models import POLL_S, Models
 
+OUTLOOK_S = 300.0
+"""So long a busy service may take to say what an adaptive test can reach; usually it takes a few seconds."""
+
 
 class Client(Models):
     """What a program does with a running service. Each method is one request, or says otherwise; nothing is retried.
@@ -132,8 +135,12 @@ class Client(Models):
         return self.post("/v1/preview", json={"participant": participant, **more})
 
     def start_test(self, participant: str, **more: Any) -> SessionTest:
-        """Start a test, the pre-session test by default. `more`: `kind`, `segments`, `joins`, narrower limits."""
-        return self.post("/v1/tests", json={"participant": participant, **more})
+        """Start a test, the pre-session test by default. `more`: `kind`, `segments`, `joins`, narrower limits.
+
+        With `kind="adaptive"` it stops itself: `target`, `max_duration_s`, `max_torque_time_nm_s`, `anyway`.
+        """
+        wait = {"timeout": OUTLOOK_S} if more.get("kind") == "adaptive" else {}
+        return self.post("/v1/tests", json={"participant": participant, **more}, **wait)
 
     def test(self, test_id: str) -> SessionTest:
         """A test as it is now."""
@@ -184,6 +191,10 @@ class Client(Models):
     def set_ran_by(self, test_id: str, name: str | None) -> SessionTest:
         """Say who ran a test at the rig; None: who asked for it."""
         return self.request("PUT", f"/v1/tests/{test_id}/ran-by", json={"ran_by": name}).json()
+
+    def enough(self, test_id: str) -> dict[str, Any]:
+        """End a running adaptive test well, at the next pulse; its recording is identified like any other."""
+        return self.post(f"/v1/tests/{test_id}/enough")
 
     def keep_plain(self, test_id: str) -> SessionTest:
         """End the fit of last session's structure after a test: the plain model is offered. Refused when none runs."""

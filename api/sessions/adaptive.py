@@ -100,6 +100,7 @@ class Follower:
         self._new: dict[str, list[Any]] = {"host_time_s": [], "counter": [], "torque_nm": []}
         self._newest: LiveEvent | None = None
         self._heard_s = 0.0
+        self._took_s = 0.0
         self._turn = Turn(-1)
         self._work: asyncio.Task[None] | None = None
 
@@ -126,6 +127,11 @@ class Follower:
             log.warning("%s", self.told.problem, extra={"test_id": self.plan.test_id})
             self.tell()
 
+    @property
+    def torque_time_nm_s(self) -> float:
+        """Measured so far, N·m·s."""
+        return 0.0 if self._newest is None else self._newest.torque_time_nms
+
     # ---- what the rig says ----------------------------------------------------------------------------------
 
     def _hear(self, event: LiveEvent) -> None:
@@ -140,7 +146,8 @@ class Follower:
         left_s = event.boundary_s - event.elapsed_s
         idle = self._work is None or self._work.done()
         turn = self._turn
-        if idle and not turn.sent and event.elapsed_s >= LEAST_S and left_s <= (EARLY_S, LATE_S, -1.0)[turn.asked]:
+        early_s = max(EARLY_S, 1.5 * self._took_s + SEND_S)  # on a busy machine at once
+        if idle and not turn.sent and event.elapsed_s >= LEAST_S and left_s <= (early_s, LATE_S, -1.0)[turn.asked]:
             turn.asked = 2 if left_s <= LATE_S else 1
             self._work = asyncio.create_task(self._ask(turn, event))
         elif turn.answer is not None and not turn.sent and left_s <= SEND_S:  # the late one is not there
@@ -166,6 +173,7 @@ class Follower:
         except ApiError as error:
             self._give_up(f"{error.title}. {error.detail}")
             return
+        self._took_s = self.clock.monotonic_s() - heard_s
         answer = self._take(said, event, heard_s)
         if turn is not self._turn or turn.sent:
             answer.row["late"] = True
@@ -181,7 +189,7 @@ class Follower:
             "at_s": round(event.elapsed_s, 3), "kind": said["kind"], "words": said["words"],
             "segments": [segment["name"] for segment in said["segments"]],
             "expected_torque_time_nm_s": said["expected_dose_nm_s"],
-            "answer_ms": round(1e3 * (self.clock.monotonic_s() - heard_s), 1),
+            "answer_ms": round(1e3 * self._took_s, 1),
         }  # fmt: skip
         if known is not None:
             told.knowledge, told.least_known = known, said["least_known"]

@@ -15,7 +15,7 @@ from api.errors import ApiError
 from api.models import stored
 from api.models.registry import Versions
 from api.sessions import adaptive_plan
-from api.sessions.adaptive import Follower
+from api.sessions.adaptive import Follower, Told
 from api.sessions.adaptive_plan import ADAPTIVE
 from api.sessions.requests import TestIn
 from api.sessions.rig_client import RigClient
@@ -161,7 +161,8 @@ class AdaptiveTests:
         rigs, follower = str(event.summary.get("ended_by") or event.outcome), self._of(row.id)
         told = self._view(follower) if follower is not None else unfollowed(row)
         ended = told["ended"] if rigs == "enough" and told["ended"] else ENDS.get(rigs, rigs)
-        return {"adaptive": {**told, "state": "ended", "ended": ended}}
+        measured_nm_s = event.summary.get("torque_time_nms", told["torque_time_nm_s"])
+        return {"adaptive": {**told, "torque_time_nm_s": measured_nm_s, "state": "ended", "ended": ended}}
 
     def fit_options(self, row: Test) -> dict[str, Any]:
         """How the recording is fitted: a short one needs to know what a curve looks like, or looked like last time."""
@@ -183,7 +184,7 @@ class AdaptiveTests:
         bounds = follower.plan.adaptive
         assert bounds is not None
         limits = {"max_duration_s": bounds.max_duration_s, "max_torque_time_nm_s": bounds.max_torque_time_nms}
-        return {**limits, **asdict(follower.told)}
+        return {**limits, "torque_time_nm_s": follower.torque_time_nm_s, **asdict(follower.told)}
 
 
 def unfollowed(row: Test) -> dict[str, Any]:
@@ -192,10 +193,11 @@ def unfollowed(row: Test) -> dict[str, Any]:
     begun = row.state not in ("requested", "refused")
     why = "The fixed plan plays on: the service was restarted during the test." if begun else ""
     return {
-        "max_duration_s": bounds.get("max_duration_s"), "max_torque_time_nm_s": bounds.get("max_torque_time_nms"),
-        "target": row.plan.get("target"), "reach": row.plan.get("reach"), "state": "fixed", "words": "", "problem": why,
-        "knowledge": None, "least_known": None, "ended": "", "decisions": [],
-    }  # fmt: skip
+        "max_duration_s": bounds.get("max_duration_s"),
+        "max_torque_time_nm_s": bounds.get("max_torque_time_nms"),
+        "torque_time_nm_s": None,
+        **asdict(Told(row.plan.get("target") or {}, row.plan.get("reach") or {}, state="fixed", problem=why)),
+    }
 
 
 def out_of_reach(reach: dict[str, Any]) -> ApiError:

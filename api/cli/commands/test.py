@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import secrets
 import sys
@@ -32,18 +33,37 @@ def test(
     data: Annotated[Path | None, typer.Option(help="data folder; default ./var, or STIMRIG_DATA_DIR")] = None,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="write the recording (HDF5) here")] = None,
     emulate: Annotated[str, typer.Option(help='options for the emulator, e.g. "--patient calcium"')] = "",
+    adaptive: Annotated[bool, typer.Option("--adaptive", help="a test that stops itself once enough is known")] = False,
+    target: Annotated[
+        str, typer.Option(help="with --adaptive: half-widths of the bands of curve and step response, %", metavar="C,S")
+    ] = "",
+    max_time: Annotated[
+        float | None, typer.Option(help="with --adaptive: longest test, s; default 45", show_default=False)
+    ] = None,
+    max_dose: Annotated[
+        float | None,
+        typer.Option(
+            help="with --adaptive: largest torque-time, N·m·s; default 12 s at the torque that stops a test",
+            show_default=False,
+        ),
+    ] = None,
+    anyway: Annotated[bool, typer.Option("--anyway", help="play it although the target is out of reach")] = False,
     as_json: Json = False,
 ) -> None:
-    """One pre-session test: PRBS, ramp and held-out levels are sent, and the muscle is identified. Approves nothing."""
+    """One pre-session test: PRBS, ramp and held-out levels are sent, and the muscle is identified. Approves nothing.
+
+    With --adaptive each segment is chosen by what is known so far, and the test stops once enough is known.
+    """
+    asked = how(adaptive, target, max_time, max_dose, anyway)
     if url:
         token = os.environ.get("STIMRIG_TOKEN") or os.environ.get("STIMRIG_ADMIN_TOKEN")
         if not token:
             raise InputError(f"--url {url} needs a token in STIMRIG_TOKEN.")
         with StopKey(at_service(url, token), say_aside) as key:
             announce(key)
-            found = through(url, token, participant)
+            found = through(url, token, participant, asked=asked)
     else:
-        found = on_own_services(rig, data, emulate, participant)
+        found = on_own_services(rig, data, emulate, participant, asked)
     recording = found.pop("recording")
     if output is not None:
         save(output, recording)
@@ -52,6 +72,43 @@ def test(
         return
     say(*report_lines(found["test"], found["model"]))
     say(f"recording      {output or found['test']['recording_url']}")
+
+
+def how(adaptive: bool, target: str, max_time: float | None, max_dose: float | None, anyway: bool) -> dict[str, Any]:
+    """What the service is asked for beside the participant.
+
+    Raises
+    ------
+    InputError
+        An option of adaptive tests without --adaptive, or what is no number.
+    """
+    given = {"max_duration_s": max_time, "max_torque_time_nm_s": max_dose, "anyway": anyway or None}
+    asked: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+    if not adaptive:
+        if asked or target:
+            raise InputError("--target, --max-time, --max-dose and --anyway go with --adaptive.")
+        return {}
+    for option, value in (("--max-time", max_time), ("--max-dose", max_dose)):
+        if value is not None and not 0 < value < math.inf:
+            raise InputError(f"{option} {value:g}: give a number above 0.")
+    return {"kind": "adaptive", **asked, **({"target": target_of(target)} if target else {})}
+
+
+def target_of(text: str) -> dict[str, float]:
+    """A target as it is typed: one number for both curves, or two.
+
+    Raises
+    ------
+    InputError
+        It is none.
+    """
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) not in (1, 2) or not all(0 < value < math.inf for value in values):
+        raise InputError(f"--target {text}: give one number, as 2, or two, as 2,3: % of the curve and step response.")
+    return {"curve_percent": values[0], "step_percent": values[-1]}
 
 
 def announce(key: StopKey) -> None:
@@ -80,7 +137,9 @@ def save(path: Path, recording: bytes) -> None:
         raise InputError(f"{path}: {error.strerror}. Give a file in a folder that can be written.") from error
 
 
-def on_own_services(rig: Path | None, data: Path | None, emulate: str, participant: str) -> dict[str, Any]:
+def on_own_services(
+    rig: Path | None, data: Path | None, emulate: str, participant: str, asked: dict[str, Any]
+) -> dict[str, Any]:
     """Start rig and service for this one test."""
     given = {"rig_file": rig, "data_dir": data}
     settings = Settings(**{key: value for key, value in given.items() if value is not None})
@@ -92,10 +151,12 @@ def on_own_services(rig: Path | None, data: Path | None, emulate: str, participa
         StopKey(at_rig(services.socket), say_aside) as key,
     ):
         announce(key)
-        return through(services.url, token, participant, services.watch)
+        return through(services.url, token, participant, services.watch, asked)
 
 
-def through(url: str, token: str, participant: str, events: Callable[[], list[str]] = list) -> dict[str, Any]:
+def through(
+    url: str, token: str, participant: str, events: Callable[[], list[str]] = list, asked: dict[str, Any] | None = None
+) -> dict[str, Any]:
     """The test through a service.
 
     Raises
@@ -104,6 +165,6 @@ def through(url: str, token: str, participant: str, events: Callable[[], list[st
         The service cannot be reached, or the test did not end in a model.
     """
     with Client(url, token) as client:
-        document = run_test(client, participant, events)
+        document = run_test(client, participant, events, **(asked or {}))
         model = client.model_file(document["model_id"])
         return {"test": document, "model": model, "recording": client.recording(document["recording_id"])}

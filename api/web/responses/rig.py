@@ -139,10 +139,11 @@ class WorkOut(Document):
 class AdaptiveOut(Document):
     """A test that stops itself: how much is known, what is left, why it ended."""
 
-    target: dict[str, float] | None = Field(description="`curve_percent`, `step_percent`")
+    target: dict[str, float] = Field(description="`curve_percent`, `step_percent`")
     max_duration_s: float | None
     max_torque_time_nm_s: float | None
-    reach: ReachOut | None
+    torque_time_nm_s: float | None = Field(description="measured so far, N·m·s; null: not known")
+    reach: ReachOut | dict[str, Any] = Field(description="empty: it was never begun")
     state: Literal["choosing", "fixed", "ending", "ended"] = Field(description="`fixed`: the fixed plan plays on")
     words: str = Field(description="the newest decision, in a sentence")
     problem: str = Field(description="why the fixed plan plays on; empty while segments are chosen")
