@@ -11,6 +11,9 @@ SEGMENTS: dict[str, Any] = {
     "prbs": lazy("Random pulses"),
     "ramp": lazy("Ramp"),
     "validate": lazy("Check (not used for fitting)"),
+    "opening": lazy("First look"),
+    "hold": lazy("Level"),
+    "step": lazy("Step"),
 }
 VERDICTS: dict[str, Any] = {
     "usable": lazy("usable"),
@@ -22,6 +25,16 @@ TEST_KINDS: dict[str, Any] = {
     "pre-session": lazy("pre-session test"),
     "next-experiment": lazy("next experiment"),
     "sequence": lazy("trial of a controller"),
+    "adaptive": lazy("test that stops itself"),
+}
+ADAPTIVE_ENDS: dict[str, Any] = {
+    "known-enough": lazy("Enough is known"),
+    "enough": lazy("A person said that it is enough"),
+    "dose": lazy("The dose is used up"),
+    "time": lazy("The time is used up"),
+    "fixed-rest": lazy("The rest of the fixed test was played"),
+    "stopped": lazy("Stopped"),
+    "fault": lazy("Ended by a fault"),
 }
 TEST_STATES: dict[str, Any] = {
     "requested": lazy("begins"),
@@ -38,8 +51,10 @@ DECISIONS: dict[str, Any] = {"approved": lazy("approved"), "rejected": lazy("rej
 
 
 def segment_words(name: str | None) -> str:
-    """What a person calls a segment; a user's own name as it is."""
-    return str(SEGMENTS.get(name or "", name or ""))
+    """What a person calls a segment, a number behind it kept; a user's own name as it is."""
+    kind, _space, number = (name or "").partition(" ")
+    known = SEGMENTS.get(kind if number.isdecimal() else name or "")
+    return (name or "") if known is None else f"{known} {number}".strip()
 
 
 def verdict_words(verdict: str) -> str:
@@ -55,6 +70,11 @@ def test_kind_words(kind: str) -> str:
 def test_state_words(state: str) -> str:
     """How a test stands."""
     return str(TEST_STATES.get(state, state))
+
+
+def adaptive_end_words(ended: str) -> str:
+    """Why a test that stops itself ended."""
+    return str(ADAPTIVE_ENDS.get(ended, ended))
 
 
 def decision_words(decision: str | None) -> str:

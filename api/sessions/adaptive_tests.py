@@ -102,7 +102,7 @@ class AdaptiveTests:
         if plan.adaptive is None:
             return {}
         how, reach = self._hows[plan.test_id]
-        return {"target": how["target"], "reach": reach}
+        return {"target": how["target"], "reach": reach, "bounds": plan.adaptive.model_dump()}
 
     # ---- while it plays --------------------------------------------------------------------------------------
 
@@ -113,7 +113,7 @@ class AdaptiveTests:
         how, reach = self._hows[plan.test_id]
         self.leave()
         self.follower = follower = Follower(plan, how, reach, self.rig, self.adviser, self.clock, self._tell)
-        self._task = asyncio.create_task(follower.run(self.rig.path), name="adaptive test")
+        self._task = asyncio.create_task(follower.run(self.rig.path))
         return follower.key
 
     def _tell(self) -> None:

@@ -80,6 +80,8 @@ POST   /v1/participants/x/calibration/finish               run-test       404
 POST   /v1/tests                                           run-test       422
 POST   /v1/tests/x/keep-plain                              run-test       404
 POST   /tests/x/keep-plain                                 run-test       404
+POST   /v1/tests/x/enough                                  run-test       404
+POST   /tests/x/enough                                     run-test       404
 POST   /v1/preview                                         run-test       422
 POST   /v1/models/x/effects                                run-test       422
 POST   /v1/models/x/improve                                run-test       404

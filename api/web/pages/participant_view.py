@@ -12,11 +12,10 @@ from api.language import when
 from api.people.auth import Principal
 from api.sessions import profiles
 from api.sessions.questions import Question, Row
-from api.sessions.requests import TestIn
 from api.store import audit
 from api.store.tables import Participant, Test
 from api.web.dependencies import Context, Ctx, Tester
-from api.web.pages import limits_form, next_view, starting
+from api.web.pages import kind_form, limits_form, next_view, starting
 from api.web.pages.limits_form import LimitsForm
 from api.web.pages.render import page
 from api.web.routes import participants
@@ -70,17 +69,19 @@ async def taken(request: Request, context: Context, who: Principal, code: str, s
     """Take the form: refuse it, ask about it, or do what it says."""
     row = await asyncio.to_thread(participants.find, context, code)
     status = context.rig.status
-    form = limits_form.read(await request.form(), row.profile, status.limits if status else {})
+    sent = await request.form()
+    form = limits_form.read(sent, row.profile, status.limits if status else {})
     if form.notice and not form.errors:
         form.notice += await asyncio.to_thread(_by_whom, context, code)
         return await shown(request, context, code, form, 409)
     if form.errors:
         return await shown(request, context, code, form, 422)
+    wanted = kind_form.asked(sent, code) if start else None
 
     async def on() -> str:
-        if not start:
+        if wanted is None:
             return f"/participants/{code}"
-        return await starting.ask(context, who, TestIn.model_validate({"participant": code}))
+        return await starting.ask(context, who, wanted)
 
     if not form.asked:
         return RedirectResponse(await on(), 303)

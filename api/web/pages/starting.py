@@ -79,7 +79,7 @@ async def ask(context: Context, who: Principal, body: TestIn, back: str = "") ->
         button=_("Start now: %(strength)s", strength=strength),
         action=action,
         rows=rows(row, preview, standing, other_than(who.name, body.ran_by) or who.name, rig_words(context)),
-        warnings=warnings(row, standing),
+        warnings=[*warnings(row, standing), *out_of_reach(preview)],
         stimulates=True,
         back=back,
     )
@@ -93,6 +93,12 @@ def warnings(row: Participant, standing: Calibrated) -> list[str]:
     return [_("%(code)s is not calibrated: %(why)s.", code=row.code, why=NOBODY)]
 
 
+def out_of_reach(preview: dict[str, Any]) -> list[str]:
+    """That a test which stops itself will probably not reach its target, with what it can."""
+    reach = preview.get("reach") or {"reachable": True}
+    return [] if reach["reachable"] else [reach["words"]]
+
+
 def rows(row: Participant, preview: dict[str, Any], standing: Calibrated, ran_by: str, rig: str) -> list[Row]:
     """What a person has to know before saying yes."""
     pulses = sum(width > 0 for width in preview["pulse_width_us"])
@@ -100,6 +106,14 @@ def rows(row: Participant, preview: dict[str, Any], standing: Calibrated, ran_by
     dose = _("%(pulses)s pulses, %(charge)s", pulses=pulses, charge=number(preview["charge_uc"] / 1000, 2, "mC"))
     if torque_time is not None:
         dose += _(", about %(effort)s of torque", effort=number(torque_time, 0, "N·m·s"))
+    long = number(preview["duration_s"], 0, "s")
+    more = []
+    if bounds := preview.get("bounds"):
+        reach, most = preview["reach"], number(bounds["max_torque_time_nms"], 0, "N·m·s")
+        long = _("at most %(most)s", most=number(bounds["max_duration_s"], 0, "s"))
+        dose = _("at most %(most)s of torque", most=most)
+        more = [Row(_("Stops once known within"), number(preview["target"]["curve_percent"], 1, "%"))]
+        more += [Row(_("Expected"), translated(reach["words"]))] if reach["reachable"] else []
     profile = row.profile
     widest, most = number(widest_us(preview), 0, "µs"), number(profile["max_pulse_width_us"], 0, "µs")
     return [
@@ -107,7 +121,8 @@ def rows(row: Participant, preview: dict[str, Any], standing: Calibrated, ran_by
         Row(_("Side and muscle"), site_words(row.side, row.muscle)),
         Row(_("Current of every pulse"), current_words(row)),
         Row(_("Widest pulse"), _("%(widest)s, comfort maximum %(most)s", widest=widest, most=most)),
-        Row(_("How long"), number(preview["duration_s"], 0, "s")),
+        *more,
+        Row(_("How long"), long),
         Row(_("Dose"), dose),
         Row(_("Stops at"), number(profile["max_torque_nm"], 1, "N·m")),
         Row(_("Calibration"), standing.words),

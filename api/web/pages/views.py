@@ -12,7 +12,7 @@ from markupsafe import Markup
 from api.charts import model_charts
 from api.charts.svg import svg
 from api.errors import ApiError
-from api.language import _, translated
+from api.language import _, plain, translated
 from api.models import stored
 from api.store.tables import Test
 from api.web.dependencies import Context, Ctx, LiveReader, Tester
@@ -29,10 +29,12 @@ async def test(request: Request, context: Ctx, _who: LiveReader, test_id: str) -
     """A test: live while it runs, its outcome after."""
     row = await asyncio.to_thread(tests.find, context, test_id)
     document = await asyncio.to_thread(context.runner.document, row)
-    planned = (row.plan.get("preview") or {}).get("pulse_width_us") or []
+    fixed = [] if document["adaptive"] else (row.plan.get("preview") or {}).get("pulse_width_us") or []
     bounds = limits_of(row, context.rig.status)
+    if told := document["adaptive"]:
+        document = {**document, "adaptive": {**told, **{name: plain(told[name]) for name in ("words", "problem")}}}
     data = {
-        "test": document, "planned_us": planned, "pulse_rate_hz": row.plan.get("pulse_rate_hz", 40.0), "limits": bounds,
+        "test": document, "planned_us": fixed, "pulse_rate_hz": row.plan.get("pulse_rate_hz", 40.0), "limits": bounds,
     }  # fmt: skip
     shown: dict[str, Any] = await drawn(context, row) if document["done"] else {"drawn": None, "drawn_problem": None}
     notes = await asyncio.to_thread(context.notes.of_test, test_id)
@@ -48,6 +50,18 @@ async def keep_plain(context: Ctx, _who: Tester, test_id: str) -> Response:
     row = await asyncio.to_thread(tests.find, context, test_id)
     plain = row.model_id if context.runner.lifecycle.keep_plain(test_id) else None
     return RedirectResponse(f"/models/{plain}" if plain else f"/tests/{test_id}", 303)
+
+
+@router.post("/tests/{test_id}/enough")
+async def enough(context: Ctx, who: Tester, test_id: str) -> Response:
+    """End a test that stops itself well; where it has ended just before the press, its page shows what came of it."""
+    row = await asyncio.to_thread(tests.find, context, test_id)
+    try:
+        await context.runner.adaptive.enough(row, who.name)
+    except ApiError as error:
+        if error.code != "rig-late":
+            raise
+    return RedirectResponse(f"/tests/{test_id}", 303)
 
 
 def limits_of(row: Test, status: Status | None) -> dict[str, float | None]:
@@ -89,6 +103,6 @@ async def what_was_recorded(context: Context, row: Test) -> Markup:
     """Torque and the pulses that were sent, up to the test's end; the rest of the plan faint."""
     path = await asyncio.to_thread(context.analyses.path, str(row.recording_id))
     found = await context.pool.submit("recorded", urgent=True, data=path).result
-    plan_us = (row.plan.get("preview") or {}).get("pulse_width_us") or []
+    plan_us = [] if row.plan.get("adaptive") else (row.plan.get("preview") or {}).get("pulse_width_us") or []
     figure = model_charts.recorded(found, plan_us, row.plan.get("pulse_rate_hz", 40.0), translated(row.state))
     return svg(figure, 1160.0, 460.0, _("Torque that was measured and pulses that were sent, over time"))

@@ -12,7 +12,8 @@ const state = {
 };
 
 function shown(text) { return String(text).replace("-", "−").replace(".", words.decimal); }
-function segmentWords(name) { return words.segments[name] || name; }
+function segmentWords(name) { const [kind, number] = name.split(" "); return words.segments[name] || (words.segments[kind] ? words.segments[kind] + " " + number : name); }
+const parts = () => state.laid || (state.test.planned || {}).segments || [];
 function say(name, text) { const box = byId(name); if (box.textContent !== text) box.textContent = text; }
 
 function take(message) {
@@ -24,6 +25,8 @@ function take(message) {
     state.torqueAge = message.torque_age_s;
     if (message.test_id === state.test.id) addFrame(message);
     showNumbers(message);
+  } else if (message.type === "adaptive") {
+    showAdaptive(message);
   } else if (message.type === "test") {
     showTest(message.test, message.words);
   } else if (message.type === "link" || message.type === "idle") {
@@ -37,6 +40,9 @@ function addFrame(message) {
   if (message.duration_s) state.duration = message.duration_s;
   state.time.push(...message.time_s); state.low.push(...message.torque_min_nm); state.high.push(...message.torque_max_nm);
   state.pulseTime.push(...message.pulse_time_s); state.width.push(...message.pulse_width_us);
+  if (!state.test.adaptive) return;
+  showDose(message.torque_time_nms);
+  if (message.laid_segments.length !== (state.laid || []).length) { state.laid = message.laid_segments; drawTrack(); }
 }
 
 function showNumbers(message) {
@@ -130,7 +136,7 @@ function frame(canvas, low, high, title, unit) {
 }
 
 function segments(pen, area, x) {
-  for (const part of (state.test.planned || {}).segments || []) {
+  for (const part of parts()) {
     if (part.name !== "validate") continue;
     pen.fillStyle = colours["held-out"];
     pen.fillRect(x(part.start_s), area.top, x(part.end_s) - x(part.start_s), area.bottom - area.top);
@@ -202,17 +208,18 @@ function cursor(pen, x, area) {
 }
 
 function drawTrack() {
-  const track = byId("track"), parts = (state.test.planned || {}).segments || [];
-  track.replaceChildren(...parts.map((part) => {
+  const track = byId("track"), shownParts = parts(), last = shownParts[shownParts.length - 1];
+  const open = state.laid && last && state.duration > last.end_s ? [{ name: "rest", start_s: last.end_s, end_s: state.duration }] : [];
+  track.replaceChildren(...[...shownParts, ...open].map((part) => {
     const box = document.createElement("span");
-    box.style.flexGrow = part.end_s - part.start_s; box.style.flexBasis = "0"; box.textContent = part.name === "rest" ? "" : segmentWords(part.name); box.title = part.name; box.className = "part part-" + part.name;
+    box.style.flexGrow = part.end_s - part.start_s; box.style.flexBasis = "0"; box.textContent = part.name === "rest" ? "" : segmentWords(part.name); box.title = part.name; box.className = "part part-" + part.name.split(" ")[0];
     return box;
   }));
   for (const box of track.children) if (box.scrollWidth > box.clientWidth) box.textContent = box.textContent.split(" (")[0]; // what stands in brackets has no room
 }
 
 function draw() {
-  if (state.dirty) { state.dirty = false; drawTorque(); drawWidth(); }
+  if (state.dirty) { state.dirty = false; drawTorque(); drawWidth(); if (state.test.adaptive) drawKnown(); }
   requestAnimationFrame(draw);
 }
 
@@ -250,6 +257,7 @@ addEventListener("colours", readColours);
 new ResizeObserver(fit).observe(document.getElementById("main"));
 readColours();
 fit();
+if (state.test.adaptive) { state.laid = []; showAdaptive(state.test.adaptive); }
 drawTrack();
 connect();
 setInterval(age, 100);
