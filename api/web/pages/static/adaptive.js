@@ -30,7 +30,7 @@ function band(name, curve, percent, title, xtitle, unit, largest) {
   const low = curve ? Math.min(0, ...curve.low) : 0, high = curve ? Math.max(...curve.high) : 1, last = curve ? curve.x[curve.x.length - 1] : largest;
   const canvas = box.getContext("2d"), ratio = window.devicePixelRatio || 1, size = box.getBoundingClientRect();
   box.width = Math.round(size.width * ratio); box.height = Math.round(size.height * ratio);
-  const pen = canvas, area = { left: 50, right: size.width - 10, top: 26, bottom: size.height - 36 };
+  const pen = canvas, area = { left: 50, right: size.width - 16, top: 26, bottom: size.height - 36 };
   pen.setTransform(ratio, 0, 0, ratio, 0, 0);
   const x = (v) => area.left + (v / last) * (area.right - area.left), y = (v) => area.bottom - ((v - low) / ((high - low) * 1.04 || 1)) * (area.bottom - area.top);
   pen.font = "12px " + FONT; pen.fillStyle = colours.dim; pen.strokeStyle = colours.grid; pen.lineWidth = 1;

@@ -1,0 +1,87 @@
+"""The pages of a test that stops itself: the choice, the question, what is known by now, Enough."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.api.browser import participant
+from tests.api.conftest import STUB, Service, run_service, wait_done
+from tests.api.test_axe import examined
+
+pytestmark = pytest.mark.browser
+
+
+@pytest.fixture
+def service(tmp_path: Path, short_dir: Path) -> Iterator[Service]:
+    """Slow enough to look at a running test from all sides."""
+    yield from run_service(tmp_path, short_dir, STUB, speed=0.25)
+
+
+def chosen(tab: Any, target: str) -> None:
+    """The choice is made and sent."""
+    tab.locator("[name=plan][value=adaptive]").check()
+    tab.locator("[name=target]").fill(target)
+    tab.locator("button.stimulate").first.click()
+
+
+def begun(tab: Any, target: str) -> None:
+    chosen(tab, target)
+    tab.locator("form.steps button.stimulate").click()
+    tab.locator("#knows").wait_for()
+
+
+def test_a_test_that_stops_itself_on_its_page(tab: Any, service: Service) -> None:
+    participant(tab, service, "X1")
+    tab.locator("[name=plan][value=adaptive]").check()
+    examined(tab, "the choice")
+    chosen(tab, "0,2")
+    tab.get_by_text("The target should be reached").wait_for()
+    examined(tab, "the question")
+    tab.locator("form.steps button.stimulate").click()
+    tab.locator("#knows").wait_for()
+    tab.get_by_text("Stops once both are known within 0.2 %").wait_for()
+    examined(tab, "a first look")
+    tab.locator("#known-words", has_text="known within 8.0 %").wait_for()
+    tab.locator("#least-known", has_text="140 µs").wait_for()
+    assert float(tab.locator("#dose-used").inner_text()) > 0
+    examined(tab, "while it is chosen")
+    with service.client() as client:
+        test_id = client.get("/v1/tests").json()[0]["id"]
+        tab.get_by_role("button", name="Enough").click()
+        document = wait_done(client, test_id)
+    assert (document["state"], document["adaptive"]["ended"]) == ("completed", "enough")
+    tab.goto(f"{service.url}/tests/{test_id}")
+    tab.get_by_text("A person said that it is enough").wait_for()
+    examined(tab, "after it")
+    assert tab.errors == []
+
+
+def test_in_german(tab: Any, service: Service) -> None:
+    participant(tab, service, "X1")
+    tab.get_by_role("button", name="Deutsch").click()
+    begun(tab, "0,2")
+    tab.get_by_text("Hört auf, sobald beide auf 0,2 % bekannt sind.").wait_for()
+    tab.locator("#known-words", has_text="Die Kurve ist auf 8,0 % bekannt").wait_for()
+    tab.get_by_role("button", name="Genug").wait_for()
+    examined(tab, "in German")
+    assert tab.locator("#knows [lang=en]").count() == 0
+
+
+def test_a_worker_that_dies_is_told_on_the_page(tab: Any, service: Service) -> None:
+    service.rig.speed = 1.0
+    participant(tab, service, "X1")
+    begun(tab, "45")
+    tab.locator("#fixed-why").get_by_text("The fixed plan plays on").wait_for()
+
+
+@pytest.mark.parametrize("typed", ["", "-1", "nan", "0,1", "51", "zwei", "1e1"])
+def test_what_is_no_target_starts_nothing(tab: Any, service: Service, typed: str) -> None:
+    participant(tab, service, "X1")
+    chosen(tab, typed)
+    tab.get_by_text("Target:").wait_for()
+    tab.get_by_text("Nothing was started").wait_for()
+    assert service.rig.starts == 0
