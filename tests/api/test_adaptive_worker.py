@@ -1,0 +1,110 @@
+"""What the adviser's worker makes of live samples: their times, their record, and decisions that keep their word."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+
+from api.workers import adaptive_verbs as verbs
+from tests.harness.adaptive import PULSE_RATE_HZ, Muscle, sigmoid
+
+HOW: dict[str, Any] = {
+    "target": {"curve_percent": 4.0, "step_percent": 4.0},
+    "max_duration_s": 45.0,
+    "max_torque_time_nm_s": 360.0,
+    "largest_us": 300.0,
+    "pulse_rate_hz": PULSE_RATE_HZ,
+}
+OPENING = [0.0] * 20 + [7.5 * k for k in range(1, 41)] + [300.0] * 12 + [0.0] * 36
+
+
+def quiet(*_: Any) -> None:
+    """Progress that nobody sees."""
+
+
+class Cell:
+    """A load cell whose samples take a while to arrive, some of them much longer."""
+
+    def __init__(self, muscle: Muscle, seed: int, rate_hz: float = 1600.0, way_s: float = 0.0024) -> None:
+        self.muscle, self.rate_hz, self.way_s, self.seed = muscle, rate_hz, way_s, seed
+        self.sent = 0
+
+    def news(self, widths: list[float], until_s: float, lost: tuple[int, int] = (0, 0)) -> dict[str, Any]:
+        """The samples that are new, as a live event tells them."""
+        rng = np.random.default_rng([self.seed, 7])
+        torque = self.muscle.torque(np.array(widths), self.rate_hz)
+        noise = 0.01 * np.random.default_rng(self.seed).standard_normal(200_000)[: torque.size]
+        late = self.way_s + rng.exponential(0.0005, 200_000)[: torque.size]
+        late[::400] += 0.08
+        numbers = [k for k in range(self.sent, int(until_s * self.rate_hz)) if not lost[0] <= k < lost[1]]
+        self.sent = int(until_s * self.rate_hz)
+        return {
+            "host_time_s": [float(k / self.rate_hz + late[k]) for k in numbers],
+            "counter": [k + 4000 for k in numbers],
+            "torque_nm": [float(torque[k] + noise[k]) for k in numbers],
+        }
+
+
+def test_times_are_those_of_the_samples_that_waited_nowhere() -> None:
+    news = Cell(sigmoid(71), 1).news([0.0] * 120, 3.0)
+    time_s = verbs.sample_times(news["host_time_s"], news["counter"])
+    assert np.abs(time_s - 0.0024 - np.arange(4800) / 1600.0).max() < 0.0003
+
+
+def test_lost_samples_and_none_move_nothing() -> None:
+    muscle, widths = sigmoid(72), OPENING
+    segments = [("opening", 0, len(widths))]
+    records = []
+    for lost in ((0, 0), (1600, 1900)):
+        news = Cell(muscle, 2).news(widths, 2.5, lost)
+        news["torque_nm"][100] = None
+        records.append(verbs.record_of(*news.values(), widths, segments, PULSE_RATE_HZ))
+    whole, holed = records
+    assert whole.time_s.size - holed.time_s.size == pytest.approx(300 / 8, abs=2)
+    kept = np.isin(whole.time_s, holed.time_s)
+    assert np.abs(np.interp(holed.time_s, whole.time_s[kept], whole.torque_nm[kept]) - holed.torque_nm).max() < 0.05
+    assert np.array_equal(holed.pulses.width_us, widths)
+
+
+def test_a_slow_cell_keeps_its_samples() -> None:
+    time_s = np.arange(300) / 100.0
+    assert verbs.means(time_s, time_s, 5 * PULSE_RATE_HZ)[0].size == 300
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [73, 74])
+def test_a_test_is_advised_to_its_end(seed: int) -> None:
+    muscle = sigmoid(seed)
+    cell = Cell(muscle, seed)
+    verbs.begin(quiet, **HOW)
+    widths, segments = list(OPENING), [("opening", 0, len(OPENING))]
+    for _ in range(30):
+        end_s = len(widths) / PULSE_RATE_HZ
+        dose = float(np.sum(muscle.curve(np.array(widths)))) / PULSE_RATE_HZ
+        news = cell.news(widths, end_s - 0.4)
+        told = verbs.advise(
+            quiet, **news, laid_us=widths, segments=segments, torque_time_nm_s=dose, measured_s=end_s - 0.4
+        )
+        json.dumps(told, allow_nan=False)
+        if told["kind"] != "next":
+            break
+        for segment in told["segments"]:
+            segments.append((segment["name"], len(widths), len(widths) + len(segment["settings"]["pulse_width_us"])))
+            widths += segment["settings"]["pulse_width_us"]
+    assert told["kind"] == "enough", told["words"]
+    assert len(widths) / PULSE_RATE_HZ < 30
+    known = told["knowledge"]["recruitment"]
+    truth = muscle.curve(np.array(known["pulse_width_us"]))
+    plateau = told["knowledge"]["plateau_nm"]
+    assert np.abs(np.array(known["torque_nm"]) - truth).max() < 0.06 * plateau
+    assert 0 <= told["least_known"]["pulse_width_us"] <= 300
+
+
+def test_a_new_test_forgets_the_one_before() -> None:
+    verbs.begin(quiet, **HOW)
+    first = verbs._running[0]
+    verbs.begin(quiet, **HOW)
+    assert verbs._running != [first] and len(verbs._running) == 1
