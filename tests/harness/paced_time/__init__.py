@@ -11,11 +11,10 @@ from pathlib import Path
 import pytest
 
 from tests.harness.paced_time.conductor import WAITED
-from tests.harness.paced_time.paced_clock import BYTES, VARIABLE, PacedClock
+from tests.harness.paced_time.paced_clock import BYTES, FOR_EVER_NS, VARIABLE, PacedClock, real_ns
 
 FOLDER = Path(__file__).parent
 CLOCK = PacedClock()
-CLOCK.rule()  # before the tests import what they test; it is real time until the first of them is on the wire
 
 
 class Pace:
@@ -48,10 +47,11 @@ class Pace:
         return CLOCK.cells[WAITED] * 1e-9
 
     def close(self) -> None:
-        """End the conductor; for a child that still reads, time has stopped."""
-        CLOCK.let_go()
+        """End the conductor; for a child that still reads, real time goes on."""
         self.process.kill()
         self.process.wait()
+        CLOCK.write(CLOCK.read(real_ns())[0], real_ns(), FOR_EVER_NS)
+        CLOCK.let_go()
         self._file.close()
 
 
@@ -73,6 +73,11 @@ class Plugin:
         waited_s, load = self._pace.waited_s - self._before_s, " ".join(f"{value:.1f}" for value in os.getloadavg())
         report.sections.append(("machine", f"time waited {waited_s:.2f} s for a processor; load {load}"))
         return report
+
+
+def pytest_configure() -> None:
+    """Rule this process before the tests import what they test; it is real time until the first is on the wire."""
+    CLOCK.rule()
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:

@@ -1,10 +1,14 @@
 """The process that lets paced time go on, or wait (`paced_clock.py` says what for).
 
-Every `TICK_S` it looks when each process that keeps time said last that it was given a processor. Where that is longer
-ago than `LATE_S`, time waits, unless that process
+Every `TICK_S` it looks whether somebody is left without a processor, and lets time wait while it is so:
 
-- computed itself in that time, or was stopped, or has ended: that is its own doing, which a test may want to see;
-- has said nothing for `LOST_S`.
+- a processor itself: a thread of this process on each of them, before all others, has not run for `LATE_S`. Its host
+  gave it to somebody else.
+- a process that keeps time: it has not said for `LATE_S` that it runs, though one of its threads is ready to run, and
+  it has used less than `OWN_SHARE` of a processor meanwhile.
+
+So time does not wait for a process that computes, or that waits for a disk, for a lock, or for a call that holds
+Python's own lock; nor for one that was stopped or has ended, nor for longer than `LOST_NS`.
 
 Nobody can read more than `AHEAD_S` beyond what was written last: when this process itself gets no processor, time waits
 as well. So at most about `LATE_S + TICK_S + AHEAD_S` of a standstill are seen, 0.043 s. The shortest wait on which a
@@ -16,59 +20,73 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
+import threading
 import time
 from pathlib import Path
 
 if __package__:
-    from tests.harness.paced_time.paced_clock import FIRST_MEMBER, MEMBERS, SLOTS, PacedClock, real_ns, real_sleep
+    from tests.harness.paced_time.paced_clock import (
+        BEAT_S,
+        FIRST_MEMBER,
+        FOR_EVER_NS,
+        LOST_NS,
+        MEMBERS,
+        PacedClock,
+        real_ns,
+        real_sleep,
+    )
 else:
-    from paced_clock import FIRST_MEMBER, MEMBERS, SLOTS, PacedClock, real_ns, real_sleep
+    from paced_clock import BEAT_S, FIRST_MEMBER, FOR_EVER_NS, LOST_NS, MEMBERS, PacedClock, real_ns, real_sleep
 
 TICK_S = 0.003
 LATE_S = 0.030
 AHEAD_S = 0.010
-LOST_S = 10.0
 OWN_SHARE = 0.3
-"""A process that used so much of a processor since it was heard was not left without one."""
 PRIORITY = 30
 WAITED = FIRST_MEMBER + 2 * MEMBERS
 """The cell that counts how long time has waited in all, ns."""
 
 
 class Conductor:
-    """Writes the file."""
+    """Writes the file.
 
-    def __init__(self, path: str) -> None:
-        clock = PacedClock()
-        clock.follow(path)
-        self._cells = clock.cells
+    Parameters
+    ----------
+    path
+        The file, `BYTES` long.
+    processors
+        When each processor was last seen to run, ns of real time, by its number.
+    """
+
+    def __init__(self, path: str, processors: dict[int, int]) -> None:
+        self._clock, self._processors = PacedClock(), processors
+        self._clock.follow(path)
         self._heard: dict[int, tuple[int, int]] = {}
+        self._last_ns = 0, 0
 
     def begin(self, now_ns: int) -> None:
         """Paced time begins as real time."""
-        self._write(now_ns, now_ns, AHEAD_S)
+        self._clock.write(now_ns, now_ns, int(AHEAD_S * 1e9))
+        self._last_ns = now_ns, now_ns
 
     def tick(self, now_ns: int) -> None:
         """Look after everybody, and go on or wait."""
-        cells = self._cells
-        place = 1 + 3 * (cells[0] % SLOTS)
-        passed_ns = now_ns - cells[place + 1]
-        went_on_ns = min(passed_ns, cells[place + 2])
-        cells[WAITED] += passed_ns - went_on_ns
-        self._write(cells[place] + went_on_ns, now_ns, 0.0 if self._someone_waits(now_ns) else AHEAD_S)
+        paced_ns, left_ns = self._clock.read(now_ns)
+        self._clock.cells[WAITED] += now_ns - self._last_ns[0] - (paced_ns - self._last_ns[1])
+        self._last_ns = now_ns, paced_ns
+        # while it waits, what a reader may have read already stays the limit: time never goes back
+        self._clock.write(paced_ns, now_ns, left_ns if self._someone_waits(now_ns) else int(AHEAD_S * 1e9))
 
-    def _write(self, paced_ns: int, now_ns: int, ahead_s: float) -> None:
-        number = self._cells[0] + 1
-        place = 1 + 3 * (number % SLOTS)
-        self._cells[place], self._cells[place + 1], self._cells[place + 2] = paced_ns, now_ns, int(ahead_s * 1e9)
-        self._cells[0] = number
+    def end(self, now_ns: int) -> None:
+        """Let real time go on for whoever still reads."""
+        self._clock.write(self._clock.read(now_ns)[0], now_ns, FOR_EVER_NS)
 
     def _someone_waits(self, now_ns: int) -> bool:
-        late = False
+        late = any(now_ns - seen_ns > LATE_S * 1e9 for seen_ns in self._processors.values())
+        cells = self._clock.cells
         for place in range(FIRST_MEMBER, FIRST_MEMBER + 2 * MEMBERS, 2):
-            pid = self._cells[place]
-            if pid:
-                late = self._waits(pid, self._cells[place + 1], place, now_ns) or late
+            if pid := cells[place]:
+                late = self._waits(pid, cells[place + 1], place, now_ns) or late
         return late
 
     def _waits(self, pid: int, heard_ns: int, place: int, now_ns: int) -> bool:
@@ -77,12 +95,12 @@ class Conductor:
         if self._heard.get(place, (0, 0))[0] != heard_ns:
             self._heard[place] = heard_ns, used_ns
         silent_ns = now_ns - heard_ns
-        if silent_ns <= LATE_S * 1e9 or silent_ns > LOST_S * 1e9:
+        if not (LATE_S * 1e9 < silent_ns <= LOST_NS):
             return False
-        state = state_of(pid)
-        if state in "XZ":
-            self._cells[place] = 0
-        return state not in "TtXZ" and used_ns - self._heard[place][1] < OWN_SHARE * silent_ns
+        states = states_of(pid)
+        if states <= {"X", "Z"}:
+            self._clock.cells[place] = 0
+        return "R" in states and used_ns - self._heard[place][1] < OWN_SHARE * silent_ns
 
 
 def processor_ns(pid: int) -> int:
@@ -93,25 +111,44 @@ def processor_ns(pid: int) -> int:
         return 0
 
 
-def state_of(pid: int) -> str:
-    """One letter, as /proc tells it: T stopped, Z ended, X none."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(") ")[2][:1]
-    except OSError:
-        return "X"
+def states_of(pid: int) -> set[str]:
+    """One letter for each thread, as /proc tells it: R ready to run, T stopped, Z ended; none: there is no process."""
+    found = set()
+    with contextlib.suppress(OSError):
+        for thread in Path(f"/proc/{pid}/task").iterdir():
+            with contextlib.suppress(OSError):
+                found.add((thread / "stat").read_text().rpartition(") ")[2][:1])
+    return found
+
+
+def be_first() -> None:
+    """Run before all others where it is allowed; for the thread that calls it."""
+    with contextlib.suppress(OSError):
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(PRIORITY))
+
+
+def stand_on(number: int, processors: dict[int, int]) -> None:
+    """Say again and again that this processor runs: the body of a thread."""
+    os.sched_setaffinity(0, {number})
+    be_first()
+    while True:
+        processors[number] = real_ns()
+        real_sleep(BEAT_S)
 
 
 def main(path: str, ready: int) -> None:
     """Run until the parent has ended."""
-    with contextlib.suppress(OSError):
-        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(PRIORITY))
-    parent = os.getppid()
-    conductor = Conductor(path)
+    parent, processors = os.getppid(), dict.fromkeys(os.sched_getaffinity(0), real_ns())
+    conductor = Conductor(path, processors)
     conductor.begin(real_ns())
+    for number in processors:
+        threading.Thread(target=stand_on, args=(number, processors), daemon=True).start()
+    be_first()
     os.write(ready, b"1")
     while os.getppid() == parent:
         conductor.tick(real_ns())
         real_sleep(TICK_S)
+    conductor.end(real_ns())
 
 
 if __name__ == "__main__":

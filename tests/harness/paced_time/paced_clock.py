@@ -7,7 +7,9 @@ given a processor, and waits while one is not (`conductor.py` says when). A proc
 by waiting for something, is not waited for: such faults are seen as ever.
 
 All processes of a test share a file that the conductor writes. A child of a test joins by itself: `sitecustomize.py`
-lies beside this file, and Python imports it first. Nothing of stimrig knows of paced time.
+lies beside this file, and Python imports it first. Nothing of stimrig knows of paced time. It rules `time.monotonic`
+and `time.sleep`, `threading`'s conditions, events and queues, `select.select`, and so asyncio, pyserial and python-can.
+Still real are `time.time`, the time limits of sockets, of locks and of pytest.
 """
 
 from __future__ import annotations
@@ -32,6 +34,9 @@ SLOTS, MEMBERS, BYTES = 64, 64, 4096
 FIRST_MEMBER = 1 + 3 * SLOTS
 BEAT_S = 0.005
 SHORTEST_S = 0.0005
+LOST_NS = 10_000_000_000
+"""A conductor that has written nothing for so long has ended: real time goes on."""
+FOR_EVER_NS = 2**62
 
 real_s, real_ns, real_sleep = time.monotonic, time.monotonic_ns, time.sleep
 
@@ -48,27 +53,30 @@ class PacedClock:
     def let_go(self) -> None:
         """Follow real time from now on."""
         self._path, self.cells = "", memoryview(bytearray(BYTES)).cast("q")
-        self.cells[3] = 2**62  # from its beginning as far as anybody may read
+        self.write(0, 0, FOR_EVER_NS)
 
     def follow(self, path: str) -> None:
         """Read this file from now on."""
         with Path(path).open("r+b") as file:
             self._path, self.cells = path, memoryview(mmap.mmap(file.fileno(), BYTES)).cast("q")
 
-    def rule(self) -> None:
-        """Be the monotonic clock of this process, and what it waits by."""
-        time.monotonic, time.sleep = self.now_s, self.sleep
-        select.select = select_paced
-        threading.Condition.wait = wait  # pyright: ignore[reportAttributeAccessIssue]
-        threading._time = self.now_s  # pyright: ignore[reportAttributeAccessIssue]
-        if "queue" in sys.modules:
-            sys.modules["queue"].time = self.now_s  # pyright: ignore[reportAttributeAccessIssue]
+    def write(self, paced_ns: int, now_ns: int, ahead_ns: int) -> None:
+        """Say what paced time is; readers see the whole slot or the one before."""
+        number = self.cells[0] + 1
+        place = 1 + 3 * (number % SLOTS)
+        self.cells[place], self.cells[place + 1], self.cells[place + 2] = paced_ns, now_ns, ahead_ns
+        self.cells[0] = number
+
+    def read(self, now_ns: int) -> tuple[int, int]:
+        """Paced time at a real time, and how much further it may go on by itself, ns."""
+        place = 1 + 3 * (self.cells[0] % SLOTS)
+        passed_ns, ahead_ns = max(now_ns - self.cells[place + 1], 0), self.cells[place + 2]
+        went_on_ns = min(passed_ns, ahead_ns)
+        return self.cells[place] + went_on_ns + max(passed_ns - max(LOST_NS, ahead_ns), 0), ahead_ns - went_on_ns
 
     def now_s(self) -> float:
         """Paced time, s: monotonic, and the same in all processes of the file."""
-        cells, now_ns = self.cells, real_ns()
-        place = 1 + 3 * (cells[0] % SLOTS)
-        return (cells[place] + min(max(now_ns - cells[place + 1], 0), cells[place + 2])) * 1e-9
+        return self.read(real_ns())[0] * 1e-9
 
     def sleep(self, duration_s: float) -> None:
         """Sleep for so much paced time."""
@@ -79,16 +87,31 @@ class PacedClock:
             real_sleep(max(left_s, SHORTEST_S))
         return None
 
+    def rule(self) -> None:
+        """Be the monotonic clock of this process, and what it waits by."""
+        time.monotonic, time.sleep = self.now_s, self.sleep
+        select.select = select_paced
+        threading.Condition.wait = wait  # pyright: ignore[reportAttributeAccessIssue]
+        threading._time = self.now_s  # pyright: ignore[reportAttributeAccessIssue]
+        if "queue" in sys.modules:
+            sys.modules["queue"].time = self.now_s  # pyright: ignore[reportAttributeAccessIssue]
+
     def keep(self) -> None:
         """Let time wait for this process from now on: a thread says again and again that it is given a processor."""
+        pid, places = os.getpid(), range(FIRST_MEMBER, FIRST_MEMBER + 2 * MEMBERS, 2)
         with Path(self._path).open("r+b") as file:
             fcntl.flock(file, fcntl.LOCK_EX)
-            places = range(FIRST_MEMBER, FIRST_MEMBER + 2 * MEMBERS, 2)
-            place = next(i for i in places if self.cells[i] in (0, os.getpid()))
-            self.cells[place + 1] = real_ns()
-            self.cells[place] = os.getpid()
-        threading.Thread(target=self._beat, args=(place + 1,), name="paced-time", daemon=True).start()
-        atexit.register(self.cells.__setitem__, place, 0)
+            free = [i for i in places if self.cells[i] == pid] or [i for i in places if self.cells[i] == 0]
+            if not free:
+                raise RuntimeError(f"paced time waits for {MEMBERS} processes at most")
+            self.cells[free[0] + 1] = real_ns()
+            self.cells[free[0]] = pid
+        threading.Thread(target=self._beat, args=(free[0] + 1,), name="paced-time", daemon=True).start()
+        atexit.register(self._leave, free[0], pid)
+
+    def _leave(self, place: int, pid: int) -> None:
+        if self.cells[place] == pid == os.getpid():  # not a child that was forked from it
+            self.cells[place] = 0
 
     def _beat(self, place: int) -> None:
         while True:
@@ -100,10 +123,11 @@ def wait(condition: threading.Condition, timeout: float | None = None) -> bool:
     """`threading.Condition.wait` in paced time."""
     if timeout is None or timeout <= 0:
         return _wait(condition, timeout)
-    end_s = time.monotonic() + timeout
-    while (left_s := end_s - time.monotonic()) > 0:
+    end_s, left_s = time.monotonic() + timeout, timeout
+    while left_s > 0:
         if _wait(condition, max(left_s, SHORTEST_S)):
             return True
+        left_s = end_s - time.monotonic()
     return False
 
 
@@ -113,11 +137,12 @@ def select_paced(
     """`select.select` in paced time."""
     if timeout is None or timeout <= 0:
         return _select(readable, writable, other, timeout)
-    end_s = time.monotonic() + timeout
-    while (left_s := end_s - time.monotonic()) > 0:
+    end_s, left_s = time.monotonic() + timeout, timeout
+    while left_s > 0:
         ready = _select(readable, writable, other, max(left_s, SHORTEST_S))
         if any(ready):
             return ready
+        left_s = end_s - time.monotonic()
     return [], [], []
 
 
