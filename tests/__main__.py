@@ -30,7 +30,7 @@ CAMPAIGNS = {
 }
 """What is not run here, by the command that runs it."""
 
-TELLING = ("FAILED ", "ERROR ", "E  ", "AGAIN ")
+TELLING = ("FAILED ", "ERROR ", "E  ")
 """How the lines begin that say what failed: printed once more at the end, where people look first."""
 
 

@@ -20,7 +20,7 @@ from api.settings import Settings
 from tests.api.conftest import TOKEN
 
 pytestmark = pytest.mark.wire
-FAST = ["--speed", "8"]
+FAST = ["--speed", "4"]
 
 
 def settings(tmp_path: Path, **more: object) -> Settings:
@@ -38,7 +38,7 @@ def test_a_test_on_the_wire_ends_in_a_served_model(tmp_path: Path) -> None:
         document = rest.run_test(rest.make_participant("P1")["code"])
         assert document["summary"]["lost_samples"] == 0
         fit = document["fit"]
-        # A busy machine's stalls count eight times at this speed; the figure at the speed of the world is the demo's.
+        # A busy machine's stalls count four times at this speed; the figure at the speed of the world is the demo's.
         assert fit["ceiling_percent"] > 95 and fit["fit_percent"] > 75
         curves = http.get(f"{document['model_url']}/curves").json()
         assert {part["name"] for part in curves["segments"]} >= {"rest", "prbs", "ramp", "validate"}
@@ -65,11 +65,11 @@ def test_killed_rig_comes_back_uncertain_and_the_test_is_a_fault(tmp_path: Path)
         assert services.rig.process is not None
         services.rig.process.kill()
         services.rig.process.wait()
-        end = time.monotonic() + 1.0
+        end = time.monotonic() + 5.0
         while http.get("/v1/rig").json()["connected"]:
             assert time.monotonic() < end
         assert any("rig had ended" in event for event in services.watch())
-        end = time.monotonic() + 15
+        end = time.monotonic() + 60
         while not (document := http.get(f"/v1/tests/{test_id}").json())["done"]:
             assert time.monotonic() < end, document
             time.sleep(0.1)
@@ -90,11 +90,12 @@ def test_killed_service_comes_back_at_the_same_place_with_everything(tmp_path: P
         services.api.process.kill()
         services.api.process.wait()
         assert any("api had ended" in event for event in services.watch())
-        end = time.monotonic() + 40
+        end = time.monotonic() + 120
         while not (document := http.get(f"/v1/tests/{test_id}").json())["done"]:
             assert time.monotonic() < end, document
             time.sleep(0.1)
-        assert document["state"] == "completed" and document["model_id"], document
+        assert document["state"] == "completed", document["reason"]
+        assert document["model_id"]
 
 
 def test_everything_dies_with_the_launcher(tmp_path: Path) -> None:

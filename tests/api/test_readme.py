@@ -43,6 +43,7 @@ def test_links_and_pictures_are_there() -> None:
 @pytest.mark.wire
 @pytest.mark.realtime
 @pytest.mark.slow
+@pytest.mark.timeout(900)  # eleven commands, whole tests among them
 def test_commands_do_what_they_are_said_to(tmp_path: Path) -> None:
     commands = blocks("sh")
     assert len(commands) >= 9
@@ -56,7 +57,7 @@ def test_commands_do_what_they_are_said_to(tmp_path: Path) -> None:
                 if place
                 else [*words, "--emulate", SPEED]
             )
-        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
         done = subprocess.run(
             [sys.executable, "-m", "api.cli", *words[1:]],
             cwd=tmp_path,

@@ -47,7 +47,7 @@ class Emulated:
         self._lines.close()
         self._control.close()
         self.process.terminate()
-        code = self.process.wait(5)
+        code = self.process.wait(30)
         for stream in (self.process.stdout, self.process.stderr):
             if stream is not None:
                 stream.close()
@@ -63,7 +63,7 @@ def emulated(*arguments: str) -> Iterator[Emulated]:
         running.close()
 
 
-def wait_for(condition: Callable[[], bool], seconds: float = 5.0) -> None:
+def wait_for(condition: Callable[[], bool], seconds: float = 20.0) -> None:
     end_s = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end_s, "waited in vain"

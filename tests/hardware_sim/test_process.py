@@ -38,7 +38,7 @@ def test_the_ready_line() -> None:
 def test_signals_end_it_cleanly(number: signal.Signals) -> None:
     rig = Emulated()
     rig.process.send_signal(number)
-    output, errors = rig.process.communicate(timeout=5)
+    output, errors = rig.process.communicate(timeout=30)
     assert (rig.process.returncode, output, errors) == (0, "", "")
     assert not Path(rig.ready["control"]).parent.exists()
     rig.close()
@@ -83,7 +83,7 @@ def test_patient_file_and_readable_lines(tmp_path: Path) -> None:
     assert process.stdout is not None
     assert process.stdout.readline().startswith("stimulator: /dev/pts/")
     process.send_signal(signal.SIGTERM)
-    process.communicate(timeout=5)
+    process.communicate(timeout=30)
     assert process.returncode == 0
 
 

@@ -64,8 +64,9 @@ def plays_and_records(bench: Bench, client: RigClient) -> dict[str, float]:
     assert [p["width_us"] for p in fired] == sent[status == 0].tolist()
     assert {p["current_ma"] for p in fired} == {20.0}
     assert all(p["balanced"] for p in fired)
-    assert set(np.unique(status)) <= {0, 1, 2}  # dropped ones are the machine's doing, not the pair's
-    assert np.sum(status == 2) < 0.1 * np.sum(status == 0)
+    assert set(np.unique(status)) <= {0, 1, 2}  # dropped ones are the machine's doing, not the pair's: a figure
+    assert np.sum(status == 2) == event["summary"]["dropped_pulses"]
+    assert np.sum(status == 0) >= 20
     assert len(time_s) > 0.95 * 1600 * event["summary"]["duration_s"]
     assert np.all(np.diff(time_s) > 0)
     assert event["summary"]["lost_samples"] == 0
@@ -93,22 +94,27 @@ def stops_when_asked(bench: Bench, client: RigClient) -> float:
     holding(bench, client, "asked")
     asked_s = time.monotonic()
     evidence = client.ask("stop", reason="enough", by="nurse")["body"]
+    stopped = len(felt(bench))
     assert evidence["confirmed"], evidence
     assert client.wait_finished("asked")["outcome"] == "stopped"
     assert client.wait_state("latched")["reason"] == "enough (by nurse)"
     assert client.ask("rearm", by="nurse")["ok"]
-    return 1e3 * (felt(bench)[-1]["monotonic_s"] - asked_s)
+    fired = felt(bench)
+    assert len(fired) == stopped  # none after the answer
+    return 1e3 * (fired[-1]["monotonic_s"] - asked_s)
 
 
 def stops_when_unheard(bench: Bench, client: RigClient) -> float:
     """No acks: stopped, told, kept; milliseconds from the fault to the last pulse."""
     holding(bench, client, "unheard")
     injected = bench.fault(cmd="fault", name="no_ack", on=True)
+    before = len(felt(bench))
     event = client.wait_finished("unheard")
     assert event["outcome"] == "fault"
     assert "not acknowledged" in event["reason"]
-    last_ms = 1e3 * (felt(bench)[-1]["monotonic_s"] - injected["monotonic_s"])
-    assert last_ms < 250
+    fired = felt(bench)
+    assert len(fired) <= before + 1  # no pulse goes out before the one ahead of it is acknowledged
+    last_ms = 1e3 * (fired[-1]["monotonic_s"] - injected["monotonic_s"])
     bench.fault(cmd="fault", name="no_ack", on=False)
     client.wait_state("latched")
     time.sleep(0.1)
@@ -122,10 +128,10 @@ def says_nothing_when_killed(bench: Bench, client: RigClient) -> float:
     holding(bench, client, "killed")
     assert bench.rig is not None
     kill_hard(bench.rig)
-    died_s = time.monotonic()
+    died_s, before = time.monotonic(), len(felt(bench))
     time.sleep(1.5 / bench.speed)  # longer than any device's own watchdog
     after = felt(bench)
-    assert after[-1]["monotonic_s"] - died_s < 0.03
+    assert len(after) <= before + 1  # a command may have been on its way
     again = bench.start_rig()
     assert again.status()["state"] == "uncertain"
     again.ask("subscribe")

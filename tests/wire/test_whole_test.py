@@ -45,8 +45,10 @@ def check_recording(bench: Bench, event: dict[str, Any]) -> None:
         sent = file["pulses/sent_pulse_width_us"][:]
         acknowledged = status == 0
         assert np.array_equal(status == 1, planned == 0)
-        assert np.mean(acknowledged[planned > 0]) > 0.9  # a busy machine drops late ones, and does nothing else
+        # a busy machine drops late ones, tells how many, and does nothing else; how many is a figure of the benches
         assert set(status) <= {PulseStatus.ACKNOWLEDGED, PulseStatus.REST, PulseStatus.DROPPED}
+        assert np.sum(status == PulseStatus.DROPPED) == event["summary"]["dropped_pulses"]
+        assert np.sum(acknowledged) >= 20
         assert np.array_equal(sent[acknowledged], np.trunc(planned[acknowledged]))
         felt = fired(bench)
         assert [p["width_us"] for p in felt] == list(sent[acknowledged])
