@@ -66,6 +66,7 @@ def plays_and_records(bench: Bench, client: RigClient) -> dict[str, float]:
         assert archive.verify(Path(event["recording_path"])) == file.attrs["content_sha256"]
         status, sent = file["pulses/status"][:], file["pulses/sent_pulse_width_us"][:]
         torque_nm, time_s = file["torque/torque_nm"][:], file["torque/time_s"][:]
+        ack_s = (file["pulses/acknowledged_time_s"][:] - file["pulses/written_time_s"][:])[status == 0]
     fired = felt(bench)
     assert [p["width_us"] for p in fired] == sent[status == 0].tolist()
     assert {p["current_ma"] for p in fired} == {20.0}
@@ -73,6 +74,7 @@ def plays_and_records(bench: Bench, client: RigClient) -> dict[str, float]:
     assert set(np.unique(status)) <= {0, 1, 2}  # how many are dropped is the machine's doing: a figure of the bench
     assert np.sum(status == 2) == event["summary"]["dropped_pulses"]
     assert np.sum(status == 0) >= 20
+    assert 0 < np.median(ack_s) < 0.01  # one that is heard after 25 ms drops the next pulse
     assert len(time_s) > 0.95 * 1600 * event["summary"]["duration_s"]
     assert np.all(np.diff(time_s) > 0)
     assert event["summary"]["lost_samples"] == 0
@@ -81,7 +83,11 @@ def plays_and_records(bench: Bench, client: RigClient) -> dict[str, float]:
     error_ms = event["summary"]["alignment"]["error_ms"]
     assert error_ms is not None
     assert error_ms < 1.0
-    return {"align_ms": error_ms, "dropped_percent": 100 * float(np.mean(status[status != 1] == 2))}
+    return {
+        "align_ms": error_ms,
+        "ack_ms": 1e3 * float(np.median(ack_s)),
+        "dropped_percent": 100 * float(np.mean(status[status != 1] == 2)),
+    }
 
 
 def holding(bench: Bench, client: RigClient, name: str) -> None:
