@@ -15,13 +15,14 @@ from pathlib import Path
 
 import pytest
 
+from rig.acquire.run import SENDER_PRIORITY
 from tests.harness.paced_time import CLOCK, conductor
-from tests.harness.paced_time.conductor import AHEAD_S, LATE_S, WAITED, Conductor, states_of
+from tests.harness.paced_time.conductor import AHEAD_S, LATE_S, Conductor, states_of
 from tests.harness.paced_time.paced_clock import (
     BYTES,
     FIRST_MEMBER,
     LOST_NS,
-    MEMBERS,
+    PLACES,
     PacedClock,
     real_ns,
     real_s,
@@ -32,6 +33,8 @@ from tests.harness.processes import ROOT, Bench
 TICK_NS = 3_000_000
 ASLEEP = "import time; print(flush=True); time.sleep(60)"
 BUSY = "while True: pass"
+RIG, ORDINARY = 2**22 + 1, 2**22 + 2
+"""Numbers that no process has."""
 
 
 class World:
@@ -46,10 +49,20 @@ class World:
         self.processors = {0: self.now_ns}
         self.conductor = Conductor(str(path), self.processors)
         self.conductor.begin(self.now_ns)
-        self.states, self.used_share = {"S", "R"}, 0.0
+        self.states, self.used_share, self.other_share = {"S", "R"}, 0.0, 0.0
         monkeypatch.setattr(conductor, "states_of", lambda _: self.states)
-        monkeypatch.setattr(conductor, "processor_ns", lambda _: int(self.used_share * self.now_ns))
+        monkeypatch.setattr(conductor, "processor_ns", self.used_ns)
+        monkeypatch.setattr(conductor, "runs_first", lambda pid: pid == RIG)
         self.runs()
+
+    def used_ns(self, pid: int) -> int:
+        """Processor time."""
+        return int((self.used_share if pid == os.getpid() else self.other_share) * self.now_ns)
+
+    def is_joined_by(self, pid: int, used_share: float) -> None:
+        """Another process keeps time, and always runs."""
+        self.other_share = used_share
+        self.clock.cells[PLACES[1]], self.clock.cells[PLACES[1] + 1] = pid, self.now_ns + 60_000_000_000
 
     def runs(self) -> None:
         """The process says that it runs."""
@@ -78,13 +91,13 @@ def world(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> World:
 
 def test_it_goes_on_with_real_time_while_all_run(world: World):
     assert world.goes_on(0.6, runs=True) == pytest.approx(0.6, abs=1e-6)
-    assert world.clock.cells[WAITED] == 0
+    assert world.clock.waited_ns(world.now_ns) == 0
 
 
 def test_it_waits_for_one_that_is_ready_to_run_and_does_not_and_goes_on_then(world: World):
     assert world.goes_on(0.6) <= LATE_S + AHEAD_S
     assert world.goes_on(0.3, runs=True) == pytest.approx(0.3, abs=0.01)
-    assert world.clock.cells[WAITED] * 1e-9 == pytest.approx(0.6, abs=0.06)
+    assert world.clock.waited_ns(world.now_ns) * 1e-9 == pytest.approx(0.6, abs=0.06)
 
 
 def test_it_waits_for_a_processor_that_its_host_took_away(world: World):
@@ -107,10 +120,27 @@ def test_it_does_not_wait_for_one_whose_own_doing_it_is(world: World, states: se
     assert (world.clock.cells[FIRST_MEMBER] == 0) is (states <= {"Z"})
 
 
+@pytest.mark.parametrize(
+    ("other", "used_share", "waits"),
+    [(RIG, 0.9, False), (RIG, 0.1, True), (ORDINARY, 0.9, True)],
+    ids=["a rig that computes", "a rig that does not", "an ordinary process"],
+)
+def test_it_does_not_wait_for_one_that_a_rig_keeps_away(world: World, other: int, used_share: float, waits: bool):
+    world.is_joined_by(other, used_share)
+    assert (world.goes_on(0.6) < 0.1) is waits
+
+
+def test_a_sender_that_computes_takes_no_processor_from_the_conductor():
+    assert conductor.PRIORITY > SENDER_PRIORITY
+
+
 def test_it_does_not_wait_for_ever(world: World):
     assert world.goes_on(LOST_NS * 1e-9 + 1.0) == pytest.approx(1.0, abs=0.1)
     before_ns = world.clock.read(world.now_ns)[0]  # its conductor is lost
     assert world.clock.read(world.now_ns + LOST_NS + 1_000_000_000)[0] - before_ns == pytest.approx(1e9, abs=2e7)
+    world.runs()
+    world.conductor.tick(world.now_ns)
+    assert world.goes_on(LOST_NS * 1e-9 + 1.0, runs=True, processor_runs=False) == pytest.approx(1.0, abs=0.1)
     world.conductor.end(world.now_ns)
     before_ns = world.clock.read(world.now_ns)[0]
     assert world.clock.read(world.now_ns + 1_000_000_000)[0] - before_ns == 1_000_000_000
@@ -179,7 +209,7 @@ def test_what_is_there_is_seen_however_short_the_wait():
 
 
 def members() -> list[int]:
-    return [CLOCK.cells[i] for i in range(FIRST_MEMBER, FIRST_MEMBER + 2 * MEMBERS, 2) if CLOCK.cells[i]]
+    return [CLOCK.cells[i] for i in PLACES if CLOCK.cells[i]]
 
 
 @pytest.mark.wire
@@ -193,6 +223,7 @@ def test_time_waits_for_the_test_an_emulator_and_a_rig(tmp_path: Path):
 
 
 @pytest.mark.wire
+@pytest.mark.realtime  # two of its processes compute
 def test_every_wait_is_longer_while_a_process_that_keeps_time_gets_no_processor():
     """It shares a processor with one that computes, and comes after it."""
     here = f"import os; os.sched_setaffinity(0, {{{min(os.sched_getaffinity(0))}}})\n"
@@ -220,8 +251,8 @@ def test_every_wait_is_longer_while_a_process_that_keeps_time_gets_no_processor(
         assert kept.stdout is not None
         kept.stdout.readline()
         begin(here + BUSY)
-        before_s, waited_ns = real_s(), CLOCK.cells[WAITED]
+        before_s, waited_ns = real_s(), CLOCK.waited_ns(real_ns())
         took_s = [float(line) for line in begin(waiter).stdout or ()]
-        waited_s = (CLOCK.cells[WAITED] - waited_ns) * 1e-9
+        waited_s = (CLOCK.waited_ns(real_ns()) - waited_ns) * 1e-9
     assert waited_s > 0.3 * (real_s() - before_s)
     assert len(took_s) == 3 and min(took_s) > 0.35, took_s

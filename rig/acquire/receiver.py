@@ -33,6 +33,8 @@ then use a whole processor."""
 LONGEST_READ_S = 0.25
 """Real seconds for which one reading counts at most: a machine that stood still did not read."""
 LIVE_BLOCKS = 4000
+RANGE_MEAN_S = 0.01
+"""Seconds of torque of which one mean counts for the range: less noise than in single samples."""
 SETTLING_S = 0.1
 BACKLOG_RATE = 1.6
 BEHIND_S = 0.1
@@ -99,6 +101,7 @@ class Receiver:
         self.peak_nm = 0.0
         self.range_nm = (np.inf, -np.inf)
         self.torque_time = TorqueTime()
+        self._unmeant_nm = np.empty(0)
         self.live: deque[NDArray[Any]] = deque(maxlen=LIVE_BLOCKS)
         self.recent: deque[tuple[float, float]] = deque(maxlen=400)
 
@@ -136,6 +139,7 @@ class Receiver:
             self._plausibility, self.torque_time = plausibility, TorqueTime()
             self._journal, self._limits_nm, self._on_fault = journal, limits_nm, on_fault
             self.counts, self.peak_nm, self.range_nm = Recorded(), 0.0, (np.inf, -np.inf)
+            self._unmeant_nm = np.empty(0)
 
     def release(self) -> Recorded:
         """Stop recording; returns the counts since `record`."""
@@ -264,8 +268,18 @@ class Receiver:
                 self._on_fault(f"torque {worst:.2f} N·m is outside {lo:g} … {hi:g} N·m")
         elif self._journal is not None:
             self.peak_nm = max(self.peak_nm, float(np.max(np.abs(torque_nm))))
-            mean_nm = float(np.mean(torque_nm))  # over a few ms, to reduce noise
-            self.range_nm = min(self.range_nm[0], mean_nm), max(self.range_nm[1], mean_nm)
+            self._widen(torque_nm)
+
+    def _widen(self, torque_nm: NDArray[np.float64]) -> None:
+        """Widen the range by means over `RANGE_MEAN_S`: however the bus cut the samples into blocks."""
+        samples = np.concatenate([self._unmeant_nm, torque_nm])
+        each = max(1, round(RANGE_MEAN_S * self.nominal_rate_hz))
+        whole = len(samples) // each * each
+        self._unmeant_nm = samples[whole:]
+        if whole:
+            means_nm = samples[:whole].reshape(-1, each).mean(axis=1)
+            lo_nm, hi_nm = self.range_nm
+            self.range_nm = min(lo_nm, float(means_nm.min())), max(hi_nm, float(means_nm.max()))
 
     def _run(self) -> None:
         try:

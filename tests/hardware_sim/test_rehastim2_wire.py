@@ -124,17 +124,18 @@ def test_a_killed_host_is_outlived_by_at_most_1200_ms(rig: Emulated) -> None:
     )
     process = subprocess.Popen([sys.executable, "-c", script, rig.ready["stimulator"]], stdout=subprocess.PIPE)
     assert process.stdout is not None
-    acked = [float(process.stdout.readline()) for _ in range(10)]
+    for _ in range(10):
+        assert process.stdout.readline()
     os.kill(process.pid, signal.SIGKILL)
+    rig.ask(cmd="state")  # what was sent before has come by now
     killed_s = time.monotonic()
-    acked += [float(line) for line in process.stdout]
     process.wait()
     process.stdout.close()
     wait_for(lambda: rig.ask(cmd="state")["mode"] == "none", seconds=2)
     played = rig.ask(cmd="pulses")["pulses"][before:]
     after = [pulse for pulse in played if pulse["monotonic_s"] > killed_s]
     assert len(after) >= 45  # it did go on: this is the bound that the safety case must state
-    assert played[-1]["monotonic_s"] - max(acked) <= 1.225
+    assert played[-1]["monotonic_s"] - killed_s <= 1.2
 
 
 @pytest.mark.parametrize(

@@ -1,9 +1,9 @@
 """A line that stalls: what is felt at the electrode, by the emulator's own record, on both stimulators.
 
 The line between rig and emulator holds what it is given, towards the device, the host, or both, in each phase of a
-test, and then delivers all of it at once. In half of the cases a stop is requested in the middle of it. All in real
-time. Judged by what the emulated electrodes felt: no interval below the limit, at most one pulse after the request to
-stop, none after a confirmed answer, and none after an unconfirmed answer that did not say that one may come.
+test, and then delivers all of it at once. In half of the cases a stop is requested in the middle of it. Judged by what
+the emulated electrodes felt: no interval below the limit, at most one pulse after the request to stop, none after a
+confirmed answer, and none after an unconfirmed answer that did not say that one may come.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class Case:
 
 
 class Rig:
-    """An emulated rig in real time whose line stalls."""
+    """An emulated rig whose line stalls."""
 
     def __init__(self, folder: Path, stimulator: str) -> None:
         self.bench = Bench(folder, "--stimulator", stimulator, "--noise-seed", "3")

@@ -24,7 +24,7 @@ from rig.errors import BusyError, DeviceError, LatchedError, PlanError, RefusedE
 from rig.messages import CalibrateStartRequest, PreviewRequest, Profile, SegmentPlan
 from tests.rig.live import SPEED, LiveRig
 
-pytestmark = pytest.mark.wire  # the rig, its devices and the clock in threads, in real time
+pytestmark = pytest.mark.wire  # the rig, its devices and the clock in threads
 
 Make = Callable[..., LiveRig]
 

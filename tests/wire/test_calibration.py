@@ -32,7 +32,7 @@ def start(client: RigClient, name: str, **fields: Any) -> dict[str, Any]:
 def test_a_calibration_from_start_to_a_test(shared: tuple[Bench, RigClient]):
     bench, client = shared
     before = len(felt(bench))
-    reply = start(client, "cal", step_us=25.0, train_s=0.5, max_pulse_width_us=130.0)
+    reply = start(client, "cal", step_us=25.0, train_s=0.5, max_pulse_width_us=205.0)
     assert reply["ok"], reply
     assert reply["body"]["state"] == "calibrating"
     assert len(felt(bench)) == before  # opening sends nothing
@@ -40,7 +40,7 @@ def test_a_calibration_from_start_to_a_test(shared: tuple[Bench, RigClient]):
     assert refused["code"] == "busy"
     assert "finish or discard" in refused["detail"]
     shown = {"pulse_width_us": 0}
-    for threshold, width_us in (("sensory", 25), ("motor", 100), ("comfort", 125)):
+    for threshold, width_us in (("sensory", 25), ("motor", 150), ("comfort", 200)):
         while shown["pulse_width_us"] < width_us:  # a train that was lost to a busy machine is sent again
             shown = step(client)
         reply = client.ask("calibrate-mark", threshold=threshold)
@@ -53,17 +53,17 @@ def test_a_calibration_from_start_to_a_test(shared: tuple[Bench, RigClient]):
     assert all(t["pulses"] <= 20 for t in trains), trains
     played = [t["pulse_width_us"] for t in trains for _ in range(t["pulses"])]
     assert [round(p["width_us"]) for p in pulses] == played
-    assert [t["pulse_width_us"] for t in trains if t["pulses"]] == [25, 50, 75, 100, 125]
+    assert [t["pulse_width_us"] for t in trains if t["pulses"]] == [25, 50, 75, 100, 125, 150, 175, 200]
     rise_nm = [t["torque_rise_nm"] for t in trains if t["torque_rise_nm"] is not None]
     assert rise_nm[-1] > 2 * rise_nm[0]
     result = client.ask("calibrate-finish", by="therapist")["body"]
     profile = result["profile"]
-    assert profile["max_pulse_width_us"] == 125.0
+    assert profile["max_pulse_width_us"] == 200.0
     assert profile["expires_at_utc"] > profile["set_at_utc"]
     assert len(result["recordings"]) == len(trains)
     with h5py.File(result["recordings"][-1]) as file:
         assert file.attrs["kind"] == "calibration"
-        assert np.nanmax(file["pulses/sent_pulse_width_us"][:]) == 125
+        assert np.nanmax(file["pulses/sent_pulse_width_us"][:]) == 200
     client.ask("subscribe")
     assert client.start(short_plan("calibrated", profile=profile))["ok"]
     assert client.wait_finished("calibrated")["outcome"] == "completed"

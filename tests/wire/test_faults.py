@@ -80,7 +80,7 @@ def test_a_fault_stops_is_told_and_latches(shared: tuple[Bench, RigClient], faul
     check_kept(event, "fault")
     assert any(words in event["reason"] for words in FAULTS[fault]), event["reason"]
     felt = control(bench.emulator.ready["control"], {"cmd": "pulses", "since": 0})["pulses"]
-    # real seconds, with slack for a shared machine; without acknowledgements one pulse is on its way at most
+    # with slack for a shared machine; without acknowledgements one pulse is on its way at most
     late_s = max(p["monotonic_s"] - injected["monotonic_s"] for p in felt)
     watch_s = EMULATOR_WATCH["stale_torque_s"] if fault == "cell_silent" else 0.0
     assert late_s < watch_s + 0.25, late_s

@@ -45,7 +45,7 @@ def check_recording(bench: Bench, event: dict[str, Any]) -> None:
         sent = file["pulses/sent_pulse_width_us"][:]
         acknowledged = status == 0
         assert np.array_equal(status == 1, planned == 0)
-        # a busy machine drops late ones, tells how many, and does nothing else; how many is a figure of the benches
+        # a busy machine drops late ones, tells how many, and does nothing else; `bench.rig_pairs` judges how many
         assert set(status) <= {PulseStatus.ACKNOWLEDGED, PulseStatus.REST, PulseStatus.DROPPED}
         assert np.sum(status == PulseStatus.DROPPED) == event["summary"]["dropped_pulses"]
         assert np.sum(acknowledged) >= 20
@@ -56,7 +56,7 @@ def check_recording(bench: Bench, event: dict[str, Any]) -> None:
         assert all(p["balanced"] for p in felt)
         delay = file["pulses/acknowledged_time_s"][:][acknowledged] - file["pulses/written_time_s"][:][acknowledged]
         assert np.all(delay >= 0)
-        assert np.median(delay) > 0
+        assert 0 < np.median(delay) < 0.01  # one that is heard after 25 ms drops the next pulse
         time_s = file["torque/time_s"][:]
         assert np.all(np.diff(time_s) > 0)
         assert np.all(np.diff(file["torque/counter"][:]) == 1)

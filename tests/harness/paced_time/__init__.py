@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 
-from tests.harness.paced_time.conductor import WAITED
 from tests.harness.paced_time.paced_clock import BYTES, FOR_EVER_NS, VARIABLE, PacedClock, real_ns
 
 FOLDER = Path(__file__).parent
@@ -44,7 +43,7 @@ class Pace:
     @property
     def waited_s(self) -> float:
         """How long time has waited in all."""
-        return CLOCK.cells[WAITED] * 1e-9
+        return CLOCK.waited_ns(real_ns()) * 1e-9
 
     def close(self) -> None:
         """End the conductor; for a child that still reads, real time goes on."""

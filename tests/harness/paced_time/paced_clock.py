@@ -28,10 +28,12 @@ from typing import Any
 
 VARIABLE = "STIMRIG_TESTS_PACED_TIME"
 """The environment variable that holds the file's path."""
-KEEPERS = ("rig", "hardware_sim")
-"""Programs (`python -m …`) for which time waits."""
+KEEPERS = ("rig", "hardware_sim", "tests", "bench")
+"""Packages whose programs (`python -m …`) time waits for."""
 SLOTS, MEMBERS, BYTES = 64, 64, 4096
 FIRST_MEMBER = 1 + 3 * SLOTS
+PLACES = range(FIRST_MEMBER, FIRST_MEMBER + 2 * MEMBERS, 2)
+"""Where the file holds who keeps time: the number of the process, and when it said last that it runs."""
 BEAT_S = 0.005
 SHORTEST_S = 0.0005
 LOST_NS = 10_000_000_000
@@ -74,6 +76,10 @@ class PacedClock:
         went_on_ns = min(passed_ns, ahead_ns)
         return self.cells[place] + went_on_ns + max(passed_ns - max(LOST_NS, ahead_ns), 0), ahead_ns - went_on_ns
 
+    def waited_ns(self, now_ns: int) -> int:
+        """For how long time has waited in all until a real time, ns."""
+        return now_ns - self.read(now_ns)[0]
+
     def now_s(self) -> float:
         """Paced time, s: monotonic, and the same in all processes of the file."""
         return self.read(real_ns())[0] * 1e-9
@@ -98,10 +104,10 @@ class PacedClock:
 
     def keep(self) -> None:
         """Let time wait for this process from now on: a thread says again and again that it is given a processor."""
-        pid, places = os.getpid(), range(FIRST_MEMBER, FIRST_MEMBER + 2 * MEMBERS, 2)
+        pid = os.getpid()
         with Path(self._path).open("r+b") as file:
             fcntl.flock(file, fcntl.LOCK_EX)
-            free = [i for i in places if self.cells[i] == pid] or [i for i in places if self.cells[i] == 0]
+            free = [i for i in PLACES if self.cells[i] == pid] or [i for i in PLACES if self.cells[i] == 0]
             if not free:
                 raise RuntimeError(f"paced time waits for {MEMBERS} processes at most")
             self.cells[free[0] + 1] = real_ns()
@@ -158,5 +164,5 @@ def join_as_child() -> None:
         clock.follow(path)
         clock.rule()
         program = line[line.index("-m") + 1] if "-m" in line[:-1] else ""
-        if program in KEEPERS or program.startswith(("tests.", "bench.")):
+        if program.partition(".")[0] in KEEPERS:
             clock.keep()
