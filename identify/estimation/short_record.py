@@ -39,6 +39,9 @@ MIDDLING = 1
 STARTS_S = (0.08, 0.2, 0.45)
 CORRELATED = 6.0
 """Log likelihood by which correlated noise must explain the residual better before it is believed."""
+COARSE = 1.0 / 3.0
+"""Power of the evidence: no kind of curve is exactly true, so none is dropped as soon as it would be if one were
+(Miller and Dunson 2019)."""
 LOG_T, LOG_DAMPING = (np.log(0.2), 1.2), (0.0, 0.8)
 """Prior mean and standard deviation, as in `Problem.prior`."""
 
@@ -377,8 +380,8 @@ class _Work:
 
 
 def _probabilities(modes: list[Mode]) -> np.ndarray:
-    weights = np.array([mode.log_evidence for mode in modes])
-    weights = np.exp(weights - weights.max())
+    evidence = np.array([mode.log_evidence for mode in modes])
+    weights = np.exp(COARSE * (evidence - evidence.max()))
     return weights / weights.sum()
 
 
