@@ -294,7 +294,11 @@ def main() -> int:
     parser.add_argument("--hidden", type=int, default=0, help="patients with one hidden effect")
     parser.add_argument("--paper", type=int, default=0, help="trials of the paper's muscle")
     parser.add_argument("--json", type=Path, help="every row goes here, one a line")
+    parser.add_argument("--rows", type=Path, help="print the table of rows that were written before")
     settings = parser.parse_args()
+    if settings.rows is not None:
+        print(*table([json.loads(line) for line in settings.rows.read_text().splitlines()]), sep="\n")
+        return 0
     warnings.filterwarnings("ignore", category=RuntimeWarning)
     rows: list[dict[str, Any]] = []
     for seed in range(settings.seeds, settings.seeds + settings.patients):
