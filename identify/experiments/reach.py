@@ -146,8 +146,8 @@ def _reached(decision: Decision, target: Target, seconds: float, dose_nm_s: floa
     words = f"The target should be reached in about {seconds:.0f} s with {dose_nm_s:.0f} N·m·s."
     if not there:
         words = (
-            f"The target is probably out of reach: in {seconds:.0f} s and with {dose_nm_s:.0f} N·m·s the curve would be "
-            f"known within {curve:.1f} % and the step response within {step:.1f} %."
+            f"The target is probably out of reach: in {seconds:.0f} s and with {dose_nm_s:.0f} N·m·s the curve would "
+            f"be known within {curve:.1f} % and the step response within {step:.1f} %."
         )
     return Reach(there, curve, step, seconds, dose_nm_s, words)
 
