@@ -172,9 +172,11 @@ def chosen_by_particles(muscle: Muscle, noise: np.ndarray, seed: int) -> dict[st
             break
         widths = np.r_[widths, np.full(HOLD, cloud.next_level(widths))]
     assert cloud is not None and known is not None
-    gain, width, middle, slow, damping = cloud.drawn().mean(axis=0)
+    gain, width, middle, slow, damping, delay = cloud.drawn().mean(axis=0)
     share = 1.0 / (1.0 + np.exp(-(np.arange(512.0) - middle) / np.exp(width)))
-    model = Muscle("", gain * (share - share[0]), muscle.top_us, float(np.exp(slow)), float(np.exp(damping)), 0.0)
+    model = Muscle(
+        "", gain * (share - share[0]), muscle.top_us, float(np.exp(slow)), float(np.exp(damping)), max(delay, 0.0)
+    )
 
     def predicted(record: Record) -> np.ndarray:
         return model.torque(record.pulse_width_us[:: round(RATE_HZ / 40.0)], RATE_HZ)
@@ -189,7 +191,7 @@ def particle_bands(rows: np.ndarray, top_us: float) -> Knowledge:
     curves = rows[:, :1] * (share - share[:, :1])
     plateau = float(curves[:, -1].mean())
     time_s = np.linspace(0.0, 3.0, 61)
-    steps = step_responses(np.c_[np.exp(rows[:, 3:5]), np.zeros(len(rows))], time_s)
+    steps = step_responses(np.c_[np.exp(rows[:, 3:5]), rows[:, 5]], time_s)
     return Knowledge(whole_band(u, curves / plateau), whole_band(time_s, steps), plateau)
 
 
@@ -238,13 +240,13 @@ def hidden(seed: int) -> dict[str, Any]:
 
 
 def of_papers_muscle(trials: int, seed: int) -> list[str]:
-    """The paper's muscle at 40 Hz with noise of 0.10 N·m and a target of 1 %."""
+    """The paper's muscle at 40 Hz with noise of 0.10 N·m and a target of 7 %: six times the noise of an interval."""
     lines = []
     for trial in range(seed, seed + trials):
         muscle, rng = papers(), np.random.default_rng([trial, 5])
         noise = rng.standard_normal(4000) * 0.10
         limits = {"left_s": 30.0, "left_nm_s": 83.0}
-        made = play(muscle, noise, Target(4.0, 4.0), rate_hz=40.0, **limits)
+        made = play(muscle, noise, Target(7.0, 7.0), rate_hz=40.0, **limits)
         assert made.record is not None
         model = identify.fit(made.record, recruitment="near-sigmoid")
         fit = unseen_percent(muscle, model.predict, trial)
