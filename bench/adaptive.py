@@ -195,22 +195,21 @@ def particle_bands(rows: np.ndarray, top_us: float) -> Knowledge:
     return Knowledge(whole_band(u, curves / plateau), whole_band(time_s, steps), plateau)
 
 
-def one(kind: str, seed: int) -> list[dict[str, Any]]:
-    """All peers on one patient."""
+def one(kind: str, seed: int, wanted: str) -> list[dict[str, Any]]:
+    """The wanted peers on one patient."""
     muscle = KINDS[kind](seed)
     noise = np.random.default_rng([seed, 5]).standard_normal(int((LONGEST_S + 30.0) * RATE_HZ)) * NOISE_NM
     other = np.random.default_rng([seed, 6]).standard_normal(noise.size) * NOISE_NM
-    ours = adaptive(muscle, noise, seed)[0]
     day = muscle.another_day(np.random.default_rng([seed, 8]))
-    last = adaptive(day, other, seed)[1]
-    found = {
-        "paper": fixed(muscle, paper_test(muscle.top_us), noise, seed),
-        "staircase": fixed(muscle, staircase(muscle.top_us), noise, seed),
-        "random pieces": adaptive(muscle, noise, seed, random=True)[0],
-        "particles": chosen_by_particles(muscle, noise, seed),
-        "ours, new": ours,
-        "ours, known": adaptive(muscle, noise, seed, earlier=last)[0],
+    peers: dict[str, Callable[[], dict[str, Any]]] = {
+        "paper": lambda: fixed(muscle, paper_test(muscle.top_us), noise, seed),
+        "staircase": lambda: fixed(muscle, staircase(muscle.top_us), noise, seed),
+        "random pieces": lambda: adaptive(muscle, noise, seed, random=True)[0],
+        "particles": lambda: chosen_by_particles(muscle, noise, seed),
+        "ours, new": lambda: adaptive(muscle, noise, seed)[0],
+        "ours, known": lambda: adaptive(muscle, noise, seed, earlier=adaptive(day, other, seed)[1])[0],
     }
+    found = {peer: play_peer() for peer, play_peer in peers.items() if peer in wanted or peer == "paper"}
     paper = found["paper"]
     return [
         line
@@ -293,6 +292,7 @@ def main() -> int:
     parser.add_argument("--patients", type=int, default=150, help="of each kind")
     parser.add_argument("--seeds", type=int, default=80_000, help="the first")
     parser.add_argument("--kinds", default="sigmoid,shaped")
+    parser.add_argument("--peers", default="paper; staircase; random pieces; particles; ours, new; ours, known")
     parser.add_argument("--hidden", type=int, default=0, help="patients with one hidden effect")
     parser.add_argument("--paper", type=int, default=0, help="trials of the paper's muscle")
     parser.add_argument("--json", type=Path, help="every row goes here, one a line")
@@ -305,7 +305,7 @@ def main() -> int:
     rows: list[dict[str, Any]] = []
     for seed in range(settings.seeds, settings.seeds + settings.patients):
         for kind in settings.kinds.split(","):
-            rows += one(kind, seed)
+            rows += one(kind, seed, settings.peers)
             print(seed, kind, file=sys.stderr, flush=True)
         if settings.json is not None:
             settings.json.write_text("\n".join(json.dumps(line) for line in rows))

@@ -41,6 +41,9 @@ COARSE = 1.0 / 3.0
 """Power of the evidence: no kind of curve is exactly true, so none is dropped as soon as it would be if one were
 (Miller and Dunson 2019)."""
 
+STRANGE = 0.8
+"""Standard deviation of the log density from which a curve counts as far from the known shape."""
+
 
 @dataclass(frozen=True)
 class Short:
@@ -78,6 +81,8 @@ class Short:
         Steps of the curve, baselines and initial states at the most probable mode.
     rise_us : float
         Rise from 10 to 90 % for which the knots were made, µs.
+    strange : float
+        Probability that the curve is far from the known shape.
     """
 
     grid: Grid
@@ -95,6 +100,7 @@ class Short:
     three: np.ndarray
     likely: np.ndarray
     rise_us: float
+    strange: float
 
     @property
     def largest_us(self) -> float:
@@ -302,6 +308,7 @@ class _Search:
             three=likely.z[:3],
             likely=best[: n + extras],
             rise_us=prior.rise_us,
+            strange=float(sum(weights[i] for i, kind in enumerate(prior.deviations) if kind.sd > STRANGE)),
         )
 
 
