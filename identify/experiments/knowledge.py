@@ -16,7 +16,8 @@ know its place too well."""
 HIDDEN = 0.25
 """Share by which bands are widened for what the draws cannot know: a sudden beginning of recruitment, which no smooth
 density has, and its effect on the dynamics. The curve's band is widened where the curve is far from the known shape.
-Without it, 30 of 33 development patients with shaped curves had each of the true curves within its band."""
+Without it, and with bands less even, each band contained its true curve in 30 of 33 development patients (seeds
+50200 to 50232, shaped curves)."""
 LEAST_SD = 1e-4
 """Standard deviations below this share of the plateau count as this share, so that a point that is known exactly (zero
 at zero width) does not decide."""
