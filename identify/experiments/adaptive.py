@@ -144,10 +144,10 @@ def decide(
         with np.errstate(all="ignore"):
             short, wrong = _fitted(grid, last, before.short if before else None)
     except (np.linalg.LinAlgError, IdentifyError) as error:
-        return Decision("misfit", words=f"No model can be fitted ({error}): the rest of the fixed test is played.")
+        return Decision("misfit", words=f"No model can be fitted ({error}). The rest of the fixed test is played.")
     known = knowledge(short)
     if wrong:
-        return Decision("misfit", words=f"{wrong}: the rest of the fixed test is played.", knowledge=known, short=short)
+        return Decision("misfit", words=f"{wrong} The rest of the fixed test is played.", knowledge=known, short=short)
     if known.curve.percent <= target.curve_percent and known.step.percent <= target.step_percent:
         return Decision("enough", words=_enough(known), knowledge=known, short=short)
     return _next(short, known, played, target, left_s, left_nm_s, largest_us)
@@ -184,16 +184,16 @@ def _fitted(grid: Grid, last: Earlier | None, before: Short | None) -> tuple[Sho
 def _misfit(short: Short) -> str | None:
     """Why the structure does not describe the record; None if it does, or if it is too early to say."""
     if not np.all(np.isfinite(short.coefficients_nm)) or not np.all(np.isfinite(short.dynamics)):
-        return "The estimate is not finite"
+        return "The estimate is not finite."
     if short.grid.size * short.grid.step_s < SETTLED_S:
         return None
     white = short.grid.noise_sd_nm / np.sqrt(max(float(np.median(short.grid.count[short.rows])), 1.0))
     own = float(np.sqrt(np.mean(short.residual_nm[short.rows] ** 2)))
     if own > EXCESS * white:
-        return f"The structure leaves {own:.2g} N·m where the noise is {white:.2g} N·m"
+        return f"The structure leaves {own:.2g} N·m where the noise is {white:.2g} N·m."
     tests = residual_tests(averaged(short, mean_of_draws=False))
     failed = [name for name, test in tests.items() if test["p_value"] < ALARM]
-    return f"The residual is not noise ({' and '.join(failed)})" if failed else None
+    return f"The residual is not noise ({' and '.join(failed)})." if failed else None
 
 
 def _next(

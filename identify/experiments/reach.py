@@ -109,7 +109,7 @@ def _curve(groups: Groups, largest_us: float, plateau_nm: float) -> Curve:
         x = np.asarray(width_us, float) / largest_us
         total = sum(share * (np.tanh(0.5 * (x - middle) / width) + 1.0) / 2.0 for share, middle, width in groups)
         start = sum(share * (np.tanh(-0.5 * middle / width) + 1.0) / 2.0 for share, middle, width in groups)
-        return plateau_nm * (total - start)
+        return np.asarray(plateau_nm * (total - start))
 
     return curve
 
@@ -143,13 +143,11 @@ def _reached(decision: Decision, target: Target, seconds: float, dose_nm_s: floa
         return Reach(False, float("inf"), float("inf"), 0.0, 0.0, words)
     curve, step = decision.knowledge.curve.percent, decision.knowledge.step.percent
     there = curve <= target.curve_percent and step <= target.step_percent
-    took = f"in about {seconds:.0f} s with {dose_nm_s:.0f} N·m·s"
-    if there:
-        words = f"The target should be reached {took}."
-    else:
+    words = f"The target should be reached in about {seconds:.0f} s with {dose_nm_s:.0f} N·m·s."
+    if not there:
         words = (
-            f"The target is probably out of reach: {took} the curve would be known within {curve:.1f} % and the step "
-            f"response within {step:.1f} %."
+            f"The target is probably out of reach: in {seconds:.0f} s and with {dose_nm_s:.0f} N·m·s the curve would "
+            f"be known within {curve:.1f} % and the step response within {step:.1f} %."
         )
     return Reach(there, curve, step, seconds, dose_nm_s, words)
 

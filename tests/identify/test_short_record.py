@@ -7,9 +7,10 @@ import pytest
 
 import identify
 from identify.errors import BadRequest
+from identify.experiments.adaptive import Target
 from identify.model import Model
 from identify.records.record import Record
-from tests.harness.adaptive import recorded, shaped, sigmoid
+from tests.harness.adaptive import play, recorded, shaped, sigmoid
 
 pytestmark = pytest.mark.slow
 
@@ -68,7 +69,9 @@ def test_direction_and_zero_of_the_load_cell_do_not_matter():
 
 def test_the_last_model_narrows_the_next_one():
     muscle = shaped(51_016)
-    last = identify.fit(short_test(muscle, 2), recruitment="near-sigmoid")
+    seen = play(muscle, np.random.default_rng(79).standard_normal(16_000) * 0.05, Target(), left_s=30.0, left_nm_s=1e3)
+    assert seen.record is not None
+    last = identify.fit(seen.record, recruitment="near-sigmoid")
     new = identify.fit(short_test(muscle, 3), recruitment="near-sigmoid")
     known = identify.fit(short_test(muscle, 3), recruitment="near-sigmoid", earlier=last)
     width = [

@@ -41,7 +41,7 @@ def near_sigmoid(grid: Grid, rows: np.ndarray, options: Mapping[str, Any]) -> tu
 
 
 def _why(short: Short, last: Earlier | None) -> str:
-    near = "the last model's curve" if last else "a sigmoid"
-    kind = DEVIATIONS[int(np.argmax(short.weights))] if last is None else None
-    said = f", whose density of thresholds deviates by a factor of {np.exp(kind.sd):.1f}" if kind else ""
-    return f"a curve that never falls, near {near}{said}"
+    if last is not None:
+        return "a curve that never falls, near that of the last model"
+    kind = DEVIATIONS[int(np.argmax(short.weights))]
+    return f"a curve that never falls; its slope is a sigmoid's times a factor of {np.exp(kind.sd):.1f} or less, mostly"
