@@ -13,8 +13,8 @@ from api.client.errors import Unreachable
 from api.client.rest import Client
 
 
-def run_test(client: Client, participant: str, events: Callable[[], list[str]] = list) -> SessionTest:
-    """Run the default pre-session test and show its progress.
+def run_test(client: Client, participant: str, events: Callable[[], list[str]] = list, **more: Any) -> SessionTest:
+    """Run a pre-session test and show its progress.
 
     Parameters
     ----------
@@ -24,6 +24,8 @@ def run_test(client: Client, participant: str, events: Callable[[], list[str]] =
         Code; made unless it is there.
     events : callable
         Says which processes of the service have ended; one is enough to give up.
+    **more
+        As in `Client.start_test`.
 
     Raises
     ------
@@ -41,7 +43,7 @@ def run_test(client: Client, participant: str, events: Callable[[], list[str]] =
 
     client.ensure_participant(participant)
     try:
-        return client.run_test(participant, watch)
+        return client.run_test(participant, watch, **more)
     except Unreachable as error:
         for event in events():
             raise ReportedError(event) from error

@@ -132,7 +132,7 @@ class Client(Models):
         return self.post("/v1/preview", json={"participant": participant, **more})
 
     def start_test(self, participant: str, **more: Any) -> SessionTest:
-        """Start a test, the pre-session test by default. `more`: `kind`, `segments`, `joins`, narrower limits."""
+        """Start a test, the pre-session test by default. `more`: `kind`, `segments`, `protocol`, `joins`, limits."""
         return self.post("/v1/tests", json={"participant": participant, **more})
 
     def test(self, test_id: str) -> SessionTest:

@@ -127,7 +127,10 @@ class TestIn(Body):
     kind: Annotated[str, StringConstraints(pattern=r"^[a-z-]{1,40}$")] = "pre-session"
     profile: ProfileIn | None = Field(None, description="for this test alone, never wider than the participant's own")
     segments: Annotated[list[SegmentIn], Field(min_length=1, max_length=200)] | None = Field(
-        None, description="None: the default pre-session test"
+        None, description="None: those of the protocol"
+    )
+    protocol: Annotated[str, StringConstraints(pattern=r"^[a-z-]{1,40}$")] | None = Field(
+        None, description="a whole test by its id in `GET /v1/sequences`; None: the default. Not together with segments"
     )
     pulse_rate_hz: Annotated[FiniteFloat, Field(ge=1, le=100)] = 40.0
     max_pulse_width_us: FiniteFloat | None = Field(
@@ -140,6 +143,12 @@ class TestIn(Body):
     joins: Annotated[str, StringConstraints(max_length=64)] | None = Field(
         None, description="a model: the new recording is joined to that model's, and both are judged together"
     )
+
+    @model_validator(mode="after")
+    def _one_of_both(self) -> TestIn:
+        if self.protocol is not None and self.segments is not None:
+            raise ValueError("give `protocol` or `segments`, not both")
+        return self
 
 
 class CalibrationIn(Body):

@@ -30,20 +30,21 @@ def test(
     rig: Annotated[Path | None, typer.Option(help="rig file (TOML); default: the emulated rig")] = None,
     url: Annotated[str, typer.Option(help="a running service; default: one is started", envvar="STIMRIG_URL")] = "",
     data: Annotated[Path | None, typer.Option(help="data folder; default ./var, or STIMRIG_DATA_DIR")] = None,
+    protocol: Annotated[str, typer.Option(help="which fixed test: paper, short")] = "paper",
     output: Annotated[Path | None, typer.Option("-o", "--output", help="write the recording (HDF5) here")] = None,
     emulate: Annotated[str, typer.Option(help='options for the emulator, e.g. "--patient calcium"')] = "",
     as_json: Json = False,
 ) -> None:
-    """One pre-session test: PRBS, ramp and held-out levels are sent, and the muscle is identified. Approves nothing."""
+    """One pre-session test: a fixed protocol is played, and the muscle is identified. Approves nothing."""
     if url:
         token = os.environ.get("STIMRIG_TOKEN") or os.environ.get("STIMRIG_ADMIN_TOKEN")
         if not token:
             raise InputError(f"--url {url} needs a token in STIMRIG_TOKEN.")
         with StopKey(at_service(url, token), say_aside) as key:
             announce(key)
-            found = through(url, token, participant)
+            found = through(url, token, participant, protocol)
     else:
-        found = on_own_services(rig, data, emulate, participant)
+        found = on_own_services(rig, data, emulate, participant, protocol)
     recording = found.pop("recording")
     if output is not None:
         save(output, recording)
@@ -80,7 +81,9 @@ def save(path: Path, recording: bytes) -> None:
         raise InputError(f"{path}: {error.strerror}. Give a file in a folder that can be written.") from error
 
 
-def on_own_services(rig: Path | None, data: Path | None, emulate: str, participant: str) -> dict[str, Any]:
+def on_own_services(
+    rig: Path | None, data: Path | None, emulate: str, participant: str, protocol: str
+) -> dict[str, Any]:
     """Start rig and service for this one test."""
     given = {"rig_file": rig, "data_dir": data}
     settings = Settings(**{key: value for key, value in given.items() if value is not None})
@@ -92,10 +95,12 @@ def on_own_services(rig: Path | None, data: Path | None, emulate: str, participa
         StopKey(at_rig(services.socket), say_aside) as key,
     ):
         announce(key)
-        return through(services.url, token, participant, services.watch)
+        return through(services.url, token, participant, protocol, services.watch)
 
 
-def through(url: str, token: str, participant: str, events: Callable[[], list[str]] = list) -> dict[str, Any]:
+def through(
+    url: str, token: str, participant: str, protocol: str, events: Callable[[], list[str]] = list
+) -> dict[str, Any]:
     """The test through a service.
 
     Raises
@@ -104,6 +109,6 @@ def through(url: str, token: str, participant: str, events: Callable[[], list[st
         The service cannot be reached, or the test did not end in a model.
     """
     with Client(url, token) as client:
-        document = run_test(client, participant, events)
+        document = run_test(client, participant, events, protocol=protocol)
         model = client.model_file(document["model_id"])
         return {"test": document, "model": model, "recording": client.recording(document["recording_id"])}
