@@ -99,7 +99,7 @@ def on_own_services(
 
 
 def through(
-    url: str, token: str, participant: str, protocol: str, events: Callable[[], list[str]] = list
+    url: str, token: str, participant: str, protocol: str = "paper", events: Callable[[], list[str]] = list
 ) -> dict[str, Any]:
     """The test through a service.
 
