@@ -47,7 +47,7 @@ def _watch(watcher: RigClient, client: RigClient, seconds: float) -> dict[str, A
     """Extend until the finished event."""
     events: list[tuple[float, dict[str, Any]]] = []
     took: dict[str, list[float]] = {"extend": [], "status": []}
-    late = 0
+    late = seen = 0
     while True:
         with contextlib.suppress(queue.Empty):
             event = watcher.events.get(timeout=60)
@@ -56,10 +56,14 @@ def _watch(watcher: RigClient, client: RigClient, seconds: float) -> dict[str, A
             if event["event"] != "live" or not event["laid"]:
                 continue
             events.append((time.monotonic(), event))
+            if event["laid"] < seen:
+                continue  # from before the last answer
             if event["boundary_s"] < seconds and event["boundary_s"] - event["elapsed_s"] < 0.5:
                 _timed(client, took["status"], "status")
                 fields = {"test_id": "bench", "key": KEY, "after": event["laid"], "segments": [SECOND]}
-                late += not _timed(client, took["extend"], "extend", **fields)["ok"]
+                reply = _timed(client, took["extend"], "extend", **fields)
+                late += not reply["ok"]
+                seen = reply["body"].get("laid", seen)
     summary = event["summary"]
     return {
         "extensions": len(took["extend"]), "late": late, "outcome": event["outcome"], "reason": event["reason"],

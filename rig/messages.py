@@ -94,7 +94,8 @@ class TestPlan(Message):
     participant: str
     kind: str = "pre-session"
     profile: Profile
-    segments: list[SegmentPlan] | None = Field(None, description="None: the default pre-session test")
+    segments: list[SegmentPlan] | None = Field(None, description="None: those of the protocol")
+    protocol: str = Field(default="paper", description="id of a protocol in rig.protocols, for a plan without segments")
     pulse_rate_hz: float = 40.0
     max_pulse_width_us: float | None = Field(default=None, description="for this test only, if tighter, µs")
     max_torque_nm: float | None = Field(default=None, description="for this test only, if tighter, N·m")
@@ -116,7 +117,7 @@ class StatusRequest(Message):
 class SubscribeRequest(Message):
     kind: Literal["subscribe"] = "subscribe"
     id: int = 0
-    samples: bool = Field(False, description="live events also carry every torque sample")
+    samples: bool = Field(default=False, description="live events also carry every torque sample")
 
 
 class PreviewRequest(Message):
@@ -139,7 +140,9 @@ class StartRequest(Message):
     kind: Literal["start"] = "start"
     id: int = 0
     plan: TestPlan
-    key: str = Field("", description="of an adaptive test: only who knows it may extend it; it is stored nowhere")
+    key: str = Field(
+        default="", description="of an adaptive test: only who knows it may extend it; it is stored nowhere"
+    )
 
 
 class ExtendRequest(Message):
@@ -163,7 +166,7 @@ class EnoughRequest(Message):
     id: int = 0
     test_id: str
     by: str = ""
-    at_once: bool = Field(False, description="at the next pulse; else where the segment that plays ends")
+    at_once: bool = Field(default=False, description="at the next pulse; else where the segment that plays ends")
 
 
 class StopRequest(Message):
@@ -343,10 +346,20 @@ class SequenceInfo(Message):
     settings: dict[str, Any] = Field(description="JSON Schema of its settings: units, ranges and defaults")
 
 
+class ProtocolInfo(Message):
+    """One protocol of the library."""
+
+    id: str
+    description: str
+    segments: list[str] = Field(description="names, in order")
+    duration_s: float = Field(description="at 40 pulses/s")
+
+
 class Sequences(Message):
     """What this rig can play."""
 
     sequences: list[SequenceInfo]
+    protocols: list[ProtocolInfo] = Field(default_factory=list, description="whole tests; the first is the default")
     default: list[SegmentPlan] = Field(description="segments of the default pre-session test")
 
 

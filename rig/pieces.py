@@ -88,9 +88,14 @@ def _named(number: int, segment: SegmentPlan) -> Iterator[None]:
 def _settings(segment: SegmentPlan, plan: TestPlan) -> dict[str, object]:
     settings = dict(segment.settings)
     if MAX_WIDTH_SETTING in sequences.find(segment.sequence).Settings.model_fields:
-        comfort_us, asked_us = plan.profile.max_pulse_width_us, plan.max_pulse_width_us
-        settings.setdefault(MAX_WIDTH_SETTING, comfort_us if asked_us is None else min(comfort_us, asked_us))
+        settings.setdefault(MAX_WIDTH_SETTING, largest_us(plan))
     return settings
+
+
+def largest_us(plan: TestPlan) -> float:
+    """The comfort maximum, or the request's limit if lower, µs."""
+    comfort_us, asked_us = plan.profile.max_pulse_width_us, plan.max_pulse_width_us
+    return comfort_us if asked_us is None else min(comfort_us, asked_us)
 
 
 def check_all(

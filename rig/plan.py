@@ -8,40 +8,33 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rig import pieces, sequences
+from rig import pieces, protocols, sequences
 from rig.errors import PlanError
 from rig.limits import Limit, Steps, check
-from rig.messages import Preview, RecruitmentTable, SegmentPlan, Sequences, TestPlan
+from rig.messages import Preview, ProtocolInfo, RecruitmentTable, Sequences, TestPlan
 from rig.pieces import MAX_SEGMENTS, MAX_WIDTH_SETTING, Piece
 
-
-def default_segments() -> list[SegmentPlan]:
-    """The pre-session test: PRBS (12.7 s), triangular ramp (10 s), held-out levels (7 s), rests around them; 38.7 s.
-
-    PRBS: 7 bits, each chip lasts 4 pulses (0.1 s). One period of 12.7 s excites 0.08 to 4.4 Hz, which covers muscles
-    with time constants of 0.1 to 0.6 s. About half of its pulses are at the full width. During the rest after it the
-    torque of the slowest muscle falls to a few percent before the ramp begins.
-    """
-    return [
-        SegmentPlan(name="rest", sequence="rest", settings={"duration_s": 2.0}),
-        SegmentPlan(name="prbs", sequence="prbs", settings={}),
-        SegmentPlan(name="rest", sequence="rest", settings={"duration_s": 3.0}),
-        SegmentPlan(name="ramp", sequence="ramp", settings={}),
-        SegmentPlan(name="rest", sequence="rest", settings={"duration_s": 2.0}),
-        SegmentPlan(name="validate", sequence="multilevel", settings={}),
-        SegmentPlan(name="rest", sequence="rest", settings={"duration_s": 2.0}),
-    ]
+USUAL_RATE_HZ = 40.0
 
 
 def library() -> Sequences:
-    """All sequences with their settings as a plan gives them, and the default test."""
+    """All sequences with their settings as a plan gives them, all protocols, and the default test."""
     found = sequences.described()
     for sequence in found:
         width = sequence.settings["properties"].get(MAX_WIDTH_SETTING)
         if width is not None:
             del width["default"]
             width["description"] += "; left out: the comfort maximum, or the test's own limit if that is lower"
-    return Sequences(sequences=found, default=default_segments())
+    default = protocols.segments(protocols.DEFAULT, 0.0)
+    told = [_protocol(name, words) for name, words in protocols.described().items()]
+    return Sequences(sequences=found, protocols=told, default=default)
+
+
+def _protocol(protocol_id: str, words: str) -> ProtocolInfo:
+    chosen = protocols.segments(protocol_id, 0.0)
+    pulses = sum(sequences.pulse_count(segment.sequence, segment.settings, USUAL_RATE_HZ) for segment in chosen)
+    names = [segment.name for segment in chosen]
+    return ProtocolInfo(id=protocol_id, description=words, segments=names, duration_s=pulses / USUAL_RATE_HZ)
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +104,9 @@ def build(plan: TestPlan, table: dict[str, Limit]) -> PlannedTest:
         The plan would break a limit: names the limit, the pulse and the excess.
     """
     pieces.refuse(check(table["pulse_rate_hz"], plan.pulse_rate_hz), "plan")
-    chosen = default_segments() if plan.segments is None else plan.segments
+    chosen = plan.segments
+    if chosen is None:
+        chosen = protocols.segments(plan.protocol, min(table["pulse_width_us"].hi, pieces.largest_us(plan)))
     if not chosen:
         raise PlanError("plan.segments is empty; leave it out for the default test, or give at least one segment")
     if len(chosen) > MAX_SEGMENTS:

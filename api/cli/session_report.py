@@ -24,6 +24,8 @@ def run_test(client: Client, participant: str, events: Callable[[], list[str]] =
         Code; made unless it is there.
     events : callable
         Says which processes of the service have ended; one is enough to give up.
+    **more
+        As in `Client.start_test`.
 
     Raises
     ------

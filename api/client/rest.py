@@ -135,7 +135,7 @@ class Client(Models):
         return self.post("/v1/preview", json={"participant": participant, **more})
 
     def start_test(self, participant: str, **more: Any) -> SessionTest:
-        """Start a test, the pre-session test by default. `more`: `kind`, `segments`, `joins`, narrower limits.
+        """Start a test, the pre-session test by default. `more`: `kind`, `segments` or `protocol`, `joins`, limits.
 
         With `kind="adaptive"` it stops itself: `target`, `max_duration_s`, `max_torque_time_nm_s`, `anyway`.
         """

@@ -137,7 +137,10 @@ class TestIn(Body):
     kind: Annotated[str, StringConstraints(pattern=r"^[a-z-]{1,40}$")] = "pre-session"
     profile: ProfileIn | None = Field(None, description="for this test alone, never wider than the participant's own")
     segments: Annotated[list[SegmentIn], Field(min_length=1, max_length=200)] | None = Field(
-        None, description="None: the default pre-session test"
+        None, description="None: those of the protocol"
+    )
+    protocol: Annotated[str, StringConstraints(pattern=r"^[a-z-]{1,40}$")] | None = Field(
+        None, description="a whole test by its id in `GET /v1/sequences`; None: the default. Not together with segments"
     )
     pulse_rate_hz: Annotated[FiniteFloat, Field(ge=1, le=100)] = 40.0
     max_pulse_width_us: FiniteFloat | None = Field(
@@ -164,10 +167,16 @@ class TestIn(Body):
     def _of_its_kind(self) -> TestIn:
         own = {"target", "max_duration_s", "max_torque_time_nm_s", "anyway"}
         sent = {name for name in self.model_fields_set if getattr(self, name) is not None}
-        wrong = sorted(sent & {"segments", "joins"} if self.kind == "adaptive" else sent & own)
+        wrong = sorted(sent & {"segments", "protocol", "joins"} if self.kind == "adaptive" else sent & own)
         if wrong:
             which = "chooses its own segments" if self.kind == "adaptive" else "has a fixed plan"
             raise ValueError(f"{', '.join(wrong)}: a test of the kind {self.kind} {which}; leave it out")
+        return self
+
+    @model_validator(mode="after")
+    def _one_of_both(self) -> TestIn:
+        if self.protocol is not None and self.segments is not None:
+            raise ValueError("give `protocol` or `segments`, not both")
         return self
 
 

@@ -214,6 +214,7 @@ class Runner:
             participant=participant.code,
             kind=body.kind,
             segments=segments,
+            **({} if body.protocol is None else {"protocol": body.protocol}),
             pulse_rate_hz=body.pulse_rate_hz,
             **limits_of(body, participant.profile),
         )

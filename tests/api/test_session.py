@@ -170,6 +170,15 @@ def test_refused_plan_says_why_and_is_kept(client: httpx.Client, participant: st
     assert client.post("/v1/tests", json={"participant": participant}).status_code == 202
 
 
+def test_a_test_may_name_its_protocol(client: httpx.Client, service: Service, participant: str) -> None:
+    both = {"protocol": "short", "segments": [{"name": "x", "sequence": "rest"}]}
+    for wrong in (both, {"protocol": "../short"}, {"protocol": True}):
+        assert client.post("/v1/tests", json={"participant": participant, **wrong}).status_code == 422
+    assert service.rig.starts == 0
+    assert client.post("/v1/tests", json={"participant": participant, "protocol": "short"}).status_code == 202
+    assert (service.rig.plan.protocol, service.rig.plan.segments) == ("short", None)
+
+
 def test_preview_plays_nothing(client: httpx.Client, service: Service, participant: str) -> None:
     answer = client.post("/v1/preview", json={"participant": participant}).json()
     assert answer["duration_s"] == 25.0 and len(answer["pulse_width_us"]) == 1000

@@ -139,7 +139,8 @@ NONE = {
 @pytest.mark.parametrize("sequence", NONE)
 def test_a_segment_without_a_pulse_is_a_mistake_in_the_plan(sequence: str):
     short = SegmentPlan(name="x", sequence=sequence, settings=NONE[sequence])
-    for segments in ([short], [*plan.default_segments(), short], [short, *plan.default_segments()]):
+    paper = plan.library().default
+    for segments in ([short], [*paper, short], [short, *paper]):
         with pytest.raises(PlanError, match=r"segment \d \(x\): too short for one pulse at 40 pulses/s"):
             built(segments)
 

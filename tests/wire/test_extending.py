@@ -73,7 +73,7 @@ def test_a_watched_test_is_extended_to_its_end(shared: tuple[Bench, RigClient]):
     assert len(counter) > 1500
     watcher.close()
     finished = seen[-1]
-    assert (finished["outcome"], finished["summary"]["ended_by"]) == ("completed", "plan")
+    assert (finished["outcome"], finished["summary"]["ended_by"]) == ("completed", "plan"), finished["reason"]
     laid = seen[-2]["laid_segments"]
     assert [s["name"] for s in laid] == ["rest", "added", "added", "added", "ramp", "rest"]
     with h5py.File(finished["recording_path"]) as file:
@@ -94,7 +94,7 @@ def test_a_test_whose_client_dies_plays_its_fixed_plan(shared: tuple[Bench, RigC
     starter.send_raw('{"kind": "extend", "id": 9, "test_id": "left", "key": "')  # it dies in the middle of a word
     starter.close()
     finished = events_of(client, "left")[-1]
-    assert (finished["outcome"], finished["summary"]["ended_by"]) == ("completed", "plan")
+    assert (finished["outcome"], finished["summary"]["ended_by"]) == ("completed", "plan"), finished["reason"]
     record = read(Path(finished["recording_path"]))
     assert record.segment_names == ("rest", "added", "ramp", "rest")
 

@@ -31,6 +31,9 @@ def test(
     rig: Annotated[Path | None, typer.Option(help="rig file (TOML); default: the emulated rig")] = None,
     url: Annotated[str, typer.Option(help="a running service; default: one is started", envvar="STIMRIG_URL")] = "",
     data: Annotated[Path | None, typer.Option(help="data folder; default ./var, or STIMRIG_DATA_DIR")] = None,
+    protocol: Annotated[
+        str | None, typer.Option(help="which fixed test: paper (default), short", show_default=False)
+    ] = None,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="write the recording (HDF5) here")] = None,
     emulate: Annotated[str, typer.Option(help='options for the emulator, e.g. "--patient calcium"')] = "",
     adaptive: Annotated[bool, typer.Option("--adaptive", help="a test that stops itself once enough is known")] = False,
@@ -50,11 +53,11 @@ def test(
     anyway: Annotated[bool, typer.Option("--anyway", help="play it although the target is out of reach")] = False,
     as_json: Json = False,
 ) -> None:
-    """One pre-session test: PRBS, ramp and held-out levels are sent, and the muscle is identified. Approves nothing.
+    """One pre-session test: a fixed protocol is played, and the muscle is identified. Approves nothing.
 
     With --adaptive each segment is chosen by what is known so far, and the test stops once enough is known.
     """
-    asked = how(adaptive, target, max_time, max_dose, anyway)
+    asked = how(adaptive, protocol, target, max_time, max_dose, anyway)
     if url:
         token = os.environ.get("STIMRIG_TOKEN") or os.environ.get("STIMRIG_ADMIN_TOKEN")
         if not token:
@@ -74,20 +77,24 @@ def test(
     say(f"recording      {output or found['test']['recording_url']}")
 
 
-def how(adaptive: bool, target: str, max_time: float | None, max_dose: float | None, anyway: bool) -> dict[str, Any]:
+def how(
+    adaptive: bool, protocol: str | None, target: str, max_time: float | None, max_dose: float | None, anyway: bool
+) -> dict[str, Any]:
     """What the service is asked for beside the participant.
 
     Raises
     ------
     InputError
-        An option of adaptive tests without --adaptive, or what is no number.
+        An option of adaptive tests without --adaptive, one of fixed tests with it, or what is no number.
     """
     given = {"max_duration_s": max_time, "max_torque_time_nm_s": max_dose, "anyway": anyway or None}
     asked: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     if not adaptive:
         if asked or target:
             raise InputError("--target, --max-time, --max-dose and --anyway go with --adaptive.")
-        return {}
+        return {} if protocol is None else {"protocol": protocol}
+    if protocol is not None:
+        raise InputError("--protocol is for a fixed test; leave it out, or leave out --adaptive.")
     for option, value in (("--max-time", max_time), ("--max-dose", max_dose)):
         if value is not None and not 0 < value < math.inf:
             raise InputError(f"{option} {value:g}: give a number above 0.")

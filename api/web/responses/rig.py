@@ -69,10 +69,20 @@ class SequenceOut(Document):
     settings: SettingsOut
 
 
+class ProtocolOut(Document):
+    """A whole test by name."""
+
+    id: str
+    description: str
+    segments: list[str] = Field(description="names, in order")
+    duration_s: float = Field(description="at 40 pulses/s")
+
+
 class SequencesOut(Document):
     """The sequences of this rig."""
 
     sequences: list[SequenceOut]
+    protocols: list[ProtocolOut] = Field([], description="whole tests by name; the first is the default")
     default: list[SegmentOut] = Field(description="the segments of a test that is given none")
 
 
