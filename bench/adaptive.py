@@ -3,10 +3,10 @@
     python -m bench.adaptive --patients 40 --seeds 80000 [--kinds sigmoid,shaped] [--hidden 20] [--json FILE]
 
 Each patient has noise of 0.05 N·m at 400 Hz, and every peer sees the same noise. Seeds from 50000 were developed on.
-Peers: the paper's test (PRBS and ramp with their rests, 29.7 s, without the held-out levels of the default test), a
-staircase, pieces of our library taken at random, a chooser as `optbayesexpt` (`bench.particles`), ours for a new
-person, and ours for a person who is known from one earlier session. A test whose structure fits badly goes on with the
-paper's test; its dose and time count. "Unseen" is the best fit to the clean torque of random levels.
+Peers: the paper's test (PRBS and ramp with their rests, 29.7 s, without the held-out levels of the default test), the
+protocol `short` without its held-out levels, a staircase, pieces of our library taken at random, a chooser as
+`optbayesexpt` (`bench.particles`), ours for a new person, and ours for a person who is known from one earlier session.
+A test whose structure fits badly goes on with the paper's test; its dose and time count. "Unseen" is the best fit to the clean torque of random levels.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from identify.experiments.knowledge import Knowledge, step_responses, whole_band
 from identify.experiments.pieces import pieces
 from identify.model import Model
 from identify.records.record import Record
-from rig.plan import default_segments
+from rig import protocols
 from rig.sequences import build
 from tests.harness.adaptive import Hidden, Muscle, Played, papers, play, recorded, shaped, sigmoid
 
@@ -42,13 +42,15 @@ LONGEST_S = 60.0
 KINDS: dict[str, Callable[[int], Muscle]] = {"sigmoid": sigmoid, "shaped": shaped}
 
 
-def paper_test(top_us: float) -> tuple[np.ndarray, list[str]]:
-    """Widths and names of the default test's PRBS and ramp with their rests."""
+def paper_test(top_us: float, protocol: str = "paper") -> tuple[np.ndarray, list[str]]:
+    """Widths and names of a protocol without its held-out levels: of the paper's, PRBS and ramp with their rests."""
     widths, names = [], []
-    for segment in default_segments()[:5]:
+    for segment in protocols.segments(protocol, top_us):
+        if segment.name == "validate":
+            break
         settings = dict(segment.settings)
         if segment.sequence != "rest":
-            settings["max_pulse_width_us"] = top_us
+            settings.setdefault("max_pulse_width_us", top_us)
         own = build(segment.sequence, settings, 40.0)
         widths.append(own)
         names += [segment.name] * own.size
@@ -203,6 +205,7 @@ def one(kind: str, seed: int, wanted: str) -> list[dict[str, Any]]:
     day = muscle.another_day(np.random.default_rng([seed, 8]))
     peers: dict[str, Callable[[], dict[str, Any]]] = {
         "paper": lambda: fixed(muscle, paper_test(muscle.top_us), noise, seed),
+        "short": lambda: fixed(muscle, paper_test(muscle.top_us, "short"), noise, seed),
         "staircase": lambda: fixed(muscle, staircase(muscle.top_us), noise, seed),
         "random pieces": lambda: adaptive(muscle, noise, seed, random=True)[0],
         "particles": lambda: chosen_by_particles(muscle, noise, seed),
@@ -292,7 +295,7 @@ def main() -> int:
     parser.add_argument("--patients", type=int, default=150, help="of each kind")
     parser.add_argument("--seeds", type=int, default=80_000, help="the first")
     parser.add_argument("--kinds", default="sigmoid,shaped")
-    parser.add_argument("--peers", default="paper; staircase; random pieces; particles; ours, new; ours, known")
+    parser.add_argument("--peers", default="paper; short; staircase; random pieces; particles; ours, new; ours, known")
     parser.add_argument("--hidden", type=int, default=0, help="patients with one hidden effect")
     parser.add_argument("--paper", type=int, default=0, help="trials of the paper's muscle")
     parser.add_argument("--json", type=Path, help="every row goes here, one a line")
