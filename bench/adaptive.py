@@ -6,7 +6,8 @@ Each patient has noise of 0.05 N·m at 400 Hz, and every peer sees the same nois
 Peers: the paper's test (PRBS and ramp with their rests, 29.7 s, without the held-out levels of the default test), the
 protocol `short` without its held-out levels, a staircase, pieces of our library taken at random, a chooser as
 `optbayesexpt` (`bench.particles`), ours for a new person, and ours for a person who is known from one earlier session.
-A test whose structure fits badly goes on with the paper's test; its dose and time count. "Unseen" is the best fit to the clean torque of random levels.
+A test whose structure fits badly goes on with the paper's test; its dose and time count. "Unseen" is the best fit to
+the clean torque of random levels.
 """
 
 from __future__ import annotations
