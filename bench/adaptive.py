@@ -26,6 +26,8 @@ import numpy as np
 import identify
 from bench.particles import HOLD, Particles
 from hardware_sim.patients.hidden.draw import draw_scenario, rng_of, still_effect_ids
+from identify.diagnosis import candidates as workers
+from identify.diagnosis import diagnose
 from identify.estimation.fit_statistics import best_fit_percent
 from identify.estimation.prepare import prepare
 from identify.experiments.adaptive import Target
@@ -43,11 +45,11 @@ LONGEST_S = 60.0
 KINDS: dict[str, Callable[[int], Muscle]] = {"sigmoid": sigmoid, "shaped": shaped}
 
 
-def paper_test(top_us: float, protocol: str = "paper") -> tuple[np.ndarray, list[str]]:
-    """Widths and names of a protocol without its held-out levels: of the paper's, PRBS and ramp with their rests."""
+def paper_test(top_us: float, protocol: str = "paper", held_out: bool = False) -> tuple[np.ndarray, list[str]]:
+    """Widths and names of a protocol: of the paper's, PRBS and ramp with their rests, and the held-out levels."""
     widths, names = [], []
     for segment in protocols.segments(protocol, top_us):
-        if segment.name == "validate":
+        if segment.name == "validate" and not held_out:
             break
         settings = dict(segment.settings)
         if segment.sequence != "rest":
@@ -224,22 +226,55 @@ def one(kind: str, seed: int, wanted: str) -> list[dict[str, Any]]:
     ]
 
 
-def hidden(seed: int) -> dict[str, Any]:
-    """How an adaptive test of a muscle with one hidden effect ends."""
+def hidden_muscle(seed: int) -> tuple[str, str, Hidden]:
+    """Name and strength of one hidden effect, and the muscle."""
     for attempt in range(20):
         rng = rng_of(seed, "adaptive", str(attempt))
         effect, strength = str(rng.choice(still_effect_ids())), str(rng.choice(["weak", "middle", "strong"]))
         try:
-            muscle = Hidden(draw_scenario((effect,), strength, seed + attempt, noise_sd_nm=NOISE_NM))
-            break
+            return effect, strength, Hidden(draw_scenario((effect,), strength, seed + attempt, noise_sd_nm=NOISE_NM))
         except ValueError:
             continue
-    else:
-        raise ValueError(f"seed {seed}: no muscle found")
-    noise = np.random.default_rng([seed, 5]).standard_normal(int(2 * LONGEST_S * RATE_HZ)) * NOISE_NM
-    dose = float(np.sum(muscle.curve(paper_test(muscle.top_us)[0]))) / 40.0
+    raise ValueError(f"seed {seed}: no muscle found")
+
+
+def hidden(seed: int) -> dict[str, Any]:
+    """What the diagnosis names of one hidden effect: after our test, the paper's test, and the paper's test twice."""
+    workers.WORKERS = 1
+    effect, strength, muscle = hidden_muscle(seed)
+    noise = np.random.default_rng([seed, 5]).standard_normal(int(3 * LONGEST_S * RATE_HZ)) * NOISE_NM
+    paper = paper_test(muscle.top_us, held_out=True)
+    dose = float(np.sum(muscle.curve(paper[0]))) / 40.0
     made = play(muscle, noise, TARGET, left_s=LONGEST_S / 2.0, left_nm_s=dose)
-    return {"seed": seed, "effect": effect, "strength": strength, "ended": made.decision.kind, "seconds": made.seconds}
+    own = made.widths_us, made.names
+    if made.decision.kind == "misfit":
+        own = np.r_[own[0], paper[0]], own[1] + paper[1]
+    tests = {"ours": own, "paper": paper, "paper twice": (np.tile(paper[0], 2), paper[1] * 2)}
+    line: dict[str, Any] = {"seed": seed, "effect": effect, "strength": strength, "ended": made.decision.kind}
+    for name, test in tests.items():
+        found = diagnose(recorded(muscle, *test, noise, RATE_HZ))
+        line[name] = {
+            "verdict": found.verdict,
+            "named": [entry["effect"] for entry in found.missing],
+            "group": found.missing[0]["confused_with"] if found.missing else [],
+            "dose_share": round(float(np.sum(muscle.curve(test[0]))) / 40.0 / dose, 3),
+        }
+    return line
+
+
+def told_of_hidden(rows: list[dict[str, Any]]) -> list[str]:
+    """How often each test let the diagnosis name the effect."""
+    lines = [
+        "| test | n | named first | only others named | nothing named | dose, of the paper's, median |",
+        "|---" * 6 + "|",
+    ]
+    for test in ("ours", "paper", "paper twice"):
+        first = sum(line[test]["named"][:1] == [line["effect"]] for line in rows)
+        others = sum(bool(line[test]["named"]) and line["effect"] not in line[test]["named"] for line in rows)
+        nothing = sum(not line[test]["named"] for line in rows)
+        share = float(np.median([line[test]["dose_share"] for line in rows]))
+        lines.append(f"| {test} | {len(rows)} | {first} | {others} | {nothing} | {100 * share:.0f} % |")
+    return lines
 
 
 def of_papers_muscle(trials: int, seed: int) -> list[str]:
@@ -314,8 +349,11 @@ def main() -> int:
         if settings.json is not None:
             settings.json.write_text("\n".join(json.dumps(line) for line in rows))
     print(*(table(rows) if rows else []), sep="\n")
+    found: list[dict[str, Any]] = []
     for seed in range(settings.seeds, settings.seeds + settings.hidden):
-        print(json.dumps(hidden(seed)), flush=True)
+        found.append(hidden(seed))
+        print(json.dumps(found[-1]), file=sys.stderr, flush=True)
+    print(*(told_of_hidden(found) if found else []), sep="\n")
     print(*of_papers_muscle(settings.paper, settings.seeds), sep="\n")
     return 0
 
