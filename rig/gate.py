@@ -73,6 +73,8 @@ class Gate:
         self.ack_delay_s: list[float] = []
         self.charge_uc = 0.0
         self.dropped = 0
+        self.not_sent: list[int] = []
+        """Indices of the pulses that were dropped or refused: the muscle felt none."""
         stimulator.listen(self._acknowledged, on_lost)
 
     @property
@@ -92,7 +94,7 @@ class Gate:
         """Clear the counts of the previous test."""
         with self._lock:
             self.last_pulse_s, self.lateness_s, self.ack_delay_s = None, [], []
-            self.charge_uc, self.dropped = 0.0, 0
+            self.charge_uc, self.dropped, self.not_sent = 0.0, 0, []
             self._recent.clear()
 
     def open(self, journal: Journal, table: dict[str, Limit]) -> None:
@@ -212,6 +214,8 @@ class Gate:
     def _skip(self, journal: Journal, index: int, status: PulseStatus, reason: str = "") -> PulseStatus:
         now_s = self._clock.now_s()
         journal.append(Kind.SKIPPED, jn.SKIPPED.pack(index, status, now_s))
+        if status != PulseStatus.REST:
+            self.not_sent.append(index)
         if status == PulseStatus.DROPPED:
             self.dropped += 1
         if reason:

@@ -440,6 +440,9 @@ class LiveEvent(Message):
     boundary_s: float = Field(0.0, description="where they end on the test's clock, s")
     ended_by: str = Field("", description="why nothing will be laid any more; empty: more may be (see `Extended`)")
     laid_segments: list[LaidSegment] = Field(default_factory=list, description="all that are laid; adaptive tests only")
+    not_sent: list[int] = Field(
+        default_factory=list, description="indices of pulses that were dropped or refused; adaptive tests only"
+    )
     samples: TorqueSamples | None = Field(None, description="for who subscribed with `samples`")
 
 

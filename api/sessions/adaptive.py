@@ -167,7 +167,7 @@ class Follower:
         widths, segments = self._laid(event)
         try:
             said = await self.adviser.ask(
-                "adaptive_advise", **news, laid_us=widths, segments=segments,
+                "adaptive_advise", **news, laid_us=widths, not_sent=event.not_sent, segments=segments,
                 torque_time_nm_s=event.torque_time_nms, measured_s=event.elapsed_s,
             )  # fmt: skip
         except ApiError as error:

@@ -116,6 +116,7 @@ class Running:
         counter: list[int],
         torque_nm: list[float | None],
         laid_us: list[float],
+        not_sent: list[int],
         segments: list[tuple[str, int, int]],
         torque_time_nm_s: float,
         measured_s: float,
@@ -126,8 +127,9 @@ class Running:
         ----------
         host_time_s, counter, torque_nm
             Samples that are new, as the rig tells them.
-        laid_us, segments
-            Widths of all pulses that are laid, µs; name, first pulse and end of each segment.
+        laid_us, not_sent, segments
+            Widths of all pulses that are laid, µs; which of them the muscle did not feel; name, first pulse and end of
+            each segment.
         torque_time_nm_s, measured_s
             Torque-time that was measured, N·m·s, and until when, s.
         """
@@ -135,6 +137,8 @@ class Running:
 
         for held, new in zip(self.samples, (host_time_s, counter, torque_nm), strict=True):
             held.extend(new)  # pyright: ignore[reportArgumentType]
+        for index in not_sent:
+            laid_us[index] = 0.0
         record = record_of(*self.samples, laid_us, segments, self.rate_hz)
         committed_nm_s = self._expected(laid_us[round(measured_s * self.rate_hz) :])
         found = decide(

@@ -157,6 +157,11 @@ class TestRun:
         return self._gate.dropped
 
     @property
+    def not_sent(self) -> list[int]:
+        """Indices of the pulses that were dropped or refused so far."""
+        return list(self._gate.not_sent)
+
+    @property
     def sent(self) -> int:
         """Number of pulses sent so far."""
         return len(self._gate.lateness_s)

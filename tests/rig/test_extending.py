@@ -27,6 +27,7 @@ from rig.messages import (
     SegmentPlan,
     TestPlan,
 )  # fmt: skip
+from rig.signals import PulseStatus
 from tests.rig.live import LiveRig
 
 pytestmark = pytest.mark.wire  # the rig, its devices and the clock in threads, in real time
@@ -95,6 +96,23 @@ def test_from_start_to_sealed_file_with_one_that_extends_and_says_enough(make: M
     with h5py.File(str(finished.recording_path)) as file:
         assert set(file["segments/name"].asstr()[:]) == {"rest", "added"}
         assert KEY not in str(dict(file.attrs))
+
+
+def test_a_watcher_learns_which_pulses_were_not_sent(make: Make):
+    live = make()
+    live.stimulator.ack_delay_s = 0.06  # the two pulses that come due meanwhile are dropped
+    live.rig.start(plan(live, hold_s=20.0), KEY)
+    event = None
+    while event is None or len(event.not_sent) < 5:
+        time.sleep(0.01)
+        event = live.rig.live()
+    assert live.rig.enough(EnoughRequest(test_id="one", by="nurse", at_once=True))
+    live.wait("ready")
+    finished = live.rig.finished
+    assert finished is not None
+    with h5py.File(str(finished.recording_path)) as file:
+        dropped = np.flatnonzero(file["pulses/status"][:] == PulseStatus.DROPPED).tolist()
+    assert event.not_sent == dropped[: len(event.not_sent)]
 
 
 def test_only_who_started_it_extends_it(make: Make):

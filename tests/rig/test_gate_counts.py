@@ -45,12 +45,12 @@ def test_a_reset_forgets_the_test_before(tmp_path: Path):
     setup.fire(100)
     setup.wait(0.001)
     setup.fire(100)
-    assert (setup.gate.charge_uc, setup.gate.dropped) == (2.0, 1)
+    assert (setup.gate.charge_uc, setup.gate.dropped, setup.gate.not_sent) == (2.0, 1, [0])
     assert setup.gate.last_pulse_s == pytest.approx(T0_S + 0.001)
     setup.gate.reset()
     gate = setup.gate
     assert (gate.last_pulse_s, gate.lateness_s, gate.ack_delay_s) == (None, [], [])
-    assert (gate.charge_uc, gate.dropped) == (0.0, 0)
+    assert (gate.charge_uc, gate.dropped, gate.not_sent) == (0.0, 0, [])
     assert setup.fire(100) == PulseStatus.UNACKNOWLEDGED, "the interval of the test before counts no more"
 
 
