@@ -71,5 +71,3 @@ def zone_name() -> str:
 
 asked_s: ContextVar[float] = ContextVar("asked_s")
 """When the request that is being answered came in, on the monotonic clock."""
-thought_s: ContextVar[float] = ContextVar("thought_s", default=0.0)
-"""How long the service itself computed before it could answer, s: nobody's hand waits on the button meanwhile."""

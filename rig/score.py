@@ -179,8 +179,9 @@ class Score:
             raise PlanError("enough: this test has a fixed plan; stop it, or let it play to its end")
         with self._lock:
             self._may_change()
-            playing = next((s.end for s in self.laid.segments if s.end > self._reached + 1), len(self.laid))
-            self._end("enough", by, self._reached + 1 if at_once else playing)
+            handed = self._reached + 1  # a segment whose first pulse is handed out to wait does not play yet
+            playing = next((s.end for s in self.laid.segments if s.end >= self._reached), len(self.laid))
+            self._end("enough", by, handed if at_once else max(handed, playing))
 
     def shut(self) -> None:
         """From now on every request is refused. Waits for nothing: whoever halts the test calls it."""

@@ -137,10 +137,12 @@ class Client(Models):
     def start_test(self, participant: str, **more: Any) -> SessionTest:
         """Start a test, the pre-session test by default. `more`: `kind`, `segments` or `protocol`, `joins`, limits.
 
-        With `kind="adaptive"` it stops itself: `target`, `max_duration_s`, `max_torque_time_nm_s`, `anyway`.
+        With `kind="adaptive"` it stops itself: `target`, `max_duration_s`, `max_torque_time_nm_s`, `anyway`. What it
+        can reach is then asked for before, in a request of its own.
         """
-        wait = {"timeout": OUTLOOK_S} if more.get("kind") == "adaptive" else {}
-        return self.post("/v1/tests", json={"participant": participant, **more}, **wait)
+        if more.get("kind") == "adaptive":  # a start must be played at once or not at all, and this may take long
+            self.post("/v1/preview", json={"participant": participant, **more}, timeout=OUTLOOK_S)
+        return self.post("/v1/tests", json={"participant": participant, **more})
 
     def test(self, test_id: str) -> SessionTest:
         """A test as it is now."""

@@ -11,7 +11,7 @@ import asyncio
 import contextlib
 import logging
 import secrets
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -103,23 +103,39 @@ class Follower:
         self._took_s = 0.0
         self._turn = Turn(-1)
         self._work: asyncio.Task[None] | None = None
+        self._sending: asyncio.Task[None] | None = None
 
     async def run(self, path: Path | None) -> None:
         """Follow it; whatever goes wrong here ends in the fixed plan, told."""
+        self._work = self._begun(self._begin())  # beside the samples, of which none may be missed
         try:
-            await self.adviser.ask("adaptive_begin", **self.how)
-            async with contextlib.aclosing(samples_of(path, self.plan.test_id)) as events:
-                async for event in events:
-                    self._hear(event)
+            await self._told_of(self._listen(path))
+        finally:
+            tasks = [task for task in (self._work, self._sending) if task is not None]
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+
+    async def _begin(self) -> None:
+        await self.adviser.ask("adaptive_begin", **self.how)
+
+    async def _listen(self, path: Path | None) -> None:
+        async with contextlib.aclosing(samples_of(path, self.plan.test_id)) as events:
+            async for event in events:
+                self._hear(event)
+
+    def _begun(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+        return asyncio.create_task(self._told_of(work))
+
+    async def _told_of(self, work: Coroutine[Any, Any, None]) -> None:
+        """Do it; whatever goes wrong is told."""
+        try:
+            await work
         except ApiError as error:
             self._give_up(f"{error.title}. {error.detail}")
         except Exception as error:
             log.exception("an adaptive test is not followed any more")
             self._give_up(f"{type(error).__name__}.")
-        finally:
-            if self._work is not None:
-                self._work.cancel()
-                await asyncio.gather(self._work, return_exceptions=True)
 
     def _give_up(self, why: str) -> None:
         if self.told.state == "choosing":
@@ -149,9 +165,9 @@ class Follower:
         early_s = max(EARLY_S, 1.5 * self._took_s + SEND_S)  # on a busy machine at once
         if idle and not turn.sent and event.elapsed_s >= LEAST_S and left_s <= (early_s, LATE_S, -1.0)[turn.asked]:
             turn.asked = 2 if left_s <= LATE_S else 1
-            self._work = asyncio.create_task(self._ask(turn, event))
+            self._work = self._begun(self._ask(turn, event))
         elif turn.answer is not None and not turn.sent and left_s <= SEND_S:  # the late one is not there
-            self._sending = asyncio.create_task(self._carry_out(turn, turn.answer))
+            self._sending = self._begun(self._carry_out(turn, turn.answer))
 
     def _left_s(self) -> float:
         """Until what is laid ends, s."""
@@ -165,14 +181,10 @@ class Follower:
         heard_s = self._heard_s
         news, self._new = self._new, {name: [] for name in self._new}
         widths, segments = self._laid(event)
-        try:
-            said = await self.adviser.ask(
-                "adaptive_advise", **news, laid_us=widths, not_sent=event.not_sent, segments=segments,
-                torque_time_nm_s=event.torque_time_nms, measured_s=event.elapsed_s,
-            )  # fmt: skip
-        except ApiError as error:
-            self._give_up(f"{error.title}. {error.detail}")
-            return
+        said = await self.adviser.ask(
+            "adaptive_advise", **news, laid_us=widths, not_sent=event.not_sent, segments=segments,
+            torque_time_nm_s=event.torque_time_nms, measured_s=event.elapsed_s,
+        )  # fmt: skip
         self._took_s = self.clock.monotonic_s() - heard_s
         answer = self._take(said, event, heard_s)
         if turn is not self._turn or turn.sent:
@@ -213,6 +225,8 @@ class Follower:
         try:
             await self.rig.ask(request)
         except ApiError as error:  # too late, or a limit: the fixed plan's next piece plays, and then it is asked again
+            if error.code == "rig-unreachable":  # whether it was laid is not known, nor what plays from now on
+                raise
             del self._added[len(self._added) - len(widths) :]
             answer.row["refused"] = error.detail
             log.info("not laid: %s", error.detail, extra={"test_id": test_id})

@@ -7,10 +7,10 @@ import contextlib
 import hashlib
 from collections import OrderedDict
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import Any
 
-from api.clock import Clock, thought_s
+from api.clock import Clock
 from api.errors import ApiError
 from api.models import stored
 from api.models.registry import Versions
@@ -19,7 +19,7 @@ from api.sessions.adaptive import Follower, Told
 from api.sessions.adaptive_plan import ADAPTIVE
 from api.sessions.requests import TestIn
 from api.sessions.rig_client import RigClient
-from api.store.tables import Test
+from api.store.tables import Participant, Test
 from api.workers.adviser import Adviser
 from rig.messages import EnoughRequest, Extended, FinishedEvent, PreviewRequest, TestPlan
 
@@ -27,8 +27,25 @@ KEPT = 20
 """Outlooks that are remembered: the question before a test and its start need the same one."""
 MOST_MODELS = 10
 """Sessions from which is learnt how much a person changes between two."""
+Place = tuple[str | None, str | None, float | None]
+"""Side, muscle, and current, mA; None: not known."""
 ENDS = {"torque_time": "dose", "limit": "time", "plan": "fixed-rest"}
 """Why a test ended, by the rig's reason, where the service did not end it."""
+
+
+@dataclass(frozen=True)
+class Planned:
+    """A plan, and of a test that stops itself what it shall reach, and what it probably will; None of another kind."""
+
+    plan: TestPlan
+    how: dict[str, Any] | None = None
+    reach: dict[str, Any] | None = None
+
+    def kept(self) -> dict[str, Any]:
+        """What is kept beside the plan; nothing of a test of another kind."""
+        if self.how is None or self.plan.adaptive is None:
+            return {}
+        return {"target": self.how["target"], "reach": self.reach, "bounds": self.plan.adaptive.model_dump()}
 
 
 class AdaptiveTests:
@@ -47,11 +64,11 @@ class AdaptiveTests:
         self.follower: Follower | None = None
         self._task: asyncio.Task[None] | None = None
         self._outlooks: OrderedDict[str, dict[str, Any]] = OrderedDict()
-        self._hows: OrderedDict[str, tuple[dict[str, Any], dict[str, Any]]] = OrderedDict()
+        self._looking = asyncio.Lock()
 
     # ---- before ----------------------------------------------------------------------------------------------
 
-    async def planned(self, body: TestIn, plan: TestPlan, preview_s: float) -> TestPlan:
+    async def planned(self, body: TestIn, plan: TestPlan, preview_s: float) -> Planned:
         """The plan with its bounds and its fixed plan; as it is where the test is of another kind.
 
         Raises
@@ -61,14 +78,13 @@ class AdaptiveTests:
             refuses. 500: the worker died.
         """
         if body.kind != ADAPTIVE:
-            return plan
-        began_s = self.clock.monotonic_s()
+            return Planned(plan)
         bounds = adaptive_plan.bounds_of(body, plan)
         how = {
             "target": body.target.model_dump(),
             "max_duration_s": bounds.max_duration_s, "max_torque_time_nm_s": bounds.max_torque_time_nms,
             "largest_us": adaptive_plan.largest_us(plan), "pulse_rate_hz": plan.pulse_rate_hz,
-            "models": await asyncio.to_thread(self._models, plan.participant),
+            "models": await asyncio.to_thread(self._models_for, plan),
         }  # fmt: skip
         torque_nm = min(t for t in (plan.profile.max_torque_nm, plan.max_torque_nm) if t is not None)
         found = await self._outlook({**how, "max_torque_nm": torque_nm})
@@ -76,43 +92,49 @@ class AdaptiveTests:
         segments = adaptive_plan.fixed_plan(found["opening_us"], default, plan.pulse_rate_hz, bounds)
         if not found["reach"]["reachable"] and not body.anyway:
             raise out_of_reach(found["reach"])
-        thought_s.set(thought_s.get() + self.clock.monotonic_s() - began_s)
-        _keep(self._hows, plan.test_id, (how, {**found["reach"], "known": found["known"]}))
-        return plan.model_copy(update={"segments": segments, "adaptive": bounds})
+        plan = plan.model_copy(update={"segments": segments, "adaptive": bounds})
+        return Planned(plan, how, {**found["reach"], "known": found["known"]})
 
     async def _outlook(self, wanted: dict[str, Any]) -> dict[str, Any]:
+        """What the test can reach. One after the other, so that a test which begins waits for one at most."""
         name = hashlib.sha256(repr(wanted).encode()).hexdigest()
-        if name not in self._outlooks:
-            if self._task is not None and not self._task.done():
-                detail = "What a test can reach is computed once the one that runs has ended."
-                raise ApiError(409, "rig-busy", "Another test is running", detail)
-            _keep(self._outlooks, name, await self.adviser.ask("adaptive_outlook", **wanted))
-        return self._outlooks[name]
+        if name in self._outlooks:
+            return self._outlooks[name]
+        async with self._looking:
+            if name not in self._outlooks:
+                if self._task is not None and not self._task.done():
+                    detail = "What a test can reach is computed once the one that runs has ended."
+                    raise ApiError(409, "rig-busy", "Another test is running", detail)
+                _keep(self._outlooks, name, await self.adviser.ask("adaptive_outlook", **wanted))
+            return self._outlooks[name]
 
-    def _models(self, participant: str) -> list[str]:
-        """The participant's approved models, oldest first; without those that are damaged."""
+    def _models_for(self, plan: TestPlan) -> list[str]:
+        person = self.versions.store.get(Participant, plan.participant)
+        return self._models(plan.participant, (person.side, person.muscle, plan.profile.current_ma))
+
+    def _models(self, participant: str, place: Place) -> list[str]:
+        """The participant's approved models, oldest first.
+
+        Without those that are damaged, and those of tests at another place: they say nothing of this one.
+        """
+        rows = self.versions.all_approved_ones(participant)
+        tests = self.versions.store.all(Test, Test.recording_id.in_([row.recording_id for row in rows]))
+        elsewhere = {test.recording_id for test in tests if _differ(place_of(test), place)}
         found = []
-        for row in self.versions.all_approved_ones(participant)[-MOST_MODELS:]:
+        for row in [row for row in rows if row.recording_id not in elsewhere][-MOST_MODELS:]:
             with contextlib.suppress(ApiError):
                 found.append(stored.text(row))
         return found
 
-    def intent(self, plan: TestPlan) -> dict[str, Any]:
-        """What is kept of a plan beside it: the target, and what was said of it; nothing of a test of another kind."""
-        if plan.adaptive is None:
-            return {}
-        how, reach = self._hows[plan.test_id]
-        return {"target": how["target"], "reach": reach, "bounds": plan.adaptive.model_dump()}
-
     # ---- while it plays --------------------------------------------------------------------------------------
 
-    def begin(self, plan: TestPlan) -> str:
+    def begin(self, planned: Planned) -> str:
         """Follow a test that is about to start; the key with which it is started. Empty for another kind of test."""
-        if plan.adaptive is None:
+        how, reach = planned.how, planned.reach
+        if how is None or reach is None:
             return ""
-        how, reach = self._hows[plan.test_id]
         self.leave()
-        self.follower = follower = Follower(plan, how, reach, self.rig, self.adviser, self.clock, self._tell)
+        self.follower = follower = Follower(planned.plan, how, reach, self.rig, self.adviser, self.clock, self._tell)
         self._task = asyncio.create_task(follower.run(self.rig.path))
         return follower.key
 
@@ -169,7 +191,7 @@ class AdaptiveTests:
         ended = (row.summary.get("adaptive") or {}).get("ended")
         if row.kind != ADAPTIVE or ended == "fixed-rest":
             return {}
-        return {"recruitment": "near-sigmoid", "models": self._models(row.participant)}
+        return {"recruitment": "near-sigmoid", "models": self._models(row.participant, place_of(row))}
 
     def document(self, row: Test) -> dict[str, Any] | None:
         """How the test stands or what became of it; None of a test of another kind."""
@@ -185,6 +207,16 @@ class AdaptiveTests:
         assert bounds is not None
         limits = {"max_duration_s": bounds.max_duration_s, "max_torque_time_nm_s": bounds.max_torque_time_nms}
         return {**limits, "torque_time_nm_s": follower.torque_time_nm_s, **asdict(follower.told)}
+
+
+def place_of(row: Test) -> Place:
+    """Where a test stimulated, and with what current, mA."""
+    return row.plan.get("side"), row.plan.get("muscle"), row.plan.get("profile", {}).get("current_ma")
+
+
+def _differ(one: Place, other: Place) -> bool:
+    """Whether two places are known to be different ones."""
+    return any(a is not None and b is not None and a != b for a, b in zip(one, other, strict=True))
 
 
 def unfollowed(row: Test) -> dict[str, Any]:

@@ -14,13 +14,14 @@ from typing import Any
 
 from sqlalchemy.exc import SQLAlchemyError
 
-from api.clock import Clock, asked_s, thought_s
+from api.clock import Clock, asked_s
 from api.errors import ApiError, NotFoundError
 from api.logs import current_test
 from api.models.analyses import Analyses
 from api.models.registry import Versions
 from api.sessions import document, profiles
-from api.sessions.adaptive_tests import AdaptiveTests
+from api.sessions.adaptive_plan import ADAPTIVE
+from api.sessions.adaptive_tests import AdaptiveTests, Planned
 from api.sessions.lifecycle import OPEN_STATES, Lifecycle
 from api.sessions.limits import limits_of
 from api.sessions.live import Hub
@@ -117,6 +118,8 @@ class Runner:
             stop came since it was asked for; 503 that was too long ago; what the rig refuses.
         """
         self.refuse_second()
+        if body.kind == ADAPTIVE:  # what it can reach is computed now, and not while others wait, and then remembered
+            await self._planned(body, await self._participant(body))
         async with self._lock:
             self.refuse_second()
             return await self._start(body, await self._participant(body), by, seen)
@@ -143,7 +146,8 @@ class Runner:
             raise not_what_was_seen(f"The limits of {participant.code} were changed meanwhile.")
         if seen is not None and (seen.side, seen.muscle) != (participant.side, participant.muscle):
             raise not_what_was_seen(f"Side or muscle of {participant.code} was changed meanwhile.")
-        plan = await self._plan(body, participant)
+        planned = await self._planned(body, participant)
+        plan = planned.plan
         if body.joins is not None:
             await asyncio.to_thread(self._check_joins, body)
         current = self.current = Current(plan.test_id, plan.participant, by)
@@ -153,9 +157,9 @@ class Runner:
             preview = await self._previewed(plan)
             if seen is not None and not seen.same(preview):
                 raise not_what_was_seen("The rig would now play something else: it was set up anew.")
-            row = await asyncio.to_thread(self._write_intent, plan, preview, by, body, participant)
+            row = await asyncio.to_thread(self._write_intent, planned, preview, by, body, participant)
             self.hub.begin(plan.test_id)
-            await self._command(plan, body, profiles.version(participant.profile))
+            await self._command(planned, body, profiles.version(participant.profile))
             current.started = True
         except BaseException:
             self.current = None
@@ -167,14 +171,15 @@ class Runner:
             await self._stop_quietly(f"start of {plan.test_id} could not be written down")
             raise
 
-    async def _command(self, plan: TestPlan, body: TestIn, version: str) -> None:
+    async def _command(self, planned: Planned, body: TestIn, version: str) -> None:
+        plan = planned.plan
         try:
             if profiles.version((await self._participant(body)).profile) != version:
                 raise not_what_was_seen(f"The limits of {plan.participant} were changed meanwhile.")
             self._refuse_overtaken(
                 asked_s.get(self.clock.monotonic_s())
             )  # nothing is waited for between this and the command
-            await self.rig.ask(StartRequest(plan=plan, key=self.adaptive.begin(plan)), timeout_s=ANSWER_S)
+            await self.rig.ask(StartRequest(plan=plan, key=self.adaptive.begin(planned)), timeout_s=ANSWER_S)
         except ApiError as error:
             if error.code == "rig-unreachable":  # it may have heard us all the same
                 await self._stop_quietly(f"start of {plan.test_id} was not answered")
@@ -195,7 +200,7 @@ class Runner:
         if self._halted_s >= since_s:
             detail = "Nothing was sent. Check the participant and the rig, re-arm the rig, and start again."
             raise ApiError(409, "stopped-meanwhile", "The start was cancelled by a stop", detail)
-        if not (self.clock.monotonic_s() - since_s - thought_s.get() <= START_S):
+        if not (self.clock.monotonic_s() - since_s <= START_S):
             detail = f"It could not begin within {START_S:g} s. Nothing was sent. Start again."
             raise ApiError(503, "too-late", "The start took too long", detail)
 
@@ -205,7 +210,7 @@ class Runner:
         except ApiError as error:
             log.warning("stop after a failed start: %s", error)
 
-    async def _plan(self, body: TestIn, participant: Participant) -> TestPlan:
+    async def _planned(self, body: TestIn, participant: Participant) -> Planned:
         segments = None
         if body.segments is not None:
             segments = [SegmentPlan(**segment.model_dump()) for segment in body.segments]
@@ -232,12 +237,12 @@ class Runner:
         return f"T{stamp}-{secrets.token_hex(3)}"
 
     def _write_intent(
-        self, plan: TestPlan, preview: dict[str, Any], by: str, body: TestIn, participant: Participant
+        self, planned: Planned, preview: dict[str, Any], by: str, body: TestIn, participant: Participant
     ) -> Test:
-        now = self.clock.utc()
+        now, plan = self.clock.utc(), planned.plan
         row = Test(id=plan.test_id, participant=plan.participant, kind=plan.kind, state="requested")
         kept = {"joins": body.joins, "side": participant.side, "muscle": participant.muscle}  # as they are now
-        kept |= self.adaptive.intent(plan)
+        kept |= planned.kept()
         row.plan, row.summary, row.reason = {**plan.model_dump(), "preview": preview, **kept}, {}, ""
         row.requested_by, row.requested_utc, row.ran_by = by, now, other_than(by, body.ran_by)
         with self.store.write() as session:
@@ -248,8 +253,8 @@ class Runner:
 
     async def preview(self, body: TestIn) -> dict[str, Any]:
         """A test's duration, dose and pulse widths; nothing is played."""
-        plan = await self._plan(body, await self._participant(body))
-        return {**await self._previewed(plan), **self.adaptive.intent(plan)}
+        planned = await self._planned(body, await self._participant(body))
+        return {**await self._previewed(planned.plan), **planned.kept()}
 
     async def _previewed(self, plan: TestPlan) -> dict[str, Any]:
         curve = await asyncio.to_thread(self._recruitment, plan.participant)

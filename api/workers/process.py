@@ -38,6 +38,7 @@ PROCESSOR_S = {
     "find_recording": 120.0,
     "join": 120.0,
     "adaptive_outlook": 60.0,
+    "adaptive_begin": 10.0,
     "adaptive_advise": 5.0,
 }
 LONGEST_PROCESSOR_S = 1200.0

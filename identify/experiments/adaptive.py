@@ -39,7 +39,7 @@ ALARM = 1e-3
 EXCESS = 1.5
 """A residual larger than this many times the samples' noise is none of noise."""
 SETTLED_S = 4.0
-"""No structure is judged before this."""
+"""No structure is judged before this, and so nothing is known well enough."""
 SECOND_COST = 2.0
 """A second of a test costs as much as so many seconds of torque at the plateau. With a third of it, tests of the
 paper's muscle took 14 s in place of 9 s for the same accuracy and dose (seeds 51000 and 51100)."""
@@ -148,7 +148,8 @@ def decide(
     known = knowledge(short)
     if wrong:
         return Decision("misfit", words=f"{wrong} The rest of the fixed test is played.", knowledge=known, short=short)
-    if known.curve.percent <= target.curve_percent and known.step.percent <= target.step_percent:
+    there = known.curve.percent <= target.curve_percent and known.step.percent <= target.step_percent
+    if there and _settled(short):
         return Decision("enough", words=_enough(known), knowledge=known, short=short)
     return _next(short, known, played, target, left_s, left_nm_s, largest_us)
 
@@ -185,7 +186,7 @@ def _misfit(short: Short) -> str | None:
     """Why the structure does not describe the record; None if it does, or if it is too early to say."""
     if not np.all(np.isfinite(short.coefficients_nm)) or not np.all(np.isfinite(short.dynamics)):
         return "The estimate is not finite."
-    if short.grid.size * short.grid.step_s < SETTLED_S:
+    if not _settled(short):
         return None
     white = short.grid.noise_sd_nm / np.sqrt(max(float(np.median(short.grid.count[short.rows])), 1.0))
     own = float(np.sqrt(np.mean(short.residual_nm[short.rows] ** 2)))
@@ -194,6 +195,11 @@ def _misfit(short: Short) -> str | None:
     tests = residual_tests(averaged(short, mean_of_draws=False))
     failed = [name for name, test in tests.items() if test["p_value"] < ALARM]
     return f"The residual is not noise ({' and '.join(failed)})." if failed else None
+
+
+def _settled(short: Short) -> bool:
+    """Whether the record is long enough to judge the structure by."""
+    return short.grid.size * short.grid.step_s >= SETTLED_S
 
 
 def _next(

@@ -137,12 +137,14 @@ def knowledge(percent: float) -> dict[str, Any]:
 
 def advised(arguments: dict[str, Any]) -> dict[str, Any]:
     """Each answer halves the bands, from 8 %; the target of 45 % is one at which the worker dies, of 44 % one at which
-    it is slow, of 43 % one at which the structure fits badly."""
+    it is slow, of 43 % one at which the structure fits badly, of 42 % one at which the answer holds nothing."""
     percent, target = 16.0 * 0.5 ** len(ADVISED), TARGET["curve_percent"]
     if len(ADVISED) > 2 and target == 45.0:
         sys.exit(9)
     if len(ADVISED) > 2 and target == 44.0:
         time.sleep(3)
+    if target == 42.0:
+        return {}
     kind = "next" if target >= 44.0 or percent > target else "misfit" if target == 43.0 else "enough"
     widths = [100.0, 200.0] * 20
     segments = [{"name": f"step {len(ADVISED)}", "sequence": "widths",
@@ -188,6 +190,8 @@ def answer(verb: str, arguments: dict[str, Any], say: Any) -> dict[str, Any]:
         say(progress=0.5, text="adding fatigue")
         return {"result": improvement(arguments.get("model_json"))}
     if verb == "adaptive_outlook":
+        if arguments["target"]["step_percent"] == 49.0:
+            time.sleep(2.0)
         within = arguments["max_torque_time_nm_s"] >= 20.0
         words = "The target should be reached in about 9 s with 20 N·m·s."
         if not within:

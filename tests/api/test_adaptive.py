@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,7 +11,10 @@ from typing import Any
 import httpx
 import pytest
 
-from api.sessions.requests import TargetIn
+from api.sessions import runner
+from api.sessions.adaptive_tests import KEPT
+from api.sessions.requests import TargetIn, TestIn
+from api.sessions.rig_client import no_rig
 from identify.experiments.target import LEAST_PERCENT, MOST_PERCENT, Target
 from tests.api.conftest import STUB, Service, run_service, wait_done
 
@@ -76,6 +80,105 @@ def test_only_new_samples_are_sent_and_none_is_lost(client: httpx.Client, servic
     assert advised[-1]["laid_us"][-40:] == [100.0, 200.0] * 20
 
 
+def test_samples_are_heard_before_the_adviser_is_ready(
+    client: httpx.Client, service: Service, participant: str
+) -> None:
+    """It may be busy with what another test can reach; a record without its beginning would mislead."""
+    adviser = service.app.state.context.runner.adaptive.adviser
+    ask, counters = adviser.ask, []
+
+    async def busy(verb: str, **arguments: Any) -> dict[str, Any]:
+        counters.extend(arguments.get("counter", []))
+        await asyncio.sleep(1.5 if verb == "adaptive_begin" else 0.0)
+        return await ask(verb, **arguments)
+
+    adviser.ask = busy
+    assert played(client)["adaptive"]["ended"] == "known-enough"
+    assert counters == list(range(len(counters))) and len(counters) > 800
+
+
+def test_a_start_that_took_long_is_not_played_and_is_quick_when_asked_again(
+    client: httpx.Client, service: Service, participant: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Who asked may have given up long ago: nobody waits for a pulse then."""
+    monkeypatch.setattr(runner, "START_S", 1.5)
+    target = {"curve_percent": 2.0, "step_percent": 49.0}  # two seconds until it is known what can be reached
+    late = start(client, target=target)
+    assert (late.status_code, late.json()["type"], service.rig.starts) == (503, "/problems/too-late", 0)
+    assert start(client, target=target).status_code == 202
+    client.post("/v1/stop")
+
+
+def test_another_start_does_not_wait_until_it_is_known_what_a_test_can_reach(
+    client: httpx.Client, service: Service, participant: str
+) -> None:
+    context = service.app.state.context
+    looked: list[int] = []
+    planned = context.runner._planned
+
+    async def watched(body: TestIn, who: Any) -> Any:
+        found = await planned(body, who)
+        looked.append(context.runner._lock.locked())
+        return found
+
+    context.runner._planned = watched
+    assert start(client).status_code == 202
+    assert looked == [False, True]
+    client.post("/v1/stop")
+
+
+def test_previews_of_others_do_not_disturb_a_test_that_starts(
+    client: httpx.Client, service: Service, participant: str
+) -> None:
+    context = service.app.state.context
+    previewed = context.runner._previewed
+
+    async def crowded(plan: Any) -> dict[str, Any]:
+        context.runner._previewed = previewed
+        for _ in range(2 * KEPT):
+            await context.runner.preview(TestIn(participant="P017", kind="adaptive"))
+        return await previewed(plan)
+
+    context.runner._previewed = crowded
+    answer = start(client)
+    assert answer.status_code == 202, answer.text
+    client.post("/v1/stop")
+
+
+def test_a_lost_answer_of_the_rig_ends_in_the_fixed_plan(
+    client: httpx.Client, service: Service, participant: str
+) -> None:
+    """Whether the rig laid it is not known; a record with the wrong widths would mislead."""
+    rig = service.app.state.context.rig
+    ask = rig.ask
+
+    async def deaf(message: Any, *more: Any, **how: Any) -> dict[str, Any]:
+        found = await ask(message, *more, **how)
+        if message.kind == "extend":
+            raise no_rig("It did not answer within 5 s.")
+        return found
+
+    rig.ask = deaf
+    told = played(client, max_duration_s=11)["adaptive"]
+    assert "did not answer" in told["problem"] and told["ended"] == "fixed-rest"
+
+
+def test_a_model_of_another_arm_or_current_says_nothing_of_this_one(
+    client: httpx.Client, service: Service, participant: str
+) -> None:
+    def known(**more: Any) -> bool:
+        body = {"participant": "P017", "kind": "adaptive", **more}
+        return client.post("/v1/preview", json=body).json()["reach"]["known"]
+
+    assert client.put("/v1/participants/P017/muscle", json={"side": "left", "muscle": "biceps"}).status_code == 200
+    document = played(client)
+    assert client.post(f"{document['model_url']}/approve", json={"reason": "good fit"}).status_code == 200
+    assert known()
+    assert not known(profile={"current_ma": 10.0})
+    client.put("/v1/participants/P017/muscle?void_calibration=true", json={"side": "right", "muscle": "biceps"})
+    assert not known()
+
+
 def test_enough_ends_it_well_at_any_time(client: httpx.Client, service: Service, participant: str) -> None:
     test_id = start(client, target={"curve_percent": 0.2, "step_percent": 0.2}).json()["id"]
     wait_for(client, test_id, lambda document: document["elapsed_s"] > 1)
@@ -97,7 +200,9 @@ def test_a_fixed_test_knows_no_enough(client: httpx.Client, service: Service, pa
 
 
 @pytest.mark.parametrize(
-    ("percent", "why"), [(45.0, "The worker process died"), (43.0, "The curve is known within")], ids=["dies", "misfit"]
+    ("percent", "why"),
+    [(45.0, "The worker process died"), (43.0, "The curve is known within"), (42.0, "KeyError")],
+    ids=["dies", "misfit", "nonsense"],
 )
 def test_the_fixed_plan_plays_on_and_it_is_told(
     client: httpx.Client, service: Service, participant: str, percent: float, why: str

@@ -11,7 +11,7 @@ import pytest
 import identify
 from identify.errors import BadRequest
 from identify.estimation.earlier import USUAL, learn_change
-from identify.experiments.adaptive import Target, decide
+from identify.experiments.adaptive import SETTLED_S, Target, decide
 from identify.experiments.pieces import pieces
 from identify.experiments.reach import reach
 from identify.records.record import Record
@@ -59,6 +59,14 @@ def test_the_first_piece_begins_at_rest_and_keeps_to_the_largest_width():
     widths = decision.segments[0].settings["pulse_width_us"]
     assert decision.kind == "next" and max(widths) <= 300.0
     assert not any(widths[:20])
+
+
+def test_nothing_is_known_enough_before_the_structure_was_judged():
+    """However wide the target: the opening alone cannot tell a muscle of another structure."""
+    made = play(sigmoid(51_007), noise(51_007), Target(50.0, 50.0), left_s=30.0, left_nm_s=1e3)
+    first = next(d for d in made.decisions if d.knowledge is not None)
+    assert first.kind == "next" and first.knowledge.curve.percent <= 50.0
+    assert made.decision.kind == "enough" and SETTLED_S <= made.seconds < SETTLED_S + 2.0
 
 
 @pytest.mark.slow

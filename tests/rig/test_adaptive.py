@@ -329,6 +329,16 @@ def test_enough_twice_may_only_end_it_sooner(tmp_path: Path):
     assert [event["event"] for event in sealed(rig).events].count("ended") == 2
 
 
+@pytest.mark.parametrize(("before_s", "pulses"), [(0.06, 40), (0.035, 40), (0.01, 41), (-0.01, 80)])
+def test_enough_right_before_a_boundary_begins_no_further_segment(tmp_path: Path, before_s: float, pulses: int):
+    """Once the next segment's first pulse waits to be sent, it alone is sent: at most one more pulse."""
+    rig = adaptive(tmp_path, fixed=[rest(0.5), hold("plays"), hold("next"), hold("after", on_s=3.0)])
+    rig.at(1.5 - before_s, lambda: rig.run.score.enough("me", at_once=False))
+    result = rig.execute()
+    assert (result.ended_by, len(rig.stimulator.sent)) == ("enough", pulses)
+    assert result.duration_s == pytest.approx(0.5 + pulses / RATE_HZ + 1.0)
+
+
 def test_enough_before_the_first_pulse_sends_none(tmp_path: Path):
     rig = adaptive(tmp_path)
     rig.run.score.enough("me", at_once=True)
