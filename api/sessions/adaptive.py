@@ -11,7 +11,7 @@ import asyncio
 import contextlib
 import logging
 import secrets
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,18 +21,20 @@ from api.errors import ApiError
 from api.sessions.rig_client import RigClient
 from api.sessions.samples import samples_of
 from api.workers.adviser import Adviser
-from rig.messages import EnoughRequest, ExtendRequest, LiveEvent, SegmentPlan, TestPlan
+from rig.messages import AHEAD, SAFE_END_S, EnoughRequest, ExtendRequest, LiveEvent, SegmentPlan, TestPlan
 
 log = logging.getLogger("stimrig.adaptive")
 
-EARLY_S = 0.8
-"""Before a boundary: the first question."""
-LATE_S = 0.4
+EARLY_S = 0.75
+"""Before the rig decides on a boundary: the first question."""
+LATE_S = 0.35
 """The second one, with the newest samples."""
-SEND_S = 0.11
-"""The early answer is sent if the late one is not there; later than 0.05 s before the boundary the rig takes none."""
+SEND_S = 0.06
+"""The early answer is sent if the late one is not there."""
 LEAST_S = 2.05
 """A shorter record tells nothing."""
+SHORTEST_PIECE_S = 1.0
+"""Of the pieces that are chosen."""
 SERVICE = "stimrig"
 """Who says enough where the target is reached."""
 
@@ -102,24 +104,34 @@ class Follower:
         self._heard_s = 0.0
         self._took_s = 0.0
         self._turn = Turn(-1)
-        self._work: asyncio.Task[None] | None = None
+        self._asking: asyncio.Task[None] | None = None
+        self._sending: asyncio.Task[None] | None = None
 
     async def run(self, path: Path | None) -> None:
-        """Follow it; whatever goes wrong here ends in the fixed plan, told."""
+        """Follow it to its end."""
         try:
-            await self.adviser.ask("adaptive_begin", **self.how)
-            async with contextlib.aclosing(samples_of(path, self.plan.test_id)) as events:
-                async for event in events:
-                    self._hear(event)
+            await self._guarded(self._follow(path))
+        finally:
+            left = [task for task in (self._asking, self._sending) if task is not None]
+            for task in left:
+                task.cancel()
+            await asyncio.gather(*left, return_exceptions=True)
+
+    async def _follow(self, path: Path | None) -> None:
+        await self.adviser.ask("adaptive_begin", **self.how)
+        async with contextlib.aclosing(samples_of(path, self.plan.test_id)) as events:
+            async for event in events:
+                self._hear(event)
+
+    async def _guarded(self, work: Awaitable[None]) -> None:
+        """Whatever goes wrong in it ends in the fixed plan, told."""
+        try:
+            await work
         except ApiError as error:
             self._give_up(f"{error.title}. {error.detail}")
         except Exception as error:
             log.exception("an adaptive test is not followed any more")
             self._give_up(f"{type(error).__name__}.")
-        finally:
-            if self._work is not None:
-                self._work.cancel()
-                await asyncio.gather(self._work, return_exceptions=True)
 
     def _give_up(self, why: str) -> None:
         if self.told.state == "choosing":
@@ -143,21 +155,25 @@ class Follower:
             self._turn = Turn(event.laid)
         if event.ended_by or self.told.state != "choosing":
             return
-        left_s = event.boundary_s - event.elapsed_s
-        idle = self._work is None or self._work.done()
+        left_s = self._left_s(event.elapsed_s)
+        idle = self._asking is None or self._asking.done()
         turn = self._turn
         early_s = max(EARLY_S, 1.5 * self._took_s + SEND_S)  # on a busy machine at once
         if idle and not turn.sent and event.elapsed_s >= LEAST_S and left_s <= (early_s, LATE_S, -1.0)[turn.asked]:
             turn.asked = 2 if left_s <= LATE_S else 1
-            self._work = asyncio.create_task(self._ask(turn, event))
+            self._asking = asyncio.create_task(self._guarded(self._ask(turn, event)))
         elif turn.answer is not None and not turn.sent and left_s <= SEND_S:  # the late one is not there
-            self._sending = asyncio.create_task(self._carry_out(turn, turn.answer))
+            self._sending = asyncio.create_task(self._guarded(self._carry_out(turn, turn.answer)))
 
-    def _left_s(self) -> float:
-        """Until what is laid ends, s."""
+    def _left_s(self, now_s: float) -> float:
+        """From a time on the test's clock until the rig decides what follows what is laid, s."""
         assert self._newest is not None
-        since_s = self.clock.monotonic_s() - self._heard_s
-        return self._newest.boundary_s - self._newest.elapsed_s - since_s
+        return self._newest.boundary_s - AHEAD / self.plan.pulse_rate_hz - now_s
+
+    def _now_s(self) -> float:
+        """The time on the test's clock."""
+        assert self._newest is not None
+        return self._newest.elapsed_s + self.clock.monotonic_s() - self._heard_s
 
     # ---- deciding ------------------------------------------------------------------------------------------
 
@@ -165,21 +181,17 @@ class Follower:
         heard_s = self._heard_s
         news, self._new = self._new, {name: [] for name in self._new}
         widths, segments = self._laid(event)
-        try:
-            said = await self.adviser.ask(
-                "adaptive_advise", **news, laid_us=widths, segments=segments,
-                torque_time_nm_s=event.torque_time_nms, measured_s=event.elapsed_s,
-            )  # fmt: skip
-        except ApiError as error:
-            self._give_up(f"{error.title}. {error.detail}")
-            return
+        said = await self.adviser.ask(
+            "adaptive_advise", **news, laid_us=widths, segments=segments,
+            torque_time_nm_s=event.torque_time_nms, measured_s=event.elapsed_s,
+        )  # fmt: skip
         self._took_s = self.clock.monotonic_s() - heard_s
         answer = self._take(said, event, heard_s)
         if turn is not self._turn or turn.sent:
             answer.row["late"] = True
             return
         turn.answer = answer
-        if turn.asked == 2 or self._left_s() <= SEND_S:
+        if turn.asked == 2 or self._left_s(self._now_s()) <= SEND_S:
             await self._carry_out(turn, answer)
 
     def _take(self, said: dict[str, Any], event: LiveEvent, heard_s: float) -> Answer:
@@ -188,7 +200,7 @@ class Follower:
         row = {
             "at_s": round(event.elapsed_s, 3), "kind": said["kind"], "words": said["words"],
             "segments": [segment["name"] for segment in said["segments"]],
-            "expected_torque_time_nm_s": said["expected_dose_nm_s"],
+            "expected_torque_time_nm_s": said["expected_torque_time_nm_s"],
             "answer_ms": round(1e3 * self._took_s, 1),
         }  # fmt: skip
         if known is not None:
@@ -226,7 +238,7 @@ class Follower:
         """Which bound leaves no room for another piece."""
         assert self._newest is not None and self.plan.adaptive is not None
         left_s = self.plan.adaptive.max_duration_s - self._newest.boundary_s
-        return "time" if left_s < 2 * SHORTEST_PIECE_S else "dose"
+        return "time" if left_s < SHORTEST_PIECE_S + SAFE_END_S else "torque-time"
 
     def _laid(self, event: LiveEvent) -> tuple[list[float], list[tuple[str, int, int]]]:
         """Width of each pulse that is laid, and the segments."""
@@ -240,7 +252,3 @@ class Follower:
             segments.append((segment.name, len(widths), len(widths) + count))
             widths += [*own, *[0.0] * count][:count]
         return widths, segments
-
-
-SHORTEST_PIECE_S = 1.0
-"""Of the library's pieces, and of the rest at the end."""

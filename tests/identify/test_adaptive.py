@@ -112,7 +112,7 @@ def test_pulses_that_are_committed_beyond_the_record_count():
     opening = np.array(decide(None, [], **LIMITS).segments[0].settings["pulse_width_us"])
     record = recorded(muscle, opening, ["opening"] * opening.size, noise(2))
     decision = decide(record, np.r_[opening, np.full(40, 200.0)], **LIMITS)
-    assert decision.kind == "next" and decision.expected_dose_nm_s >= 0.0
+    assert decision.kind == "next" and decision.expected_torque_time_nm_s >= 0.0
 
 
 @pytest.mark.slow
@@ -123,7 +123,7 @@ def test_nothing_is_played_beyond_what_is_left():
     for left in ({"left_s": 0.5}, {"left_s": 0.5, "left_nm_s": 0.0}):
         assert decide(record, opening, **(LIMITS | left)).kind == "spent"
     modest = decide(record, opening, **(LIMITS | {"left_nm_s": 0.5}))
-    assert modest.kind == "spent" or modest.expected_dose_nm_s <= 0.5
+    assert modest.kind == "spent" or modest.expected_torque_time_nm_s <= 0.5
     assert decide(None, [], **(LIMITS | {"left_s": 1.0})).kind == "spent"
 
 

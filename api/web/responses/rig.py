@@ -110,7 +110,7 @@ class ReachOut(Document):
     curve_percent: float | None = Field(description="half-width of the curve's band at the end, %; null: none at all")
     step_percent: float | None = Field(description="of the step response, %")
     seconds: float = Field(description="what the test would take, s")
-    dose_nm_s: float = Field(description="its torque-time, N·m·s")
+    torque_time_nm_s: float = Field(description="what it would cost, N·m·s")
     words: str
     known: bool = Field(False, description="whether a model of an earlier session helps")
 
@@ -160,8 +160,8 @@ class AdaptiveOut(Document):
     knowledge: dict[str, Any] | None = Field(description="both curves with their 95 % bands, and their half-widths, %")
     least_known: dict[str, float] | None = Field(description="`pulse_width_us` and `time_s` where the bands are widest")
     ended: str = Field(
-        description="`known-enough`, `enough` (a person said so), `dose`, `time`, `fixed-rest` (the fixed plan was "
-        "played to its end), `stopped` or `fault`; empty while it runs"
+        description="`known-enough`, `enough` (a person said so), `torque-time`, `time`, `limit` (of the "
+        "charge, say), `fixed-rest` (the fixed plan was played to its end), `stopped` or `fault`; empty while it runs"
     )  # fmt: skip
     decisions: list[dict[str, Any]] = Field(description="each answer of the adviser, with the time it took")
 
