@@ -104,7 +104,9 @@ def report_lines(test: Mapping[str, Any], model: dict[str, Any]) -> list[str]:
         dose += f", {number(torque_time, 0)} N·m·s planned"
     return [
         f"test           {test['id']}  participant {test['participant']}, {number(summary.get('duration_s'), 1)} s",
-        f"segments       {segments}",
+        *(
+            [] if test.get("adaptive") else [f"segments       {segments}"]
+        ),  # else what is planned is not what was played
         f"dose           {dose}",
         f"torque         {summary.get('samples')} samples at {number(summary.get('sample_rate_hz'), 1)} Hz, "
         f"lost {summary.get('lost_samples')}, peak {number(summary.get('torque_peak_nm'))} N·m",

@@ -196,7 +196,9 @@ class Follower:
 
     def _take(self, said: dict[str, Any], event: LiveEvent, heard_s: float) -> Answer:
         told, known = self.told, said["knowledge"]
-        told.words = said["words"]
+        fits = said["kind"] != "misfit"  # else that is told as the problem, and its bands mean nothing
+        if fits:
+            told.words = said["words"]
         row = {
             "at_s": round(event.elapsed_s, 3), "kind": said["kind"], "words": said["words"],
             "segments": [segment["name"] for segment in said["segments"]],
@@ -204,7 +206,8 @@ class Follower:
             "answer_ms": round(1e3 * self._took_s, 1),
         }  # fmt: skip
         if known is not None:
-            told.knowledge, told.least_known = known, said["least_known"]
+            if fits:
+                told.knowledge, told.least_known = known, said["least_known"]
             row |= {name: round(known[name], 3) for name in ("curve_percent", "step_percent")}
         told.decisions.append(row)
         self.tell()

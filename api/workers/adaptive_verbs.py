@@ -47,6 +47,12 @@ def outlook(
     return clean({"opening_us": widths, "reach": asdict(found), "known": bool(person)})
 
 
+def warm() -> None:
+    """Have the compiled parts compiled: on a new installation this takes longer than anybody waits at a question."""
+    limits = {"playable_s": 6.0, "max_torque_time_nm_s": 100.0, "largest_us": 300.0, "pulse_rate_hz": 40.0}
+    outlook(lambda _share, _text: None, {"curve_percent": 0.2, "step_percent": 0.2}, max_torque_nm=15.0, **limits)
+
+
 def known(models: Sequence[str]) -> dict[str, Any]:
     """The last model and how much the person changes between sessions; nothing of a new person.
 
@@ -105,7 +111,7 @@ class Running:
         self.target = Target(**target)
         self.playable_s, self.max_torque_time_nm_s = playable_s, max_torque_time_nm_s
         self.largest_us, self.rate_hz, self.known = largest_us, pulse_rate_hz, known
-        self.samples: tuple[list[float], list[int], list[float]] = ([], [], [])
+        self.samples: tuple[list[float], list[int], list[float | None]] = ([], [], [])
         self.before: Any = None
 
     def advise(
@@ -148,6 +154,10 @@ class Running:
         )
         self.before = found if found.short is not None else self.before
         told = found.to_dict()
+        for number, segment in enumerate(
+            told["segments"], start=len(segments) + 1
+        ):  # laid ones may not be measured yet
+            segment["name"] = f"{segment['name'].rpartition(' ')[0]} {number}"
         if found.knowledge is not None:
             told["knowledge"] = rounded(told["knowledge"])
             told["least_known"] = least_known(found.knowledge)

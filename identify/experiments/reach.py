@@ -6,7 +6,7 @@ worse of the two counts.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,6 +48,13 @@ class Reach:
     seconds: float
     torque_time_nm_s: float
     words: str
+
+    @property
+    def cost(self) -> tuple[float, float]:
+        """What is worse the larger it is: torque-time and time, or the bands that are left, %."""
+        if self.reachable:
+            return self.torque_time_nm_s, self.seconds
+        return max(self.curve_percent, self.step_percent), self.torque_time_nm_s
 
 
 def reach(
@@ -97,7 +104,12 @@ def reach(
         muscles = [(linear, _curve(groups, largest_us, plateau_nm)) for linear, groups in USUAL]
     known = {"earlier": earlier, "change": change} if earlier is not None else {}
     tests = [_play(linear, curve, target, noise_nm, limits, known) for linear, curve in muscles]
-    return max(tests, key=lambda test: (not test.reachable, test.curve_percent, test.torque_time_nm_s))
+    return worse(tests)
+
+
+def worse(tests: Sequence[Reach]) -> Reach:
+    """That which misses the target by more; if all reach it, that which takes more."""
+    return max(tests, key=lambda test: (not test.reachable, *test.cost))
 
 
 Curve = Callable[[np.ndarray], np.ndarray]

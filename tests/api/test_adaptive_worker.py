@@ -96,6 +96,7 @@ def test_a_test_is_advised_to_its_end(seed: int) -> None:
             segments.append((segment["name"], len(widths), len(widths) + len(segment["settings"]["pulse_width_us"])))
             widths += segment["settings"]["pulse_width_us"]
     assert told["kind"] == "enough", told["words"]
+    assert [int(name.split()[1]) for name, _, _ in segments[1:]] == list(range(2, len(segments) + 1))
     assert len(widths) / PULSE_RATE_HZ < 30
     known = told["knowledge"]["recruitment"]
     truth = muscle.curve(np.array(known["pulse_width_us"]))
