@@ -64,7 +64,7 @@ class Told:
     """What is known of the test, for pages and for its document."""
 
     target: dict[str, float]
-    reach: dict[str, Any]
+    reach: dict[str, Any] | None
     state: str = "choosing"
     """choosing; fixed: the fixed plan plays on, `problem` says why; ending."""
     words: str = ""

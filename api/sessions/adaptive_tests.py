@@ -71,7 +71,7 @@ class AdaptiveTests:
             "models": await asyncio.to_thread(self._models, plan.participant),
         }  # fmt: skip
         found = await self._outlook({**how, "max_torque_nm": plan.stopping_torque_nm})
-        default = await self.rig.ask(PreviewRequest(plan=plan), timeout_s=preview_s)
+        default = await self.rig.ask(PreviewRequest(plan=plan, recruitment=None), timeout_s=preview_s)
         segments = adaptive_plan.fixed_plan(found["opening_us"], default, plan.pulse_rate_hz, bounds)
         if not found["reach"]["reachable"] and not body.anyway:
             raise out_of_reach(found["reach"])
@@ -204,7 +204,7 @@ def unfollowed(row: Test) -> dict[str, Any]:
         "max_duration_s": bounds.get("max_duration_s"),
         "max_torque_time_nm_s": bounds.get("max_torque_time_nms"),
         "torque_time_nm_s": None,
-        **asdict(Told(row.plan.get("target") or {}, row.plan.get("reach") or {}, state="fixed", problem=why)),
+        **asdict(Told(row.plan.get("target") or {}, row.plan.get("reach"), state="fixed", problem=why)),
     }
 
 

@@ -49,8 +49,8 @@ def outlook(
 
 def warm() -> None:
     """Have the compiled parts compiled: on a new installation this takes longer than anybody waits at a question."""
-    limits = {"playable_s": 6.0, "max_torque_time_nm_s": 100.0, "largest_us": 300.0, "pulse_rate_hz": 40.0}
-    outlook(lambda _share, _text: None, {"curve_percent": 0.2, "step_percent": 0.2}, max_torque_nm=15.0, **limits)
+    target = {"curve_percent": 0.2, "step_percent": 0.2}
+    outlook(lambda _share, _text: None, target, 6.0, 100.0, largest_us=300.0, max_torque_nm=15.0, pulse_rate_hz=40.0)
 
 
 def known(models: Sequence[str]) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator
 from typing import Any
 
 import pytest
@@ -41,13 +41,14 @@ class World:
             await asyncio.Event().wait()
         return answer
 
-    async def events(self, _path: object, test_id: str) -> AsyncIterator[LiveEvent]:
+    async def events(self, _path: object, test_id: str) -> AsyncGenerator[LiveEvent, None]:
         while self.now_s < FIRST_S:
             self.now_s += 0.02
             yield LiveEvent(
                 test_id=test_id, segment="opening", elapsed_s=self.now_s, duration_s=45.0, time_s=[],
                 torque_min_nm=[], torque_max_nm=[], pulse_time_s=[], pulse_width_us=[], torque_age_s=0.0,
-                lost_samples=0, dropped_pulses=0, sent_pulses=0, charge_uc=0.0, laid=30, boundary_s=FIRST_S,
+                lost_samples=0, dropped_pulses=0, sent_pulses=0, charge_uc=0.0, torque_time_nms=0.0, ended_by="",
+                samples=None, laid=30, boundary_s=FIRST_S,
                 laid_segments=[LaidSegment(name="opening", start_s=0.0, end_s=FIRST_S, by="plan")],
             )  # fmt: skip
             for _ in range(5):
@@ -58,7 +59,9 @@ def followed(world: World, rate_hz: float, monkeypatch: pytest.MonkeyPatch) -> F
     monkeypatch.setattr(adaptive, "samples_of", world.events)
     opening = SegmentPlan(name="opening", sequence="widths", settings={"pulse_width_us": [0.0] * round(3 * rate_hz)})
     plan = TestPlan(
-        test_id="T1", participant="P017", profile=Profile(), segments=[opening], pulse_rate_hz=rate_hz,
+        test_id="T1", participant="P017",
+        profile=Profile(current_ma=20.0, max_pulse_width_us=300.0, max_torque_nm=30.0),
+        segments=[opening], pulse_rate_hz=rate_hz,
         adaptive=AdaptivePlan(max_duration_s=45.0, max_torque_time_nms=360.0),
     )  # fmt: skip
     whole: Any = world
