@@ -30,9 +30,10 @@ TEST_KINDS: dict[str, Any] = {
 ADAPTIVE_ENDS: dict[str, Any] = {
     "known-enough": lazy("Enough is known"),
     "enough": lazy("A person said that it is enough"),
-    "dose": lazy("The dose is used up"),
+    "torque-time": lazy("The torque-time is used up"),
     "time": lazy("The time is used up"),
-    "fixed-rest": lazy("The rest of the fixed test was played"),
+    "limit": lazy("A limit of the whole test was reached"),
+    "fixed-rest": lazy("The fixed plan was played to its end"),
     "stopped": lazy("Stopped"),
     "fault": lazy("Ended by a fault"),
 }

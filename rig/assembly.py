@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rig import align, journal, laid
+from rig import align, intended, journal
 from rig.clock import utc_text
 from rig.errors import RecordingError
 from rig.journal import JournalContents, Kind
@@ -66,7 +66,7 @@ def _assembled(contents: JournalContents, outcome: str, reason: str) -> Recordin
     _refuse_empty(contents)
     notes = _damage(contents)
     header = contents.first_json(Kind.HEADER) or _header_of_blocks(contents, notes)
-    planned, segments = laid.planned(contents, header, notes)
+    planned, segments = intended.planned(contents, header, notes)
     rate_hz = float(header["plan"]["pulse_rate_hz"])
     begun, t0_s, unix_s = _start(contents, header, rate_hz)
     end = contents.first_json(Kind.END) or {"outcome": outcome, "reason": reason, "time_s": _last_time(contents)}
@@ -113,7 +113,7 @@ def _ending(contents: JournalContents, header: dict[str, Any], end: dict[str, An
     return {
         "adaptive": int(bool(header["plan"].get("adaptive"))),
         "ended_by": end.get("ended_by", "plan") if completed else end["outcome"],
-        "laid": json.dumps([block.described() for block in laid.blocks(contents)]),
+        "laid": json.dumps([block.described() for block in intended.laid_blocks(contents)]),
     }
 
 
@@ -141,7 +141,7 @@ def _damage(contents: JournalContents) -> list[str]:
 
 def _header_of_blocks(contents: JournalContents, notes: list[str]) -> dict[str, Any]:
     """A header inferred from the blocks, if both copies are damaged."""
-    intents = laid.intents(contents)
+    intents = intended.intents(contents)
     rate_hz = LIKELY_RATE_HZ
     if len(intents) > 1 and intents[-1][0] > intents[0][0]:
         rate_hz = round((intents[-1][0] - intents[0][0]) / (intents[-1][2] - intents[0][2]), 6)
@@ -175,7 +175,7 @@ def _start(contents: JournalContents, header: dict[str, Any], rate_hz: float) ->
     started = contents.first_json(Kind.START)
     if started is not None:
         return True, float(started["t0_s"]), float(started["unix_s"])
-    intents = laid.intents(contents)
+    intents = intended.intents(contents)
     t0_s = float(header["time_s"])
     if intents:
         t0_s = float(np.median([due_s - index / rate_hz for index, _, due_s, _, _ in intents]))
@@ -193,7 +193,7 @@ def _sample_rate(contents: JournalContents) -> float:
 
 
 def _first_time(contents: JournalContents) -> float:
-    times = [intent[1] for intent in laid.intents(contents)[:1]]
+    times = [intent[1] for intent in intended.intents(contents)[:1]]
     times += [float(np.frombuffer(p, SAMPLE)["host_time_s"][0]) for k, p in contents.blocks if k == Kind.TORQUE][:1]
     return min(times, default=0.0)
 

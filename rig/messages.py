@@ -31,6 +31,11 @@ TestOutcome = Literal["completed", "stopped", "fault"]
 
 LONGEST_LINE = 1_900_000
 """Bytes of a request. The rig refuses longer ones."""
+SAFE_END_S = 1.0
+"""Seconds without pulses with which an adaptive test ends, wherever it ends."""
+AHEAD = 2
+"""Pulse periods before the end of what is laid of an adaptive test: then the fixed plan's next segment is laid, and a
+client is late."""
 
 
 def stop_socket(path: Path) -> Path:
@@ -100,6 +105,18 @@ class TestPlan(Message):
     max_pulse_width_us: float | None = Field(default=None, description="for this test only, if tighter, µs")
     max_torque_nm: float | None = Field(default=None, description="for this test only, if tighter, N·m")
     adaptive: AdaptivePlan | None = Field(default=None, description="the test may be extended while it plays")
+
+    @property
+    def largest_us(self) -> float:
+        """The comfort maximum, or this test's own limit if it is lower, µs."""
+        comfort_us, asked_us = self.profile.max_pulse_width_us, self.max_pulse_width_us
+        return comfort_us if asked_us is None else min(comfort_us, asked_us)
+
+    @property
+    def stopping_torque_nm(self) -> float:
+        """The profile's torque at which a test stops, or this test's own limit if it is lower, N·m."""
+        own_nm, asked_nm = self.profile.max_torque_nm, self.max_torque_nm
+        return own_nm if asked_nm is None else min(own_nm, asked_nm)
 
 
 class RecruitmentTable(Message):

@@ -16,14 +16,12 @@ from numpy.typing import NDArray
 from rig import sequences
 from rig.errors import PlanError, RefusedError
 from rig.limits import Limit, Refusal, admit, check
-from rig.messages import SegmentPlan, TestPlan
+from rig.messages import SAFE_END_S, SegmentPlan, TestPlan
 from rig.signals import Pulse
 
 MAX_SEGMENTS = 200
 MAX_WIDTH_SETTING = "max_pulse_width_us"
 """If the plan does not give this setting of a sequence, it is the comfort maximum, or the request's limit if lower."""
-SAFE_END_S = 1.0
-"""Seconds without pulses with which a test that is extended ends, wherever it ends."""
 NOTHING = np.empty(0)
 
 
@@ -88,14 +86,8 @@ def _named(number: int, segment: SegmentPlan) -> Iterator[None]:
 def _settings(segment: SegmentPlan, plan: TestPlan) -> dict[str, object]:
     settings = dict(segment.settings)
     if MAX_WIDTH_SETTING in sequences.find(segment.sequence).Settings.model_fields:
-        settings.setdefault(MAX_WIDTH_SETTING, largest_us(plan))
+        settings.setdefault(MAX_WIDTH_SETTING, plan.largest_us)
     return settings
-
-
-def largest_us(plan: TestPlan) -> float:
-    """The comfort maximum, or the request's limit if lower, µs."""
-    comfort_us, asked_us = plan.profile.max_pulse_width_us, plan.max_pulse_width_us
-    return comfort_us if asked_us is None else min(comfort_us, asked_us)
 
 
 def check_all(

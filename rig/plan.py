@@ -106,7 +106,7 @@ def build(plan: TestPlan, table: dict[str, Limit]) -> PlannedTest:
     pieces.refuse(check(table["pulse_rate_hz"], plan.pulse_rate_hz), "plan")
     chosen = plan.segments
     if chosen is None:
-        chosen = protocols.segments(plan.protocol, min(table["pulse_width_us"].hi, pieces.largest_us(plan)))
+        chosen = protocols.segments(plan.protocol, min(table["pulse_width_us"].hi, plan.largest_us))
     if not chosen:
         raise PlanError("plan.segments is empty; leave it out for the default test, or give at least one segment")
     if len(chosen) > MAX_SEGMENTS:
@@ -127,10 +127,10 @@ def _check_end(widths_us: NDArray[np.float64], plan: TestPlan, table: dict[str, 
     pieces.refuse(check(table["duration_s"], whole / plan.pulse_rate_hz), "plan, with its safe end")
 
 
-def laid_out(built: Sequence[Piece], start: int = 0) -> tuple[PlannedSegment, ...]:
-    """Start and end of each piece, the first of which begins at pulse `start`."""
-    ends = (start + np.cumsum([len(piece.pulse_width_us) for piece in built])).tolist()
-    starts = [start, *ends[:-1]]
+def laid_out(built: Sequence[Piece]) -> tuple[PlannedSegment, ...]:
+    """Start and end of each piece."""
+    ends = np.cumsum([len(piece.pulse_width_us) for piece in built]).tolist()
+    starts = [0, *ends[:-1]]
     return tuple(PlannedSegment(piece.of.name, *at) for piece, *at in zip(built, starts, ends, strict=True))
 
 

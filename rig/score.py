@@ -1,4 +1,4 @@
-"""What is laid out to be played. It grows while it plays, if the test is adaptive; what is laid is never changed.
+"""What is laid out to be played. It grows while it plays, if the test is adaptive; only an end takes laid pulses away.
 
 The sender asks for one pulse after the other. Shortly before it reaches the end of what is laid, the fixed plan's next
 segment is laid, unless a client has laid others by then. So the test never waits, whatever a client does. Each segment
@@ -11,51 +11,26 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rig import journal as jn
 from rig import pieces
 from rig.clock import Clock
 from rig.errors import BusyError, PlanError, RefusedError, TooLateError
 from rig.journal import Journal, Kind
+from rig.laid import Laid
 from rig.limits import Limit, check, tightened
-from rig.messages import Extended, LaidSegment, SegmentPlan
+from rig.messages import AHEAD, Extended, LaidSegment, SegmentPlan
 from rig.pieces import Piece
 from rig.plan import PlannedTest
 
-AHEAD = 2
-"""Pulse periods before the end of what is laid: then the fixed plan's next segment is laid, and a client is late."""
 MAX_EXTENSION_SEGMENTS = 8
 MAX_EXTENSION_S = 30.0
 MAX_CHECKED = 20
 """Extensions that are checked while the test plays towards one boundary; each takes time beside the sender."""
 MAX_NAME = 60
 SAFE_END = SegmentPlan(name="rest", sequence="rest", settings={})
-
-
-@dataclass(frozen=True, slots=True)
-class Laid:
-    """Everything that is laid: widths in µs, shape (n,), and the segments."""
-
-    pulse_width_us: NDArray[np.float64]
-    segments: tuple[jn.Segment, ...]
-
-    def __len__(self) -> int:
-        return len(self.pulse_width_us)
-
-    def cut(self, end: int) -> Laid:
-        """The part before pulse `end`."""
-        kept = (s._replace(end=min(s.end, end)) for s in self.segments if s.start < end)
-        return Laid(self.pulse_width_us[:end], tuple(kept))
-
-    def with_piece(self, piece: Piece, by: jn.LaidBy) -> Laid:
-        """It, and a piece after it."""
-        end = len(self) + len(piece.pulse_width_us)
-        added = jn.Segment(piece.of.name, len(self), end, by)
-        return Laid(np.concatenate([self.pulse_width_us, piece.pulse_width_us]), (*self.segments, added))
 
 
 class Score:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -18,6 +19,8 @@ SHOWN_BEYOND = 1.5
 FONT = {"family": "system-ui, -apple-system, 'Segoe UI', 'DejaVu Sans', sans-serif", "size": 13, "color": role("ink")}
 TOOLBAR_PX = 42
 """On the right of a chart: the buttons stand there one below the other, and cover neither legend nor line."""
+LETTER = 0.007
+"""Width of a letter of a segment's name, as a share of a wide chart."""
 SYMBOLS = {"rising": "triangle-up", "falling": "triangle-down"}
 
 
@@ -125,8 +128,9 @@ def segment_name(name: str) -> str:
 
 
 def segment_marks(segments: list[dict[str, Any]]) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Shades and names of the segments; the held-out one stands out."""
-    shapes, labels = [], []
+    """Shades of the segments, and their names where they have room; the held-out one stands out."""
+    shapes, labels, free_s = [], [], -math.inf
+    letter_s = LETTER * (segments[-1]["end_s"] if segments else 0.0)
     for segment in segments:
         name, start_s, end_s = segment["name"], segment["start_s"], segment["end_s"]
         if name == "rest":
@@ -134,8 +138,13 @@ def segment_marks(segments: list[dict[str, Any]]) -> tuple[list[dict[str, Any]],
         shapes.append({"type": "rect", "xref": "x", "yref": "paper", "x0": start_s, "x1": end_s, "y0": 0, "y1": 1,
                        "fillcolor": role("held-out" if name == "validate" else "segment"), "line": {"width": 0},
                        "layer": "below"})  # fmt: skip
-        labels.append({"xref": "x", "yref": "paper", "x": (start_s + end_s) / 2, "y": 1.0, "yanchor": "bottom",
-                       "text": segment_name(name), "showarrow": False,
+        text, middle_s = segment_name(name), (start_s + end_s) / 2
+        half_s = letter_s * len(text) / 2
+        if middle_s - half_s < free_s:
+            continue  # it would be written over the name before it
+        free_s = middle_s + half_s
+        labels.append({"xref": "x", "yref": "paper", "x": middle_s, "y": 1.0, "yanchor": "bottom",
+                       "text": text, "showarrow": False,
                        "font": {"size": 12, "color": role("mark")}})  # fmt: skip
     return shapes, labels
 

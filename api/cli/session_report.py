@@ -11,6 +11,7 @@ from api.cli.terminal import carried_lines, model_report, number
 from api.client.documents import SessionTest
 from api.client.errors import Unreachable
 from api.client.rest import Client
+from api.clinical_words import adaptive_end_words
 
 
 def run_test(client: Client, participant: str, events: Callable[[], list[str]] = list, **more: Any) -> SessionTest:
@@ -76,15 +77,6 @@ class Progress:
         self.last = segment
 
 
-ENDED = {
-    "known-enough": "enough is known",
-    "enough": "a person said that it is enough",
-    "dose": "the dose is used up",
-    "time": "the time is used up",
-    "fixed-rest": "the rest of the fixed test was played",
-}
-
-
 def adaptive_lines(told: Mapping[str, Any] | None) -> list[str]:
     """Why a test that stops itself ended, and what it reached; nothing of another one."""
     if not told:
@@ -94,8 +86,8 @@ def adaptive_lines(told: Mapping[str, Any] | None) -> list[str]:
         f"{words} within {number(known.get(name), 1)} % (asked: {number(target.get(name), 1)} %)"
         for name, words in (("curve_percent", "curve"), ("step_percent", "step response"))
     )
-    dose = f"{number(told['torque_time_nm_s'], 1)} of at most {number(told['max_torque_time_nm_s'], 1)} N·m·s"
-    lines = [f"stopped        {ENDED.get(told['ended'], told['ended'])}; {dose}", f"known          {reached}"]
+    used = f"{number(told['torque_time_nm_s'], 1)} of at most {number(told['max_torque_time_nm_s'], 1)} N·m·s"
+    lines = [f"ended          {adaptive_end_words(told['ended'])}; {used}", f"known          {reached}"]
     return [*lines, *([f"in doubt       {told['problem']}"] if told["problem"] else [])]
 
 
@@ -112,7 +104,9 @@ def report_lines(test: Mapping[str, Any], model: dict[str, Any]) -> list[str]:
         dose += f", {number(torque_time, 0)} N·m·s planned"
     return [
         f"test           {test['id']}  participant {test['participant']}, {number(summary.get('duration_s'), 1)} s",
-        f"segments       {segments}",
+        *(
+            [] if test.get("adaptive") else [f"segments       {segments}"]
+        ),  # else what is planned is not what was played
         f"dose           {dose}",
         f"torque         {summary.get('samples')} samples at {number(summary.get('sample_rate_hz'), 1)} Hz, "
         f"lost {summary.get('lost_samples')}, peak {number(summary.get('torque_peak_nm'))} N·m",

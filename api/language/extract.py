@@ -29,7 +29,7 @@ SENTENCES = (
     "identify/estimation/effect_fit.py", "identify/estimation/pilot.py", "identify/methods/**/*.py",
     "identify/simulation/predict.py",
     "rig/acquire/*.py", "rig/control/*.py", "rig/devices/*.py", "rig/assembly.py", "rig/gate.py", "rig/journal.py",
-    "rig/laid.py", "rig/limits.py", "rig/pieces.py", "rig/plan.py", "rig/protocols/*.py", "rig/score.py",
+    "rig/intended.py", "rig/limits.py", "rig/pieces.py", "rig/plan.py", "rig/protocols/*.py", "rig/score.py",
     "rig/sequences/*.py", "rig/trial.py", "api/models/*.py", "api/people/*.py", "api/sessions/*.py", "api/web/*.py",
     "api/web/routes/*.py", "api/web/pages/*.py", "api/workers/*.py", "api/errors.py",
 )  # fmt: skip

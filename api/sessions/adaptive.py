@@ -21,18 +21,20 @@ from api.errors import ApiError
 from api.sessions.rig_client import RigClient
 from api.sessions.samples import samples_of
 from api.workers.adviser import Adviser
-from rig.messages import EnoughRequest, ExtendRequest, LiveEvent, SegmentPlan, TestPlan
+from rig.messages import AHEAD, SAFE_END_S, EnoughRequest, ExtendRequest, LiveEvent, SegmentPlan, TestPlan
 
 log = logging.getLogger("stimrig.adaptive")
 
-EARLY_S = 0.8
-"""Before a boundary: the first question."""
-LATE_S = 0.4
+EARLY_S = 0.75
+"""Before the rig decides on a boundary: the first question."""
+LATE_S = 0.35
 """The second one, with the newest samples."""
-SEND_S = 0.11
-"""The early answer is sent if the late one is not there; later than 0.05 s before the boundary the rig takes none."""
+SEND_S = 0.06
+"""The early answer is sent if the late one is not there."""
 LEAST_S = 2.05
 """A shorter record tells nothing."""
+SHORTEST_PIECE_S = 1.0
+"""Of the pieces that are chosen."""
 SERVICE = "stimrig"
 """Who says enough where the target is reached."""
 
@@ -62,7 +64,7 @@ class Told:
     """What is known of the test, for pages and for its document."""
 
     target: dict[str, float]
-    reach: dict[str, Any]
+    reach: dict[str, Any] | None
     state: str = "choosing"
     """choosing; fixed: the fixed plan plays on, `problem` says why; ending."""
     words: str = ""
@@ -102,19 +104,19 @@ class Follower:
         self._heard_s = 0.0
         self._took_s = 0.0
         self._turn = Turn(-1)
-        self._work: asyncio.Task[None] | None = None
+        self._asking: asyncio.Task[None] | None = None
         self._sending: asyncio.Task[None] | None = None
 
     async def run(self, path: Path | None) -> None:
-        """Follow it; whatever goes wrong here ends in the fixed plan, told."""
-        self._work = self._begun(self._begin())  # beside the samples, of which none may be missed
+        """Follow it to its end."""
+        self._asking = self._begun(self._begin())  # beside the samples, of which none may be missed
         try:
-            await self._told_of(self._listen(path))
+            await self._guarded(self._listen(path))
         finally:
-            tasks = [task for task in (self._work, self._sending) if task is not None]
-            for task in tasks:
+            left = [task for task in (self._asking, self._sending) if task is not None]
+            for task in left:
                 task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
+            await asyncio.gather(*left, return_exceptions=True)
 
     async def _begin(self) -> None:
         await self.adviser.ask("adaptive_begin", **self.how)
@@ -125,10 +127,10 @@ class Follower:
                 self._hear(event)
 
     def _begun(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
-        return asyncio.create_task(self._told_of(work))
+        return asyncio.create_task(self._guarded(work))
 
-    async def _told_of(self, work: Coroutine[Any, Any, None]) -> None:
-        """Do it; whatever goes wrong is told."""
+    async def _guarded(self, work: Coroutine[Any, Any, None]) -> None:
+        """Whatever goes wrong in it ends in the fixed plan, told."""
         try:
             await work
         except ApiError as error:
@@ -159,21 +161,25 @@ class Follower:
             self._turn = Turn(event.laid)
         if event.ended_by or self.told.state != "choosing":
             return
-        left_s = event.boundary_s - event.elapsed_s
-        idle = self._work is None or self._work.done()
+        left_s = self._left_s(event.elapsed_s)
+        idle = self._asking is None or self._asking.done()
         turn = self._turn
         early_s = max(EARLY_S, 1.5 * self._took_s + SEND_S)  # on a busy machine at once
         if idle and not turn.sent and event.elapsed_s >= LEAST_S and left_s <= (early_s, LATE_S, -1.0)[turn.asked]:
             turn.asked = 2 if left_s <= LATE_S else 1
-            self._work = self._begun(self._ask(turn, event))
+            self._asking = self._begun(self._ask(turn, event))
         elif turn.answer is not None and not turn.sent and left_s <= SEND_S:  # the late one is not there
             self._sending = self._begun(self._carry_out(turn, turn.answer))
 
-    def _left_s(self) -> float:
-        """Until what is laid ends, s."""
+    def _left_s(self, now_s: float) -> float:
+        """From a time on the test's clock until the rig decides what follows what is laid, s."""
         assert self._newest is not None
-        since_s = self.clock.monotonic_s() - self._heard_s
-        return self._newest.boundary_s - self._newest.elapsed_s - since_s
+        return self._newest.boundary_s - AHEAD / self.plan.pulse_rate_hz - now_s
+
+    def _now_s(self) -> float:
+        """The time on the test's clock."""
+        assert self._newest is not None
+        return self._newest.elapsed_s + self.clock.monotonic_s() - self._heard_s
 
     # ---- deciding ------------------------------------------------------------------------------------------
 
@@ -191,20 +197,23 @@ class Follower:
             answer.row["late"] = True
             return
         turn.answer = answer
-        if turn.asked == 2 or self._left_s() <= SEND_S:
+        if turn.asked == 2 or self._left_s(self._now_s()) <= SEND_S:
             await self._carry_out(turn, answer)
 
     def _take(self, said: dict[str, Any], event: LiveEvent, heard_s: float) -> Answer:
         told, known = self.told, said["knowledge"]
-        told.words = said["words"]
+        fits = said["kind"] != "misfit"  # else that is told as the problem, and its bands mean nothing
+        if fits:
+            told.words = said["words"]
         row = {
             "at_s": round(event.elapsed_s, 3), "kind": said["kind"], "words": said["words"],
             "segments": [segment["name"] for segment in said["segments"]],
-            "expected_torque_time_nm_s": said["expected_dose_nm_s"],
+            "expected_torque_time_nm_s": said["expected_torque_time_nm_s"],
             "answer_ms": round(1e3 * self._took_s, 1),
         }  # fmt: skip
         if known is not None:
-            told.knowledge, told.least_known = known, said["least_known"]
+            if fits:
+                told.knowledge, told.least_known = known, said["least_known"]
             row |= {name: round(known[name], 3) for name in ("curve_percent", "step_percent")}
         told.decisions.append(row)
         self.tell()
@@ -240,7 +249,7 @@ class Follower:
         """Which bound leaves no room for another piece."""
         assert self._newest is not None and self.plan.adaptive is not None
         left_s = self.plan.adaptive.max_duration_s - self._newest.boundary_s
-        return "time" if left_s < 2 * SHORTEST_PIECE_S else "dose"
+        return "time" if left_s < SHORTEST_PIECE_S + SAFE_END_S else "torque-time"
 
     def _laid(self, event: LiveEvent) -> tuple[list[float], list[tuple[str, int, int]]]:
         """Width of each pulse that is laid, and the segments."""
@@ -254,7 +263,3 @@ class Follower:
             segments.append((segment.name, len(widths), len(widths) + count))
             widths += [*own, *[0.0] * count][:count]
         return widths, segments
-
-
-SHORTEST_PIECE_S = 1.0
-"""Of the library's pieces, and of the rest at the end."""

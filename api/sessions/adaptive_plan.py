@@ -7,36 +7,27 @@ from typing import Any
 
 from api.errors import ApiError
 from api.sessions.requests import TestIn
-from rig.messages import AdaptivePlan, SegmentPlan, TestPlan
+from rig.messages import SAFE_END_S, AdaptivePlan, SegmentPlan, TestPlan
 
 ADAPTIVE = "adaptive"
 """Kind of test."""
 DURATION_S = 45.0
 """The longest test, where nobody says: the default test and the opening before it fit in."""
-PLATEAU_S = 12.0
-"""The dose, where nobody says: so many seconds at the torque that stops the test."""
+AT_STOPPING_TORQUE_S = 12.0
+"""The largest torque-time, where nobody says: so many seconds at the torque that stops the test."""
 TAIL_S = 0.4
 """Silence behind the opening: when it ends, enough was measured to decide what follows."""
 PIECE_S = 2.0
 """The fixed plan is cut into pieces of this length, so that a late answer costs no more."""
-SAFE_END_S = 1.0
-"""With so much rest the rig ends the test."""
 
 
 def bounds_of(body: TestIn, plan: TestPlan) -> AdaptivePlan:
     """Longest duration and largest torque-time of the whole test."""
-    torque_nm = min(value for value in (plan.profile.max_torque_nm, plan.max_torque_nm) if value is not None)
     given_s, given_nm_s = body.max_duration_s, body.max_torque_time_nm_s
     return AdaptivePlan(
         max_duration_s=DURATION_S if given_s is None else given_s,
-        max_torque_time_nms=PLATEAU_S * torque_nm if given_nm_s is None else given_nm_s,
+        max_torque_time_nms=AT_STOPPING_TORQUE_S * plan.stopping_torque_nm if given_nm_s is None else given_nm_s,
     )
-
-
-def largest_us(plan: TestPlan) -> float:
-    """The widest pulse that the test may send, µs."""
-    own_us, asked_us = plan.profile.max_pulse_width_us, plan.max_pulse_width_us
-    return own_us if asked_us is None else min(own_us, asked_us)
 
 
 def fixed_plan(

@@ -16,12 +16,12 @@ from api.models import stored
 from api.models.registry import Versions
 from api.sessions import adaptive_plan
 from api.sessions.adaptive import Follower, Told
-from api.sessions.adaptive_plan import ADAPTIVE
+from api.sessions.adaptive_plan import ADAPTIVE, PIECE_S
 from api.sessions.requests import TestIn
 from api.sessions.rig_client import RigClient
 from api.store.tables import Participant, Test
 from api.workers.adviser import Adviser
-from rig.messages import EnoughRequest, Extended, FinishedEvent, PreviewRequest, TestPlan
+from rig.messages import SAFE_END_S, EnoughRequest, Extended, FinishedEvent, PreviewRequest, TestPlan
 
 KEPT = 20
 """Outlooks that are remembered: the question before a test and its start need the same one."""
@@ -29,8 +29,8 @@ MOST_MODELS = 10
 """Sessions from which is learnt how much a person changes between two."""
 Place = tuple[str | None, str | None, float | None]
 """Side, muscle, and current, mA; None: not known."""
-ENDS = {"torque_time": "dose", "limit": "time", "plan": "fixed-rest"}
-"""Why a test ended, by the rig's reason, where the service did not end it."""
+ENDS = {"torque_time": "torque-time", "plan": "fixed-rest"}
+"""Why a test ended, by the rig's reason, where it is told by another name."""
 
 
 @dataclass(frozen=True)
@@ -82,13 +82,12 @@ class AdaptiveTests:
         bounds = adaptive_plan.bounds_of(body, plan)
         how = {
             "target": body.target.model_dump(),
-            "max_duration_s": bounds.max_duration_s, "max_torque_time_nm_s": bounds.max_torque_time_nms,
-            "largest_us": adaptive_plan.largest_us(plan), "pulse_rate_hz": plan.pulse_rate_hz,
+            "playable_s": bounds.max_duration_s - SAFE_END_S, "max_torque_time_nm_s": bounds.max_torque_time_nms,
+            "largest_us": plan.largest_us, "pulse_rate_hz": plan.pulse_rate_hz,
             "models": await asyncio.to_thread(self._models_for, plan),
         }  # fmt: skip
-        torque_nm = min(t for t in (plan.profile.max_torque_nm, plan.max_torque_nm) if t is not None)
-        found = await self._outlook({**how, "max_torque_nm": torque_nm})
-        default = await self.rig.ask(PreviewRequest(plan=plan), timeout_s=preview_s)
+        found = await self._outlook({**how, "max_torque_nm": plan.stopping_torque_nm})
+        default = await self.rig.ask(PreviewRequest(plan=plan, recruitment=None), timeout_s=preview_s)
         segments = adaptive_plan.fixed_plan(found["opening_us"], default, plan.pulse_rate_hz, bounds)
         if not found["reach"]["reachable"] and not body.anyway:
             raise out_of_reach(found["reach"])
@@ -183,13 +182,22 @@ class AdaptiveTests:
         rigs, follower = str(event.summary.get("ended_by") or event.outcome), self._of(row.id)
         told = self._view(follower) if follower is not None else unfollowed(row)
         ended = told["ended"] if rigs == "enough" and told["ended"] else ENDS.get(rigs, rigs)
+        if rigs == "limit" and told["max_duration_s"] - event.summary["duration_s"] < PIECE_S:
+            ended = "time"  # another piece of the fixed plan would have been too long
         measured_nm_s = event.summary.get("torque_time_nms", told["torque_time_nm_s"])
         return {"adaptive": {**told, "torque_time_nm_s": measured_nm_s, "state": "ended", "ended": ended}}
 
     def fit_options(self, row: Test) -> dict[str, Any]:
-        """How the recording is fitted: a short one needs to know what a curve looks like, or looked like last time."""
+        """How the recording is fitted: a short one needs to know what a curve looks like, or looked like last time.
+
+        One that holds the whole default test needs no such help: its fixed plan was played, and was not cut off by a
+        bound.
+        """
+        if row.kind != ADAPTIVE:
+            return {}
         ended = (row.summary.get("adaptive") or {}).get("ended")
-        if row.kind != ADAPTIVE or ended == "fixed-rest":
+        planned = [segment["name"] for segment in (row.plan.get("preview") or {}).get("segments") or []]
+        if ended == "fixed-rest" and "validate" in planned:
             return {}
         return {"recruitment": "near-sigmoid", "models": self._models(row.participant, place_of(row))}
 
@@ -228,15 +236,15 @@ def unfollowed(row: Test) -> dict[str, Any]:
         "max_duration_s": bounds.get("max_duration_s"),
         "max_torque_time_nm_s": bounds.get("max_torque_time_nms"),
         "torque_time_nm_s": None,
-        **asdict(Told(row.plan.get("target") or {}, row.plan.get("reach") or {}, state="fixed", problem=why)),
+        **asdict(Told(row.plan.get("target") or {}, row.plan.get("reach"), state="fixed", problem=why)),
     }
 
 
 def out_of_reach(reach: dict[str, Any]) -> ApiError:
     """422: said before the first pulse, with what can be reached."""
     detail = (
-        f'{reach["words"]} Nothing was started. Allow more dose or time, ask for less, or send "anyway": true to play '
-        "it all the same."
+        f'{reach["words"]} Nothing was started. Allow more torque-time or time, ask for less, or send "anyway": true '
+        "to play it all the same."
     )
     return ApiError(422, "out-of-reach", "The target cannot be reached", detail, reach=reach)
 

@@ -118,7 +118,9 @@ class SegmentIn(Body):
     settings: Annotated[dict[str, Any], WithJsonSchema(SETTINGS)] = Field(default_factory=dict)
 
 
-Percent = Annotated[FiniteFloat, Field(ge=0.2, le=50.0)]
+LEAST_PERCENT, MOST_PERCENT = 0.2, 50.0
+"""As `identify.experiments.target` has them; named here, too, so that the service need not load it."""
+Percent = Annotated[FiniteFloat, Field(ge=LEAST_PERCENT, le=MOST_PERCENT)]
 
 
 class TargetIn(Body):

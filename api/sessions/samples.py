@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator, AsyncIterator
 from pathlib import Path
 
 from api.errors import ApiError
@@ -12,7 +12,7 @@ from api.sessions.rig_client import LINE_LIMIT, no_rig
 from rig.messages import LiveEvent, SubscribeRequest
 
 
-async def samples_of(path: Path | None, test_id: str) -> AsyncIterator[LiveEvent]:
+async def samples_of(path: Path | None, test_id: str) -> AsyncGenerator[LiveEvent, None]:
     """The live events of a test with all samples, until it has ended.
 
     Raises

@@ -9,31 +9,28 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from api.workers.json_values import clean
+from api.workers.live_record import record_of
 
 Progress = Callable[[float, str], None]
 NEW_PERSON_SHARE = 1 / 3
 """Of the torque that stops a test: the guess of a new person's torque at the largest width."""
-EARLIEST = 0.02
-"""Share of the samples that arrive earliest: what comes later waited somewhere."""
-SAFE_END_S = 1.0
-"""Kept free behind the last piece for the rest with which the rig ends the test."""
-BINS = 5
-"""Means for each pulse interval, where a load cell gives at least twice as many samples: the delay of a sample's way to
-the host, some milliseconds that only a sealed recording corrects, is then within the one sample that the fit allows."""
 DIGITS = 4
 
 
 def outlook(
     progress: Progress,
     target: dict[str, float],
-    max_duration_s: float,
+    playable_s: float,
     max_torque_time_nm_s: float,
     largest_us: float,
     max_torque_nm: float,
     pulse_rate_hz: float,
     models: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """The opening's pulse widths, and what the test will probably reach; `models`: approved ones, oldest first."""
+    """The opening's pulse widths, and what the test will probably reach.
+
+    `playable_s`: for all segments, without the rest at the end; `models`: approved ones, oldest first.
+    """
     from dataclasses import asdict
 
     from identify.experiments.adaptive import decide
@@ -41,12 +38,19 @@ def outlook(
     from identify.experiments.target import Target
 
     progress(0.1, "playing the test on a simulated muscle")
-    left = {"target": Target(**target), "left_s": max_duration_s - SAFE_END_S, "left_nm_s": max_torque_time_nm_s}
+    left = {"target": Target(**target), "left_s": playable_s, "left_nm_s": max_torque_time_nm_s}
     top = {"largest_us": largest_us, "pulse_rate_hz": pulse_rate_hz}
-    opening = decide(None, (), **left, **top, **known(models))
+    person = known(models)
+    opening = decide(None, (), **left, **top, **person)
     widths = [width for segment in opening.segments for width in segment.settings["pulse_width_us"]]
-    found = reach(plateau_nm=NEW_PERSON_SHARE * max_torque_nm, **left, **top, **known(models))
-    return clean({"opening_us": widths, "reach": asdict(found), "known": bool(known(models))})
+    found = reach(plateau_nm=NEW_PERSON_SHARE * max_torque_nm, **left, **top, **person)
+    return clean({"opening_us": widths, "reach": asdict(found), "known": bool(person)})
+
+
+def warm() -> None:
+    """Have the compiled parts compiled: on a new installation this takes longer than anybody waits at a question."""
+    target = {"curve_percent": 0.2, "step_percent": 0.2}
+    outlook(lambda _share, _text: None, target, 6.0, 100.0, largest_us=300.0, max_torque_nm=15.0, pulse_rate_hz=40.0)
 
 
 def known(models: Sequence[str]) -> dict[str, Any]:
@@ -71,7 +75,7 @@ def known(models: Sequence[str]) -> dict[str, Any]:
 def begin(
     progress: Progress,
     target: dict[str, float],
-    max_duration_s: float,
+    playable_s: float,
     max_torque_time_nm_s: float,
     largest_us: float,
     pulse_rate_hz: float,
@@ -80,7 +84,7 @@ def begin(
     """A test begins: what was known of another one is forgotten."""
     progress(0.5, "beginning")
     _running.clear()
-    _running.append(Running(target, max_duration_s, max_torque_time_nm_s, largest_us, pulse_rate_hz, known(models)))
+    _running.append(Running(target, playable_s, max_torque_time_nm_s, largest_us, pulse_rate_hz, known(models)))
     return {}
 
 
@@ -96,7 +100,7 @@ class Running:
     def __init__(
         self,
         target: dict[str, float],
-        max_duration_s: float,
+        playable_s: float,
         max_torque_time_nm_s: float,
         largest_us: float,
         pulse_rate_hz: float,
@@ -105,9 +109,9 @@ class Running:
         from identify.experiments.target import Target
 
         self.target = Target(**target)
-        self.max_duration_s, self.max_torque_time_nm_s = max_duration_s, max_torque_time_nm_s
+        self.playable_s, self.max_torque_time_nm_s = playable_s, max_torque_time_nm_s
         self.largest_us, self.rate_hz, self.known = largest_us, pulse_rate_hz, known
-        self.samples: tuple[list[float], list[int], list[float]] = ([], [], [])
+        self.samples: tuple[list[float], list[int], list[float | None]] = ([], [], [])
         self.before: Any = None
 
     def advise(
@@ -145,7 +149,7 @@ class Running:
             record,
             laid_us,
             target=self.target,
-            left_s=max(0.0, self.max_duration_s - SAFE_END_S - len(laid_us) / self.rate_hz),
+            left_s=max(0.0, self.playable_s - len(laid_us) / self.rate_hz),
             left_nm_s=max(0.0, self.max_torque_time_nm_s - torque_time_nm_s - committed_nm_s),
             largest_us=self.largest_us,
             pulse_rate_hz=self.rate_hz,
@@ -154,6 +158,10 @@ class Running:
         )
         self.before = found if found.short is not None else self.before
         told = found.to_dict()
+        for number, segment in enumerate(
+            told["segments"], start=len(segments) + 1
+        ):  # laid ones may not be measured yet
+            segment["name"] = f"{segment['name'].rpartition(' ')[0]} {number}"
         if found.knowledge is not None:
             told["knowledge"] = rounded(told["knowledge"])
             told["least_known"] = least_known(found.knowledge)
@@ -171,74 +179,6 @@ class Running:
     @property
     def _plateau_nm(self) -> float:
         return self.before.knowledge.plateau_nm
-
-
-def record_of(
-    host_time_s: list[float],
-    counter: list[int],
-    torque_nm: list[float | None],
-    laid_us: list[float],
-    segments: list[tuple[str, int, int]],
-    rate_hz: float,
-) -> Any:
-    """The record of what was measured since the first pulse, for `decide`; None where there is nothing yet."""
-    import numpy as np
-
-    from identify.records.record import Pulses, Record
-
-    if len(host_time_s) < 2:
-        return None
-    time_s, torque = sample_times(host_time_s, counter), np.array(torque_nm, float)
-    inside = np.isfinite(torque) & (time_s >= 0) & (time_s < len(laid_us) / rate_hz - 1e-9)
-    if not inside.any():
-        return None
-    time_s, torque = means(time_s[inside], torque[inside], BINS * rate_hz)
-    slot = np.floor(time_s * rate_hz + 1e-9).astype(int)
-    widths = np.asarray(laid_us, float)
-    starts = np.array([start for _, start, _ in segments])
-    code = np.searchsorted(starts, slot, side="right") - 1
-    due, none = np.arange(widths.size) / rate_hz, np.zeros(widths.size)
-    return Record.from_arrays(
-        time_s,
-        widths[slot],
-        torque,
-        code,
-        segment_names=[name for name, _, _ in segments],
-        pulses=Pulses(due, widths, none, none.astype(bool)),
-        pulse_rate_hz=rate_hz,
-    )
-
-
-def means(time_s: Any, torque_nm: Any, rate_hz: float) -> tuple[Any, Any]:
-    """Means over even bins, each at the middle of its bin; the samples themselves where there are not two for each."""
-    import numpy as np
-
-    if time_s.size < 2 * rate_hz * (time_s[-1] - time_s[0]):
-        return time_s, torque_nm
-    number = np.floor(time_s * rate_hz + 1e-9).astype(int)
-    count = np.bincount(number)
-    filled = np.flatnonzero(count)
-    return (filled + 0.5) / rate_hz, (np.bincount(number, torque_nm)[filled] / count[filled])
-
-
-def sample_times(host_time_s: list[float], counter: list[int]) -> Any:
-    """When the samples were taken, on the test's clock: evenly by the cell's counter, set by those that came earliest.
-
-    Samples arrive late and never early, so the line through their arrivals is drawn twice, the second time through
-    those below the first.
-    """
-    import numpy as np
-
-    host = np.array(host_time_s, float)
-    number = np.array(counter, float)
-    if number.min() < 0:  # the cell has none
-        number = np.arange(host.size, dtype=float)
-    number -= number[0]
-    slope, first = np.polyfit(number, host, 1)
-    early = host <= slope * number + first
-    if early.sum() > 2 and np.ptp(number[early]) > 0.5 * np.ptp(number):
-        slope = np.polyfit(number[early], host[early], 1)[0]
-    return slope * number + float(np.quantile(host - slope * number, EARLIEST))
 
 
 def least_known(knowledge: Any) -> dict[str, Any]:

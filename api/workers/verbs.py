@@ -163,6 +163,7 @@ def warm(progress: Progress) -> dict[str, Any]:
 
     progress(0.1, "loading")
     identify.fit(read_csv(_warm_csv().encode(), Path("warm.csv")))
+    adaptive_verbs.warm()
     return {}
 
 

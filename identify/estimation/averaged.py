@@ -8,7 +8,7 @@ import numpy as np
 
 from identify.estimation.gram import gram
 from identify.estimation.joint import Fitted
-from identify.estimation.short_record import Short
+from identify.estimation.short_result import Short
 from identify.noise.level import profile, whitened
 from identify.simulation.problem import Problem
 from identify.simulation.setup import Setup

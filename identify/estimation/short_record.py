@@ -7,7 +7,6 @@ A spline with a smoothness penalty needs a record that covers the curve. A short
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
@@ -16,6 +15,7 @@ from identify.dynamics.pulse_grid import Grid
 from identify.estimation.curve_posterior import CurvePosterior, Mode
 from identify.estimation.earlier import Earlier
 from identify.estimation.short_data import ShortData, direction
+from identify.estimation.short_result import Short
 from identify.noise.level import NoiseLevel
 from identify.recruitment.near_shape import (
     FINE_KNOTS,
@@ -43,79 +43,6 @@ COARSE = 1.0 / 3.0
 
 STRANGE = 0.8
 """Standard deviation of the log density from which a curve counts as far from the known shape."""
-
-
-@dataclass(frozen=True)
-class Short:
-    """What a short record shows.
-
-    Parameters
-    ----------
-    grid : Grid
-        The record on the grid of pulses.
-    rows : ndarray of bool, shape (K,)
-        Intervals that were fitted.
-    basis : SplineBasis
-        Of the curve.
-    sign : float
-        1 where stimulation raises the record's torque, -1 where it lowers it.
-    linear : SecondOrder
-        The most probable dynamics.
-    coefficients_nm : ndarray, shape (S, n)
-        Draws of the curve's coefficients, positive as the muscle pulls, N·m.
-    dynamics : ndarray, shape (S, 3)
-        Draws of T, s, ζ and the delay, s.
-    others_nm : ndarray, shape (S, E)
-        Draws of the baselines and initial states (torque, N·m, and rate, N·m/s).
-    modes : tuple of Mode
-        One for each kind of the curve's deviation from the known shape.
-    weights : ndarray, shape (M,)
-        Their probabilities.
-    noise : NoiseLevel
-        Of the intervals' means.
-    residual_nm : ndarray, shape (K,)
-        Measured minus the most probable model, N·m.
-    three : ndarray, shape (3,)
-        Log gain, middle and log width at the most probable mode.
-    likely : ndarray, shape (n + E,)
-        Steps of the curve, baselines and initial states at the most probable mode.
-    rise_us : float
-        Rise from 10 to 90 % for which the knots were made, µs.
-    strange : float
-        Probability that the curve is far from the known shape.
-    """
-
-    grid: Grid
-    rows: np.ndarray
-    basis: SplineBasis
-    sign: float
-    linear: SecondOrder
-    coefficients_nm: np.ndarray
-    dynamics: np.ndarray
-    others_nm: np.ndarray
-    modes: tuple[Mode, ...]
-    weights: np.ndarray
-    noise: NoiseLevel
-    residual_nm: np.ndarray
-    three: np.ndarray
-    likely: np.ndarray
-    rise_us: float
-    strange: float
-
-    @property
-    def largest_us(self) -> float:
-        """Largest width of the curve, µs."""
-        return self.basis.largest_us
-
-    @cached_property
-    def mean_nm(self) -> np.ndarray:
-        """Mean of the curve's coefficients, N·m."""
-        return self.coefficients_nm.mean(axis=0)
-
-    @cached_property
-    def plateau_nm(self) -> float:
-        """The mean curve at its largest width, N·m."""
-        return float(self.mean_nm[-1])
 
 
 @dataclass(frozen=True)

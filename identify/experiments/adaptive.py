@@ -19,7 +19,8 @@ from identify.estimation.averaged import averaged
 from identify.estimation.earlier import Change, Earlier, learn_change
 from identify.estimation.prepare import prepare
 from identify.estimation.residual_tests import residual_tests
-from identify.estimation.short_record import Short, fit_short
+from identify.estimation.short_record import fit_short
+from identify.estimation.short_result import Short
 from identify.experiments.designs import Segment
 from identify.experiments.foresight import Foresight
 from identify.experiments.knowledge import Knowledge, knowledge
@@ -56,14 +57,14 @@ class Decision:
     kind : str
         `next`: play `segments`. `enough`: both curves are known within the target. `misfit`: the structure fits badly;
         play the rest of the fixed test, so that the diagnosis gets its record. `spent`: no piece is left within the
-        dose or time.
+        torque-time or the time.
     segments : tuple of Segment
         What to play, in order, as sequences of the rig; empty unless `kind` is `next`.
     words : str
         One sentence for people.
     knowledge : Knowledge or None
         The bands as they are; None before the first fit.
-    expected_dose_nm_s : float
+    expected_torque_time_nm_s : float
         Torque-time of the segments, N·m·s, by the mean curve.
     short : Short or None
         The fit, which makes the next call faster (`before`).
@@ -73,17 +74,17 @@ class Decision:
     segments: tuple[Segment, ...] = ()
     words: str = ""
     knowledge: Knowledge | None = None
-    expected_dose_nm_s: float = 0.0
+    expected_torque_time_nm_s: float = 0.0
     short: Short | None = field(default=None, repr=False)
 
     def to_dict(self) -> dict:
-        """Plain values, for the journal and the page."""
+        """Plain values, for the test's document and the page."""
         return {
             "kind": self.kind,
             "segments": [{"name": s.name, "sequence": s.sequence, "settings": s.settings} for s in self.segments],
             "words": self.words,
             "knowledge": None if self.knowledge is None else self.knowledge.to_dict(),
-            "expected_dose_nm_s": self.expected_dose_nm_s,
+            "expected_torque_time_nm_s": self.expected_torque_time_nm_s,
         }
 
 
@@ -167,7 +168,7 @@ def _opening(largest_us: float, rate: float, left_s: float, left_nm_s: float, la
     ]
     dose = 0.0 if last is None else float(np.sum(np.abs(last.model.recruitment(widths))) / rate)
     if widths.size / rate > left_s or dose > left_nm_s:
-        return Decision("spent", words="The dose or time that is left does not allow a first piece.")
+        return Decision("spent", words="The torque-time or the time that is left does not allow a first piece.")
     return Decision("next", (Piece("opening", widths).segment(1),), "A first look at the whole range.", None, dose)
 
 
@@ -218,7 +219,9 @@ def _next(
     seconds = np.array([piece.pulse_width_us.size for piece in candidates]) / rate
     allowed = (dose <= left_nm_s) & (seconds <= left_s + 1e-9)
     if not allowed.any():
-        return Decision("spent", words=f"The dose or time is used up. {_state(known)}", knowledge=known, short=short)
+        return Decision(
+            "spent", words=f"The torque-time or the time is used up. {_state(known)}", knowledge=known, short=short
+        )
     cost = dose / max(known.plateau_nm, 1e-9) + SECOND_COST * seconds
     score = np.where(allowed, np.log(np.maximum(foresight.now / after, 1.0)) / cost, -1.0)
     best = int(np.argmax(score))

@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 
 from identify.dynamics.boundary import step_matrix
-from identify.estimation.short_record import Short
+from identify.estimation.short_result import Short
 from identify.experiments.knowledge import POINTS, knowledge, step_responses
 from identify.experiments.pieces import Piece
 from identify.experiments.target import Target

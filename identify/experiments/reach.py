@@ -1,4 +1,4 @@
-"""What an adaptive test can reach within a dose and a time: said before the first pulse.
+"""What an adaptive test can reach within a torque-time and a time: said before the first pulse.
 
 The test is played in a simulation: on the last model of a known person, or on two usual muscles for a new one. The
 worse of the two counts.
@@ -6,7 +6,7 @@ worse of the two counts.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,7 +36,7 @@ class Reach:
         Whether the target is.
     curve_percent, step_percent : float
         Largest half-widths of both bands at the end, %.
-    seconds, dose_nm_s : float
+    seconds, torque_time_nm_s : float
         What the test then took.
     words : str
         One sentence for people.
@@ -46,8 +46,15 @@ class Reach:
     curve_percent: float
     step_percent: float
     seconds: float
-    dose_nm_s: float
+    torque_time_nm_s: float
     words: str
+
+    @property
+    def cost(self) -> tuple[float, float]:
+        """What is worse the larger it is: torque-time and time, or the bands that are left, %."""
+        if self.reachable:
+            return self.torque_time_nm_s, self.seconds
+        return max(self.curve_percent, self.step_percent), self.torque_time_nm_s
 
 
 def reach(
@@ -97,7 +104,12 @@ def reach(
         muscles = [(linear, _curve(groups, largest_us, plateau_nm)) for linear, groups in USUAL]
     known = {"earlier": earlier, "change": change} if earlier is not None else {}
     tests = [_play(linear, curve, target, noise_nm, limits, known) for linear, curve in muscles]
-    return max(tests, key=lambda test: (not test.reachable, test.curve_percent, test.dose_nm_s))
+    return worse(tests)
+
+
+def worse(tests: Sequence[Reach]) -> Reach:
+    """That which misses the target by more; if all reach it, that which takes more."""
+    return max(tests, key=lambda test: (not test.reachable, *test.cost))
 
 
 Curve = Callable[[np.ndarray], np.ndarray]
@@ -137,19 +149,19 @@ def _play(linear: SecondOrder, curve: Curve, target: Target, noise_nm: float, li
         record = Record.from_arrays(time_s, np.repeat(widths, SAMPLES), measured, pulse_rate_hz=rate)
 
 
-def _reached(decision: Decision, target: Target, seconds: float, dose_nm_s: float) -> Reach:
+def _reached(decision: Decision, target: Target, seconds: float, torque_time_nm_s: float) -> Reach:
     if decision.knowledge is None:
-        words = "The dose or time that is left does not allow a first piece: nothing can be reached."
+        words = "The torque-time or the time that is left does not allow a first piece: nothing can be reached."
         return Reach(False, float("inf"), float("inf"), 0.0, 0.0, words)
     curve, step = decision.knowledge.curve.percent, decision.knowledge.step.percent
     there = curve <= target.curve_percent and step <= target.step_percent
-    words = f"The target should be reached in about {seconds:.0f} s with {dose_nm_s:.0f} N·m·s."
+    words = f"The target should be reached in about {seconds:.0f} s with {torque_time_nm_s:.0f} N·m·s."
     if not there:
         words = (
-            f"The target is probably out of reach: in {seconds:.0f} s and with {dose_nm_s:.0f} N·m·s the curve would "
-            f"be known within {curve:.1f} % and the step response within {step:.1f} %."
+            f"The target is probably out of reach: in {seconds:.0f} s and with {torque_time_nm_s:.0f} N·m·s the curve "
+            f"would be known within {curve:.1f} % and the step response within {step:.1f} %."
         )
-    return Reach(there, curve, step, seconds, dose_nm_s, words)
+    return Reach(there, curve, step, seconds, torque_time_nm_s, words)
 
 
 __all__ = ["Reach", "reach"]

@@ -150,7 +150,7 @@ def advised(arguments: dict[str, Any]) -> dict[str, Any]:
     segments = [{"name": f"step {len(ADVISED)}", "sequence": "widths",
                  "settings": {"pulse_width_us": widths, "jumps": True}}]  # fmt: skip
     return {
-        "kind": kind, "segments": segments if kind == "next" else [], "expected_dose_nm_s": 2.0,
+        "kind": kind, "segments": segments if kind == "next" else [], "expected_torque_time_nm_s": 2.0,
         "words": f"The curve is known within {percent:.1f} %, the step response within {percent / 2:.1f} %.",
         "knowledge": knowledge(percent), "least_known": {"pulse_width_us": 140.0, "time_s": 0.4},
     }  # fmt: skip
@@ -198,7 +198,7 @@ def answer(verb: str, arguments: dict[str, Any], say: Any) -> dict[str, Any]:
             words = "The target is probably out of reach: in about 4 s with 9 N·m·s the curve would be known within "
             words += "6.0 % and the step response within 3.0 %."
         reach = {"reachable": within, "curve_percent": 1.9 if within else 6.0, "step_percent": 3.0, "seconds": 9.0,
-                 "dose_nm_s": 20.0, "words": words}  # fmt: skip
+                 "torque_time_nm_s": 20.0, "words": words}  # fmt: skip
         return {"result": {"opening_us": OPENING, "reach": reach, "known": bool(arguments["models"])}}
     if verb == "adaptive_begin":
         ADVISED.clear()

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from api.workers import adaptive_verbs as verbs
+from api.workers import live_record
 from tests.harness.adaptive import PULSE_RATE_HZ, Muscle, sigmoid
 
 HOW: dict[str, Any] = {
     "target": {"curve_percent": 4.0, "step_percent": 4.0},
-    "max_duration_s": 45.0,
+    "playable_s": 44.0,
     "max_torque_time_nm_s": 360.0,
     "largest_us": 300.0,
     "pulse_rate_hz": PULSE_RATE_HZ,
@@ -50,7 +51,7 @@ class Cell:
 
 def test_times_are_those_of_the_samples_that_waited_nowhere() -> None:
     news = Cell(sigmoid(71), 1).news([0.0] * 120, 3.0)
-    time_s = verbs.sample_times(news["host_time_s"], news["counter"])
+    time_s = live_record.sample_times(news["host_time_s"], news["counter"])
     assert np.abs(time_s - 0.0024 - np.arange(4800) / 1600.0).max() < 0.0003
 
 
@@ -61,7 +62,7 @@ def test_lost_samples_and_none_move_nothing() -> None:
     for lost in ((0, 0), (1600, 1900)):
         news = Cell(muscle, 2).news(widths, 2.5, lost)
         news["torque_nm"][100] = None
-        records.append(verbs.record_of(*news.values(), widths, segments, PULSE_RATE_HZ))
+        records.append(live_record.record_of(*news.values(), widths, segments, PULSE_RATE_HZ))
     whole, holed = records
     assert whole.time_s.size - holed.time_s.size == pytest.approx(300 / 8, abs=2)
     kept = np.isin(whole.time_s, holed.time_s)
@@ -71,7 +72,7 @@ def test_lost_samples_and_none_move_nothing() -> None:
 
 def test_a_slow_cell_keeps_its_samples() -> None:
     time_s = np.arange(300) / 100.0
-    assert verbs.means(time_s, time_s, 5 * PULSE_RATE_HZ)[0].size == 300
+    assert live_record.means(time_s, time_s, 5 * PULSE_RATE_HZ)[0].size == 300
 
 
 @pytest.mark.slow
@@ -97,6 +98,7 @@ def test_a_test_is_advised_to_its_end(seed: int, dropped: float) -> None:
             segments.append((segment["name"], len(widths), len(widths) + len(segment["settings"]["pulse_width_us"])))
             widths += segment["settings"]["pulse_width_us"]
     assert told["kind"] == "enough", told["words"]
+    assert [int(name.split()[1]) for name, _, _ in segments[1:]] == list(range(2, len(segments) + 1))
     assert len(widths) / PULSE_RATE_HZ < 30
     known = told["knowledge"]["recruitment"]
     truth = muscle.curve(np.array(known["pulse_width_us"]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import httpx
@@ -153,7 +154,20 @@ def test_segments_in_a_clinicians_words() -> None:
     assert [segment_words(name) for name in names] == [
         "Rest", "Random pulses", "Ramp", "Check (not used for fitting)", "my <own>"
     ]  # fmt: skip
-    marks = segment_marks([{"name": name, "start_s": 0.0, "end_s": 1.0} for name in names])[1]
+    runs = [{"name": name, "start_s": 10.0 * at, "end_s": 10.0 * at + 10.0} for at, name in enumerate(names)]
+    marks = segment_marks(runs)[1]
     assert [mark["text"] for mark in marks] == [
         "Random pulses", "Ramp", "Check (not used for fitting)", "my ‹own›"
     ]  # fmt: skip
+
+
+def test_names_of_short_segments_are_not_written_over_one_another() -> None:
+    from api.charts.model_charts import LETTER, segment_marks
+
+    ends = [2.7, 3.7, 4.7, 6.7, 8.7, 40.0]
+    names = ["opening", "ramp 2", "ramp 3", "step 4", "prbs", "ramp"]
+    runs = [{"name": n, "start_s": a, "end_s": b} for n, a, b in zip(names, [0.0, *ends[:-1]], ends, strict=True)]
+    shapes, marks = segment_marks(runs)
+    assert len(shapes) == len(runs) and 2 <= len(marks) < len(runs)
+    places = [(mark["x"], 40.0 * LETTER * len(mark["text"]) / 2) for mark in marks]
+    assert all(b - half_b >= a + half_a for (a, half_a), (b, half_b) in itertools.pairwise(places))

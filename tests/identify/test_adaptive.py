@@ -13,7 +13,7 @@ from identify.errors import BadRequest
 from identify.estimation.earlier import USUAL, learn_change
 from identify.experiments.adaptive import SETTLED_S, Target, decide
 from identify.experiments.pieces import pieces
-from identify.experiments.reach import reach
+from identify.experiments.reach import Reach, reach, worse
 from identify.records.record import Record
 from rig.sequences import build
 from tests.harness.adaptive import Muscle, Played, play, recorded, shaped, sigmoid
@@ -120,7 +120,7 @@ def test_pulses_that_are_committed_beyond_the_record_count():
     opening = np.array(decide(None, [], **LIMITS).segments[0].settings["pulse_width_us"])
     record = recorded(muscle, opening, ["opening"] * opening.size, noise(2))
     decision = decide(record, np.r_[opening, np.full(40, 200.0)], **LIMITS)
-    assert decision.kind == "next" and decision.expected_dose_nm_s >= 0.0
+    assert decision.kind == "next" and decision.expected_torque_time_nm_s >= 0.0
 
 
 @pytest.mark.slow
@@ -131,7 +131,7 @@ def test_nothing_is_played_beyond_what_is_left():
     for left in ({"left_s": 0.5}, {"left_s": 0.5, "left_nm_s": 0.0}):
         assert decide(record, opening, **(LIMITS | left)).kind == "spent"
     modest = decide(record, opening, **(LIMITS | {"left_nm_s": 0.5}))
-    assert modest.kind == "spent" or modest.expected_dose_nm_s <= 0.5
+    assert modest.kind == "spent" or modest.expected_torque_time_nm_s <= 0.5
     assert decide(None, [], **(LIMITS | {"left_s": 1.0})).kind == "spent"
 
 
@@ -154,6 +154,14 @@ def test_what_cannot_be_reached_is_said_before_the_first_pulse():
     assert not none.reachable and none.seconds == 0.0
     with pytest.raises(BadRequest, match="plateau_nm"):
         reach(target=Target(), left_s=30.0, left_nm_s=100.0, largest_us=300.0, plateau_nm=math.nan)
+
+
+def test_of_two_muscles_that_reach_the_target_the_one_that_takes_more_is_told():
+    quick, slow = Reach(True, 2.9, 0.3, 4.0, 16.0, ""), Reach(True, 2.5, 0.3, 11.0, 33.0, "")
+    wide, wider = Reach(False, 4.0, 1.0, 44.0, 90.0, ""), Reach(False, 3.0, 6.0, 44.0, 80.0, "")
+    assert worse([quick, slow]) is worse([slow, quick]) is slow
+    assert worse([wide, wider]) is worse([wider, wide]) is wider
+    assert worse([slow, wide]) is wide
 
 
 @pytest.mark.slow

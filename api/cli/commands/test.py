@@ -43,7 +43,7 @@ def test(
     max_time: Annotated[
         float | None, typer.Option(help="with --adaptive: longest test, s; default 45", show_default=False)
     ] = None,
-    max_dose: Annotated[
+    max_torque_time: Annotated[
         float | None,
         typer.Option(
             help="with --adaptive: largest torque-time, N·m·s; default 12 s at the torque that stops a test",
@@ -57,7 +57,7 @@ def test(
 
     With --adaptive each segment is chosen by what is known so far, and the test stops once enough is known.
     """
-    asked = how(adaptive, protocol, target, max_time, max_dose, anyway)
+    asked = how(adaptive, protocol, target, max_time, max_torque_time, anyway)
     if url:
         token = os.environ.get("STIMRIG_TOKEN") or os.environ.get("STIMRIG_ADMIN_TOKEN")
         if not token:
@@ -78,7 +78,12 @@ def test(
 
 
 def how(
-    adaptive: bool, protocol: str | None, target: str, max_time: float | None, max_dose: float | None, anyway: bool
+    adaptive: bool,
+    protocol: str | None,
+    target: str,
+    max_time: float | None,
+    max_torque_time: float | None,
+    anyway: bool,
 ) -> dict[str, Any]:
     """What the service is asked for beside the participant.
 
@@ -87,15 +92,15 @@ def how(
     InputError
         An option of adaptive tests without --adaptive, one of fixed tests with it, or what is no number.
     """
-    given = {"max_duration_s": max_time, "max_torque_time_nm_s": max_dose, "anyway": anyway or None}
+    given = {"max_duration_s": max_time, "max_torque_time_nm_s": max_torque_time, "anyway": anyway or None}
     asked: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     if not adaptive:
         if asked or target:
-            raise InputError("--target, --max-time, --max-dose and --anyway go with --adaptive.")
+            raise InputError("--target, --max-time, --max-torque-time and --anyway go with --adaptive.")
         return {} if protocol is None else {"protocol": protocol}
     if protocol is not None:
         raise InputError("--protocol is for a fixed test; leave it out, or leave out --adaptive.")
-    for option, value in (("--max-time", max_time), ("--max-dose", max_dose)):
+    for option, value in (("--max-time", max_time), ("--max-torque-time", max_torque_time)):
         if value is not None and not 0 < value < math.inf:
             raise InputError(f"{option} {value:g}: give a number above 0.")
     return {"kind": "adaptive", **asked, **({"target": target_of(target)} if target else {})}

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import functools
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from babel.support import LazyProxy
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from jinja2 import Environment, FileSystemLoader, StrictUndefined, pass_context
+from jinja2.runtime import Context
 
 from api import clinical_words, effect_words, language
 from api.charts.config import PAGE_CONFIG
@@ -51,7 +54,20 @@ def in_words(value: Any) -> str:
 
 texts: Any = environment  # the extension adds the method
 texts.install_gettext_callables(words.gettext, words.plural, newstyle=True)
-environment.filters.update({
+
+
+def in_its_language(words: Callable[..., Any]) -> Callable[..., Any]:
+    """A filter that is asked anew for each page: of a constant jinja would keep the answer of the first page."""
+
+    @pass_context
+    @functools.wraps(words)
+    def asked(_context: Context, *given: Any, **more: Any) -> Any:
+        return words(*given, **more)
+
+    return asked
+
+
+environment.filters.update({name: in_its_language(words_of) for name, words_of in {
     "number": number, "followed": followed, "figures": figures, "when": language.when, "clock": language.clock,
     "day": language.day, "until": language.until,
     "translated": language.translated, "plain_words": language.plain, "localised": language.localised,
@@ -60,7 +76,7 @@ environment.filters.update({
     "effect_words": effect_words.effect_words, "effects_words": effect_words.effects_words,
     "decision_words": clinical_words.decision_words, "test_kind_words": clinical_words.test_kind_words,
     "test_state_words": clinical_words.test_state_words,
-})  # fmt: skip
+}.items()})  # fmt: skip
 environment.globals["chart_config"] = PAGE_CONFIG
 environment.policies["json.dumps_kwargs"] = {"sort_keys": True, "default": in_words}
 environment.globals["language"] = language

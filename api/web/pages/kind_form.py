@@ -5,10 +5,8 @@ from __future__ import annotations
 from starlette.datastructures import FormData
 
 from api.errors import ApiError
-from api.sessions.requests import TargetIn, TestIn
+from api.sessions.requests import LEAST_PERCENT, MOST_PERCENT, TargetIn, TestIn
 from api.web.pages import typed
-
-LEAST, MOST = 0.2, 50.0
 
 
 def asked(sent: FormData, code: str) -> TestIn:
@@ -25,8 +23,8 @@ def asked(sent: FormData, code: str) -> TestIn:
         percent = typed.number(str(sent.get("target") or ""))
     except ValueError as error:
         raise no_target(str(error)) from None
-    if not (LEAST <= percent <= MOST):
-        raise no_target(f"{percent:g} % is not from {LEAST:g} to {MOST:g} %")
+    if not (LEAST_PERCENT <= percent <= MOST_PERCENT):
+        raise no_target(f"{percent:g} % is not from {LEAST_PERCENT:g} to {MOST_PERCENT:g} %")
     target = TargetIn(curve_percent=percent, step_percent=percent)
     return TestIn(participant=code, kind="adaptive", target=target, anyway=True)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Literal
 
 from pydantic import Field
 
@@ -110,7 +110,7 @@ class ReachOut(Document):
     curve_percent: float | None = Field(description="half-width of the curve's band at the end, %; null: none at all")
     step_percent: float | None = Field(description="of the step response, %")
     seconds: float = Field(description="what the test would take, s")
-    dose_nm_s: float = Field(description="its torque-time, N·m·s")
+    torque_time_nm_s: float = Field(description="what it would cost, N·m·s")
     words: str
     known: bool = Field(False, description="whether a model of an earlier session helps")
 
@@ -146,6 +146,50 @@ class WorkOut(Document):
     time_left_s: float | None = Field(None, description="null: not known yet")
 
 
+class KnownCurveOut(Document):
+    """A recruitment curve with its 95 % band as a whole."""
+
+    pulse_width_us: list[float]
+    torque_nm: list[float]
+    lower_nm: list[float]
+    upper_nm: list[float]
+
+
+class KnownStepOut(Document):
+    """The response to a unit step with its 95 % band as a whole."""
+
+    time_s: list[float]
+    value: list[float]
+    lower: list[float]
+    upper: list[float]
+
+
+class KnowledgeOut(Document):
+    """What is known of the muscle by now."""
+
+    plateau_nm: float
+    curve_percent: float = Field(description="largest half-width of the curve's band, % of the plateau")
+    step_percent: float = Field(description="of the step response, %")
+    recruitment: KnownCurveOut
+    step_response: KnownStepOut
+
+
+class DecisionOut(Document):
+    """One answer of the worker that chooses."""
+
+    at_s: float = Field(description="newest sample that it knew, s")
+    kind: Literal["next", "enough", "misfit", "spent"]
+    words: str
+    segments: list[str] = Field(description="names of what was chosen")
+    expected_torque_time_nm_s: float
+    answer_ms: float = Field(description="from the question to the answer")
+    curve_percent: float | None = Field(None, description="how well the curve was known, %; missing before a fit")
+    step_percent: float | None = Field(None, description="and the step response, %")
+    late: bool = Field(False, description="it came too late and fell away")
+    refused: str | None = Field(None, description="why the rig did not lay it; missing where it did")
+    sample_to_plan_ms: float | None = Field(None, description="from that sample until the rig had laid it")
+
+
 class AdaptiveOut(Document):
     """A test that stops itself: how much is known, what is left, why it ended."""
 
@@ -153,17 +197,17 @@ class AdaptiveOut(Document):
     max_duration_s: float | None
     max_torque_time_nm_s: float | None
     torque_time_nm_s: float | None = Field(description="measured so far, N·m·s; null: not known")
-    reach: ReachOut | dict[str, Any] = Field(description="empty: it was never begun")
+    reach: ReachOut | None = Field(description="null: it was never begun")
     state: Literal["choosing", "fixed", "ending", "ended"] = Field(description="`fixed`: the fixed plan plays on")
     words: str = Field(description="the newest decision, in a sentence")
     problem: str = Field(description="why the fixed plan plays on; empty while segments are chosen")
-    knowledge: dict[str, Any] | None = Field(description="both curves with their 95 % bands, and their half-widths, %")
+    knowledge: KnowledgeOut | None = Field(description="both curves with their bands; null before the first fit")
     least_known: dict[str, float] | None = Field(description="`pulse_width_us` and `time_s` where the bands are widest")
     ended: str = Field(
-        description="`known-enough`, `enough` (a person said so), `dose`, `time`, `fixed-rest` (the fixed plan was "
-        "played to its end), `stopped` or `fault`; empty while it runs"
+        description="`known-enough`, `enough` (a person said so), `torque-time`, `time`, `limit` (of the "
+        "charge, say), `fixed-rest` (the fixed plan was played to its end), `stopped` or `fault`; empty while it runs"
     )  # fmt: skip
-    decisions: list[dict[str, Any]] = Field(description="each answer of the adviser, with the time it took")
+    decisions: list[DecisionOut]
 
 
 class LeftOut(Document):

@@ -12,7 +12,8 @@ from identify.errors import BadRequest
 from identify.estimation.averaged import averaged
 from identify.estimation.earlier import Change, Earlier
 from identify.estimation.joint import Fitted
-from identify.estimation.short_record import Short, fit_short
+from identify.estimation.short_record import fit_short
+from identify.estimation.short_result import Short
 from identify.model import Model
 from identify.recruitment.near_shape import DEVIATIONS
 

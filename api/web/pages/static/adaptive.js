@@ -9,8 +9,12 @@ function showAdaptive(told) {
   if (told.least_known) say("least-known", words.least_known.replace("{width}", shown(told.least_known.pulse_width_us.toFixed(0))).replace("{time}", shown(told.least_known.time_s.toFixed(2))));
   const why = document.getElementById("fixed-why");
   why.hidden = !told.problem; if (told.problem) say("fixed-why", told.problem);
+  showEnough(told.state === "choosing" || told.state === "fixed");
+}
+
+function showEnough(may) {
   const form = document.getElementById("enough");
-  if (form) form.hidden = told.state === "ending";
+  if (form) form.hidden = !may;
 }
 
 function showDose(torque_time_nm_s) {

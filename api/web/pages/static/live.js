@@ -29,6 +29,7 @@ function take(message) {
     showAdaptive(message);
   } else if (message.type === "test") {
     showTest(message.test, message.words);
+    if (state.test.adaptive && message.test.state !== "running") showEnough(false);
   } else if (message.type === "link" || message.type === "idle") {
     state.connected = message.type === "link" ? message.connected : message.rig_connected;
   }

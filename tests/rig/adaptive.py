@@ -1,0 +1,52 @@
+"""Adaptive tests on a virtual rig: what they are made of, how they are asked, and what is left of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rig import assembly, journal
+from rig.errors import RigError
+from rig.messages import AdaptivePlan, SegmentPlan
+from tests.rig.fakes import VirtualRig
+
+RATE_HZ = 40.0
+
+
+def rest(duration_s: float) -> SegmentPlan:
+    return SegmentPlan(name="rest", sequence="rest", settings={"duration_s": duration_s})
+
+
+def hold(name: str = "hold", on_s: float = 1.0, **settings: float) -> SegmentPlan:
+    return SegmentPlan(name=name, sequence="steps", settings={"on_s": on_s, "off_s": 0.0, "repeats": 1, **settings})
+
+
+FIXED = [rest(0.5), hold("first"), SegmentPlan(name="ramp", sequence="ramp", settings={"up_s": 0.5, "down_s": 0.5})]
+
+
+def adaptive(
+    folder: Path, max_duration_s: float = 10.0, max_nms: float = 1e4, fixed: list[SegmentPlan] = FIXED, **more: Any
+) -> VirtualRig:
+    bounds = AdaptivePlan(max_duration_s=max_duration_s, max_torque_time_nms=max_nms)
+    return VirtualRig(folder, fixed, adaptive=bounds, **more)
+
+
+def refusals(rig: VirtualRig, *requests: Callable[[], object]) -> list[RigError]:
+    """What the requests raise, in order."""
+    found: list[RigError] = []
+    for request in requests:
+        with pytest.raises(RigError) as told:
+            request()
+        found.append(told.value)
+    return found
+
+
+def sealed(rig: VirtualRig) -> assembly.Recording:
+    return assembly.assemble(journal.read(rig.path))
+
+
+def widths_sent(rig: VirtualRig) -> list[int]:
+    return [pulse.pulse_width_us for _, pulse in rig.stimulator.sent]

@@ -1,0 +1,91 @@
+"""A test that is extended while it plays: what is written, when, and what is left of a damaged journal."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from rig import archive, assembly, journal
+from rig.errors import JournalError
+from rig.journal import Kind, LaidBlock
+from tests.rig.adaptive import adaptive, hold, refusals, sealed, widths_sent
+
+
+def test_each_segment_is_in_the_journal_before_its_first_pulse(tmp_path: Path):
+    rig = adaptive(tmp_path)
+    rig.at(0.2, lambda: rig.run.score.extend(20, [hold("added")]))
+    rig.at(1.7, lambda: rig.run.score.enough("me", at_once=True))
+    rig.execute()
+    laid_to, seen = 20, []
+    for kind, payload in journal.read(rig.path).blocks:
+        if kind == Kind.LAID:
+            block = LaidBlock.of_bytes(payload)
+            assert len(block.pulse_width_us) == block.segment.end - block.segment.start
+            laid_to = block.segment.end
+            seen.append(block.segment.by)
+        elif kind == Kind.INTENT:
+            assert journal.INTENT.unpack(payload)[0] < laid_to
+    assert seen == ["extension", "plan", "end"]
+
+
+def test_a_disk_that_takes_no_segment_ends_it_as_a_fault(tmp_path: Path):
+    rig = adaptive(tmp_path)
+    rig.at(0.2, lambda: setattr(rig.journal, "_failure", "disk full"))
+    rig.at(0.3, lambda: refusals(rig, lambda: rig.run.score.extend(20, [hold()])))
+    result = rig.execute()
+    assert (result.outcome, result.reason, rig.stimulator.sent) == ("fault", "disk full", [])
+    (tmp_path / "2").mkdir()
+    rig = adaptive(tmp_path / "2")
+    rig.journal._failure = "disk full"
+    with pytest.raises(JournalError):
+        rig.run.score.extend(20, [hold()])
+    assert len(rig.run.score.laid) == 20
+
+
+def test_the_sealed_file_holds_the_true_sequence(tmp_path: Path):
+    rig = adaptive(tmp_path)
+    rig.at(0.2, lambda: rig.run.score.extend(20, [hold("added")]))
+    rig.at(1.0, lambda: rig.run.score.enough("me", at_once=True))
+    rig.execute()
+    file_path = archive.seal(sealed(rig), tmp_path).path
+    with h5py.File(file_path) as file:
+        assert list(file["segments/name"].asstr()[:]) == ["rest", "added", "rest"]
+        assert (file.attrs["adaptive"], file.attrs["ended_by"]) == (1, "enough")
+        assert file["segments/end_s"][1] == file["segments/start_s"][2]
+        sent, planned = file["pulses/sent_pulse_width_us"][:], file["pulses/pulse_width_us"][:]
+        assert np.array_equal(sent, planned)
+        assert np.count_nonzero(sent) == len(rig.stimulator.sent)
+
+
+@pytest.mark.slow
+def test_a_journal_cut_anywhere_or_without_a_laid_block_loses_no_pulse(tmp_path: Path):
+    rig = adaptive(tmp_path)
+    rig.at(0.2, lambda: rig.run.score.extend(20, [hold("added", max_pulse_width_us=150.0)]))
+    rig.at(1.8, lambda: rig.run.score.enough("me", at_once=True))
+    rig.execute()
+    whole = rig.path.read_bytes()
+    copy = tmp_path / "copy.journal"
+    for end in np.linspace(9000, len(whole), 40).astype(int):
+        copy.write_bytes(whole[:end])
+        contents = journal.read(copy)
+        columns = assembly.assemble(contents).columns
+        intents = sum(kind == Kind.INTENT for kind, _ in contents.blocks)
+        assert np.sum(np.nan_to_num(columns["pulses/current_ma"]) > 0) == intents
+        assert np.sum(np.nan_to_num(columns["pulses/sent_pulse_width_us"]) > 0) == intents
+    at = [place for place in range(len(whole)) if whole.startswith(journal._MARK + bytes([Kind.LAID]), place)]
+    assert len(at) == 3
+    for lost in ([0], [1], [2], [0, 1], [0, 1, 2]):
+        spoiled = bytearray(whole)
+        for number in lost:
+            spoiled[at[number] + 20] ^= 255
+        copy.write_bytes(spoiled)
+        recording = assembly.assemble(journal.read(copy))
+        sent = recording.columns["pulses/sent_pulse_width_us"]
+        assert np.nan_to_num(sent)[np.nan_to_num(sent) > 0].tolist() == widths_sent(rig)
+        assert "journal is damaged" in recording.attributes["journal_note"]
+        if 0 in lost:
+            assert "which segments pulses 21 to" in recording.attributes["journal_note"]
+            assert "added" not in recording.names
