@@ -126,8 +126,8 @@ Percent = Annotated[FiniteFloat, Field(ge=LEAST_PERCENT, le=MOST_PERCENT)]
 class TargetIn(Body):
     """What a test that stops itself must reach: half-widths of the 95 % bands of whole curves, %."""
 
-    curve_percent: Percent = Field(2.0, description="of the recruitment curve, % of its plateau")
-    step_percent: Percent = Field(2.0, description="of the response to a unit step, %")
+    curve_percent: Percent = Field(default=2.0, description="of the recruitment curve, % of its plateau")
+    step_percent: Percent = Field(default=2.0, description="of the response to a unit step, %")
 
 
 class TestIn(Body):
@@ -137,33 +137,44 @@ class TestIn(Body):
 
     participant: Code
     kind: Annotated[str, StringConstraints(pattern=r"^[a-z-]{1,40}$")] = "pre-session"
-    profile: ProfileIn | None = Field(None, description="for this test alone, never wider than the participant's own")
+    profile: ProfileIn | None = Field(
+        default=None, description="for this test alone, never wider than the participant's own"
+    )
     segments: Annotated[list[SegmentIn], Field(min_length=1, max_length=200)] | None = Field(
-        None, description="None: those of the protocol"
+        default=None, description="None: those of the protocol"
     )
     protocol: Annotated[str, StringConstraints(pattern=r"^[a-z-]{1,40}$")] | None = Field(
-        None, description="a whole test by its id in `GET /v1/sequences`; None: the default. Not together with segments"
+        default=None,
+        description="a whole test by its id in `GET /v1/sequences`; None: the default. Not together with segments",
     )
     pulse_rate_hz: Annotated[FiniteFloat, Field(ge=1, le=100)] = 40.0
     max_pulse_width_us: FiniteFloat | None = Field(
-        None, ge=LIMITS["max_pulse_width_us"].least, description="for this test alone, if tighter, µs"
+        default=None, ge=LIMITS["max_pulse_width_us"].least, description="for this test alone, if tighter, µs"
     )
     max_torque_nm: FiniteFloat | None = Field(
-        None, ge=LIMITS["max_torque_nm"].least, description="for this test alone, if tighter, N·m"
+        default=None, ge=LIMITS["max_torque_nm"].least, description="for this test alone, if tighter, N·m"
     )
-    ran_by: PersonName | None = Field(None, description="who runs it at the rig, if that is not who asks for it")
+    ran_by: PersonName | None = Field(
+        default=None, description="who runs it at the rig, if that is not who asks for it"
+    )
     joins: Annotated[str, StringConstraints(max_length=64)] | None = Field(
-        None, description="a model: the new recording is joined to that model's, and both are judged together"
+        default=None, description="a model: the new recording is joined to that model's, and both are judged together"
     )
-    target: TargetIn = Field(TargetIn(), description="kind `adaptive`: what must be known before the test stops")
+    target: TargetIn = Field(
+        default=TargetIn(), description="kind `adaptive`: what must be known before the test stops"
+    )
     max_duration_s: FiniteFloat | None = Field(
-        None, ge=5, le=300, description="kind `adaptive`: the longest test, s; None: 45"
+        default=None, ge=5, le=300, description="kind `adaptive`: the longest test, s; None: 50"
     )
     max_torque_time_nm_s: FiniteFloat | None = Field(
-        None, gt=0, le=10_000, description="kind `adaptive`: the largest torque-time, N·m·s; None: 12 s at the torque "
-        "that stops a test"
-    )  # fmt: skip
-    anyway: StrictBool = Field(False, description="kind `adaptive`: play it although the target is out of reach")
+        default=None,
+        gt=0,
+        le=10_000,
+        description="kind `adaptive`: the largest torque-time, N·m·s; None: 12 s at the torque that stops a test",
+    )
+    anyway: StrictBool = Field(
+        default=False, description="kind `adaptive`: play it although the target is out of reach"
+    )
 
     @model_validator(mode="after")
     def _of_its_kind(self) -> TestIn:

@@ -57,7 +57,7 @@ def test_a_test_stops_itself_once_enough_is_known(client: httpx.Client, service:
         from api.store.tables import Test
 
         plan = session.get(Test, document["id"]).plan
-    assert plan["adaptive"] == {"max_duration_s": 45.0, "max_torque_time_nms": 360.0}
+    assert plan["adaptive"] == {"max_duration_s": 50.0, "max_torque_time_nms": 360.0}
     assert "key" not in plan and service.rig.key not in str(plan)
 
 

@@ -41,7 +41,7 @@ def test(
         str, typer.Option(help="with --adaptive: half-widths of the bands of curve and step response, %", metavar="C,S")
     ] = "",
     max_time: Annotated[
-        float | None, typer.Option(help="with --adaptive: longest test, s; default 45", show_default=False)
+        float | None, typer.Option(help="with --adaptive: longest test, s; default 50", show_default=False)
     ] = None,
     max_torque_time: Annotated[
         float | None,

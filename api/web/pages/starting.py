@@ -95,8 +95,8 @@ def warnings(row: Participant, standing: Calibrated) -> list[str]:
 
 def out_of_reach(preview: dict[str, Any]) -> list[str]:
     """That a test which stops itself will probably not reach its target, with what it can."""
-    reach = preview.get("reach") or {"reachable": True}
-    return [] if reach["reachable"] else [reach["words"]]
+    reach = preview.get("reach")
+    return [] if reach is None or reach["reachable"] else [reach["words"]]
 
 
 def rows(row: Participant, preview: dict[str, Any], standing: Calibrated, ran_by: str, rig: str) -> list[Row]:
