@@ -27,6 +27,8 @@ from rig.signals import Ack, LateError, Pulse, PulseStatus
 LATE_ACK_S = 0.015
 """Real seconds. A slower ack is noted in the recording: the pulse may have been felt that late, and at 40 pulses/s the
 next one then follows too closely."""
+LATE_S = 0.002
+"""Rig seconds. Who follows a test learns of pulses that were sent later than this."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +77,8 @@ class Gate:
         self.dropped = 0
         self.not_sent: list[int] = []
         """Indices of the pulses that were dropped or refused: the muscle felt none."""
+        self.late: list[tuple[int, float]] = []
+        """Indices of the pulses that were written more than `LATE_S` late, and by how much, s."""
         stimulator.listen(self._acknowledged, on_lost)
 
     @property
@@ -94,7 +98,7 @@ class Gate:
         """Clear the counts of the previous test."""
         with self._lock:
             self.last_pulse_s, self.lateness_s, self.ack_delay_s = None, [], []
-            self.charge_uc, self.dropped, self.not_sent = 0.0, 0, []
+            self.charge_uc, self.dropped, self.not_sent, self.late = 0.0, 0, [], []
             self._recent.clear()
 
     def open(self, journal: Journal, table: dict[str, Limit]) -> None:
@@ -207,6 +211,8 @@ class Gate:
         self._recent.append((written_s, pulse.charge_uc))
         self.last_pulse_s = written_s
         self.lateness_s.append(written_s - due_s)
+        if written_s - due_s > LATE_S:
+            self.late.append((index, written_s - due_s))
         self.charge_uc += pulse.charge_uc
         journal.append(Kind.WRITTEN, jn.WRITTEN.pack(index, number, written_s))
         return PulseStatus.UNACKNOWLEDGED

@@ -460,6 +460,10 @@ class LiveEvent(Message):
     not_sent: list[int] = Field(
         default_factory=list, description="indices of pulses that were dropped or refused; adaptive tests only"
     )
+    late: list[tuple[int, float]] = Field(
+        default_factory=list,
+        description="index of each pulse that was sent more than 2 ms late, and by how much, s; adaptive tests only",
+    )
     samples: TorqueSamples | None = Field(None, description="for who subscribed with `samples`")
 
 

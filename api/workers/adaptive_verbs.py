@@ -121,6 +121,7 @@ class Running:
         torque_nm: list[float | None],
         laid_us: list[float],
         not_sent: list[int],
+        late: list[tuple[int, float]],
         segments: list[tuple[str, int, int]],
         torque_time_nm_s: float,
         measured_s: float,
@@ -131,9 +132,9 @@ class Running:
         ----------
         host_time_s, counter, torque_nm
             Samples that are new, as the rig tells them.
-        laid_us, not_sent, segments
-            Widths of all pulses that are laid, µs; which of them the muscle did not feel; name, first pulse and end of
-            each segment.
+        laid_us, not_sent, late, segments
+            Widths of all pulses that are laid, µs; which of them the muscle did not feel; which were felt late, and by
+            how much, s; name, first pulse and end of each segment.
         torque_time_nm_s, measured_s
             Torque-time that was measured, N·m·s, and until when, s.
         """
@@ -143,7 +144,7 @@ class Running:
             held.extend(new)  # pyright: ignore[reportArgumentType]
         for index in not_sent:
             laid_us[index] = 0.0
-        record = record_of(*self.samples, laid_us, segments, self.rate_hz)
+        record = record_of(*self.samples, laid_us, late, segments, self.rate_hz)
         committed_nm_s = self._expected(laid_us[round(measured_s * self.rate_hz) :])
         found = decide(
             record,

@@ -16,6 +16,7 @@ def record_of(
     counter: list[int],
     torque_nm: list[float | None],
     laid_us: list[float],
+    late: list[tuple[int, float]],
     segments: list[tuple[str, int, int]],
     rate_hz: float,
 ) -> Any:
@@ -35,14 +36,17 @@ def record_of(
     widths = np.asarray(laid_us, float)
     starts = np.array([start for _, start, _ in segments])
     code = np.searchsorted(starts, slot, side="right") - 1
-    due, none = np.arange(widths.size) / rate_hz, np.zeros(widths.size)
+    due, late_s = np.arange(widths.size) / rate_hz, np.zeros(widths.size)
+    for index, by_s in late:
+        late_s[index] = by_s
     return Record.from_arrays(
         time_s,
         widths[slot],
         torque,
         code,
         segment_names=[name for name, _, _ in segments],
-        pulses=Pulses(due, widths, none, none.astype(bool)),
+        late_s=late_s[slot],
+        pulses=Pulses(due, widths, late_s, np.zeros(widths.size, bool)),
         pulse_rate_hz=rate_hz,
     )
 

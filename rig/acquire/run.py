@@ -162,6 +162,11 @@ class TestRun:
         return list(self._gate.not_sent)
 
     @property
+    def late(self) -> list[tuple[int, float]]:
+        """Indices of the pulses that were sent late so far, and by how much, s."""
+        return list(self._gate.late)
+
+    @property
     def sent(self) -> int:
         """Number of pulses sent so far."""
         return len(self._gate.lateness_s)

@@ -77,7 +77,11 @@ def _of_run(run: TestRun, now_s: float, first_pulse: int) -> dict[str, Any]:
         "laid": len(laid),
         "boundary_s": len(laid) / rate_hz,
         "ended_by": run.ended_by,
-        **({"laid_segments": run.score.segments(), "not_sent": run.not_sent} if run.score.adaptive else {}),
+        **(
+            {"laid_segments": run.score.segments(), "not_sent": run.not_sent, "late": run.late}
+            if run.score.adaptive
+            else {}
+        ),
     }
 
 

@@ -62,12 +62,21 @@ def test_lost_samples_and_none_move_nothing() -> None:
     for lost in ((0, 0), (1600, 1900)):
         news = Cell(muscle, 2).news(widths, 2.5, lost)
         news["torque_nm"][100] = None
-        records.append(live_record.record_of(*news.values(), widths, segments, PULSE_RATE_HZ))
+        records.append(live_record.record_of(*news.values(), widths, [], segments, PULSE_RATE_HZ))
     whole, holed = records
     assert whole.time_s.size - holed.time_s.size == pytest.approx(300 / 8, abs=2)
     kept = np.isin(whole.time_s, holed.time_s)
     assert np.abs(np.interp(holed.time_s, whole.time_s[kept], whole.torque_nm[kept]) - holed.torque_nm).max() < 0.05
     assert np.array_equal(holed.pulses.width_us, widths)
+
+
+def test_a_late_pulse_is_late_in_the_record() -> None:
+    news = Cell(sigmoid(72), 2).news(OPENING, 2.5)
+    record = live_record.record_of(*news.values(), OPENING, [(30, 0.004)], [("opening", 0, len(OPENING))], 40.0)
+    late = (record.time_s >= 30 / 40.0) & (record.time_s < 31 / 40.0)
+    assert late.sum() == live_record.BINS
+    assert np.array_equal(record.late_s, np.where(late, 0.004, 0.0))
+    assert record.pulses.late_s[30] == 0.004
 
 
 def test_a_slow_cell_keeps_its_samples() -> None:
@@ -89,7 +98,7 @@ def test_a_test_is_advised_to_its_end(seed: int, dropped: float) -> None:
         felt = [0.0 if index in not_sent else width for index, width in enumerate(widths)]
         dose = float(np.sum(muscle.curve(np.array(felt)))) / PULSE_RATE_HZ
         news = cell.news(felt, end_s - 0.4)
-        laid = {"laid_us": list(widths), "not_sent": not_sent, "segments": segments}
+        laid = {"laid_us": list(widths), "not_sent": not_sent, "late": [], "segments": segments}
         told = verbs.advise(quiet, **news, **laid, torque_time_nm_s=dose, measured_s=end_s - 0.4)
         json.dumps(told, allow_nan=False)
         if told["kind"] != "next":

@@ -73,6 +73,17 @@ def test_lateness_charge_and_delay_are_those_of_the_pulses_sent(tmp_path: Path):
     assert [jn.ACKED.unpack(p) for p in blocks(setup, Kind.ACKED)] == [(3, pytest.approx(now_s + 0.004))]
 
 
+def test_who_follows_a_test_learns_which_pulses_were_late(tmp_path: Path):
+    setup = Setup(tmp_path)
+    for index, late_s in ((3, 0.001), (4, 0.005)):
+        now_s = setup.clock.now_s()
+        setup.gate.fire(index, Pulse(100.0, 20.0), now_s - late_s, now_s)
+        setup.wait(0.025)
+    assert setup.gate.late == [(4, pytest.approx(0.005))]
+    setup.gate.reset()
+    assert setup.gate.late == []
+
+
 @pytest.mark.parametrize(
     ("width_us", "current_ma", "status"),
     [
