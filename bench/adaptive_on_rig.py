@@ -23,6 +23,7 @@ import numpy as np
 
 from api.cli.launcher import Services
 from api.client.documents import SessionTest
+from api.client.errors import NotCompleted
 from api.client.rest import Client
 from api.settings import Settings
 from bench.adaptive import unseen_percent
@@ -117,13 +118,19 @@ def main() -> int:
     parser.add_argument("--json", type=Path, help="every row goes here, one a line")
     settings = parser.parse_args()
     rows: list[dict[str, Any]] = []
+    failed: list[str] = []
     for seed in range(settings.seeds, settings.seeds + settings.patients):
         with tempfile.TemporaryDirectory(prefix="adaptive-") as folder:
-            rows.append(one(seed, Path(folder)))
+            try:
+                rows.append(one(seed, Path(folder)))
+            except NotCompleted as error:  # the machine stood still, and the rig stopped
+                failed.append(f"{seed}: {error}")
+                print(failed[-1], file=sys.stderr, flush=True)
+                continue
         print(json.dumps(rows[-1]), file=sys.stderr, flush=True)
         if settings.json is not None:
             settings.json.write_text("\n".join(json.dumps(row) for row in rows))
-    print(*lines_of(rows), sep="\n")
+    print(*(lines_of(rows) if rows else []), *failed, sep="\n")
     return 0
 
 
