@@ -434,6 +434,13 @@ class StateEvent(Message):
     status: Status
 
 
+class LatePulse(Message):
+    """A pulse that was sent late."""
+
+    index: int
+    by_s: float
+
+
 class LiveEvent(Message):
     """Data for a page's chart, about 20 times per second while torque arrives."""
 
@@ -460,9 +467,8 @@ class LiveEvent(Message):
     not_sent: list[int] = Field(
         default_factory=list, description="indices of pulses that were dropped or refused; adaptive tests only"
     )
-    late: list[tuple[int, float]] = Field(
-        default_factory=list,
-        description="index of each pulse that was sent more than 2 ms late, and by how much, s; adaptive tests only",
+    late: list[LatePulse] = Field(
+        default_factory=list, description="pulses that were sent more than 2 ms late; adaptive tests only"
     )
     samples: TorqueSamples | None = Field(None, description="for who subscribed with `samples`")
 

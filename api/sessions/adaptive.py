@@ -188,7 +188,8 @@ class Follower:
         news, self._new = self._new, {name: [] for name in self._new}
         widths, segments = self._laid(event)
         said = await self.adviser.ask(
-            "adaptive_advise", **news, laid_us=widths, not_sent=event.not_sent, late=event.late, segments=segments,
+            "adaptive_advise", **news, laid_us=widths, not_sent=event.not_sent, segments=segments,
+            late=[(pulse.index, pulse.by_s) for pulse in event.late],
             torque_time_nm_s=event.torque_time_nms, measured_s=event.elapsed_s,
         )  # fmt: skip
         self._took_s = self.clock.monotonic_s() - heard_s

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rig.acquire.receiver import Receiver
 from rig.acquire.run import TestRun
-from rig.messages import LiveEvent, TorqueSamples
+from rig.messages import LatePulse, LiveEvent, TorqueSamples
 
 BIN_S = 0.01
 
@@ -78,11 +78,15 @@ def _of_run(run: TestRun, now_s: float, first_pulse: int) -> dict[str, Any]:
         "boundary_s": len(laid) / rate_hz,
         "ended_by": run.ended_by,
         **(
-            {"laid_segments": run.score.segments(), "not_sent": run.not_sent, "late": run.late}
+            {"laid_segments": run.score.segments(), "not_sent": run.not_sent, "late": _late(run)}
             if run.score.adaptive
             else {}
         ),
     }
+
+
+def _late(run: TestRun) -> list[LatePulse]:
+    return [LatePulse(index=index, by_s=round(by_s, 6)) for index, by_s in run.late]
 
 
 def _samples(found: NDArray[Any], origin_s: float) -> TorqueSamples:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -113,6 +114,20 @@ def test_a_watcher_learns_which_pulses_were_not_sent(make: Make):
     with h5py.File(str(finished.recording_path)) as file:
         dropped = np.flatnonzero(file["pulses/status"][:] == PulseStatus.DROPPED).tolist()
     assert event.not_sent == dropped[: len(event.not_sent)]
+
+
+def test_a_live_event_is_read_as_it_was_sent(make: Make):
+    live = make()
+    live.rig.start(plan(live, hold_s=20.0), KEY)
+    live.wait_pulses(5)
+    run = live.rig._run
+    assert run is not None
+    run._gate.late, run._gate.not_sent = [(3, 0.004)], [4]
+    event = None
+    while event is None:
+        event = live.rig.live(samples=True)
+    assert [(pulse.index, pulse.by_s) for pulse in event.late] == [(3, 0.004)]
+    assert LiveEvent.model_validate(json.loads(event.model_dump_json())) == event
 
 
 def test_only_who_started_it_extends_it(make: Make):
