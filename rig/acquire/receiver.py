@@ -99,7 +99,7 @@ class Receiver:
         self.last_torque_nm: float | None = None
         self.peak_nm = 0.0
         self.range_nm = (np.inf, -np.inf)
-        self._unmeant_nm = np.empty(0)
+        self._unaveraged_nm = np.empty(0)
         self.live: deque[NDArray[Any]] = deque(maxlen=LIVE_BLOCKS)
         self.recent: deque[tuple[float, float]] = deque(maxlen=400)
 
@@ -137,7 +137,7 @@ class Receiver:
             self._plausibility = plausibility
             self._journal, self._limits_nm, self._on_fault = journal, limits_nm, on_fault
             self.counts, self.peak_nm, self.range_nm = Recorded(), 0.0, (np.inf, -np.inf)
-            self._unmeant_nm = np.empty(0)
+            self._unaveraged_nm = np.empty(0)
 
     def release(self) -> Recorded:
         """Stop recording; returns the counts since `record`."""
@@ -268,10 +268,10 @@ class Receiver:
 
     def _widen(self, torque_nm: NDArray[np.float64]) -> None:
         """Widen the range by means over `RANGE_MEAN_S`: however the bus cut the samples into blocks."""
-        samples = np.concatenate([self._unmeant_nm, torque_nm])
+        samples = np.concatenate([self._unaveraged_nm, torque_nm])
         each = max(1, round(RANGE_MEAN_S * self.nominal_rate_hz))
         whole = len(samples) // each * each
-        self._unmeant_nm = samples[whole:]
+        self._unaveraged_nm = samples[whole:]
         if whole:
             means_nm = samples[:whole].reshape(-1, each).mean(axis=1)
             lo_nm, hi_nm = self.range_nm

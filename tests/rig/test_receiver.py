@@ -69,15 +69,14 @@ def test_what_is_told_of_the_newest_sample():
 def test_the_range_does_not_depend_on_how_the_bus_cut_the_samples(tmp_path: Path, per_block: int):
     clock = VirtualClock()
     receiver = Receiver(FakeCell(clock, FakeStimulator(clock)), clock, lambda _: None)
-    torque_nm = np.random.default_rng(0).normal(2.0, 0.1, 1000)
+    torque_nm = np.random.default_rng(0).normal(2.0, 0.1, 999)
     for name in ("first", "again"):  # what the first recording left over is not part of the next
         receiver.record(Journal(tmp_path / name), (-10, 10), lambda _: None)
         for at in range(0, 999, per_block):
-            part = torque_nm[at : min(at + per_block, 999)]
-            samples = block(list(range(len(part)))).samples
-            samples["counter"] = (0 if name == "first" else 2000) + at + np.arange(len(part))
-            samples["torque_nm"] = part
-            receiver.take(TorqueBlock(samples))
+            part = block(list(range(at, min(at + per_block, 999))))
+            part.samples["counter"] += 0 if name == "first" else 2000
+            part.samples["torque_nm"] = torque_nm[at : at + per_block]
+            receiver.take(part)
         means_nm = torque_nm[:992].reshape(-1, 16).mean(axis=1)  # 10 ms at 1600 samples/s
         assert receiver.range_nm == pytest.approx((means_nm.min(), means_nm.max()))
 
