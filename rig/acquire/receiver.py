@@ -136,8 +136,16 @@ class Receiver:
         with self._lock:
             self._plausibility = plausibility
             self._journal, self._limits_nm, self._on_fault = journal, limits_nm, on_fault
-            self.counts, self.peak_nm, self.range_nm = Recorded(), 0.0, (np.inf, -np.inf)
-            self._unaveraged_nm = np.empty(0)
+            self.counts, self.peak_nm = Recorded(), 0.0
+            self._begin_range()
+
+    def begin_range(self) -> None:
+        """Forget the range until now: the limb may have moved before the first pulse."""
+        with self._lock:
+            self._begin_range()
+
+    def _begin_range(self) -> None:
+        self.range_nm, self._unaveraged_nm = (np.inf, -np.inf), np.empty(0)
 
     def release(self) -> Recorded:
         """Stop recording; returns the counts since `record`."""

@@ -208,6 +208,7 @@ class TestRun:
             due_s = t0_s + index * period_s
             if index == first:
                 self._rest_nm = self._receiver.torque_around(0.1 * clock.speed)  # before the first pulse: at rest
+                self._receiver.begin_range()
             if clock.wait(due_s, self.halt.event):
                 return
             self._asked_s = clock.now_s()
@@ -282,7 +283,7 @@ class TestRun:
         )
 
     def _rise_nm(self) -> float | None:
-        """Largest change of the torque from rest, N·m."""
+        """Largest change of the torque from rest since the first pulse, N·m; None if that is not known."""
         lo_nm, hi_nm = self._receiver.range_nm
         if self._rest_nm is None or not (lo_nm <= hi_nm):
             return None
