@@ -101,7 +101,7 @@ class Receiver:
         self.peak_nm = 0.0
         self.range_nm = (np.inf, -np.inf)
         self.torque_time = TorqueTime()
-        self._unmeant_nm = np.empty(0)
+        self._unaveraged_nm = np.empty(0)
         self.live: deque[NDArray[Any]] = deque(maxlen=LIVE_BLOCKS)
         self.recent: deque[tuple[float, float]] = deque(maxlen=400)
 
@@ -138,8 +138,16 @@ class Receiver:
         with self._lock:
             self._plausibility, self.torque_time = plausibility, TorqueTime()
             self._journal, self._limits_nm, self._on_fault = journal, limits_nm, on_fault
-            self.counts, self.peak_nm, self.range_nm = Recorded(), 0.0, (np.inf, -np.inf)
-            self._unmeant_nm = np.empty(0)
+            self.counts, self.peak_nm = Recorded(), 0.0
+            self._begin_range()
+
+    def begin_range(self) -> None:
+        """Forget the range until now: the limb may have moved before the first pulse."""
+        with self._lock:
+            self._begin_range()
+
+    def _begin_range(self) -> None:
+        self.range_nm, self._unaveraged_nm = (np.inf, -np.inf), np.empty(0)
 
     def release(self) -> Recorded:
         """Stop recording; returns the counts since `record`."""
@@ -272,10 +280,10 @@ class Receiver:
 
     def _widen(self, torque_nm: NDArray[np.float64]) -> None:
         """Widen the range by means over `RANGE_MEAN_S`: however the bus cut the samples into blocks."""
-        samples = np.concatenate([self._unmeant_nm, torque_nm])
+        samples = np.concatenate([self._unaveraged_nm, torque_nm])
         each = max(1, round(RANGE_MEAN_S * self.nominal_rate_hz))
         whole = len(samples) // each * each
-        self._unmeant_nm = samples[whole:]
+        self._unaveraged_nm = samples[whole:]
         if whole:
             means_nm = samples[:whole].reshape(-1, each).mean(axis=1)
             lo_nm, hi_nm = self.range_nm

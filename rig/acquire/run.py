@@ -247,8 +247,9 @@ class TestRun:
         clock.wait(t0_s + index * period_s, self.halt.event)
 
     def _at_rest(self) -> None:
-        """Right before the first pulse: what torque is rest, and no torque-time yet."""
+        """Right before the first pulse: what torque is rest, and no range or torque-time yet."""
         self._rest_nm = self._receiver.torque_around(0.1 * self._clock.speed)
+        self._receiver.begin_range()
         self._receiver.torque_time.begin(self._rest_nm or 0.0, self._clock.now_s())
 
     def _stop(self) -> StopEvidence:
@@ -318,7 +319,7 @@ class TestRun:
         )
 
     def _rise_nm(self) -> float | None:
-        """Largest change of the torque from rest, N·m."""
+        """Largest change of the torque from rest since the first pulse, N·m; None if that is not known."""
         lo_nm, hi_nm = self._receiver.range_nm
         if self._rest_nm is None or not (lo_nm <= hi_nm):
             return None

@@ -69,17 +69,27 @@ def test_what_is_told_of_the_newest_sample():
 def test_the_range_does_not_depend_on_how_the_bus_cut_the_samples(tmp_path: Path, per_block: int):
     clock = VirtualClock()
     receiver = Receiver(FakeCell(clock, FakeStimulator(clock)), clock, lambda _: None)
-    torque_nm = np.random.default_rng(0).normal(2.0, 0.1, 1000)
-    for name in ("first", "again"):  # what the first recording left over is not part of the next
+    for name in ("first", "again"):  # what the first recording left over is not part of the next, nor is its range
+        torque_nm = np.random.default_rng(0).normal(2.0, 0.1 if name == "first" else 0.01, 999)
         receiver.record(Journal(tmp_path / name), (-10, 10), lambda _: None)
         for at in range(0, 999, per_block):
-            part = torque_nm[at : min(at + per_block, 999)]
-            samples = block(list(range(len(part)))).samples
-            samples["counter"] = (0 if name == "first" else 2000) + at + np.arange(len(part))
-            samples["torque_nm"] = part
-            receiver.take(TorqueBlock(samples))
+            part = block(list(range(at, min(at + per_block, 999))))
+            part.samples["counter"] += 0 if name == "first" else 2000
+            part.samples["torque_nm"] = torque_nm[at : at + per_block]
+            receiver.take(part)
         means_nm = torque_nm[:992].reshape(-1, 16).mean(axis=1)  # 10 ms at 1600 samples/s
         assert receiver.range_nm == pytest.approx((means_nm.min(), means_nm.max()))
+
+
+def test_every_sample_of_a_slow_cell_counts_for_the_range(tmp_path: Path):
+    clock = VirtualClock()
+    cell = FakeCell(clock, FakeStimulator(clock))
+    cell.sample_rate_hz = 10.0
+    receiver = Receiver(cell, clock, lambda _: None)
+    receiver.record(Journal(tmp_path / "j"), (-10, 10), lambda _: None)
+    receiver.take(block([1], torque_nm=1.0))
+    receiver.take(block([2], torque_nm=3.0))
+    assert receiver.range_nm == (1.0, 3.0)
 
 
 class SilentCell(FakeCell):

@@ -223,12 +223,18 @@ def test_a_stop_waits_for_the_torque_of_a_host_that_paused(tmp_path: Path, held_
     assert result.evidence.confirmed is confirmed, result.evidence.detail
 
 
-def test_a_rest_is_measured_again_at_the_first_pulse(tmp_path: Path):
+@pytest.mark.parametrize("moved_nm", [3.0, -8.0])
+def test_a_rest_is_measured_again_at_the_first_pulse(tmp_path: Path, moved_nm: float):
     """The limb moved between arming and the first pulse: by what is not the muscle's."""
+    (tmp_path / "still").mkdir()
+    still_nm = VirtualRig(tmp_path / "still").execute().rise_nm
     rig = VirtualRig(tmp_path)
-    rig.at(0.1, lambda: setattr(rig.cell, "add_nm", 3.0))
+    rig.at(0.1, lambda: setattr(rig.cell, "add_nm", 0.5 * moved_nm))  # slowly enough to be no knock
+    rig.at(0.2, lambda: setattr(rig.cell, "add_nm", moved_nm))
     result = rig.execute()
-    assert result.rise_nm == pytest.approx(result.peak_nm - 3.0, abs=0.01)
+    assert result.outcome == "completed", result.reason
+    assert still_nm is not None and 1.0 < still_nm < 8.0
+    assert result.rise_nm == pytest.approx(still_nm, abs=0.01)
 
 
 class Heard:

@@ -55,7 +55,7 @@ def test_a_calibration_from_start_to_a_test(shared: tuple[Bench, RigClient]):
     assert [round(p["width_us"]) for p in pulses] == played
     assert [t["pulse_width_us"] for t in trains if t["pulses"]] == [25, 50, 75, 100, 125, 150, 175, 200]
     rise_nm = [t["torque_rise_nm"] for t in trains if t["torque_rise_nm"] is not None]
-    assert rise_nm[-1] > 2 * rise_nm[0]
+    assert rise_nm[-1] > 5 * rise_nm[0]
     result = client.ask("calibrate-finish", by="therapist")["body"]
     profile = result["profile"]
     assert profile["max_pulse_width_us"] == 200.0
