@@ -6,6 +6,7 @@ The test that runs stays in this process between two calls: a call brings only t
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import Any
 
 from api.workers.json_values import clean
@@ -56,12 +57,16 @@ def warm() -> None:
 def known(models: Sequence[str]) -> dict[str, Any]:
     """The last model and how much the person changes between sessions; nothing of a new person.
 
-    A last model of another kind than the adaptive test fits is no help, and none is taken.
+    A model that cannot be read here, for it holds an effect that is not installed, is left out. A last model of another
+    kind than the adaptive test fits is no help, and none is taken.
     """
     import identify
     from identify.estimation.earlier import Earlier, learn_change
 
-    read = [identify.Model.from_json(text) for text in models]
+    read: list[identify.Model] = []
+    for text in models:
+        with suppress(identify.IdentifyError):
+            read.append(identify.Model.from_json(text))
     if not read:
         return {}
     change = learn_change(read)

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+import identify
 from api.workers import adaptive_verbs as verbs
 from api.workers import live_record
-from tests.harness.adaptive import PULSE_RATE_HZ, Muscle, sigmoid
+from tests.harness.adaptive import PULSE_RATE_HZ, Muscle, recorded, sigmoid
 
 HOW: dict[str, Any] = {
     "target": {"curve_percent": 4.0, "step_percent": 4.0},
@@ -121,3 +122,12 @@ def test_a_new_test_forgets_the_one_before() -> None:
     first = verbs._running[0]
     verbs.begin(quiet, **HOW)
     assert verbs._running != [first] and len(verbs._running) == 1
+
+
+def test_a_model_that_cannot_be_read_here_keeps_nobody_from_a_test() -> None:
+    widths = np.array([*OPENING, *[150.0] * 80])
+    noise_nm = 0.05 * np.random.default_rng(3).standard_normal(4000)
+    record = recorded(sigmoid(74), widths, ["opening"] * widths.size, noise_nm)
+    readable = identify.fit(record, recruitment="near-sigmoid").to_json()
+    assert set(verbs.known([readable, "{}"])) == {"earlier", "change"}
+    assert verbs.known(["{}", "no JSON"]) == {}
