@@ -1,22 +1,27 @@
 """The rig's protocols on the same simulated muscles: accuracy on unseen input, dose and time, beside the paper's test.
 
-    python -m bench.protocols [--seeds 1000:1020] [--steep] [--noise-sd-nm 0.05] [--json]
+    python -m bench.protocols [--seeds 1000:1020] [--steep] [--hidden] [--noise-sd-nm 0.05] [--json]
 
 Plain Hammerstein muscles of the emulator (`hardware_sim.patients.hidden`), sampled at 400 Hz. Each protocol's record is
 fitted; the model then predicts 30 s of levels that no protocol plays, without noise. Development used seeds below 100.
+With `--hidden` each seed is a muscle with one hidden effect, in turn every effect of middle and strong strength, and
+every fourth one a muscle without any; told is what the diagnosis of each protocol's record names.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import sys
 from typing import Any
 
 import numpy as np
 
 from hardware_sim.hidden_records import sampled
 from hardware_sim.patients.hidden.design import Design, make_design
-from hardware_sim.patients.hidden.draw import Scenario, draw_scenario, rng_of
+from hardware_sim.patients.hidden.draw import Scenario, draw_scenario, rng_of, still_effect_ids
+from identify.diagnosis import candidates as workers
+from identify.diagnosis import diagnose
 from identify.fitting import fit
 from identify.records.record import Record
 from rig import limits, plan, protocols
@@ -25,6 +30,7 @@ from tests.harness.carried_sessions import as_record
 
 RATE_HZ = 400.0
 UNSEEN_S = 30.0
+STRENGTHS = ("middle", "strong")
 
 
 def measure(seeds: range, steep: bool, noise_sd_nm: float) -> list[dict[str, Any]]:
@@ -47,6 +53,40 @@ def measure(seeds: range, steep: bool, noise_sd_nm: float) -> list[dict[str, Any
                 "unseen_fit": _unseen(record, truth),
             })  # fmt: skip
     return rows
+
+
+def name_hidden(seeds: range, noise_sd_nm: float) -> list[dict[str, Any]]:
+    """What the diagnosis names of each muscle, one row for each protocol."""
+    workers.WORKERS = 1
+    rows = []
+    for seed in seeds:
+        names, number = still_effect_ids(), seed - seed // 4
+        effect = names[number % len(names)] if seed % 4 else ""
+        strength = STRENGTHS[number // len(names) % 2]
+        scenario = draw_scenario((effect,) if effect else (), strength, seed, noise_sd_nm=noise_sd_nm)
+        for protocol in protocols.library():
+            design = _design(protocol, float(np.floor(scenario.base.largest_width_us)))
+            found = diagnose(_record(scenario, design, rng_of(seed, "noise", protocol), noise_sd_nm))
+            rows.append({
+                "seed": seed, "effect": effect, "strength": strength, "protocol": protocol, "verdict": found.verdict,
+                "named": [entry["effect"] for entry in found.missing],
+                "group": found.missing[0]["confused_with"] if found.missing else [],
+            })  # fmt: skip
+            print(json.dumps(rows[-1]), file=sys.stderr, flush=True)
+    return rows
+
+
+def _told_of_hidden(rows: list[dict[str, Any]]) -> None:
+    print("| protocol | named first | or in its group | nothing named | nothing hidden, and said so |")
+    print("|---" * 5 + "|")
+    for protocol in protocols.library():
+        of = [row for row in rows if row["protocol"] == protocol and row["effect"]]
+        first = sum(row["named"][:1] == [row["effect"]] for row in of)
+        group = sum(row["effect"] in [*row["named"][:1], *row["group"]] for row in of)
+        nothing = sum(not row["named"] for row in of)
+        plain = [row["verdict"] for row in rows if row["protocol"] == protocol and not row["effect"]]
+        said = f"{plain.count('nothing_missing')} of {len(plain)}"
+        print(f"| {protocol} | {first} of {len(of)} | {group} | {nothing} | {said} |")
 
 
 def _design(protocol: str, largest_us: float) -> Design:
@@ -79,10 +119,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--seeds", default="1000:1020", help="first:last, last not included")
     parser.add_argument("--steep", action="store_true", help="recruitment that rises within 5 to 25 µs")
+    parser.add_argument("--hidden", action="store_true", help="what the diagnosis names")
     parser.add_argument("--noise-sd-nm", type=float, default=0.05)
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     first, last = map(int, options.seeds.split(":"))
+    if options.hidden:
+        _told_of_hidden(name_hidden(range(first, last), options.noise_sd_nm))
+        return
     rows = measure(range(first, last), options.steep, options.noise_sd_nm)
     if options.json:
         print(json.dumps(rows))
