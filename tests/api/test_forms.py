@@ -34,9 +34,14 @@ def fields(tab: httpx.Client, page: str = PAGE) -> dict[str, str]:
 
 def inputs(html: str, page: str = PAGE) -> dict[str, str]:
     form = next(part for part in html.split("<form")[1:] if f'action="{page}' in part.split(">")[0])
-    tags = re.findall(r"<input[^>]*>", form.split("</form>")[0])
+    tags = [tag for tag in re.findall(r"<input[^>]*>", form.split("</form>")[0]) if _sent(tag)]
     found = [re.search(r'name="([^"]*)".*value="([^"]*)"', tag) for tag in tags]
     return {match[1]: match[2] for match in found if match}
+
+
+def _sent(tag: str) -> bool:
+    """Of choices only the chosen one."""
+    return not re.search(r'type="(radio|checkbox)"', tag) or " checked" in tag
 
 
 def send(tab: httpx.Client, path: str = f"{PAGE}/profile", **typed_texts: str) -> httpx.Response:
