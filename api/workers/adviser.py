@@ -7,6 +7,7 @@ import itertools
 import logging
 from typing import Any
 
+from api.errors import ApiError
 from api.workers.process import WORKER, Call, Places, Worker
 
 log = logging.getLogger("stimrig.adviser")
@@ -30,6 +31,8 @@ class Adviser:
         self.worker = Worker(command, places or Places())
         self._numbers = itertools.count(1)
         self._turn = asyncio.Lock()
+        self._knows: asyncio.subprocess.Process | None = None
+        """The process that keeps the test."""
 
     async def ask(self, verb: str, **arguments: Any) -> dict[str, Any]:
         """Its answer.
@@ -40,7 +43,13 @@ class Adviser:
             The worker refused, took too long or died; the next question starts a new one, which knows of no test.
         """
         async with self._turn:
-            return await self.worker.run(Call(next(self._numbers), verb, arguments))
+            if verb == "adaptive_advise" and await self.worker.start() is not self._knows:
+                detail = "It ended between two questions. Your data are safe. Try again, or see logs/api.log."
+                raise ApiError(500, "worker-died", "The worker process died", detail)
+            found = await self.worker.run(Call(next(self._numbers), verb, arguments))
+            if verb == "adaptive_begin":
+                self._knows = self.worker.process
+            return found
 
     async def close(self) -> None:
         """End the process."""

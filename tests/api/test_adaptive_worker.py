@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 from typing import Any
 
@@ -9,8 +10,10 @@ import numpy as np
 import pytest
 
 import identify
+from api.errors import ApiError
 from api.workers import adaptive_verbs as verbs
 from api.workers import live_record
+from api.workers.adviser import Adviser
 from tests.harness.adaptive import PULSE_RATE_HZ, Muscle, recorded, sigmoid
 
 HOW: dict[str, Any] = {
@@ -131,3 +134,20 @@ def test_a_model_that_cannot_be_read_here_keeps_nobody_from_a_test() -> None:
     readable = identify.fit(record, recruitment="near-sigmoid").to_json()
     assert set(verbs.known([readable, "{}"])) == {"earlier", "change"}
     assert verbs.known(["{}", "no JSON"]) == {}
+
+
+def test_a_worker_that_died_between_two_questions_is_told() -> None:
+    async def asked() -> None:
+        adviser = Adviser()
+        try:
+            await adviser.ask("adaptive_begin", **HOW)
+            assert adviser.worker.process is not None
+            adviser.worker.process.kill()
+            await adviser.worker.process.wait()
+            with pytest.raises(ApiError, match="between two questions"):
+                await adviser.ask("adaptive_advise", **Cell(sigmoid(71), 1).news([0.0] * 80, 2.0))
+            assert await adviser.ask("adaptive_begin", **HOW) == {}
+        finally:
+            await adviser.close()
+
+    asyncio.run(asked())

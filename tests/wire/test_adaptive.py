@@ -74,13 +74,15 @@ def test_a_test_stops_itself_and_is_identified(whole: Whole) -> None:
     print(told["ended"], told["problem"], told["torque_time_nm_s"], document["summary"])
     assert document["state"] == "completed", document["reason"]
     assert told["decisions"], told
-    assert told["problem"] == ""
     if told["ended"] == "known-enough":
+        assert told["problem"] == ""
         assert told["knowledge"]["curve_percent"] <= 4.0
         assert document["summary"]["duration_s"] < 38.7
-    else:  # the machine was too busy: then the fixed plan played, and the test never waited
+    else:  # the machine was too busy: answers came late, or pulses; then the fixed plan played, and it never waited
         assert told["ended"] == "fixed-rest"
-        assert all(row.get("late") or row.get("refused") or row["kind"] == "next" for row in told["decisions"])
+        kinds = {row["kind"] for row in told["decisions"] if not (row.get("late") or row.get("refused"))}
+        assert kinds <= {"next", "misfit"}
+        assert told["problem"] == "" or ("misfit" in kinds and document["summary"]["dropped_pulses"] > 0)
     assert document["fit"]["fit_percent"] > 90.0
 
 
