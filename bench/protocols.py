@@ -1,11 +1,12 @@
 """The rig's protocols on the same simulated muscles: accuracy on unseen input, dose and time, beside the paper's test.
 
-    python -m bench.protocols [--seeds 1000:1020] [--steep] [--hidden] [--noise-sd-nm 0.05] [--json]
+    python -m bench.protocols [--seeds 1000:1020] [--steep] [--noise-sd-nm 0.05] [--json]
+    python -m bench.protocols --hidden [--strengths middle,strong] [--seeds 1100:1164]
 
 Plain Hammerstein muscles of the emulator (`hardware_sim.patients.hidden`), sampled at 400 Hz. Each protocol's record is
 fitted; the model then predicts 30 s of levels that no protocol plays, without noise. Development used seeds below 100.
-With `--hidden` each seed is a muscle with one hidden effect, in turn every effect of middle and strong strength, and
-every fourth one a muscle without any; told is what the diagnosis of each protocol's record names.
+With `--hidden` each seed is a muscle with one hidden effect, in turn every effect in each strength, and every fourth
+one a muscle without any; told is what the diagnosis of each protocol's record names.
 """
 
 from __future__ import annotations
@@ -30,7 +31,6 @@ from tests.harness.carried_sessions import as_record
 
 RATE_HZ = 400.0
 UNSEEN_S = 30.0
-STRENGTHS = ("middle", "strong")
 
 
 def measure(seeds: range, steep: bool, noise_sd_nm: float) -> list[dict[str, Any]]:
@@ -55,14 +55,14 @@ def measure(seeds: range, steep: bool, noise_sd_nm: float) -> list[dict[str, Any
     return rows
 
 
-def name_hidden(seeds: range, noise_sd_nm: float) -> list[dict[str, Any]]:
+def name_hidden(seeds: range, strengths: list[str], noise_sd_nm: float) -> list[dict[str, Any]]:
     """What the diagnosis names of each muscle, one row for each protocol."""
     workers.WORKERS = 1
     rows = []
     for seed in seeds:
         names, number = still_effect_ids(), seed - seed // 4
         effect = names[number % len(names)] if seed % 4 else ""
-        strength = STRENGTHS[number // len(names) % 2]
+        strength = strengths[number // len(names) % len(strengths)]
         scenario = draw_scenario((effect,) if effect else (), strength, seed, noise_sd_nm=noise_sd_nm)
         for protocol in protocols.library():
             design = _design(protocol, float(np.floor(scenario.base.largest_width_us)))
@@ -120,12 +120,13 @@ def main() -> None:
     parser.add_argument("--seeds", default="1000:1020", help="first:last, last not included")
     parser.add_argument("--steep", action="store_true", help="recruitment that rises within 5 to 25 µs")
     parser.add_argument("--hidden", action="store_true", help="what the diagnosis names")
+    parser.add_argument("--strengths", default="middle,strong", help="of the hidden effects")
     parser.add_argument("--noise-sd-nm", type=float, default=0.05)
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     first, last = map(int, options.seeds.split(":"))
     if options.hidden:
-        _told_of_hidden(name_hidden(range(first, last), options.noise_sd_nm))
+        _told_of_hidden(name_hidden(range(first, last), options.strengths.split(","), options.noise_sd_nm))
         return
     rows = measure(range(first, last), options.steep, options.noise_sd_nm)
     if options.json:
