@@ -77,16 +77,14 @@ def _of_run(run: TestRun, now_s: float, first_pulse: int) -> dict[str, Any]:
         "laid": len(laid),
         "boundary_s": len(laid) / rate_hz,
         "ended_by": run.ended_by,
-        **(
-            {"laid_segments": run.score.segments(), "not_sent": run.not_sent, "late": _late(run)}
-            if run.score.adaptive
-            else {}
-        ),
+        **(_of_adaptive(run) if run.score.adaptive else {}),
     }
 
 
-def _late(run: TestRun) -> list[LatePulse]:
-    return [LatePulse(index=index, by_s=round(by_s, 6)) for index, by_s in run.late]
+def _of_adaptive(run: TestRun) -> dict[str, Any]:
+    """What whoever chooses its pieces needs."""
+    late = [LatePulse(index=index, by_s=round(by_s, 6)) for index, by_s in run.late]
+    return {"laid_segments": run.score.segments(), "not_sent": run.not_sent, "late": late}
 
 
 def _samples(found: NDArray[Any], origin_s: float) -> TorqueSamples:

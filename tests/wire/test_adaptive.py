@@ -11,6 +11,7 @@ from typing import Any
 
 import h5py
 import httpx
+import numpy as np
 import pytest
 
 from api.settings import Settings
@@ -103,6 +104,5 @@ def test_a_worker_that_is_killed_ends_in_the_fixed_plan(whole: Whole, tmp_path: 
     with h5py.File(path) as file:
         names = list(file["segments/name"].asstr()[:])
         assert names[0] == "opening" and {"prbs", "rest"} & set(names[1:])
-        starts_s, ends_s = file["segments/start_s"][:], file["segments/end_s"][:]
-        assert ends_s[-1] > after_s + 3.0
-        assert list(starts_s[1:]) == list(ends_s[:-1])  # it never waited
+        assert file["segments/end_s"][-1] > after_s + 3.0
+        assert np.any(file["pulses/sent_pulse_width_us"][round(40 * after_s) :] > 0)  # it did not wait, resting
