@@ -6,7 +6,8 @@
 Plain Hammerstein muscles of the emulator (`hardware_sim.patients.hidden`), sampled at 400 Hz. Each protocol's record is
 fitted; the model then predicts 30 s of levels that no protocol plays, without noise. Development used seeds below 100.
 With `--hidden` each seed is a muscle with one hidden effect, in turn every effect in each strength, and every fourth
-one a muscle without any; told is what the diagnosis of each protocol's record names.
+one a muscle without any; told is what the diagnosis of each protocol's record names. `--steep` and `--json` have no
+part in that.
 """
 
 from __future__ import annotations
@@ -77,16 +78,19 @@ def name_hidden(seeds: range, strengths: list[str], noise_sd_nm: float) -> list[
 
 
 def _told_of_hidden(rows: list[dict[str, Any]]) -> None:
-    print("| protocol | named first | or in its group | nothing named | nothing hidden, and said so |")
-    print("|---" * 5 + "|")
+    print(
+        "| protocol | named first | and 'effect missing' | or in its group | nothing named | nothing hidden, said so |"
+    )
+    print("|---" * 6 + "|")
     for protocol in protocols.library():
         of = [row for row in rows if row["protocol"] == protocol and row["effect"]]
         first = sum(row["named"][:1] == [row["effect"]] for row in of)
+        sure = sum(row["named"][:1] == [row["effect"]] and row["verdict"] == "effect_missing" for row in of)
         group = sum(row["effect"] in [*row["named"][:1], *row["group"]] for row in of)
         nothing = sum(not row["named"] for row in of)
         plain = [row["verdict"] for row in rows if row["protocol"] == protocol and not row["effect"]]
         said = f"{plain.count('nothing_missing')} of {len(plain)}"
-        print(f"| {protocol} | {first} of {len(of)} | {group} | {nothing} | {said} |")
+        print(f"| {protocol} | {first} of {len(of)} | {sure} | {group} | {nothing} | {said} |")
 
 
 def _design(protocol: str, largest_us: float) -> Design:

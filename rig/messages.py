@@ -468,7 +468,8 @@ class LiveEvent(Message):
         default_factory=list, description="indices of pulses that were dropped or refused; adaptive tests only"
     )
     late: list[LatePulse] = Field(
-        default_factory=list, description="pulses that were sent more than 2 ms late; adaptive tests only"
+        default_factory=list,
+        description="pulses that were sent more than 2 ms late; adaptive tests only, for who subscribed with `samples`",
     )
     samples: TorqueSamples | None = Field(None, description="for who subscribed with `samples`")
 

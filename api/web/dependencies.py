@@ -142,7 +142,7 @@ def _build(settings: Settings, clock: Clock, worker: tuple[str, ...], lock: Serv
     pool = Pool(settings.workers, worker, places(settings, store))
     versions = Versions(store, clock)
     analyses = Analyses(store, clock, pool, versions, settings)
-    adviser = Adviser(worker, pool.places)
+    adviser = Adviser(worker, places(settings, store))  # its own: a folder that the pool learns ends no test
     runner = Runner(store, clock, rig, pool, versions, analyses, adviser, settings.recordings_dir)
     jobs = Jobs(pool)
     people = People(store, clock, auth, guesses)

@@ -57,24 +57,26 @@ def warm() -> None:
 def known(models: Sequence[str]) -> dict[str, Any]:
     """The last model and how much the person changes between sessions; nothing of a new person.
 
-    A model that cannot be read here, for it holds an effect that is not installed, is left out. A last model of another
-    kind than the adaptive test fits is no help, and none is taken.
+    A model that cannot be read here is left out. A last model that cannot be read, or that is of another kind than the
+    adaptive test fits, is no help, and none is taken in its place.
     """
     import identify
     from identify.estimation.earlier import Earlier, learn_change
 
-    read: list[identify.Model] = []
+    read, last = [], None
     for text in models:
+        last = None
         with suppress(identify.IdentifyError):
-            read.append(identify.Model.from_json(text))
-    if not read:
+            last = identify.Model.from_json(text)
+            read.append(last)
+    if last is None:
         return {}
     change = learn_change(read)
     try:
-        Earlier(read[-1], change)
+        Earlier(last, change)
     except identify.IdentifyError:
         return {}
-    return {"earlier": read[-1], "change": change}
+    return {"earlier": last, "change": change}
 
 
 def begin(

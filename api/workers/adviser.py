@@ -44,8 +44,10 @@ class Adviser:
         """
         async with self._turn:
             if verb == "adaptive_advise" and await self.worker.start() is not self._knows:
-                detail = "It ended between two questions. Your data are safe. Try again, or see logs/api.log."
+                detail = "It ended between two questions. Your data are safe. See logs/api.log."
                 raise ApiError(500, "worker-died", "The worker process died", detail)
+            if verb == "adaptive_begin":
+                self._knows = None
             found = await self.worker.run(Call(next(self._numbers), verb, arguments))
             if verb == "adaptive_begin":
                 self._knows = self.worker.process

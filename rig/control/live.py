@@ -47,7 +47,7 @@ def live_event(
         torque_age_s=max(0.0, receiver.age_s(now_s)),
         lost_samples=receiver.counts.lost_samples,
         samples=_samples(found, origin_s) if samples else None,
-        **(_idle() if run is None else _of_run(run, now_s, first_pulse)),
+        **(_idle() if run is None else _of_run(run, now_s, first_pulse, samples)),
     )
 
 
@@ -58,7 +58,7 @@ def _idle() -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _of_run(run: TestRun, now_s: float, first_pulse: int) -> dict[str, Any]:
+def _of_run(run: TestRun, now_s: float, first_pulse: int, samples: bool) -> dict[str, Any]:
     """What the test has sent, and what is laid of it."""
     rate_hz, laid = run.plan.pulse_rate_hz, run.score.laid
     reached = 0 if run.t0_s is None else int(np.floor((now_s - run.t0_s) * rate_hz)) + 1
@@ -77,14 +77,14 @@ def _of_run(run: TestRun, now_s: float, first_pulse: int) -> dict[str, Any]:
         "laid": len(laid),
         "boundary_s": len(laid) / rate_hz,
         "ended_by": run.ended_by,
-        **(_of_adaptive(run) if run.score.adaptive else {}),
+        **(_of_adaptive(run, samples) if run.score.adaptive else {}),
     }
 
 
-def _of_adaptive(run: TestRun) -> dict[str, Any]:
-    """What whoever chooses its pieces needs."""
-    late = [LatePulse(index=index, by_s=round(by_s, 6)) for index, by_s in run.late]
-    return {"laid_segments": run.score.segments(), "not_sent": run.not_sent, "late": late}
+def _of_adaptive(run: TestRun, chooses: bool) -> dict[str, Any]:
+    """What whoever chooses its pieces needs. The segments last: they hold every pulse that is told before."""
+    late = [LatePulse(index=index, by_s=round(by_s, 6)) for index, by_s in run.late] if chooses else []
+    return {"not_sent": run.not_sent, "late": late, "laid_segments": run.score.segments()}
 
 
 def _samples(found: NDArray[Any], origin_s: float) -> TorqueSamples:

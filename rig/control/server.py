@@ -110,7 +110,7 @@ class Server:
             return
         full = to_line(event)
         with_samples = isinstance(event, LiveEvent) and event.samples is not None
-        plain = to_line(event.model_copy(update={"samples": None})) if with_samples else full
+        plain = to_line(event.model_copy(update={"samples": None, "late": []})) if with_samples else full
         for writer, samples in tuple(self._subscribers.items()):
             waiting = writer.transport.get_write_buffer_size()
             if waiting > DEAD_BYTES:

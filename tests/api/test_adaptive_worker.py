@@ -14,6 +14,8 @@ from api.errors import ApiError
 from api.workers import adaptive_verbs as verbs
 from api.workers import live_record
 from api.workers.adviser import Adviser
+from identify.experiments import adaptive
+from identify.experiments.adaptive import Decision
 from tests.harness.adaptive import PULSE_RATE_HZ, Muscle, recorded, sigmoid
 
 HOW: dict[str, Any] = {
@@ -120,6 +122,25 @@ def test_a_test_is_advised_to_its_end(seed: int, dropped: float) -> None:
     assert 0 <= told["least_known"]["pulse_width_us"] <= 300
 
 
+def test_what_was_late_or_not_sent_reaches_the_decision(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[Any] = []
+
+    def decide(record: Any, laid_us: Any, **_: Any) -> Decision:
+        seen.append((record.pulses.late_s[30], laid_us[31]))
+        return Decision("spent")
+
+    monkeypatch.setattr(adaptive, "decide", decide)
+    verbs.begin(quiet, **HOW)
+    laid = {
+        "laid_us": list(OPENING),
+        "not_sent": [31],
+        "late": [(30, 0.004)],
+        "segments": [("opening", 0, len(OPENING))],
+    }
+    verbs.advise(quiet, **Cell(sigmoid(72), 2).news(OPENING, 2.5), **laid, torque_time_nm_s=1.0, measured_s=2.5)
+    assert seen == [(0.004, 0.0)]
+
+
 def test_a_new_test_forgets_the_one_before() -> None:
     verbs.begin(quiet, **HOW)
     first = verbs._running[0]
@@ -132,8 +153,8 @@ def test_a_model_that_cannot_be_read_here_keeps_nobody_from_a_test() -> None:
     noise_nm = 0.05 * np.random.default_rng(3).standard_normal(4000)
     record = recorded(sigmoid(74), widths, ["opening"] * widths.size, noise_nm)
     readable = identify.fit(record, recruitment="near-sigmoid").to_json()
-    assert set(verbs.known([readable, "{}"])) == {"earlier", "change"}
-    assert verbs.known(["{}", "no JSON"]) == {}
+    assert set(verbs.known(["{}", readable])) == {"earlier", "change"}
+    assert verbs.known([readable, "{}"]) == verbs.known(["no JSON"]) == {}  # an older one is not the last one
 
 
 def test_a_worker_that_died_between_two_questions_is_told() -> None:

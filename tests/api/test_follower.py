@@ -10,7 +10,17 @@ import pytest
 
 from api.sessions import adaptive
 from api.sessions.adaptive import Follower
-from rig.messages import AHEAD, AdaptivePlan, ExtendRequest, LaidSegment, LiveEvent, Profile, SegmentPlan, TestPlan
+from rig.messages import (
+    AHEAD,
+    AdaptivePlan,
+    ExtendRequest,
+    LaidSegment,
+    LatePulse,
+    LiveEvent,
+    Profile,
+    SegmentPlan,
+    TestPlan,
+)
 
 FIRST_S = 3.0
 NEXT = {"name": "hold 2", "sequence": "widths", "settings": {"pulse_width_us": [100.0] * 10, "jumps": True}}
@@ -26,17 +36,19 @@ class World:
     def __init__(self, answers: list[Any]) -> None:
         self.now_s, self.answers = 0.0, answers
         self.requests: list[tuple[float, Any]] = []
+        self.asked: list[dict[str, Any]] = []
 
     def monotonic_s(self) -> float:
         return self.now_s
 
-    async def ask(self, what: Any, **_arguments: Any) -> Any:
+    async def ask(self, what: Any, **arguments: Any) -> Any:
         """A question to the adviser is a text; None of the answers never comes."""
         if what == "adaptive_begin":
             return {}
         if not isinstance(what, str):
             self.requests.append((self.now_s, what))
             return {}
+        self.asked.append(arguments)
         if (answer := self.answers.pop(0) if self.answers else None) is None:
             await asyncio.Event().wait()
         return answer
@@ -48,7 +60,7 @@ class World:
                 test_id=test_id, segment="opening", elapsed_s=self.now_s, duration_s=45.0, time_s=[],
                 torque_min_nm=[], torque_max_nm=[], pulse_time_s=[], pulse_width_us=[], torque_age_s=0.0,
                 lost_samples=0, dropped_pulses=0, sent_pulses=0, charge_uc=0.0, torque_time_nms=0.0, ended_by="",
-                samples=None, laid=30, boundary_s=FIRST_S,
+                samples=None, laid=30, boundary_s=FIRST_S, not_sent=[4], late=[LatePulse(index=2, by_s=0.01)],
                 laid_segments=[LaidSegment(name="opening", start_s=0.0, end_s=FIRST_S, by="plan")],
             )  # fmt: skip
             for _ in range(5):
@@ -89,6 +101,12 @@ def test_the_newest_answer_is_sent_at_once(monkeypatch: pytest.MonkeyPatch) -> N
     [(at_s, request)] = world.requests
     assert request.segments[0].name == "ramp 2"
     assert at_s == pytest.approx(FIRST_S - AHEAD / 40.0 - adaptive.LATE_S, abs=0.03)
+
+
+def test_the_adviser_learns_what_the_muscle_felt(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = World([SAID])
+    followed(world, 40.0, monkeypatch)
+    assert (world.asked[0]["not_sent"], world.asked[0]["late"]) == ([4], [(2, 0.01)])
 
 
 def test_an_answer_that_cannot_be_used_is_told(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -70,20 +70,20 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Whole]:
 def test_a_test_stops_itself_and_is_identified(whole: Whole) -> None:
     test_id = whole.start(target={"curve_percent": 4.0, "step_percent": 4.0})
     document = wait_done(whole.client, test_id, PATIENCE_S)
-    told = document["adaptive"]
+    told, summary = document["adaptive"], document["summary"]
     print(json.dumps([{k: v for k, v in row.items() if k != "words"} for row in told["decisions"]]))
-    print(told["ended"], told["problem"], told["torque_time_nm_s"], document["summary"])
+    print(told["ended"], told["problem"], told["torque_time_nm_s"], summary)
     assert document["state"] == "completed", document["reason"]
     assert told["decisions"], told
     if told["ended"] == "known-enough":
         assert told["problem"] == ""
         assert told["knowledge"]["curve_percent"] <= 4.0
-        assert document["summary"]["duration_s"] < 38.7
+        assert summary["duration_s"] < 38.7
     else:  # the machine was too busy: answers came late, or pulses; then the fixed plan played, and it never waited
-        assert told["ended"] == "fixed-rest"
+        assert told["ended"] in ("fixed-rest", "time")
         kinds = {row["kind"] for row in told["decisions"] if not (row.get("late") or row.get("refused"))}
         assert kinds <= {"next", "misfit"}
-        assert told["problem"] == "" or ("misfit" in kinds and document["summary"]["dropped_pulses"] > 0)
+        assert told["problem"] == "" or ("misfit" in kinds and (summary["dropped_pulses"] > 0 or summary["warnings"]))
     assert document["fit"]["fit_percent"] > 90.0
 
 
