@@ -12,7 +12,7 @@ from rig.messages import SAFE_END_S, AdaptivePlan, SegmentPlan, TestPlan
 ADAPTIVE = "adaptive"
 """Kind of test."""
 DURATION_S = 50.0
-"""The longest test, where nobody says: the opening, ten seconds of chosen pieces and then the whole default test fit in."""
+"""The longest test, where nobody says: the opening, some ten seconds of pieces, then the whole default test fit in."""
 AT_STOPPING_TORQUE_S = 12.0
 """The largest torque-time, where nobody says: so many seconds at the torque that stops the test."""
 TAIL_S = 0.4
