@@ -14,6 +14,7 @@ from identify.dynamics.linear import Discrete, Linear, SecondOrder
 from identify.dynamics.make_grid import make_grid
 from identify.dynamics.pulse_grid import Grid
 from identify.effects import get
+from identify.effects.base import Form
 from identify.errors import BadModel
 from identify.records.record import Record
 from identify.recruitment.curve import Curve
@@ -80,8 +81,19 @@ def predict_on(model: Muscle, grid: Grid) -> np.ndarray:
     return np.where(grid.record.held_out, predictable, problem.at_samples(theta))
 
 
-def problem_of(model: Muscle, grid: Grid) -> tuple[Problem, np.ndarray]:
+def problem_of(
+    model: Muscle, grid: Grid, further: Sequence[tuple[Form, Sequence[float]]] = ()
+) -> tuple[Problem, np.ndarray]:
     """The model as a `Problem` on a record, and its parameters there.
+
+    Parameters
+    ----------
+    model : Muscle
+        With second-order dynamics.
+    grid : Grid
+        The record.
+    further : sequence of (Form, sequence of float)
+        Forms that act beside the model's effects, and the values of their parameters.
 
     Raises
     ------
@@ -120,6 +132,9 @@ def problem_of(model: Muscle, grid: Grid) -> tuple[Problem, np.ndarray]:
                     fix="Record this column, or fit without the effect.",
                 )
         effects.append((effect.id, form))
+    for form, own in further:
+        effects.append((form.name, form))
+        parameters += own
     problem = Problem(setup, effects)
     values = np.zeros(problem.size)
     values[:3] = model.linear.time_constant_s, model.linear.damping, model.linear.delay_s

@@ -1,0 +1,185 @@
+"""What is tracked from trial to trial, how it changes, and one step of the Kalman filter.
+
+Three levels, relative to the approved model: the log of the gain, the shift of the threshold (µs) and the log of the
+time scale. Each has a trend: a level changes by its trend and by a step without memory, and a trend fades. This is the
+damped local linear trend model (Harvey 1989, Forecasting, structural time series models and the Kalman filter, 4.1;
+Gardner and McKenzie 1985). A trial's weight falls with its surprise, as for noise with heavy tails (Meinhold and
+Singpurwalla 1989): one odd trial moves little. If the next one says the same, it was a change, and it is followed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+QUANTITIES = ("gain", "threshold_shift_us", "time_scale")
+LEVELS = len(QUANTITIES)
+TREND_KEPT = 0.95
+"""Share of a trend that is left one trial later."""
+SURPRISING = 16.0
+"""Squared distance, in standard deviations of the prediction, beyond which a trial is odd (p = 0.001 for three)."""
+TAILS = 6.0
+"""Degrees of freedom of the innovations' distribution."""
+
+
+def _row(*values: float) -> np.ndarray:
+    return np.array(values, float)
+
+
+@dataclass(frozen=True)
+class Rates:
+    """How fast a person changes, in the units of the levels (log gain, µs, log time scale); arrays of shape (3,).
+
+    Parameters
+    ----------
+    start : ndarray
+        Standard deviation of the first trial's levels: what the approved model does not know.
+    step : ndarray
+        Standard deviation of a change from one trial to the next that has no trend.
+    trend : ndarray
+        Mean trend at the first trial, per trial.
+    trend_sd, turn : ndarray
+        Standard deviations of the first trend, and of its change from trial to trial.
+    sessions : int
+        Sessions that they were learnt from; 0 for the usual ones.
+    """
+
+    start: np.ndarray = field(default_factory=lambda: _row(0.08, 6.0, 0.10))
+    step: np.ndarray = field(default_factory=lambda: _row(0.006, 0.5, 0.008))
+    trend: np.ndarray = field(default_factory=lambda: np.zeros(LEVELS))
+    trend_sd: np.ndarray = field(default_factory=lambda: _row(0.025, 1.2, 0.012))
+    turn: np.ndarray = field(default_factory=lambda: _row(0.008, 0.5, 0.005))
+    sessions: int = 0
+
+
+USUAL = Rates()
+
+
+@dataclass(frozen=True)
+class Values:
+    """Gain and time scale as factors on the approved model's, the shift of its threshold in µs."""
+
+    gain: float = 1.0
+    threshold_shift_us: float = 0.0
+    time_scale: float = 1.0
+
+    @classmethod
+    def of(cls, levels: np.ndarray) -> Values:
+        """From log gain, µs, log time scale."""
+        return cls(float(np.exp(levels[0])), float(levels[1]), float(np.exp(levels[2])))
+
+    @property
+    def levels(self) -> np.ndarray:
+        """Log gain, µs, log time scale, shape (3,)."""
+        return np.array([np.log(self.gain), self.threshold_shift_us, np.log(self.time_scale)])
+
+
+@dataclass(frozen=True)
+class State:
+    """What is known of the levels and their trends.
+
+    Parameters
+    ----------
+    mean : ndarray, shape (6,)
+        Three levels, three trends.
+    covariance : ndarray, shape (6, 6)
+        Its covariance.
+    trials : int
+        Trials that it was learnt from.
+    odd : ndarray, shape (3,) or None
+        The last trial's innovation if it was odd.
+    """
+
+    mean: np.ndarray
+    covariance: np.ndarray
+    trials: int = 0
+    odd: np.ndarray | None = None
+
+    @classmethod
+    def start(cls, rates: Rates = USUAL) -> State:
+        """Before the first trial."""
+        mean = np.r_[np.zeros(LEVELS), rates.trend]
+        return cls(mean, np.diag(np.r_[rates.start, rates.trend_sd] ** 2))
+
+    @property
+    def values(self) -> Values:
+        """The levels in their units."""
+        return Values.of(self.mean[:LEVELS])
+
+    def band(self, quantity: int, sds: float = 1.96) -> tuple[float, float]:
+        """Lower and upper end of a quantity's band, in its unit."""
+        half = sds * float(np.sqrt(self.covariance[quantity, quantity]))
+        ends = self.mean[quantity] - half, self.mean[quantity] + half
+        low, high = ends if quantity == 1 else np.exp(ends)
+        return float(low), float(high)
+
+    def ahead(self, rates: Rates = USUAL) -> State:
+        """Before the next trial."""
+        move = np.eye(2 * LEVELS)
+        move[:LEVELS, LEVELS:] = np.eye(LEVELS)
+        move[LEVELS:, LEVELS:] *= TREND_KEPT
+        spread = np.diag(np.r_[rates.step, rates.turn] ** 2)
+        return State(move @ self.mean, move @ self.covariance @ move.T + spread, self.trials, self.odd)
+
+    def to_dict(self) -> dict[str, Any]:
+        """As JSON."""
+        return {
+            "mean": self.mean.tolist(),
+            "covariance": self.covariance.tolist(),
+            "trials": self.trials,
+            "odd": None if self.odd is None else self.odd.tolist(),
+        }
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> State:
+        """The state that `to_dict` wrote."""
+        odd = data.get("odd")
+        return cls(
+            np.array(data["mean"], float),
+            np.array(data["covariance"], float),
+            int(data["trials"]),
+            None if odd is None else np.array(odd, float),
+        )
+
+
+def updated(before: State, seen: np.ndarray, information: np.ndarray) -> tuple[State, float]:
+    """The state after a trial, and how odd the trial was.
+
+    Parameters
+    ----------
+    before : State
+        Before the trial.
+    seen : ndarray, shape (3,)
+        The levels that explain the trial best.
+    information : ndarray, shape (3, 3)
+        Inverse of their covariance; zero in a direction of which the trial tells nothing.
+
+    Returns
+    -------
+    State
+        After the trial.
+    float
+        Squared distance of what was seen from what was expected, in standard deviations; about 3 on average if the
+        trial tells something of all three.
+    """
+    away = seen - before.mean[:LEVELS]
+    expected = before.covariance[:LEVELS, :LEVELS]
+    # The distance by the information form: it exists too where the trial tells nothing.
+    gain = np.linalg.solve(np.eye(LEVELS) + information @ expected, information)
+    distance = float(away @ gain @ away)
+    covariance, weight, odd = before.covariance, 1.0, None
+    if distance > SURPRISING:
+        if before.odd is not None and float(before.odd @ gain @ away) > 0.5 * distance:
+            covariance = covariance.copy()  # twice the same: a change
+            covariance[:LEVELS, :LEVELS] += np.outer(away, away)
+        else:
+            weight, odd = (TAILS + LEVELS) / (TAILS + distance), away
+            weight *= SURPRISING / distance
+    expected = covariance[:LEVELS, :LEVELS]
+    gain = np.linalg.solve(np.eye(LEVELS) + weight * information @ expected, weight * information)
+    lever = covariance[:, :LEVELS]
+    mean = before.mean + lever @ gain @ away
+    after = covariance - lever @ gain @ lever.T
+    return State(mean, 0.5 * (after + after.T), before.trials + 1, odd), distance
