@@ -1,7 +1,22 @@
 """Following an approved model from trial to trial: gain, threshold and time scale, with bands."""
 
+from identify.tracking.follow import Outcome, Step, follow, levels_of, model_for_next
 from identify.tracking.served import moved_model
-from identify.tracking.state import USUAL, Rates, State, Values, updated
+from identify.tracking.state import QUANTITIES, USUAL, Rates, State, Values
 from identify.tracking.trial import Seen, look
 
-__all__ = ["USUAL", "Rates", "Seen", "State", "Values", "look", "moved_model", "updated"]
+__all__ = [
+    "QUANTITIES",
+    "USUAL",
+    "Outcome",
+    "Rates",
+    "Seen",
+    "State",
+    "Step",
+    "Values",
+    "follow",
+    "levels_of",
+    "look",
+    "model_for_next",
+    "moved_model",
+]

@@ -105,7 +105,9 @@ def look(model: Model, expected: Values, record: Record) -> Seen:
     scale_nm = max(float(np.ptp(target[rows])), 1e-6)
     theta[list(problem.baselines)] = np.median(target[rows][: max(4, round(0.5 / grid.step_s))])
     start = theta[free].copy()
-    loose = np.r_[LOOSE, RUN, np.full(len(problem.baselines), scale_nm), np.tile([0.1, 1.0], problem.setup.starts.size) * scale_nm]
+    loose = np.r_[
+        LOOSE, RUN, np.full(len(problem.baselines), scale_nm), np.tile([0.1, 1.0], problem.setup.starts.size) * scale_nm
+    ]
     weight = np.ones(int(rows.sum()))
     before_nm = 0.0
     for turn in range(ROUNDS):

@@ -1,0 +1,125 @@
+"""One trial followed: what was expected, what it said, what is expected next, and what a person should know of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+import numpy as np
+
+from identify.model import Model
+from identify.records.record import Record
+from identify.tracking.served import moved_model
+from identify.tracking.state import LEVELS, QUANTITIES, USUAL, Rates, State, updated
+from identify.tracking.trial import Seen, look
+
+CONTRADICTS = 4.0
+"""An error so many times what the approved model left is not one of gain, threshold or speed."""
+LITTLE = 0.7
+"""A trial that leaves more than this share of the standard deviation of each level tells little."""
+
+
+class Outcome(StrEnum):
+    """What became of a trial."""
+
+    FOLLOWED = "followed"
+    LITTLE = "little"
+    """It tells little: too short, too weak, or too uneven."""
+    ODD = "odd"
+    """It is far from what was expected. It moves little, unless the next trial says the same."""
+    CONTRADICTS = "contradicts"
+    """Gain, threshold and speed do not explain it: the structure is not the model's. It moves nothing."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """One trial followed.
+
+    Parameters
+    ----------
+    outcome : Outcome
+        What became of it.
+    seen : Seen
+        What the trial said by itself.
+    before, after : State
+        What was expected of it; what is known after it.
+    coming : State
+        What is expected of the next trial: of this the controller is told.
+    distance : float
+        Squared distance of what was seen from what was expected, in standard deviations.
+    """
+
+    outcome: Outcome
+    seen: Seen
+    before: State
+    after: State
+    coming: State
+    distance: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """As JSON: the levels of this trial and of the next with their bands, and what people may ask."""
+        return {
+            "outcome": str(self.outcome),
+            "trial": self.after.trials,
+            "now": levels_of(self.after),
+            "coming": levels_of(self.coming),
+            "error_nm": self.seen.error_nm,
+            "expected_error_nm": self.seen.expected_nm,
+            "error_before_nm": self.seen.before_nm,
+            "torque_nm": self.seen.torque_nm,
+            "disturbed_s": [list(stretch) for stretch in self.seen.disturbed],
+            "distance": self.distance,
+            "state": self.coming.to_dict(),
+        }
+
+
+def levels_of(state: State) -> dict[str, dict[str, float]]:
+    """`value`, `low` and `high` (95 %) of each tracked quantity."""
+    values = state.values
+    found = {}
+    for place, name in enumerate(QUANTITIES):
+        low, high = state.band(place)
+        found[name] = {"value": float(getattr(values, name)), "low": low, "high": high}
+    return found
+
+
+def follow(model: Model, state: State | None, record: Record, rates: Rates = USUAL) -> Step:
+    """Learn from one trial.
+
+    Parameters
+    ----------
+    model : Model
+        The approved one, with second-order dynamics. It is not changed.
+    state : State or None
+        What was expected of this trial: `coming` of the trial before; None for the first.
+    record : Record
+        The trial, with its rest before and after.
+    rates : Rates
+        How fast this person changes.
+
+    Raises
+    ------
+    BadModel
+        The model cannot be tracked, or not on this record: see `identify.simulation.predict.problem_of`.
+    BadRecord
+        The record is too short, or sampled more slowly than the pulses.
+    """
+    before = State.start(rates) if state is None else state
+    seen = look(model, before.values, record)
+    if seen.misfit > CONTRADICTS:
+        after, distance, outcome = before, float("nan"), Outcome.CONTRADICTS
+    else:
+        after, distance = updated(before, seen.levels, seen.information)
+        outcome = Outcome.ODD if after.odd is not None else _told(before, after)
+    return Step(outcome, seen, before, after, after.ahead(rates), distance)
+
+
+def _told(before: State, after: State) -> Outcome:
+    left = np.sqrt(np.diag(after.covariance)[:LEVELS] / np.diag(before.covariance)[:LEVELS])
+    return Outcome.LITTLE if np.all(left > LITTLE) else Outcome.FOLLOWED
+
+
+def model_for_next(model: Model, step: Step) -> Model:
+    """The approved model as it is expected to be in the next trial."""
+    return moved_model(model, step.coming.values)
