@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from identify.errors import BadModel
 from identify.dynamics.linear import SecondOrder
+from identify.errors import BadModel
 from identify.model import Model
 from identify.recruitment.curve import Curve
 from identify.recruitment.spline import SplineBasis
