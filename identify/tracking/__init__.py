@@ -1,6 +1,7 @@
 """Following an approved model from trial to trial: gain, threshold and time scale, with bands."""
 
 from identify.tracking.follow import Outcome, Step, follow, levels_of, model_for_next
+from identify.tracking.rates import learn_rates
 from identify.tracking.served import moved_model
 from identify.tracking.state import QUANTITIES, USUAL, Rates, State, Values
 from identify.tracking.trial import Seen, look
@@ -15,6 +16,7 @@ __all__ = [
     "Step",
     "Values",
     "follow",
+    "learn_rates",
     "levels_of",
     "look",
     "model_for_next",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any
 
@@ -14,7 +14,7 @@ from identify.tracking.served import moved_model
 from identify.tracking.state import LEVELS, QUANTITIES, USUAL, Rates, State, updated
 from identify.tracking.trial import Seen, look
 
-CONTRADICTS = 4.0
+UNEXPLAINED = 4.0
 """An error so many times what the approved model left is not one of gain, threshold or speed."""
 LITTLE = 0.7
 """A trial that leaves more than this share of the standard deviation of each level tells little."""
@@ -27,9 +27,9 @@ class Outcome(StrEnum):
     LITTLE = "little"
     """It tells little: too short, too weak, or too uneven."""
     ODD = "odd"
-    """It is far from what was expected. It moves little, unless the next trial says the same."""
+    """It is far from what was expected, or something else happened in it. It moves little or nothing."""
     CONTRADICTS = "contradicts"
-    """Gain, threshold and speed do not explain it: the structure is not the model's. It moves nothing."""
+    """Gain, threshold and speed do not explain two trials running: the structure is no longer the model's."""
 
 
 @dataclass(frozen=True)
@@ -46,8 +46,8 @@ class Step:
         What was expected of it; what is known after it.
     coming : State
         What is expected of the next trial: of this the controller is told.
-    distance : float
-        Squared distance of what was seen from what was expected, in standard deviations.
+    distance : float or None
+        Squared distance of what was seen from what was expected, in standard deviations; None if it moved nothing.
     """
 
     outcome: Outcome
@@ -55,7 +55,7 @@ class Step:
     before: State
     after: State
     coming: State
-    distance: float
+    distance: float | None
 
     def to_dict(self) -> dict[str, Any]:
         """As JSON: the levels of this trial and of the next with their bands, and what people may ask."""
@@ -107,11 +107,12 @@ def follow(model: Model, state: State | None, record: Record, rates: Rates = USU
     """
     before = State.start(rates) if state is None else state
     seen = look(model, before.values, record)
-    if seen.misfit > CONTRADICTS:
-        after, distance, outcome = before, float("nan"), Outcome.CONTRADICTS
-    else:
-        after, distance = updated(before, seen.levels, seen.information)
-        outcome = Outcome.ODD if after.odd is not None else _told(before, after)
+    if seen.misfit > UNEXPLAINED:
+        after = replace(before, trials=before.trials + 1, unexplained=before.unexplained + 1)
+        outcome = Outcome.CONTRADICTS if after.unexplained > 1 else Outcome.ODD
+        return Step(outcome, seen, before, after, after.ahead(rates), None)
+    after, distance = updated(before, seen.levels, seen.information)
+    outcome = Outcome.ODD if after.odd is not None else _told(before, after)
     return Step(outcome, seen, before, after, after.ahead(rates), distance)
 
 

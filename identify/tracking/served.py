@@ -13,8 +13,11 @@ from identify.recruitment.curve import Curve
 from identify.recruitment.spline import SplineBasis
 from identify.tracking.state import Values
 
-STEPS = 60
+EVEN = 31
 """Knots of the moved curve, evenly spaced, beside those of the approved curve."""
+CLOSEST_US = 0.5
+"""Knots are no closer than this."""
+PER_KNOT = 6
 
 
 def moved_curve(curve: Curve, values: Values) -> Curve:
@@ -30,11 +33,23 @@ def moved_curve(curve: Curve, values: Values) -> Curve:
     if values.threshold_shift_us == 0.0:
         return replace(curve, coefficients_nm=values.gain * curve.coefficients_nm)
     largest = curve.basis.largest_us
-    basis = SplineBasis(np.linspace(0.0, largest, STEPS + 1))
-    u = np.linspace(0.0, largest, 8 * STEPS + 1)
+    own = np.asarray(getattr(curve.basis, "knots_us", np.zeros(0))) + values.threshold_shift_us
+    basis = SplineBasis(_apart(np.r_[own, np.linspace(0.0, largest, EVEN)], largest))
+    # Between every two knots the same number of places, so that a steep rise counts as much as a long plateau.
+    share = np.arange(PER_KNOT) / PER_KNOT
+    u = np.r_[(basis.knots_us[:-1, None] + share * np.diff(basis.knots_us)[:, None]).ravel(), largest]
     wanted = values.gain * curve(np.clip(u - values.threshold_shift_us, 0.0, largest))
-    design = basis.design(u)
-    return Curve(basis, np.linalg.lstsq(design, wanted, rcond=None)[0])
+    return Curve(basis, np.linalg.lstsq(basis.design(u), wanted, rcond=None)[0])
+
+
+def _apart(knots_us: np.ndarray, largest_us: float) -> np.ndarray:
+    """The knots within 0 and the largest width, both included, without those too close to one before them."""
+    inner = np.sort(knots_us[(knots_us > CLOSEST_US) & (knots_us < largest_us - CLOSEST_US)])
+    kept = [0.0]
+    for knot in inner.tolist():
+        if knot - kept[-1] >= CLOSEST_US:
+            kept.append(knot)
+    return np.array([*kept, largest_us])
 
 
 def moved_model(model: Model, values: Values) -> Model:

@@ -1,25 +1,23 @@
 """What is tracked from trial to trial, how it changes, and one step of the Kalman filter.
 
 Three levels, relative to the approved model: the log of the gain, the shift of the threshold (µs) and the log of the
-time scale. Each has a trend: a level changes by its trend and by a step without memory, and a trend fades. This is the
-damped local linear trend model (Harvey 1989, Forecasting, structural time series models and the Kalman filter, 4.1;
-Gardner and McKenzie 1985). A trial's weight falls with its surprise, as for noise with heavy tails (Meinhold and
-Singpurwalla 1989): one odd trial moves little. If the next one says the same, it was a change, and it is followed.
+time scale. Each has a trend: a level changes by its trend and by a step without memory, and the trend turns slowly. This is
+the local linear trend model (Harvey 1989, Forecasting, structural time series models and the Kalman filter, 2.3). A
+trial's weight falls with its surprise, as for noise with heavy tails (Meinhold and Singpurwalla 1989): one odd trial
+moves little. If the next one says the same, it was a change, and it is followed.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 QUANTITIES = ("gain", "threshold_shift_us", "time_scale")
 LEVELS = len(QUANTITIES)
-TREND_KEPT = 0.95
-"""Share of a trend that is left one trial later."""
-SURPRISING = 16.0
-"""Squared distance, in standard deviations of the prediction, beyond which a trial is odd (p = 0.001 for three)."""
+SURPRISING = 11.3
+"""Squared distance, in standard deviations of the prediction, beyond which a trial is odd (p = 0.01 for three)."""
 TAILS = 6.0
 """Degrees of freedom of the innovations' distribution."""
 
@@ -90,12 +88,15 @@ class State:
         Trials that it was learnt from.
     odd : ndarray, shape (3,) or None
         The last trial's innovation if it was odd.
+    unexplained : int
+        Trials since the last one that gain, threshold and speed explained.
     """
 
     mean: np.ndarray
     covariance: np.ndarray
     trials: int = 0
     odd: np.ndarray | None = None
+    unexplained: int = 0
 
     @classmethod
     def start(cls, rates: Rates = USUAL) -> State:
@@ -111,17 +112,16 @@ class State:
     def band(self, quantity: int, sds: float = 1.96) -> tuple[float, float]:
         """Lower and upper end of a quantity's band, in its unit."""
         half = sds * float(np.sqrt(self.covariance[quantity, quantity]))
-        ends = self.mean[quantity] - half, self.mean[quantity] + half
-        low, high = ends if quantity == 1 else np.exp(ends)
+        ends = np.array([self.mean[quantity] - half, self.mean[quantity] + half])
+        low, high = ends if QUANTITIES[quantity].endswith("_us") else np.exp(ends)
         return float(low), float(high)
 
     def ahead(self, rates: Rates = USUAL) -> State:
         """Before the next trial."""
         move = np.eye(2 * LEVELS)
         move[:LEVELS, LEVELS:] = np.eye(LEVELS)
-        move[LEVELS:, LEVELS:] *= TREND_KEPT
         spread = np.diag(np.r_[rates.step, rates.turn] ** 2)
-        return State(move @ self.mean, move @ self.covariance @ move.T + spread, self.trials, self.odd)
+        return replace(self, mean=move @ self.mean, covariance=move @ self.covariance @ move.T + spread)
 
     def to_dict(self) -> dict[str, Any]:
         """As JSON."""
@@ -130,6 +130,7 @@ class State:
             "covariance": self.covariance.tolist(),
             "trials": self.trials,
             "odd": None if self.odd is None else self.odd.tolist(),
+            "unexplained": self.unexplained,
         }
 
     @classmethod
@@ -141,6 +142,7 @@ class State:
             np.array(data["covariance"], float),
             int(data["trials"]),
             None if odd is None else np.array(odd, float),
+            int(data["unexplained"]),
         )
 
 

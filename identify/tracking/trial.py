@@ -131,11 +131,13 @@ def look(model: Model, expected: Values, record: Record) -> Seen:
     information = _without(known + np.diag(np.r_[np.zeros(LEVELS), 1.0 / loose[LEVELS:] ** 2]))
     levels = np.array([theta[moved[0]], theta[moved[1]], theta[0] - np.log(model.linear.time_constant_s)])  # pyright: ignore
     levels = levels + np.linalg.lstsq(information, (levels - expected.levels) / LOOSE**2, rcond=1e-9)[0]
+    expected_nm = _expected(model)
     return Seen(
         levels=levels,
-        information=information,
+        # What fits worse than it should may err by more than its own scatter says.
+        information=information / max(1.0, sd_nm / expected_nm) ** 2,
         error_nm=sd_nm,
-        expected_nm=_expected(model),
+        expected_nm=expected_nm,
         before_nm=before_nm,
         torque_nm=float(np.sqrt(np.mean((mean[rows] - np.median(mean[rows][:4])) ** 2))),
         disturbed=_stretches(grid, rows, weight),
