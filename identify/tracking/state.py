@@ -1,10 +1,10 @@
 """What is tracked from trial to trial, how it changes, and one step of the Kalman filter.
 
 Three levels, relative to the approved model: the log of the gain, the shift of the threshold (µs) and the log of the
-time scale. Each has a trend: a level changes by its trend and by a step without memory, and the trend turns slowly. This is
-the local linear trend model (Harvey 1989, Forecasting, structural time series models and the Kalman filter, 2.3). A
-trial's weight falls with its surprise, as for noise with heavy tails (Meinhold and Singpurwalla 1989): one odd trial
-moves little. If the next one says the same, it was a change, and it is followed.
+time scale. Each has a trend: a level changes by its trend and by a step without memory, and the trend turns slowly.
+This is the local linear trend model (Harvey 1989, Forecasting, structural time series models and the Kalman filter,
+2.3). One odd trial moves no level by more than its band. If the next one says the same, it was a change, and it is
+followed.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ QUANTITIES = ("gain", "threshold_shift_us", "time_scale")
 LEVELS = len(QUANTITIES)
 SURPRISING = 11.3
 """Squared distance, in standard deviations of the prediction, beyond which a trial is odd (p = 0.01 for three)."""
-TAILS = 6.0
-"""Degrees of freedom of the innovations' distribution."""
+MOST_BY_ODD = 1.9
+"""Most that an odd trial moves, in standard deviations of what was expected: less than the band of 95 %."""
 
 
 def _row(*values: float) -> np.ndarray:
@@ -168,20 +168,22 @@ def updated(before: State, seen: np.ndarray, information: np.ndarray) -> tuple[S
     """
     away = seen - before.mean[:LEVELS]
     expected = before.covariance[:LEVELS, :LEVELS]
-    # The distance by the information form: it exists too where the trial tells nothing.
-    gain = np.linalg.solve(np.eye(LEVELS) + information @ expected, information)
-    distance = float(away @ gain @ away)
-    covariance, weight, odd = before.covariance, 1.0, None
+    distance = float(away @ _gain(expected, information) @ away)
+    covariance = before.covariance
     if distance > SURPRISING:
-        if before.odd is not None and float(before.odd @ gain @ away) > 0.5 * distance:
-            covariance = covariance.copy()  # twice the same: a change
-            covariance[:LEVELS, :LEVELS] += np.outer(away, away)
-        else:
-            weight, odd = (TAILS + LEVELS) / (TAILS + distance), away
-            weight *= SURPRISING / distance
-    expected = covariance[:LEVELS, :LEVELS]
-    gain = np.linalg.solve(np.eye(LEVELS) + weight * information @ expected, weight * information)
+        again = before.odd is not None and float(before.odd @ _gain(expected, information) @ away) > 0.5 * distance
+        if not again:
+            # No further than the band of what was expected, and nothing is known better than before.
+            move = covariance[:, :LEVELS] @ _gain(expected, information) @ away * (MOST_BY_ODD / np.sqrt(distance))
+            return replace(before, mean=before.mean + move, trials=before.trials + 1, odd=away, unexplained=0), distance
+        covariance = covariance.copy()
+        covariance[:LEVELS, :LEVELS] += np.outer(away, away)
+    gain = _gain(covariance[:LEVELS, :LEVELS], information)
     lever = covariance[:, :LEVELS]
-    mean = before.mean + lever @ gain @ away
     after = covariance - lever @ gain @ lever.T
-    return State(mean, 0.5 * (after + after.T), before.trials + 1, odd), distance
+    return State(before.mean + lever @ gain @ away, 0.5 * (after + after.T), before.trials + 1), distance
+
+
+def _gain(expected: np.ndarray, information: np.ndarray) -> np.ndarray:
+    """Inverse of the covariance of what is seen; it exists too where a trial tells nothing."""
+    return np.linalg.solve(np.eye(LEVELS) + information @ expected, information)

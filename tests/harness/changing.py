@@ -1,0 +1,77 @@
+"""A simulated muscle that changes from trial to trial: gain, threshold, speed; and what disturbs a trial."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from identify.records.record import Record
+from tests.harness.muscle import FINE_HZ, Patient, second_order
+
+PULSE_RATE_HZ = 40.0
+
+
+def _none(_trial: float) -> float:
+    return 0.0
+
+
+def _one(_trial: float) -> float:
+    return 1.0
+
+
+def _quiet(_trial: int, time_s: np.ndarray) -> np.ndarray:
+    return np.zeros(time_s.size)
+
+
+@dataclass(frozen=True)
+class Changing:
+    """A patient whose gain, shift of the threshold (µs) and time scale are functions of the trial's number.
+
+    The number goes on within a trial: halfway through the third one it is 2.5. `added(trial, time_s)` is a torque that
+    is no muscle's answer, N·m.
+    """
+
+    patient: Patient
+    gain: Callable[[float], float] = _one
+    shift_us: Callable[[float], float] = _none
+    time_scale: Callable[[float], float] = _one
+    added: Callable[[int, np.ndarray], np.ndarray] = field(default=_quiet)
+
+    def play(
+        self,
+        widths_us: np.ndarray,
+        trial: int,
+        rng: np.random.Generator,
+        *,
+        rate_hz: float = 400.0,
+        noise_nm: float = 0.05,
+        sign: float = 1.0,
+        baseline_nm: float = 0.0,
+        start_s: float = 0.0,
+    ) -> Record:
+        """The record of one trial, from rest."""
+        at = trial + np.arange(widths_us.size) / widths_us.size
+        moved = np.array([self.shift_us(a) for a in at])
+        gain = np.array([self.gain(a) for a in at])
+        drive = gain * self.patient.recruitment(np.where(widths_us > 0.0, np.maximum(widths_us - moved, 0.0), 0.0))
+        late = round(self.patient.delay_s * FINE_HZ)
+        fine = np.r_[np.zeros(late), np.repeat(drive, round(FINE_HZ / PULSE_RATE_HZ))]
+        fine = fine[: round(FINE_HZ / PULSE_RATE_HZ) * widths_us.size]
+        constant_s = self.patient.time_constant_s * self.time_scale(trial + 0.5)
+        clean = second_order(fine, constant_s, self.patient.damping, FINE_HZ)
+        time_s = np.arange(round(widths_us.size / PULSE_RATE_HZ * rate_hz)) / rate_hz
+        torque = clean[np.round(time_s * FINE_HZ).astype(int)] + self.added(trial, time_s)
+        slot = np.minimum((time_s * PULSE_RATE_HZ + 1e-9).astype(int), widths_us.size - 1)
+        seen = sign * torque + baseline_nm + noise_nm * rng.standard_normal(time_s.size)
+        return Record.from_arrays(start_s + time_s, widths_us[slot], seen)
+
+
+def reach_widths(patient: Patient, share: float = 0.4, seconds: float = 10.0) -> np.ndarray:
+    """Widths of a trial: a second of rest, moves between levels up to a share of the plateau, a second of rest."""
+    table_us = np.arange(0.0, 301.0)
+    levels = share * np.array([0.0, 0.5, 0.5, 1.0, 1.0, 0.15, 0.15]) * patient.gain
+    wanted = np.interp(np.linspace(0.0, 6.0, round(seconds * PULSE_RATE_HZ)), np.arange(7.0), levels)
+    widths = np.round(np.interp(wanted, patient.recruitment(table_us), table_us))
+    return np.r_[np.zeros(40), widths, np.zeros(40)]

@@ -1,0 +1,247 @@
+"""Following a model from trial to trial: what is followed, what moves nothing, what changes nothing."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pytest
+
+from identify.errors import BadModel
+from identify.fitting import fit
+from identify.model import Model
+from identify.records.record import Record
+from identify.tracking import (
+    USUAL,
+    Outcome,
+    State,
+    Step,
+    Values,
+    follow,
+    learn_rates,
+    levels_of,
+    model_for_next,
+    moved_model,
+)
+from tests.harness.changing import Changing, reach_widths
+from tests.harness.muscle import Patient
+from tests.harness.patients import make_record
+
+PATIENT = Patient.with_rise(45.0, 120.0, gain=8.0, time_constant_s=0.25, damping=0.9)
+WIDTHS = reach_widths(PATIENT)
+
+
+@pytest.fixture(scope="module")
+def model() -> Model:
+    """What a pre-session test of the patient gives."""
+    record, _ = make_record(PATIENT, np.random.default_rng(1))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return fit(record)
+
+
+def followed(model: Model, records: Sequence[Record]) -> list[Step]:
+    steps, state = [], None
+    for record in records:
+        steps.append(follow(model, state, record))
+        state = State.from_dict(json.loads(json.dumps(steps[-1].coming.to_dict())))  # as the service keeps it
+    return steps
+
+
+def session(muscle: Changing, trials: int, seed: int = 5, **how: float) -> list[Record]:
+    rng = np.random.default_rng(seed)
+    return [muscle.play(WIDTHS, trial, rng, **how) for trial in range(trials)]
+
+
+def moves(steps: Sequence[Step]) -> np.ndarray:
+    """How far each trial moved each level, in units of the band that it was expected in; shape (trials, 3)."""
+    return np.array(
+        [
+            np.abs(step.after.mean[:3] - step.before.mean[:3]) / (1.96 * np.sqrt(np.diag(step.before.covariance)[:3]))
+            for step in steps
+        ]
+    )
+
+
+@pytest.fixture(scope="module")
+def unchanged(model: Model) -> State:
+    """After five trials of the patient as tested: what the approved model has wrong is in these levels."""
+    return followed(model, session(Changing(PATIENT), 5))[-1].after
+
+
+CHANGES = {
+    "fatigue": (Changing(PATIENT, gain=lambda n: 0.6 ** (n / 10)), 0, np.log(0.6) / 10),
+    "potentiation": (Changing(PATIENT, gain=lambda n: 1.02**n), 0, np.log(1.02)),
+    "threshold": (Changing(PATIENT, shift_us=lambda n: -0.8 * n), 1, -0.8),
+    "slower": (Changing(PATIENT, time_scale=lambda n: 1.03**n), 2, np.log(1.03)),
+}
+NEAR = np.array([0.012, 0.6, 0.02])
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_what_changes_steadily_is_followed_and_foreseen(model: Model, unchanged: State, name: str) -> None:
+    muscle, quantity, per_trial = CHANGES[name]
+    last = followed(model, session(muscle, 8))[-1]
+    for state, trials in ((last.after, 7.5), (last.coming, 8.5)):
+        away = state.mean[quantity] - unchanged.mean[quantity] - trials * per_trial
+        assert abs(away) < NEAR[quantity], (name, trials, away)
+    # What counts for a controller: the torque of a trial that was not seen yet.
+    unseen = muscle.play(WIDTHS, 8, np.random.default_rng(0), noise_nm=0.0)
+    share = [np.std(m.predict(unseen) - unseen.torque_nm) / np.std(unseen.torque_nm) for m in
+             (model, model_for_next(model, last))]  # fmt: skip
+    assert share[1] < 0.03 and share[1] < 0.3 * share[0], share
+
+
+def test_where_nothing_changes_no_trial_moves_the_model_by_more_than_its_band(model: Model) -> None:
+    steps = followed(model, session(Changing(PATIENT), 20, seed=8))
+    assert np.all(moves(steps) < 1.0)
+    assert {step.outcome for step in steps} <= {Outcome.FOLLOWED, Outcome.LITTLE}
+
+
+def bump(size_nm: float, at_s: float, width_s: float) -> Callable[[int, np.ndarray], np.ndarray]:
+    """A torque of its own in the fourth trial."""
+    return lambda trial, time_s: (trial == 3) * size_nm * np.exp(-0.5 * ((time_s - at_s) / width_s) ** 2)
+
+
+@pytest.mark.parametrize(
+    ("size_nm", "at_s", "width_s"), [(4.0, 5.0, 0.15), (-2.5, 8.0, 0.3), (1.5, 6.0, 1.2), (3, 4, 2)]
+)
+def test_a_spasm_or_an_effort_moves_nothing_by_more_than_its_band(
+    model: Model, size_nm: float, at_s: float, width_s: float
+) -> None:
+    steps = followed(model, session(Changing(PATIENT, added=bump(size_nm, at_s, width_s)), 6))
+    assert np.all(moves(steps) < 1.0)
+    stretches = steps[3].seen.disturbed
+    assert steps[3].outcome is Outcome.ODD or any(begin <= at_s <= end for begin, end in stretches)
+    assert steps[4].outcome is not Outcome.CONTRADICTS
+    assert not any(step.seen.disturbed for step in (*steps[:3], *steps[4:]))
+
+
+def test_a_sudden_change_is_followed_when_the_next_trial_says_the_same(model: Model) -> None:
+    muscle = Changing(PATIENT, gain=lambda n: 1.0 if n < 3 else 0.7)
+    steps = followed(model, session(muscle, 6))
+    assert steps[3].outcome is Outcome.ODD
+    assert np.all(moves(steps[:4]) < 1.0)
+    assert steps[4].outcome is Outcome.FOLLOWED
+    gains = [step.after.values.gain for step in steps]
+    assert gains[4] / gains[2] == pytest.approx(0.7, abs=0.01)
+    assert gains[5] / gains[2] == pytest.approx(0.7, abs=0.01)
+
+
+def test_another_structure_is_told_when_two_trials_show_it(model: Model) -> None:
+    other = Changing(PATIENT, added=lambda _, time_s: 0.8 * np.sin(2 * np.pi * 1.3 * time_s))
+    steps = followed(model, session(Changing(PATIENT), 2) + session(other, 3))
+    assert [step.outcome for step in steps[2:]] == [Outcome.ODD, Outcome.CONTRADICTS, Outcome.CONTRADICTS]
+    assert steps[-1].after.values == Values.of(steps[-1].before.mean[:3])
+    back = follow(model, steps[-1].coming, session(Changing(PATIENT), 1)[0])
+    assert back.outcome is not Outcome.CONTRADICTS and back.after.unexplained == 0
+
+
+def test_a_trial_that_tells_little_moves_little_and_says_so(model: Model) -> None:
+    rest = np.zeros(200)
+    barely = np.r_[np.zeros(40), np.full(60, 5.0), np.zeros(40)]
+    for widths in (rest, barely):
+        record = Changing(PATIENT).play(widths, 0, np.random.default_rng(3))
+        step = follow(model, None, record)
+        assert step.outcome is Outcome.LITTLE
+        assert np.all(moves([step]) < 0.5)
+        assert np.all(np.diag(step.after.covariance)[:3] > 0.3 * np.diag(step.before.covariance)[:3])
+
+
+ALIKE = {
+    "upside down": {"sign": -1.0},
+    "another zero": {"baseline_nm": 7.3},
+    "another start": {"start_s": 1000.0},
+    "a slow recorder": {"rate_hz": 80.0},
+    "a fast recorder": {"rate_hz": 2000.0, "noise_nm": 0.11},
+}
+
+
+@pytest.mark.parametrize("name", ALIKE)
+def test_what_changes_nothing_about_the_muscle_changes_no_answer(model: Model, name: str) -> None:
+    how = ALIKE[name]
+    muscle = Changing(PATIENT, gain=lambda n: 0.95**n, shift_us=lambda n: 0.5 * n)
+    usual = followed(model, session(muscle, 5))[-1]
+    turned = model
+    if how.get("sign") == -1.0:
+        record, _ = make_record(PATIENT, np.random.default_rng(1))
+        turned = fit(Record.from_arrays(record.time_s, record.pulse_width_us, -record.torque_nm))
+    other = followed(turned, session(muscle, 5, **how))[-1]
+    sd = np.sqrt(np.diag(usual.after.covariance)[:3] + np.diag(other.after.covariance)[:3])
+    assert np.all(np.abs(usual.after.mean[:3] - other.after.mean[:3]) < 3.0 * sd + [0.004, 0.1, 0.01])
+    assert usual.outcome == other.outcome
+
+
+def test_a_trial_that_begins_within_a_contraction(model: Model) -> None:
+    whole = Changing(PATIENT, gain=lambda _: 0.9).play(WIDTHS, 0, np.random.default_rng(2))
+    late = whole.time_s > 4.0
+    cut = Record.from_arrays(whole.time_s[late], whole.pulse_width_us[late], whole.torque_nm[late])
+    away = follow(model, None, cut).after.mean[:3] - follow(model, None, whole).after.mean[:3]
+    assert np.all(np.abs(away) < [0.03, 0.6, 0.04])
+
+
+def test_the_moved_model_is_the_muscle_as_it_is_now(model: Model) -> None:
+    values = Values(gain=0.8, threshold_shift_us=9.0, time_scale=1.2)
+    moved = Model.from_json(moved_model(model, values).to_json())
+    width = np.linspace(0.0, 300.0, 601)
+    wanted = 0.8 * model.recruitment(np.maximum(width - 9.0, 0.0))
+    assert np.max(np.abs(moved.recruitment(width) - wanted)) < 2e-3 * np.ptp(wanted)
+    muscle = Changing(PATIENT, gain=lambda _: 0.8, shift_us=lambda _: 9.0, time_scale=lambda _: 1.2)
+    record = muscle.play(WIDTHS, 0, np.random.default_rng(4), noise_nm=0.0)
+    error = moved.predict(record) - record.torque_nm
+    assert np.sqrt(np.mean(error**2)) < 0.02 * np.ptp(record.torque_nm)
+    assert moved_model(model, Values()).to_dict()["recruitment"] == model.to_dict()["recruitment"]
+
+
+def test_the_approved_model_is_not_touched(model: Model) -> None:
+    before = model.to_json()
+    step = followed(model, session(Changing(PATIENT, gain=lambda _: 0.9), 2))[-1]
+    assert model_for_next(model, step).to_json() != before == model.to_json()
+
+
+def test_a_model_with_an_effect_is_followed_too(model: Model) -> None:
+    record, _ = make_record(PATIENT, np.random.default_rng(1))
+    with_fatigue = fit(record, effects=["fatigue"])
+    still = followed(with_fatigue, session(Changing(PATIENT), 5))[-1].after
+    tired = followed(with_fatigue, session(Changing(PATIENT, gain=lambda n: 0.95**n), 5))[-1].after
+    assert tired.values.gain / still.values.gain == pytest.approx(0.95**4.5, rel=0.02)
+
+
+def test_dynamics_of_another_kind_are_refused_with_the_mend() -> None:
+    record, _ = make_record(PATIENT, np.random.default_rng(1))
+    other = fit(record, method="narx")
+    trial = Changing(PATIENT).play(WIDTHS, 0, np.random.default_rng(2))
+    with pytest.raises(BadModel, match="second-order"):
+        follow(other, None, trial)
+    with pytest.raises(BadModel, match="second-order"):
+        moved_model(other, Values(gain=0.9))
+
+
+def test_rates_are_the_usual_ones_until_there_are_earlier_sessions(model: Model) -> None:
+    steps = followed(model, session(Changing(PATIENT), 2))
+    assert learn_rates([]) is USUAL
+    assert learn_rates([[levels_of(step.after) for step in steps]]) is USUAL
+
+
+def test_a_person_who_always_tires_is_expected_to(model: Model) -> None:
+    muscle = Changing(PATIENT, gain=lambda n: 0.95**n)
+    told = [[levels_of(step.after) for step in followed(model, session(muscle, 6, seed))] for seed in (11, 12, 13)]
+    rates = learn_rates(told)
+    assert rates.sessions == 3
+    assert np.log(0.95) < rates.trend[0] < 0.5 * np.log(0.95)
+    assert rates.trend[1] == pytest.approx(0.0, abs=0.1) and rates.trend[2] == pytest.approx(0.0, abs=0.005)
+    first = session(muscle, 1, seed=14)[0]
+    usual, learnt = follow(model, None, first), follow(model, None, first, rates)
+    wanted = usual.after.values.gain * 0.95
+    assert abs(learnt.coming.values.gain - wanted) < 0.6 * abs(usual.coming.values.gain - wanted)
+
+
+def test_a_person_who_jumps_about_gets_wider_bands(model: Model) -> None:
+    rng = np.random.default_rng(6)
+    levels = rng.normal(0.0, 0.06, 30)
+    jumping = Changing(PATIENT, gain=lambda n: float(np.exp(levels[int(n)])))
+    told = [[levels_of(step.after) for step in followed(model, session(jumping, 10, seed))] for seed in (21, 22)]
+    rates = learn_rates(told)
+    assert rates.step[0] > 3.0 * USUAL.step[0] and rates.step[2] < 1.5 * USUAL.step[2]
