@@ -12,12 +12,12 @@ from identify.model import Model
 from identify.records.record import Record
 from identify.tracking.served import moved_model
 from identify.tracking.state import LEVELS, QUANTITIES, USUAL, Rates, State, updated
-from identify.tracking.trial import Seen, look
+from identify.tracking.trial import Seen, curve_covariance, look
 
 UNEXPLAINED = 4.0
 """An error so many times what the approved model left is not one of gain, threshold or speed."""
-LITTLE = 0.7
-"""A trial that leaves more than this share of the standard deviation of each level tells little."""
+LITTLE = np.array([0.05, 5.0, 0.08])
+"""A trial that would tell none of the levels to within such a standard deviation tells little."""
 
 
 class Outcome(StrEnum):
@@ -105,22 +105,23 @@ def follow(model: Model, state: State | None, record: Record, rates: Rates = USU
     BadRecord
         The record is too short, or sampled more slowly than the pulses.
     """
-    before = State.start(rates) if state is None else state
-    seen = look(model, before.values, record)
+    before = State.start(curve_covariance(model), rates) if state is None else state
+    seen = look(model, before, record)
     if seen.misfit > UNEXPLAINED:
         after = replace(before, trials=before.trials + 1, unexplained=before.unexplained + 1)
         outcome = Outcome.CONTRADICTS if after.unexplained > 1 else Outcome.ODD
         return Step(outcome, seen, before, after, after.ahead(rates), None)
-    after, distance = updated(before, seen.levels, seen.information)
-    outcome = Outcome.ODD if after.odd is not None else _told(before, after)
+    after, distance = updated(before, seen.vector, seen.information)
+    outcome = Outcome.ODD if after.odd is not None else _told(seen)
     return Step(outcome, seen, before, after, after.ahead(rates), distance)
 
 
-def _told(before: State, after: State) -> Outcome:
-    left = np.sqrt(np.diag(after.covariance)[:LEVELS] / np.diag(before.covariance)[:LEVELS])
-    return Outcome.LITTLE if np.all(left > LITTLE) else Outcome.FOLLOWED
+def _told(seen: Seen) -> Outcome:
+    own = seen.information[:LEVELS, :LEVELS] + np.diag(1e-3 / LITTLE**2)
+    little = np.all(np.sqrt(np.diag(np.linalg.inv(own))) > LITTLE)
+    return Outcome.LITTLE if little else Outcome.FOLLOWED
 
 
 def model_for_next(model: Model, step: Step) -> Model:
     """The approved model as it is expected to be in the next trial."""
-    return moved_model(model, step.coming.values)
+    return moved_model(model, step.coming.values, step.coming.curve_nm)

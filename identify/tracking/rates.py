@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from identify.tracking.state import QUANTITIES, USUAL, Rates
+from identify.tracking.state import QUANTITIES, USUAL, Rates, Values
 
 BELIEVED_SESSIONS = 2.0
 """The usual start and the usual first trend count like this many sessions of the person's own."""
@@ -15,7 +15,6 @@ BELIEVED_TRIALS = 12.0
 """The usual steps and turns count like this many trials."""
 FIRST = 3
 """Trials from which a session's first trend is taken."""
-SDS = 2 * 1.96
 
 Told = Mapping[str, Mapping[str, Any]]
 
@@ -32,20 +31,19 @@ def learn_rates(sessions: Sequence[Sequence[Told]]) -> Rates:
     Returns
     -------
     Rates
-        Each variance is a mean of the usual one and of the person's own, weighted by how many there are.
+        Each variance is a mean of the usual one and of the person's own, weighted by how many there are. The person's
+        own holds the scatter of the trials, too.
     """
     known = [_levels(session) for session in sessions if len(session) >= FIRST]
     if not known:
         return USUAL
     count = len(known)
-    starts = np.array([levels[0] for levels, _ in known])
-    trends = np.array([(levels[FIRST - 1] - levels[0]) / (FIRST - 1) for levels, _ in known])
+    starts = np.array([levels[0] for levels in known])
+    trends = np.array([(levels[FIRST - 1] - levels[0]) / (FIRST - 1) for levels in known])
     trend = trends.sum(axis=0) / (count + BELIEVED_SESSIONS)
-    bends = np.concatenate([np.diff(levels, n=2, axis=0) for levels, _ in known])
-    # A bend holds one turn and two steps, and the noise of three levels, of which the middle one counts twice.
-    noise = np.mean(np.concatenate([variance for _, variance in known]), axis=0)
-    own = np.maximum(np.sum(bends**2, axis=0) - 6.0 * len(bends) * noise, 0.0)
-    usual = USUAL.turn**2 + 2.0 * USUAL.step**2
+    bends = np.concatenate([np.diff(levels, n=2, axis=0) for levels in known])
+    usual = USUAL.turn**2 + 2.0 * USUAL.step**2  # of a bend, which holds one turn and two steps
+    own = np.sum(bends**2, axis=0)
     faster = np.sqrt((BELIEVED_TRIALS * usual + own) / ((BELIEVED_TRIALS + len(bends)) * usual))
     return Rates(
         start=_pooled(USUAL.start, starts, count),
@@ -57,15 +55,10 @@ def learn_rates(sessions: Sequence[Sequence[Told]]) -> Rates:
     )
 
 
-def _levels(session: Sequence[Told]) -> tuple[np.ndarray, np.ndarray]:
-    """Log gain, µs and log time scale of each trial and their variances, both of shape (N, 3)."""
-    ends = np.array(
-        [[[trial[name][key] for key in ("value", "low", "high")] for name in QUANTITIES] for trial in session]
-    )
-    for place, name in enumerate(QUANTITIES):
-        if not name.endswith("_us"):
-            ends[:, place] = np.log(ends[:, place])
-    return ends[..., 0], ((ends[..., 2] - ends[..., 1]) / SDS) ** 2
+def _levels(session: Sequence[Told]) -> np.ndarray:
+    """Log gain, µs and log time scale of each trial, shape (N, 3)."""
+    values = [[float(trial[name]["value"]) for name in QUANTITIES] for trial in session]
+    return np.array([Values(*trial).levels for trial in values])
 
 
 def _pooled(usual: np.ndarray, own: np.ndarray, count: int) -> np.ndarray:

@@ -21,7 +21,7 @@ PER_KNOT = 6
 
 
 def moved_curve(curve: Curve, values: Values) -> Curve:
-    """gain · f(u - shift), as a spline; beyond the approved curve's end it goes on level.
+    """gain · f(u - shift), as a spline if it is shifted; beyond the curve's end it goes on level.
 
     Parameters
     ----------
@@ -52,8 +52,8 @@ def _apart(knots_us: np.ndarray, largest_us: float) -> np.ndarray:
     return np.array([*kept, largest_us])
 
 
-def moved_model(model: Model, values: Values) -> Model:
-    """The model with the levels of `values`.
+def moved_model(model: Model, values: Values, curve_nm: np.ndarray | float = 0.0) -> Model:
+    """The model with the levels of `values`, and with `curve_nm` added to the coefficients of its curve.
 
     Raises
     ------
@@ -63,4 +63,6 @@ def moved_model(model: Model, values: Values) -> Model:
     if not isinstance(model.linear, SecondOrder):
         raise BadModel("only second-order dynamics are tracked", fix="Fit with maximum-likelihood.")
     linear = replace(model.linear, time_constant_s=model.linear.time_constant_s * values.time_scale)
-    return model.with_(recruitment=moved_curve(model.recruitment, values), linear=linear)
+    sign = float(model.effects[0].get("settings", {}).get("sign", 1.0)) if model.effects else 1.0
+    own = replace(model.recruitment, coefficients_nm=model.recruitment.coefficients_nm + sign * curve_nm)
+    return model.with_(recruitment=moved_curve(own, values), linear=linear)

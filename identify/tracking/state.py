@@ -3,8 +3,10 @@
 Three levels, relative to the approved model: the log of the gain, the shift of the threshold (µs) and the log of the
 time scale. Each has a trend: a level changes by its trend and by a step without memory, and the trend turns slowly.
 This is the local linear trend model (Harvey 1989, Forecasting, structural time series models and the Kalman filter,
-2.3). One odd trial moves no level by more than its band. If the next one says the same, it was a change, and it is
-followed.
+2.3). Beside them stands what the approved curve has wrong, one number for each of its coefficients. That does not
+change from trial to trial; without it, an error in the curve's shape would look like a change of the muscle.
+
+One odd trial moves no level by more than its band. If the next one says the same, it was a change, and it is followed.
 """
 
 from __future__ import annotations
@@ -16,6 +18,8 @@ import numpy as np
 
 QUANTITIES = ("gain", "threshold_shift_us", "time_scale")
 LEVELS = len(QUANTITIES)
+CURVE = 2 * LEVELS
+"""Where the curve begins in a state."""
 SURPRISING = 11.3
 """Squared distance, in standard deviations of the prediction, beyond which a trial is odd (p = 0.01 for three)."""
 MOST_BY_ODD = 1.9
@@ -76,18 +80,18 @@ class Values:
 
 @dataclass(frozen=True)
 class State:
-    """What is known of the levels and their trends.
+    """What is known of the levels, their trends and the curve.
 
     Parameters
     ----------
-    mean : ndarray, shape (6,)
-        Three levels, three trends.
-    covariance : ndarray, shape (6, 6)
+    mean : ndarray, shape (6 + n,)
+        Three levels, three trends, and what is to be added to the n coefficients of the approved curve, N·m.
+    covariance : ndarray, shape (6 + n, 6 + n)
         Its covariance.
     trials : int
         Trials that it was learnt from.
     odd : ndarray, shape (3,) or None
-        The last trial's innovation if it was odd.
+        How far the last trial would have moved the levels, if it was odd.
     unexplained : int
         Trials since the last one that gain, threshold and speed explained.
     """
@@ -99,15 +103,28 @@ class State:
     unexplained: int = 0
 
     @classmethod
-    def start(cls, rates: Rates = USUAL) -> State:
-        """Before the first trial."""
-        mean = np.r_[np.zeros(LEVELS), rates.trend]
-        return cls(mean, np.diag(np.r_[rates.start, rates.trend_sd] ** 2))
+    def start(cls, curve_covariance: np.ndarray, rates: Rates = USUAL) -> State:
+        """Before the first trial; `curve_covariance` is that of the approved curve's coefficients, (N·m)²."""
+        size = len(curve_covariance)
+        covariance = np.zeros((CURVE + size, CURVE + size))
+        covariance[:CURVE, :CURVE] = np.diag(np.r_[rates.start, rates.trend_sd] ** 2)
+        covariance[CURVE:, CURVE:] = curve_covariance
+        return cls(np.r_[np.zeros(LEVELS), rates.trend, np.zeros(size)], covariance)
 
     @property
     def values(self) -> Values:
         """The levels in their units."""
         return Values.of(self.mean[:LEVELS])
+
+    @property
+    def curve_nm(self) -> np.ndarray:
+        """What is to be added to the coefficients of the approved curve, N·m, shape (n,)."""
+        return self.mean[CURVE:]
+
+    @property
+    def seen(self) -> np.ndarray:
+        """Places of what a trial sees of: levels and curve, not the trends."""
+        return np.r_[np.arange(LEVELS), np.arange(CURVE, self.mean.size)]
 
     def band(self, quantity: int, sds: float = 1.96) -> tuple[float, float]:
         """Lower and upper end of a quantity's band, in its unit."""
@@ -118,9 +135,9 @@ class State:
 
     def ahead(self, rates: Rates = USUAL) -> State:
         """Before the next trial."""
-        move = np.eye(2 * LEVELS)
-        move[:LEVELS, LEVELS:] = np.eye(LEVELS)
-        spread = np.diag(np.r_[rates.step, rates.turn] ** 2)
+        move = np.eye(self.mean.size)
+        move[:LEVELS, LEVELS:CURVE] = np.eye(LEVELS)
+        spread = np.diag(np.r_[rates.step, rates.turn, np.zeros(self.mean.size - CURVE)] ** 2)
         return replace(self, mean=move @ self.mean, covariance=move @ self.covariance @ move.T + spread)
 
     def to_dict(self) -> dict[str, Any]:
@@ -146,16 +163,16 @@ class State:
         )
 
 
-def updated(before: State, seen: np.ndarray, information: np.ndarray) -> tuple[State, float]:
+def updated(before: State, vector: np.ndarray, information: np.ndarray) -> tuple[State, float]:
     """The state after a trial, and how odd the trial was.
 
     Parameters
     ----------
     before : State
         Before the trial.
-    seen : ndarray, shape (3,)
-        The levels that explain the trial best.
-    information : ndarray, shape (3, 3)
+    vector : ndarray, shape (3 + n,)
+        Information times the levels and the curve that explain the trial best.
+    information : ndarray, shape (3 + n, 3 + n)
         Inverse of their covariance; zero in a direction of which the trial tells nothing.
 
     Returns
@@ -163,27 +180,30 @@ def updated(before: State, seen: np.ndarray, information: np.ndarray) -> tuple[S
     State
         After the trial.
     float
-        Squared distance of what was seen from what was expected, in standard deviations; about 3 on average if the
-        trial tells something of all three.
+        Squared distance by which the trial moves the levels, in the standard deviations that are expected of such a
+        move; about 3 on average if the trial tells something of all three.
     """
-    away = seen - before.mean[:LEVELS]
-    expected = before.covariance[:LEVELS, :LEVELS]
-    distance = float(away @ _gain(expected, information) @ away)
-    covariance = before.covariance
-    if distance > SURPRISING:
-        again = before.odd is not None and float(before.odd @ _gain(expected, information) @ away) > 0.5 * distance
-        if not again:
-            # No further than the band of what was expected, and nothing is known better than before.
-            move = covariance[:, :LEVELS] @ _gain(expected, information) @ away * (MOST_BY_ODD / np.sqrt(distance))
-            return replace(before, mean=before.mean + move, trials=before.trials + 1, odd=away, unexplained=0), distance
-        covariance = covariance.copy()
-        covariance[:LEVELS, :LEVELS] += np.outer(away, away)
-    gain = _gain(covariance[:LEVELS, :LEVELS], information)
-    lever = covariance[:, :LEVELS]
-    after = covariance - lever @ gain @ lever.T
-    return State(before.mean + lever @ gain @ away, 0.5 * (after + after.T), before.trials + 1), distance
+    after = _filtered(before, vector, information)
+    move = (after.mean - before.mean)[:LEVELS]
+    allowed = (before.covariance - after.covariance)[:LEVELS, :LEVELS]
+    whitened = np.linalg.pinv(allowed, rcond=1e-6, hermitian=True) @ move
+    distance = max(float(move @ whitened), 0.0)
+    if distance <= SURPRISING:
+        return after, distance
+    if before.odd is None or not float(before.odd @ whitened) > 0.5 * distance:
+        # No further than the band of what was expected, and nothing is known better than before.
+        mean = before.mean + (after.mean - before.mean) * (MOST_BY_ODD / np.sqrt(distance))
+        return replace(before, mean=mean, trials=before.trials + 1, odd=move, unexplained=0), distance
+    wider = before.covariance.copy()
+    wider[:LEVELS, :LEVELS] += np.outer(move, move)
+    return _filtered(replace(before, covariance=wider), vector, information), distance
 
 
-def _gain(expected: np.ndarray, information: np.ndarray) -> np.ndarray:
-    """Inverse of the covariance of what is seen; it exists too where a trial tells nothing."""
-    return np.linalg.solve(np.eye(LEVELS) + information @ expected, information)
+def _filtered(before: State, vector: np.ndarray, information: np.ndarray) -> State:
+    """Kalman's update in the information form: it exists too where a trial tells nothing."""
+    lever = before.covariance[:, before.seen]
+    expected = lever[before.seen]
+    solve = np.linalg.solve(np.eye(before.seen.size) + information @ expected, np.c_[information, vector])
+    away = solve[:, -1] - solve[:, :-1] @ before.mean[before.seen]
+    covariance = before.covariance - lever @ solve[:, :-1] @ lever.T
+    return State(before.mean + lever @ away, 0.5 * (covariance + covariance.T), before.trials + 1)

@@ -15,8 +15,9 @@ from identify.dynamics.pulse_grid import Grid, runs
 from identify.model import Model
 from identify.records.record import Record
 from identify.simulation.predict import problem_of
+from identify.simulation.problem import Problem
 from identify.tracking.forms import GAIN, SHIFT
-from identify.tracking.state import LEVELS, Values
+from identify.tracking.state import LEVELS, State
 
 ROUNDS = 7
 TRUSTED_ROUNDS = 2
@@ -28,8 +29,12 @@ DISTURBED = 0.3
 """A stretch with a smaller weight counts as disturbed."""
 MOST_ALIKE = 0.97
 """Largest correlation of neighbouring errors."""
-LOOSE = np.array([0.4, 40.0, 0.4])
-"""Standard deviations that keep the fit of a trial that tells little in place."""
+LOOSE = np.array([0.2, 20.0, 0.2])
+"""By how much looser than expected the levels are in the fit of a trial, so that a jump is found."""
+NEAR = 1e-4
+"""The fit is done when a step is smaller than this share of `LOOSE`."""
+SHAPE = 0.003
+"""Of the largest torque: standard deviation of what is wrong in a coefficient of the curve, as no fit knows it."""
 
 RUN = np.array([0.05, 2.0])
 """Standard deviations of how far the log gain and the threshold (µs) run within a trial."""
@@ -41,9 +46,10 @@ class Seen:
 
     Parameters
     ----------
-    levels : ndarray, shape (3,)
-        Log gain, threshold shift (µs) and log time scale that explain it best.
-    information : ndarray, shape (3, 3)
+    vector : ndarray, shape (3 + n,)
+        Information times what explains it best: log gain, threshold shift (µs), log time scale, and what is to be
+        added to the coefficients of the approved curve (N·m).
+    information : ndarray, shape (3 + n, 3 + n)
         Inverse of their covariance.
     error_nm : float
         Robust standard deviation of what is left unexplained, N·m.
@@ -57,7 +63,7 @@ class Seen:
         Begin and end of the stretches that do not fit, s in the record's time.
     """
 
-    levels: np.ndarray
+    vector: np.ndarray
     information: np.ndarray
     error_nm: float
     expected_nm: float
@@ -70,20 +76,32 @@ class Seen:
         """What is left unexplained, in units of what the approved model left unexplained."""
         return self.error_nm / self.expected_nm
 
-    def sd(self) -> np.ndarray:
-        """Standard deviations of the levels, infinite where the trial tells nothing; shape (3,)."""
-        return np.sqrt(1.0 / np.maximum(np.linalg.eigvalsh(self.information), 1e-300))
+
+def curve_covariance(model: Model) -> np.ndarray:
+    """How well the curve of an approved model is known: the covariance of its coefficients, (N·m)², shape (n, n).
+
+    That of the fit, for twice the standard deviation, and a little for each coefficient. With more (2 % of the largest
+    torque), half of a person's fatigue was taken for an error of the curve; without it, an error of a steep curve was
+    taken for a change of the gain by 30 %.
+    """
+    size = model.recruitment.basis.size
+    top_nm = float(np.ptp(model.recruitment.table()[1]))
+    found = np.eye(size) * (SHAPE * top_nm) ** 2
+    if model.covariance is not None:
+        own = [place for place, name in enumerate(model.covariance.names) if name.startswith("recruitment_")]
+        found = found + 4.0 * model.covariance.matrix[np.ix_(own, own)]
+    return found
 
 
-def look(model: Model, expected: Values, record: Record) -> Seen:
+def look(model: Model, expected: State, record: Record) -> Seen:
     """Fit a trial.
 
     Parameters
     ----------
     model : Model
         The approved one, with second-order dynamics.
-    expected : Values
-        Where the fit begins.
+    expected : State
+        What is expected of it: where the fit begins.
     record : Record
         The trial, from its rest before to its rest after.
 
@@ -93,55 +111,83 @@ def look(model: Model, expected: Values, record: Record) -> Seen:
         As `identify.simulation.predict.predict`.
     """
     grid = make_grid(record)
-    further = ((SHIFT, (expected.threshold_shift_us, 0.0)), (GAIN, (float(np.log(expected.gain)), 0.0)))
-    problem, theta = problem_of(model, grid, further)
+    log_gain, shift_us, log_time = expected.mean[:LEVELS].tolist()
+    problem, theta = problem_of(model, grid, ((SHIFT, (shift_us, 0.0)), (GAIN, (log_gain, 0.0))))
+    theta[0] += log_time
+    theta[problem.coefficients] += expected.curve_nm
     shift, gain = problem.chosen[-2].first, problem.chosen[-1].first
-    theta[0] += np.log(expected.time_scale)
-    moved = [gain, shift, 0]  # log gain, shift, log time scale
+    curve = range(problem.coefficients.start, problem.coefficients.stop)
     own = [gain + 1, shift + 1, *problem.baselines, *problem.initials]
-    free = np.array([*moved, *own])
-    rows = grid.fitted
     target = problem.setup.to_muscle(grid.torque_nm)
-    scale_nm = max(float(np.ptp(target[rows])), 1e-6)
-    theta[list(problem.baselines)] = np.median(target[rows][: max(4, round(0.5 / grid.step_s))])
-    start = theta[free].copy()
-    loose = np.r_[
-        LOOSE, RUN, np.full(len(problem.baselines), scale_nm), np.tile([0.1, 1.0], problem.setup.starts.size) * scale_nm
-    ]
-    weight = np.ones(int(rows.sum()))
-    before_nm = 0.0
+    scale_nm = max(float(np.ptp(target[grid.fitted])), 1e-6)
+    theta[list(problem.baselines)] = np.median(target[grid.fitted][: max(4, round(0.5 / grid.step_s))])
+    states = np.tile([0.1, 1.0], problem.setup.starts.size)
+    own_sd = np.r_[RUN, np.r_[np.ones(len(problem.baselines)), states] * scale_nm]
+    found = _fitted(problem, theta, np.array([gain, shift, 0, *curve, *own]), _precision(expected, own_sd), target)
+    expected_nm = _expected(model)
+    vector, information = _marginal(found, expected.mean[expected.seen], own_sd)
+    doubt = max(1.0, found.sd_nm / expected_nm) ** 2  # what fits worse than it should may err by more than it scatters
+    return Seen(
+        vector=vector / doubt,
+        information=information / doubt,
+        error_nm=found.sd_nm,
+        expected_nm=expected_nm,
+        before_nm=found.before_nm,
+        torque_nm=found.torque_nm,
+        disturbed=_stretches(grid, found.weight),
+    )
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """The last round of a fit: where it was, relative to where it began, and the likelihood's slope and bend there."""
+
+    moved: np.ndarray
+    slope: np.ndarray
+    bend: np.ndarray
+    weight: np.ndarray
+    sd_nm: float
+    before_nm: float
+    torque_nm: float
+
+
+def _fitted(problem: Problem, theta: np.ndarray, free: np.ndarray, prior: np.ndarray, target: np.ndarray) -> _Fit:
+    """Gauss and Newton's steps with weights that follow the errors."""
+    grid, start = problem.setup.grid, theta[free].copy()
+    rows = grid.fitted
+    weight, before_nm, done = np.ones(int(rows.sum())), None, False
     for turn in range(ROUNDS):
         mean, jacobian = problem.run(theta, derivatives=True)
         assert jacobian is not None
-        error = (target - mean)[rows]
-        slope = jacobian[free][:, rows]
-        if turn == 0:
-            before_nm = float(np.sqrt(np.mean((error - np.median(error)) ** 2)))
+        error, lever = (target - mean)[rows], jacobian[free][:, rows]
+        if before_nm is None:
+            before_nm = float(np.std(error))
         if turn >= TRUSTED_ROUNDS:
             weight = _weights(error, round(LOCAL_S / grid.step_s))
         sd_nm, alike = _spread(error, weight)
         precision = weight / (sd_nm**2 * (1.0 + alike) / (1.0 - alike))
-        known = (slope * precision) @ slope.T
-        pull = (slope * precision) @ error + (start - theta[free]) / loose**2
-        step = np.linalg.solve(known + np.diag(1.0 / loose**2), pull)
-        step[:LEVELS] = np.clip(step[:LEVELS], -0.5 * LOOSE, 0.5 * LOOSE)
+        bend, slope, moved = (lever * precision) @ lever.T, (lever * precision) @ error, theta[free] - start
+        if done or turn == ROUNDS - 1:
+            return _Fit(moved, slope, bend, weight, sd_nm, before_nm, float(np.std(mean[rows])))
+        step = np.linalg.solve(bend + prior, slope - prior @ moved)
+        step[:LEVELS] = np.clip(step[:LEVELS], -LOOSE, LOOSE)
         theta[free] += step
-        if turn > TRUSTED_ROUNDS and np.all(np.abs(step[:LEVELS]) < 1e-4 * LOOSE):
-            break
-    information = _without(known + np.diag(np.r_[np.zeros(LEVELS), 1.0 / loose[LEVELS:] ** 2]))
-    levels = np.array([theta[moved[0]], theta[moved[1]], theta[0] - np.log(model.linear.time_constant_s)])  # pyright: ignore
-    levels = levels + np.linalg.lstsq(information, (levels - expected.levels) / LOOSE**2, rcond=1e-9)[0]
-    expected_nm = _expected(model)
-    return Seen(
-        levels=levels,
-        # What fits worse than it should may err by more than its own scatter says.
-        information=information / max(1.0, sd_nm / expected_nm) ** 2,
-        error_nm=sd_nm,
-        expected_nm=expected_nm,
-        before_nm=before_nm,
-        torque_nm=float(np.sqrt(np.mean((mean[rows] - np.median(mean[rows][:4])) ** 2))),
-        disturbed=_stretches(grid, rows, weight),
-    )
+        done = turn > TRUSTED_ROUNDS and bool(np.all(np.abs(step[:LEVELS]) < NEAR * LOOSE))
+    raise AssertionError("the last round returns")
+
+
+def _marginal(found: _Fit, seen: np.ndarray, own_sd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Information vector and matrix on levels and curve, once what is the trial's own has taken its part."""
+    told = seen.size
+    joint = found.bend.copy()
+    joint[told:, told:] += np.diag(1.0 / own_sd**2)
+    # Relative to where the fit began: there the trial's own parameters have their prior mean.
+    vector = found.bend @ found.moved + found.slope
+    taken = np.linalg.solve(joint[told:, told:], np.c_[joint[told:, :told], vector[told:]])
+    matrix = joint[:told, :told] - joint[:told, told:] @ taken[:, :-1]
+    values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
+    information = (vectors * np.maximum(values, 0.0)) @ vectors.T
+    return vector[:told] - joint[:told, told:] @ taken[:, -1] + information @ seen, information
 
 
 def _expected(model: Model) -> float:
@@ -167,16 +213,19 @@ def _spread(error: np.ndarray, weight: np.ndarray) -> tuple[float, float]:
     return float(np.sqrt(max(power, 1e-18))), float(np.clip(alike, 0.0, MOST_ALIKE))
 
 
-def _without(known: np.ndarray) -> np.ndarray:
-    """Information on the levels once the baseline and the initial state have taken theirs."""
-    cross = known[:LEVELS, LEVELS:]
-    left = known[:LEVELS, :LEVELS] - cross @ np.linalg.solve(known[LEVELS:, LEVELS:], cross.T)
-    values, vectors = np.linalg.eigh(0.5 * (left + left.T))
-    return (vectors * np.maximum(values, 0.0)) @ vectors.T
+def _precision(expected: State, own_sd: np.ndarray) -> np.ndarray:
+    """Prior precision of the fit: levels, looser than expected, so that a jump is found; curve; the trial's own."""
+    seen = expected.covariance[np.ix_(expected.seen, expected.seen)].copy()
+    seen[np.arange(LEVELS), np.arange(LEVELS)] += LOOSE**2
+    size = len(seen)
+    precision = np.zeros((size + own_sd.size,) * 2)
+    precision[:size, :size] = np.linalg.inv(seen)
+    precision[size:, size:] = np.diag(1.0 / own_sd**2)
+    return precision
 
 
-def _stretches(grid: Grid, rows: np.ndarray, weight: np.ndarray) -> tuple[tuple[float, float], ...]:
+def _stretches(grid: Grid, weight: np.ndarray) -> tuple[tuple[float, float], ...]:
     low = np.zeros(grid.size, bool)
-    low[rows] = weight < DISTURBED
+    low[grid.fitted] = weight < DISTURBED
     begins = grid.time_s - grid.record.time_s[0]
     return tuple((float(begins[run.start]), float(begins[run.stop - 1] + grid.step_s)) for run in runs(low))

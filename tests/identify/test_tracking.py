@@ -77,7 +77,7 @@ CHANGES = {
     "threshold": (Changing(PATIENT, shift_us=lambda n: -0.8 * n), 1, -0.8),
     "slower": (Changing(PATIENT, time_scale=lambda n: 1.03**n), 2, np.log(1.03)),
 }
-NEAR = np.array([0.012, 0.6, 0.02])
+NEAR = np.array([0.05, 0.6, 0.02])
 
 
 @pytest.mark.parametrize("name", CHANGES)
@@ -87,6 +87,7 @@ def test_what_changes_steadily_is_followed_and_foreseen(model: Model, unchanged:
     for state, trials in ((last.after, 7.5), (last.coming, 8.5)):
         away = state.mean[quantity] - unchanged.mean[quantity] - trials * per_trial
         assert abs(away) < NEAR[quantity], (name, trials, away)
+        assert state.mean[3 + quantity] == pytest.approx(per_trial, rel=0.15)
     # What counts for a controller: the torque of a trial that was not seen yet.
     unseen = muscle.play(WIDTHS, 8, np.random.default_rng(0), noise_nm=0.0)
     share = [np.std(m.predict(unseen) - unseen.torque_nm) / np.std(unseen.torque_nm) for m in
@@ -126,8 +127,8 @@ def test_a_sudden_change_is_followed_when_the_next_trial_says_the_same(model: Mo
     assert np.all(moves(steps[:4]) < 1.0)
     assert steps[4].outcome is Outcome.FOLLOWED
     gains = [step.after.values.gain for step in steps]
-    assert gains[4] / gains[2] == pytest.approx(0.7, abs=0.01)
-    assert gains[5] / gains[2] == pytest.approx(0.7, abs=0.01)
+    assert gains[4] / gains[2] == pytest.approx(0.7, abs=0.03)
+    assert gains[5] / gains[2] == pytest.approx(0.7, abs=0.03)
 
 
 def test_another_structure_is_told_when_two_trials_show_it(model: Model) -> None:
@@ -230,12 +231,12 @@ def test_a_person_who_always_tires_is_expected_to(model: Model) -> None:
     told = [[levels_of(step.after) for step in followed(model, session(muscle, 6, seed))] for seed in (11, 12, 13)]
     rates = learn_rates(told)
     assert rates.sessions == 3
-    assert np.log(0.95) < rates.trend[0] < 0.5 * np.log(0.95)
+    assert np.log(0.95) < rates.trend[0] < 0.4 * np.log(0.95)
     assert rates.trend[1] == pytest.approx(0.0, abs=0.1) and rates.trend[2] == pytest.approx(0.0, abs=0.005)
     first = session(muscle, 1, seed=14)[0]
     usual, learnt = follow(model, None, first), follow(model, None, first, rates)
     wanted = usual.after.values.gain * 0.95
-    assert abs(learnt.coming.values.gain - wanted) < 0.6 * abs(usual.coming.values.gain - wanted)
+    assert abs(learnt.coming.values.gain - wanted) < 0.75 * abs(usual.coming.values.gain - wanted)
 
 
 def test_a_person_who_jumps_about_gets_wider_bands(model: Model) -> None:
