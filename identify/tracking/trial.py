@@ -12,6 +12,7 @@ import numpy as np
 
 from identify.dynamics.make_grid import make_grid
 from identify.dynamics.pulse_grid import Grid, runs
+from identify.errors import BadRecord
 from identify.model import Model
 from identify.records.record import Record
 from identify.simulation.predict import problem_of
@@ -19,6 +20,7 @@ from identify.simulation.problem import Problem
 from identify.tracking.forms import GAIN, SHIFT
 from identify.tracking.state import LEVELS, State
 
+SHORTEST_S = 1.0
 ROUNDS = 7
 TRUSTED_ROUNDS = 2
 """Rounds before stretches lose weight: until then the levels may be far off."""
@@ -108,9 +110,13 @@ def look(model: Model, expected: State, record: Record) -> Seen:
     Raises
     ------
     BadModel, BadRecord
-        As `identify.simulation.predict.predict`.
+        As `identify.simulation.predict.predict`; and a trial shorter than a second.
     """
     grid = make_grid(record)
+    if not np.sum(grid.fitted) * grid.step_s >= SHORTEST_S:
+        raise BadRecord(
+            f"less than {SHORTEST_S:g} s that can be used", fix="Play a longer trial; rows of `validate` do not count."
+        )
     log_gain, shift_us, log_time = expected.mean[:LEVELS].tolist()
     problem, theta = problem_of(model, grid, ((SHIFT, (shift_us, 0.0)), (GAIN, (log_gain, 0.0))))
     theta[0] += log_time

@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 import warnings
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import pytest
 
-from identify.errors import BadModel
+from identify.errors import BadModel, BadRecord
 from identify.fitting import fit
 from identify.model import Model
 from identify.records.record import Record
@@ -50,7 +51,7 @@ def followed(model: Model, records: Sequence[Record]) -> list[Step]:
     return steps
 
 
-def session(muscle: Changing, trials: int, seed: int = 5, **how: float) -> list[Record]:
+def session(muscle: Changing, trials: int, seed: int = 5, **how: Any) -> list[Record]:
     rng = np.random.default_rng(seed)
     return [muscle.play(WIDTHS, trial, rng, **how) for trial in range(trials)]
 
@@ -151,7 +152,7 @@ def test_a_trial_that_tells_little_moves_little_and_says_so(model: Model) -> Non
         assert np.all(np.diag(step.after.covariance)[:3] > 0.3 * np.diag(step.before.covariance)[:3])
 
 
-ALIKE = {
+ALIKE: dict[str, dict[str, float]] = {
     "upside down": {"sign": -1.0},
     "another zero": {"baseline_nm": 7.3},
     "another start": {"start_s": 1000.0},
@@ -218,6 +219,28 @@ def test_dynamics_of_another_kind_are_refused_with_the_mend() -> None:
         follow(other, None, trial)
     with pytest.raises(BadModel, match="second-order"):
         moved_model(other, Values(gain=0.9))
+
+
+@pytest.mark.parametrize("held_out", [False, True])
+def test_a_trial_without_a_second_to_use_is_refused(model: Model, held_out: bool) -> None:
+    whole = Changing(PATIENT).play(WIDTHS, 0, np.random.default_rng(2))
+    kept = slice(None) if held_out else slice(0, 350)
+    names = np.full(whole.time_s.size, "validate" if held_out else "trial")[kept]
+    cut = Record.from_arrays(whole.time_s[kept], whole.pulse_width_us[kept], whole.torque_nm[kept], names)
+    with pytest.raises(BadRecord, match="less than 1 s"):
+        follow(model, None, cut)
+
+
+def test_a_hundred_trials_stay_well_behaved(model: Model) -> None:
+    rng, state = np.random.default_rng(9), None
+    for trial in range(100):
+        step = follow(
+            model, state, Changing(PATIENT, gain=lambda n: 1.0 + 0.1 * np.sin(n / 9)).play(WIDTHS, trial, rng)
+        )
+        state = step.coming
+    assert np.linalg.eigvalsh(step.after.covariance).min() > -1e-12
+    assert step.after.values.gain == pytest.approx(1.0 + 0.1 * np.sin(99.5 / 9), abs=0.04)
+    assert moves([step]).max() < 1.0
 
 
 def test_rates_are_the_usual_ones_until_there_are_earlier_sessions(model: Model) -> None:
