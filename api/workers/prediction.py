@@ -27,20 +27,29 @@ def forecast(
 def invert(
     progress: Progress,
     model_json: str,
-    reference_torque_nm: list[float],
+    reference_torque_nm: list[float] | None = None,
     time_s: list[float] | None = None,
+    table: str | None = None,
     pulse_rate_hz: float | None = None,
     largest_us: float | None = None,
     rise_us: float | None = None,
     whole: bool = True,
 ) -> dict[str, Any]:
-    """The pulse widths whose predicted torque follows a reference best, and where it cannot be reached and why."""
+    """The pulse widths whose predicted torque follows a reference best, and where it cannot be reached and why.
+
+    The reference comes as numbers, or as the text of a CSV file (`table`).
+    """
     import identify
     from identify.inversion import Reference
     from identify.inversion import invert as widths_for
+    from identify.inversion.table import read_reference
 
     progress(0.1, "inverting")
     model = identify.Model.from_json(model_json)
-    reference = Reference.of(reference_torque_nm, time_s, pulse_rate_hz=pulse_rate_hz or model.pulse_rate_hz)
+    rate_hz = pulse_rate_hz or model.pulse_rate_hz
+    if table is not None:
+        reference = read_reference(table.encode(), "the upload", rate_hz)
+    else:
+        reference = Reference.of(reference_torque_nm, time_s, pulse_rate_hz=rate_hz)
     found = widths_for(model, reference, largest_us=largest_us, rise_us=rise_us, whole=whole)
     return clean(found.to_dict())

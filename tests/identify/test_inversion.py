@@ -178,7 +178,7 @@ def test_with_a_rise_limit_pulses_under_the_threshold_prepare_a_rise():
         return int(np.flatnonzero(found.pulse_width_us[:60] == 0.0)[-1]) + 1
 
     first = last_start(held)
-    assert first < last_start(free) and held.pulse_width_us[first] > 20.0
+    assert first < last_start(free) and held.pulse_width_us[first] > 10.0
     assert np.max(held.predicted_nm[first : first + 3]) < 0.03
     assert held.whole_fit_percent > free.whole_fit_percent - 10.0  # pyright: ignore
 
