@@ -122,6 +122,8 @@ POST   /participants/x/archive                             run-test       404
 POST   /participants/x/unarchive                           run-test       404
 POST   /participants/x/muscle                              run-test       404
 POST   /tests/x/ran-by                                     run-test       404
+POST   /participants/x/keys/x/revoke                       run-test       404
+POST   /participants/x/keys                                approve-model  404
 POST   /v1/rearm                                           rearm          200
 POST   /rearm                                              rearm          303
 POST   /v1/models/x/approve                                approve-model  404
