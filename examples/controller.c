@@ -1,7 +1,7 @@
 /* One trial from C: fetch the widths for a reference torque, play them, wait for the end, fetch the recording.
  *
  *   gcc -std=c11 -Wall -Wextra -o controller examples/controller.c -lcurl -lcjson -lm
- *   STIMRIG_KEY=… ./controller http://127.0.0.1:8000 P017 trial.h5
+ *   STIMRIG_TOKEN=… ./controller http://127.0.0.1:8000 P017 trial.h5
  *
  * Needs libcurl and cJSON (Debian: libcurl4-openssl-dev, libcjson-dev). Every answer that is not 2xx ends the program
  * with the sentence of the service: it says what is wrong and what to do.
@@ -139,10 +139,10 @@ static char *play(const char *url, const char *key, const char *participant, cJS
 
 int main(int count, char **words)
 {
-    const char *key = getenv("STIMRIG_KEY");
+    const char *key = getenv("STIMRIG_TOKEN");
     char path[256];
     if (count != 4 || key == NULL)
-        fail("usage", "STIMRIG_KEY=… controller URL PARTICIPANT FILE.h5");
+        fail("usage", "STIMRIG_TOKEN=… controller URL PARTICIPANT FILE.h5");
     curl_global_init(CURL_GLOBAL_DEFAULT);
     snprintf(path, sizeof path, "/v1/participants/%s/model", words[2]);
     cJSON *model = ask_json(words[1], key, path, NULL);

@@ -1,4 +1,4 @@
-"""docs/controllers.md does what it says: its blocks are run in order, with a key of the page; its C program compiles."""
+"""docs/controllers.md does what it says: its blocks are run in order, with a key; its C program compiles and plays."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def ready(request: pytest.FixtureRequest) -> None:
 
 def environment(served: tuple[Service, str]) -> dict[str, str]:
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
-    keys = {"KEY": served[1], "STIMRIG_KEY": served[1], "STIMRIG_TOKEN": served[1]}
+    keys = {"KEY": served[1], "STIMRIG_TOKEN": served[1]}
     return {**os.environ, "PATH": path, "URL": served[0].url, "PYTHONPATH": str(ROOT), **keys}
 
 
