@@ -18,7 +18,7 @@ OPEN = [
     for method, path, table in (
         ("POST", STOP, None),
         ("POST", "/v1/tests", None),
-        ("GET", "/v1/participants/([^/]+)/model", str),
+        ("GET", "/v1/participants/([^/]+)/(?:model|tracking)", str),
         ("POST", "/v1/models/([^/]+)/prediction", Model),
         ("POST", "/v1/models/([^/]+)/widths", Model),
         ("GET", "/v1/tests/([^/]+)", Test),
@@ -50,7 +50,9 @@ def _opens(store: Store, participant: str, method: str, path: str) -> bool:
             return True
         if table is str:
             return found[1] == participant
-        row = store.get(table, found[1])
+        # What is tracked from a model has the id of that model before a point.
+        own_id = found[1].partition(".")[0] if table is Model else found[1]
+        row = store.get(table, own_id)
         of_test = table is not Recording or (row is not None and row.test_id is not None)
         return row is not None and row.participant == participant and of_test
     return False
