@@ -35,9 +35,10 @@ def make(auth: Auth, name: str, participant: str, plan: dict[str, Any], by: str)
 
 
 def of(auth: Auth, participant: str) -> list[dict[str, Any]]:
-    """The keys of a participant, newest first; `id` is for `revoke`, and `state` says whether it opens anything."""
+    """Today's keys of a participant, newest first; `id` is for `revoke`, `state` says whether it opens anything."""
     with auth.store.read() as session:
-        of_participant = select(Token).where(Token.participant == participant)
+        today = Token.created_utc >= auth.clock.start_of_day_utc()
+        of_participant = select(Token).where(Token.participant == participant, today)
         rows = list(session.scalars(of_participant.order_by(Token.created_utc.desc())))
     return [{"id": row.hash[:16], "state": _state(auth, row), **row.as_dict()} for row in rows]
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import httpx
 import pytest
+from sqlalchemy import select
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
@@ -238,6 +239,11 @@ def test_it_ends_with_its_day_and_where_it_is_revoked_and_still_stops(shared: Se
         assert answer.status_code == 401 and "revoked" in answer.text
     page = admin.get("/participants/P1", headers=HTML).text
     assert "revoked" in page and "expired" in page and text not in page
+    context.auth._known.clear()
+    with context.store.write() as session:
+        for row in session.scalars(select(Token).where(Token.participant == "P1")):
+            row.created_utc = "2020-01-01T09:00:00.000Z"
+    assert "None yet." in admin.get("/participants/P1", headers=HTML).text, "those of other days are gone"
 
 
 def test_a_live_channel_is_its_own_participants(shared: Service, admin: httpx.Client, done: dict[str, Any]) -> None:
