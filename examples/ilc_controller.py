@@ -50,6 +50,8 @@ STEP = 0.8
 LEAST_SHARE = 0.2
 """A trial worse than the one before halves the share of each correction, down to this: near the noise a full correction
 only plays the last trial's noise back; some is kept, since a muscle changes."""
+GROWTH = 1.5
+"""A trial better than the one before makes the share grow by this factor again, up to 1."""
 
 
 @dataclass(frozen=True)
@@ -277,8 +279,9 @@ def learn(
         error_nm = reference.torque_nm - torque_nm
         lost = int(np.sum(sent_us != widths_us))
         percent = 100 * float(np.sqrt(np.mean(error_nm**2))) / reference.rms_nm
-        if done and percent > done[-1].error_percent:
-            share = max(LEAST_SHARE, share / 2)
+        if done:
+            worse = percent > done[-1].error_percent
+            share = max(LEAST_SHARE, share / 2) if worse else min(1.0, GROWTH * share)
         done.append(Trial(widths_us, torque_nm, percent, lost))
         print(f"  trial {len(done):2d}  {percent:6.2f} % of the reference's rms, {lost} pulses lost", file=sys.stderr)
         not_sent_nm = plant.G @ (plant.level(widths_us) - plant.level(sent_us))  # a late pulse is dropped by the rig:

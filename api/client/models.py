@@ -69,6 +69,30 @@ class Models(Connection):
         body = {"pulse_width_us": list(pulse_width_us), "pulse_rate_hz": pulse_rate_hz}
         return self.post(f"/v1/models/{model_id}/prediction", json=body)["torque_nm"]
 
+    def widths(
+        self, model_id: str, reference: Sequence[float], time_s: Sequence[float] | None = None, **more: Any
+    ) -> dict[str, Any]:
+        """The pulse widths with which the model follows a torque best, and what of it is out of reach.
+
+        Parameters
+        ----------
+        model_id : str
+            Version.
+        reference : sequence of float
+            Torque above rest, N·m: one for each pulse, or one for each of `time_s`.
+        time_s : sequence of float, optional
+            Times, s, rising.
+        **more
+            `pulse_rate_hz`, `max_pulse_width_us`, `max_rise_us`, `whole_us`.
+
+        Returns
+        -------
+        dict
+            `pulse_width_us`, `predicted_torque_nm`, `unreachable`, `fit_percent`, and `segments` for `start_test`.
+        """
+        body = {"reference_torque_nm": list(reference), "time_s": None if time_s is None else list(time_s), **more}
+        return self.post(f"/v1/models/{model_id}/widths", json=body)
+
     def curves(self, model_id: str) -> dict[str, Any]:
         """Measured and predicted torque, pulse widths and step response, for drawing."""
         return self.get(f"/v1/models/{model_id}/curves")

@@ -6,6 +6,7 @@ import hashlib
 import secrets
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from typing import Any
 
 from sqlalchemy import delete, select
 from sqlalchemy.orm import Session
@@ -56,6 +57,10 @@ class Principal:
         The browser's session, however it was opened; None for a bearer token.
     locked : bool
         Whether that session waits to be unlocked: then it may press stop, and nothing else.
+    participant : str or None
+        The only one that a controller's key opens; None for everybody else.
+    plan : dict or None
+        What trials that key may play.
     """
 
     name: str
@@ -64,6 +69,8 @@ class Principal:
     session_hash: str | None = None
     page_session: PageSession | None = None
     locked: bool = False
+    participant: str | None = None
+    plan: dict[str, Any] | None = None
 
     def may(self, scope: Scope) -> bool:
         """Whether the scope is held."""
@@ -90,16 +97,18 @@ class Auth:
         self._known: dict[str, Token] = {}
 
     def issue(self, name: str, scopes: list[Scope], by: str, *, text: str | None = None, origin: str = "issued",
-              expires_utc: str | None = None) -> str:  # fmt: skip
-        """Make a token and return its text, which is shown this once."""
+              expires_utc: str | None = None, participant: str | None = None,
+              plan: dict[str, Any] | None = None) -> str:  # fmt: skip
+        """Make a token and return its text, which is shown this once; `participant` and `plan` as in `Principal`."""
         text = text or f"stimrig_{secrets.token_urlsafe(32)}"
         now = self.clock.utc()
         with self.store.write() as session:
             row = Token(hash=digest(text), prefix=text[:12] if origin == "issued" else "(set)", name=name)
             row.scopes, row.created_utc, row.origin = [str(scope) for scope in scopes], now, origin
-            row.expires_utc, row.revoked = expires_utc, False
+            row.expires_utc, row.revoked, row.participant, row.plan = expires_utc, False, participant, plan
             session.merge(row)
-            audit.write(session, now, by, "issue token", name, scopes=row.scopes)
+            bound = {} if participant is None else {"participant": participant, "plan": plan, "until": expires_utc}
+            audit.write(session, now, by, "issue token", name, scopes=row.scopes, **bound)
         self._known = {}
         return text
 
@@ -166,11 +175,14 @@ class Auth:
             raise unauthorized("The token is unknown or has been revoked. Ask an administrator for a new one.")
         if token.expires_utc is not None and token.expires_utc <= self.clock.utc() and not forgive_age:
             raise unauthorized("The token has expired. Ask an administrator for a new one.")
-        return Principal(token.name, frozenset(token.scopes), csrf)
+        return Principal(token.name, frozenset(token.scopes), csrf, participant=token.participant, plan=token.plan)
 
     def sign_in(self, token_text: str, address: str) -> str:
-        """Open a page session for a token's holder; its cookie. Raises as `bearer` does."""
-        return self.open_session(digest(token_text), self.bearer(token_text, address).name)
+        """Open a page session for a token's holder; its cookie. Raises as `bearer` does; 403 for a controller's key."""
+        who = self.bearer(token_text, address)
+        if who.participant is not None:
+            raise outside(who.participant)
+        return self.open_session(digest(token_text), who.name)
 
     def open_session(self, token_hash: str, name: str) -> str:
         """Open a page session for the holder of a token; its cookie."""
@@ -245,9 +257,19 @@ class Auth:
         return replace(principal, session_hash=row.hash, scopes=principal.scopes | more)
 
     def identify(
-        self, connection: HTTPConnection, *, forgive_age: bool = False, forgive_lock: bool = False
+        self, connection: HTTPConnection, *, forgive_age: bool = False, forgive_lock: bool = False, bound: bool = False
     ) -> Principal:
-        """Who stands behind a request or a WebSocket."""
+        """Who stands behind a request or a WebSocket.
+
+        A controller's key, which is bound to a participant, is refused (403) unless whoever asks looks after that
+        (`bound`): `api.web.key_guard`, and stop.
+        """
+        who = self._identify(connection, forgive_age, forgive_lock)
+        if who.participant is not None and not bound:
+            raise outside(who.participant)
+        return who
+
+    def _identify(self, connection: HTTPConnection, forgive_age: bool, forgive_lock: bool) -> Principal:
         header = connection.headers.get("authorization", "")
         if header:
             kind, _, text = header.partition(" ")
@@ -271,3 +293,12 @@ def unauthorized(detail: str, code: str = "unauthorized", title: str = "Not sign
     problem = ApiError(401, code, title, detail)
     problem.headers["WWW-Authenticate"] = 'Bearer realm="stimrig"'
     return problem
+
+
+def outside(participant: str | None) -> ApiError:
+    """403 for whatever a key does not open; the same for what is another's and for what is not there."""
+    detail = (
+        f"This key is for one participant, {participant}, and one day: the approved model, predictions and widths, "
+        "live signals and recordings of tests, and trials within the plan. This is not among them."
+    )
+    return ApiError(403, "outside-key", "This key does not open it", detail)

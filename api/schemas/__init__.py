@@ -17,6 +17,7 @@ OF_VERB = {
     "compare": "comparison",
     "diagnose": "diagnosis",
     "improve": "improvement",
+    "invert": "inversion",
 }
 """The schema of a verb's `--json`, where it bears another name than the verb."""
 

@@ -136,6 +136,10 @@ class Token(Table):
     expires_utc: Mapped[str | None] = mapped_column(String(32), default=None)
     revoked: Mapped[bool] = mapped_column(Boolean, default=False)
     origin: Mapped[str] = mapped_column(String(20), default="issued")
+    participant: Mapped[str | None] = mapped_column(String(32), default=None)
+    """The only one that a controller's key opens; None: a token that is bound to nobody."""
+    plan: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True), default=None)
+    """What trials a controller's key may play."""
 
 
 class PageSession(Table):

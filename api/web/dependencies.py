@@ -69,6 +69,8 @@ class Context:
     limits_turn: asyncio.Lock = field(default_factory=asyncio.Lock)
     """Who changes a participant's limits, and who lets a calibration send by them, take turns: once a change is
     answered nothing begins with what was before."""
+    key_turn: asyncio.Lock = field(default_factory=asyncio.Lock)
+    """Trials of controllers' keys are counted and begun one after the other."""
     stops: StopLog = field(default_factory=StopLog)
     started_s: float = field(default_factory=time.monotonic)
     flushing: asyncio.Task[None] | None = None

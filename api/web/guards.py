@@ -11,6 +11,7 @@ from fastapi.security import APIKeyCookie, HTTPBearer
 
 from api.errors import ApiError
 from api.people.auth import COOKIE, Principal, Scope
+from api.web.key_guard import refuse_outside
 
 SAFE_METHODS = {"GET", "HEAD", "OPTIONS"}
 POLLED = ("/rig/", "/jobs/now/", "/v1/jobs/")
@@ -44,8 +45,9 @@ def require(scope: Scope) -> Callable[..., Awaitable[Principal]]:
 
 def identified(request: Request) -> Principal:
     """Who asks; where it is a person's own doing, the session is not idle."""
-    auth = request.app.state.context.auth
-    principal = auth.identify(request)
+    context = request.app.state.context
+    auth, principal = context.auth, context.auth.identify(request, bound=True)
+    refuse_outside(context.store, principal, request.method, request.url.path)
     if principal.page_session is not None and by_a_person(request):
         auth.idle.acted(principal.page_session.hash)
     return principal

@@ -26,10 +26,11 @@ Right = Annotated[object, Security(RIGHT)]
 
 @dataclass(frozen=True)
 class Press:
-    """A stop that is allowed: who pressed it, and why."""
+    """A stop that is allowed: who pressed it, and why; a controller's key is told of no other participant."""
 
     by: str
     reason: str
+    by_key: bool = False
 
 
 async def anyone_who_may_stop(request: Request, _token: Token, _session: Session, _right: Right) -> Press:
@@ -43,7 +44,8 @@ async def anyone_who_may_stop(request: Request, _token: Token, _session: Session
         if by is not None:
             return Press(by, reason)
         try:
-            return Press(request.app.state.context.auth.identify(request, forgive_age=True).name, reason)
+            who = request.app.state.context.auth.identify(request, forgive_age=True, bound=True)
+            return Press(who.name, reason, who.participant is not None)
         except ApiError as error:
             reason, by = await _within(LONGEST_PATIENCE_S - PATIENCE_S, request, coming)
             if by is not None:

@@ -1,35 +1,55 @@
-"""What a model says a list of pulse widths would give: for a controller that plans a trial. Run in a worker."""
+"""What a model says a list of pulse widths would give, and which widths a torque needs. Run in a worker."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from typing import Any
 
-REST_S = 1.0
-SAMPLES_A_PULSE = 8
+from api.workers.json_values import clean
+
+Progress = Callable[[float, str], None]
 
 
 def forecast(
-    progress: Callable[[float, str], None], model_json: str, pulse_width_us: list[float], pulse_rate_hz: float = 40.0
+    progress: Progress, model_json: str, pulse_width_us: list[float], pulse_rate_hz: float = 40.0
 ) -> dict[str, Any]:
-    """Mean torque that the pulses give in each pulse's period, N·m, effects included, after one second of rest.
-
-    What the same model gives without any pulse is taken off: voluntary effort, tremor, hum and drift of the day of the
-    test are no answer to a stimulus, and won't be there again.
-    """
+    """Mean torque that the pulses give in each pulse's period, N·m, effects included, after one second of rest."""
     import numpy as np
 
     import identify
+    from identify.simulation.pulses import above_rest
 
     progress(0.1, "predicting")
     model = identify.Model.from_json(model_json)
-    rest = round(REST_S * pulse_rate_hz)
+    return {"torque_nm": above_rest(model, np.asarray(pulse_width_us, float), pulse_rate_hz).round(6).tolist()}
 
-    def torque_of(widths_us: np.ndarray) -> np.ndarray:
-        held = np.repeat(np.r_[np.zeros(rest), widths_us], SAMPLES_A_PULSE)
-        time_s = np.arange(held.size) / (SAMPLES_A_PULSE * pulse_rate_hz)
-        record = identify.Record.from_arrays(time_s, held, np.zeros(held.size), pulse_rate_hz=pulse_rate_hz)
-        return np.asarray(identify.predict(model, record)).reshape(-1, SAMPLES_A_PULSE).mean(axis=1)[rest:]
 
-    widths = np.asarray(pulse_width_us, float)
-    return {"torque_nm": (torque_of(widths) - torque_of(np.zeros(widths.size))).round(6).tolist()}
+def invert(
+    progress: Progress,
+    model_json: str,
+    reference_torque_nm: list[float] | None = None,
+    time_s: list[float] | None = None,
+    table: str | None = None,
+    pulse_rate_hz: float | None = None,
+    largest_us: float | None = None,
+    rise_us: float | None = None,
+    whole: bool = True,
+) -> dict[str, Any]:
+    """The pulse widths whose predicted torque follows a reference best, and where it cannot be reached and why.
+
+    The reference comes as numbers, or as the text of a CSV file (`table`).
+    """
+    import identify
+    from identify.inversion import Reference
+    from identify.inversion import invert as widths_for
+    from identify.inversion.table import read_reference
+
+    progress(0.1, "inverting")
+    model = identify.Model.from_json(model_json)
+    rate_hz = pulse_rate_hz or model.pulse_rate_hz
+    if table is not None:
+        reference = read_reference(table.encode(), "the upload", rate_hz)
+    else:
+        reference = Reference.of(reference_torque_nm, time_s, pulse_rate_hz=rate_hz)
+    found = widths_for(model, reference, largest_us=largest_us, rise_us=rise_us, whole=whole)
+    return clean(found.to_dict())

@@ -37,6 +37,7 @@ PROCESSOR_S = {
     "plain_csv": 120.0,
     "find_recording": 120.0,
     "join": 120.0,
+    "invert": 60.0,
     "adaptive_outlook": 60.0,
     "adaptive_begin": 10.0,
     "adaptive_advise": 5.0,

@@ -14,7 +14,7 @@ from typing import Any
 from api.workers import adaptive_verbs
 from api.workers.diagnosis_verbs import diagnosis, improve, joined
 from api.workers.json_values import clean
-from api.workers.prediction import forecast
+from api.workers.prediction import forecast, invert
 from api.workers.recorded_signals import recorded
 
 Progress = Callable[[float, str], None]
@@ -257,6 +257,7 @@ VERBS: dict[str, Callable[..., dict[str, Any]]] = {
     "effects": effects,
     "warm": warm,
     "forecast": forecast,
+    "invert": invert,
     "export_csv": export_csv,
     "plain_csv": plain_csv,
     "find_recording": find_recording,

@@ -58,6 +58,18 @@ def default_widths() -> tuple[list[float], list[dict[str, Any]]]:
 PATIENT = Patient(gain=6.9, a2=1 / 25, a3=float(np.exp(6)))
 
 
+def trial_widths(plan: list[m.SegmentPlan]) -> tuple[list[float], list[dict[str, Any]]]:
+    """Rests and lists of widths, as a controller plans them."""
+    widths: list[float] = []
+    segments: list[dict[str, Any]] = []
+    for segment in plan:
+        start = len(widths) / PULSE_RATE_HZ
+        rest = [0.0] * round(segment.settings.get("duration_s", 1.0) * PULSE_RATE_HZ)
+        widths += segment.settings.get("pulse_width_us", rest)
+        segments.append({"name": segment.name, "start_s": start, "end_s": len(widths) / PULSE_RATE_HZ})
+    return widths, segments
+
+
 def muscle(widths: list[float], rate_hz: float) -> list[float]:
     """Torque of the patient with noise of 0.04 N·m, the same for the same widths."""
     torque = PATIENT.torque(np.array(widths), rate_hz, PULSE_RATE_HZ)
@@ -178,6 +190,8 @@ class FakeRig:
                 raise m_refusal(
                     "bad-plan", "No such sequence", f"{segment.sequence!r}; there are prbs, ramp, rest, widths."
                 )
+        if plan.kind == "sequence" and plan.segments:
+            return trial_widths(plan.segments)
         if plan.adaptive is None:
             return default_widths()
         score = FakeScore(plan, [], [])
@@ -326,7 +340,7 @@ class FakeRig:
             )
 
     async def _played(self, plan: m.TestPlan) -> None:
-        self.score = score = FakeScore(plan, *default_widths())
+        self.score = score = FakeScore(plan, *(self._widths(plan) if plan.adaptive is None else default_widths()))
         torque = muscle(score.widths, self.rate_hz)
         self.duration_s = plan.adaptive.max_duration_s if plan.adaptive else score.end_s
         self._send(m.StateEvent(status=self.status()))

@@ -208,6 +208,16 @@ def answer(verb: str, arguments: dict[str, Any], say: Any) -> dict[str, Any]:
         return {"result": advised(arguments)}
     if verb == "forecast":
         return {"result": {"torque_nm": [width / 100 for width in arguments["pulse_width_us"]]}}
+    if verb == "invert":
+        if arguments.get("table") == "":
+            return {"error": {"expected": True, "detail": "the upload: empty. Give a header.", "place": "the upload"}}
+        wanted = arguments.get("reference_torque_nm") or [0.0, 1.0, 2.0]
+        widths = [min(100.0 * torque, arguments["largest_us"] or 500.0) for torque in wanted]
+        lacks = [{"begin_s": 0.025, "end_s": 0.05, "reason": "above-plateau", "shortfall_nm": 0.5}]
+        return {"result": {"pulse_rate_hz": 40.0, "duration_s": len(wanted) / 40, "reference_torque_nm": wanted,
+                           "pulse_width_us": widths, "predicted_torque_nm": [width / 100 for width in widths],
+                           "unreachable": lacks, "fit_percent": 90.0, "whole_fit_percent": 80.0,
+                           "tolerance_nm": 0.1}}  # fmt: skip
     if verb == "join":
         Path(arguments["out"]).write_text("\n".join(arguments["parts"]))
         return {"result": {"file_sha256": "0" * 64}}

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from tests.api.browser import PHONE, WIDE, open_tab, participant, sign_in_with_token, start
+from tests.api.browser import PASSWORD, PHONE, WIDE, open_tab, participant, sign_in_with_token, start
 from tests.api.conftest import STUB, Service, run_service, run_test, wait_done
 
 axe_path = pytest.importorskip("axe_playwright_python.base").AXE_FILE_PATH
@@ -215,6 +215,30 @@ def test_in_german(tab: Any, service: Service) -> None:
     for path in ("/participants/X6", f"/tests/{done['id']}", "/participants/X6/trend"):
         visit(tab, service, path)
     assert tab.locator("html").get_attribute("lang") == "de"
+
+
+def test_widths_for_a_torque_and_a_controllers_key(tab: Any, service: Service, tmp_path: Path) -> None:
+    with service.client() as http:
+        http.post("/v1/participants", json={"code": "X7"})
+        model = run_test(http, "X7")["model_id"]
+    reference = tmp_path / "reference.csv"
+    reference.write_text("torque_nm\n0\n1\n2\n")
+    visit(tab, service, f"/models/{model}/widths")
+    tab.get_by_label("CSV with").set_input_files(reference)
+    tab.get_by_role("button", name="Find the pulse widths").click()
+    tab.get_by_role("heading", name="Out of reach").wait_for()
+    examined(tab, "widths for a torque")
+    with tab.expect_download() as download:
+        tab.get_by_role("button", name="Download the widths").click()
+    assert Path(download.value.path()).read_text().startswith("time_s,pulse_width_us")
+    visit(tab, service, "/participants/X7")
+    tab.get_by_label("Name of the controller").fill("ilc")
+    tab.get_by_label("Your password, once more").fill(PASSWORD)
+    tab.get_by_role("button", name="Make the key").click()
+    tab.get_by_text("shown this once").wait_for()
+    examined(tab, "a key")
+    tab.get_by_role("button", name="Revoke the key of ilc").click()
+    tab.get_by_role("cell", name="revoked").wait_for()
 
 
 def test_a_diagnosis_under_way(tab: Any, service: Service) -> None:

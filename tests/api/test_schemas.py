@@ -46,13 +46,16 @@ def model(record: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize("verb", ["fit", "predict", "compare", "diagnose", "improve", "effects", "doctor"])
+@pytest.mark.parametrize("verb", ["fit", "predict", "compare", "diagnose", "improve", "invert", "effects", "doctor"])
 def test_a_verbs_json_holds_to_its_schema(
     verb: str, record: Path, model: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    reference = record.with_name("reference.csv")
+    reference.write_text("time_s,torque_nm\n0,0\n1,2\n2,0\n")
     given = {
         "fit": [record], "predict": [model, record, "-o", record.with_name("out.csv")], "compare": [model, record],
-        "diagnose": [record], "improve": [record], "effects": [], "doctor": ["--data", record.parent],
+        "diagnose": [record], "improve": [record], "effects": [],
+        "invert": [model, reference, "-o", reference], "doctor": ["--data", record.parent],
     }[verb]  # fmt: skip
     capsys.readouterr()
     assert main.run([verb, *map(str, given), "--json"]) == 0

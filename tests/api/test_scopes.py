@@ -52,6 +52,10 @@ GET    /v1/models/x/comparison                             read-model     404
 GET    /v1/models/x/curves                                 read-model     404
 GET    /v1/models/x/diagnosis                              read-model     404
 POST   /v1/models/x/prediction                             read-model     422
+POST   /v1/models/x/widths                                 read-model     422
+GET    /models/x/widths                                    read-model     404
+POST   /models/x/widths                                    read-model     4xx
+POST   /models/x/widths.csv                                read-model     4xx
 GET    /v1/participants/x/model                            read-model     404
 GET    /v1/participants/x/models                           read-model     404
 GET    /v1/participants/x/trend                            read-model     404
@@ -118,6 +122,8 @@ POST   /participants/x/archive                             run-test       404
 POST   /participants/x/unarchive                           run-test       404
 POST   /participants/x/muscle                              run-test       404
 POST   /tests/x/ran-by                                     run-test       404
+POST   /participants/x/keys/x/revoke                       run-test       404
+POST   /participants/x/keys                                approve-model  404
 POST   /v1/rearm                                           rearm          200
 POST   /rearm                                              rearm          303
 POST   /v1/models/x/approve                                approve-model  404

@@ -148,3 +148,25 @@ def test_trial_that_did_not_end_well_halts_the_controller(ilc: ModuleType) -> No
         recording.attrs["outcome"], recording.attrs["reason"] = "fault", "the load cell fell silent"
     with pytest.raises(ilc.HaltedError, match="load cell fell silent"):
         ilc.measured(file.getvalue(), 400)
+
+
+def test_a_share_that_was_halved_grows_again(ilc: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second trial is disturbed; what is learnt after it is learnt faster than with the half share."""
+
+    class Disturbed(Muscle):
+        count = 0
+
+        def play(self, widths_us: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            self.count += 1
+            torque_nm, sent_us = super().play(widths_us)
+            return torque_nm + (1.5 if self.count == 2 else 0.0), sent_us
+
+    reference, errors = ilc.Reference.reach(4.0), {}
+    for growth in (1.5, 1.0):
+        monkeypatch.setattr(ilc, "GROWTH", growth)
+        errors[growth] = [
+            trial.error_percent for trial in ilc.learn(Disturbed(), model_of(*MODEL), reference, "norm-optimal", 6)
+        ]
+    assert errors[1.5][1] > errors[1.5][0], "else nothing was halved"
+    assert errors[1.5][:3] == errors[1.0][:3]
+    assert errors[1.5][3] < 0.8 * errors[1.0][3], errors

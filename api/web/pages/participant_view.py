@@ -9,6 +9,7 @@ from fastapi import APIRouter, Request
 from fastapi.responses import RedirectResponse, Response
 
 from api.language import when
+from api.people import controller_keys
 from api.people.auth import Principal
 from api.sessions import profiles
 from api.sessions.questions import Question, Row
@@ -31,9 +32,13 @@ async def participant(request: Request, context: Ctx, _who: Tester, code: str) -
 
 
 async def shown(
-    request: Request, context: Context, code: str, form: LimitsForm | None = None, status: int = 200
-) -> Response:
-    """The page, with the form as it was sent where something was wrong with it."""
+    request: Request, context: Context, code: str, form: LimitsForm | None = None, status: int = 200,
+    made: dict[str, Any] | None = None,
+) -> Response:  # fmt: skip
+    """The page, with the form as it was sent where something was wrong with it.
+
+    `made`: a controller's key that was just made, the only time its text is seen.
+    """
 
     def gather() -> dict[str, Any]:
         row = participants.find(context, code)
@@ -48,6 +53,8 @@ async def shown(
             "fields": limits_form.fields(context.rig.status),
             "tests": [context.runner.document(test) for test in history],
             "models": context.versions.of(code),
+            "keys": controller_keys.of(context.auth, code),
+            "made": made,
         }
 
     return page(request, "participant.html", status, **await asyncio.to_thread(gather))

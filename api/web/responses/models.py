@@ -229,3 +229,32 @@ class PredictionOut(Document):
     model_id: str
     pulse_rate_hz: float
     torque_nm: list[float] = Field(description="mean torque in each pulse's period, N·m")
+
+
+class Unreachable(Document):
+    """Where a reference cannot be followed."""
+
+    begin_s: float = Field(description="from the first pulse, s")
+    end_s: float
+    reason: str = Field(
+        description="above-plateau, below-zero, rises-too-fast, falls-too-fast, under-threshold, not-followed"
+    )
+    shortfall_nm: float = Field(description="the largest difference in it, N·m")
+
+
+class InversionOut(Document):
+    """Pulse widths for a reference torque."""
+
+    model_id: str
+    pulse_rate_hz: float
+    duration_s: float
+    reference_torque_nm: list[float] = Field(description="mean in each pulse's period, N·m")
+    pulse_width_us: list[float] = Field(description="one for each pulse, µs")
+    predicted_torque_nm: list[float] = Field(description="mean in each pulse's period, N·m above rest")
+    unreachable: list[Unreachable]
+    fit_percent: float | None = Field(description="where it can be reached, %; null where the reference is level")
+    whole_fit_percent: float | None = Field(description="of all of it, %")
+    tolerance_nm: float = Field(description="a smaller difference counts as reached, N·m")
+    max_pulse_width_us: float | None = Field(description="that was held to, µs")
+    max_rise_us: float | None = Field(description="from pulse to pulse that was held to, µs")
+    segments: list[SegmentOut] = Field(description="a rest, the trial, a rest: for `POST /v1/tests`, kind `sequence`")

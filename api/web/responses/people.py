@@ -59,6 +59,8 @@ class ListedToken(Document):
     expires_utc: str | None
     revoked: bool
     origin: str
+    participant: str | None = Field(None, description="the only one that a controller's key opens")
+    plan: dict[str, JsonValue] | None = Field(None, description="what trials that key may play")
 
 
 class AuditEntryOut(Document):

@@ -63,7 +63,8 @@ async def stop(request: Request, context: Ctx, press: MayStop) -> Response:
     if wants_html(request):
         return await stop_on_page(request, context, press)
     evidence = await context.runner.stop(press.reason, press.by)
-    return JSONResponse({"stopped": evidence.confirmed, "evidence": evidence.model_dump(), "rig": rig_state(context)})
+    rig = {} if press.by_key else {"rig": rig_state(context)}
+    return JSONResponse({"stopped": evidence.confirmed, "evidence": evidence.model_dump(), **rig})
 
 
 async def stop_on_page(request: Request, context: Context, press: Press) -> Response:

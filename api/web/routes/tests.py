@@ -14,12 +14,14 @@ from sqlalchemy.exc import SQLAlchemyError
 from api import language
 from api.errors import ApiError, NotFoundError
 from api.people.auth import Scope
+from api.sessions import controller_trials
 from api.sessions.refusals import other_than
 from api.sessions.requests import TestIn
 from api.store import audit
 from api.store.tables import Test
 from api.web import page_language
 from api.web.dependencies import PROBLEM, Context, Ctx, LiveReader, Tester, of
+from api.web.key_guard import refuse_outside
 from api.web.requests import RanByIn
 from api.web.responses.base import answers
 from api.web.responses.rig import LeftOut, TestOut
@@ -43,7 +45,7 @@ def find(context: Context, test_id: str) -> Test:
 @router.post("", status_code=202, **answers(TestOut, 202, "begun; see `Location`"))
 async def start_test(context: Ctx, who: Tester, body: TestIn, response: Response) -> dict[str, Any]:
     """Start a test; `Location` is where its progress is read. One at a time: 409 names the holder."""
-    row = await context.runner.start(body, who.name)
+    row = await controller_trials.start(context.runner, context.key_turn, context.store, who, body)
     response.headers["Location"] = f"/v1/tests/{row.id}"
     return context.runner.document(row)
 
@@ -125,7 +127,8 @@ def _admit(socket: WebSocket, context: Context) -> None:
     ApiError
         401: no valid token or session, or it is locked; 403: without the scope, or from another site's page.
     """
-    principal = context.auth.identify(socket)
+    principal = context.auth.identify(socket, bound=True)
+    refuse_outside(context.store, principal, "WS", socket.url.path)
     if not principal.may(Scope.READ_LIVE):
         raise ApiError(403, "forbidden", "Not allowed", f"This needs the scope {Scope.READ_LIVE}.")
     origin = socket.headers.get("origin")

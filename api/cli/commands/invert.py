@@ -1,0 +1,59 @@
+"""`stimrig invert`: the pulse widths with which a model follows a reference torque."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from api.cli.errors import InputError
+from api.cli.terminal import Json, ModelFile, load_model, number, percent, say, say_json, table, writing
+
+
+def register(app: typer.Typer) -> None:
+    """Add the verb."""
+    app.command("invert")(invert)
+
+
+def invert(
+    model_json: ModelFile,
+    reference: Annotated[
+        Path, typer.Argument(help="CSV file: time_s,torque_nm, or torque_nm alone", metavar="REFERENCE.csv")
+    ],
+    output: Annotated[Path, typer.Option("-o", "--output", help="CSV file to write", show_default=False)],
+    largest_us: Annotated[
+        float | None, typer.Option(help="widest pulse, µs; default: what the model holds for")
+    ] = None,
+    rise_us: Annotated[float | None, typer.Option(help="largest rise from pulse to pulse, µs")] = 50.0,
+    as_json: Json = False,
+) -> None:
+    """Pulse widths whose predicted torque follows a reference best, and what of it is out of reach."""
+    from api.models import inverted
+    from identify.errors import IdentifyError
+    from identify.inversion import invert as widths_for
+    from identify.inversion.table import read_reference
+
+    model = load_model(model_json)
+    try:
+        content = reference.read_bytes()
+    except OSError as error:
+        raise InputError(f"{reference}: {error.strerror}. Give a CSV file with time_s,torque_nm.") from error
+    try:
+        wanted = read_reference(content, str(reference), model.pulse_rate_hz)
+        found = widths_for(model, wanted, largest_us=largest_us, rise_us=rise_us).to_dict()
+    except IdentifyError as error:
+        raise InputError(str(error)) from error
+    with writing(output):
+        output.write_text(inverted.table(found), "utf-8", newline="")
+    if as_json:
+        say_json({"output": str(output), **found})
+        return
+    fit = percent(found["fit_percent"])
+    say(f"{output}: {len(found['pulse_width_us'])} pulses, fit {fit} where it can be reached")
+    if found["unreachable"]:
+        rows = [
+            [f"{one['begin_s']:.2f}", f"{one['end_s']:.2f}", number(one["shortfall_nm"], 3), one["reason"]]
+            for one in found["unreachable"]
+        ]
+        say(*table(["begin (s)", "end (s)", "lacks (N·m)", "reason"], rows))

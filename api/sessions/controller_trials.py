@@ -1,0 +1,115 @@
+"""Trials that a controller's key may play: within the plan that a person set when the key was made."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Annotated, Any
+
+from pydantic import Field, FiniteFloat
+
+from api.errors import ApiError
+from api.people.auth import Principal, outside
+from api.sessions.lifecycle import SEQUENCE
+from api.sessions.profiles import LIMITS
+from api.sessions.requests import Body, CurrentMa, ProfileIn, TestIn, WidthUs
+from api.sessions.runner import Runner
+from api.store import Store
+from api.store.tables import Participant, Test
+
+LONGEST_S = 300.0
+MOST_TRIALS = 200
+
+
+class PlanIn(Body):
+    """What a controller may play, trial by trial."""
+
+    current_ma: CurrentMa
+    max_pulse_width_us: WidthUs
+    max_duration_s: Annotated[FiniteFloat, Field(gt=0, le=LONGEST_S, description="of one trial, rests included, s")]
+    trials: Annotated[int, Field(ge=1, le=MOST_TRIALS, description="that are played")]
+
+
+def plan_within(plan: PlanIn, participant: Participant) -> dict[str, Any]:
+    """The plan, as it is kept with the key.
+
+    Raises
+    ------
+    ApiError
+        422: wider than the participant's limits.
+    """
+    for name in ("current_ma", "max_pulse_width_us"):
+        asked, own = getattr(plan, name), participant.profile.get(name)
+        if own is None or not asked <= own:
+            unit = LIMITS[name].unit
+            detail = f"{LIMITS[name].words}: {asked:g} {unit} is above the limit of today, {own or 0:g} {unit}."
+            raise ApiError(422, "wider-profile", "Wider than the participant's limits", detail)
+    return plan.model_dump()
+
+
+async def start(runner: Runner, turn: asyncio.Lock, store: Store, who: Principal, body: TestIn) -> Test:
+    """Start a test; where a controller's key asks for it, within its plan.
+
+    Raises
+    ------
+    ApiError
+        403: outside the key or its plan, and by how much; else as `Runner.start`.
+    """
+    if who.participant is None:
+        return await runner.start(body, who.name)
+    async with turn:  # no two trials share the last one that is left
+        try:
+            body = await _within_plan(runner, store, who, body)
+            return await runner.start(body, who.name)
+        except ApiError as error:
+            if error.code != "rig-busy":
+                raise
+            detail = "The rig is in use. Wait until it is free."
+            raise ApiError(409, "rig-busy", "Another test is running", detail) from None
+
+
+async def _within_plan(runner: Runner, store: Store, who: Principal, body: TestIn) -> TestIn:
+    """The test with the plan's limits, where the plan allows it."""
+    plan = who.plan or {}
+    _refuse_kind(who, body)
+    played = await asyncio.to_thread(_played, store, who.name)
+    if played >= plan["trials"]:
+        raise beyond(f"All {plan['trials']} trials of this key are played. A person can make another key")
+    participant: Participant = await asyncio.to_thread(store.get, Participant, who.participant)
+    limits = {}
+    for name in ("current_ma", "max_pulse_width_us"):
+        asked = body.profile.sent().get(name) if body.profile else None
+        unit = LIMITS[name].unit
+        if asked is not None and not asked <= plan[name]:
+            raise beyond(f"{name} {asked:g} {unit} is above the plan's {plan[name]:g} {unit}")
+        limits[name] = min(value for value in (asked, plan[name], participant.profile.get(name)) if value is not None)
+    torque = {"max_torque_nm": body.profile.max_torque_nm} if body.profile and body.profile.max_torque_nm else {}
+    narrowed = body.model_copy(update={"profile": ProfileIn(**limits, **torque)})
+    preview = await runner.preview(narrowed)
+    if not preview["duration_s"] <= plan["max_duration_s"] + 1e-9:
+        raise beyond(f"{preview['duration_s']:g} s is longer than the plan's {plan['max_duration_s']:g} s")
+    widest_us = max(preview["pulse_width_us"], default=0.0)
+    if not widest_us <= plan["max_pulse_width_us"]:
+        raise beyond(f"A pulse of {widest_us:g} µs is above the plan's {plan['max_pulse_width_us']:g} µs")
+    return narrowed
+
+
+def _refuse_kind(who: Principal, body: TestIn) -> None:
+    if body.participant != who.participant:
+        raise outside(who.participant)
+    if body.kind != SEQUENCE:
+        raise beyond(f"The kind is {body.kind!r}. Send kind {SEQUENCE!r}")
+    if body.segments is None:
+        raise beyond("No segments were sent. Send the trial's segments")
+    wrong = [name for name in ("joins", "ran_by") if getattr(body, name) is not None]
+    if wrong:
+        raise beyond(f"A key sends no {wrong[0]}. Leave it out")
+
+
+def _played(store: Store, name: str) -> int:
+    """Trials that a key has begun; what the rig refused was not one."""
+    return len(store.all(Test, Test.requested_by == name, Test.state != "refused"))
+
+
+def beyond(why: str) -> ApiError:
+    """403: not within the plan."""
+    return ApiError(403, "beyond-plan", "Not within the plan of this key", f"{why}.")

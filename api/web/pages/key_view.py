@@ -1,0 +1,60 @@
+"""Keys of controllers on a participant's page: made by whoever may approve, revoked by whoever runs tests."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Annotated
+
+from fastapi import APIRouter, Form, Request
+from fastapi.responses import RedirectResponse, Response
+from pydantic import StringConstraints
+
+from api.errors import ApiError, NotFoundError
+from api.people import controller_keys
+from api.sessions.controller_trials import PlanIn, plan_within
+from api.sessions.refusals import refuse_archived
+from api.web.dependencies import Approver, Ctx, Tester
+from api.web.pages import participant_view, typed
+from api.web.pages.checked import checked
+from api.web.routes import participants
+
+router = APIRouter(include_in_schema=False, prefix="/participants/{code}/keys")
+Text = Annotated[str, Form()]
+
+
+class KeyFor(PlanIn):
+    """A key's name and plan."""
+
+    name: Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_. -]{1,60}$")]
+
+
+@router.post("")
+async def make(
+    request: Request, context: Ctx, who: Approver, code: str, name: Text = "", current_ma: Text = "",
+    max_pulse_width_us: Text = "", max_duration_s: Text = "", trials: Text = "",
+) -> Response:  # fmt: skip
+    """A key that ends with its day; its text is shown on the answering page only."""
+    row = await asyncio.to_thread(participants.find, context, code)
+    refuse_archived(row)
+    asked = {"current_ma": current_ma, "max_pulse_width_us": max_pulse_width_us, "max_duration_s": max_duration_s}
+    body = checked(
+        KeyFor, name=name.strip(), trials=typed.whole(trials), **{k: _number(k, v) for k, v in asked.items()}
+    )
+    plan = plan_within(PlanIn(**body.model_dump(exclude={"name"})), row)
+    text, made = await asyncio.to_thread(controller_keys.make, context.auth, body.name, code, plan, who.name)
+    return await participant_view.shown(request, context, code, made={"text": text, "name": made.name})
+
+
+@router.post("/{key_id}/revoke")
+async def revoke(context: Ctx, who: Tester, code: str, key_id: str) -> Response:
+    """It opens nothing any more."""
+    if not await asyncio.to_thread(controller_keys.revoke, context.auth, code, key_id, who.name):
+        raise NotFoundError("key", key_id, "The participant's page lists them.")
+    return RedirectResponse(f"/participants/{code}#keys", 303)
+
+
+def _number(field: str, text: str) -> float:
+    try:
+        return typed.number(text)
+    except ValueError as error:
+        raise ApiError(422, "invalid-input", "This value cannot be used", f"{field}: {error}.") from None

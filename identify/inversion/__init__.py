@@ -1,0 +1,77 @@
+"""From a torque that a controller wants to the pulse widths that follow it best; where it cannot be had, and why."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from identify.inversion.demand import Bounds, best_demand
+from identify.inversion.plant import Plant
+from identify.inversion.reached import Inversion, judged
+from identify.inversion.reference import Reference
+from identify.model import Model
+from identify.simulation.pulses import above_rest
+
+__all__ = ["Inversion", "Reference", "invert"]
+
+TURNS = 10
+"""Corrections on the model's own prediction, at most: each is a trial that the model plays."""
+STEP = 0.8
+"""Share of the predicted error that a correction asks for."""
+ENOUGH = 2e-3
+"""Root mean square of the predicted error, as a share of the largest torque, below which no correction follows."""
+GAIN = 0.97
+"""A correction that leaves more than this share of the best error so far is the last one but one."""
+
+
+def invert(
+    model: Model,
+    reference: Reference,
+    *,
+    largest_us: float | None = None,
+    rise_us: float | None = None,
+    whole: bool = True,
+) -> Inversion:
+    """The pulse widths whose predicted torque follows a reference best.
+
+    The demand before f is found by regularised least squares through G (norm-optimal control, Amann, Owens and Rogers
+    1996), with 0 and the largest demand as bounds; f is inverted; then the demand is corrected on what the model
+    predicts, effects included, as between trials.
+
+    Parameters
+    ----------
+    model : Model
+        With second-order dynamics; with or without effects.
+    reference : Reference
+        Torque above rest.
+    largest_us : float, optional
+        Widest pulse, µs; never wider than the model is valid for.
+    rise_us : float, optional
+        Largest rise from pulse to pulse, µs. The rig's gate has such a limit.
+    whole : bool
+        Whole µs. What rounding takes is given back by the pulses after.
+
+    Raises
+    ------
+    BadModel
+        The model has other dynamics, gives no torque, or holds for another pulse rate.
+    BadRequest
+        A limit is not a positive number.
+    """
+    plant = Plant.of(model, reference, largest_us, rise_us, whole)
+    wanted = plant.sign * reference.torque_nm
+    demand, best, least = np.zeros(wanted.size), None, np.inf
+    target, idle = wanted, 0
+    for _ in range(TURNS):
+        demand = best_demand(plant.a, plant.b, target, Bounds(plant.largest_nm, plant.rises(demand)))
+        widths = plant.widths(demand)
+        got = plant.sign * above_rest(model, widths, reference.pulse_rate_hz)
+        error = wanted - got
+        left = float(np.sqrt(np.mean(error**2)))
+        idle = idle + 1 if left > GAIN * least else 0
+        if left < least:
+            best, least = (demand, widths, got), left
+        if idle > 1 or left < ENOUGH * plant.largest_nm or (not model.effects and rise_us is None):
+            break
+        target = plant.linear(demand) + STEP * error
+    assert best is not None
+    return judged(plant, reference, *best)

@@ -1,0 +1,160 @@
+"""The demand that follows a torque best through G, within bounds: banded least squares, exact, some milliseconds.
+
+With G = B(q)/A(q), both of a few coefficients, torque and demand are written by one sequence v: y = B v, w = A v. Then
+least squares with bounds is a quadratic programme whose matrices are banded. It is solved by an interior-point method
+(Mehrotra 1992), each step of which is a banded Cholesky factorisation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_solve_banded, cholesky_banded
+
+BEND = 0.02
+"""Weight of the demand's second differences: a demand that jumps from pulse to pulse is nobody's wish."""
+RIDGE = 1e-7
+ROUNDS = 40
+CLOSE = 1e-8
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Where the demand may be.
+
+    Parameters
+    ----------
+    largest_nm : float
+        N·m; the smallest is 0.
+    rise_nm : ndarray or None, shape (K,)
+        Largest rise of the demand to each pulse from the one before, N·m; the first from 0.
+    """
+
+    largest_nm: float
+    rise_nm: np.ndarray | None = None
+
+
+class Banded:
+    """A lower triangular Toeplitz matrix with few coefficients, shape (K, K)."""
+
+    def __init__(self, taps: np.ndarray, size: int) -> None:
+        self.taps, self.size = np.asarray(taps, float), size
+        self.used = [i for i in np.flatnonzero(self.taps) if i < size]
+
+    def __call__(self, v: np.ndarray) -> np.ndarray:
+        """The matrix times a column."""
+        return np.convolve(self.taps, v)[: self.size]
+
+    def transposed(self, y: np.ndarray) -> np.ndarray:
+        """Its transpose times a column."""
+        return np.convolve(self.taps, y[::-1])[: self.size][::-1]
+
+    def gram(self, weight: np.ndarray, bands: int) -> np.ndarray:
+        """Tᵀ diag(weight) T in LAPACK's lower banded form, shape (bands, K)."""
+        out = np.zeros((bands, self.size))
+        for i in self.used:
+            for j in self.used:
+                if i <= j:  # row k of T holds taps[j] at k - j and taps[i] at k - i, which is j - i further on
+                    out[j - i, : self.size - j] += self.taps[i] * self.taps[j] * weight[j:]
+        return out
+
+
+def best_demand(a: np.ndarray, b: np.ndarray, target_nm: np.ndarray, bounds: Bounds) -> np.ndarray:
+    """The demand within the bounds whose torque is closest to a target, N·m, shape (K,).
+
+    Parameters
+    ----------
+    a, b : ndarray
+        Coefficients of G on the grid of pulses, a[0] = 1.
+    target_nm : ndarray, shape (K,)
+        Torque, N·m.
+    bounds : Bounds
+        Where the demand may be.
+    """
+    size = target_nm.size
+    scale = bounds.largest_nm
+    A, B = Banded(a, size), Banded(b, size)
+    bend = Banded(np.convolve(a, [1.0, -2.0, 1.0]), size)
+    bands = max(len(a) + 2, int(np.ptp(B.used)) + 1 if B.used else 1)
+    bands = min(bands, size)
+    smooth = np.full(size, BEND)
+    smooth[:2] = 0.0  # the first pulse may begin anywhere
+    P = B.gram(np.ones(size), bands) + bend.gram(smooth, bands) + A.gram(np.full(size, RIDGE), bands)
+    q = -B.transposed(target_nm / scale)
+    sides = [(A, 1.0, np.ones(size)), (A, -1.0, np.zeros(size))]
+    if bounds.rise_nm is not None:
+        sides.append((Banded(np.convolve(a, [1.0, -1.0]), size), 1.0, bounds.rise_nm / scale))
+    return np.clip(scale * A(_Programme(P, q, sides, bands).solve()), 0.0, scale)
+
+
+class _Programme:
+    """argmin ½ vᵀ P v + qᵀ v with sign · (T v) ≤ limit for each of the sides."""
+
+    def __init__(self, P: np.ndarray, q: np.ndarray, sides: list[tuple[Banded, float, np.ndarray]], bands: int) -> None:
+        self.P, self.q, self.sides, self.bands = P, q, sides, bands
+        self.limit = np.stack([limit for *_, limit in sides])
+
+    def constrained(self, v: np.ndarray) -> np.ndarray:
+        """What the limits bound, shape (sides, K)."""
+        return np.stack([sign * T(v) for T, sign, _ in self.sides])
+
+    def back(self, y: np.ndarray) -> np.ndarray:
+        """The transpose of `constrained`."""
+        return np.sum([sign * T.transposed(row) for (T, sign, _), row in zip(self.sides, y, strict=True)], axis=0)
+
+    def solve(self) -> np.ndarray:
+        """v, shape (K,)."""
+        v = cho_solve_banded((cholesky_banded(self.P, lower=True), True), -self.q)
+        if np.all(self.constrained(v) <= self.limit):
+            return v
+        slack = np.maximum(self.limit - self.constrained(v), 0.1)
+        dual = np.full(slack.shape, 0.1)
+        for _ in range(ROUNDS):
+            gradient = _times(self.P, v) + self.q + self.back(dual)
+            outside = self.constrained(v) + slack - self.limit
+            gap = float(np.mean(slack * dual))
+            if gap < CLOSE and np.max(np.abs(outside)) < CLOSE and np.max(np.abs(gradient)) < 100 * CLOSE:
+                break
+            grams = [T.gram(w, self.bands) for (T, *_), w in zip(self.sides, dual / slack, strict=True)]
+            at = _Point(gradient, outside, slack, dual, cholesky_banded(self.P + np.sum(grams, axis=0), lower=True))
+            _, ds, dz = self._step(at, slack * dual)
+            length = min(_longest(slack, ds), _longest(dual, dz))
+            ahead = float(np.mean((slack + length * ds) * (dual + length * dz)))
+            dv, ds, dz = self._step(at, slack * dual + ds * dz - gap * (ahead / gap) ** 3)
+            length = 0.99 * min(_longest(slack, ds), _longest(dual, dz))
+            v, slack, dual = v + length * dv, slack + length * ds, dual + length * dz
+        return v
+
+    def _step(self, at: _Point, product: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Newton's step of v, slack and dual that takes `product` off slack times dual."""
+        dv = cho_solve_banded((at.factor, True), -at.gradient - self.back((at.dual * at.outside - product) / at.slack))
+        ds = -at.outside - self.constrained(dv)
+        return dv, ds, (-product - at.dual * ds) / at.slack
+
+
+@dataclass(frozen=True)
+class _Point:
+    """Where Newton's step is taken from: what is left of each condition, and the factor of its matrix."""
+
+    gradient: np.ndarray
+    outside: np.ndarray
+    slack: np.ndarray
+    dual: np.ndarray
+    factor: np.ndarray
+
+
+def _longest(x: np.ndarray, dx: np.ndarray) -> float:
+    """The longest step up to 1/0.99 that keeps x positive."""
+    down = dx < 0.0
+    return min(1.0 / 0.99, float(np.min(-x[down] / dx[down]))) if np.any(down) else 1.0 / 0.99
+
+
+def _times(bands: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """A symmetric matrix in lower banded form times a column."""
+    out = bands[0] * v
+    for j in range(1, bands.shape[0]):
+        row = bands[j, : v.size - j]
+        out[j:] += row * v[: v.size - j]
+        out[: v.size - j] += row * v[j:]
+    return out

@@ -1,0 +1,201 @@
+"""The model as its inversion sees it: f both ways, positive in the direction of pull, and G on the grid of pulses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from identify.dynamics.linear import SecondOrder
+from identify.dynamics.second_order import recursion, transition
+from identify.errors import BadModel, BadRequest
+from identify.inversion.reference import Reference
+from identify.model import Model
+from identify.recruitment.landmarks import THRESHOLD_SHARE
+from identify.simulation.predict import LARGEST_RATE_CHANGE
+from identify.simulation.pulses import SAMPLES_A_PULSE, above_rest
+
+OWED = 0.05
+"""Most that one pulse leaves to those after it, as a share of the largest torque."""
+NOTHING = 2e-3
+"""A demand below this share of the largest one gets no pulse."""
+PROBE_S = 3.0
+
+
+@dataclass(frozen=True)
+class Plant:
+    """f, f⁻¹ and G of a model.
+
+    Parameters
+    ----------
+    sign : float
+        1 or -1: the sign of the record's torque where the muscle pulls.
+    width_us, level_nm : ndarray, shape (M,)
+        The curve's table up to the widest pulse; torque positive in the direction of pull.
+    inverse_nm, inverse_us : ndarray, shape (L,)
+        Rising torques, and the smallest width that reaches each.
+    a, b : ndarray
+        G on the grid of pulses: a from 1, b from the pulse itself.
+    settled : int
+        Pulses after which a step has gone 95 % of its way.
+    rise_us : float or None
+        Largest rise from pulse to pulse.
+    whole : bool
+        Whether widths are whole µs.
+    """
+
+    sign: float
+    width_us: np.ndarray
+    level_nm: np.ndarray
+    inverse_nm: np.ndarray
+    inverse_us: np.ndarray
+    a: np.ndarray
+    b: np.ndarray
+    settled: int
+    rise_us: float | None
+    whole: bool
+
+    @classmethod
+    def of(
+        cls, model: Model, reference: Reference, largest_us: float | None, rise_us: float | None, whole: bool
+    ) -> Plant:
+        """Of a model, for a reference.
+
+        Raises
+        ------
+        BadModel, BadRequest
+            As `invert`.
+        """
+        rate_hz = reference.pulse_rate_hz
+        if not isinstance(model.linear, SecondOrder):
+            raise BadModel(
+                f"{model.method} has no second-order dynamics", place="linear", fix="Fit with maximum-likelihood."
+            )
+        if not abs(rate_hz / model.pulse_rate_hz - 1.0) <= LARGEST_RATE_CHANGE:
+            raise BadModel(
+                f"the model holds for {model.pulse_rate_hz:g} pulses a second, the reference has {rate_hz:g}",
+                place="pulse_rate_hz",
+                fix=f"Give it at {model.pulse_rate_hz:g} pulses a second, or fit a model at that rate.",
+            )
+        for name, limit in (("largest_us", largest_us), ("rise_us", rise_us)):
+            if limit is not None and not 0.0 < limit < np.inf:
+                raise BadRequest(f"{limit:g} µs", place=name, fix="Give a positive number, or leave it out.")
+        sign, width_us, level_nm = _curve(model, largest_us, whole)
+        top = np.maximum.accumulate(np.maximum(level_nm, 0.0))
+        first = np.r_[True, top[1:] > top[:-1]]
+        linear = replace(model.linear, delay_s=model.linear.delay_s + _later(model, rate_hz, float(width_us[-1])))
+        a, b = on_pulses(linear, rate_hz)
+        step = recursion(a, np.cumsum(np.r_[b, np.zeros(round(30.0 * rate_hz))]))
+        settled = 1 + int(np.max(np.flatnonzero(np.abs(step - 1.0) > 0.05), initial=0))
+        return cls(sign, width_us, level_nm, top[first], width_us[first], a, b, settled, rise_us, whole)
+
+    @property
+    def largest_nm(self) -> float:
+        """The largest demand, N·m."""
+        return float(self.inverse_nm[-1])
+
+    @property
+    def threshold_nm(self) -> float:
+        """Torque at the threshold, N·m."""
+        return THRESHOLD_SHARE * self.largest_nm
+
+    def level(self, width_us: np.ndarray | float) -> np.ndarray:
+        """f, N·m."""
+        return np.asarray(np.interp(width_us, self.width_us, self.level_nm))
+
+    def linear(self, demand_nm: np.ndarray) -> np.ndarray:
+        """G times a demand, from rest, shape (K,)."""
+        return recursion(self.a, np.convolve(self.b, demand_nm)[: demand_nm.size])
+
+    def rises(self, demand_nm: np.ndarray) -> np.ndarray | None:
+        """Largest rise of the demand to each pulse, where it was `demand_nm` before, N·m, shape (K,); None: any."""
+        if self.rise_us is None:
+            return None
+        before = np.r_[0.0, demand_nm[:-1]]
+        width_us = np.maximum(np.interp(before, self.inverse_nm, self.inverse_us), self._ready_us)
+        return np.maximum(self.level(np.minimum(width_us + self.rise_us, self.width_us[-1])) - before, 0.0)
+
+    @cached_property
+    def _ready_us(self) -> float:
+        """The widest pulse that gives no torque worth speaking of: to be there before a rise costs nothing."""
+        quiet = np.flatnonzero(np.maximum.accumulate(np.abs(self.level_nm)) <= 0.002 * self.largest_nm)
+        return float(self.width_us[quiet[-1]]) if quiet.size else 0.0
+
+    def widths(self, demand_nm: np.ndarray) -> np.ndarray:
+        """f⁻¹ of a demand, µs, shape (K,); what rounding and the rise limit take, the pulses after give back."""
+        wanted = np.where(demand_nm > NOTHING * self.largest_nm, np.minimum(demand_nm, self.largest_nm), 0.0)
+        least_us = self._lead_in(np.interp(wanted, self.inverse_nm, self.inverse_us))
+        most_owed, widest_us = OWED * self.largest_nm, float(self.width_us[-1])
+        widths, owed, last = np.zeros(wanted.size), 0.0, 0.0
+        for k, demand in enumerate(wanted):
+            asked = float(np.interp(demand + owed, self.inverse_nm, self.inverse_us)) if demand > 0.0 else 0.0
+            width = min(max(asked, least_us[k]), widest_us)
+            if self.rise_us is not None:
+                width = min(width, last + self.rise_us)
+            if self.whole:
+                width = min(round(width), int(widest_us), int(last + (self.rise_us or widest_us)))
+            widths[k] = last = width
+            owed = min(max(owed + demand - float(self.level(width)), -most_owed), most_owed) if demand > 0.0 else 0.0
+        return widths
+
+    def _lead_in(self, widths_us: np.ndarray) -> np.ndarray:
+        """Widths without torque that let a rise begin in time, µs, shape (K,)."""
+        least = np.zeros(widths_us.size)
+        if self.rise_us is None:
+            return least
+        coming = 0.0
+        for k in range(widths_us.size - 1, -1, -1):
+            least[k] = min(max(coming - self.rise_us, 0.0), self._ready_us)
+            coming = max(widths_us[k], least[k])
+        return np.floor(least) if self.whole else least
+
+
+def _curve(model: Model, largest_us: float | None, whole: bool) -> tuple[float, np.ndarray, np.ndarray]:
+    """The sign of the pull, and the curve's table up to the widest pulse, positive in that direction."""
+    width_us, torque_nm = model.recruitment.table()
+    sign = 1.0 if torque_nm[np.argmax(np.abs(torque_nm))] >= 0.0 else -1.0
+    valid_us = float(model.valid_for.get("pulse_width_us", (0.0, width_us[-1]))[1])
+    widest_us = min(valid_us, float(width_us[-1]), np.inf if largest_us is None else largest_us)
+    widest_us = float(np.floor(widest_us)) if whole else widest_us
+    inside = width_us < widest_us
+    width_us, torque_nm = (
+        np.r_[width_us[inside], widest_us],
+        np.r_[torque_nm[inside], np.interp(widest_us, width_us, torque_nm)],
+    )
+    if not np.max(sign * torque_nm) > 1e-9:
+        raise BadModel(
+            f"the model gives no torque up to {widest_us:g} µs", place="largest_us", fix="Allow wider pulses."
+        )
+    return sign, width_us, sign * torque_nm
+
+
+def _later(model: Model, rate_hz: float, widest_us: float) -> float:
+    """By how much effects delay the model's answer to a step, s: the time between half-way points; at least 0."""
+    if not model.effects:
+        return 0.0
+    size = round(PROBE_S * rate_hz)
+    plain = model.with_(effects=())
+    half_s = []
+    for one in (model, plain):
+        step = np.abs(above_rest(one, np.full(size, widest_us), rate_hz))
+        peak = int(np.argmax(step))
+        half_s.append(
+            float(np.interp(step[peak] / 2, np.maximum.accumulate(step[: peak + 1]), np.arange(peak + 1))) / rate_hz
+        )
+    return max(half_s[0] - half_s[1], 0.0)
+
+
+def on_pulses(linear: SecondOrder, rate_hz: float) -> tuple[np.ndarray, np.ndarray]:
+    """G from the demand of each pulse to the mean torque in its period: a and b of y = B(q)/A(q) w.
+
+    The mean is that of the samples that `above_rest` takes.
+    """
+    phi, _ = transition(linear.time_constant_s, linear.damping, 1.0 / rate_hz)
+    a = np.array([1.0, -np.trace(phi), np.linalg.det(phi)])
+    size = max(int(np.ceil(linear.delay_s * rate_hz)), 0) + 5
+    sampled = linear.step_response(np.arange(size * SAMPLES_A_PULSE) / (SAMPLES_A_PULSE * rate_hz))
+    step = sampled.reshape(size, SAMPLES_A_PULSE).mean(axis=1)
+    b = np.convolve(a, np.diff(step, prepend=0.0))[: size - 1]
+    b[np.abs(b) < 1e-12] = 0.0
+    return a, b * (a.sum() / b.sum())

@@ -1,0 +1,138 @@
+"""The torque that is wanted, checked and brought onto the pulses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from identify.errors import BadRequest
+
+LONGEST_S = 300.0
+MOST_SAMPLES = 2_000_000
+LARGEST_NM = 1000.0
+LONGEST_GAP_S = 1.0
+"""Between neighbouring samples: across a longer one a straight line is no wish of anybody's."""
+RATES_HZ = (10.0, 100.0)
+
+
+@dataclass(frozen=True)
+class Reference:
+    """Torque above rest, mean over each pulse interval.
+
+    Parameters
+    ----------
+    torque_nm : ndarray, shape (K,)
+        N·m, with the sign that the record of the model has.
+    pulse_rate_hz : float
+        Pulses per second.
+    """
+
+    torque_nm: np.ndarray
+    pulse_rate_hz: float = 40.0
+
+    @property
+    def time_s(self) -> np.ndarray:
+        """Time of each pulse from the first, s, shape (K,)."""
+        return np.arange(self.torque_nm.size) / self.pulse_rate_hz
+
+    @classmethod
+    def of(
+        cls, torque_nm: object, time_s: object = None, *, pulse_rate_hz: float = 40.0, name: str = "reference_torque_nm"
+    ) -> Reference:
+        """A reference as somebody gives it.
+
+        Parameters
+        ----------
+        torque_nm : array_like, shape (N,)
+            N·m above rest.
+        time_s : array_like, shape (N,), optional
+            Times, s, rising, in any steps; the first is that of the first pulse. None: one torque for each pulse.
+        pulse_rate_hz : float
+            Pulses per second.
+        name : str
+            How the torque is called in messages.
+
+        Raises
+        ------
+        BadRequest
+            Empty, too long, not finite, times that do not rise, another number of times than torques.
+        """
+        if not RATES_HZ[0] <= pulse_rate_hz <= RATES_HZ[1]:
+            raise BadRequest(
+                f"{pulse_rate_hz:g} pulses a second",
+                place="pulse_rate_hz",
+                fix=f"Give {RATES_HZ[0]:g} to {RATES_HZ[1]:g}, the rate at which the model was identified.",
+            )
+        torque = _column(torque_nm, name)
+        large = np.flatnonzero(~(np.abs(torque) <= LARGEST_NM))
+        if large.size:
+            raise BadRequest(
+                f"{torque[large[0]]:g} N·m",
+                place=f"{name}[{large[0]}]",
+                fix=f"At most {LARGEST_NM:g} N·m; is it in mN·m?",
+            )
+        if time_s is not None:
+            torque = _on_pulses(_times(time_s, torque.size, name), torque, pulse_rate_hz)
+        if torque.size > LONGEST_S * pulse_rate_hz:
+            raise BadRequest(
+                f"{torque.size / pulse_rate_hz:.5g} s long", place=name, fix=f"Give at most {LONGEST_S:g} s, one trial."
+            )
+        return cls(torque, float(pulse_rate_hz))
+
+
+def _column(values: object, name: str) -> np.ndarray:
+    try:
+        column = np.asarray(values, float)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise BadRequest("not a list of numbers", place=name, fix="Give one number for each pulse, N·m.") from error
+    if column.ndim != 1:
+        raise BadRequest(f"{column.ndim} dimensions", place=name, fix="Give a plain list of numbers.")
+    if column.size == 0:
+        raise BadRequest("empty", place=name, fix="Give at least one number.")
+    if column.size > MOST_SAMPLES:
+        raise BadRequest(f"{column.size} numbers", place=name, fix=f"Give at most {MOST_SAMPLES}.")
+    bad = np.flatnonzero(~np.isfinite(column))
+    if bad.size:
+        raise BadRequest(
+            f"{column[bad[0]]} is not a number that can be followed",
+            place=f"{name}[{bad[0]}]",
+            fix="Give a finite number at every place.",
+        )
+    return column
+
+
+def _times(values: object, size: int, name: str) -> np.ndarray:
+    time_s = _column(values, "time_s")
+    if time_s.size != size:
+        raise BadRequest(
+            f"{time_s.size} times for {size} of {name}", place="time_s", fix="Give one time for each torque."
+        )
+    if size < 2:
+        raise BadRequest("one time only", place="time_s", fix="Give two or more, or leave the times out.")
+    step_s = np.diff(time_s)
+    wrong = np.flatnonzero(~((step_s > 0.0) & (step_s <= LONGEST_GAP_S)))
+    if wrong.size:
+        at = wrong[0] + 1
+        raise BadRequest(
+            f"{time_s[at]:g} s after {time_s[at - 1]:g} s",
+            place=f"time_s[{at}]",
+            fix=f"Times must rise, by at most {LONGEST_GAP_S:g} s.",
+        )
+    if time_s[-1] - time_s[0] > LONGEST_S:
+        raise BadRequest(
+            f"{time_s[-1] - time_s[0]:.5g} s long", place="time_s", fix=f"Give at most {LONGEST_S:g} s, one trial."
+        )
+    return time_s
+
+
+def _on_pulses(time_s: np.ndarray, torque_nm: np.ndarray, pulse_rate_hz: float) -> np.ndarray:
+    """Means of straight lines between the samples over each pulse interval, shape (K,)."""
+    size = max(1, round((time_s[-1] - time_s[0]) * pulse_rate_hz))
+    edges = time_s[0] + np.arange(size + 1) / pulse_rate_hz
+    area = np.r_[0.0, np.cumsum(np.diff(time_s) * (torque_nm[1:] + torque_nm[:-1]) / 2)]
+    at = np.clip(np.searchsorted(time_s, edges, side="right") - 1, 0, time_s.size - 2)
+    past = np.clip(edges, time_s[0], time_s[-1]) - time_s[at]
+    slope = (torque_nm[at + 1] - torque_nm[at]) / (time_s[at + 1] - time_s[at])
+    whole = area[at] + past * (torque_nm[at] + slope * past / 2) + np.maximum(edges - time_s[-1], 0.0) * torque_nm[-1]
+    return np.diff(whole) * pulse_rate_hz

@@ -1,0 +1,300 @@
+"""A controller's key: one participant, one day, one plan. Every route is tried with it, and every way around it."""
+
+from __future__ import annotations
+
+import html
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from sqlalchemy import select
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+
+from api.people.auth import digest
+from api.store.tables import AuditEntry, Test, Token
+from api.web.key_guard import OPEN
+from tests.api.conftest import STUB, TOKEN, Service, run_service, run_test
+from tests.api.test_scopes import ROWS
+
+HTML = {"Accept": "text/html"}
+PLAN = {"name": "ilc", "current_ma": "15", "max_pulse_width_us": "200", "max_duration_s": "60", "trials": "3"}
+SEGMENTS = [{"name": "trial", "sequence": "widths", "settings": {"pulse_width_us": [0, 100, 150] * 20}}]
+TRIAL = {"participant": "P1", "kind": "sequence", "segments": SEGMENTS}
+FREE = {"GET /health", "GET /metrics", "GET /static/page.css", "GET /docs", "GET /v1/schemas", "GET /v1/schemas/x",
+        "GET /", "GET /rig/now", "GET /stopped/x", "GET /sign-in", "POST /language", "POST /colours"}  # fmt: skip
+"""What nobody needs to be anybody for: a key gets there what a stranger gets."""
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
+    for service in run_service(tmp_path_factory.mktemp("keys"), short_dir, STUB):
+        with service.client() as admin:
+            for code in ("P1", "P2"):
+                admin.post("/v1/participants", json={"code": code})
+        yield service
+
+
+@pytest.fixture(scope="module")
+def admin(shared: Service) -> Iterator[httpx.Client]:
+    with shared.client() as client:
+        yield client
+
+
+@pytest.fixture(autouse=True)
+def ready(shared: Service) -> None:
+    """Whatever the test before has stopped."""
+    if shared.rig.state != "ready":
+        with shared.client() as admin:
+            assert admin.post("/v1/rearm").status_code == 200
+
+
+@pytest.fixture(scope="module")
+def done(admin: httpx.Client) -> dict[str, dict[str, Any]]:
+    """A test with an approved model of each participant."""
+    found = {}
+    for code in ("P1", "P2"):
+        found[code] = run_test(admin, code)
+        assert admin.post(f"/v1/models/{found[code]['model_id']}/approve", json={}).status_code == 200
+    return found
+
+
+def made(admin: httpx.Client, code: str = "P1", **changed: str) -> str:
+    """A key's text, from the page."""
+    answer = admin.post(f"/participants/{code}/keys", data={**PLAN, **changed}, headers=HTML)
+    assert answer.status_code == 200, answer.text
+    return re.search(r"stimrig_[\w-]{43}", html.unescape(answer.text))[0]  # pyright: ignore
+
+
+@pytest.fixture
+def key(shared: Service, admin: httpx.Client) -> Iterator[httpx.Client]:
+    with shared.client(made(admin)) as client:
+        yield client
+
+
+@pytest.fixture(scope="module")
+def one_key(admin: httpx.Client) -> str:
+    return made(admin)
+
+
+def refused(answer: httpx.Response, code: str = "outside-key") -> str:
+    assert answer.status_code == 403, (answer.request.url, answer.status_code, answer.text[:300])
+    assert answer.json()["type"] == f"/problems/{code}"
+    return answer.json()["detail"]
+
+
+@pytest.mark.parametrize(("method", "path"), [row[:2] for row in ROWS], ids=[f"{row[0]} {row[1]}" for row in ROWS])
+def test_every_route_that_is_not_opened_is_closed(shared: Service, one_key: str, method: str, path: str) -> None:
+    """With x for whatever a path names: what is not there is refused as what is another's."""
+    with shared.client(one_key) as key:
+        answer = key.request(method, path)
+    if f"{method} {path}" in FREE:
+        with shared.client(token=None) as stranger:
+            assert answer.status_code == stranger.request(method, path).status_code
+    elif (method, path) == ("POST", "/v1/stop"):
+        assert answer.status_code == 200 and "rig" not in answer.json()
+    elif (method, path) == ("POST", "/v1/tests"):
+        assert answer.status_code == 422  # no body: which participant is meant is not known yet
+    elif (method, path) in (("POST", "/sign-in"), ("POST", "/v1/sessions")):
+        assert answer.status_code == 401
+    else:
+        assert answer.status_code == 403, answer.text
+        assert "P1" in answer.text and "not among them" in answer.text
+
+
+def test_it_opens_what_is_its_participants(key: httpx.Client, done: dict[str, dict[str, Any]]) -> None:
+    test = done["P1"]
+    model = key.get("/v1/participants/P1/model")
+    assert model.status_code == 200 and model.headers["etag"]
+    assert key.get("/v1/participants/P1/model", headers={"If-None-Match": model.headers["etag"]}).status_code == 304
+    ask = f"/v1/models/{test['model_id']}"
+    assert key.post(f"{ask}/prediction", json={"pulse_width_us": [0, 100]}).status_code == 200
+    assert key.post(f"{ask}/widths", json={"reference_torque_nm": [0, 1]}).status_code == 200
+    assert key.get(f"/v1/tests/{test['id']}").json()["participant"] == "P1"
+    assert key.get(f"/v1/recordings/{test['recording_id']}").content.startswith(b"\x89HDF")
+    assert key.get(f"/v1/recordings/{test['recording_id']}/csv").status_code == 200
+    assert len(OPEN) == 8, "what is opened further is tried here"
+
+
+def test_what_is_anothers_is_refused_as_what_is_not_there(key: httpx.Client, done: dict[str, dict[str, Any]]) -> None:
+    other = done["P2"]
+    tried = {
+        "/v1/participants/{}/model": "P2",
+        "/v1/tests/{}": other["id"],
+        "/v1/recordings/{}": other["recording_id"],
+        "/v1/recordings/{}/csv": other["recording_id"],
+    }
+    for path, there in tried.items():
+        assert refused(key.get(path.format(there))) == refused(key.get(path.format("nothing")))
+    for path, body in (("prediction", {"pulse_width_us": [0]}), ("widths", {"reference_torque_nm": [0]})):
+        answers = [key.post(f"/v1/models/{model}/{path}", json=body) for model in (other["model_id"], "nothing")]
+        assert refused(answers[0]) == refused(answers[1])
+    answers = [key.post("/v1/tests", json={**TRIAL, "participant": code}) for code in ("P2", "P99")]
+    assert refused(answers[0]) == refused(answers[1]) and "P2" not in answers[0].text
+
+
+def test_a_busy_rig_tells_nothing_of_another_participant(
+    shared: Service, key: httpx.Client, admin: httpx.Client
+) -> None:
+    shared.rig.speed = 1.0
+    begun = admin.post("/v1/tests", json={"participant": "P2"})
+    assert begun.status_code == 202
+    try:
+        answer = key.post("/v1/tests", json=TRIAL)
+        assert answer.status_code == 409 and "P2" not in answer.text and "holder" not in answer.json()
+        stopped = key.post("/v1/stop")
+        assert stopped.status_code == 200 and "P2" not in stopped.text
+    finally:
+        shared.rig.speed = 12.0
+    ended(admin, begun.json()["id"])
+
+
+def ended(client: httpx.Client, test_id: str) -> dict[str, Any]:
+    while not (test := client.get(f"/v1/tests/{test_id}").json())["done"]:
+        pass
+    return test
+
+
+def test_a_trial_is_played_with_the_plans_limits_and_watched(shared: Service, key: httpx.Client) -> None:
+    begun = key.post("/v1/tests", json=TRIAL)
+    assert begun.status_code == 202, begun.text
+    test_id = begun.json()["id"]
+    url = shared.url.replace("http", "ws") + f"/v1/tests/{test_id}/live"
+    with connect(url, additional_headers={"Authorization": key.headers["authorization"]}) as socket:
+        kinds = {json.loads(message)["type"] for message in socket}
+    assert {"history", "test"} <= kinds
+    test = ended(key, test_id)
+    assert test["state"] == "completed" and key.get(f"/v1/recordings/{test['recording_id']}").status_code == 200
+    row = shared.app.state.context.store.get(Test, test_id)
+    assert row.plan["profile"]["current_ma"] == 15.0 and row.plan["max_pulse_width_us"] == 200.0
+    assert row.requested_by.startswith("ilc (")
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"kind": "pre-session"}, "kind"),
+        ({"kind": "adaptive", "segments": None}, "kind"),
+        ({"segments": None}, "segments"),
+        ({"segments": None, "protocol": "paper"}, "segments"),
+        ({"profile": {"current_ma": 16.0}}, "current_ma 16 mA is above the plan's 15 mA"),
+        ({"profile": {"max_pulse_width_us": 201.0}}, "max_pulse_width_us 201 µs is above the plan's 200 µs"),
+        ({"joins": "none"}, "joins"),
+        ({"ran_by": "Somebody Else"}, "ran_by"),
+    ],
+)
+def test_what_is_beyond_the_plan_is_refused_in_one_line(key: httpx.Client, changed: dict[str, Any], words: str) -> None:
+    detail = refused(key.post("/v1/tests", json={**TRIAL, **changed}), "beyond-plan")
+    assert words in detail and "\n" not in detail and detail.endswith(".")
+
+
+def test_a_trial_that_is_longer_or_wider_than_the_plan_is_not_begun(shared: Service, admin: httpx.Client) -> None:
+    before = shared.rig.starts
+    with shared.client(made(admin, max_duration_s="0,5")) as key:
+        assert "longer than the plan's 0.5 s" in refused(key.post("/v1/tests", json=TRIAL), "beyond-plan")
+    with shared.client(made(admin, max_pulse_width_us="120")) as key:
+        assert "150 µs is above the plan's 120 µs" in refused(key.post("/v1/tests", json=TRIAL), "beyond-plan")
+    assert shared.rig.starts == before
+
+
+def test_no_more_trials_than_planned(shared: Service, admin: httpx.Client) -> None:
+    with shared.client(made(admin, trials="1")) as key:
+        ended(key, key.post("/v1/tests", json=TRIAL).json()["id"])
+        assert "all 1 trials" in refused(key.post("/v1/tests", json=TRIAL), "beyond-plan").lower()
+        assert key.get("/v1/participants/P2/model").status_code == 403
+        assert key.post("/v1/stop").status_code == 200
+
+
+def test_limits_that_were_narrowed_after_the_key_was_made_hold(shared: Service, admin: httpx.Client) -> None:
+    with shared.client(made(admin)) as key:
+        before = admin.get("/v1/participants/P1").json()["profile"]
+        admin.put("/v1/participants/P1/profile", json={"current_ma": 9.0})
+        test_id = key.post("/v1/tests", json=TRIAL).json()["id"]
+        ended(key, test_id)
+        admin.put("/v1/participants/P1/profile", json={"current_ma": before["current_ma"]})
+    assert shared.app.state.context.store.get(Test, test_id).plan["profile"]["current_ma"] == 9.0
+
+
+def test_it_ends_with_its_day_and_where_it_is_revoked_and_still_stops(shared: Service, admin: httpx.Client) -> None:
+    context, text = shared.app.state.context, made(admin)
+    row = context.store.get(Token, digest(text))
+    assert row.expires_utc == context.clock.end_of_day_utc() and row.participant == "P1"
+    with shared.client(text) as key:
+        context.auth._known.clear()
+        with context.store.write() as session:
+            session.get(Token, digest(text)).expires_utc = context.clock.utc()
+        assert key.get("/v1/participants/P1/model").status_code == 401
+        assert key.post("/v1/stop").status_code == 200
+    text = made(admin)
+    with shared.client(text) as key:
+        assert key.get("/v1/participants/P2/model").status_code == 403
+        address = f"/participants/P1/keys/{digest(text)[:16]}/revoke"
+        assert admin.post(address.replace("P1", "P2"), headers=HTML).status_code == 404
+        assert admin.post(address, headers=HTML).status_code == 303
+        answer = key.get("/v1/participants/P1/model")
+        assert answer.status_code == 401 and "revoked" in answer.text
+    page = admin.get("/participants/P1", headers=HTML).text
+    assert "revoked" in page and "expired" in page and text not in page
+    context.auth._known.clear()
+    with context.store.write() as session:
+        for row in session.scalars(select(Token).where(Token.participant == "P1")):
+            row.created_utc = "2020-01-01T09:00:00.000Z"
+    assert "None yet." in admin.get("/participants/P1", headers=HTML).text, "those of other days are gone"
+
+
+def test_a_live_channel_is_its_own_participants(shared: Service, admin: httpx.Client, done: dict[str, Any]) -> None:
+    text = made(admin)
+    for test_id in (done["P2"]["id"], "nothing"):
+        url = shared.url.replace("http", "ws") + f"/v1/tests/{test_id}/live"
+        with connect(url, additional_headers={"Authorization": f"Bearer {text}"}) as socket:
+            said = json.loads(socket.recv())
+            assert said["problem"]["type"] == "/problems/outside-key"
+            with pytest.raises(ConnectionClosed):
+                socket.recv()
+
+
+def test_it_signs_nobody_in_on_the_page(shared: Service, admin: httpx.Client) -> None:
+    text = made(admin)
+    with shared.client(token=None) as browser:
+        answer = browser.post("/sign-in", data={"token": text})
+        assert answer.status_code == 403 and "set-cookie" not in answer.headers
+        home = browser.get("/", headers={"Authorization": f"Bearer {text}"})
+        assert "P2" not in home.text and "sign-in" in home.text
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"current_ma": "21"}, "above the limit of today"),
+        ({"max_pulse_width_us": "301"}, "above the limit of today"),
+        ({"trials": "0"}, "trials"),
+        ({"trials": "201"}, "trials"),
+        ({"max_duration_s": "301"}, "max_duration_s"),
+        ({"current_ma": "1e1"}, "current_ma"),
+        ({"name": "<b>"}, "name"),
+    ],
+)
+def test_a_plan_is_never_wider_than_the_participants_limits(
+    admin: httpx.Client, changed: dict[str, str], words: str
+) -> None:
+    answer = admin.post("/participants/P1/keys", data={**PLAN, **changed}, headers=HTML)
+    assert answer.status_code == 422 and words in html.unescape(answer.text)
+
+
+def test_who_may_not_approve_makes_no_key(shared: Service) -> None:
+    with shared.client(shared.token("operator", "run-test", "read-model")) as operator:
+        assert operator.post("/participants/P1/keys", data=PLAN).status_code == 403
+        assert "Make the key" not in operator.get("/participants/P1", headers=HTML).text
+
+
+def test_key_and_trials_are_in_the_trail(shared: Service, admin: httpx.Client) -> None:
+    text = made(admin, name="audited")
+    entries = shared.app.state.context.store.all(AuditEntry, order=AuditEntry.seq)
+    (entry,) = [one for one in entries if one.subject.startswith("audited (")]
+    assert entry.action == "issue token" and entry.detail["participant"] == "P1" and entry.detail["plan"]["trials"] == 3
+    assert entry.detail["until"] and text not in json.dumps(entry.detail)
+    assert text not in admin.get("/v1/tokens").text and TOKEN not in admin.get("/v1/tokens").text

@@ -1,0 +1,137 @@
+"""docs/controllers.md does what it says: its blocks are run in order, with a key; its C program compiles and plays."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from api.people import controller_keys
+from api.web import routes
+from api.workers.pool import WORKER
+from tests.api.conftest import Service, run_service
+from tests.api.test_worker import made_up_csv
+
+ROOT = Path(__file__).parents[2]
+TEXT = (ROOT / "docs" / "controllers.md").read_text("utf-8")
+PROGRAM = ROOT / "examples" / "controller.c"
+PLAN = {"current_ma": 20.0, "max_pulse_width_us": 300.0, "max_duration_s": 30.0, "trials": 9}
+LIBRARIES = ("-lcurl", "-lcjson", "-lm")
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```", TEXT, re.MULTILINE | re.DOTALL)
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[tuple[Service, str]]:
+    """A service with an approved model of P017, and a key."""
+    folder = tmp_path_factory.mktemp("controllers")
+    for service in run_service(folder, short_dir, WORKER):
+        with service.client(timeout=120) as admin:
+            admin.post("/v1/participants", json={"code": "P017"})
+            body = made_up_csv(folder / "record.csv").read_bytes()
+            model = admin.post("/v1/participants/P017/recordings", content=body).json()["model"]["id"]
+            assert admin.post(f"/v1/models/{model}/approve", json={"reason": "for the page's test"}).status_code == 200
+        text, _ = controller_keys.make(service.app.state.context.auth, "page", "P017", PLAN, "test")
+        yield service, text
+
+
+@pytest.fixture(autouse=True)
+def ready(request: pytest.FixtureRequest) -> None:
+    """The page ends with a stop; a person would look and re-arm."""
+    if "served" in request.fixturenames:
+        service, _ = request.getfixturevalue("served")
+        with service.client() as admin:
+            admin.post("/v1/rearm")
+
+
+def environment(served: tuple[Service, str]) -> dict[str, str]:
+    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+    keys = {"KEY": served[1], "STIMRIG_TOKEN": served[1]}
+    return {**os.environ, "PATH": path, "URL": served[0].url, "PYTHONPATH": str(ROOT), **keys}
+
+
+def in_shell(served: tuple[Service, str], folder: Path, lines: list[str]) -> str:
+    (folder / "examples").symlink_to(ROOT / "examples")
+    done = subprocess.run(
+        ["bash", "-euo", "pipefail", "-c", "\n".join(lines)], cwd=folder, env=environment(served), text=True,
+        capture_output=True, timeout=120, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.mark.slow
+def test_every_line_for_the_shell_runs_in_order(served: tuple[Service, str], tmp_path: Path) -> None:
+    shell = blocks("bash")
+    assert len(shell) >= 8
+    live = [block for block in shell if "live_torque" in block]
+    out = in_shell(served, tmp_path, [block for block in shell if block not in live])
+    assert "304" in out and '"torque_nm"' in out and '"state":"completed"' in out.replace(" ", "")
+    assert (tmp_path / "trial.h5").read_bytes().startswith(b"\x89HDF") and "fit_percent" in out
+
+
+@pytest.mark.slow
+def test_live_torque_comes_while_it_is_measured(served: tuple[Service, str], tmp_path: Path) -> None:
+    first, *_ = blocks("bash")
+    (live,) = [block for block in blocks("bash") if "live_torque" in block]
+    in_shell(served, tmp_path, [first, live])
+    head, *rows = (tmp_path / "live.csv").read_text().splitlines()
+    assert head == "time_s,torque_min_nm,torque_max_nm"
+    values = [[float(cell) for cell in row.split(",")] for row in rows]
+    assert values[-1][0] > 3.0 and max(row[2] for row in values) > 0.2, "a ramp of 150 µs gives torque"
+    assert all(low <= high for _, low, high in values)
+
+
+@pytest.mark.slow
+def test_every_block_of_python_runs(served: tuple[Service, str]) -> None:
+    scope = {"url": served[0].url, "key": served[1], "code": "P017"}
+    for block in blocks("python"):
+        exec(compile(block, "controllers.md", "exec"), scope)
+    assert scope["ended"]["state"] == "completed"  # pyright: ignore
+
+
+def test_every_address_on_the_page_is_a_route() -> None:
+    known = {re.sub(r"\{\w+\}", "x", route.path) for router in routes.routers() for route in router.routes}  # pyright: ignore
+    found = set(re.findall(r"/v1/[\w/{}$.-]*", re.sub(r'" \+ [\w.]+(?: \+ ")?', "x", TEXT)))
+    assert len(found) > 8
+    for path in found:
+        plain = re.sub(r"\$\w+|\{\w+\}|x+", "x", path).rstrip("./")
+        assert plain in known, path
+
+
+@pytest.fixture(scope="module")
+def compiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    gcc = shutil.which("gcc")
+    if gcc is None:
+        pytest.skip("not compiled: there is no gcc")
+    header = "#include <cjson/cJSON.h>\n#include <curl/curl.h>\n"
+    flags = os.environ.get("STIMRIG_TEST_CFLAGS", "").split()
+    there = subprocess.run([gcc, *flags, "-E", "-"], input=header, text=True, capture_output=True, check=False)
+    if there.returncode != 0:
+        pytest.skip("not compiled: libcurl4-openssl-dev and libcjson-dev are not installed")
+    out = tmp_path_factory.mktemp("c") / "controller"
+    strict = ["-std=c11", "-Wall", "-Wextra", "-Werror"]
+    subprocess.run([gcc, *strict, *flags, "-o", str(out), str(PROGRAM), *LIBRARIES], check=True)
+    return out
+
+
+@pytest.mark.slow
+def test_the_c_program_plays_a_trial(compiled: Path, served: tuple[Service, str], tmp_path: Path) -> None:
+    time.sleep(1.0)  # the rest between two tests
+    out = tmp_path / "trial.h5"
+    run = [str(compiled), served[0].url, "P017", str(out)]
+    subprocess.run(run, env=environment(served), check=True, timeout=60)
+    assert out.read_bytes().startswith(b"\x89HDF")
+    wrong = subprocess.run(
+        [*run[:2], "P018", str(out)], env=environment(served), capture_output=True, text=True, check=False
+    )
+    assert wrong.returncode == 1 and "This key is for one participant" in wrong.stderr

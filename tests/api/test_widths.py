@@ -1,0 +1,180 @@
+"""A reference torque over HTTP, on the page and as a verb: widths by a real worker, refusals in words."""
+
+from __future__ import annotations
+
+import csv
+import html
+import io
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+
+from api.cli import main
+from api.workers.pool import WORKER
+from rig.messages import Bound
+from stimrig import Client
+from tests.api.conftest import PATIENCE_S, TOKEN, Service, run_service
+from tests.api.fake_rig import muscle
+from tests.api.test_worker import made_up_csv
+
+HTML = {"Accept": "text/html"}
+TIME_S = np.arange(0, 6, 0.01)
+WANTED_NM = 1.5 * np.sin(np.pi * TIME_S / 6) ** 2
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[tuple[Service, str]]:
+    folder = tmp_path_factory.mktemp("widths")
+    for service in run_service(folder, short_dir, WORKER):
+        service.rig.limits["width_rise_us"] = Bound(hi=50.0, unit="µs/pulse", owner="hard limit")
+        with service.client() as client:
+            client.timeout = 120
+            limits = {"current_ma": 20.0, "max_pulse_width_us": 250.0, "max_torque_nm": 30.0}
+            client.post("/v1/participants", json={"code": "P1", "profile": limits})
+            body = made_up_csv(folder / "record.csv").read_bytes()
+            made = client.post("/v1/participants/P1/recordings", content=body)
+            assert made.status_code == 201, made.text
+            yield service, made.json()["model"]["id"]
+
+
+@pytest.fixture
+def client(served: tuple[Service, str]) -> Iterator[httpx.Client]:
+    with served[0].client(timeout=60) as client:
+        yield client
+
+
+def table(time_s: np.ndarray = TIME_S, torque_nm: np.ndarray = WANTED_NM) -> bytes:
+    rows = [f"{at:.4f},{torque:.5f}" for at, torque in zip(time_s, torque_nm, strict=True)]
+    return "\n".join(["time_s,torque_nm", *rows]).encode()
+
+
+def test_the_muscle_follows_what_was_asked_for(served: tuple[Service, str]) -> None:
+    service, model_id = served
+    with Client(service.url, TOKEN, PATIENCE_S) as client:
+        found = client.widths(model_id, WANTED_NM.tolist(), TIME_S.tolist())
+        assert client.predict(model_id, found["pulse_width_us"]) == pytest.approx(
+            found["predicted_torque_nm"], abs=1e-5
+        )
+        again = client.widths(model_id, found["reference_torque_nm"])
+        assert again["pulse_width_us"] == found["pulse_width_us"]
+    came = np.array(muscle(found["pulse_width_us"], 400.0)).reshape(-1, 10).mean(axis=1)
+    wanted = np.array(found["reference_torque_nm"])
+    assert np.linalg.norm(came - wanted) < 0.1 * np.linalg.norm(wanted)
+    assert found["fit_percent"] > 95 and found["unreachable"] == []
+    assert (found["max_pulse_width_us"], found["max_rise_us"]) == (250.0, 50.0)
+    rest, trial, _ = found["segments"]
+    assert (rest["sequence"], trial["sequence"]) == ("rest", "widths")
+    assert trial["settings"]["pulse_width_us"] == found["pulse_width_us"]
+
+
+def test_the_participants_limit_holds_and_what_is_beyond_is_named(
+    client: httpx.Client, served: tuple[Service, str]
+) -> None:
+    wanted = [0.0] * 20 + [50.0] * 80
+    ask = f"/v1/models/{served[1]}/widths"
+    found = client.post(ask, json={"reference_torque_nm": wanted, "max_pulse_width_us": 400.0}).json()
+    assert max(found["pulse_width_us"]) == 250.0
+    assert "above-plateau" in {one["reason"] for one in found["unreachable"]}
+    narrow = client.post(ask, json={"reference_torque_nm": wanted, "max_pulse_width_us": 180.0}).json()
+    assert max(narrow["pulse_width_us"]) == 180.0
+    slow = client.post(ask, json={"reference_torque_nm": wanted, "max_rise_us": 5.0}).json()
+    assert np.max(np.diff(slow["pulse_width_us"], prepend=0.0)) <= 5.0
+
+
+@pytest.mark.parametrize(
+    ("body", "words"),
+    [
+        ({}, "reference_torque_nm"),
+        ({"reference_torque_nm": []}, "reference_torque_nm"),
+        ({"reference_torque_nm": [True]}, "reference_torque_nm"),
+        ({"reference_torque_nm": [1.0, 2.0], "time_s": [0.0]}, "one time for each torque"),
+        ({"reference_torque_nm": [1.0, 2.0], "time_s": [0.5, 0.0]}, "must rise"),
+        ({"reference_torque_nm": [1e5]}, "mN·m"),
+        ({"reference_torque_nm": [0.0] * 12_001}, "at most 300 s"),
+        ({"reference_torque_nm": [1.0], "pulse_rate_hz": 20.0}, "40 pulses a second"),
+        ({"reference_torque_nm": [1.0], "max_pulse_width_us": 0.0}, "max_pulse_width_us"),
+        ({"reference_torque_nm": [1.0], "further": 1}, "further"),
+    ],
+)
+def test_a_senseless_reference_is_refused_in_words(
+    client: httpx.Client, served: tuple[Service, str], body: dict[str, object], words: str
+) -> None:
+    answer = client.post(f"/v1/models/{served[1]}/widths", json=body)
+    assert answer.status_code == 422
+    assert words in answer.text.replace("Give one time for each torque", "one time for each torque"), answer.text
+
+
+def test_json_that_is_no_number_is_refused(client: httpx.Client, served: tuple[Service, str]) -> None:
+    for text in ("NaN", "Infinity", "1e999"):
+        answer = client.post(
+            f"/v1/models/{served[1]}/widths",
+            content=f'{{"reference_torque_nm": [{text}]}}',
+            headers={"content-type": "application/json"},
+        )
+        assert answer.status_code in (400, 422), answer.text
+
+
+def test_the_page_shows_reference_prediction_and_what_is_out_of_reach(
+    client: httpx.Client, served: tuple[Service, str]
+) -> None:
+    address = f"/models/{served[1]}/widths"
+    assert f'href="{address}"' in client.get(f"/models/{served[1]}?diagnose=0", headers=HTML).text
+    empty = client.get(address, headers=HTML)
+    assert empty.status_code == 200 and "No reference yet." in empty.text and 'class="still"' not in empty.text
+    sent = client.post(address, files={"file": ("reach.csv", table(torque_nm=20 * WANTED_NM))}, headers=HTML)
+    assert sent.status_code == 200 and 'class="still"' in sent.text and "reach.csv" in sent.text
+    for words in ("Torque above rest (N·m)", "Pulse width (µs)", "Time (s)", "too high for the widest pulse"):
+        assert words in sent.text, words
+    reference = html.unescape(re.search(r'name="reference" value="([^"]*)"', sent.text)[1])  # pyright: ignore
+    got = client.post(address + ".csv", data={"reference": reference})
+    assert got.headers["content-type"].startswith("text/csv") and "widths.csv" in got.headers["content-disposition"]
+    rows = list(csv.DictReader(io.StringIO(got.text)))
+    assert list(rows[0]) == ["time_s", "pulse_width_us", "reference_torque_nm", "predicted_torque_nm"]
+    assert len(rows) == 240 and max(float(row["pulse_width_us"]) for row in rows) == 250.0
+    whole = client.post(address, files={"file": ("r.csv", table())}, headers=HTML)
+    assert "All of it can be reached." in whole.text and "Out of reach" not in whole.text
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"", "empty"),
+        (b"a,b\n1,2\n", "line 1"),
+        (b"time_s,torque_nm\n0,1\n0.1,x\n", "line 3, column torque_nm"),
+        (b"\x89HDF\r\n\x1a\n\x00\x00", "not text"),
+        (b"time_s,torque_nm\n0,\xb51\n", "line 2"),
+    ],
+)
+def test_a_file_that_is_no_reference_is_told_beside_the_form(
+    client: httpx.Client, served: tuple[Service, str], content: bytes, words: str
+) -> None:
+    answer = client.post(f"/models/{served[1]}/widths", files={"file": ("x.csv", content)}, headers=HTML)
+    assert answer.status_code == 422 and words in html.unescape(answer.text), answer.text[-3000:]
+    assert "Find the pulse widths" in answer.text
+
+
+def test_the_verb_writes_the_same_table(
+    served: tuple[Service, str], client: httpx.Client, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model, reference, out = (tmp_path / name for name in ("MODEL.json", "reference.csv", "widths.csv"))
+    model.write_bytes(client.get(f"/v1/models/{served[1]}/file").content)
+    reference.write_bytes(table())
+    options = ["invert", str(model), str(reference), "-o", str(out), "--largest-us", "250"]
+    assert main.run([*options, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    body = {"reference_torque_nm": WANTED_NM.tolist(), "time_s": TIME_S.tolist()}
+    asked = client.post(f"/v1/models/{served[1]}/widths", json=body).json()
+    assert found["pulse_width_us"] == pytest.approx(asked["pulse_width_us"], abs=1.0)
+    rows = list(csv.DictReader(out.open()))
+    assert [float(row["pulse_width_us"]) for row in rows] == found["pulse_width_us"]
+    reference.write_bytes(table(torque_nm=20 * WANTED_NM))
+    assert main.run(options) == 0 and "above-plateau" in capsys.readouterr().out
+    reference.write_text("nothing")
+    assert main.run(options) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and "reference.csv, line 1" in said and "torque_nm" in said
