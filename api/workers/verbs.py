@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from api.workers import adaptive_verbs
+from api.workers import adaptive_verbs, tracking_verbs
 from api.workers.diagnosis_verbs import diagnosis, improve, joined
 from api.workers.json_values import clean
 from api.workers.prediction import forecast
@@ -262,4 +262,5 @@ VERBS: dict[str, Callable[..., dict[str, Any]]] = {
     "find_recording": find_recording,
     "recorded": recorded,
     **adaptive_verbs.VERBS,
+    **tracking_verbs.VERBS,
 }

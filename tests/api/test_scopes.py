@@ -54,6 +54,7 @@ GET    /v1/models/x/diagnosis                              read-model     404
 POST   /v1/models/x/prediction                             read-model     422
 GET    /v1/participants/x/model                            read-model     404
 GET    /v1/participants/x/models                           read-model     404
+GET    /v1/participants/x/tracking                         read-model     404
 GET    /v1/participants/x/trend                            read-model     404
 GET    /v1/participants/x/trend.csv                        read-model     404
 GET    /v1/recordings/x                                    read-model     404
