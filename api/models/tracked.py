@@ -10,7 +10,7 @@ from typing import Any
 
 from sqlalchemy.orm import defer
 
-from api.clock import Clock, unix_of
+from api.clock import Clock
 from api.models import headline, stored, tracking
 from api.models.registry import Served, Versions
 from api.models.tracking import NOT_FOLLOWED, Bounds, Limits
@@ -194,9 +194,10 @@ class TrackedVersions:
                 found = self._served[participant] = approved if row is None else _served(row, approval)
         return found
 
-    def age_s(self, served: Served) -> float:
-        """For how long this has been what is known, s."""
-        return max(0.0, self.clock.unix_s() - unix_of(served.at_utc))
+    def asks(self, approval_id: int) -> str | None:
+        """Why a new test is needed now; None where none is."""
+        row = self.newest(approval_id)
+        return row.ask if row else None
 
     def document(self, participant: str) -> dict[str, Any] | None:
         """The trials of the approval that holds, as clients see them; None where none holds."""
@@ -205,7 +206,6 @@ class TrackedVersions:
             return None
         rows, served = self.rows(approval.id), self.served(participant)
         model = self.versions.get(approval.model_id)
-        asking = [row for row in rows if row.step is not None][-1:]
         return {
             "participant": participant,
             "approved_model_id": approval.model_id,
@@ -215,7 +215,7 @@ class TrackedVersions:
             "served_utc": served.at_utc if served else None,
             "served_trial": json.loads(served.body).get("tracking", {}).get("trial", 0) if served else None,
             "etag": served.etag if served else None,
-            "ask": asking[0].ask if asking else None,
+            "ask": self.asks(approval.id),
             "trials": [told(row) for row in rows],
         }
 

@@ -18,7 +18,7 @@ NAMES = (
     "current_ma", "step_us", "max_pulse_width_us", "max_torque_nm", "version", "trains",
     "calibration", "shown_us", "right",
     "archived", "at", "colours", "kind", "language", "muscle", "now", "q", "ran_by", "secret", "side",
-    "plan", "target", "test_id", "text", "username",
+    "gain_percent", "threshold_percent", "time_scale_percent", "plan", "target", "test_id", "text", "username",
 )  # fmt: skip
 """Every field of every form; `test_no_field_is_forgotten` looks."""
 ODD = [

@@ -89,6 +89,7 @@ POST   /v1/models/x/improve                                run-test       404
 DELETE /v1/jobs/x                                          run-test       404
 GET    /participants/x                                     run-test       404
 GET    /participants/x/next                                run-test       404
+GET    /participants/x/trials                              run-test       404
 POST   /participants                                       run-test       4xx
 POST   /participants/x/profile                             run-test       4xx
 POST   /participants/x/tests                               run-test       4xx
