@@ -94,7 +94,7 @@ class Picture(trend_charts.Plane):
 
     def frame(self) -> list[str]:
         """Grid and values, and the unit above them."""
-        return [*super().frame(), f'<text class="y" x="{LEFT - 5:g}" y="{TOP - 3:g}">{self.unit}</text>']
+        return [*super().frame(), f'<text class="x" x="1" y="{TOP - 2:g}">{self.unit}</text>']
 
     def limits(self) -> list[str]:
         """The limits that lie within the picture."""

@@ -59,6 +59,7 @@ class Version(TypedDict):
     words: str
     reasons: list[str]
     decision: Literal["approved", "rejected"] | None
+    tracking: dict[str, float] | None
     served: bool
     created_utc: str
 

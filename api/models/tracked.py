@@ -194,6 +194,19 @@ class TrackedVersions:
                 found = self._served[participant] = approved if row is None else _served(row, approval)
         return found
 
+    def text_of(self, model_id: str) -> str:
+        """MODEL.json of a version, or of one that was tracked from it. Raises ApiError (404, 500)."""
+        base, _, number = model_id.rpartition(".")
+        base, _, approval = base.rpartition(".")
+        if base and all(part.isascii() and part.isdigit() and len(part) < 10 for part in (approval, number)):
+            conditions = (Tracked.model_id == base, Tracked.approval_id == int(approval))
+            if int(number) == 0:
+                return stored.text(self.versions.get(base))
+            for row in self.store.all(Tracked, *conditions, Tracked.number == int(number)):
+                if row.document is not None:
+                    return row.document.decode()
+        return stored.text(self.versions.get(model_id))
+
     def asks(self, approval_id: int) -> str | None:
         """Why a new test is needed now; None where none is."""
         row = self.newest(approval_id)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -84,12 +85,13 @@ def ask(number: int, step: Mapping[str, Any], bounds: Bounds) -> str | None:
     """
     if step["outcome"] == CONTRADICTS:
         times = step["error_nm"] / step["expected_error_nm"]
-        found = (
+        words = (
             f"Trial {number} contradicts the structure of the approved model: its error is {times:.1f} times the "
             "expected one, whatever the gain, threshold and time scale are."
         )
-        return " ".join((found, NEW_TEST))
-    values = {name: float(step["coming"][name]["value"]) for name in QUANTITIES}
+        return " ".join((words, NEW_TEST))
+    found = {name: step["coming"][name]["value"] for name in QUANTITIES}
+    values = {name: math.nan if value is None else float(value) for name, value in found.items()}
     for name, (low, high) in bounds.items():
         if not (low <= values[name] <= high):
             return " ".join((_left(number, name, values[name], low, high), NEW_TEST))

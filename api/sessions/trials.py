@@ -151,8 +151,11 @@ class Trials:
 
     async def _resume(self) -> None:
         for approval, left in await asyncio.to_thread(self._left):
-            for test_id in left:
-                await self.follow(test_id)
+            try:
+                for test_id in left:
+                    await self.follow(test_id)
+            except ApiError as error:  # a damaged model: the other participants' trials are followed all the same
+                log.warning("trials of %s are not followed: %s", approval.participant, error)
             await self._warm(approval.participant)
 
     def _left(self) -> list[tuple[Approval, list[str]]]:

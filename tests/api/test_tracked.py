@@ -111,6 +111,16 @@ def test_without_an_approval_nothing_is_served_or_noted(client: httpx.Client, pa
     assert client.get("/v1/participants/P999/tracking").json()["title"] == "No such participant"
 
 
+def test_a_tracked_version_foretells_a_trial(client: httpx.Client, approved: str) -> None:
+    play(client)
+    tracked_id, body = tracked(client).json()["model_id"], {"pulse_width_us": [100.0]}
+    for model_id in (approved, tracked_id, f"{approved}.1.0"):
+        told = client.post(f"/v1/models/{model_id}/prediction", json=body)
+        assert told.status_code == 200 and told.json()["model_id"] == model_id
+    for model_id in (f"{approved}.1.2", f"{approved}.2.1", "none.1.1", f"{approved}.1.{'9' * 30}", ".1.1"):
+        assert client.post(f"/v1/models/{model_id}/prediction", json=body).status_code == 404
+
+
 # ---- within what a person allowed -------------------------------------------------------------------------------
 
 

@@ -64,6 +64,12 @@ def test_within_them_nobody_is_asked(coming: dict[str, float]) -> None:
     assert tracking.ask(4, step(**coming), Limits().bounds(80.0)) is None
 
 
+def test_a_number_that_json_has_not_is_beyond_every_bound() -> None:
+    without = step()
+    without["coming"] = {**without["coming"], "gain": {"value": None}}
+    assert "the gain is expected to be nan %" in str(tracking.ask(1, without, Limits().bounds(80.0)))
+
+
 def test_what_is_not_tracked_asks_nobody() -> None:
     assert tracking.ask(1, step(gain=0.1), Limits(gain_percent=0.0).bounds(80.0)) is None
 
