@@ -11,6 +11,7 @@ from typing import Any
 from sqlalchemy.orm import defer
 
 from api.clock import Clock
+from api.errors import ApiError
 from api.models import headline, stored, tracking
 from api.models.registry import Served, Versions
 from api.models.tracking import NOT_FOLLOWED, Bounds, Limits
@@ -35,6 +36,8 @@ class Trial:
         The approved MODEL.json.
     bounds : Bounds
         What a person allowed.
+    problem : str
+        Why the approved model cannot be followed; empty where it can.
     number : int
         Of the approval's trials, from 1.
     state : dict or None
@@ -47,6 +50,7 @@ class Trial:
     approval: Approval
     model_json: str
     bounds: Bounds
+    problem: str
     number: int
     state: dict[str, Any] | None
     missed: int
@@ -76,9 +80,13 @@ class TrackedVersions:
             return None
         rows = self.rows(approval.id)
         followed = [row for row in rows if row.step is not None]
-        model = self.versions.get(approval.model_id)
+        model, text, bounds, problem = self.versions.get(approval.model_id), "", Bounds(), ""
+        try:
+            text, bounds = stored.text(model), self.bounds(approval, model)
+        except ApiError as error:
+            problem = error.detail
         return Trial(
-            test, approval, stored.text(model), self.bounds(approval, model), len(rows) + 1,
+            test, approval, text, bounds, problem, len(rows) + 1,
             followed[-1].step["state"] if followed and followed[-1].step else None,
             len(rows) - followed[-1].number if followed else len(rows),
         )  # fmt: skip

@@ -123,8 +123,8 @@ class Trials:
     async def _found(self, trial: Trial) -> dict[str, Any]:
         """What the worker found, or why it found nothing: no trial is lost by that."""
         recording: Recording | None = await asyncio.to_thread(self.store.get, Recording, trial.test.recording_id or "")
-        if recording is None:
-            return {"reason": "It has no recording."}
+        if recording is None or trial.problem:
+            return {"reason": trial.problem or "It has no recording."}
         if await asyncio.to_thread(self._elsewhere, trial):
             return {"reason": ELSEWHERE}
         try:

@@ -13,7 +13,7 @@ import httpx
 import pytest
 
 from api.models.tracking import NEW_TEST
-from api.store.tables import Test, Tracked
+from api.store.tables import Model, Test, Tracked
 from rig.messages import FinishedEvent
 from tests.api.conftest import STUB, Service, run_service, run_test, wait_done
 from tests.api.fake_rig import default_widths
@@ -284,6 +284,16 @@ def test_a_recording_that_is_gone_or_another_current(service: Service, client: h
     play(client)
     (row,) = soon(lambda: trials(client))
     assert row["outcome"] == "not-followed" and "another side, muscle or current" in row["reason"]
+
+
+def test_a_damaged_model_is_not_followed(service: Service, client: httpx.Client, approved: str) -> None:
+    with service.app.state.context.store.write() as session:
+        row = session.get(Model, approved)
+        row.document = row.document.replace(b"1", b"2", 1)
+    play(client)
+    (row,) = soon(lambda: service.app.state.context.tracked.rows(1))
+    assert row.outcome == "not-followed" and "no longer what was stored" in row.reason
+    assert tracked(client).status_code == 500
 
 
 def test_a_trial_that_is_told_twice_moves_nothing_twice(service: Service, client: httpx.Client, approved: str) -> None:

@@ -10,6 +10,7 @@ from fastapi.responses import HTMLResponse, Response
 
 from api.charts import tracking_charts
 from api.clock import unix_of
+from api.errors import ApiError
 from api.language import _, clock, ngettext
 from api.models.tracking import Limits
 from api.models.tracking_words import OUTCOMES, sentences
@@ -45,7 +46,10 @@ def drawn(context: Context, who: Principal, code: str, found: dict[str, Any]) ->
 def card(context: Context, code: str) -> dict[str, Any] | None:
     """What the card shows; None where no model may be tracked today."""
     approval = context.tracked.allowing(code)
-    told = context.tracked.document(code) if approval is not None else None
+    try:
+        told = context.tracked.document(code) if approval is not None else None
+    except ApiError:  # the model is damaged: its own page says so
+        return None
     if approval is None or told is None:
         return None
     model = context.versions.get(approval.model_id)
