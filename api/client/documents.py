@@ -59,6 +59,7 @@ class Version(TypedDict):
     words: str
     reasons: list[str]
     decision: Literal["approved", "rejected"] | None
+    tracking: dict[str, float] | None
     served: bool
     created_utc: str
 
@@ -73,6 +74,25 @@ class Trend(TypedDict):
     participant: str
     sessions: list[dict[str, Any]]
     changes: dict[str, Any] | None
+
+
+class Tracking(TypedDict):
+    """What was tracked since the approval that holds.
+
+    Each of `trials` has `number`, `test_id`, `outcome`, `reason`, `error_percent`, and `now` and `coming` with `gain`,
+    `threshold_shift_us` and `time_scale`, each `value`, `low` and `high`; None where it was not followed.
+    """
+
+    participant: str
+    approved_model_id: str
+    approved_utc: str
+    limits: dict[str, float] | None
+    threshold_us: float | None
+    served_utc: str | None
+    served_trial: int | None
+    etag: str | None
+    ask: str | None
+    trials: list[dict[str, Any]]
 
 
 class SessionTest(TypedDict):

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from api.client.connection import Connection
-from api.client.documents import ApprovedModel, Job, Trend, Version
+from api.client.documents import ApprovedModel, Job, Tracking, Trend, Version
 from api.client.errors import NotCompleted, ServiceError, refused
 
 POLL_S = 0.1
@@ -38,8 +38,13 @@ class Models(Connection):
         """MODEL.json of a version, as `stimrig.Model.from_dict` takes it."""
         return self.get(f"/v1/models/{model_id}/file")
 
-    def approved_model(self, participant: str, known: ApprovedModel | None = None) -> ApprovedModel:
+    def approved_model(
+        self, participant: str, known: ApprovedModel | None = None, tracked: bool = False
+    ) -> ApprovedModel:
         """The approved model now. With the one that is `known`, the service sends it only if it has changed.
+
+        With `tracked` it is as it was tracked to the last trial, within the limits of the approval; its key `tracking`
+        says how, and in `ask` why a new test is needed, if one is.
 
         Raises
         ------
@@ -47,14 +52,37 @@ class Models(Connection):
             No model is approved today.
         """
         headers = {"If-None-Match": known.etag} if known else {}
-        answer = self.request("GET", f"/v1/participants/{participant}/model", headers=headers)
+        params = {"tracked": True} if tracked else {}
+        answer = self.request("GET", f"/v1/participants/{participant}/model", headers=headers, params=params)
         if known and answer.status_code == 304:
             return ApprovedModel(known.document, known.etag, changed=False)
         return ApprovedModel(answer.json(), answer.headers["etag"])
 
-    def approve(self, model_id: str, reason: str = "") -> Version:
-        """Let the controller have this version."""
-        return self.post(f"/v1/models/{model_id}/approve", json={"reason": reason})
+    def tracking(self, participant: str) -> Tracking:
+        """The trials since the approval that holds: how gain, threshold and time scale moved, and whether to ask.
+
+        Raises
+        ------
+        NotFound
+            No model is approved today.
+        """
+        return self.get(f"/v1/participants/{participant}/tracking")
+
+    def approve(self, model_id: str, reason: str = "", tracking: dict[str, float] | None = None) -> Version:
+        """Let the controller have this version.
+
+        Parameters
+        ----------
+        model_id : str
+            The version.
+        reason : str
+            Why; needed for a model that is not usable.
+        tracking : dict, optional
+            `gain_percent`, `threshold_percent`, `time_scale_percent`: how far the tracked model may move, each 0 (not
+            tracked) to 60; 20 where it is left out.
+        """
+        body = {"reason": reason, **({} if tracking is None else {"tracking": tracking})}
+        return self.post(f"/v1/models/{model_id}/approve", json=body)
 
     def reject(self, model_id: str, reason: str = "") -> Version:
         """Keep this version from the controller."""

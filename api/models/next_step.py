@@ -8,7 +8,8 @@ from typing import Literal
 from api.language import _
 
 Kind = Literal[
-    "running", "identifying", "look", "done", "archived", "rearm", "wait", "calibrating", "calibrate", "test", "again",
+    "running", "identifying", "look", "asked", "done", "archived", "rearm", "wait", "calibrating", "calibrate", "test",
+    "again",
 ]  # fmt: skip
 
 NO_MODEL = ("stopped", "fault", "refused", "failed")
@@ -52,6 +53,8 @@ class Situation:
         Until when the controller has an approved model (time of day); empty where it has none.
     archived_since : str
         Since when the participant is in the archive, as a page shows it; empty where it is not.
+    asked : bool
+        The trials of the approved model ask for a new test.
     """
 
     code: str
@@ -66,6 +69,7 @@ class Situation:
     rejected: bool = False
     served_until: str = ""
     archived_since: str = ""
+    asked: bool = False
 
 
 @dataclass(frozen=True)
@@ -119,6 +123,9 @@ def _of_model(now: Situation) -> Step | None:
     if model is not None and not model.decided and model.verdict != "not usable":
         words = _("The model is ready. Look at it, then approve or reject it.")
         return Step("look", words, _("Look at the model"), f"/models/{model.id}", model.id)
+    if now.served_until and now.asked:
+        words = _("The trials say that a new test is needed.")
+        return Step("asked", words, _("See why"), f"/participants/{now.code}#trials", now.served_until)
     if now.served_until:
         words = _("Done. The controller has today's model until %(time)s.", time=now.served_until)
         return Step("done", words, _("Back to the participants"), "/", now.served_until)

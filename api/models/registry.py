@@ -15,6 +15,7 @@ from sqlalchemy.orm import defer
 from api.clock import Clock
 from api.errors import ApiError, NotFoundError
 from api.models import headline, reasons, stored, summary
+from api.models.tracking import Limits
 from api.store import Store, audit
 from api.store.tables import Approval, Model
 
@@ -31,6 +32,9 @@ class Served:
     body: bytes
     etag: str
     expires_utc: str
+    approval_id: int
+    at_utc: str
+    """Since when it holds."""
 
 
 class Versions:
@@ -151,11 +155,16 @@ class Versions:
         self.decide(row.id, False, by, words)
         parent = self.get(row.parent_id)
         if holding is not None and holding.model_id == row.id and self.quality(parent)["verdict"] not in reasons.POOR:
-            self.decide(parent.id, True, by, words)
+            self.decide(parent.id, True, by, words, Limits(**holding.tracking) if holding.tracking else None)
         return parent
 
-    def decide(self, model_id: str, approved: bool, by: str, reason: str) -> Approval:
+    def decide(self, model_id: str, approved: bool, by: str, reason: str, tracking: Limits | None = None) -> Approval:
         """Approve or reject a version; only a person does this.
+
+        Parameters
+        ----------
+        tracking : Limits, optional
+            How far it may be tracked; None: not at all.
 
         Raises
         ------
@@ -170,9 +179,11 @@ class Versions:
         decision = Approval(model_id=row.id, participant=row.participant, approved=approved, reason=reason)
         decision.by, decision.at_utc = by, now
         decision.expires_utc = self.clock.end_of_day_utc() if approved else None
+        decision.tracking = tracking.to_dict() if approved and tracking else None
+        allowed = {"tracking": decision.tracking} if decision.tracking else {}
         with self.store.write() as session:
             session.add(decision)
-            audit.write(session, now, by, "approve" if approved else "reject", row.id, reason=reason)
+            audit.write(session, now, by, "approve" if approved else "reject", row.id, reason=reason, **allowed)
             self._served.pop(row.participant, None)
         return decision
 
@@ -236,8 +247,9 @@ class Versions:
                     return None
                 row = self.get(approval.model_id)
                 found = self._served[participant] = Served(
-                    row.id, stored.whole(row), f'"{row.etag}"', approval.expires_utc or LATEST
-                )
+                    row.id, stored.whole(row), f'"{row.etag}"', approval.expires_utc or LATEST, approval.id,
+                    approval.at_utc,
+                )  # fmt: skip
         return found
 
     def recruitment(self, participant: str) -> dict[str, list[float]] | None:
@@ -288,6 +300,7 @@ class Versions:
             "decided_utc": decision.at_utc if decision else None,
             "decision_reason": decision.reason if decision else None,
             "expires_utc": decision.expires_utc if decision else None,
+            "tracking": decision.tracking if decision else None,
             "served": holding is not None and holding.model_id == row.id,
             "created_utc": row.created_utc,
             "created_by": row.created_by,

@@ -17,6 +17,7 @@ from api.models.registry import Versions
 from api.sessions import adaptive_plan
 from api.sessions.adaptive import Follower, Told
 from api.sessions.adaptive_plan import ADAPTIVE, PIECE_S
+from api.sessions.places import Place, differ, place_of
 from api.sessions.requests import TestIn
 from api.sessions.rig_client import RigClient
 from api.store.tables import Participant, Test
@@ -27,8 +28,6 @@ KEPT = 20
 """Outlooks that are remembered: the question before a test and its start need the same one."""
 MOST_MODELS = 10
 """Sessions from which is learnt how much a person changes between two."""
-Place = tuple[str | None, str | None, float | None]
-"""Side, muscle, and current, mA; None: not known."""
 ENDS = {"torque_time": "torque-time", "plan": "fixed-rest"}
 """Why a test ended, by the rig's reason, where it is told by another name."""
 
@@ -118,7 +117,7 @@ class AdaptiveTests:
         """
         rows = self.versions.all_approved_ones(participant)
         tests = self.versions.store.all(Test, Test.recording_id.in_([row.recording_id for row in rows]))
-        elsewhere = {test.recording_id for test in tests if _differ(place_of(test), place)}
+        elsewhere = {test.recording_id for test in tests if differ(place_of(test), place)}
         found = []
         for row in [row for row in rows if row.recording_id not in elsewhere][-MOST_MODELS:]:
             with contextlib.suppress(ApiError):
@@ -215,16 +214,6 @@ class AdaptiveTests:
         assert bounds is not None
         limits = {"max_duration_s": bounds.max_duration_s, "max_torque_time_nm_s": bounds.max_torque_time_nms}
         return {**limits, "torque_time_nm_s": follower.torque_time_nm_s, **asdict(follower.told)}
-
-
-def place_of(row: Test) -> Place:
-    """Where a test stimulated, and with what current, mA."""
-    return row.plan.get("side"), row.plan.get("muscle"), row.plan.get("profile", {}).get("current_ma")
-
-
-def _differ(one: Place, other: Place) -> bool:
-    """Whether two places are known to be different ones."""
-    return any(a is not None and b is not None and a != b for a, b in zip(one, other, strict=True))
 
 
 def unfollowed(row: Test) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from api.models.analyses import Analyses
 from api.models.registry import Versions
 from api.sessions.adaptive_tests import AdaptiveTests
 from api.sessions.rig_client import RigClient
+from api.sessions.trials import SEQUENCE
 from api.store import Store, audit
 from api.store.tables import Model, Recording, Test
 from api.workers.pool import Call, Pool
@@ -21,8 +22,6 @@ from rig.messages import FinishedEvent
 
 log = logging.getLogger("stimrig.outcomes")
 
-SEQUENCE = "sequence"
-"""A test of this kind plays what a controller has planned; nothing is identified from it."""
 OPEN_STATES = ("requested", "running", "sealing", "identifying")
 
 

@@ -58,6 +58,7 @@ def _limit(name: str, description: str) -> Any:
 CurrentMa = Annotated[FiniteFloat, _limit("current_ma", "fixed current of every pulse, mA")]
 WidthUs = Annotated[FiniteFloat, _limit("max_pulse_width_us", "comfort maximum, µs")]
 TorqueNm = Annotated[FiniteFloat, _limit("max_torque_nm", "torque at which a test stops, N·m")]
+ReferenceNm = Annotated[FiniteFloat, Field(ge=-LIMITS["max_torque_nm"].most, le=LIMITS["max_torque_nm"].most)]
 
 
 class Body(BaseModel):
@@ -176,11 +177,19 @@ class TestIn(Body):
         default=False, description="kind `adaptive`: play it although the target is out of reach"
     )
 
+    reference_torque_nm: Annotated[list[ReferenceNm], Field(min_length=1, max_length=12_000)] | None = Field(
+        default=None,
+        description="kind `sequence`: the torque that the controller wants, one value for each pulse of the whole "
+        "test, N·m. Only to tell its tracking error; it changes nothing that is played",
+    )
+
     @model_validator(mode="after")
     def _of_its_kind(self) -> TestIn:
         own = {"target", "max_duration_s", "max_torque_time_nm_s", "anyway"}
         sent = {name for name in self.model_fields_set if getattr(self, name) is not None}
         wrong = sorted(sent & {"segments", "protocol", "joins"} if self.kind == "adaptive" else sent & own)
+        if self.reference_torque_nm is not None and self.kind != "sequence":
+            raise ValueError("reference_torque_nm: only a test of the kind sequence has one; leave it out")
         if wrong:
             which = "chooses its own segments" if self.kind == "adaptive" else "has a fixed plan"
             raise ValueError(f"{', '.join(wrong)}: a test of the kind {self.kind} {which}; leave it out")

@@ -28,6 +28,7 @@ from api.sessions.live import Hub
 from api.sessions.refusals import Current, busy, not_what_was_seen, other_than, refuse_archived
 from api.sessions.requests import TestIn
 from api.sessions.rig_client import AnyEvent, RigClient
+from api.sessions.trials import SEQUENCE, Trials
 from api.store import Store, audit
 from api.store.tables import Participant, Test
 from api.workers.adviser import Adviser
@@ -80,11 +81,12 @@ class Runner:
 
     def __init__(
         self, store: Store, clock: Clock, rig: RigClient, pool: Pool, versions: Versions, analyses: Analyses,
-        adviser: Adviser, recordings_dir: Path,
+        adviser: Adviser, trials: Trials, recordings_dir: Path,
     ) -> None:  # fmt: skip
         self.store, self.clock, self.rig, self.versions, self.pool = store, clock, rig, versions, pool
         self.hub = Hub(clock)
         self.adaptive = AdaptiveTests(clock, rig, versions, adviser, self.hub.send)
+        self.trials = trials
         self.current: Current | None = None
         self.lifecycle = Lifecycle(
             store, clock, rig, pool, versions, analyses, self.adaptive, recordings_dir, self.announce
@@ -242,7 +244,7 @@ class Runner:
         now, plan = self.clock.utc(), planned.plan
         row = Test(id=plan.test_id, participant=plan.participant, kind=plan.kind, state="requested")
         kept = {"joins": body.joins, "side": participant.side, "muscle": participant.muscle}  # as they are now
-        kept |= planned.kept()
+        kept |= planned.kept() | self.trials.kept(body, len(preview["pulse_width_us"]))
         row.plan, row.summary, row.reason = {**plan.model_dump(), "preview": preview, **kept}, {}, ""
         row.requested_by, row.requested_utc, row.ran_by = by, now, other_than(by, body.ran_by)
         with self.store.write() as session:
@@ -365,10 +367,14 @@ class Runner:
         """Take over a finished test: store the recording, identify, store the model."""
         if self.current is not None and self.current.test_id == event.test_id:
             self.current.ending = True
-        row = await asyncio.to_thread(self.lifecycle.take_recording, event)
-        if row is None:
-            return
-        self.announce(row.id)
+        with self.trials.ending():
+            row = await asyncio.to_thread(self.lifecycle.take_recording, event)
+            if row is None:
+                return
+            self.announce(row.id)
+            if row.kind == SEQUENCE and row.state == "completed":
+                self._release(event.test_id)
+                await self.trials.follow(row.id, event.last_sample_unix_s)
         if row.state == "identifying":
             self._release(event.test_id)
             await self.lifecycle.identify(row.id, event.last_sample_unix_s)
@@ -383,6 +389,7 @@ class Runner:
 
     async def resume(self) -> None:
         """Take up what a restart of the service left open."""
+        self.trials.resume()
         for row in await asyncio.to_thread(self.store.all, Test, Test.state.in_(OPEN_STATES)):
             status = self.rig.status
             if (
@@ -421,4 +428,5 @@ class Runner:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
         await self.adaptive.close()
+        await self.trials.close()
         await asyncio.to_thread(self._notes.shutdown)

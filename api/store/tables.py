@@ -112,6 +112,36 @@ class Approval(Table):
     by: Mapped[str] = mapped_column(String(80))
     at_utc: Mapped[str] = mapped_column(String(32))
     expires_utc: Mapped[str | None] = mapped_column(String(32), default=None)
+    tracking: Mapped[dict[str, float] | None] = mapped_column(JSON(none_as_null=True), default=None)
+    """How far the model may be tracked, in percent (`api.models.tracking.Limits`); None: nobody has allowed it."""
+
+
+class Tracked(Table):
+    """One trial of a controller under an approval: what it said of the muscle, and what was served after it."""
+
+    __tablename__ = "tracked"
+    test_id: Mapped[str] = mapped_column(ForeignKey("tests.id"), primary_key=True)
+    approval_id: Mapped[int] = mapped_column(ForeignKey("approvals.id"), index=True)
+    participant: Mapped[str] = mapped_column(ForeignKey("participants.code"))
+    model_id: Mapped[str] = mapped_column(ForeignKey("models.id"))
+    recording_id: Mapped[str | None] = mapped_column(String(64), default=None)
+    number: Mapped[int] = mapped_column(Integer)
+    """Of the approval's trials, from 1."""
+    outcome: Mapped[str] = mapped_column(String(20))
+    """As `identify.tracking.Outcome`, or `not-followed`."""
+    reason: Mapped[str] = mapped_column(Text, default="")
+    """Why it was not followed."""
+    step: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True), default=None)
+    error_percent: Mapped[float | None] = mapped_column(Float, default=None)
+    """Error of the torque against the controller's reference, % of the reference's rms."""
+    ask: Mapped[str | None] = mapped_column(Text, default=None)
+    """Why a new test is needed."""
+    document: Mapped[bytes | None] = mapped_column(LargeBinary, default=None)
+    """The MODEL.json that was served after it; None: that of the trial before."""
+    etag: Mapped[str | None] = mapped_column(String(64), default=None)
+    at_utc: Mapped[str] = mapped_column(String(32))
+    delay_s: Mapped[float | None] = mapped_column(Float, default=None)
+    """From its last sample to its being served."""
 
 
 class Analysis(Table):

@@ -19,6 +19,7 @@ from api import owner_only
 from api.clock import Clock, set_zone
 from api.models.analyses import Analyses
 from api.models.registry import Versions
+from api.models.tracked import TrackedVersions
 from api.models.trend import Trend
 from api.people.accounts import People
 from api.people.auth import Auth, Principal, Scope
@@ -30,6 +31,7 @@ from api.sessions.rig_client import RigClient
 from api.sessions.runner import Runner
 from api.sessions.stop_log import StopLog
 from api.sessions.stop_right import StopRights
+from api.sessions.trials import Trials
 from api.settings import Settings
 from api.store import Store, uploads
 from api.store.lock import ServiceLock
@@ -58,6 +60,7 @@ class Context:
     rig: RigClient
     pool: Pool
     versions: Versions
+    tracked: TrackedVersions
     runner: Runner
     analyses: Analyses
     trend: Trend
@@ -145,13 +148,15 @@ def _build(settings: Settings, clock: Clock, worker: tuple[str, ...], lock: Serv
     versions = Versions(store, clock)
     analyses = Analyses(store, clock, pool, versions, settings)
     adviser = Adviser(worker, places(settings, store))  # its own: a folder that the pool learns ends no test
-    runner = Runner(store, clock, rig, pool, versions, analyses, adviser, settings.recordings_dir)
+    tracked = TrackedVersions(store, clock, versions)
+    trials = Trials(store, clock, tracked, Adviser(worker, places(settings, store)))
+    runner = Runner(store, clock, rig, pool, versions, analyses, adviser, trials, settings.recordings_dir)
     jobs = Jobs(pool)
     people = People(store, clock, auth, guesses)
     rights = StopRights(owner_only.key(settings.data_dir / "stop-right.key"), clock)
     questions = Questions(clock)
     return Context(
-        settings, clock, store, auth, people, rights, rig, pool, versions, runner, analyses,
+        settings, clock, store, auth, people, rights, rig, pool, versions, tracked, runner, analyses,
         Trend(store, clock, pool), jobs, lock, questions, Notes(store, clock), drawn
     )  # fmt: skip
 

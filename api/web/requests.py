@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import Field, StringConstraints
+from pydantic import Field, FiniteFloat, StringConstraints
 
+from api.models.tracking import LEAST_PERCENT, MOST_PERCENT, USUAL_PERCENT, Limits
 from api.sessions.requests import FIRST_PROFILE, Body, Code, FirstProfileIn, Muscle, PersonName, Side
 
 
@@ -28,6 +29,29 @@ class DecisionIn(Body):
     """Why a model is approved or rejected."""
 
     reason: Annotated[str, StringConstraints(max_length=500)] = ""
+
+
+TrackedPercent = Annotated[FiniteFloat, Field(ge=LEAST_PERCENT, le=MOST_PERCENT)]
+
+
+class TrackingIn(Body):
+    """How far a tracked model may move from the approved one, either way, %; 0: this is not tracked."""
+
+    gain_percent: TrackedPercent = Field(default=USUAL_PERCENT, description="of the gain")
+    threshold_percent: TrackedPercent = Field(
+        default=USUAL_PERCENT, description="of the threshold: the width at which the curve has gone 5 % of its way"
+    )
+    time_scale_percent: TrackedPercent = Field(default=USUAL_PERCENT, description="of the time constant")
+
+    def limits(self) -> Limits:
+        """As the registry takes them."""
+        return Limits(**self.model_dump())
+
+
+class ApprovalIn(DecisionIn):
+    """Why a model is approved, and how far it may be tracked from trial to trial."""
+
+    tracking: TrackingIn = Field(default=TrackingIn())
 
 
 class EffectsIn(Body):

@@ -1,4 +1,4 @@
-"""The worker of adaptive tests: a process of its own that keeps the test that runs from one question to the next."""
+"""A worker beside the pool: of adaptive tests, whose test it keeps from one question to the next, or of trials."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ log = logging.getLogger("stimrig.adviser")
 class Adviser:
     """Answers one question at a time, beside the pool: nothing else keeps it busy.
 
-    It is started by the first question, the one of what a test can reach; so whoever runs no adaptive test has no
-    such process, and during a test it is warm.
+    It is started by the first question, so whoever asks none has no such process. For an adaptive test that is what it
+    can reach: during the test it is warm.
 
     Parameters
     ----------

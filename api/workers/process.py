@@ -41,6 +41,8 @@ PROCESSOR_S = {
     "adaptive_outlook": 60.0,
     "adaptive_begin": 10.0,
     "adaptive_advise": 5.0,
+    "track": 10.0,
+    "track_warm": 60.0,
 }
 LONGEST_PROCESSOR_S = 1200.0
 """What a call may compute; improving a long record takes minutes on a slow machine."""

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from api.workers import adaptive_verbs
+from api.workers import adaptive_verbs, tracking_verbs
 from api.workers.diagnosis_verbs import diagnosis, improve, joined
 from api.workers.json_values import clean
 from api.workers.prediction import forecast, invert
@@ -263,4 +263,5 @@ VERBS: dict[str, Callable[..., dict[str, Any]]] = {
     "find_recording": find_recording,
     "recorded": recorded,
     **adaptive_verbs.VERBS,
+    **tracking_verbs.VERBS,
 }

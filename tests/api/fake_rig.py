@@ -83,6 +83,7 @@ class FakeRig:
         self.path, self.data, self.speed, self.rate_hz = path, data, speed, rate_hz
         self.state, self.reason = "ready", ""
         self.plan: m.TestPlan | None = None
+        self.last_plan: m.TestPlan | None = None
         self.elapsed_s = self.duration_s = 0.0
         self.segment: str | None = None
         self.confirms_stop = True
@@ -221,6 +222,7 @@ class FakeRig:
             raise m_refusal(self.state, "The rig stands still", f"{self.reason}. Re-arm it.")
         self._widths(request.plan)
         self.starts += 1
+        self.last_plan = request.plan
         self.plan, self.state, self.reason, self.key = request.plan, "running", "", request.key
         self._stop.clear()
         self._play = asyncio.create_task(self._run(request.plan))

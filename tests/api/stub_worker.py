@@ -159,6 +159,32 @@ def advised(arguments: dict[str, Any]) -> dict[str, Any]:
 TARGET: dict[str, float] = {}
 
 
+def tracked(arguments: dict[str, Any]) -> dict[str, Any]:
+    """A gain 2 % lower each trial; `track.json` beside the recording says otherwise, once."""
+    told = Path(arguments["data"]).parent / "track.json"
+    wanted = json.loads(told.read_text()) if told.exists() else {}
+    told.unlink(missing_ok=True)
+    if wanted.get("die"):
+        sys.exit(9)
+    time.sleep(wanted.get("slow_s", 0.0))
+    error = None if arguments["reference_torque_nm"] is None else 7.5
+    if "reason" in wanted:
+        return {"error_percent": error, "reason": wanted["reason"]}
+    state = arguments["state"] or {"trials": 0, "gain": 1.0}
+    values = {"gain": state["gain"] * 0.98, "threshold_shift_us": 0.5, "time_scale": 1.0} | wanted.get("values", {})
+    levels = {name: {"value": value, "low": value - 0.01, "high": value + 0.01} for name, value in values.items()}
+    after = {"trials": state["trials"] + 1, "gain": values["gain"], "missed": arguments["missed"]}
+    step = {
+        "outcome": wanted.get("outcome", "followed"), "trial": after["trials"], "now": levels, "coming": levels,
+        "error_nm": wanted.get("error_nm", 0.04), "expected_error_nm": 0.04, "error_before_nm": 0.1, "torque_nm": 2.0,
+        "disturbed_s": [], "distance": 2.0, "state": after,
+    }  # fmt: skip
+    moved = json.loads(arguments["model_json"])
+    gain = values["gain"] if "gain" in arguments["tracked"] else 1.0
+    moved["recruitment"]["torque_nm"] = [gain * y for y in moved["recruitment"]["torque_nm"]]
+    return {"error_percent": error, "step": step, "model": json.dumps(moved)}
+
+
 def answer(verb: str, arguments: dict[str, Any], say: Any) -> dict[str, Any]:
     if verb == "fit":
         say(progress=0.5, text="identifying")
@@ -206,6 +232,8 @@ def answer(verb: str, arguments: dict[str, Any], say: Any) -> dict[str, Any]:
     if verb == "adaptive_advise":
         ADVISED.append(len(arguments["torque_nm"]))
         return {"result": advised(arguments)}
+    if verb == "track":
+        return {"result": tracked(arguments)}
     if verb == "forecast":
         return {"result": {"torque_nm": [width / 100 for width in arguments["pulse_width_us"]]}}
     if verb == "invert":

@@ -27,7 +27,7 @@ OLD = Path(__file__).parent / "databases"
 ADDED_SINCE = [
     ("approvals", "expires_utc"), ("recordings", "warnings"), ("participants", "side"), ("participants", "muscle"),
     ("participants", "archived_utc"), ("tests", "ran_by"), ("models", "carried_from_id"), ("models", "carried"),
-    ("page_sessions", "acted_unix_s"), ("page_sessions", "locked_unix_s"),
+    ("page_sessions", "acted_unix_s"), ("page_sessions", "locked_unix_s"), ("approvals", "tracking"),
     ("tokens", "participant"), ("tokens", "plan"),
 ]  # fmt: skip
 """Columns that the tables of a first database did not have."""
@@ -64,7 +64,7 @@ def test_a_new_database_is_at_the_newest_revision_and_holds_the_tables_of_today(
         assert database.execute("SELECT version_num FROM alembic_version").fetchone() == (migrations.NEWEST,)
 
 
-@pytest.mark.parametrize("name", ["unversioned", "2", "3", "4", "5"])
+@pytest.mark.parametrize("name", ["unversioned", "2", "3", "4", "5", "6"])
 def test_a_database_of_each_older_version_is_upgraded_and_keeps_its_rows(tmp_path: Path, name: str) -> None:
     path = old(tmp_path / "stimrig.db", name)
     for _ in range(2):  # the second time there is nothing to do
@@ -115,7 +115,7 @@ def test_a_service_goes_on_with_an_older_database(tmp_path: Path, short_dir: Pat
             http.post(f"/v1/models/{model}/approve", json={"reason": "good"})
     change(
         tmp_path / "stimrig.db", "DROP TABLE alembic_version", "DROP TABLE schema_version", "DROP TABLE confirmations",
-        "DROP TABLE known_places", "DROP TABLE users", "DROP TABLE notes",
+        "DROP TABLE known_places", "DROP TABLE users", "DROP TABLE notes", "DROP TABLE tracked",
         *(f"ALTER TABLE {table} DROP COLUMN {column}" for table, column in ADDED_SINCE),
     )  # fmt: skip
     for service in run_service(tmp_path, short_dir, STUB):

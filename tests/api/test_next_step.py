@@ -35,6 +35,8 @@ TABLE: list[tuple[dict[str, Any], str, str, str]] = [
     ({"model": DONE, "served_until": "23:59"}, "done", "today's model until 23:59", "/"),
     ({"model": DONE, "served_until": "23:59", "rig": "latched"}, "done", "until 23:59", "/"),
     ({"model": POOR, "served_until": "23:59"}, "done", "until 23:59", "/"),
+    ({"model": DONE, "served_until": "23:59", "asked": True}, "asked", "new test is needed", "/participants/P1#trials"),
+    ({"model": DONE, "asked": True}, "test", "Start the pre-session test", "form"),
     ({"model": DONE}, "test", "Start the pre-session test", "form"),
     ({"model": POOR}, "again", "is not usable. Test again", "form"),
     ({"model": POOR, "calibration": "expired"}, "calibrate", "not usable. The last", "/participants/P1/calibration"),

@@ -19,6 +19,7 @@ NAMES = (
     "calibration", "shown_us", "right",
     "archived", "at", "colours", "kind", "language", "muscle", "now", "q", "ran_by", "secret", "side",
     "plan", "reference", "max_duration_s", "trials", "target", "test_id", "text", "username",
+    "gain_percent", "threshold_percent", "time_scale_percent",
 )  # fmt: skip
 """Every field of every form; `test_no_field_is_forgotten` looks."""
 ODD = [

@@ -58,6 +58,7 @@ POST   /models/x/widths                                    read-model     4xx
 POST   /models/x/widths.csv                                read-model     4xx
 GET    /v1/participants/x/model                            read-model     404
 GET    /v1/participants/x/models                           read-model     404
+GET    /v1/participants/x/tracking                         read-model     404
 GET    /v1/participants/x/trend                            read-model     404
 GET    /v1/participants/x/trend.csv                        read-model     404
 GET    /v1/recordings/x                                    read-model     404
@@ -92,6 +93,7 @@ POST   /v1/models/x/improve                                run-test       404
 DELETE /v1/jobs/x                                          run-test       404
 GET    /participants/x                                     run-test       404
 GET    /participants/x/next                                run-test       404
+GET    /participants/x/trials                              run-test       404
 POST   /participants                                       run-test       4xx
 POST   /participants/x/profile                             run-test       4xx
 POST   /participants/x/tests                               run-test       4xx

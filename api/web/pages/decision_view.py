@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Form, Request
 from fastapi.responses import RedirectResponse, Response
@@ -12,7 +12,9 @@ from api.errors import ApiError
 from api.models import advice, reasons, stored
 from api.store.tables import Model
 from api.web.dependencies import Approver, Context, Ctx
+from api.web.pages import tracking_form
 from api.web.pages.render import page
+from api.web.routes import models
 
 router = APIRouter(include_in_schema=False, prefix="/models/{model_id}")
 Reason = Annotated[str, Form()]
@@ -31,9 +33,13 @@ async def ask(request: Request, context: Ctx, who: Approver, model_id: str) -> R
 async def approve(request: Request, context: Ctx, who: Approver, model_id: str, reason: Reason = "") -> Response:
     """Let the controller have a version; one that is not usable wants a reason."""
     row = await asyncio.to_thread(context.versions.get, model_id)
+    sent = await request.form()
+    tracking = tracking_form.read(sent)
     if _poor(context, row) and not reasons.is_reason(reason):
-        return await _question(request, context, row, who.session_hash, reason)
-    return await _decided(context, who.name, model_id, True, reason)
+        given = {name: sent[name] for name in tracking_form.LABELS if name in sent}
+        return await _question(request, context, row, who.session_hash, reason, given)
+    await models.let_have(context, model_id, who.name, reason.strip()[:500], tracking)
+    return RedirectResponse(f"/models/{model_id}", 303)
 
 
 @router.post("/reject")
@@ -48,7 +54,8 @@ async def reject(context: Ctx, who: Approver, model_id: str, reason: Reason = ""
     if not reason.strip():
         detail = "Go back and say in a few words why; it is kept in the audit trail. Nothing was decided."
         raise ApiError(422, "reason-missing", "A rejection needs a reason", detail)
-    return await _decided(context, who.name, model_id, False, reason)
+    await asyncio.to_thread(context.versions.decide, model_id, False, who.name, reason.strip()[:500])
+    return RedirectResponse(f"/models/{model_id}", 303)
 
 
 def _poor(context: Context, row: Model) -> bool:
@@ -56,8 +63,9 @@ def _poor(context: Context, row: Model) -> bool:
 
 
 async def _question(
-    request: Request, context: Context, row: Model, session: str | None, typed: str | None = None
-) -> Response:
+    request: Request, context: Context, row: Model, session: str | None, typed: str | None = None,
+    sent: dict[str, Any] | None = None,
+) -> Response:  # fmt: skip
     """What would be risked, and the field for the reason; with what was typed where it is no reason."""
     document = stored.read(row)
     return page(
@@ -68,10 +76,6 @@ async def _question(
         risks=advice.risks(document, advice.findings(document)),
         ask_password=not await context.people.is_confirmed(session),
         typed=typed,
+        sent=sent,
         what_to_write=reasons.WHAT_TO_WRITE,
     )
-
-
-async def _decided(context: Context, by: str, model_id: str, approved: bool, reason: str) -> Response:
-    await asyncio.to_thread(context.versions.decide, model_id, approved, by, reason.strip()[:500])
-    return RedirectResponse(f"/models/{model_id}", 303)

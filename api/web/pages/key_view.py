@@ -42,7 +42,7 @@ async def make(
     )
     plan = plan_within(PlanIn(**body.model_dump(exclude={"name"})), row)
     text, made = await asyncio.to_thread(controller_keys.make, context.auth, body.name, code, plan, who.name)
-    return await participant_view.shown(request, context, code, made={"text": text, "name": made.name})
+    return await participant_view.shown(request, context, who, code, made={"text": text, "name": made.name})
 
 
 @router.post("/{key_id}/revoke")

@@ -8,7 +8,8 @@ from fastapi import APIRouter
 
 from api import language
 from api.models import next_step
-from api.sessions.lifecycle import OPEN_STATES, SEQUENCE
+from api.sessions.lifecycle import OPEN_STATES
+from api.sessions.trials import SEQUENCE
 from api.store.tables import Model, Participant, Test
 from api.web.dependencies import Context, Ctx, Tester
 from api.web.pages import rig_state, starting
@@ -48,13 +49,14 @@ def situation(context: Context, row: Participant) -> next_step.Situation:
         calibration=standing.state,
         may_start=standing.may_start,
         holder=holder,
-        running=test.id if test is not None and mine else "",
+        running=test.id if test is not None and mine and not (served and test.kind == SEQUENCE) else "",
         identifying=test.id if test is not None and open_test and not mine else "",
         ended=test.state if test is not None and test.state in next_step.NO_MODEL and test.kind != SEQUENCE else "",
         model=kept and next_step.Today(kept.id, context.versions.quality(kept)["verdict"], decided),
         rejected=bool(models) and kept is None,
         served_until=language.until(served.expires_utc or context.clock.end_of_day_utc())[-5:] if served else "",
         archived_since=language.when(row.archived_utc) if row.archived_utc else "",
+        asked=served is not None and context.tracked.asks(served.id) is not None,
     )
 
 

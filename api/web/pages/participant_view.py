@@ -7,6 +7,7 @@ from typing import Any
 
 from fastapi import APIRouter, Request
 from fastapi.responses import RedirectResponse, Response
+from markupsafe import Markup
 
 from api.language import when
 from api.people import controller_keys
@@ -16,7 +17,7 @@ from api.sessions.questions import Question, Row
 from api.store import audit
 from api.store.tables import Participant, Test
 from api.web.dependencies import Context, Ctx, Tester
-from api.web.pages import kind_form, limits_form, next_view, starting
+from api.web.pages import kind_form, limits_form, next_view, starting, trials_view
 from api.web.pages.limits_form import LimitsForm
 from api.web.pages.render import page
 from api.web.routes import participants
@@ -26,13 +27,13 @@ router = APIRouter(include_in_schema=False, prefix="/participants/{code}")
 
 
 @router.get("")
-async def participant(request: Request, context: Ctx, _who: Tester, code: str) -> Response:
+async def participant(request: Request, context: Ctx, who: Tester, code: str) -> Response:
     """A participant: limits, start, history of tests and models."""
-    return await shown(request, context, code)
+    return await shown(request, context, who, code)
 
 
 async def shown(
-    request: Request, context: Context, code: str, form: LimitsForm | None = None, status: int = 200,
+    request: Request, context: Context, who: Principal, code: str, form: LimitsForm | None = None, status: int = 200,
     made: dict[str, Any] | None = None,
 ) -> Response:  # fmt: skip
     """The page, with the form as it was sent where something was wrong with it.
@@ -55,9 +56,16 @@ async def shown(
             "models": context.versions.of(code),
             "keys": controller_keys.of(context.auth, code),
             "made": made,
+            "trials": trials_of(context, who, code),
         }
 
     return page(request, "participant.html", status, **await asyncio.to_thread(gather))
+
+
+def trials_of(context: Context, who: Principal, code: str) -> Markup | None:
+    """The card of the trials; empty before the first one, None where no model may be tracked."""
+    found = trials_view.card(context, code)
+    return None if found is None else Markup(trials_view.drawn(context, who, code, found))
 
 
 @router.post("/profile")
@@ -80,9 +88,9 @@ async def taken(request: Request, context: Context, who: Principal, code: str, s
     form = limits_form.read(sent, row.profile, status.limits if status else {})
     if form.notice and not form.errors:
         form.notice += await asyncio.to_thread(_by_whom, context, code)
-        return await shown(request, context, code, form, 409)
+        return await shown(request, context, who, code, form, 409)
     if form.errors:
-        return await shown(request, context, code, form, 422)
+        return await shown(request, context, who, code, form, 422)
     wanted = kind_form.asked(sent, code) if start else None
 
     async def on() -> str:

@@ -42,6 +42,14 @@ class CarriedOut(Document):
     effects: list[CarriedEffect]
 
 
+class TrackingLimits(Document):
+    """How far a tracked model may move from the approved one, either way, %; 0: this is not tracked."""
+
+    gain_percent: float
+    threshold_percent: float = Field(description="of the threshold: where the curve has gone 5 % of its way")
+    time_scale_percent: float
+
+
 class VersionOut(Document):
     """One model version."""
 
@@ -69,6 +77,9 @@ class VersionOut(Document):
     words: str = Field(description="the verdict in one sentence")
     reasons: list[str] = Field(description="what speaks against the model, worst first")
     decision: Literal["approved", "rejected"] | None
+    tracking: TrackingLimits | None = Field(
+        None, description="how far it may be tracked; null: not approved, or before it could be"
+    )
     served: bool = Field(description="the controller gets this one")
     created_utc: str
 

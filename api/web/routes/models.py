@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 import asyncio
+from email.utils import formatdate
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Header, Response
+from fastapi import APIRouter, Header, Query, Response
 
+from api.clock import unix_of
 from api.errors import ApiError
 from api.models import stored
-from api.web.dependencies import PROBLEM, Approver, Ctx, ModelReader
+from api.models.tracking import Limits
+from api.store.tables import Model
+from api.web.dependencies import PROBLEM, Approver, Context, Ctx, ModelReader
 from api.web.headers import entity_tags
-from api.web.requests import DecisionIn
+from api.web.requests import ApprovalIn, DecisionIn
 from api.web.responses.base import published
 from api.web.responses.models import VersionOut
 from api.web.routes import participants
 
 router = APIRouter(prefix="/v1", tags=["models"], responses=PROBLEM)
 TAG = {"description": "send it as `If-None-Match`", "schema": {"type": "string"}}
+AGE = {"description": "with `tracked`: when it was found", "schema": {"type": "string"}}
 APPROVED: dict[int | str, dict[str, Any]] = {
-    200: {**published("model", "MODEL.json"), "headers": {"ETag": TAG}},
+    200: {**published("model", "MODEL.json"), "headers": {"ETag": TAG, "Last-Modified": AGE}},
     304: {"description": "it is the one of `If-None-Match`"},
 }
 WITH_MODEL: dict[str, Any] = {
@@ -33,21 +38,35 @@ WITH_MODEL: dict[str, Any] = {
 
 @router.get("/participants/{code}/model", response_class=Response, responses=APPROVED)
 async def approved_model(
-    context: Ctx, _who: ModelReader, code: str, if_none_match: Annotated[str | None, Header()] = None
-) -> Response:
-    """The approved model, for the ILC controller: MODEL.json with its `ETag`; 304 where it is known already."""
-    served = context.versions.served(code)
+    context: Ctx, _who: ModelReader, code: str, if_none_match: Annotated[str | None, Header()] = None,
+    tracked: Annotated[bool, Query(description="as tracked to the last trial, within the approved limits")] = False,
+) -> Response:  # fmt: skip
+    """The approved model, for the ILC controller: MODEL.json with its `ETag`; 304 where it is known already.
+
+    With `tracked` it is the newest version that was tracked from it, with the key `tracking`; where there is none yet,
+    the approved model itself. A trial that has just ended is waited for, for two seconds at most.
+    """
+    if tracked:
+        await context.runner.trials.settled()
+    served = context.tracked.served(code) if tracked else context.versions.served(code)
     if served is None:
         await asyncio.to_thread(participants.find, context, code)
-        detail = (
-            f"Participant {code!r} has no model approved today; an approval ends with its day. "
-            "POST /v1/models/{id}/approve approves one."
-        )
-        raise ApiError(404, "no-approved-model", "No approved model", detail)
+        raise none_approved(code)
     headers = {"ETag": served.etag, "Cache-Control": "private, no-cache"}
+    if tracked:
+        headers["Last-Modified"] = formatdate(unix_of(served.at_utc), usegmt=True)
     if if_none_match and matches(if_none_match, served.etag):
         return Response(status_code=304, headers=headers)
     return Response(served.body, media_type="application/json", headers=headers)
+
+
+def none_approved(code: str) -> ApiError:
+    """404, with what to do."""
+    detail = (
+        f"Participant {code!r} has no model approved today; an approval ends with its day. "
+        "POST /v1/models/{id}/approve approves one."
+    )
+    return ApiError(404, "no-approved-model", "No approved model", detail)
 
 
 def matches(if_none_match: str, etag: str) -> bool:
@@ -79,10 +98,19 @@ def model_file(context: Ctx, _who: ModelReader, model_id: str) -> Response:
 
 
 @router.post("/models/{model_id}/approve", response_model=VersionOut)
-def approve(context: Ctx, who: Approver, model_id: str, body: DecisionIn | None = None) -> dict[str, Any]:
-    """Let the controller have this version."""
-    context.versions.decide(model_id, True, who.name, body.reason if body else "")
-    return context.versions.document(context.versions.get(model_id))
+async def approve(context: Ctx, who: Approver, model_id: str, body: ApprovalIn | None = None) -> dict[str, Any]:
+    """Let the controller have this version, and what is tracked from it within limits, until the day ends."""
+    given = body or ApprovalIn()
+    row = await let_have(context, model_id, who.name, given.reason, given.tracking.limits())
+    return await asyncio.to_thread(context.versions.document, row)
+
+
+async def let_have(context: Context, model_id: str, by: str, reason: str, tracking: Limits) -> Model:
+    """Approve a version; the worker that follows its trials is warm by the first one."""
+    row = await asyncio.to_thread(context.versions.get, model_id)
+    await asyncio.to_thread(context.versions.decide, model_id, True, by, reason, tracking)
+    context.runner.trials.warm(row.participant)
+    return row
 
 
 @router.post("/models/{model_id}/reject", response_model=VersionOut)

@@ -8,7 +8,6 @@ from typing import Annotated, Any
 from fastapi import APIRouter
 from pydantic import Field, FiniteFloat
 
-from api.models import stored
 from api.sessions.requests import Body
 from api.web.dependencies import PROBLEM, Ctx, ModelReader
 from api.web.responses.base import answers
@@ -28,11 +27,14 @@ class WidthsIn(Body):
 
 @router.post("/models/{model_id}/prediction", **answers(PredictionOut))
 async def prediction(context: Ctx, _who: ModelReader, model_id: str, body: WidthsIn) -> dict[str, Any]:
-    """Mean torque the pulses give in each pulse's period, N·m, after a second of rest; effects included."""
-    row = await asyncio.to_thread(context.versions.get, model_id)
+    """Mean torque the pulses give in each pulse's period, N·m, after a second of rest; effects included.
+
+    Of a version, or of one that was tracked from it (its `model_id`).
+    """
+    text = await asyncio.to_thread(context.tracked.text_of, model_id)
     call = context.pool.submit(
-        "forecast", urgent=True, model_json=stored.text(row), pulse_width_us=body.pulse_width_us,
+        "forecast", urgent=True, model_json=text, pulse_width_us=body.pulse_width_us,
         pulse_rate_hz=body.pulse_rate_hz,
     )  # fmt: skip
     found = await call.result
-    return {"model_id": row.id, "pulse_rate_hz": body.pulse_rate_hz, **found}
+    return {"model_id": model_id, "pulse_rate_hz": body.pulse_rate_hz, **found}

@@ -1,0 +1,256 @@
+"""Tracked versions of approved models: one row a trial, and what the controller is served of them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy.orm import defer
+
+from api.clock import Clock
+from api.errors import ApiError
+from api.models import headline, stored, tracking
+from api.models.registry import Served, Versions
+from api.models.tracking import NOT_FOLLOWED, Bounds, Limits
+from api.store import Store, audit
+from api.store.tables import Approval, Model, Test, Tracked
+
+log = logging.getLogger("stimrig.tracking")
+SUPERSEDED = "Another model was approved, or this approval ended, before the trial was followed."
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A trial that is to be followed.
+
+    Parameters
+    ----------
+    test : Test
+        Its test, which has a recording.
+    approval : Approval
+        The one under which it was begun.
+    model_json : str
+        The approved MODEL.json.
+    bounds : Bounds
+        What a person allowed.
+    problem : str
+        Why the approved model cannot be followed; empty where it can.
+    number : int
+        Of the approval's trials, from 1.
+    state : dict or None
+        What is known from the last trial that was followed; None: there is none.
+    missed : int
+        Trials since then that were not followed.
+    """
+
+    test: Test
+    approval: Approval
+    model_json: str
+    bounds: Bounds
+    problem: str
+    number: int
+    state: dict[str, Any] | None
+    missed: int
+
+
+class TrackedVersions:
+    """What was tracked under each approval; the newest version of each participant is kept in memory."""
+
+    def __init__(self, store: Store, clock: Clock, versions: Versions) -> None:
+        self.store, self.clock, self.versions = store, clock, versions
+        self._served: dict[str, Served] = {}
+
+    # ---- a trial -----------------------------------------------------------------------------------------------
+
+    def allowing(self, participant: str) -> Approval | None:
+        """The approval that holds, if it allows tracking."""
+        approval = self.versions.approved(participant)
+        return approval if approval is not None and approval.tracking and Limits(**approval.tracking).allows else None
+
+    def opened(self, test_id: str) -> Trial | None:
+        """A trial with all that is needed to follow it; None: it has been noted, or was played without an approval."""
+        test: Test | None = self.store.get(Test, test_id)
+        if test is None or self.store.get(Tracked, test_id) is not None:
+            return None
+        approval: Approval | None = self.store.get(Approval, test.plan.get("approval_id") or 0)
+        if approval is None or approval.tracking is None:
+            return None
+        rows = self.rows(approval.id)
+        followed = [row for row in rows if row.step is not None]
+        model, text, bounds, problem = self.versions.get(approval.model_id), "", Bounds(), ""
+        try:
+            text, bounds = stored.text(model), self.bounds(approval, model)
+        except ApiError as error:
+            problem = error.detail
+        return Trial(
+            test, approval, text, bounds, problem, len(rows) + 1,
+            followed[-1].step["state"] if followed and followed[-1].step else None,
+            len(rows) - followed[-1].number if followed else len(rows),
+        )  # fmt: skip
+
+    def text(self, approval: Approval) -> str:
+        """The approved MODEL.json. Raises ApiError (500) where it is damaged."""
+        return stored.text(self.versions.get(approval.model_id))
+
+    def bounds(self, approval: Approval, model: Model) -> Bounds:
+        """What a person allowed, in the quantities' units."""
+        figures = model.fit.get("figures") or headline.of(stored.read(model))
+        return Limits(**(approval.tracking or {})).bounds(figures["threshold_us"]["value"])
+
+    def rows(self, approval_id: int) -> list[Tracked]:
+        """The trials of an approval, the oldest first, without what was served."""
+        with self.store.read() as session:
+            found = session.query(Tracked).options(defer(Tracked.document)).filter(Tracked.approval_id == approval_id)
+            return list(found.order_by(Tracked.number))
+
+    def keep(self, trial: Trial, found: dict[str, Any], last_sample_unix_s: float | None = None) -> Tracked | None:
+        """Write down what a trial said, and serve what may be served after it.
+
+        Nothing is moved by a trial that is noted already, or whose approval holds no longer.
+
+        Parameters
+        ----------
+        trial : Trial
+            The trial.
+        found : dict
+            `step` and `model` (`api.workers.tracking_verbs`), or the `reason` why it was not followed.
+        last_sample_unix_s : float, optional
+            When its last sample came.
+
+        Returns
+        -------
+        Tracked or None
+            The row; None where the trial had been noted.
+        """
+        approval, step = trial.approval, found.get("step")
+        with self.store.write() as session:  # no approval slips in between looking and writing
+            if session.get(Tracked, trial.test.id) is not None:
+                return None
+            holding = self.versions.approved(approval.participant)
+            if step is not None and (holding is None or holding.id != approval.id):
+                step, found = None, {**found, "reason": SUPERSEDED}
+            now = self.clock.utc()
+            row = Tracked(test_id=trial.test.id, approval_id=approval.id, number=trial.number, at_utc=now)
+            row.participant, row.model_id = approval.participant, approval.model_id
+            row.recording_id, row.error_percent = trial.test.recording_id, found.get("error_percent")
+            row.outcome, row.reason = NOT_FOLLOWED, found.get("reason", "")
+            served = None
+            if step is not None:
+                row.outcome, row.reason, row.step = step["outcome"], "", step
+                row.ask = tracking.ask(trial.number, step, trial.bounds)
+                row.document = body = self._document(trial, row, found["model"])
+                row.etag = hashlib.sha256(body).hexdigest()
+                if last_sample_unix_s is not None:
+                    row.delay_s = round(self.clock.unix_s() - last_sample_unix_s, 3)
+                served = _served(row, approval)
+            session.add(row)
+            detail = {"trial": row.number, "outcome": row.outcome, "reason": row.reason, "etag": row.etag}
+            audit.write(session, now, f"test {row.test_id}", "track model", row.model_id, ask=row.ask, **detail)
+        if served is not None:
+            self._served[row.participant] = served
+        return row
+
+    def _document(self, trial: Trial, row: Tracked, model_json: str) -> bytes:
+        """What is served from now on: the moved model, or where a person is asked the last one within the limits."""
+        approval, step = trial.approval, row.step
+        assert step is not None
+        if row.ask is None:
+            document = json.loads(model_json)
+            told = {
+                "approved_model_id": approval.model_id, "trial": row.number, "test_id": row.test_id,
+                "at_utc": row.at_utc, "levels": {when: step[when] for when in ("now", "coming")},
+                "limits": approval.tracking, "outcome": row.outcome,
+            }  # fmt: skip
+        else:
+            before = self.newest(approval.id)
+            document = json.loads(before.document if before is not None and before.document else trial.model_json)
+            told = document.get("tracking") or {
+                "approved_model_id": approval.model_id, "trial": 0, "test_id": None, "at_utc": approval.at_utc,
+                "levels": None, "limits": approval.tracking, "outcome": None,
+            }  # fmt: skip
+        document["model_id"] = f"{approval.model_id}.{approval.id}.{told['trial']}"
+        document["tracking"] = {**told, "ask": row.ask}
+        return json.dumps(document, ensure_ascii=False, allow_nan=False).encode()
+
+    # ---- what is served ----------------------------------------------------------------------------------------
+
+    def newest(self, approval_id: int) -> Tracked | None:
+        """The trial after which something was served last."""
+        conditions = (Tracked.approval_id == approval_id, Tracked.document.is_not(None))
+        found = self.store.all(Tracked, *conditions, order=Tracked.number.desc(), limit=1)
+        return found[0] if found else None
+
+    def served(self, participant: str) -> Served | None:
+        """The newest tracked version of the approval that holds, else the approved model itself; None without one.
+
+        Raises
+        ------
+        ApiError
+            500: the approved model is damaged.
+        """
+        approved = self.versions.served(participant)
+        if approved is None:
+            return None
+        found = self._served.get(participant)
+        if found is None or found.approval_id != approved.approval_id:
+            with self.store.write_lock:  # as for the approved one: nothing comes between reading and keeping
+                row = self.newest(approved.approval_id)
+                approval = self.store.get(Approval, approved.approval_id)
+                found = self._served[participant] = approved if row is None else _served(row, approval)
+        return found
+
+    def text_of(self, model_id: str) -> str:
+        """MODEL.json of a version, or of one that was tracked from it. Raises ApiError (404, 500)."""
+        base, _, number = model_id.rpartition(".")
+        base, _, approval = base.rpartition(".")
+        if base and all(part.isascii() and part.isdigit() and len(part) < 10 for part in (approval, number)):
+            conditions = (Tracked.model_id == base, Tracked.approval_id == int(approval))
+            if int(number) == 0:
+                return stored.text(self.versions.get(base))
+            for row in self.store.all(Tracked, *conditions, Tracked.number == int(number)):
+                if row.document is not None:
+                    return row.document.decode()
+        return stored.text(self.versions.get(model_id))
+
+    def asks(self, approval_id: int) -> str | None:
+        """Why a new test is needed now; None where none is."""
+        row = self.newest(approval_id)
+        return row.ask if row else None
+
+    def document(self, participant: str) -> dict[str, Any] | None:
+        """The trials of the approval that holds, as clients see them; None where none holds."""
+        approval = self.versions.approved(participant)
+        if approval is None:
+            return None
+        rows, served = self.rows(approval.id), self.served(participant)
+        model = self.versions.get(approval.model_id)
+        return {
+            "participant": participant,
+            "approved_model_id": approval.model_id,
+            "approved_utc": approval.at_utc,
+            "limits": approval.tracking,
+            "threshold_us": (model.fit.get("figures") or headline.of(stored.read(model)))["threshold_us"]["value"],
+            "served_utc": served.at_utc if served else None,
+            "served_trial": json.loads(served.body).get("tracking", {}).get("trial", 0) if served else None,
+            "etag": served.etag if served else None,
+            "ask": self.asks(approval.id),
+            "trials": [told(row) for row in rows],
+        }
+
+
+def told(row: Tracked) -> dict[str, Any]:
+    """A trial as clients see it."""
+    step = row.step or {}
+    more = {name: step.get(name) for name in ("now", "coming", "error_nm", "expected_error_nm", "disturbed_s")}
+    kept = ("number", "test_id", "recording_id", "at_utc", "outcome", "reason", "ask", "error_percent", "delay_s")
+    return {**{name: getattr(row, name) for name in kept}, **more}
+
+
+def _served(row: Tracked, approval: Approval) -> Served:
+    assert row.document is not None
+    told = json.loads(row.document)
+    expires_utc = approval.expires_utc or ""
+    return Served(told["model_id"], row.document, f'"{row.etag}"', expires_utc, approval.id, told["tracking"]["at_utc"])

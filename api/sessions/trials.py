@@ -1,0 +1,191 @@
+"""After each trial of a controller: the muscle is followed, in a worker of its own, and what was found is kept.
+
+A trial's test is over before it is followed: nothing that is played waits for it. Trials are followed one after the
+other, in the order in which they ended.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from api.clock import Clock
+from api.errors import ApiError
+from api.models.tracked import TrackedVersions, Trial
+from api.sessions.places import differ, place_of
+from api.sessions.requests import TestIn
+from api.store import Store
+from api.store.tables import Approval, Model, Recording, Test, Tracked
+from api.workers.adviser import Adviser
+
+log = logging.getLogger("stimrig.tracking")
+SEQUENCE = "sequence"
+"""A test of this kind is a controller's trial; nothing is identified from it."""
+PATIENCE_S = 2.0
+"""So long who fetches a tracked model waits for a trial that has just ended."""
+ELSEWHERE = "It was played at another side, muscle or current than the approved model's test."
+
+
+class Trials:
+    """Follows what controllers play.
+
+    Parameters
+    ----------
+    tracker : Adviser
+        A worker that does nothing else.
+    """
+
+    def __init__(self, store: Store, clock: Clock, tracked: TrackedVersions, tracker: Adviser) -> None:
+        self.store, self.clock, self.tracked, self.tracker = store, clock, tracked, tracker
+        self._turn = asyncio.Lock()
+        self._ending = 0
+        self._settled = asyncio.Event()
+        self._settled.set()
+        self._tasks: set[asyncio.Task[None]] = set()
+
+    # ---- before a trial ----------------------------------------------------------------------------------------
+
+    def kept(self, body: TestIn, pulses: int) -> dict[str, Any]:
+        """What is kept beside the plan of a trial: its approval, and what the controller wants. Nothing of others.
+
+        Raises
+        ------
+        ApiError
+            422: the reference has not one value for each pulse.
+        """
+        if body.kind != SEQUENCE:
+            return {}
+        reference = body.reference_torque_nm
+        if reference is not None and len(reference) != pulses:
+            detail = f"reference_torque_nm: {len(reference)} values, but the whole test has {pulses} pulses."
+            raise ApiError(422, "invalid-input", "The reference does not fit the test", detail)
+        approval = self.tracked.allowing(body.participant)
+        return {"approval_id": approval.id if approval else None, "reference_torque_nm": reference}
+
+    def warm(self, participant: str) -> None:
+        """Have the worker load what a trial of this participant needs, so that none waits for it."""
+        self._start(self._warm(participant))
+
+    async def _warm(self, participant: str) -> None:
+        approval = await asyncio.to_thread(self.tracked.allowing, participant)
+        if approval is None:
+            return
+        try:
+            text = await asyncio.to_thread(self.tracked.text, approval)
+            await self.tracker.ask("track_warm", model_json=text)
+        except ApiError as error:
+            log.warning("the worker of trials could not be warmed: %s", error)
+
+    # ---- after it ----------------------------------------------------------------------------------------------
+
+    @contextmanager
+    def ending(self) -> Iterator[None]:
+        """Around the end of a test: who fetches a tracked model meanwhile waits, for it may be a trial."""
+        self._ending += 1
+        self._settled.clear()
+        try:
+            yield
+        finally:
+            self._ending -= 1
+            if not self._ending:
+                self._settled.set()
+
+    async def settled(self) -> None:
+        """Wait for trials that have ended and are being followed, for a little while."""
+        try:
+            async with asyncio.timeout(PATIENCE_S):
+                await self._settled.wait()
+        except TimeoutError:
+            log.warning("a trial is still being followed; the version before it is served")
+
+    async def follow(self, test_id: str, last_sample_unix_s: float | None = None) -> Tracked | None:
+        """Follow a trial that has ended; one that is noted already moves nothing.
+
+        Returns
+        -------
+        Tracked or None
+            What was written down; None where there was nothing to follow.
+        """
+        with self.ending():
+            async with self._turn:
+                trial = await asyncio.to_thread(self.tracked.opened, test_id)
+                if trial is None:
+                    return None
+                found = await self._found(trial)
+                row = await asyncio.to_thread(self.tracked.keep, trial, found, last_sample_unix_s)
+        if row is not None:
+            log.info("trial %d: %s %s", row.number, row.outcome, row.reason, extra={"test_id": test_id})
+        return row
+
+    async def _found(self, trial: Trial) -> dict[str, Any]:
+        """What the worker found, or why it found nothing: no trial is lost by that."""
+        recording: Recording | None = await asyncio.to_thread(self.store.get, Recording, trial.test.recording_id or "")
+        if recording is None or trial.problem:
+            return {"reason": trial.problem or "It has no recording."}
+        if await asyncio.to_thread(self._elsewhere, trial):
+            return {"reason": ELSEWHERE}
+        try:
+            return await self.tracker.ask(
+                "track", data=recording.path, model_json=trial.model_json, tracked=list(trial.bounds),
+                state=trial.state, missed=trial.missed,
+                reference_torque_nm=trial.test.plan.get("reference_torque_nm"),
+            )  # fmt: skip
+        except ApiError as error:
+            if error.code == "worker-died":
+                self.warm(trial.test.participant)
+            return {"reason": error.detail or error.title}
+
+    def _elsewhere(self, trial: Trial) -> bool:
+        model: Model = self.store.get(Model, trial.approval.model_id)
+        tests = self.store.all(Test, Test.recording_id == model.recording_id)
+        return any(differ(place_of(test), place_of(trial.test)) for test in tests)
+
+    # ---- the service's own day ---------------------------------------------------------------------------------
+
+    def resume(self) -> None:
+        """Follow what a restart left open, and warm the worker where a model may be tracked."""
+        self._start(self._resume())
+
+    async def _resume(self) -> None:
+        for approval, left in await asyncio.to_thread(self._left):
+            try:
+                for test_id in left:
+                    await self.follow(test_id)
+            except ApiError as error:  # a damaged model: the other participants' trials are followed all the same
+                log.warning("trials of %s are not followed: %s", approval.participant, error)
+            await self._warm(approval.participant)
+
+    def _left(self) -> list[tuple[Approval, list[str]]]:
+        """Approvals that hold and allow tracking, each with its trials that are not noted, oldest first."""
+        given = self.store.all(Approval, Approval.approved, Approval.expires_utc > self.clock.utc())
+        holding = [self.tracked.allowing(code) for code in dict.fromkeys(row.participant for row in given)]
+        return [(approval, self._open_trials(approval)) for approval in holding if approval is not None]
+
+    def _open_trials(self, approval: Approval) -> list[str]:
+        conditions = (
+            Test.participant == approval.participant, Test.kind == SEQUENCE, Test.state == "completed",
+            Test.requested_utc >= self.clock.start_of_day_utc(),
+        )  # fmt: skip
+        played = self.store.all(Test, *conditions, order=Test.requested_utc)
+        noted = {row.test_id for row in self.tracked.rows(approval.id)}
+        return [test.id for test in played if test.plan.get("approval_id") == approval.id and test.id not in noted]
+
+    def _start(self, work: Any) -> None:
+        task = asyncio.create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._ended)
+
+    def _ended(self, task: asyncio.Task[None]) -> None:
+        self._tasks.discard(task)
+        if not task.cancelled() and (error := task.exception()) is not None:
+            log.error("trials could not be followed", exc_info=error)
+
+    async def close(self) -> None:
+        """Let everything go; what is open is followed at the next start."""
+        for task in list(self._tasks):
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await self.tracker.close()

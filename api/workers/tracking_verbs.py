@@ -1,0 +1,147 @@
+"""What the worker does after a controller's trial: read the recording, follow the muscle, move the approved model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from api.workers.json_values import clean
+
+Progress = Callable[[float, str], None]
+STILL = {"gain": 1.0, "threshold_shift_us": 0.0, "time_scale": 1.0}
+"""A quantity that is not tracked stays there."""
+MOST_MISSED = 50
+SETTLED_S = 0.2
+"""So long the torque must have been measured at rest for its offset to be known."""
+
+
+def rates() -> Any:
+    """How fast this person changes from trial to trial."""
+    from identify.tracking import USUAL
+
+    return USUAL
+
+
+def track(
+    data: str,
+    progress: Progress,
+    model_json: str,
+    tracked: Sequence[str],
+    state: dict[str, Any] | None = None,
+    missed: int = 0,
+    reference_torque_nm: Sequence[float] | None = None,
+) -> dict[str, Any]:
+    """Follow one trial.
+
+    Parameters
+    ----------
+    data : str
+        The recording.
+    model_json : str
+        The approved MODEL.json.
+    tracked : sequence of str
+        The quantities that a person allowed to move; the others stay in the model for the next trial.
+    state : dict, optional
+        What was expected after the last trial that was followed.
+    missed : int
+        Trials since then that were not followed: what is known has become less certain by them.
+    reference_torque_nm : sequence of float, optional
+        What the controller wanted, one value for each pulse, N·m.
+
+    Returns
+    -------
+    dict
+        `error_percent`, None without a reference; `step` and the text of the `model` for the next trial, or the
+        `reason` why the trial was not followed.
+    """
+    import identify
+    from identify.simulation.predict import refuse_rate
+    from identify.tracking import State, follow, moved_model
+
+    progress(0.1, "reading the recording")
+    record = identify.read(Path(data))
+    error = error_percent(record, reference_torque_nm)
+    try:
+        model = second_order(identify.Model.from_json(model_json))
+        refuse_rate(model, record)
+        before = State.start(rates()) if state is None else State.from_dict(state)
+        for _ in range(min(missed, MOST_MISSED)):
+            before = before.ahead(rates())
+        step = follow(model, before, record, rates())
+        still = {name: value for name, value in STILL.items() if name not in tracked}
+        moved = moved_model(model, replace(step.coming.values, **still))
+    except identify.IdentifyError as problem:
+        return {"error_percent": error, "reason": " ".join(str(problem).split())}
+    return {"error_percent": error, "step": clean(step.to_dict()), "model": moved.to_json(None)}
+
+
+def second_order(model: Any) -> Any:
+    """The model, if it can be followed.
+
+    Raises
+    ------
+    BadModel
+        Its dynamics are not of second order.
+    """
+    import identify
+    from identify.dynamics.linear import SecondOrder
+
+    if not isinstance(model.linear, SecondOrder):
+        message = "a model whose dynamics are not of second order cannot be tracked"
+        raise identify.BadModel(message, fix="Fit with maximum-likelihood.")
+    return model
+
+
+def error_percent(record: Any, reference_torque_nm: Sequence[float] | None) -> float | None:
+    """Root mean square of reference minus torque, % of the reference's; None without one.
+
+    The torque is its mean in each pulse's period, above the rest before the first pulse.
+    """
+    import numpy as np
+
+    reference = np.asarray(reference_torque_nm or [], float)
+    size_nm = float(np.sqrt(np.mean(reference**2))) if reference.size else 0.0
+    if not size_nm > 0.0:
+        return None
+    time_s, torque_nm = record.time_s, record.torque_nm
+    begun = np.flatnonzero(record.pulse_width_us > 0.0)
+    rest = slice(0, begun[0] if begun.size else time_s.size)
+    known = time_s[rest].size > 1 and time_s[rest][-1] - time_s[rest][0] >= SETTLED_S
+    offset_nm = float(np.mean(torque_nm[rest])) if known else 0.0
+    period = np.floor(time_s * record.pulse_rate_hz + 1e-6).astype(int)
+    inside = (period >= 0) & (period < reference.size) & np.isfinite(torque_nm)
+    count = np.bincount(period[inside], minlength=reference.size)
+    mean_nm = np.bincount(period[inside], torque_nm[inside], reference.size)[count > 0] / count[count > 0]
+    if not mean_nm.size:
+        return None
+    return float(100.0 * np.sqrt(np.mean((reference[count > 0] - (mean_nm - offset_nm)) ** 2)) / size_nm)
+
+
+def warm(progress: Progress, model_json: str) -> dict[str, Any]:
+    """Load all that `track` needs, and follow two seconds of the model's own torque: then a trial waits for nothing."""
+    import contextlib
+    import importlib
+
+    import numpy as np
+
+    import identify
+    from identify.tracking import follow, model_for_next
+
+    progress(0.1, "loading")
+    importlib.import_module("h5py")
+    with contextlib.suppress(identify.IdentifyError):  # what cannot be followed is said after the first trial
+        model = second_order(identify.Model.from_json(model_json))
+        widest_us = float(model.recruitment.basis.largest_us)
+        time_s = np.arange(800) / 400.0
+        widths_us = np.where((time_s > 0.5) & (time_s < 1.2), 0.7 * widest_us, 0.0)
+        own = {"pulse_rate_hz": model.pulse_rate_hz}
+        empty = identify.Record.from_arrays(time_s, widths_us, np.zeros(time_s.size), **own)
+        torque_nm = identify.predict(model, empty)
+        step = follow(model, None, identify.Record.from_arrays(time_s, widths_us, torque_nm, **own), rates())
+        model_for_next(model, step).to_json(None)
+    return {}
+
+
+VERBS: dict[str, Callable[..., dict[str, Any]]] = {"track": track, "track_warm": warm}
