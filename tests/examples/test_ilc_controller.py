@@ -8,7 +8,7 @@ import io
 import sys
 from itertools import pairwise
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import h5py
@@ -148,3 +148,86 @@ def test_trial_that_did_not_end_well_halts_the_controller(ilc: ModuleType) -> No
         recording.attrs["outcome"], recording.attrs["reason"] = "fault", "the load cell fell silent"
     with pytest.raises(ilc.HaltedError, match="load cell fell silent"):
         ilc.measured(file.getvalue(), 400)
+
+
+# ---- the model followed from trial to trial -------------------------------------------------------------------------
+
+
+def levels(gain: float, shift_us: float, time_scale: float) -> dict[str, dict[str, float]]:
+    """As the service tells them, without their bands."""
+    values = {"gain": gain, "threshold_shift_us": shift_us, "time_scale": time_scale}
+    return {name: {"value": value, "low": value, "high": value} for name, value in values.items()}
+
+
+def moved(gain: float, shift_us: float, time_scale: float) -> tuple[float, float, float, float]:
+    """A muscle's four figures (`patient_of`), moved by such levels."""
+    period_s, damping, plateau_nm, middle_us = MODEL
+    return period_s * time_scale, damping, plateau_nm * gain, middle_us + shift_us
+
+
+class Tiring(Muscle):
+    """Loses gain, its threshold rises and it slows from trial to trial; told of by a service that follows it well."""
+
+    def __init__(self, falls: float = 0.05, rises_us: float = 1.5, slows: float = 0.03) -> None:
+        super().__init__()
+        self.step, self.trials = (1 - falls, rises_us, 1 + slows), 0
+
+    def at(self, trial: int) -> tuple[float, float, float]:
+        gain, shift_us, slow = self.step
+        return gain**trial, shift_us * trial, slow**trial
+
+    def play(self, widths_us: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        torque_nm = felt(patient_of(*moved(*self.at(self.trials))), widths_us)
+        self.trials += 1
+        return torque_nm + 0.005 * self.rng.standard_normal(widths_us.size), widths_us
+
+    def fetch_followed(self) -> dict[str, Any]:
+        coming, now = self.at(self.trials), self.at(self.trials - 1)
+        return model_of(*moved(*coming)) | {"tracking": {"now": levels(*now), "coming": levels(*coming)}}
+
+
+def test_plant_now_is_the_plant_of_the_levels_now(ilc: ModuleType) -> None:
+    now, coming = (0.8, 6.0, 1.1), (0.7, 9.0, 1.2)
+    document = model_of(*moved(*coming)) | {"tracking": {"now": levels(*now), "coming": levels(*coming)}}
+    plant, wanted, widths = ilc.Plant(document, 400).now(), ilc.Plant(model_of(*moved(*now)), 400), np.arange(0, 290.0)
+    np.testing.assert_allclose(plant.level(widths), wanted.level(widths), atol=0.01)
+    np.testing.assert_allclose(plant.response.cumsum(), wanted.response.cumsum(), atol=0.01)
+
+
+@pytest.mark.parametrize(
+    "changes", [{"rises_us": 0.0, "slows": 0.0}, {"falls": 0.0, "slows": 0.0}, {"falls": 0.0, "rises_us": 0.0}, {}]
+)
+def test_a_muscle_that_tires_is_followed(ilc: ModuleType, changes: dict[str, float]) -> None:
+    """A well-followed model leaves nearly the error of a muscle that does not change; without it, far more is left."""
+    reference, last = ilc.Reference.reach(3.0), {}
+    for name, muscle, tracked in (
+        ("still", Tiring(0.0, 0.0, 0.0), False),
+        ("tracked", Tiring(**changes), True),
+        ("untracked", Tiring(**changes), False),
+    ):
+        trials = ilc.learn(muscle, model_of(*MODEL), reference, "norm-optimal", 10, tracked=tracked)
+        last[name] = np.mean([trial.error_percent for trial in trials[-3:]])
+    assert last["tracked"] < 1.4 * last["still"], last
+    assert last["untracked"] > 2 * last["tracked"], last
+
+
+def test_a_model_that_is_never_moved_is_played_as_untracked(ilc: ModuleType) -> None:
+    reference, still = ilc.Reference.reach(3.0), {"falls": 0.0, "rises_us": 0.0, "slows": 0.0}
+    untracked, tracked = (
+        ilc.learn(Tiring(**still), model_of(*MODEL), reference, "norm-optimal", 4, tracked=tracked)
+        for tracked in (False, True)
+    )
+    for one, other in zip(untracked, tracked, strict=True):
+        np.testing.assert_array_equal(one.widths_us, other.widths_us)
+
+
+def test_a_followed_model_is_waited_for(ilc: ModuleType) -> None:
+    class Slow:
+        asked = 0
+
+        def approved_model(self, participant: str, known: Any, tracked: bool = False) -> Any:
+            assert tracked and participant == "P" and (known is None) == (self.asked == 0)
+            self.asked += 1
+            return SimpleNamespace(document={"number": self.asked}, changed=self.asked == 3)
+
+    assert ilc.Service(Slow(), "P").fetch_followed() == {"number": 3}
