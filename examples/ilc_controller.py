@@ -19,8 +19,10 @@ a trial, until the prediction has moved by the error.
 
 With `--tracked` the model is fetched again after each trial: the approved one, moved to where gain, threshold and speed
 are expected in the next trial (`tracking.coming`; `tracking.now` is what is known of the trial just played). The trial
-was planned with a model that was a little wrong: what it demanded of the muscle is w + f_now(u) - f_planned(u). What
-the next trial would give beyond it for the same demand, (G_coming - G_now) w, is corrected beforehand.
+was planned with a model that was a little wrong: what it demanded of the muscle is w + f_now(u) - f_planned(u). The
+torque that the model now does not explain, d, is learnt as above, without the stretches in which the muscle did
+something of its own (`tracking.disturbed_s`). What the model foretells carries no noise and is corrected in full:
+the next trial is planned for reference - d. Without a change of the model this is the law above.
 """
 
 from __future__ import annotations
@@ -54,6 +56,8 @@ PLAN_STEPS = 12
 STEP = 0.8
 """Share of the error that is corrected at once where the prediction, not (f, G), is inverted."""
 TRACKED = ("gain", "threshold_shift_us", "time_scale")
+ROUND_S = 0.25
+"""A disturbance begins and ends less sharply than it is told."""
 TRACKED_WITHIN_S = 5.0
 """After a trial the service follows it; that takes half a second."""
 LEAST_SHARE = 0.2
@@ -109,6 +113,14 @@ class Plant:
         plant.response = np.diff(step, prepend=0.0)
         plant.G = lower_triangle(plant.response)
         return plant
+
+    def undisturbed(self) -> np.ndarray:
+        """1 where the last trial was the muscle's answer to its pulses alone, else 0; shape (N,)."""
+        time_s = BEFORE_S + np.arange(self.response.size) / PULSE_RATE_HZ
+        kept = np.ones(time_s.size)
+        for begin_s, end_s in self.document.get("tracking", {}).get("disturbed_s", ()):
+            kept[(time_s > begin_s - ROUND_S) & (time_s < end_s + ROUND_S)] = 0.0
+        return kept
 
     def level(self, widths_us: np.ndarray) -> np.ndarray:
         """f, N·m."""
@@ -318,7 +330,7 @@ def learn(
         demand = demand if static_start else follow(plant, demand, reference.torque_nm, predict)
     if tracked or not model["effects"]:
         update = LAWS[law](plant)
-    share = 1.0
+    share, left_nm = 1.0, np.zeros(demand.size)
     for _ in range(trials):
         widths_us = plant.widths(demand)
         torque_nm, sent_us = service.play(widths_us)
@@ -335,7 +347,11 @@ def learn(
             played, plant = plant, Plant(service.fetch_followed(), demand.size)
             now, update = plant.now(), LAWS[law](plant)
             demand = demand + now.level(widths_us) - played.level(widths_us)
-            demand = update(demand, (now.G - plant.G) @ demand)  # foretold, not measured: no noise, so not by `share`
+            new_nm = torque_nm + not_sent_nm - now.G @ demand - left_nm
+            left_nm = left_nm + share * plant.undisturbed() * new_nm
+            demand = update(demand, reference.torque_nm - left_nm - plant.G @ demand)
+            demand = np.clip(demand, 0.0, plant.largest_nm)
+            continue
         if update is not None:
             corrected = demand + share * (update(demand, learnt_nm) - demand)
             demand = np.clip(corrected, 0.0, plant.largest_nm)

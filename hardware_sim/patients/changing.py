@@ -4,9 +4,11 @@ Recruitment is the share of nerve fibres whose threshold a pulse exceeds, with W
 f(u) = F (1 - exp(-((u - θ) / λ)^k)) above θ; then 2nd-order dynamics (`held`). Widths are scaled by charge. All changes
 are in use or time:
 
-- A *store* s fills with use and empties at rest: s' = r a (1 - s) - s / τ, a = f / F (after Riener's fatigue, 1996).
-  r is chosen so that the usual session, ten contractions of 12 s at a third of F with rests of 15 s, leaves the wanted
-  share at its end. Fatigue: gain · (1 - s). Potentiation: gain · (1 + s). Slowing: T · (1 + s).
+- A *store* s fills with use and empties at rest: s' = r v (1 - s) - s / τ (after Riener's fatigue, 1996). A fibre tires
+  by the pulses that excite it, and those of low threshold are excited by most. So v = a (1 + h) / (a + h), a = f / F
+  and h = 0.15, grows less than recruitment does. r is chosen so that the usual session, ten contractions of 12 s at a
+  third of F with rests of 15 s, leaves the wanted share at its end. Fatigue: gain · (1 - s). Potentiation:
+  gain · (1 + s). Slowing: T · (1 + s).
 - The threshold moves by D (1 - exp(-t / τ)), t since the first pulse: an electrode that settles like an RC.
 - In one contraction, a spasm (a steep burst) or an effort (a slow bump) is added to the torque. A contraction begins
   with the first pulse after a pause of 5 s. The test before a session is the first.
@@ -24,8 +26,9 @@ from hardware_sim.patients.held import HeldPulses
 
 PAUSE_S = 5.0
 """A pause as long begins a new contraction."""
-SESSION, CONTRACTION_S, REST_S, USE = 10, 12.0, 15.0, 1.0 / 3.0
-"""The usual session: contractions, their length, the rests between them, share of the largest torque."""
+HALF_USE = 0.15
+SESSION, CONTRACTION_S, REST_S, SHARE = 10, 12.0, 15.0, 1.0 / 3.0
+"""The usual session: contractions, their length, the rests between them, share of the fibres recruited."""
 
 
 @dataclass(frozen=True)
@@ -103,8 +106,12 @@ def _rate(share: float, recovery_s: float) -> float:
 def _after_session(rate: float, recovery_s: float) -> float:
     level = 0.0
     for _ in range(SESSION):
-        level = _filled(level * math.exp(-REST_S / recovery_s), CONTRACTION_S, rate * USE, 1.0 / recovery_s)
+        level = _filled(level * math.exp(-REST_S / recovery_s), CONTRACTION_S, rate * _use(SHARE), 1.0 / recovery_s)
     return level
+
+
+def _use(recruited: float) -> float:
+    return recruited * (1.0 + HALF_USE) / (recruited + HALF_USE)
 
 
 class ChangingMuscle(HeldPulses):
@@ -116,7 +123,7 @@ class ChangingMuscle(HeldPulses):
         self._fatigue = Store(p.fatigue_share, p.fatigue_recovery_s)
         self._potentiation = Store(p.potentiation_share, p.potentiation_recovery_s)
         self._slowing = Store(p.slowing_share, p.slowing_recovery_s)
-        self._use = 0.0
+        self._recruited = 0.0
         self._first_pulse_s, self._last_pulse_s = math.inf, -math.inf
         self._begun_s = 0.0
         self.contractions = 0
@@ -151,8 +158,8 @@ class ChangingMuscle(HeldPulses):
         self._last_pulse_s = time_s
         if self.parameters.slowing_share:
             self._set_period(self.parameters.natural_period_s * self.time_scale)
-        self._use = self.recruited(width_us, current_ma, self.shift_us(time_s))
-        return self.parameters.largest_nm * self.gain * self._use
+        self._recruited = self.recruited(width_us, current_ma, self.shift_us(time_s))
+        return self.parameters.largest_nm * self.gain * self._recruited
 
     def torque_nm(self, time_s: float) -> float:
         """Advance to `time_s` and give the elbow torque there, N·m."""
@@ -175,7 +182,7 @@ class ChangingMuscle(HeldPulses):
         self._y, self._dy, self._fatigue.level, self._potentiation.level, self._slowing.level = kept
 
     def _step_to(self, time_s: float, input_nm: float) -> None:
-        dt, use = max(time_s - self._time_s, 0.0), self._use if input_nm else 0.0
+        dt, use = max(time_s - self._time_s, 0.0), _use(self._recruited) if input_nm else 0.0
         for store in (self._fatigue, self._potentiation, self._slowing):
             store.step(dt, use)
         super()._step_to(time_s, input_nm)

@@ -213,12 +213,40 @@ def test_a_muscle_that_tires_is_followed(ilc: ModuleType, changes: dict[str, flo
 
 def test_a_model_that_is_never_moved_is_played_as_untracked(ilc: ModuleType) -> None:
     reference, still = ilc.Reference.reach(3.0), {"falls": 0.0, "rises_us": 0.0, "slows": 0.0}
-    untracked, tracked = (
-        ilc.learn(Tiring(**still), model_of(*MODEL), reference, "norm-optimal", 4, tracked=tracked)
-        for tracked in (False, True)
-    )
+    document, runs = model_of(*moved(1.1, 4.0, 1.1)), []  # with something to learn
+    for tracked in (False, True):
+        muscle = Tiring(**still)
+        muscle.fetch_followed = lambda: document
+        runs.append(ilc.learn(muscle, document, reference, "norm-optimal", 6, tracked=tracked))
+    untracked, tracked = runs
+    assert np.abs(untracked[1].widths_us - tracked[1].widths_us).max() <= 1.0
+    assert untracked[0].error_percent > 5 * untracked[1].error_percent
     for one, other in zip(untracked, tracked, strict=True):
-        np.testing.assert_array_equal(one.widths_us, other.widths_us)
+        assert other.error_percent == pytest.approx(one.error_percent, rel=0.1)
+
+
+def test_what_a_muscle_did_of_its_own_is_not_learnt(ilc: ModuleType) -> None:
+    """A spasm in the third trial: told of it, the controller plays the fourth as if it had not been."""
+    reference, after = ilc.Reference.reach(3.0), []
+    for told in (True, False):
+        muscle = Tiring(0.0, 0.0, 0.0)
+        play, followed = muscle.play, muscle.fetch_followed
+
+        def with_spasm(widths_us: np.ndarray, muscle: Any = muscle, play: Any = play) -> tuple[np.ndarray, np.ndarray]:
+            torque_nm, sent_us = play(widths_us)
+            torque_nm[200:220] += 2.0 * (muscle.trials == 3)
+            return torque_nm, sent_us
+
+        def with_stretch(muscle: Any = muscle, followed: Any = followed, told: bool = told) -> dict[str, Any]:
+            document = followed()
+            if told and muscle.trials == 3:
+                document["tracking"]["disturbed_s"] = [[6.0, 6.5]]
+            return document
+
+        muscle.play, muscle.fetch_followed = with_spasm, with_stretch
+        trials = ilc.learn(muscle, model_of(*MODEL), reference, "norm-optimal", 4, tracked=True)
+        after.append(trials[3].error_percent / trials[1].error_percent)
+    assert after[0] < 1.3 and after[1] > 5, after
 
 
 def test_a_followed_model_is_waited_for(ilc: ModuleType) -> None:
