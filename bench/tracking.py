@@ -16,6 +16,7 @@ import io
 import json
 import sys
 import time
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -124,7 +125,7 @@ def moves(served: list[dict[str, Any]]) -> list[list[float]]:
     One row a trial: gain, threshold, time scale.
     """
     found = []
-    for before, after in zip(served[:-1], served[1:], strict=True):
+    for before, after in pairwise(served):
         if not before or not after:
             continue
         found.append([

@@ -1,4 +1,4 @@
-"""Muscles that change over a session, for the benches of tracking: drawn by seed; what changes, by the name of a case."""
+"""Muscles that change over a session, for the benches of tracking: drawn by seed; and what changes, by case."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ from identify.model import Model
 from identify.records.join import join
 from identify.records.record import Record
 from identify.recruitment.curve import Curve
-from identify.tracking import State, Values, follow, model_for_next, moved_model
+from identify.tracking import Values, follow, model_for_next, moved_model
 
 PULSE_RATE_HZ = 40.0
 FINE = 20
@@ -85,13 +85,13 @@ def tracked(ours: Any, trial: Record) -> dict[str, Any]:
 class Recursive:
     """Recursive least squares with forgetting, alternating between curve and dynamics.
 
-    After Le, Markovsky, Freeman and Rogers, Control Engineering Practice 2012: given G, the curve's coefficients are
+    After Le, Markovsky, Freeman and Rogers (Control Engineering Practice 2012): given G, the curve's coefficients are
     linear in the torque; given f, the dynamics are estimated; each by a recursion that forgets. Three things are done
-    better than by the letter. Both are fitted to the simulated output: with noise on the torque the equation error of an
-    ARX regression is biased. G has the approved model's two parameters. And what is forgotten returns to the approved
-    model, not to nothing (Gunnarsson, Combining tracking and regularization in recursive least squares, 1996), so the
-    curve does not run off where a trial does not go. Within a trial the recursion is summed up, with each interval's own
-    weight, and the two steps alternate until both agree.
+    better than by the letter. Both are fitted to the simulated output: with noise on the torque the equation error of
+    an ARX regression is biased. G has the approved model's two parameters. And what is forgotten returns to the
+    approved model, not to nothing (Gunnarsson, Combining tracking and regularization in recursive least squares, 1996),
+    so the curve does not run off where a trial does not go. Within a trial the recursion is summed up, with each
+    interval's own weight, and the two steps alternate.
     """
 
     MEMORY_TRIALS = 0.3
@@ -237,4 +237,3 @@ FOLLOWERS: dict[str, Callable[[Model, Record], Follower] | None] = {
     "refit, last trial": Refit,
     "refit, test and all trials": RefitAll,
 }
-__all__ = ["FOLLOWERS", "OURS", "UNTRACKED", "Follower", "State"]
