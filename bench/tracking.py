@@ -140,7 +140,9 @@ def tables(rows: list[dict[str, Any]]) -> list[str]:
     """Errors of the tenth trial, and their ratio to that of the same muscle and follower when nothing changes."""
     names = list(dict.fromkeys(row["who"] for row in rows))
     last = {(row["seed"], row["case"], row["who"]): float(row["errors"][-1]) for row in rows}
-    lines = ["| case | " + " | ".join(names) + " |", "|---" * (len(names) + 1) + "|"]
+    muscles = {name: len({key[0] for key in last if key[2] == name}) for name in names}
+    lines = ["| case | " + " | ".join(f"{name}, n = {muscles[name]}" for name in names) + " |"]
+    lines += ["|---" * (len(names) + 1) + "|"]
     for case in dict.fromkeys(row["case"] for row in rows):
         cells = []
         for name in names:

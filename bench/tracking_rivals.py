@@ -6,6 +6,7 @@ now. Its free settings (constants here) were chosen on seeds from 54000, each fo
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from typing import Any, Protocol
 
@@ -155,32 +156,21 @@ class Recursive:
 
 
 class Refit:
-    """The whole model fitted again after each trial."""
+    """The whole model fitted again after each trial, on the pre-session test and all trials so far.
 
-    LAST = 1
-    """On so many of the last trials."""
-    WITH_TEST = False
-    """Joined with the pre-session test's record."""
+    That was better for it than the last one, two or three trials, with or without the test: a trial alone does not
+    reach the upper end of the curve, which a muscle that tires needs next.
+    """
 
     def __init__(self, model: Model, test: Record) -> None:
-        self.served, self.test, self.trials = model.to_dict(), test, []
+        self.served, self.records = model.to_dict(), [test]
 
     def learn(self, trial: Record) -> dict[str, Any]:
-        """The new model, or the last one where a trial does not determine it."""
-        self.trials = [*self.trials, trial]
-        records = [self.test] * self.WITH_TEST + self.trials[-self.LAST :]
-        try:
-            fitted = identify.fit(join(records, [None] * len(records)) if len(records) > 1 else trial)
-        except IdentifyError:
-            return self.served
-        self.served = fitted.to_dict()
+        """The new model, or the last one where the records do not determine it."""
+        self.records.append(trial)
+        with contextlib.suppress(IdentifyError):
+            self.served = identify.fit(join(self.records, [None] * len(self.records))).to_dict()
         return self.served
-
-
-class RefitAll(Refit):
-    """On the test and all trials so far."""
-
-    LAST, WITH_TEST = 1000, True
 
 
 class Bank:
@@ -234,6 +224,5 @@ FOLLOWERS: dict[str, Callable[[Model, Record], Follower] | None] = {
     OURS: Ours,
     "recursive least squares": Recursive,
     "bank of models": Bank,
-    "refit, last trial": Refit,
-    "refit, test and all trials": RefitAll,
+    "refit of everything": Refit,
 }
