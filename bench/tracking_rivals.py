@@ -95,7 +95,7 @@ class Recursive:
     interval's own weight, and the two steps alternate.
     """
 
-    MEMORY_TRIALS = 0.3
+    MEMORY_TRIALS = 0.7
     """Trials after which a weight has fallen to 1/e."""
     CURVE_SHARE, CURVE_LENGTH_US = 0.3, 60.0
     """How far the curve may leave the approved one, of its largest torque, and over which widths that is alike."""
