@@ -16,11 +16,19 @@ Two laws, both on the demanded torque w before f⁻¹, e the tracking error of a
 If the model carries effects, no equation of theirs is needed here: the service predicts a trial
 (`POST /v1/models/{id}/prediction`), and the plan is corrected on the prediction until it follows the reference; after
 a trial, until the prediction has moved by the error.
+
+With `--tracked` the model is fetched again after each trial: the approved one, moved to where gain, threshold and speed
+are expected in the next trial (`tracking.coming`; `tracking.now` is what is known of the trial just played). The trial
+was planned with a model that was a little wrong: what it demanded of the muscle is w + f_now(u) - f_planned(u). The
+torque that the model now does not explain, d, is learnt as above, without the stretches in which the muscle did
+something of its own (`tracking.disturbed_s`). What the model foretells carries no noise and is corrected in full:
+the next trial is planned for reference - d. Without a change of the model this is the law above.
 """
 
 from __future__ import annotations
 
 import argparse
+import copy
 import io
 import os
 import sys
@@ -47,6 +55,11 @@ LAMBDA = 0.02
 PLAN_STEPS = 12
 STEP = 0.8
 """Share of the error that is corrected at once where the prediction, not (f, G), is inverted."""
+TRACKED = ("gain", "threshold_shift_us", "time_scale")
+ROUND_S = 0.25
+"""A disturbance begins and ends less sharply than it is told."""
+TRACKED_WITHIN_S = 5.0
+"""After a trial the service follows it; that takes half a second."""
 LEAST_SHARE = 0.2
 """A trial worse than the one before halves the share of each correction, down to this: near the noise a full correction
 only plays the last trial's noise back; some is kept, since a muscle changes."""
@@ -87,8 +100,29 @@ class Plant:
         self.widest_us = float(document["valid_for"]["pulse_width_us"][1])
         self.largest_nm = float(self.inverse_nm[-1])
         self.response = pulse_response(document["linear"], float(document["sample_rate_hz"]), size)
-        steps = np.subtract.outer(np.arange(size), np.arange(size))
-        self.G = np.where(steps >= 0, self.response[np.abs(steps)], 0.0)
+        self.G = lower_triangle(self.response)
+
+    def now(self) -> Plant:
+        """What was known after the last trial, where this one is what is expected of the next; forward only."""
+        tracking = self.document.get("tracking")
+        if not tracking:
+            return self
+        level = {name: (tracking["now"][name]["value"], tracking["coming"][name]["value"]) for name in TRACKED}
+        (gain, of), (shift_us, from_us), (slow, than) = (level[name] for name in TRACKED)
+        plant, time = copy.copy(self), np.arange(self.response.size + 1.0)
+        plant.level_nm = gain / of * self.level(self.width_us - (shift_us - from_us))
+        step = np.interp((time[1:] - 0.5) * than / slow, np.r_[0.0, time[1:] - 0.5], np.r_[0.0, self.response.cumsum()])
+        plant.response = np.diff(step, prepend=0.0)
+        plant.G = lower_triangle(plant.response)
+        return plant
+
+    def undisturbed(self) -> np.ndarray:
+        """1 where the last trial was the muscle's answer to its pulses alone, else 0; shape (N,)."""
+        time_s = BEFORE_S + np.arange(self.response.size) / PULSE_RATE_HZ
+        kept = np.ones(time_s.size)
+        for begin_s, end_s in self.document.get("tracking", {}).get("disturbed_s", ()):
+            kept[(time_s > begin_s - ROUND_S) & (time_s < end_s + ROUND_S)] = 0.0
+        return kept
 
     def level(self, widths_us: np.ndarray) -> np.ndarray:
         """f, N·m."""
@@ -103,6 +137,12 @@ class Plant:
             got = float(self.level(np.array(last)))
             owed = float(np.clip(owed + demand - got, -0.3, 0.3)) if demand > 0 else 0.0
         return widths
+
+
+def lower_triangle(response: np.ndarray) -> np.ndarray:
+    """G as a matrix, shape (N, N)."""
+    steps = np.subtract.outer(np.arange(response.size), np.arange(response.size))
+    return np.where(steps >= 0, response[np.abs(steps)], 0.0)
 
 
 def pulse_response(linear: dict[str, Any], rate_hz: float, size: int) -> np.ndarray:
@@ -174,10 +214,20 @@ class Service:
         self.client, self.participant = client, participant
         self.known: Any = None
 
-    def fetch(self) -> dict[str, Any]:
-        """The approved model. It is sent again only if it has changed (ETag)."""
-        self.known = self.client.approved_model(self.participant, self.known)
+    def fetch(self, tracked: bool = False) -> dict[str, Any]:
+        """The approved model, as it is or tracked. It is sent again only if it has changed (ETag)."""
+        asked = {"tracked": True} if tracked else {}
+        self.known = self.client.approved_model(self.participant, self.known, **asked)
         return self.known.document
+
+    def fetch_followed(self) -> dict[str, Any]:
+        """The tracked model once the trial just played is in it, or the last one if that does not come."""
+        patience = time.monotonic() + TRACKED_WITHIN_S
+        while True:
+            document = self.fetch(tracked=True)
+            if self.known.changed or time.monotonic() > patience:
+                return document
+            time.sleep(0.05)
 
     def play(self, widths_us: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Play a trial; its torque above rest in each pulse's period, N·m, and the widths sent, µs, both (N,)."""
@@ -262,17 +312,27 @@ def follow(
 
 
 def learn(
-    service: Service, model: dict[str, Any], reference: Reference, law: str, trials: int, static_start: bool = False
+    service: Service,
+    model: dict[str, Any],
+    reference: Reference,
+    law: str,
+    trials: int,
+    static_start: bool = False,
+    tracked: bool = False,
 ) -> list[Trial]:
-    """Play and correct, trial after trial; `static_start`: the first trial inverts f alone, as if there were no G."""
+    """Play and correct, trial after trial.
+
+    `static_start`: the first trial inverts f alone, as if there were no G. `tracked`: the model is followed; its
+    effects then serve the first plan only.
+    """
     plant, update, predict = Plant(model, reference.torque_nm.size), None, None
     demand, done = reference.torque_nm if static_start else plan(plant, reference), []
     if model["effects"]:
         predict = partial(service.predict, model["model_id"])
         demand = demand if static_start else follow(plant, demand, reference.torque_nm, predict)
-    else:
+    if tracked or not model["effects"]:
         update = LAWS[law](plant)
-    share = 1.0
+    share, left_nm = 1.0, np.zeros(demand.size)
     for _ in range(trials):
         widths_us = plant.widths(demand)
         torque_nm, sent_us = service.play(widths_us)
@@ -286,6 +346,15 @@ def learn(
         print(f"  trial {len(done):2d}  {percent:6.2f} % of the reference's rms, {lost} pulses lost", file=sys.stderr)
         not_sent_nm = plant.G @ (plant.level(widths_us) - plant.level(sent_us))  # a late pulse is dropped by the rig:
         learnt_nm = error_nm - not_sent_nm  # no reason to learn from it
+        if tracked:
+            played, plant = plant, Plant(service.fetch_followed(), demand.size)
+            now, update = plant.now(), LAWS[law](plant)
+            demand = demand + now.level(widths_us) - played.level(widths_us)
+            new_nm = torque_nm + not_sent_nm - now.G @ demand - left_nm
+            left_nm = left_nm + share * plant.undisturbed() * new_nm
+            demand = update(demand, reference.torque_nm - left_nm - plant.G @ demand)
+            demand = np.clip(demand, 0.0, plant.largest_nm)
+            continue
         if update is not None:
             corrected = demand + share * (update(demand, learnt_nm) - demand)
             demand = np.clip(corrected, 0.0, plant.largest_nm)
@@ -322,14 +391,15 @@ def main() -> None:
     parser.add_argument("--law", choices=[*LAWS, "both"], default="both")
     parser.add_argument("--trials", type=int, default=10)
     parser.add_argument("--peak-nm", type=float, help="default: 60 %% of the largest torque the model is valid for")
+    parser.add_argument("--tracked", action="store_true", help="fetch the model anew after each trial, as it stands")
     parser.add_argument("--svg", help="draw here")
     options = parser.parse_args()
     token = os.environ.get("STIMRIG_TOKEN") or sys.exit("set STIMRIG_TOKEN: read-model, read-live and run-test")
     service = Service(Client(options.url, token), options.participant)
-    model = service.fetch()
+    model = service.fetch(options.tracked)
     reference = Reference.reach(options.peak_nm or 0.6 * float(model["recruitment"]["inverse"]["torque_nm"][-1]))
     laws = list(LAWS) if options.law == "both" else [options.law]
-    runs = {law: learn(service, model, reference, law, options.trials) for law in laws}
+    runs = {law: learn(service, model, reference, law, options.trials, tracked=options.tracked) for law in laws}
     print(f"model {model['model_id']}, reference {reference.rms_nm:.2f} N·m rms; error in % of it")
     print("trial  " + "  ".join(f"{law:>12}" for law in runs))
     for number in range(options.trials):

@@ -15,13 +15,14 @@ def simulate(
     current_ma: float,
     rate_hz: float,
     duration_s: float,
+    begin_s: float = 0.0,
 ) -> NDArray[np.float64]:
     """Elbow torque of `muscle`, driven by the pulses given, without the sensor's noise.
 
     Parameters
     ----------
     muscle : Muscle
-        At rest, its time not yet beyond zero.
+        Its time not yet beyond `begin_s`.
     pulse_times_s, widths_us : array_like, shape (P,)
         When each pulse arrives, rising, and its width a phase. A width of 0 is no pulse.
     current_ma : float
@@ -30,11 +31,13 @@ def simulate(
         Samples per second of the record.
     duration_s : float
         Length of the record.
+    begin_s : float
+        Time of its first sample: a session is simulated stretch by stretch, on one clock.
 
     Returns
     -------
     ndarray, shape (N,)
-        Torque in N·m at the times n / rate_hz, n = 0 … N - 1, N = round(duration_s · rate_hz).
+        Torque in N·m at the times begin_s + n / rate_hz, n = 0 … N - 1, N = round(duration_s · rate_hz).
 
     Raises
     ------
@@ -53,7 +56,7 @@ def simulate(
     torque_nm = np.empty(sample_count)
     next_pulse = 0
     for n in range(sample_count):
-        time_s = n / rate_hz
+        time_s = begin_s + n / rate_hz
         while next_pulse < len(pulses) and pulses[next_pulse][0] <= time_s:
             muscle.pulse(*pulses[next_pulse], current_ma)
             next_pulse += 1

@@ -41,13 +41,13 @@ def make(name: str, parameters: Mapping[str, float] | None = None) -> Muscle:
     if name not in modules:
         raise PatientError(f"patient '{name}' is neither a file nor one of {', '.join(modules)}")
     module = modules[name]
-    known = [field.name for field in dataclasses.fields(module.Parameters)]
+    known: dict[str, Any] = {field.name: field.default for field in dataclasses.fields(module.Parameters)}
     for key, value in (parameters or {}).items():
         if key not in known:
             raise PatientError(f"patient '{name}' has no parameter '{key}'; it has {', '.join(known)}")
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
             raise PatientError(f"parameter '{key}' must be a finite number, not {value!r}")
-        if key.endswith(("_s", "_ma", "_us")) and not value > 0:
+        if key.endswith(("_s", "_ma", "_us")) and known[key] > 0 and not value > 0:  # a shift may have either sign
             raise PatientError(f"parameter '{key}' must be above zero, not {value!r}")
     return module.make(module.Parameters(**(parameters or {})))
 

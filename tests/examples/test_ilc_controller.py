@@ -8,7 +8,7 @@ import io
 import sys
 from itertools import pairwise
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import h5py
@@ -170,3 +170,114 @@ def test_a_share_that_was_halved_grows_again(ilc: ModuleType, monkeypatch: pytes
     assert errors[1.5][1] > errors[1.5][0], "else nothing was halved"
     assert errors[1.5][:3] == errors[1.0][:3]
     assert errors[1.5][3] < 0.8 * errors[1.0][3], errors
+
+
+# ---- the model followed from trial to trial -------------------------------------------------------------------------
+
+
+def levels(gain: float, shift_us: float, time_scale: float) -> dict[str, dict[str, float]]:
+    """As the service tells them, without their bands."""
+    values = {"gain": gain, "threshold_shift_us": shift_us, "time_scale": time_scale}
+    return {name: {"value": value, "low": value, "high": value} for name, value in values.items()}
+
+
+def moved(gain: float, shift_us: float, time_scale: float) -> tuple[float, float, float, float]:
+    """A muscle's four figures (`patient_of`), moved by such levels."""
+    period_s, damping, plateau_nm, middle_us = MODEL
+    return period_s * time_scale, damping, plateau_nm * gain, middle_us + shift_us
+
+
+class Tiring(Muscle):
+    """Loses gain, its threshold rises and it slows from trial to trial; told of by a service that follows it well."""
+
+    def __init__(self, falls: float = 0.05, rises_us: float = 1.5, slows: float = 0.03) -> None:
+        super().__init__()
+        self.step, self.trials = (1 - falls, rises_us, 1 + slows), 0
+
+    def at(self, trial: int) -> tuple[float, float, float]:
+        gain, shift_us, slow = self.step
+        return gain**trial, shift_us * trial, slow**trial
+
+    def play(self, widths_us: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        torque_nm = felt(patient_of(*moved(*self.at(self.trials))), widths_us)
+        self.trials += 1
+        return torque_nm + 0.005 * self.rng.standard_normal(widths_us.size), widths_us
+
+    def fetch_followed(self) -> dict[str, Any]:
+        coming, now = self.at(self.trials), self.at(self.trials - 1)
+        return model_of(*moved(*coming)) | {"tracking": {"now": levels(*now), "coming": levels(*coming)}}
+
+
+def test_plant_now_is_the_plant_of_the_levels_now(ilc: ModuleType) -> None:
+    now, coming = (0.8, 6.0, 1.1), (0.7, 9.0, 1.2)
+    document = model_of(*moved(*coming)) | {"tracking": {"now": levels(*now), "coming": levels(*coming)}}
+    plant, wanted, widths = ilc.Plant(document, 400).now(), ilc.Plant(model_of(*moved(*now)), 400), np.arange(0, 290.0)
+    np.testing.assert_allclose(plant.level(widths), wanted.level(widths), atol=0.01)
+    np.testing.assert_allclose(plant.response.cumsum(), wanted.response.cumsum(), atol=0.01)
+
+
+@pytest.mark.parametrize(
+    "changes", [{"rises_us": 0.0, "slows": 0.0}, {"falls": 0.0, "slows": 0.0}, {"falls": 0.0, "rises_us": 0.0}, {}]
+)
+def test_a_muscle_that_tires_is_followed(ilc: ModuleType, changes: dict[str, float]) -> None:
+    """A well-followed model leaves nearly the error of a muscle that does not change; without it, far more is left."""
+    reference, last = ilc.Reference.reach(3.0), {}
+    for name, muscle, tracked in (
+        ("still", Tiring(0.0, 0.0, 0.0), False),
+        ("tracked", Tiring(**changes), True),
+        ("untracked", Tiring(**changes), False),
+    ):
+        trials = ilc.learn(muscle, model_of(*MODEL), reference, "norm-optimal", 10, tracked=tracked)
+        last[name] = np.mean([trial.error_percent for trial in trials[-3:]])
+    assert last["tracked"] < 1.4 * last["still"], last
+    assert last["untracked"] > 2 * last["tracked"], last
+
+
+def test_a_model_that_is_never_moved_is_played_as_untracked(ilc: ModuleType) -> None:
+    reference, still = ilc.Reference.reach(3.0), {"falls": 0.0, "rises_us": 0.0, "slows": 0.0}
+    document, runs = model_of(*moved(1.1, 4.0, 1.1)), []  # with something to learn
+    for tracked in (False, True):
+        muscle = Tiring(**still)
+        muscle.fetch_followed = lambda: document
+        runs.append(ilc.learn(muscle, document, reference, "norm-optimal", 6, tracked=tracked))
+    untracked, tracked = runs
+    assert np.abs(untracked[1].widths_us - tracked[1].widths_us).max() <= 1.0
+    assert untracked[0].error_percent > 5 * untracked[1].error_percent
+    for one, other in zip(untracked, tracked, strict=True):
+        assert other.error_percent == pytest.approx(one.error_percent, rel=0.1)
+
+
+def test_what_a_muscle_did_of_its_own_is_not_learnt(ilc: ModuleType) -> None:
+    """A spasm in the third trial: told of it, the controller plays the fourth as if it had not been."""
+    reference, after = ilc.Reference.reach(3.0), []
+    for told in (True, False):
+        muscle = Tiring(0.0, 0.0, 0.0)
+        play, followed = muscle.play, muscle.fetch_followed
+
+        def with_spasm(widths_us: np.ndarray, muscle: Any = muscle, play: Any = play) -> tuple[np.ndarray, np.ndarray]:
+            torque_nm, sent_us = play(widths_us)
+            torque_nm[200:220] += 2.0 * (muscle.trials == 3)
+            return torque_nm, sent_us
+
+        def with_stretch(muscle: Any = muscle, followed: Any = followed, told: bool = told) -> dict[str, Any]:
+            document = followed()
+            if told and muscle.trials == 3:
+                document["tracking"]["disturbed_s"] = [[6.0, 6.5]]
+            return document
+
+        muscle.play, muscle.fetch_followed = with_spasm, with_stretch
+        trials = ilc.learn(muscle, model_of(*MODEL), reference, "norm-optimal", 4, tracked=True)
+        after.append(trials[3].error_percent / trials[1].error_percent)
+    assert after[0] < 1.3 and after[1] > 5, after
+
+
+def test_a_followed_model_is_waited_for(ilc: ModuleType) -> None:
+    class Slow:
+        asked = 0
+
+        def approved_model(self, participant: str, known: Any, tracked: bool = False) -> Any:
+            assert tracked and participant == "P" and (known is None) == (self.asked == 0)
+            self.asked += 1
+            return SimpleNamespace(document={"number": self.asked}, changed=self.asked == 3)
+
+    assert ilc.Service(Slow(), "P").fetch_followed() == {"number": 3}

@@ -186,8 +186,8 @@ def test_records_refuse_what_is_no_train(times: list[float], widths: list[float]
 
 
 class TestRegistry:
-    def test_both_are_found(self) -> None:
-        assert {"paper", "calcium"} <= set(registry.names())
+    def test_all_are_found(self) -> None:
+        assert {"paper", "calcium", "changing"} <= set(registry.names())
 
     @pytest.mark.parametrize("suffix", [".toml", ".json"])
     def test_file_overrides_by_name(self, tmp_path: Path, suffix: str) -> None:
@@ -203,7 +203,7 @@ class TestRegistry:
     @pytest.mark.parametrize(
         ("text", "told"),
         [
-            ('patient = "papr"', "calcium, paper"),
+            ('patient = "papr"', "calcium, changing, paper"),
             ('patient = "paper"\n[parameters]\na9 = 1.0', "no parameter 'a9'"),
             ('patient = "paper"\n[parameters]\na1 = "x"', "finite number"),
             ('patient = "paper"\n[parameters]\na1 = nan', "finite number"),

@@ -1,0 +1,207 @@
+"""Following a muscle that changes from trial to trial: ours and peers, on simulated sessions without waiting.
+
+    python -m bench.tracking [--seeds 94000:94020] [--cases fatigue …] [--who tracking …] [--json FILE]
+
+For each muscle and each case of `bench.tracking_cases`: the paper's test, a model fitted on it, a minute of rest, then
+ten trials of `examples/ilc_controller.py` with 15 s of rest between them, each time from the same state of the muscle
+and with the same noise. Told is the error of a trial, rms of reference minus torque, % of the reference's rms.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import copy
+import io
+import json
+import sys
+import time
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import identify
+from bench.adaptive import paper_test
+from bench.tracking_cases import CASES, NOTHING, PEAK_SHARE, patient
+from bench.tracking_rivals import FOLLOWERS, OURS, UNTRACKED, Follower
+from examples import ilc_controller as ilc
+from hardware_sim.offline import simulate
+from hardware_sim.patients import registry
+from identify.model import Model
+from identify.records.record import Record
+
+RATE_HZ, NOISE_NM, CURRENT_MA, LARGEST_US = 400.0, 0.05, 20.0, 300.0
+TRIALS, REST_S, APPROVAL_S = 10, 15.0, 60.0
+PER = round(RATE_HZ / ilc.PULSE_RATE_HZ)
+
+
+class Person:
+    """A muscle on its own clock, and the noise of its sensor."""
+
+    def __init__(self, seed: int, case: str) -> None:
+        self.muscle = registry.make("changing", patient(seed, case))
+        self.rng = np.random.default_rng([seed, 15])
+        self.now_s = 0.0
+
+    def play(self, widths_us: np.ndarray, names: list[str]) -> Record:
+        """The record of such pulses, from now on."""
+        span_s = widths_us.size / ilc.PULSE_RATE_HZ
+        times = self.now_s + np.arange(widths_us.size) / ilc.PULSE_RATE_HZ
+        clean = simulate(self.muscle, times, widths_us, CURRENT_MA, RATE_HZ, span_s, self.now_s)
+        self.now_s += span_s
+        noisy = clean + NOISE_NM * self.rng.standard_normal(clean.size)
+        held = np.repeat(widths_us, PER)
+        return Record.from_arrays(np.arange(clean.size) / RATE_HZ, held, noisy, np.repeat(names, PER))
+
+
+class Simulated:
+    """What `ilc.learn` asks of the service."""
+
+    def __init__(self, person: Person, follower: Follower | None) -> None:
+        self.person, self.follower = person, follower
+        self.record: Record | None = None
+        self.served: list[dict[str, Any]] = []
+        self.seconds: list[float] = []
+        self.gains: list[float] = []
+
+    def play(self, widths_us: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """A trial with its rests, after the rest before it."""
+        self.person.now_s += REST_S
+        before, after = round(ilc.BEFORE_S * ilc.PULSE_RATE_HZ), round(ilc.AFTER_S * ilc.PULSE_RATE_HZ)
+        names = ["rest"] * before + ["trial"] * widths_us.size + ["rest"] * after
+        self.record = self.person.play(np.r_[np.zeros(before), widths_us, np.zeros(after)], names)
+        self.gains.append(float(getattr(self.person.muscle, "gain", 1.0)))
+        torque = self.record.torque_nm.reshape(-1, PER)
+        baseline_nm = torque[round(0.3 * before) : before].mean()
+        return torque[before : before + widths_us.size].mean(axis=1) - baseline_nm, widths_us
+
+    def fetch_followed(self) -> dict[str, Any]:
+        """What the follower makes of the trial just played."""
+        assert self.follower is not None and self.record is not None
+        began = time.perf_counter()
+        document = self.follower.learn(self.record)
+        self.seconds.append(time.perf_counter() - began)
+        self.served.append(document.get("tracking", {}))
+        return document
+
+
+def one(seed: int, case: str, who: list[str], trials: int = TRIALS) -> list[dict[str, Any]]:
+    """Each follower's session with this muscle."""
+    person = Person(seed, case)
+    test = person.play(*paper_test(LARGEST_US, held_out=True))
+    person.now_s += APPROVAL_S
+    model = identify.fit(test)
+    document = model.to_dict()
+    reference = ilc.Reference.reach(PEAK_SHARE * float(document["recruitment"]["inverse"]["torque_nm"][-1]))
+    return [{"seed": seed, "case": case} | session(copy.deepcopy(person), model, test, reference, name, trials)
+            for name in who]  # fmt: skip
+
+
+def session(
+    person: Person, model: Model, test: Record, reference: ilc.Reference, name: str, trials: int
+) -> dict[str, Any]:
+    """Ten trials with one follower."""
+    make = FOLLOWERS[name]
+    service: Any = Simulated(person, make(model, test) if make else None)
+    with contextlib.redirect_stderr(io.StringIO()):
+        done = ilc.learn(
+            service, model.to_dict(), reference, "norm-optimal", trials, tracked=service.follower is not None
+        )
+    return {
+        "who": name,
+        "errors": [trial.error_percent for trial in done],
+        "gains": service.gains,
+        "seconds": service.seconds,
+        "moves": moves(service.served),
+        "outcomes": [served.get("outcome") for served in service.served],
+    }
+
+
+def moves(served: list[dict[str, Any]]) -> list[list[float]]:
+    """How far each trial moved what is expected of the next, in half widths of the band before it; from the second on.
+
+    One row a trial: gain, threshold, time scale.
+    """
+    found = []
+    for before, after in pairwise(served):
+        if not before or not after:
+            continue
+        found.append([
+            abs(after["coming"][name]["value"] - before["coming"][name]["value"])
+            / max((before["coming"][name]["high"] - before["coming"][name]["low"]) / 2, 1e-12)
+            for name in ilc.TRACKED
+        ])  # fmt: skip
+    return found
+
+
+def tables(rows: list[dict[str, Any]]) -> list[str]:
+    """Errors of the tenth trial, and their ratio to that of the same muscle and follower when nothing changes."""
+    names = list(dict.fromkeys(row["who"] for row in rows))
+    last = {(row["seed"], row["case"], row["who"]): float(row["errors"][-1]) for row in rows}
+    muscles = {name: len({key[0] for key in last if key[2] == name}) for name in names}
+    lines = ["| case | " + " | ".join(f"{name}, n = {muscles[name]}" for name in names) + " |"]
+    lines += ["|---" * (len(names) + 1) + "|"]
+    for case in dict.fromkeys(row["case"] for row in rows):
+        cells = []
+        for name in names:
+            keys = [key for key in last if key[1:] == (case, name)]
+            errors = np.array([last[key] for key in keys])
+            still = np.array([last.get((key[0], NOTHING, name), np.nan) for key in keys])
+            if not errors.size:
+                cells.append("")
+                continue
+            ratio = np.nanquantile(errors / still, [0.5, 0.9]) if np.isfinite(still).any() else [np.nan] * 2
+            cells.append(f"{np.median(errors):.2f} % (× {ratio[0]:.2f}, {ratio[1]:.2f})")
+        lines.append(f"| {case} | " + " | ".join(cells) + " |")
+    return lines
+
+
+def seconds_of(rows: list[dict[str, Any]]) -> list[str]:
+    """Time that following a trial took."""
+    lines = []
+    for name in dict.fromkeys(row["who"] for row in rows if row["seconds"]):
+        taken = np.concatenate([row["seconds"] for row in rows if row["who"] == name])
+        half, most = 1e3 * np.quantile(taken, [0.5, 0.99])
+        lines.append(f"{name}: {half:.0f} ms in the middle, p99 {most:.0f} ms, n = {taken.size}")
+    return lines
+
+
+def moved_lines(rows: list[dict[str, Any]]) -> list[str]:
+    """How often a trial moved what is served by more than its band."""
+    lines = []
+    for case in dict.fromkeys(row["case"] for row in rows):
+        found = [row["moves"] for row in rows if row["case"] == case and row["who"] == OURS and row["moves"]]
+        if found:
+            moved = np.concatenate(found)
+            beyond = np.mean(np.any(moved > 1.0, axis=1))
+            lines.append(
+                f"{case}: {100 * beyond:.1f} % of {len(moved)} trials moved beyond a band; largest, in bands: "
+                + ", ".join(f"{name} {value:.2f}" for name, value in zip(ilc.TRACKED, moved.max(axis=0), strict=True))
+            )
+    return lines
+
+
+def main() -> int:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(prog="python -m bench.tracking", description=__doc__)
+    parser.add_argument("--seeds", default="94000:94020", help="first:end")
+    parser.add_argument("--cases", nargs="*", default=list(CASES))
+    parser.add_argument("--who", nargs="*", default=list(FOLLOWERS), help=f"e.g. '{UNTRACKED}'")
+    parser.add_argument("--json", type=Path, help="every row goes here, one a line")
+    options = parser.parse_args()
+    first, end = map(int, options.seeds.split(":"))
+    rows: list[dict[str, Any]] = []
+    for seed in range(first, end):
+        for case in options.cases:
+            rows += one(seed, case, options.who)
+        print(f"seed {seed}", file=sys.stderr, flush=True)
+        if options.json is not None:
+            options.json.write_text("\n".join(json.dumps(row) for row in rows))
+    print(*tables(rows), "", *seconds_of(rows), "", *moved_lines(rows), sep="\n")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

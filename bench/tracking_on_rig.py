@@ -1,0 +1,223 @@
+"""Following a muscle that changes, on the emulated rig in real time: test, approval, ten trials, for each case.
+
+    python -m bench.tracking_on_rig [--seeds 94101 94102 94103] [--cases …] [--who …] [--json FILE] [--offline FILE]
+
+Muscles and cases are those of `bench.tracking_cases`; every session is on a rig of its own, from a rested muscle. The
+controller is `examples/ilc_controller.py`. Rows that FILE holds already are not played again, so a long run can be
+done in parts. Writes docs/results/tracking.md; `--offline` adds what `bench.tracking --json` wrote.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from api.cli.launcher import Services
+from api.client.rest import Client
+from api.settings import Settings
+from bench.ilc import Patient, approve
+from bench.stamp import RESULTS, written_by
+from bench.tracking import APPROVAL_S, LARGEST_US, REST_S, TRIALS, moved_lines, moves, seconds_of, tables
+from bench.tracking_cases import CASES, PEAK_SHARE, patient
+from bench.tracking_rivals import FOLLOWERS, OURS, UNTRACKED, Follower
+from examples import ilc_controller as ilc
+from identify.model import Model
+from identify.records.recording import read_recording
+
+TOKEN, PERSON = "token-of-the-tracking-bench", "TRACK"
+
+
+class KeepingClient(Client):
+    """Keeps the last recording that was fetched."""
+
+    last = b""
+
+    def recording(self, recording_id: str) -> bytes:
+        """The sealed recording."""
+        self.last = super().recording(recording_id)
+        return self.last
+
+
+class Session(Patient):
+    """A participant who rests before each trial; the model is followed here, from the recording."""
+
+    client: KeepingClient
+    follower: Follower | None = None
+
+    def __init__(self, client: KeepingClient) -> None:
+        super().__init__(client, PERSON)
+        self.served: list[dict[str, Any]] = []
+        self.sent_us: list[np.ndarray] = []
+        self.seconds: list[float] = []
+
+    def play(self, widths_us: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """After a rest."""
+        time.sleep(REST_S)
+        torque_nm, sent_us = super().play(widths_us)
+        self.sent_us.append(sent_us)
+        return torque_nm, sent_us
+
+    def fetch_followed(self) -> dict[str, Any]:
+        """What is served of the trial just played."""
+        began = time.perf_counter()
+        document = followed(self)
+        self.seconds.append(time.perf_counter() - began)
+        self.served.append(document.get("tracking", {}))
+        return document
+
+
+def followed(session: Session) -> dict[str, Any]:
+    """The model after the trial: a peer's, and ours until the service tracks; then `ilc.Service.fetch_followed`."""
+    assert session.follower is not None
+    return session.follower.learn(read_recording(session.client.last, Path("trial.h5")))
+
+
+def patient_file(seed: int, case: str, path: Path) -> Path:
+    """The emulator's file of that muscle."""
+    rows = "".join(f"{name} = {float(value)!r}\n" for name, value in patient(seed, case).items())
+    path.write_text(f'patient = "changing"\n[parameters]\n{rows}')
+    return path
+
+
+def one(seed: int, case: str, who: str, folder: Path) -> dict[str, Any]:
+    """One session."""
+    file = patient_file(seed, case, folder / "patient.toml")
+    emulator = ["--patient", str(file), "--noise-seed", str(seed), "--rate-hz", "400"]
+    with Services(Settings(data_dir=folder / "data", port=0), emulator, TOKEN) as services:
+        service = Session(KeepingClient(services.url, TOKEN))
+        client = service.client
+        client.make_participant(PERSON, {"current_ma": 20.0, "max_pulse_width_us": LARGEST_US, "max_torque_nm": 30.0})
+        test = client.run_test(PERSON)
+        approve(service, test["model_id"])
+        document = service.fetch()
+        make = FOLLOWERS[who]
+        if make:
+            own = read_recording(client.recording(test["recording_id"]), Path("test.h5"))
+            service.follower = make(Model.from_dict(document), own)
+        reference = ilc.Reference.reach(PEAK_SHARE * float(document["recruitment"]["inverse"]["torque_nm"][-1]))
+        time.sleep(APPROVAL_S - REST_S)
+        done = ilc.learn(service, document, reference, "norm-optimal", TRIALS, tracked=bool(make))
+    return {
+        "seed": seed,
+        "case": case,
+        "who": who,
+        "errors": but_lost(done, service.sent_us, ilc.Plant(document, reference.torque_nm.size), reference),
+        "errors_as_played": [trial.error_percent for trial in done],
+        "lost": sum(trial.lost_pulses for trial in done),
+        "lost_in_test": test["summary"]["dropped_pulses"],
+        "repeated": service.repeated,
+        "seconds": service.seconds,
+        "moves": moves(service.served),
+        "outcomes": [served.get("outcome") for served in service.served],
+    }
+
+
+def but_lost(
+    done: list[ilc.Trial], sent_us: list[np.ndarray], plant: ilc.Plant, reference: ilc.Reference
+) -> list[float]:
+    """Errors without what the pulses that the rig dropped would have given by the approved model, %."""
+    found = []
+    for trial, sent in zip(done, sent_us, strict=True):
+        lost_nm = plant.G @ (plant.level(trial.widths_us) - plant.level(sent))
+        error_nm = reference.torque_nm - trial.torque_nm - lost_nm
+        found.append(100 * float(np.sqrt(np.mean(error_nm**2))) / reference.rms_nm)
+    return found
+
+
+def page(rows: list[dict[str, Any]], offline: list[dict[str, Any]]) -> str:
+    """The figures as a page."""
+    lines = [
+        "# Following a muscle that changes",
+        "",
+        f"{written_by('python -m bench.tracking_on_rig')}",
+        "",
+        f"Ten trials with {REST_S:g} s of rest between them, after a pre-session test and {APPROVAL_S:g} s of rest. "
+        f"The reference goes up to {100 * PEAK_SHARE:g} % of the largest torque. "
+        "Error: rms of reference minus torque, % of the reference's rms. In a table: the tenth trial's error, the "
+        "median of the muscles; in brackets its ratio to that of the same muscle and follower when nothing changes, "
+        "the median and the worst tenth.",
+        "*Moved beyond a band*: what is served for the next trial differs from what was served before by more than "
+        "half the width of the 95 % band that was served with it.",
+        "",
+        "What changes: " + "; ".join(f"{name} ({_words(what)})" for name, what in CASES.items() if what) + ". "
+        "`hardware_sim/patients/changing.py` says by which laws.",
+    ]
+    if rows:
+        lines += ["", "## On the emulated rig in real time", "", *rig_lines(rows)]
+    if offline:
+        seeds = sorted({row["seed"] for row in offline})
+        lines += ["", "## Simulated, without waiting", ""]
+        lines += [f"`python -m bench.tracking`: {len(seeds)} muscles, seeds {seeds[0]} to {seeds[-1]}.", ""]
+        lines += [*tables(offline), "", *_list(seconds_of(offline)), "", *_list(moved_lines(offline))]
+    return "\n".join(lines) + "\n"
+
+
+def rig_lines(rows: list[dict[str, Any]]) -> list[str]:
+    """Tables of the rig's sessions: the tenth trials, and each session by itself."""
+    seeds = sorted({row["seed"] for row in rows})
+    lines = [f"Muscles of the seeds {', '.join(map(str, seeds))}.", "", *tables(rows), ""]
+    lines += [*_list(seconds_of(rows)), "", *_list(moved_lines(rows)), ""]
+    lines += [
+        "The rig drops a pulse when the computer is late for it. Errors are without what the approved model says these "
+        "would have given; in the last column they are as played.",
+        "",
+        "| muscle | case | follower | error of trials 1 to 10, % | dropped pulses | trials repeated | as played |",
+        "|---" * 7 + "|",
+    ]
+    for row in rows:
+        errors, played = (", ".join(f"{e:.2f}" for e in row[key]) for key in ("errors", "errors_as_played"))
+        cells = [row["seed"], row["case"], row["who"], errors, row["lost"], row["repeated"], played]
+        lines.append("| " + " | ".join(map(str, cells)) + " |")
+    return lines
+
+
+def _list(lines: list[str]) -> list[str]:
+    return [f"- {line}" for line in lines]
+
+
+def _words(what: dict[str, float]) -> str:
+    return ", ".join(f"`{name}` {value:g}" for name, value in what.items())
+
+
+def read_rows(path: Path | None) -> list[dict[str, Any]]:
+    """Rows, one JSON object a line."""
+    return [json.loads(line) for line in path.read_text().splitlines()] if path and path.exists() else []
+
+
+def main() -> int:
+    """Play what is not played yet, and write the page."""
+    parser = argparse.ArgumentParser(prog="python -m bench.tracking_on_rig", description=__doc__)
+    parser.add_argument("--seeds", type=int, nargs="*", default=[94101, 94102, 94103])
+    parser.add_argument("--cases", nargs="*", default=list(CASES))
+    parser.add_argument("--who", nargs="*", default=[OURS, UNTRACKED])
+    parser.add_argument("--json", type=Path, help="rows, one a line; those in it are not played again")
+    parser.add_argument("--offline", type=Path, help="rows of bench.tracking")
+    options = parser.parse_args()
+    rows = read_rows(options.json)
+    done = {(row["seed"], row["case"], row["who"]) for row in rows}
+    wanted = [(s, c, w) for s in options.seeds for c in options.cases for w in options.who if (s, c, w) not in done]
+    for seed, case, who in wanted:
+        print(f"{seed}, {case}, {who}", file=sys.stderr, flush=True)
+        with tempfile.TemporaryDirectory(prefix="tracking-") as folder:
+            try:
+                rows.append(one(seed, case, who, Path(folder)))
+            except (Exception, SystemExit) as error:  # the machine stood still: told, and played again another time
+                print(f"{seed}, {case}, {who}: {error!r}", file=sys.stderr, flush=True)
+                continue
+        if options.json is not None:
+            options.json.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    words = page(rows, read_rows(options.offline))
+    (RESULTS / "tracking.md").write_text(words, "utf-8")
+    print(words)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
