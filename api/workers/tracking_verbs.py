@@ -58,7 +58,7 @@ def track(
     """
     import identify
     from identify.simulation.predict import refuse_rate
-    from identify.tracking import State, follow, moved_model
+    from identify.tracking import State, begin, follow, moved_model
 
     progress(0.1, "reading the recording")
     record = identify.read(Path(data))
@@ -66,12 +66,13 @@ def track(
     try:
         model = second_order(identify.Model.from_json(model_json))
         refuse_rate(model, record)
-        before = State.start(rates()) if state is None else State.from_dict(state)
+        before = begin(model, rates()) if state is None else State.from_dict(state)
         for _ in range(min(missed, MOST_MISSED)):
             before = before.ahead(rates())
         step = follow(model, before, record, rates())
         still = {name: value for name, value in STILL.items() if name not in tracked}
-        moved = moved_model(model, replace(step.coming.values, **still))
+        curve_nm = step.coming.curve_nm if "gain" in tracked else 0.0
+        moved = moved_model(model, replace(step.coming.values, **still), curve_nm)
     except identify.IdentifyError as problem:
         return {"error_percent": error, "reason": " ".join(str(problem).split())}
     return {"error_percent": error, "step": clean(step.to_dict()), "model": moved.to_json(None)}

@@ -1,6 +1,6 @@
 """Following an approved model from trial to trial: gain, threshold and time scale, with bands."""
 
-from identify.tracking.follow import Outcome, Step, follow, levels_of, model_for_next
+from identify.tracking.follow import Outcome, Step, begin, follow, levels_of, model_for_next
 from identify.tracking.rates import learn_rates
 from identify.tracking.served import moved_model
 from identify.tracking.state import QUANTITIES, USUAL, Rates, State, Values
@@ -15,6 +15,7 @@ __all__ = [
     "State",
     "Step",
     "Values",
+    "begin",
     "follow",
     "learn_rates",
     "levels_of",

@@ -84,6 +84,11 @@ def levels_of(state: State) -> dict[str, dict[str, float]]:
     return found
 
 
+def begin(model: Model, rates: Rates = USUAL) -> State:
+    """What is expected of the first trial after the approval of a model."""
+    return State.start(curve_covariance(model), rates)
+
+
 def follow(model: Model, state: State | None, record: Record, rates: Rates = USUAL) -> Step:
     """Learn from one trial.
 
@@ -105,7 +110,7 @@ def follow(model: Model, state: State | None, record: Record, rates: Rates = USU
     BadRecord
         The record is too short, or sampled more slowly than the pulses.
     """
-    before = State.start(curve_covariance(model), rates) if state is None else state
+    before = begin(model, rates) if state is None else state
     seen = look(model, before, record)
     if seen.misfit > UNEXPLAINED:
         after = replace(before, trials=before.trials + 1, unexplained=before.unexplained + 1)

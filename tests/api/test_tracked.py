@@ -16,7 +16,6 @@ from api.models.tracking import NEW_TEST
 from api.store.tables import Model, Test, Tracked
 from rig.messages import FinishedEvent
 from tests.api.conftest import STUB, Service, run_service, run_test, wait_done
-from tests.api.fake_rig import default_widths
 
 WIDTHS = [{"name": "trial", "sequence": "widths", "settings": {"pulse_width_us": [100.0] * 40}}]
 MODEL, TRACKING = "/v1/participants/P017/model", "/v1/participants/P017/tracking"
@@ -345,7 +344,7 @@ def test_a_restart_goes_on_where_it_was(tmp_path: Path, short_dir: Path) -> None
 def test_a_reference_tells_the_error_and_changes_nothing_that_is_played(
     service: Service, client: httpx.Client, approved: str
 ) -> None:
-    played = play(client, reference_torque_nm=[1.0] * len(default_widths()[0]))
+    played = play(client, reference_torque_nm=[1.0] * 40)
     assert tracked(client).status_code == 200 and trials(client)[0]["error_percent"] == 7.5
     plain = play(client)
     assert tracked(client).status_code == 200 and trials(client)[1]["error_percent"] is None
