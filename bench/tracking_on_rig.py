@@ -24,7 +24,7 @@ from api.client.rest import Client
 from api.settings import Settings
 from bench.ilc import Patient, approve
 from bench.stamp import RESULTS, written_by
-from bench.tracking import APPROVAL_S, LARGEST_US, REST_S, TRIALS, moved_lines, moves, seconds_of, tables
+from bench.tracking import APPROVAL_S, LARGEST_US, NOISE_NM, REST_S, TRIALS, moved_lines, moves, seconds_of, tables
 from bench.tracking_cases import CASES, PEAK_SHARE, patient
 from bench.tracking_rivals import FOLLOWERS, OURS, UNTRACKED, Follower
 from examples import ilc_controller as ilc
@@ -160,7 +160,11 @@ def page(rows: list[dict[str, Any]], offline: list[dict[str, Any]]) -> str:
     if offline:
         seeds = sorted({row["seed"] for row in offline})
         lines += ["", "## Simulated, without waiting", ""]
-        lines += [f"`python -m bench.tracking`: {len(seeds)} muscles, seeds {seeds[0]} to {seeds[-1]}.", ""]
+        lines += [
+            f"`python -m bench.tracking`: {len(seeds)} muscles, seeds {seeds[0]} to {seeds[-1]}, noise {NOISE_NM:g} N·m. "
+            "The controller that is not tracked halves its share after a worse trial; this costs it much with fatigue.",
+            "",
+        ]
         lines += [*tables(offline), "", *_list(seconds_of(offline)), "", *_list(moved_lines(offline))]
     return "\n".join(lines) + "\n"
 
@@ -171,8 +175,9 @@ def rig_lines(rows: list[dict[str, Any]]) -> list[str]:
     lines = [f"Muscles of the seeds {', '.join(map(str, seeds))}.", "", *tables(rows), ""]
     lines += [*_list(seconds_of(rows)), "", *_list(moved_lines(rows)), ""]
     lines += [
-        "The rig drops a pulse when the computer is late for it. Errors are without what the approved model says these "
-        "would have given; in the last column they are as played.",
+        "The rig drops a pulse when the computer is late for it; the more work runs beside it, the more are dropped. "
+        "Errors are without what the approved model says these would have given; in the last column they are as "
+        "played.",
         "",
         "| muscle | case | follower | error of trials 1 to 10, % | dropped pulses | trials repeated | as played |",
         "|---" * 7 + "|",
