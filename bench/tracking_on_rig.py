@@ -162,8 +162,8 @@ def page(rows: list[dict[str, Any]], offline: list[dict[str, Any]]) -> str:
         lines += ["", "## Simulated, without waiting", ""]
         lines += [
             f"`python -m bench.tracking`: {len(seeds)} muscles, seeds {seeds[0]} to {seeds[-1]}, "
-            f"noise {NOISE_NM:g} N·m. The controller that is not tracked halves its share after a worse trial; this costs "
-            "it much with fatigue.",
+            f"noise {NOISE_NM:g} N·m. The controller that is not tracked halves its share after a worse trial; this "
+            "costs it much with fatigue.",
             "",
         ]
         lines += [*tables(offline), "", *_list(seconds_of(offline)), "", *_list(moved_lines(offline))]
