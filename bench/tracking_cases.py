@@ -13,6 +13,8 @@ DISTURBED_TRIAL = 5
 PEAK_SHARE = 0.4
 """The reference's peak, of the largest torque: a muscle that has lost 40 % of it can still reach it."""
 
+# The test before the trials tires, too: with this share of fatigue 40 % of the gain are lost from the begin of the
+# first trial to the end of the tenth.
 CASES = {
     NOTHING: {},
     "fatigue": {"fatigue_share": 0.55, "fatigue_recovery_s": 600.0},

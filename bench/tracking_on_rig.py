@@ -24,7 +24,7 @@ from api.client.rest import Client
 from api.settings import Settings
 from bench.ilc import Patient, approve
 from bench.stamp import RESULTS, written_by
-from bench.tracking import APPROVAL_S, LARGEST_US, REST_S, TRIALS, moved_lines, moves, seconds_of, tables
+from bench.tracking import APPROVAL_S, LARGEST_US, NOISE_NM, REST_S, TRIALS, moved_lines, moves, seconds_of, tables
 from bench.tracking_cases import CASES, PEAK_SHARE, patient
 from bench.tracking_rivals import FOLLOWERS, OURS, UNTRACKED, Follower
 from examples import ilc_controller as ilc
@@ -51,8 +51,9 @@ class Session(Patient):
     client: KeepingClient
     follower: Follower | None = None
 
-    def __init__(self, client: KeepingClient) -> None:
+    def __init__(self, client: KeepingClient, keep: Path | None) -> None:
         super().__init__(client, PERSON)
+        self.keep = keep
         self.served: list[dict[str, Any]] = []
         self.sent_us: list[np.ndarray] = []
         self.seconds: list[float] = []
@@ -62,6 +63,8 @@ class Session(Patient):
         time.sleep(REST_S)
         torque_nm, sent_us = super().play(widths_us)
         self.sent_us.append(sent_us)
+        if self.keep is not None:
+            (self.keep / f"trial-{len(self.sent_us):02d}.h5").write_bytes(self.client.last)
         return torque_nm, sent_us
 
     def fetch_followed(self) -> dict[str, Any]:
@@ -86,17 +89,20 @@ def patient_file(seed: int, case: str, path: Path) -> Path:
     return path
 
 
-def one(seed: int, case: str, who: str, folder: Path) -> dict[str, Any]:
-    """One session."""
+def one(seed: int, case: str, who: str, folder: Path, keep: Path | None = None) -> dict[str, Any]:
+    """One session; its trials' recordings and the approved model go to `keep`."""
     file = patient_file(seed, case, folder / "patient.toml")
     emulator = ["--patient", str(file), "--noise-seed", str(seed), "--rate-hz", "400"]
     with Services(Settings(data_dir=folder / "data", port=0), emulator, TOKEN) as services:
-        service = Session(KeepingClient(services.url, TOKEN))
+        service = Session(KeepingClient(services.url, TOKEN), keep)
         client = service.client
         client.make_participant(PERSON, {"current_ma": 20.0, "max_pulse_width_us": LARGEST_US, "max_torque_nm": 30.0})
         test = client.run_test(PERSON)
         approve(service, test["model_id"])
         document = service.fetch()
+        if keep is not None:
+            keep.mkdir(parents=True, exist_ok=True)
+            (keep / "MODEL.json").write_text(json.dumps(document))
         make = FOLLOWERS[who]
         if make:
             own = read_recording(client.recording(test["recording_id"]), Path("test.h5"))
@@ -154,7 +160,12 @@ def page(rows: list[dict[str, Any]], offline: list[dict[str, Any]]) -> str:
     if offline:
         seeds = sorted({row["seed"] for row in offline})
         lines += ["", "## Simulated, without waiting", ""]
-        lines += [f"`python -m bench.tracking`: {len(seeds)} muscles, seeds {seeds[0]} to {seeds[-1]}.", ""]
+        lines += [
+            f"`python -m bench.tracking`: {len(seeds)} muscles, seeds {seeds[0]} to {seeds[-1]}, "
+            f"noise {NOISE_NM:g} N·m. The controller that is not tracked halves its share after a worse trial; this "
+            "costs it much with fatigue.",
+            "",
+        ]
         lines += [*tables(offline), "", *_list(seconds_of(offline)), "", *_list(moved_lines(offline))]
     return "\n".join(lines) + "\n"
 
@@ -165,8 +176,9 @@ def rig_lines(rows: list[dict[str, Any]]) -> list[str]:
     lines = [f"Muscles of the seeds {', '.join(map(str, seeds))}.", "", *tables(rows), ""]
     lines += [*_list(seconds_of(rows)), "", *_list(moved_lines(rows)), ""]
     lines += [
-        "The rig drops a pulse when the computer is late for it. Errors are without what the approved model says these "
-        "would have given; in the last column they are as played.",
+        "The rig drops a pulse when the computer is late for it; the more work runs beside it, the more are dropped. "
+        "Errors are without what the approved model says these would have given; in the last column they are as "
+        "played.",
         "",
         "| muscle | case | follower | error of trials 1 to 10, % | dropped pulses | trials repeated | as played |",
         "|---" * 7 + "|",
@@ -198,6 +210,7 @@ def main() -> int:
     parser.add_argument("--cases", nargs="*", default=list(CASES))
     parser.add_argument("--who", nargs="*", default=[OURS, UNTRACKED])
     parser.add_argument("--json", type=Path, help="rows, one a line; those in it are not played again")
+    parser.add_argument("--keep", type=Path, help="a folder for each session's recordings")
     parser.add_argument("--offline", type=Path, help="rows of bench.tracking")
     options = parser.parse_args()
     rows = read_rows(options.json)
@@ -207,7 +220,8 @@ def main() -> int:
         print(f"{seed}, {case}, {who}", file=sys.stderr, flush=True)
         with tempfile.TemporaryDirectory(prefix="tracking-") as folder:
             try:
-                rows.append(one(seed, case, who, Path(folder)))
+                keep = options.keep and options.keep / f"{seed}-{case}-{who}".replace(" ", "-")
+                rows.append(one(seed, case, who, Path(folder), keep))
             except (Exception, SystemExit) as error:  # the machine stood still: told, and played again another time
                 print(f"{seed}, {case}, {who}: {error!r}", file=sys.stderr, flush=True)
                 continue
