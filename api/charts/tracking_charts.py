@@ -60,7 +60,7 @@ def _point(trial: Mapping[str, Any], name: str, unit: str, factor: float) -> Poi
     return {
         "at_s": float(trial["number"]), "value": None if value is None else factor * value, "half": half,
         "current_ma": None, "approved": trial["outcome"] in ("followed", "little"), "noted": bool(trial["ask"]),
-        "words": words, "tip": tip, "href": f"/tests/{trial['test_id']}",
+        "words": words, "tip": tip,
     }  # fmt: skip
 
 
@@ -120,7 +120,7 @@ class Picture(trend_charts.Plane):
         """What the pointer meets, told by the browser itself: the card is renewed while somebody points at it."""
         half = (WIDE - LEFT - RIGHT) / (2 * max(len(self.points), 1))
         return [
-            f'<a href="{escape(one["href"])}"><rect class="column" x="{self.x(one["at_s"]) - half:.1f}" y="0" '
-            f'width="{2 * half:.1f}" height="{TALL - BOTTOM:g}"><title>{escape(one["tip"])}</title></rect></a>'
+            f'<rect class="column" x="{self.x(one["at_s"]) - half:.1f}" y="0" '
+            f'width="{2 * half:.1f}" height="{TALL - BOTTOM:g}"><title>{escape(one["tip"])}</title></rect>'
             for one in self.points
         ]

@@ -167,6 +167,18 @@ def test_a_model_and_what_is_made_of_it(tab: Any, service: Service) -> None:
     visit(tab, service, "/participants/X3")
 
 
+def test_trials_of_a_controller(tab: Any, service: Service) -> None:
+    with service.client() as http:
+        http.post("/v1/participants", json={"code": "X7"})
+        model = run_test(http, "X7")["model_id"]
+        http.post(f"/v1/models/{model}/approve")
+        (service.data / "recordings" / "track.json").write_text(json.dumps({"values": {"gain": 0.5}}))
+        trial = http.post("/v1/tests", json={"participant": "X7", "kind": "sequence"}).json()
+        wait_done(http, trial["id"])
+        assert http.get("/v1/participants/X7/model?tracked=true").json()["tracking"]["ask"]
+    visit(tab, service, "/participants/X7", tab.get_by_text("All trials as a table").click)
+
+
 def test_in_the_dark(browser: Any, service: Service) -> None:
     """The main pages, their notices and their states, where the system is dark."""
     with service.client() as http:
