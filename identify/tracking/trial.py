@@ -38,8 +38,12 @@ NEAR = 1e-4
 SHAPE = 0.003
 """Of the largest torque: standard deviation of what is wrong in a coefficient of the curve, as no fit knows it."""
 
-RUN = np.array([0.05, 2.0])
-"""Standard deviations of how far the log gain and the threshold (µs) run within a trial."""
+OWN = np.array([0.05, 2.0, 0.006])
+"""Standard deviations of what is a trial's own: how far log gain and threshold (µs) run within it, and its lag (s).
+
+The lag is the rig's: after a computer's stall one trial was 7 ms later than its neighbours, which looked like a change
+of the gain by twice its band.
+"""
 
 
 @dataclass(frozen=True)
@@ -123,12 +127,12 @@ def look(model: Model, expected: State, record: Record) -> Seen:
     theta[problem.coefficients] += expected.curve_nm
     shift, gain = problem.chosen[-2].first, problem.chosen[-1].first
     curve = range(problem.coefficients.start, problem.coefficients.stop)
-    own = [gain + 1, shift + 1, *problem.baselines, *problem.initials]
+    own = [gain + 1, shift + 1, *problem.delay, *problem.baselines, *problem.initials]
     target = problem.setup.to_muscle(grid.torque_nm)
     scale_nm = max(float(np.ptp(target[grid.fitted])), 1e-6)
     theta[list(problem.baselines)] = np.median(target[grid.fitted][: max(4, round(0.5 / grid.step_s))])
     states = np.tile([0.1, 1.0], problem.setup.starts.size)
-    own_sd = np.r_[RUN, np.r_[np.ones(len(problem.baselines)), states] * scale_nm]
+    own_sd = np.r_[OWN, np.r_[np.ones(len(problem.baselines)), states] * scale_nm]
     found = _fitted(problem, theta, np.array([gain, shift, 0, *curve, *own]), _precision(expected, own_sd), target)
     expected_nm = _expected(model)
     vector, information = _marginal(found, expected.mean[expected.seen], own_sd)
