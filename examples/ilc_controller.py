@@ -105,7 +105,7 @@ class Plant:
     def now(self) -> Plant:
         """What was known after the last trial, where this one is what is expected of the next; forward only."""
         tracking = self.document.get("tracking")
-        if not tracking:
+        if not tracking or tracking["now"] is None:
             return self
         level = {name: (tracking["now"][name]["value"], tracking["coming"][name]["value"]) for name in TRACKED}
         (gain, of), (shift_us, from_us), (slow, than) = (level[name] for name in TRACKED)
@@ -120,7 +120,7 @@ class Plant:
         """1 where the last trial was the muscle's answer to its pulses alone, else 0; shape (N,)."""
         time_s = BEFORE_S + np.arange(self.response.size) / PULSE_RATE_HZ
         kept = np.ones(time_s.size)
-        for begin_s, end_s in self.document.get("tracking", {}).get("disturbed_s", ()):
+        for begin_s, end_s in self.document.get("tracking", {}).get("disturbed_s") or ():
             kept[(time_s > begin_s - ROUND_S) & (time_s < end_s + ROUND_S)] = 0.0
         return kept
 

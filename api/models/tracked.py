@@ -19,6 +19,8 @@ from api.store import Store, audit
 from api.store.tables import Approval, Model, Test, Tracked
 
 log = logging.getLogger("stimrig.tracking")
+TOLD = ("now", "coming", "disturbed_s")
+"""What of a step is served with the model."""
 SUPERSEDED = "Another model was approved, or this approval ended, before the trial was followed."
 
 
@@ -161,7 +163,7 @@ class TrackedVersions:
             document = json.loads(model_json)
             told = {
                 "approved_model_id": approval.model_id, "trial": row.number, "test_id": row.test_id,
-                "at_utc": row.at_utc, "levels": {when: step[when] for when in ("now", "coming")},
+                "at_utc": row.at_utc, **{key: step[key] for key in TOLD},
                 "limits": approval.tracking, "outcome": row.outcome,
             }  # fmt: skip
         else:
@@ -169,7 +171,7 @@ class TrackedVersions:
             document = json.loads(before.document if before is not None and before.document else trial.model_json)
             told = document.get("tracking") or {
                 "approved_model_id": approval.model_id, "trial": 0, "test_id": None, "at_utc": approval.at_utc,
-                "levels": None, "limits": approval.tracking, "outcome": None,
+                **dict.fromkeys(TOLD), "limits": approval.tracking, "outcome": None,
             }  # fmt: skip
         document["model_id"] = f"{approval.model_id}.{approval.id}.{told['trial']}"
         document["tracking"] = {**told, "ask": row.ask}

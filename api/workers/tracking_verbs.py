@@ -11,7 +11,7 @@ from api.workers.json_values import clean
 
 Progress = Callable[[float, str], None]
 STILL = {"gain": 1.0, "threshold_shift_us": 0.0, "time_scale": 1.0}
-"""A quantity that is not tracked stays there."""
+"""A quantity that is not tracked stays there in the model that is served."""
 MOST_MISSED = 50
 SETTLED_S = 0.2
 """So long the torque must have been measured at rest for its offset to be known."""
@@ -42,7 +42,7 @@ def track(
     model_json : str
         The approved MODEL.json.
     tracked : sequence of str
-        The quantities that a person allowed to move; the others stay in the model for the next trial.
+        The quantities that a person allowed to move; in the model for the next trial the others stay.
     state : dict, optional
         What was expected after the last trial that was followed.
     missed : int
@@ -57,7 +57,6 @@ def track(
         `reason` why the trial was not followed.
     """
     import identify
-    from identify.simulation.predict import refuse_rate
     from identify.tracking import State, begin, follow, moved_model
 
     progress(0.1, "reading the recording")
@@ -65,11 +64,11 @@ def track(
     error = error_percent(record, reference_torque_nm)
     try:
         model = second_order(identify.Model.from_json(model_json))
-        refuse_rate(model, record)
         before = begin(model, rates()) if state is None else State.from_dict(state)
         for _ in range(min(missed, MOST_MISSED)):
             before = before.ahead(rates())
         step = follow(model, before, record, rates())
+        # All three are followed: one that was held would be taken for a change of the others.
         still = {name: value for name, value in STILL.items() if name not in tracked}
         curve_nm = step.coming.curve_nm if "gain" in tracked else 0.0
         moved = moved_model(model, replace(step.coming.values, **still), curve_nm)

@@ -10,6 +10,7 @@ import numpy as np
 
 from identify.model import Model
 from identify.records.record import Record
+from identify.simulation.predict import refuse_rate
 from identify.tracking.served import moved_model
 from identify.tracking.state import LEVELS, QUANTITIES, USUAL, Rates, State, updated
 from identify.tracking.trial import Seen, curve_covariance, look
@@ -57,6 +58,13 @@ class Step:
     coming: State
     distance: float | None
 
+    @property
+    def disturbed_s(self) -> list[list[float]]:
+        """Stretches from which nothing should be learnt, s since the record's begin: all of an unexplained trial."""
+        if self.distance is None:
+            return [[0.0, self.seen.duration_s]]
+        return [list(stretch) for stretch in self.seen.disturbed]
+
     def to_dict(self) -> dict[str, Any]:
         """As JSON: the levels of this trial and of the next with their bands, and what people may ask."""
         return {
@@ -68,7 +76,7 @@ class Step:
             "expected_error_nm": self.seen.expected_nm,
             "error_before_nm": self.seen.before_nm,
             "torque_nm": self.seen.torque_nm,
-            "disturbed_s": [list(stretch) for stretch in self.seen.disturbed],
+            "disturbed_s": self.disturbed_s,
             "distance": self.distance,
             "state": self.coming.to_dict(),
         }
@@ -106,10 +114,12 @@ def follow(model: Model, state: State | None, record: Record, rates: Rates = USU
     Raises
     ------
     BadModel
-        The model cannot be tracked, or not on this record: see `identify.simulation.predict.problem_of`.
+        The model's dynamics are not of second order, the record's pulse rate is another one, or see
+        `identify.simulation.predict.problem_of`.
     BadRecord
         The record is too short, or sampled more slowly than the pulses.
     """
+    refuse_rate(model, record)
     before = begin(model, rates) if state is None else state
     seen = look(model, before, record)
     if seen.misfit > UNEXPLAINED:

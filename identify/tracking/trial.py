@@ -66,7 +66,9 @@ class Seen:
     torque_nm : float
         Root mean square of the torque that the model predicts, N·m.
     disturbed : tuple of (float, float)
-        Begin and end of the stretches that do not fit, s in the record's time.
+        Begin and end of the stretches that do not fit, s since the record's begin.
+    duration_s : float
+        Length of the record, s.
     """
 
     vector: np.ndarray
@@ -76,6 +78,7 @@ class Seen:
     before_nm: float
     torque_nm: float
     disturbed: tuple[tuple[float, float], ...]
+    duration_s: float
 
     @property
     def misfit(self) -> float:
@@ -145,6 +148,7 @@ def look(model: Model, expected: State, record: Record) -> Seen:
         before_nm=found.before_nm,
         torque_nm=found.torque_nm,
         disturbed=_stretches(grid, found.weight),
+        duration_s=grid.size * grid.step_s,
     )
 
 

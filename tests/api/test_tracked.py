@@ -83,7 +83,7 @@ def test_each_trial_moves_it_and_the_approved_one_never_changes(client: httpx.Cl
         assert gain(document, before.json()) == pytest.approx(0.98**number)
         assert (told["trial"], told["test_id"], told["approved_model_id"]) == (number, test["id"], approved)
         assert told["ask"] is None and told["outcome"] == "followed" and told["limits"]["gain_percent"] == 20.0
-        assert told["levels"]["coming"]["gain"]["low"] < told["levels"]["coming"]["gain"]["value"]
+        assert told["coming"]["gain"]["low"] < told["coming"]["gain"]["value"]
         assert document["model_id"].startswith(f"{approved}.") and document["model_id"].endswith(f".{number}")
         assert tracked(client, **{"If-None-Match": answer.headers["etag"]}).status_code == 304
         tags.add(answer.headers["etag"])

@@ -243,6 +243,13 @@ def test_a_hundred_trials_stay_well_behaved(model: Model) -> None:
     assert moves([step]).max() < 1.0
 
 
+def test_another_pulse_rate_is_refused(model: Model) -> None:
+    time_s = np.arange(2000) / 400.0
+    record = Record.from_arrays(time_s, np.full(2000, 100.0), np.zeros(2000), pulse_rate_hz=20.0)
+    with pytest.raises(BadModel, match="pulses a second"):
+        follow(model, None, record)
+
+
 def test_rates_are_the_usual_ones_until_there_are_earlier_sessions(model: Model) -> None:
     steps = followed(model, session(Changing(PATIENT), 2))
     assert learn_rates([]) is USUAL
