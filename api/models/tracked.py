@@ -19,6 +19,8 @@ from api.store import Store, audit
 from api.store.tables import Approval, Model, Test, Tracked
 
 log = logging.getLogger("stimrig.tracking")
+MOST_EARLIER = 20
+"""Approvals before this one from which it is learnt how fast a person changes."""
 TOLD = ("now", "coming", "disturbed_s")
 """What of a step is served with the model."""
 SUPERSEDED = "Another model was approved, or this approval ended, before the trial was followed."
@@ -46,6 +48,8 @@ class Trial:
         What is known from the last trial that was followed; None: there is none.
     missed : int
         Trials since then that were not followed.
+    earlier : list of list of dict
+        The levels of the trials under earlier approvals of this person, oldest first: how fast they change.
     """
 
     test: Test
@@ -56,6 +60,7 @@ class Trial:
     number: int
     state: dict[str, Any] | None
     missed: int
+    earlier: list[list[dict[str, Any]]]
 
 
 class TrackedVersions:
@@ -64,6 +69,7 @@ class TrackedVersions:
     def __init__(self, store: Store, clock: Clock, versions: Versions) -> None:
         self.store, self.clock, self.versions = store, clock, versions
         self._served: dict[str, Served] = {}
+        self._earlier: dict[int, list[list[dict[str, Any]]]] = {}
 
     # ---- a trial -----------------------------------------------------------------------------------------------
 
@@ -90,8 +96,17 @@ class TrackedVersions:
         return Trial(
             test, approval, text, bounds, problem, len(rows) + 1,
             followed[-1].step["state"] if followed and followed[-1].step else None,
-            len(rows) - followed[-1].number if followed else len(rows),
+            len(rows) - followed[-1].number if followed else len(rows), self.earlier(approval),
         )  # fmt: skip
+
+    def earlier(self, approval: Approval) -> list[list[dict[str, Any]]]:
+        """The levels of the trials under this person's earlier approvals, oldest first; read once for an approval."""
+        if approval.id not in self._earlier:
+            before = (Approval.participant == approval.participant, Approval.id < approval.id)
+            last = self.store.all(Approval, *before, order=Approval.id.desc(), limit=MOST_EARLIER)
+            sessions = [[row.step["now"] for row in self.rows(one.id) if row.step is not None] for one in last[::-1]]
+            self._earlier[approval.id] = [levels for levels in sessions if levels]
+        return self._earlier[approval.id]
 
     def text(self, approval: Approval) -> str:
         """The approved MODEL.json. Raises ApiError (500) where it is damaged."""

@@ -75,6 +75,7 @@ class Trials:
             return
         try:
             text = await asyncio.to_thread(self.tracked.text, approval)
+            await asyncio.to_thread(self.tracked.earlier, approval)
             await self.tracker.ask("track_warm", model_json=text)
         except ApiError as error:
             log.warning("the worker of trials could not be warmed: %s", error)
@@ -130,7 +131,7 @@ class Trials:
         try:
             return await self.tracker.ask(
                 "track", data=recording.path, model_json=trial.model_json, tracked=list(trial.bounds),
-                state=trial.state, missed=trial.missed,
+                state=trial.state, missed=trial.missed, earlier=trial.earlier,
                 reference_torque_nm=trial.test.plan.get("reference_torque_nm"),
             )  # fmt: skip
         except ApiError as error:

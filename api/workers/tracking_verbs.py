@@ -17,13 +17,6 @@ SETTLED_S = 0.2
 """So long the torque must have been measured at rest for its offset to be known."""
 
 
-def rates() -> Any:
-    """How fast this person changes from trial to trial."""
-    from identify.tracking import USUAL
-
-    return USUAL
-
-
 def track(
     data: str,
     progress: Progress,
@@ -31,6 +24,7 @@ def track(
     tracked: Sequence[str],
     state: dict[str, Any] | None = None,
     missed: int = 0,
+    earlier: Sequence[Sequence[dict[str, Any]]] = (),
     reference_torque_nm: Sequence[float] | None = None,
 ) -> dict[str, Any]:
     """Follow one trial.
@@ -47,6 +41,8 @@ def track(
         What was expected after the last trial that was followed.
     missed : int
         Trials since then that were not followed: what is known has become less certain by them.
+    earlier : sequence of sequences of dict
+        The levels of the trials of this person's earlier sessions: how fast they change from trial to trial.
     reference_torque_nm : sequence of float, optional
         What the controller wanted, one value for each pulse, N·m.
 
@@ -57,17 +53,18 @@ def track(
         `reason` why the trial was not followed.
     """
     import identify
-    from identify.tracking import State, begin, follow, moved_model
+    from identify.tracking import State, begin, follow, learn_rates, moved_model
 
     progress(0.1, "reading the recording")
     record = identify.read(Path(data))
     error = error_percent(record, reference_torque_nm)
     try:
         model = second_order(identify.Model.from_json(model_json))
-        before = begin(model, rates()) if state is None else State.from_dict(state)
+        rates = learn_rates(earlier)
+        before = begin(model, rates) if state is None else State.from_dict(state)
         for _ in range(min(missed, MOST_MISSED)):
-            before = before.ahead(rates())
-        step = follow(model, before, record, rates())
+            before = before.ahead(rates)
+        step = follow(model, before, record, rates)
         # All three are followed: one that was held would be taken for a change of the others.
         still = {name: value for name, value in STILL.items() if name not in tracked}
         curve_nm = step.coming.curve_nm if "gain" in tracked else 0.0
@@ -139,7 +136,7 @@ def warm(progress: Progress, model_json: str) -> dict[str, Any]:
         own = {"pulse_rate_hz": model.pulse_rate_hz}
         empty = identify.Record.from_arrays(time_s, widths_us, np.zeros(time_s.size), **own)
         torque_nm = identify.predict(model, empty)
-        step = follow(model, None, identify.Record.from_arrays(time_s, widths_us, torque_nm, **own), rates())
+        step = follow(model, None, identify.Record.from_arrays(time_s, widths_us, torque_nm, **own))
         model_for_next(model, step).to_json(None)
     return {}
 

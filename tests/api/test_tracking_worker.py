@@ -13,7 +13,6 @@ import pytest
 import identify
 from api.models.tracking import QUANTITIES
 from api.workers import tracking_verbs
-from identify import tracking
 from rig import messages as m
 from tests.api.fake_rig import PATIENT, write_recording
 from tests.harness.sessions import Planned, record
@@ -108,15 +107,16 @@ def test_the_error_is_that_of_the_torque_above_rest(model_json: str, tmp_path: P
     assert follow(data, model_json, reference_torque_nm=[0.0] * WIDTHS.size)["error_percent"] is None
 
 
-def test_rates_of_a_person_go_in_at_one_place(model_json: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    data = recorded(tmp_path, 0.9)
-    usual = follow(data, model_json)["step"]["coming"]["gain"]
-    steady = tracking.Rates(
-        start=np.full(3, 1e-4), step=np.full(3, 1e-6), trend_sd=np.full(3, 1e-6), turn=np.full(3, 1e-6)
+def test_a_person_who_tired_in_earlier_sessions_is_expected_to(model_json: str, tmp_path: Path) -> None:
+    def told(gain: float) -> dict[str, Any]:
+        values = {"gain": gain, "threshold_shift_us": 0.0, "time_scale": 1.0}
+        return {name: {"value": value, "low": value, "high": value} for name, value in values.items()}
+
+    data, earlier = recorded(tmp_path, 0.95), [[told(0.95**trial) for trial in range(1, 6)]] * 4
+    usual, known = (
+        follow(data, model_json, **more)["step"]["coming"]["gain"]["value"] for more in ({}, {"earlier": earlier})
     )
-    monkeypatch.setattr(tracking_verbs, "rates", lambda: steady)
-    slow = follow(data, model_json)["step"]["coming"]["gain"]
-    assert usual["value"] < 0.95 < slow["value"]
+    assert known < usual - 0.02
 
 
 def test_warming_needs_no_recording_and_refuses_no_model(model_json: str) -> None:
