@@ -112,6 +112,9 @@ class Server:
         with_samples = isinstance(event, LiveEvent) and event.samples is not None
         plain = to_line(event.model_copy(update={"samples": None, "late": []})) if with_samples else full
         for writer, samples in tuple(self._subscribers.items()):
+            if writer.transport.is_closing():  # it left while its subscription was still being answered
+                self._subscribers.pop(writer, None)
+                continue
             waiting = writer.transport.get_write_buffer_size()
             if waiting > DEAD_BYTES:
                 self._subscribers.pop(writer, None)

@@ -97,6 +97,21 @@ def test_samples_are_heard_before_the_adviser_is_ready(
     assert counters == list(range(len(counters))) and len(counters) > 800
 
 
+def test_a_folder_that_the_pool_learns_ends_no_test(
+    client: httpx.Client, service: Service, participant: str, tmp_path: Path
+) -> None:
+    """A recording elsewhere starts the pool's workers anew, not the one that keeps the test."""
+    context = service.app.state.context
+    ask = context.runner.adaptive.adviser.ask
+
+    async def meanwhile(verb: str, **arguments: Any) -> dict[str, Any]:
+        context.pool.places.learn({"data": str(tmp_path / verb / "recording.h5")})
+        return await ask(verb, **arguments)
+
+    context.runner.adaptive.adviser.ask = meanwhile
+    assert played(client)["adaptive"]["ended"] == "known-enough"
+
+
 def test_a_start_that_took_long_is_not_played_and_is_quick_when_asked_again(
     client: httpx.Client, service: Service, participant: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

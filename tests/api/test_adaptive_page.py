@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from tests.api.browser import participant
+from tests.api.browser import open_tab, participant
 from tests.api.conftest import STUB, Service, run_service, wait_done
 from tests.api.test_axe import examined
 
@@ -78,11 +78,40 @@ def test_in_german(tab: Any, service: Service) -> None:
     assert tab.locator("#knows [lang=en]").count() == 0
 
 
+LOOKS = (
+    "(name) => { const is = getComputedStyle(document.getElementById(name)); return [is.fontStyle, is.fontWeight]; }"
+)
+
+
+@pytest.mark.parametrize("colours", ["light", "dark"])
+def test_numbers_that_are_out_of_date_look_so_and_can_be_read(browser: Any, service: Service, colours: str) -> None:
+    cut: list[bool] = []
+
+    def forward(socket: Any) -> None:
+        server = socket.connect_to_server()
+        server.on_message(lambda message: None if cut else socket.send(message))
+
+    for page in open_tab(browser, service, color_scheme=colours):
+        participant(page, service, f"X{colours}")
+        page.route_web_socket("**/live", forward)
+        begun(page, "0,2")
+        page.locator("#known-words", has_text="known within 8.0 %").wait_for()
+        numbers = ("left", "current", "dose-used", "known-words")
+        assert {page.evaluate(LOOKS, name)[0] for name in numbers} == {"normal"}
+        cut.append(True)
+        page.locator("#live.is-stale").wait_for()
+        assert [page.evaluate(LOOKS, name) for name in numbers] == [["italic", "400"]] * 4
+        assert page.evaluate(LOOKS, "age")[0] == "normal", "this one is still right"
+        examined(page, "out of date")
+        assert page.locator("#live.is-stale").count() == 1
+
+
 def test_a_worker_that_dies_is_told_on_the_page(tab: Any, service: Service) -> None:
     service.rig.speed = 1.0
     participant(tab, service, "X1")
     begun(tab, "45")
     tab.locator("#fixed-why").get_by_text("The fixed plan plays on").wait_for()
+    tab.locator("#stops-once").wait_for(state="hidden")
 
 
 @pytest.mark.parametrize("typed", ["", "-1", "nan", "0,1", "51", "zwei", "1e1"])

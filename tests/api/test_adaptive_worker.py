@@ -172,3 +172,18 @@ def test_a_worker_that_died_between_two_questions_is_told() -> None:
             await adviser.close()
 
     asyncio.run(asked())
+
+
+def test_a_begin_that_failed_leaves_no_test_to_advise() -> None:
+    async def asked() -> None:
+        adviser = Adviser()
+        try:
+            await adviser.ask("adaptive_begin", **HOW)
+            with pytest.raises(ApiError):
+                await adviser.ask("adaptive_begin", **HOW, models=7)
+            with pytest.raises(ApiError, match="between two questions"):
+                await adviser.ask("adaptive_advise", **Cell(sigmoid(71), 1).news([0.0] * 80, 2.0))
+        finally:
+            await adviser.close()
+
+    asyncio.run(asked())

@@ -123,22 +123,6 @@ def test_a_test_and_its_ends(tab: Any, service: Service) -> None:
     service.rig.speed = 8.0
 
 
-@pytest.mark.parametrize("colours", ["light", "dark"])
-def test_a_display_that_is_out_of_date(browser: Any, service: Service, colours: str) -> None:
-    """Its numbers look so, and can still be read."""
-    service.rig.speed = 0.7
-    for page in open_tab(browser, service, color_scheme=colours):
-        participant(page, service, f"X7{colours}")
-        page.route_web_socket("**/live", lambda socket: socket.close())
-        start(page)
-        page.locator("#live.is-stale").wait_for()
-        examined(page, "out of date")
-        assert page.locator("#live.is-stale").count() == 1
-        page.get_by_role("button", name="Stop stimulation").click()
-        page.get_by_text("The rig confirms").wait_for()
-    service.rig.speed = 8.0
-
-
 def test_a_model_and_what_is_made_of_it(tab: Any, service: Service) -> None:
     with service.client() as http:
         http.post("/v1/participants", json={"code": "X3"})

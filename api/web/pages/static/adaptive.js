@@ -9,6 +9,7 @@ function showAdaptive(told) {
   if (told.least_known) say("least-known", words.least_known.replace("{width}", shown(told.least_known.pulse_width_us.toFixed(0))).replace("{time}", shown(told.least_known.time_s.toFixed(2))));
   const why = document.getElementById("fixed-why");
   why.hidden = !told.problem; if (told.problem) say("fixed-why", told.problem);
+  document.getElementById("stops-once").hidden = !!told.problem;
   showEnough(told.state === "choosing" || told.state === "fixed");
 }
 

@@ -43,7 +43,12 @@ function addFrame(message) {
   state.pulseTime.push(...message.pulse_time_s); state.width.push(...message.pulse_width_us);
   if (!state.test.adaptive) return;
   showDose(message.torque_time_nms);
-  if (message.laid_segments.length !== (state.laid || []).length) { state.laid = message.laid_segments; drawTrack(); }
+  if (laidEnd(message.laid_segments) !== laidEnd(state.laid || [])) { state.laid = message.laid_segments; drawTrack(); }
+}
+
+function laidEnd(segments) { // the end of a test replaces a segment that was laid: their number stays
+  const last = segments[segments.length - 1];
+  return last ? last.name + " " + last.end_s : "";
 }
 
 function showNumbers(message) {
