@@ -13,6 +13,7 @@ from sqlalchemy.orm import defer
 from api.clock import Clock
 from api.errors import ApiError
 from api.models import headline, stored, tracking
+from api.models.places import Place, differ, place_of
 from api.models.registry import Served, Versions
 from api.models.tracking import NOT_FOLLOWED, Bounds, Limits
 from api.store import Store, audit
@@ -100,13 +101,26 @@ class TrackedVersions:
         )  # fmt: skip
 
     def earlier(self, approval: Approval) -> list[list[dict[str, Any]]]:
-        """The levels of the trials under this person's earlier approvals, oldest first; read once for an approval."""
+        """The levels of the trials under this person's earlier approvals, oldest first; read once for an approval.
+
+        Those of another side, muscle or current say nothing here.
+        """
         if approval.id not in self._earlier:
             before = (Approval.participant == approval.participant, Approval.id < approval.id)
             last = self.store.all(Approval, *before, order=Approval.id.desc(), limit=MOST_EARLIER)
-            sessions = [[row.step["now"] for row in self.rows(one.id) if row.step is not None] for one in last[::-1]]
+            alike = [one for one in last[::-1] if not self.elsewhere(one, self.places(approval))]
+            sessions = [[row.step["now"] for row in self.rows(one.id) if row.step is not None] for one in alike]
             self._earlier[approval.id] = [levels for levels in sessions if levels]
         return self._earlier[approval.id]
+
+    def places(self, approval: Approval) -> list[Place]:
+        """Where the test of the approved model stimulated; nothing is known of an uploaded recording."""
+        model: Model = self.store.get(Model, approval.model_id)
+        return [place_of(test) for test in self.store.all(Test, Test.recording_id == model.recording_id)]
+
+    def elsewhere(self, approval: Approval, places: list[Place]) -> bool:
+        """Whether an approved model is known to be one of another side, muscle or current than these places."""
+        return any(differ(own, place) for own in self.places(approval) for place in places)
 
     def text(self, approval: Approval) -> str:
         """The approved MODEL.json. Raises ApiError (500) where it is damaged."""
@@ -221,16 +235,18 @@ class TrackedVersions:
 
     def text_of(self, model_id: str) -> str:
         """MODEL.json of a version, or of one that was tracked from it. Raises ApiError (404, 500)."""
-        base, _, number = model_id.rpartition(".")
-        base, _, approval = base.rpartition(".")
-        if base and all(part.isascii() and part.isdigit() and len(part) < 10 for part in (approval, number)):
-            conditions = (Tracked.model_id == base, Tracked.approval_id == int(approval))
-            if int(number) == 0:
-                return stored.text(self.versions.get(base))
-            for row in self.store.all(Tracked, *conditions, Tracked.number == int(number)):
+        base, approval, number = _parts(model_id)
+        if number:
+            conditions = (Tracked.model_id == base, Tracked.approval_id == approval, Tracked.number == number)
+            for row in self.store.all(Tracked, *conditions):
                 if row.document is not None:
                     return row.document.decode()
-        return stored.text(self.versions.get(model_id))
+            base = model_id
+        return stored.text(self.versions.get(base))
+
+    def version_of(self, model_id: str) -> Model:
+        """The version itself, or the one from which it was tracked. Raises ApiError (404)."""
+        return self.versions.get(_parts(model_id)[0])
 
     def asks(self, approval_id: int) -> str | None:
         """Why a new test is needed now; None where none is."""
@@ -264,6 +280,14 @@ def told(row: Tracked) -> dict[str, Any]:
     more = {name: step.get(name) for name in ("now", "coming", "error_nm", "expected_error_nm", "disturbed_s")}
     kept = ("number", "test_id", "recording_id", "at_utc", "outcome", "reason", "ask", "error_percent", "delay_s")
     return {**{name: getattr(row, name) for name in kept}, **more}
+
+
+def _parts(model_id: str) -> tuple[str, int, int]:
+    """The version, the approval and the trial of a tracked id; of any other one itself, 0 and 0."""
+    base, *places = model_id.rsplit(".", 2)
+    if base and len(places) == 2 and all(part.isascii() and part.isdigit() and len(part) < 10 for part in places):
+        return base, int(places[0]), int(places[1])
+    return model_id, 0, 0
 
 
 def _served(row: Tracked, approval: Approval) -> Served:

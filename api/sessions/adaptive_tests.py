@@ -13,11 +13,11 @@ from typing import Any
 from api.clock import Clock
 from api.errors import ApiError
 from api.models import stored
+from api.models.places import Place, differ, place_of
 from api.models.registry import Versions
 from api.sessions import adaptive_plan
 from api.sessions.adaptive import Follower, Told
 from api.sessions.adaptive_plan import ADAPTIVE, PIECE_S
-from api.sessions.places import Place, differ, place_of
 from api.sessions.requests import TestIn
 from api.sessions.rig_client import RigClient
 from api.store.tables import Participant, Test

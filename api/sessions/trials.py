@@ -14,11 +14,11 @@ from typing import Any
 
 from api.clock import Clock
 from api.errors import ApiError
+from api.models.places import place_of
 from api.models.tracked import TrackedVersions, Trial
-from api.sessions.places import differ, place_of
 from api.sessions.requests import TestIn
 from api.store import Store
-from api.store.tables import Approval, Model, Recording, Test, Tracked
+from api.store.tables import Approval, Recording, Test, Tracked
 from api.workers.adviser import Adviser
 
 log = logging.getLogger("stimrig.tracking")
@@ -126,11 +126,11 @@ class Trials:
         recording: Recording | None = await asyncio.to_thread(self.store.get, Recording, trial.test.recording_id or "")
         if recording is None or trial.problem:
             return {"reason": trial.problem or "It has no recording."}
-        if await asyncio.to_thread(self._elsewhere, trial):
+        if await asyncio.to_thread(self.tracked.elsewhere, trial.approval, [place_of(trial.test)]):
             return {"reason": ELSEWHERE}
         try:
             return await self.tracker.ask(
-                "track", data=recording.path, model_json=trial.model_json, tracked=list(trial.bounds),
+                "track", data=recording.path, model_json=trial.model_json, bounds=trial.bounds,
                 state=trial.state, missed=trial.missed, earlier=trial.earlier,
                 reference_torque_nm=trial.test.plan.get("reference_torque_nm"),
             )  # fmt: skip
@@ -138,11 +138,6 @@ class Trials:
             if error.code == "worker-died":
                 self.warm(trial.test.participant)
             return {"reason": error.detail or error.title}
-
-    def _elsewhere(self, trial: Trial) -> bool:
-        model: Model = self.store.get(Model, trial.approval.model_id)
-        tests = self.store.all(Test, Test.recording_id == model.recording_id)
-        return any(differ(place_of(test), place_of(trial.test)) for test in tests)
 
     # ---- the service's own day ---------------------------------------------------------------------------------
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ def track(
     data: str,
     progress: Progress,
     model_json: str,
-    tracked: Sequence[str],
+    bounds: Mapping[str, Sequence[float]],
     state: dict[str, Any] | None = None,
     missed: int = 0,
     earlier: Sequence[Sequence[dict[str, Any]]] = (),
@@ -35,8 +35,9 @@ def track(
         The recording.
     model_json : str
         The approved MODEL.json.
-    tracked : sequence of str
-        The quantities that a person allowed to move; in the model for the next trial the others stay.
+    bounds : mapping of str to (float, float)
+        Least and most that a person allowed, of each quantity that may move; in the model for the next trial the
+        others stay.
     state : dict, optional
         What was expected after the last trial that was followed.
     missed : int
@@ -53,7 +54,7 @@ def track(
         `reason` why the trial was not followed.
     """
     import identify
-    from identify.tracking import State, begin, follow, learn_rates, moved_model
+    from identify.tracking import State, begin, follow, largest_change, learn_rates, moved_model
 
     progress(0.1, "reading the recording")
     record = identify.read(Path(data))
@@ -66,9 +67,13 @@ def track(
             before = before.ahead(rates)
         step = follow(model, before, record, rates)
         # All three are followed: one that was held would be taken for a change of the others.
-        still = {name: value for name, value in STILL.items() if name not in tracked}
-        curve_nm = step.coming.curve_nm if "gain" in tracked else 0.0
-        moved = moved_model(model, replace(step.coming.values, **still), curve_nm)
+        still = {name: value for name, value in STILL.items() if name not in bounds}
+        values = replace(step.coming.values, **still)
+        low, high = bounds.get("gain", (1.0, 1.0))
+        # The torque of every pulse stays within what the gain may be; if it does not, the curve keeps its shape.
+        away = values.gain * largest_change(model, step.coming.curve_nm)
+        curve_nm = step.coming.curve_nm if low <= values.gain - away and values.gain + away <= high else 0.0
+        moved = moved_model(model, values, curve_nm)
     except identify.IdentifyError as problem:
         return {"error_percent": error, "reason": " ".join(str(problem).split())}
     return {"error_percent": error, "step": clean(step.to_dict()), "model": moved.to_json(None)}

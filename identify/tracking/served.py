@@ -52,6 +52,12 @@ def _apart(knots_us: np.ndarray, largest_us: float) -> np.ndarray:
     return np.array([*kept, largest_us])
 
 
+def largest_change(model: Model, curve_nm: np.ndarray) -> float:
+    """How far `curve_nm` moves the curve anywhere, as a share of its largest torque."""
+    change = replace(model.recruitment, coefficients_nm=curve_nm).table()[1]
+    return float(np.max(np.abs(change)) / max(np.ptp(model.recruitment.table()[1]), 1e-9))
+
+
 def moved_model(model: Model, values: Values, curve_nm: np.ndarray | float = 0.0) -> Model:
     """The model with the levels of `values`, and with `curve_nm` added to the coefficients of its curve.
 

@@ -180,7 +180,7 @@ def tracked(arguments: dict[str, Any]) -> dict[str, Any]:
         "disturbed_s": [], "distance": 2.0, "state": after,
     }  # fmt: skip
     moved = json.loads(arguments["model_json"])
-    gain = values["gain"] if "gain" in arguments["tracked"] else 1.0
+    gain = values["gain"] if "gain" in arguments["bounds"] else 1.0
     moved["recruitment"]["torque_nm"] = [gain * y for y in moved["recruitment"]["torque_nm"]]
     return {"error_percent": error, "step": step, "model": json.dumps(moved)}
 

@@ -116,8 +116,12 @@ def test_a_tracked_version_foretells_a_trial(client: httpx.Client, approved: str
     for model_id in (approved, tracked_id, f"{approved}.1.0"):
         told = client.post(f"/v1/models/{model_id}/prediction", json=body)
         assert told.status_code == 200 and told.json()["model_id"] == model_id
+        wanted = client.post(f"/v1/models/{model_id}/widths", json={"reference_torque_nm": [0.0, 1.0]})
+        assert wanted.status_code == 200 and wanted.json()["model_id"] == model_id
     for model_id in (f"{approved}.1.2", f"{approved}.2.1", "none.1.1", f"{approved}.1.{'9' * 30}", ".1.1"):
         assert client.post(f"/v1/models/{model_id}/prediction", json=body).status_code == 404
+        wanted = {"reference_torque_nm": [1.0]}
+        assert client.post(f"/v1/models/{model_id}/widths", json=wanted).status_code == 404
 
 
 # ---- within what a person allowed -------------------------------------------------------------------------------
@@ -283,6 +287,21 @@ def test_a_recording_that_is_gone_or_another_current(service: Service, client: h
     play(client)
     (row,) = soon(lambda: trials(client))
     assert row["outcome"] == "not-followed" and "another side, muscle or current" in row["reason"]
+
+
+def test_rates_are_learnt_from_the_same_place(service: Service, client: httpx.Client, approved: str) -> None:
+    def sessions() -> int:
+        tracked = service.app.state.context.tracked
+        return len(tracked.earlier(tracked.allowing("P017")))
+
+    play(client)
+    assert sessions() == 0
+    client.post(f"/v1/models/{approved}/approve")
+    assert sessions() == 1, "the approval before this one"
+    client.put("/v1/participants/P017/profile", json={"current_ma": 15.0})
+    other = run_test(client, "P017")["model_id"]
+    assert client.post(f"/v1/models/{other}/approve").status_code == 200
+    assert sessions() == 0, "none at this current"
 
 
 def test_a_damaged_model_is_not_followed(service: Service, client: httpx.Client, approved: str) -> None:

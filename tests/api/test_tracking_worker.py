@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 
 import identify
-from api.models.tracking import QUANTITIES
+from api.models.tracking import Limits
 from api.workers import tracking_verbs
 from rig import messages as m
 from tests.api.fake_rig import PATIENT, write_recording
 from tests.harness.sessions import Planned, record
 
 RATE_HZ = 400
+WIDE = Limits(60.0, 60.0, 60.0).bounds(80.0)
 WIDTHS = np.concatenate([
     np.zeros(40), np.linspace(0.0, 200.0, 80), np.full(60, 200.0), np.linspace(200.0, 120.0, 60), np.full(80, 120.0),
     np.linspace(120.0, 0.0, 120), np.zeros(40),
@@ -46,7 +47,7 @@ def recorded(folder: Path, gain: float, offset_nm: float = 0.0) -> str:
 
 
 def follow(data: str, model_json: str, **more: Any) -> dict[str, Any]:
-    return tracking_verbs.track(data, silent, **{"model_json": model_json, "tracked": QUANTITIES} | more)
+    return tracking_verbs.track(data, silent, **{"model_json": model_json, "bounds": WIDE} | more)
 
 
 def test_trials_of_a_muscle_that_tires_are_followed_to_the_model_of_the_next(model_json: str, tmp_path: Path) -> None:
@@ -64,10 +65,27 @@ def test_trials_of_a_muscle_that_tires_are_followed_to_the_model_of_the_next(mod
 
 
 def test_what_a_person_does_not_let_move_stays(model_json: str, tmp_path: Path) -> None:
-    found = follow(recorded(tmp_path, 0.9), model_json, tracked=["time_scale"])
+    found = follow(recorded(tmp_path, 0.9), model_json, bounds={"time_scale": (0.5, 1.5)})
     moved, approved = identify.Model.from_json(found["model"]), identify.Model.from_json(model_json)
     assert moved.recruitment.table()[1] == pytest.approx(approved.recruitment.table()[1])
     assert found["step"]["now"]["gain"]["value"] < 0.95, "it is seen all the same"
+
+
+def test_the_shape_of_the_curve_moves_no_torque_beyond_what_the_gain_may(model_json: str, tmp_path: Path) -> None:
+    data, approved = recorded(tmp_path, 0.95), identify.Model.from_json(model_json)
+
+    def served(low: float, high: float) -> tuple[np.ndarray, float]:
+        found = follow(data, model_json, bounds={"gain": (low, high)})
+        torque_nm = approved.recruitment.table()[0]
+        moved = identify.Model.from_json(found["model"]).recruitment(torque_nm)
+        return moved - gain_of(found) * approved.recruitment(torque_nm), gain_of(found)
+
+    def gain_of(found: dict[str, Any]) -> float:
+        return float(found["step"]["coming"]["gain"]["value"])
+
+    shape_nm, gain = served(0.5, 1.5)
+    assert np.max(np.abs(shape_nm)) > 1e-4, "the shape is corrected, too"
+    assert np.max(np.abs(served(gain - 1e-6, gain + 1e-6)[0])) < 1e-9, "not where that would pass the limit"
 
 
 def test_a_trial_in_between_that_was_not_followed_widens_what_is_expected(model_json: str, tmp_path: Path) -> None:

@@ -36,7 +36,7 @@ async def invert(
     row = await asyncio.to_thread(context.versions.get, model_id)
     table = text_of(await file.read()) if file is not None else ""
     try:
-        found = await inverted(context, row, {"table": table})
+        found = await inverted(context, model_id, {"table": table})
     except ApiError as error:
         if error.status != 422:
             raise
@@ -47,8 +47,7 @@ async def invert(
 @router.post("/widths.csv")
 async def download(context: Ctx, _who: ModelReader, model_id: str, reference: Annotated[str, Form()] = "") -> Response:
     """The same as a table: time, pulse width, reference, prediction."""
-    row = await asyncio.to_thread(context.versions.get, model_id)
-    found = await inverted(context, row, {"table": reference})
+    found = await inverted(context, model_id, {"table": reference})
     headers = {"Content-Disposition": 'attachment; filename="widths.csv"'}
     return PlainTextResponse(words.table(found), media_type="text/csv; charset=utf-8", headers=headers)
 

@@ -8,10 +8,9 @@ from typing import Annotated, Any
 from fastapi import APIRouter
 from pydantic import Field, FiniteFloat, StrictBool
 
-from api.models import stored
 from api.sessions.limits import tighter
 from api.sessions.requests import Body
-from api.store.tables import Model, Participant
+from api.store.tables import Participant
 from api.web.dependencies import PROBLEM, Context, Ctx, ModelReader
 from api.web.responses.base import answers
 from api.web.responses.models import InversionOut
@@ -36,14 +35,16 @@ class ReferenceIn(Body):
 
 @router.post("/models/{model_id}/widths", **answers(InversionOut))
 async def widths(context: Ctx, _who: ModelReader, model_id: str, body: ReferenceIn) -> dict[str, Any]:
-    """The pulse widths whose predicted torque follows a reference best, and where and why it is out of reach."""
-    row = await asyncio.to_thread(context.versions.get, model_id)
+    """The pulse widths whose predicted torque follows a reference best, and where and why it is out of reach.
+
+    Of a version, or of one that was tracked from it (its `model_id`).
+    """
     given = body.model_dump(include={"reference_torque_nm", "time_s", "pulse_rate_hz"})
-    return await inverted(context, row, given, body.max_pulse_width_us, body.max_rise_us, body.whole_us)
+    return await inverted(context, model_id, given, body.max_pulse_width_us, body.max_rise_us, body.whole_us)
 
 
 async def inverted(
-    context: Context, row: Model, given: dict[str, Any], width_us: float | None = None, rise_us: float | None = None,
+    context: Context, model_id: str, given: dict[str, Any], width_us: float | None = None, rise_us: float | None = None,
     whole: bool = True,
 ) -> dict[str, Any]:  # fmt: skip
     """What a worker makes of a reference, within the limits of participant and rig.
@@ -55,15 +56,17 @@ async def inverted(
     width_us, rise_us : float, optional
         Further limits.
     """
-    participant: Participant = await asyncio.to_thread(context.store.get, Participant, row.participant)
+    text = await asyncio.to_thread(context.tracked.text_of, model_id)
+    version = await asyncio.to_thread(context.tracked.version_of, model_id)
+    participant: Participant = await asyncio.to_thread(context.store.get, Participant, version.participant)
     largest_us = tighter(width_us, participant.profile.get("max_pulse_width_us"))
     rise_us = tighter(rise_us, _rise_of_rig(context))
     call = context.pool.submit(
-        "invert", urgent=True, model_json=stored.text(row), largest_us=largest_us, rise_us=rise_us, whole=whole, **given
+        "invert", urgent=True, model_json=text, largest_us=largest_us, rise_us=rise_us, whole=whole, **given
     )
     found = await call.result
     limits = {"max_pulse_width_us": largest_us, "max_rise_us": rise_us}
-    return {"model_id": row.id, **found, **limits, "segments": segments(found["pulse_width_us"])}
+    return {"model_id": model_id, **found, **limits, "segments": segments(found["pulse_width_us"])}
 
 
 def _rise_of_rig(context: Context) -> float | None:
