@@ -221,10 +221,18 @@ class Service:
         return self.known.document
 
     def fetch_followed(self) -> dict[str, Any]:
-        """The tracked model once the trial just played is in it, or the last one if that does not come."""
+        """The tracked model once the trial just played is in it, or the last one if that does not come.
+
+        Raises
+        ------
+        HaltedError
+            The muscle is no longer what a person allowed: they are asked.
+        """
         patience = time.monotonic() + TRACKED_WITHIN_S
         while True:
             document = self.fetch(tracked=True)
+            if ask := document.get("tracking", {}).get("ask"):
+                raise HaltedError(ask)
             if self.known.changed or time.monotonic() > patience:
                 return document
             time.sleep(0.05)

@@ -281,3 +281,10 @@ def test_a_followed_model_is_waited_for(ilc: ModuleType) -> None:
             return SimpleNamespace(document={"number": self.asked}, changed=self.asked == 3)
 
     assert ilc.Service(Slow(), "P").fetch_followed() == {"number": 3}
+
+
+def test_it_stops_where_a_person_has_to_be_asked(ilc: ModuleType) -> None:
+    asks = SimpleNamespace(document={"tracking": {"ask": "A new test is needed."}}, changed=True)
+    client = SimpleNamespace(approved_model=lambda *_, **__: asks)
+    with pytest.raises(ilc.HaltedError, match="A new test is needed"):
+        ilc.Service(client, "P").fetch_followed()
