@@ -213,6 +213,7 @@ class Service:
     def __init__(self, client: Client, participant: str) -> None:
         self.client, self.participant = client, participant
         self.known: Any = None
+        self.wanted_nm: np.ndarray | None = None
 
     def fetch(self, tracked: bool = False) -> dict[str, Any]:
         """The approved model, as it is or tracked. It is sent again only if it has changed (ETag)."""
@@ -250,11 +251,15 @@ class Service:
         raise HaltedError(f"the trial ended as {test['state']}: {test['reason']}")
 
     def start(self, segments: list[dict[str, Any]]) -> str:
-        """Start a trial as soon as the rig has rested; the id of its test."""
+        """Start a trial as soon as the rig has rested; the id of its test. The service shows its error."""
         patience = time.monotonic() + 90
+        rests = round(BEFORE_S * PULSE_RATE_HZ), round(AFTER_S * PULSE_RATE_HZ)
+        wanted_nm = None if self.wanted_nm is None else np.pad(self.wanted_nm, rests).tolist()
         while True:
             try:
-                return self.client.start_test(self.participant, kind="sequence", segments=segments)["id"]
+                return self.client.start_test(
+                    self.participant, kind="sequence", segments=segments, reference_torque_nm=wanted_nm
+                )["id"]
             except (Conflict, Invalid) as error:
                 if "rest" not in error.detail or time.monotonic() > patience:
                     raise
@@ -340,6 +345,7 @@ def learn(
         demand = demand if static_start else follow(plant, demand, reference.torque_nm, predict)
     if tracked or not model["effects"]:
         update = LAWS[law](plant)
+    service.wanted_nm = reference.torque_nm
     share, left_nm = 1.0, np.zeros(demand.size)
     for _ in range(trials):
         widths_us = plant.widths(demand)
