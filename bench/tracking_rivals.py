@@ -19,7 +19,7 @@ from identify.model import Model
 from identify.records.join import join
 from identify.records.record import Record
 from identify.recruitment.curve import Curve
-from identify.tracking import Values, follow, model_for_next, moved_model
+from identify.tracking import QUANTITIES, Values, follow, model_for_next, moved_model
 
 PULSE_RATE_HZ = 40.0
 FINE = 20
@@ -80,7 +80,7 @@ def tracked(ours: Any, trial: Record) -> dict[str, Any]:
     """What the service serves after a trial, made here from the recording."""
     step = follow(ours.model, ours.state, trial)
     ours.state = step.coming
-    return model_for_next(ours.model, step).to_dict() | {"tracking": step.to_dict()}
+    return model_for_next(ours.model, step).to_dict() | {"tracking": step.to_dict() | {"moved": list(QUANTITIES)}}
 
 
 class Recursive:

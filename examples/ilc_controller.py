@@ -108,7 +108,8 @@ class Plant:
         if not tracking or tracking["now"] is None:
             return self
         level = {name: (tracking["now"][name]["value"], tracking["coming"][name]["value"]) for name in TRACKED}
-        (gain, of), (shift_us, from_us), (slow, than) = (level[name] for name in TRACKED)
+        held = (1.0, 1.0)  # by what does not move with the muscle nothing is explained: it is learnt
+        (gain, of), (shift_us, from_us), (slow, than) = (level[n] if n in tracking["moved"] else held for n in TRACKED)
         plant, time = copy.copy(self), np.arange(self.response.size + 1.0)
         plant.level_nm = gain / of * self.level(self.width_us - (shift_us - from_us))
         step = np.interp((time[1:] - 0.5) * than / slow, np.r_[0.0, time[1:] - 0.5], np.r_[0.0, self.response.cumsum()])
@@ -216,24 +217,24 @@ class Service:
         self.wanted_nm: np.ndarray | None = None
 
     def fetch(self, tracked: bool = False) -> dict[str, Any]:
-        """The approved model, as it is or tracked. It is sent again only if it has changed (ETag)."""
-        asked = {"tracked": True} if tracked else {}
-        self.known = self.client.approved_model(self.participant, self.known, **asked)
-        return self.known.document
-
-    def fetch_followed(self) -> dict[str, Any]:
-        """The tracked model once the trial just played is in it, or the last one if that does not come.
+        """The approved model, as it is or tracked. It is sent again only if it has changed (ETag).
 
         Raises
         ------
         HaltedError
             The muscle is no longer what a person allowed: they are asked.
         """
+        asked = {"tracked": True} if tracked else {}
+        self.known = self.client.approved_model(self.participant, self.known, **asked)
+        if ask := self.known.document.get("tracking", {}).get("ask"):
+            raise HaltedError(ask)
+        return self.known.document
+
+    def fetch_followed(self) -> dict[str, Any]:
+        """The tracked model once the trial just played is in it, or the last one if that does not come."""
         patience = time.monotonic() + TRACKED_WITHIN_S
         while True:
             document = self.fetch(tracked=True)
-            if ask := document.get("tracking", {}).get("ask"):
-                raise HaltedError(ask)
             if self.known.changed or time.monotonic() > patience:
                 return document
             time.sleep(0.05)
@@ -413,7 +414,10 @@ def main() -> None:
     model = service.fetch(options.tracked)
     reference = Reference.reach(options.peak_nm or 0.6 * float(model["recruitment"]["inverse"]["torque_nm"][-1]))
     laws = list(LAWS) if options.law == "both" else [options.law]
-    runs = {law: learn(service, model, reference, law, options.trials, tracked=options.tracked) for law in laws}
+    runs = {}
+    for law in laws:
+        model = service.fetch(options.tracked)
+        runs[law] = learn(service, model, reference, law, options.trials, tracked=options.tracked)
     print(f"model {model['model_id']}, reference {reference.rms_nm:.2f} N·m rms; error in % of it")
     print("trial  " + "  ".join(f"{law:>12}" for law in runs))
     for number in range(options.trials):

@@ -22,7 +22,7 @@ from api.store.tables import Approval, Model, Test, Tracked
 log = logging.getLogger("stimrig.tracking")
 MOST_EARLIER = 20
 """Approvals before this one from which it is learnt how fast a person changes."""
-TOLD = ("now", "coming", "disturbed_s")
+TOLD = ("now", "coming", "moved", "disturbed_s")
 """What of a step is served with the model."""
 SUPERSEDED = "Another model was approved, or this approval ended, before the trial was followed."
 

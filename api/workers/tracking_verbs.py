@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from api.workers.json_values import clean
 
 Progress = Callable[[float, str], None]
-STILL = {"gain": 1.0, "threshold_shift_us": 0.0, "time_scale": 1.0}
-"""A quantity that is not tracked stays there in the model that is served."""
 MOST_MISSED = 50
 SETTLED_S = 0.2
 """So long the torque must have been measured at rest for its offset to be known."""
@@ -54,7 +51,7 @@ def track(
         `reason` why the trial was not followed.
     """
     import identify
-    from identify.tracking import State, begin, follow, largest_change, learn_rates, moved_model
+    from identify.tracking import State, begin, follow, learn_rates, model_for_next
 
     progress(0.1, "reading the recording")
     record = identify.read(Path(data))
@@ -66,17 +63,11 @@ def track(
         for _ in range(min(missed, MOST_MISSED)):
             before = before.ahead(rates)
         step = follow(model, before, record, rates)
-        # All three are followed: one that was held would be taken for a change of the others.
-        still = {name: value for name, value in STILL.items() if name not in bounds}
-        values = replace(step.coming.values, **still)
-        low, high = bounds.get("gain", (1.0, 1.0))
-        # The torque of every pulse stays within what the gain may be; if it does not, the curve keeps its shape.
-        away = values.gain * largest_change(model, step.coming.curve_nm)
-        curve_nm = step.coming.curve_nm if low <= values.gain - away and values.gain + away <= high else 0.0
-        moved = moved_model(model, values, curve_nm)
+        moved = model_for_next(model, step, bounds)
     except identify.IdentifyError as problem:
         return {"error_percent": error, "reason": " ".join(str(problem).split())}
-    return {"error_percent": error, "step": clean(step.to_dict()), "model": moved.to_json(None)}
+    told = clean(step.to_dict()) | {"moved": list(bounds)}
+    return {"error_percent": error, "step": told, "model": moved.to_json(None)}
 
 
 def second_order(model: Any) -> Any:

@@ -2,7 +2,7 @@
 
 from identify.tracking.follow import Outcome, Step, begin, follow, levels_of, model_for_next
 from identify.tracking.rates import learn_rates
-from identify.tracking.served import largest_change, moved_model
+from identify.tracking.served import moved_model
 from identify.tracking.state import QUANTITIES, USUAL, Rates, State, Values
 from identify.tracking.trial import Seen, look
 
@@ -17,7 +17,6 @@ __all__ = [
     "Values",
     "begin",
     "follow",
-    "largest_change",
     "learn_rates",
     "levels_of",
     "look",

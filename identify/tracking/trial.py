@@ -64,7 +64,11 @@ class Seen:
     before_nm : float
         Root mean square of the error before this fit, N·m: of the model as it was expected.
     torque_nm : float
-        Root mean square of the torque that the model predicts, N·m.
+        Standard deviation over the trial of the torque that the fitted model predicts, N·m.
+    wanted_nm : float
+        The same of the model as it was expected.
+    came : float
+        How much of the expected torque came: slope of the measured one on it.
     disturbed : tuple of (float, float)
         Begin and end of the stretches that do not fit, s since the record's begin.
     duration_s : float
@@ -77,6 +81,8 @@ class Seen:
     expected_nm: float
     before_nm: float
     torque_nm: float
+    wanted_nm: float
+    came: float
     disturbed: tuple[tuple[float, float], ...]
     duration_s: float
 
@@ -147,6 +153,8 @@ def look(model: Model, expected: State, record: Record) -> Seen:
         expected_nm=expected_nm,
         before_nm=found.before_nm,
         torque_nm=found.torque_nm,
+        wanted_nm=found.wanted_nm,
+        came=found.came,
         disturbed=_stretches(grid, found.weight),
         duration_s=grid.size * grid.step_s,
     )
@@ -161,33 +169,41 @@ class _Fit:
     bend: np.ndarray
     weight: np.ndarray
     sd_nm: float
-    before_nm: float
     torque_nm: float
+    before_nm: float
+    wanted_nm: float
+    came: float
 
 
 def _fitted(problem: Problem, theta: np.ndarray, free: np.ndarray, prior: np.ndarray, target: np.ndarray) -> _Fit:
     """Gauss and Newton's steps with weights that follow the errors."""
     grid, start = problem.setup.grid, theta[free].copy()
     rows = grid.fitted
-    weight, before_nm, done = np.ones(int(rows.sum())), None, False
+    weight, first, done = np.ones(int(rows.sum())), None, False
     for turn in range(ROUNDS):
         mean, jacobian = problem.run(theta, derivatives=True)
         assert jacobian is not None
         error, lever = (target - mean)[rows], jacobian[free][:, rows]
-        if before_nm is None:
-            before_nm = float(np.std(error))
+        first = first or _compared(target[rows], mean[rows])
         if turn >= TRUSTED_ROUNDS:
             weight = _weights(error, round(LOCAL_S / grid.step_s))
         sd_nm, alike = _spread(error, weight)
         precision = weight / (sd_nm**2 * (1.0 + alike) / (1.0 - alike))
         bend, slope, moved = (lever * precision) @ lever.T, (lever * precision) @ error, theta[free] - start
         if done or turn == ROUNDS - 1:
-            return _Fit(moved, slope, bend, weight, sd_nm, before_nm, float(np.std(mean[rows])))
+            return _Fit(moved, slope, bend, weight, sd_nm, float(np.std(mean[rows])), *first)
         step = np.linalg.solve(bend + prior, slope - prior @ moved)
         step[:LEVELS] = np.clip(step[:LEVELS], -LOOSE, LOOSE)
         theta[free] += step
         done = turn > TRUSTED_ROUNDS and bool(np.all(np.abs(step[:LEVELS]) < NEAR * LOOSE))
     raise AssertionError("the last round returns")
+
+
+def _compared(measured_nm: np.ndarray, expected_nm: np.ndarray) -> tuple[float, float, float]:
+    """Standard deviations of the error and of what was expected; and how much of that came."""
+    away = expected_nm - expected_nm.mean()
+    came = float(away @ measured_nm / max(away @ away, 1e-300))
+    return float(np.std(measured_nm - expected_nm)), float(np.std(expected_nm)), came
 
 
 def _marginal(found: _Fit, seen: np.ndarray, own_sd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

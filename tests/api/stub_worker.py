@@ -177,7 +177,7 @@ def tracked(arguments: dict[str, Any]) -> dict[str, Any]:
     step = {
         "outcome": wanted.get("outcome", "followed"), "trial": after["trials"], "now": levels, "coming": levels,
         "error_nm": wanted.get("error_nm", 0.04), "expected_error_nm": 0.04, "error_before_nm": 0.1, "torque_nm": 2.0,
-        "disturbed_s": [], "distance": 2.0, "state": after,
+        "disturbed_s": [], "distance": 2.0, "moved": list(arguments["bounds"]), "state": after,
     }  # fmt: skip
     moved = json.loads(arguments["model_json"])
     gain = values["gain"] if "gain" in arguments["bounds"] else 1.0

@@ -187,6 +187,14 @@ def moved(gain: float, shift_us: float, time_scale: float) -> tuple[float, float
     return period_s * time_scale, damping, plateau_nm * gain, middle_us + shift_us
 
 
+def document_of(now: tuple[float, ...], coming: tuple[float, ...], held: tuple[str, ...] = ()) -> dict[str, Any]:
+    """What the service sends, with the levels now and in the next trial; by what is held the model is not moved."""
+    still = {"gain": 1.0, "threshold_shift_us": 0.0, "time_scale": 1.0}
+    by = (still[name] if name in held else value for name, value in zip(still, coming, strict=True))
+    told = {"now": levels(*now), "coming": levels(*coming), "moved": [name for name in still if name not in held]}
+    return model_of(*moved(*by)) | {"tracking": told}
+
+
 class Tiring(Muscle):
     """Loses gain, its threshold rises and it slows from trial to trial; told of by a service that follows it well."""
 
@@ -204,13 +212,12 @@ class Tiring(Muscle):
         return torque_nm + 0.005 * self.rng.standard_normal(widths_us.size), widths_us
 
     def fetch_followed(self) -> dict[str, Any]:
-        coming, now = self.at(self.trials), self.at(self.trials - 1)
-        return model_of(*moved(*coming)) | {"tracking": {"now": levels(*now), "coming": levels(*coming)}}
+        return document_of(self.at(self.trials - 1), self.at(self.trials))
 
 
 def test_plant_now_is_the_plant_of_the_levels_now(ilc: ModuleType) -> None:
     now, coming = (0.8, 6.0, 1.1), (0.7, 9.0, 1.2)
-    document = model_of(*moved(*coming)) | {"tracking": {"now": levels(*now), "coming": levels(*coming)}}
+    document = document_of(now, coming)
     plant, wanted, widths = ilc.Plant(document, 400).now(), ilc.Plant(model_of(*moved(*now)), 400), np.arange(0, 290.0)
     np.testing.assert_allclose(plant.level(widths), wanted.level(widths), atol=0.01)
     np.testing.assert_allclose(plant.response.cumsum(), wanted.response.cumsum(), atol=0.01)
@@ -231,6 +238,16 @@ def test_a_muscle_that_tires_is_followed(ilc: ModuleType, changes: dict[str, flo
         last[name] = np.mean([trial.error_percent for trial in trials[-3:]])
     assert last["tracked"] < 1.4 * last["still"], last
     assert last["untracked"] > 2 * last["tracked"], last
+
+
+def test_what_a_person_holds_is_learnt_as_without_following(ilc: ModuleType) -> None:
+    reference, last = ilc.Reference.reach(3.0), {}
+    for tracked in (False, True):
+        muscle = Tiring(rises_us=0.0, slows=0.0)
+        muscle.fetch_followed = lambda m=muscle: document_of(m.at(m.trials - 1), m.at(m.trials), held=("gain",))
+        trials = ilc.learn(muscle, model_of(*MODEL), reference, "norm-optimal", 10, tracked=tracked)
+        last[tracked] = np.mean([trial.error_percent for trial in trials[-3:]])
+    assert last[True] < 1.2 * last[False], last
 
 
 def test_a_model_that_is_never_moved_is_played_as_untracked(ilc: ModuleType) -> None:
@@ -286,5 +303,6 @@ def test_a_followed_model_is_waited_for(ilc: ModuleType) -> None:
 def test_it_stops_where_a_person_has_to_be_asked(ilc: ModuleType) -> None:
     asks = SimpleNamespace(document={"tracking": {"ask": "A new test is needed."}}, changed=True)
     client = SimpleNamespace(approved_model=lambda *_, **__: asks)
-    with pytest.raises(ilc.HaltedError, match="A new test is needed"):
-        ilc.Service(client, "P").fetch_followed()
+    for fetch in (ilc.Service.fetch_followed, ilc.Service.fetch):
+        with pytest.raises(ilc.HaltedError, match="A new test is needed"):
+            fetch(ilc.Service(client, "P"))

@@ -132,6 +132,22 @@ def test_a_sudden_change_is_followed_when_the_next_trial_says_the_same(model: Mo
     assert gains[5] / gains[2] == pytest.approx(0.7, abs=0.03)
 
 
+@pytest.mark.parametrize("left", [0.0, 0.02, 0.1, 0.2])
+def test_a_loose_electrode_is_told_at_once_and_moves_nothing(model: Model, left: float) -> None:
+    steps = followed(model, session(Changing(PATIENT, gain=lambda n: left if 3 <= n < 6 else 1.0), 8))
+    assert {step.outcome for step in steps[3:6]} == {Outcome.NO_TORQUE}
+    assert {step.outcome for step in (*steps[:3], *steps[6:])} == {Outcome.FOLLOWED}
+    for step in steps[3:6]:
+        assert step.disturbed_s == [[0.0, step.seen.duration_s]]
+        assert np.array_equal(step.after.mean, step.before.mean)
+    assert np.all(moves(steps) < 1.0)
+
+
+def test_from_an_odd_trial_nothing_is_learnt(model: Model) -> None:
+    (*_, odd) = followed(model, session(Changing(PATIENT, gain=lambda n: 1.0 if n < 3 else 0.6), 4))
+    assert odd.outcome is Outcome.ODD and odd.disturbed_s == [[0.0, odd.seen.duration_s]]
+
+
 def test_another_structure_is_told_when_two_trials_show_it(model: Model) -> None:
     other = Changing(PATIENT, added=lambda _, time_s: 0.8 * np.sin(2 * np.pi * 1.3 * time_s))
     steps = followed(model, session(Changing(PATIENT), 2) + session(other, 3))

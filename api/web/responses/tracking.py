@@ -33,7 +33,7 @@ class TrialOut(Document):
     test_id: str
     recording_id: str | None
     at_utc: str = Field(description="when it was followed")
-    outcome: Literal["followed", "little", "odd", "contradicts", "not-followed"] = Field(
+    outcome: Literal["followed", "little", "odd", "no-torque", "contradicts", "not-followed"] = Field(
         description="`little`: it tells little; `odd`: it is far from what was expected, and moves little; "
         "`contradicts`: gain, threshold and time scale do not explain it; `not-followed`: `reason` says why"
     )
