@@ -282,7 +282,7 @@ def test_a_trial_that_cannot_be_followed_is_noted_and_nothing_is_lost(
     assert state["missed"] == 1, "what is known has become less certain by the trial in between"
 
 
-def test_a_recording_that_is_gone_or_another_current(service: Service, client: httpx.Client, approved: str) -> None:
+def test_a_trial_at_another_current_moves_nothing(service: Service, client: httpx.Client, approved: str) -> None:
     client.put("/v1/participants/P017/profile", json={"current_ma": 15.0})
     play(client)
     (row,) = soon(lambda: trials(client))

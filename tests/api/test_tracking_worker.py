@@ -101,10 +101,10 @@ def test_another_pulse_rate_and_other_dynamics_are_no_trial(model_json: str, tmp
     document = json.loads(model_json) | {"pulse_rate_hz": 20.0}
     found = follow(recorded(tmp_path, 0.96), json.dumps(document))
     assert "pulses a second" in found["reason"] and "step" not in found
-    other = identify.fit(record(Planned(PATIENT, 0.0), 3), method="ramp-deconvolution").to_json()
+    other = identify.fit(record(Planned(PATIENT, 0.0), 3), method="narx").to_json()
     found = follow(recorded(tmp_path, 0.96), other)
-    if "step" not in found:
-        assert "cannot be tracked" in found["reason"]
+    assert "cannot be tracked" in found["reason"] and "step" not in found
+    assert tracking_verbs.warm(silent, other) == {}, "that is said after a trial, not before"
 
 
 def test_a_recording_that_cannot_be_read_is_told_as_such(model_json: str, tmp_path: Path) -> None:
@@ -137,5 +137,16 @@ def test_a_person_who_tired_in_earlier_sessions_is_expected_to(model_json: str, 
     assert known < usual - 0.02
 
 
-def test_warming_needs_no_recording_and_refuses_no_model(model_json: str) -> None:
+def test_warming_follows_a_trial_of_its_own(model_json: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    import identify.tracking
+
+    followed: list[float] = []
+    own = identify.tracking.follow
+
+    def noted(model: Any, state: Any, record: identify.Record) -> Any:
+        followed.append(float(np.ptp(record.torque_nm)))
+        return own(model, state, record)
+
+    monkeypatch.setattr(identify.tracking, "follow", noted)
     assert tracking_verbs.warm(silent, model_json) == {}
+    assert len(followed) == 1 and followed[0] > 1.0
