@@ -1,7 +1,7 @@
 """The three quantities that are tracked, as stages of a simulation: they act on any model, with or without effects.
 
 Gain and threshold may also move within a trial, in proportion to time, by `…_run` from its first to its last second;
-the level is that in its middle.
+the level is that in its middle. So may the zero of the torque.
 """
 
 from __future__ import annotations
@@ -42,4 +42,13 @@ GAIN = Form(
     (Parameter("gain_log", "1", -3.0, 3.0), Parameter("gain_run_log", "1", -1.0, 1.0)),
     _gain,
     True,
+)
+
+
+def _drift(_none: None, p: dict[str, Any], scene: Scene) -> np.ndarray:
+    return p["drift_nm"] * _along(scene)
+
+
+DRIFT = Form(
+    "drift", "additive", "y + drift · share of time", (Parameter("drift_nm", "N·m", -100.0, 100.0),), _drift, True
 )

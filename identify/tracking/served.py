@@ -71,4 +71,5 @@ def moved_model(model: Model, values: Values, curve_nm: np.ndarray | float = 0.0
     linear = replace(model.linear, time_constant_s=model.linear.time_constant_s * values.time_scale)
     sign = float(model.effects[0].get("settings", {}).get("sign", 1.0)) if model.effects else 1.0
     own = replace(model.recruitment, coefficients_nm=model.recruitment.coefficients_nm + sign * curve_nm)
-    return model.with_(recruitment=moved_curve(own, values), linear=linear)
+    # What was known of the approved model's own parameters holds for none of the moved ones.
+    return model.with_(recruitment=moved_curve(own, values), linear=linear, covariance=None, bands={})

@@ -17,7 +17,7 @@ from identify.model import Model
 from identify.records.record import Record
 from identify.simulation.predict import problem_of
 from identify.simulation.problem import Problem
-from identify.tracking.forms import GAIN, SHIFT
+from identify.tracking.forms import DRIFT, GAIN, SHIFT
 from identify.tracking.state import LEVELS, State
 
 SHORTEST_S = 1.0
@@ -33,6 +33,12 @@ MOST_ALIKE = 0.97
 """Largest correlation of neighbouring errors."""
 LOOSE = np.array([0.2, 20.0, 0.2])
 """By how much looser than expected the levels are in the fit of a trial, so that a jump is found."""
+FAR = 1.3
+"""An error so many times the expected one is looked at again from another start."""
+GONE_NOT_BELOW = 0.05
+"""Least gain, relative to what was expected, from which that starts."""
+DRIFTS = 0.1
+"""Of the trial's torque: standard deviation of the drift of its zero from begin to end (posture, load cell)."""
 NEAR = 1e-4
 """The fit is done when a step is smaller than this share of `LOOSE`."""
 SHAPE = 0.003
@@ -130,34 +136,56 @@ def look(model: Model, expected: State, record: Record) -> Seen:
         raise BadRecord(
             f"less than {SHORTEST_S:g} s that can be used", fix="Play a longer trial; rows of `validate` do not count."
         )
-    log_gain, shift_us, log_time = expected.mean[:LEVELS].tolist()
-    problem, theta = problem_of(model, grid, ((SHIFT, (shift_us, 0.0)), (GAIN, (log_gain, 0.0))))
-    theta[0] += log_time
-    theta[problem.coefficients] += expected.curve_nm
-    shift, gain = problem.chosen[-2].first, problem.chosen[-1].first
-    curve = range(problem.coefficients.start, problem.coefficients.stop)
-    own = [gain + 1, shift + 1, *problem.delay, *problem.baselines, *problem.initials]
-    target = problem.setup.to_muscle(grid.torque_nm)
-    scale_nm = max(float(np.ptp(target[grid.fitted])), 1e-6)
-    theta[list(problem.baselines)] = np.median(target[grid.fitted][: max(4, round(0.5 / grid.step_s))])
-    states = np.tile([0.1, 1.0], problem.setup.starts.size)
-    own_sd = np.r_[OWN, np.r_[np.ones(len(problem.baselines)), states] * scale_nm]
-    found = _fitted(problem, theta, np.array([gain, shift, 0, *curve, *own]), _precision(expected, own_sd), target)
-    expected_nm = _expected(model)
-    vector, information = _marginal(found, expected.mean[expected.seen], own_sd)
+    asked = _asked(model, expected, grid)
+    start, expected_nm = expected.mean[expected.seen], _expected(model)
+    first = found = _fitted(asked, start)
+    if found.sd_nm > FAR * expected_nm:
+        # After a sudden loss the fit may end where the threshold explains it badly: so much less torque came.
+        lower = (
+            start + np.r_[np.log(np.clip(first.came, GONE_NOT_BELOW, 1.0 / GONE_NOT_BELOW)), np.zeros(start.size - 1)]
+        )
+        other = _fitted(asked, lower)
+        start, found = (lower, other) if other.sd_nm < found.sd_nm else (start, found)
+    vector, information = _marginal(found, start, asked.own_sd)
     doubt = max(1.0, found.sd_nm / expected_nm) ** 2  # what fits worse than it should may err by more than it scatters
     return Seen(
         vector=vector / doubt,
         information=information / doubt,
         error_nm=found.sd_nm,
         expected_nm=expected_nm,
-        before_nm=found.before_nm,
+        before_nm=first.before_nm,
         torque_nm=found.torque_nm,
-        wanted_nm=found.wanted_nm,
-        came=found.came,
+        wanted_nm=first.wanted_nm,
+        came=first.came,
         disturbed=_stretches(grid, found.weight),
         duration_s=grid.size * grid.step_s,
     )
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """What is fitted to a trial: levels and curve, and behind them what is the trial's own."""
+
+    problem: Problem
+    theta: np.ndarray
+    free: np.ndarray
+    target: np.ndarray
+    prior: np.ndarray
+    own_sd: np.ndarray
+
+
+def _asked(model: Model, expected: State, grid: Grid) -> _Asked:
+    problem, theta = problem_of(model, grid, ((SHIFT, (0.0, 0.0)), (GAIN, (0.0, 0.0)), (DRIFT, (0.0,))))
+    shift, gain, drift = (chosen.first for chosen in problem.chosen[-3:])
+    curve = range(problem.coefficients.start, problem.coefficients.stop)
+    own = [gain + 1, shift + 1, *problem.delay, *problem.baselines, drift, *problem.initials]
+    target = problem.setup.to_muscle(grid.torque_nm)
+    scale_nm = max(float(np.ptp(target[grid.fitted])), 1e-6)
+    theta[list(problem.baselines)] = np.median(target[grid.fitted][: max(4, round(0.5 / grid.step_s))])
+    states = np.tile([0.1, 1.0], problem.setup.starts.size)
+    own_sd = np.r_[OWN, np.r_[np.ones(len(problem.baselines)), DRIFTS, states] * scale_nm]
+    free = np.array([gain, shift, 0, *curve, *own])
+    return _Asked(problem, theta, free, target, _precision(expected, own_sd), own_sd)
 
 
 @dataclass(frozen=True)
@@ -175,8 +203,11 @@ class _Fit:
     came: float
 
 
-def _fitted(problem: Problem, theta: np.ndarray, free: np.ndarray, prior: np.ndarray, target: np.ndarray) -> _Fit:
-    """Gauss and Newton's steps with weights that follow the errors."""
+def _fitted(asked: _Asked, levels: np.ndarray) -> _Fit:
+    """Gauss and Newton's steps with weights that follow the errors, from such levels and curve."""
+    problem, free, prior, target = asked.problem, asked.free, asked.prior, asked.target
+    theta = asked.theta.copy()
+    theta[free[: levels.size]] += levels
     grid, start = problem.setup.grid, theta[free].copy()
     rows = grid.fitted
     weight, first, done = np.ones(int(rows.sum())), None, False
