@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 from identify.model import Model
 from identify.records.record import Record
 from identify.simulation.predict import refuse_rate
+from identify.tracking.carried import passed, rest_before, rested, with_states
 from identify.tracking.served import moved_model
 from identify.tracking.state import LEVELS, QUANTITIES, USUAL, Rates, State, updated
 from identify.tracking.trial import Seen, curve_covariance, look
@@ -19,6 +20,9 @@ UNEXPLAINED = 4.0
 """An error so many times what the approved model left is not one of gain, threshold or speed."""
 LITTLE = np.array([0.05, 5.0, 0.08])
 """A trial that would tell none of the levels to within such a standard deviation tells little."""
+
+USUAL_REST_S = 15.0
+"""Rest after the first trial, as it is expected: in the one before it the model was approved."""
 
 
 class Outcome(StrEnum):
@@ -49,6 +53,9 @@ class Step:
         What is expected of the next trial: of this the controller is told.
     distance : float or None
         Squared distance of what was seen from what was expected, in standard deviations; None if it moved nothing.
+    effects : dict of dict
+        By effect id, its slow state at the trial's end, `now`, and as expected at the begin of the next one, `coming`,
+        after a rest as long as the one before this trial, but at most `USUAL_REST_S` if that was the first.
     """
 
     outcome: Outcome
@@ -57,6 +64,12 @@ class Step:
     after: State
     coming: State
     distance: float | None
+    effects: dict[str, dict[str, float]] = field(default_factory=dict)
+
+    @property
+    def coming_effects(self) -> dict[str, float]:
+        """By effect id, its slow state as expected at the begin of the next trial."""
+        return {effect: states["coming"] for effect, states in self.effects.items()}
 
     @property
     def disturbed_s(self) -> list[list[float]]:
@@ -78,6 +91,7 @@ class Step:
             "torque_nm": self.seen.torque_nm,
             "disturbed_s": self.disturbed_s,
             "distance": self.distance,
+            "effects": self.effects,
             "state": self.coming.to_dict(),
         }
 
@@ -92,12 +106,17 @@ def levels_of(state: State) -> dict[str, dict[str, float]]:
     return found
 
 
-def begin(model: Model, rates: Rates = USUAL) -> State:
-    """What is expected of the first trial after the approval of a model."""
-    return State.start(curve_covariance(model), rates)
+def begin(model: Model, rates: Rates = USUAL, test: Record | None = None) -> State:
+    """What is expected of the first trial after the approval of a model; with the record of the `test` before it, what
+    that has done to the muscle.
+    """
+    state = State.start(curve_covariance(model), rates)
+    return state if test is None else passed(model, state, test)
 
 
-def follow(model: Model, state: State | None, record: Record, rates: Rates = USUAL) -> Step:
+def follow(
+    model: Model, state: State | None, record: Record, rates: Rates = USUAL, rest_s: float | None = None
+) -> Step:
     """Learn from one trial.
 
     Parameters
@@ -110,6 +129,9 @@ def follow(model: Model, state: State | None, record: Record, rates: Rates = USU
         The trial, with its rest before and after.
     rates : Rates
         How fast this person changes.
+    rest_s : float, optional
+        Rest between the end of what was seen last and this record's begin, s. None: by their clocks, `Part.begun_s`.
+        If it is not known, or no rest (negative, not a number), the muscle is taken to have recovered.
 
     Raises
     ------
@@ -121,14 +143,20 @@ def follow(model: Model, state: State | None, record: Record, rates: Rates = USU
     """
     refuse_rate(model, record)
     before = begin(model, rates) if state is None else state
-    seen = look(model, before, record)
+    rest_s = rest_before(before, record, rest_s)
+    begun = rested(model, before.effects, rest_s)
+    seen = look(with_states(model, begun), before, record)
     if seen.misfit > UNEXPLAINED:
-        after = replace(before, trials=before.trials + 1, unexplained=before.unexplained + 1)
+        after, distance = replace(before, trials=before.trials + 1, unexplained=before.unexplained + 1), None
         outcome = Outcome.CONTRADICTS if after.unexplained > 1 else Outcome.ODD
-        return Step(outcome, seen, before, after, after.ahead(rates), None)
-    after, distance = updated(before, seen.vector, seen.information)
-    outcome = Outcome.ODD if after.odd is not None else _told(seen)
-    return Step(outcome, seen, before, after, after.ahead(rates), distance)
+    else:
+        after, distance = updated(before, seen.vector, seen.information)
+        outcome = Outcome.ODD if after.odd is not None else _told(seen)
+    after = passed(model, replace(after, effects=begun), record, 0.0)
+    next_s = rest_s if before.trials or rest_s is None else min(rest_s, USUAL_REST_S)
+    coming = rested(model, after.effects, next_s)
+    effects = {effect: {"now": now, "coming": coming[effect]} for effect, now in after.effects.items()}
+    return Step(outcome, seen, before, after, after.ahead(rates), distance, effects)
 
 
 def _told(seen: Seen) -> Outcome:
@@ -139,4 +167,4 @@ def _told(seen: Seen) -> Outcome:
 
 def model_for_next(model: Model, step: Step) -> Model:
     """The approved model as it is expected to be in the next trial."""
-    return moved_model(model, step.coming.values, step.coming.curve_nm)
+    return moved_model(model, step.coming.values, step.coming.curve_nm, step.coming_effects)

@@ -10,7 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from identify.dynamics.pulse_grid import Grid
 from identify.effects.base import Form, Parameter, Scene
+from identify.model import Model
+from identify.simulation.predict import problem_of
+from identify.simulation.problem import Problem
+from identify.tracking.state import LEVELS, State
 
 
 def _along(scene: Scene) -> np.ndarray:
@@ -43,3 +48,18 @@ GAIN = Form(
     _gain,
     True,
 )
+
+
+def placed(model: Model, expected: State, grid: Grid) -> tuple[Problem, np.ndarray]:
+    """The approved model on a record as it is expected to be there, and its parameters: the gain first, the shift last.
+
+    Raises
+    ------
+    BadModel
+        As `identify.simulation.predict.problem_of`.
+    """
+    log_gain, shift_us, log_time = expected.mean[:LEVELS].tolist()
+    problem, theta = problem_of(model, grid, ((SHIFT, (shift_us, 0.0)), (GAIN, (log_gain, 0.0))))
+    theta[0] += log_time
+    theta[problem.coefficients] += expected.curve_nm
+    return problem, theta

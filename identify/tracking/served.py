@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from identify.errors import BadModel
 from identify.model import Model
 from identify.recruitment.curve import Curve
 from identify.recruitment.spline import SplineBasis
+from identify.tracking.carried import with_states
 from identify.tracking.state import Values
 
 EVEN = 31
@@ -52,8 +54,11 @@ def _apart(knots_us: np.ndarray, largest_us: float) -> np.ndarray:
     return np.array([*kept, largest_us])
 
 
-def moved_model(model: Model, values: Values, curve_nm: np.ndarray | float = 0.0) -> Model:
-    """The model with the levels of `values`, and with `curve_nm` added to the coefficients of its curve.
+def moved_model(
+    model: Model, values: Values, curve_nm: np.ndarray | float = 0.0, effects: Mapping[str, float] | None = None
+) -> Model:
+    """The model with the levels of `values`, with `curve_nm` added to the coefficients of its curve, and its effects
+    where `effects` says that they begin.
 
     Raises
     ------
@@ -65,4 +70,4 @@ def moved_model(model: Model, values: Values, curve_nm: np.ndarray | float = 0.0
     linear = replace(model.linear, time_constant_s=model.linear.time_constant_s * values.time_scale)
     sign = float(model.effects[0].get("settings", {}).get("sign", 1.0)) if model.effects else 1.0
     own = replace(model.recruitment, coefficients_nm=model.recruitment.coefficients_nm + sign * curve_nm)
-    return model.with_(recruitment=moved_curve(own, values), linear=linear)
+    return with_states(model, effects or {}).with_(recruitment=moved_curve(own, values), linear=linear)

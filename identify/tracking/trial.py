@@ -15,9 +15,8 @@ from identify.dynamics.pulse_grid import Grid, runs
 from identify.errors import BadRecord
 from identify.model import Model
 from identify.records.record import Record
-from identify.simulation.predict import problem_of
 from identify.simulation.problem import Problem
-from identify.tracking.forms import GAIN, SHIFT
+from identify.tracking.forms import placed
 from identify.tracking.state import LEVELS, State
 
 SHORTEST_S = 1.0
@@ -124,11 +123,8 @@ def look(model: Model, expected: State, record: Record) -> Seen:
         raise BadRecord(
             f"less than {SHORTEST_S:g} s that can be used", fix="Play a longer trial; rows of `validate` do not count."
         )
-    log_gain, shift_us, log_time = expected.mean[:LEVELS].tolist()
-    problem, theta = problem_of(model, grid, ((SHIFT, (shift_us, 0.0)), (GAIN, (log_gain, 0.0))))
-    theta[0] += log_time
-    theta[problem.coefficients] += expected.curve_nm
-    shift, gain = problem.chosen[-2].first, problem.chosen[-1].first
+    problem, theta = placed(model, expected, grid)
+    gain, shift = problem.chosen[0].first, problem.chosen[-1].first
     curve = range(problem.coefficients.start, problem.coefficients.stop)
     own = [gain + 1, shift + 1, *problem.delay, *problem.baselines, *problem.initials]
     target = problem.setup.to_muscle(grid.torque_nm)
