@@ -26,6 +26,8 @@ SEQUENCE = "sequence"
 """A test of this kind is a controller's trial; nothing is identified from it."""
 PATIENCE_S = 2.0
 """So long who fetches a tracked model waits for a trial that has just ended."""
+MOST_BETWEEN = 20
+"""So many recordings between two trials that were followed are passed through the effects."""
 ELSEWHERE = "It was played at another side, muscle or current than the approved model's test."
 
 
@@ -133,6 +135,7 @@ class Trials:
                 "track", data=recording.path, model_json=trial.model_json, tracked=list(trial.bounds),
                 state=trial.state, missed=trial.missed, earlier=trial.earlier,
                 reference_torque_nm=trial.test.plan.get("reference_torque_nm"),
+                between=await asyncio.to_thread(self._between, trial, recording),
             )  # fmt: skip
         except ApiError as error:
             if error.code == "worker-died":
@@ -143,6 +146,25 @@ class Trials:
         model: Model = self.store.get(Model, trial.approval.model_id)
         tests = self.store.all(Test, Test.recording_id == model.recording_id)
         return any(differ(place_of(test), place_of(trial.test)) for test in tests)
+
+    def _between(self, trial: Trial, recording: Recording) -> list[str]:
+        """What the muscle did since what is known of it, oldest first; nothing for a model without effects.
+
+        Where nothing was followed yet, it begins with the approved model's test.
+        """
+        model: Model = self.store.get(Model, trial.approval.model_id)
+        since: Recording | None = self.store.get(Recording, trial.since)
+        if since is None or not model.effects:
+            return []
+        conditions = (
+            Recording.participant == recording.participant, Recording.test_id.is_not(None),
+            Recording.created_utc > since.created_utc, Recording.created_utc < recording.created_utc,
+        )  # fmt: skip
+        found = self.store.all(Recording, *conditions, order=Recording.created_utc.desc(), limit=MOST_BETWEEN)[::-1]
+        tests = {row.id: row for row in self.store.all(Test, Test.id.in_([row.test_id for row in found]))}
+        own = place_of(trial.test)
+        here = [row for row in found if row.test_id in tests and not differ(place_of(tests[row.test_id]), own)]
+        return [row.path for row in (here if trial.state else [since, *here])]
 
     # ---- the service's own day ---------------------------------------------------------------------------------
 

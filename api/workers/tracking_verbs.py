@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from api.workers.diagnosis_verbs import begun
 from api.workers.json_values import clean
 
 Progress = Callable[[float, str], None]
@@ -26,6 +28,7 @@ def track(
     missed: int = 0,
     earlier: Sequence[Sequence[dict[str, Any]]] = (),
     reference_torque_nm: Sequence[float] | None = None,
+    between: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Follow one trial.
 
@@ -45,6 +48,9 @@ def track(
         The levels of the trials of this person's earlier sessions: how fast they change from trial to trial.
     reference_torque_nm : sequence of float, optional
         What the controller wanted, one value for each pulse, N·m.
+    between : sequence of str
+        Recordings of what the muscle did since `state`, oldest first; without one, since the begin of the approved
+        model's test. They are read only if the model has effects with slow states, such as fatigue.
 
     Returns
     -------
@@ -56,7 +62,7 @@ def track(
     from identify.tracking import State, begin, follow, learn_rates, moved_model
 
     progress(0.1, "reading the recording")
-    record = identify.read(Path(data))
+    record = dated(Path(data))
     error = error_percent(record, reference_torque_nm)
     try:
         model = second_order(identify.Model.from_json(model_json))
@@ -64,14 +70,37 @@ def track(
         before = begin(model, rates) if state is None else State.from_dict(state)
         for _ in range(min(missed, MOST_MISSED)):
             before = before.ahead(rates)
+        before = worked(model, before, between)
         step = follow(model, before, record, rates)
         # All three are followed: one that was held would be taken for a change of the others.
         still = {name: value for name, value in STILL.items() if name not in tracked}
         curve_nm = step.coming.curve_nm if "gain" in tracked else 0.0
-        moved = moved_model(model, replace(step.coming.values, **still), curve_nm)
+        moved = moved_model(model, replace(step.coming.values, **still), curve_nm, step.coming_effects)
     except identify.IdentifyError as problem:
         return {"error_percent": error, "reason": " ".join(str(problem).split())}
     return {"error_percent": error, "step": clean(step.to_dict()), "model": moved.to_json(None)}
+
+
+def dated(path: Path) -> Any:
+    """A recording that knows when it began, if its file says so."""
+    import identify
+
+    record = identify.read(path)
+    part = record.parts[0]
+    if len(record.parts) > 1 or part.begun_s is not None:
+        return record
+    return replace(record, parts=(replace(part, own_s=float(record.time_s[0]), begun_s=begun(path)),))
+
+
+def worked(model: Any, state: Any, between: Sequence[str]) -> Any:
+    """The state after what the muscle did in these recordings; of one that cannot be read nobody knows what it did."""
+    import identify
+    from identify.tracking import passed, slow_forms
+
+    for path in between if slow_forms(model) else ():
+        with contextlib.suppress(identify.IdentifyError, OSError):
+            state = passed(model, state, dated(Path(path)))
+    return state
 
 
 def second_order(model: Any) -> Any:
@@ -118,7 +147,6 @@ def error_percent(record: Any, reference_torque_nm: Sequence[float] | None) -> f
 
 def warm(progress: Progress, model_json: str) -> dict[str, Any]:
     """Load all that `track` needs, and follow two seconds of the model's own torque: then a trial waits for nothing."""
-    import contextlib
     import importlib
 
     import numpy as np

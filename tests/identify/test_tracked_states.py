@@ -29,15 +29,20 @@ from tests.harness.patients import make_record
 SEED = 54200
 PER, RATE_HZ, CURRENT_MA = 10, 400.0, 20.0
 FORMS = [(effect.id, form.name) for effect in effects().values() for form in effect.forms if form.state is not None]
-WIDTHS = np.r_[np.zeros(40), np.linspace(60.0, 200.0, 160), np.full(120, 160.0), np.zeros(80), np.full(80, 120.0)]
+PATIENT = Patient.with_rise(45.0, 120.0, gain=8.0, time_constant_s=0.2, damping=0.9)
+WIDTHS = np.r_[np.zeros(40), np.linspace(60.0, 200.0, 160), np.full(120, 160.0), np.zeros(120), np.full(120, 140.0)]
 
 
 @pytest.fixture(scope="module")
-def plain() -> Model:
-    record, _ = make_record(Patient.with_rise(45.0, 120.0, gain=8.0), np.random.default_rng(SEED))
+def tested() -> Record:
+    return make_record(PATIENT, np.random.default_rng(SEED))[0]
+
+
+@pytest.fixture(scope="module")
+def plain(tested: Record) -> Model:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return fit(record)
+        return fit(tested)
 
 
 def having(model: Model, effect_id: str, name: str, **more: Any) -> Model:
@@ -67,13 +72,14 @@ def test_a_record_cut_in_two_with_its_state_is_the_uncut_one(plain: Model, effec
     second = passed(model, first, record_of(WIDTHS[cut:]), 0.0)
     assert second.effects == pytest.approx(whole[0].states(whole[1]), abs=1e-9)
     assert 0.01 < first.effects[effect] < 1.0
-    # Its torque, too, once what was left of the dynamics has faded; without the state it is another one.
-    later = slice((cut + 80) * PER, None)
-    wanted = predict(model, record_of(WIDTHS))[later]
-    carried = predict(with_states(model, first.effects), record_of(WIDTHS[cut:]))[80 * PER :]
-    assert carried == pytest.approx(wanted, abs=0.02)
+    # So is its torque, if it is cut where the muscle has come to rest; without the state it is another one.
+    quiet = 435
+    before, after = record_of(WIDTHS[:quiet]), record_of(WIDTHS[quiet:])
+    wanted = predict(model, record_of(WIDTHS))[quiet * PER :]
+    carried = with_states(model, passed(model, begin(model), before).effects)
+    assert predict(carried, after) == pytest.approx(wanted, abs=2e-3)
     if effect != "catch_like":  # that has worn off by then
-        assert np.max(np.abs(predict(model, record_of(WIDTHS[cut:]))[80 * PER :] - wanted)) > 0.2
+        assert np.max(np.abs(predict(model, after) - wanted)) > 0.2
 
 
 @pytest.mark.parametrize(("effect", "form"), FORMS)
@@ -109,11 +115,10 @@ def test_a_state_that_is_none_is_refused_with_place_and_mend(plain: Model, state
         Model.from_dict(document)
 
 
-def test_on_its_own_record_a_model_begins_rested() -> None:
-    record, _ = make_record(Patient.with_rise(45.0, 120.0, gain=8.0), np.random.default_rng(SEED))
-    model = fit(record, effects=["fatigue"])
+def test_on_its_own_record_a_model_begins_rested(plain: Model, tested: Record) -> None:
+    model = having(plain, "fatigue", "fitness")
     tired = with_states(model, {"fatigue": 0.8})
-    assert np.array_equal(model.predict(record), tired.predict(record))
+    assert np.array_equal(model.predict(tested), tired.predict(tested))
     trial = record_of(WIDTHS)
     assert not np.array_equal(model.predict(trial), tired.predict(trial))
 
@@ -131,7 +136,8 @@ def test_state_and_model_come_back_from_their_files(plain: Model) -> None:
 
 
 def trial_of(model: Model, begun_s: float | None = None) -> Record:
-    return record_of(WIDTHS, begun_s, predict(model, record_of(WIDTHS)))
+    torque_nm = predict(model, record_of(WIDTHS))
+    return record_of(WIDTHS, begun_s, torque_nm + 0.05 * np.random.default_rng(SEED).standard_normal(torque_nm.size))
 
 
 def test_rests_are_told_by_the_clocks_of_the_records(plain: Model) -> None:
@@ -221,6 +227,6 @@ def test_the_next_trial_is_foretold_better_with_the_states(effect: str, changes:
         forgot = follow(model, forgot, trial, rest_s=math.inf).coming
         forgot = replace(forgot, effects={})
     found = np.array(errors)
-    assert found[0, 0] < 0.6 * found[0, 1], "the first trial knows what the test did"
+    assert found[0, 0] < 0.85 * found[0, 1], "the first trial knows what the test did"
     with_states_nm, without_nm = np.sqrt(np.mean(found[1:] ** 2, axis=0))
-    assert with_states_nm < 0.8 * without_nm, found
+    assert with_states_nm < 0.5 * without_nm, found
