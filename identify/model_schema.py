@@ -18,12 +18,12 @@ MOST_KNOTS = 1000
 LONGEST = 10_000
 
 
-def number(lo: float, hi: float) -> Check:
+def number(lo: float, hi: float, fix: str = FIX) -> Check:
     """A number within bounds; not a boolean."""
 
     def check(value: Any, place: str) -> None:
         if isinstance(value, bool) or not isinstance(value, int | float) or not (lo <= value <= hi):
-            raise BadModel(f"{_short(value)} is not a number from {lo:g} to {hi:g}", place=place, fix=FIX)
+            raise BadModel(f"{_short(value)} is not a number from {lo:g} to {hi:g}", place=place, fix=fix)
 
     return check
 
@@ -186,9 +186,10 @@ SETTINGS = {
     "sign": sign,
     "reference_s": number(-PLAUSIBLE, PLAUSIBLE),
 }
+EFFECT_STATE = number(0.0, 1.0, "Give a number from 0 (rested) to 1, or leave it out: rested.")
 EFFECT = fields(
     {"id": text, "parameters": each(lambda value, place: ANY(parameter_value(value), place))},
-    {"form": text, "settings": fields({}, SETTINGS)},
+    {"form": text, "settings": fields({}, SETTINGS), "state": EFFECT_STATE},
 )
 WHOLE = number(0, LONGEST)
 _NARX = fields(

@@ -22,7 +22,7 @@ from api.store.tables import Approval, Model, Test, Tracked
 log = logging.getLogger("stimrig.tracking")
 MOST_EARLIER = 20
 """Approvals before this one from which it is learnt how fast a person changes."""
-TOLD = ("now", "coming", "moved", "disturbed_s")
+TOLD = ("now", "coming", "moved", "effects", "disturbed_s")
 """What of a step is served with the model."""
 SUPERSEDED = "Another model was approved, or this approval ended, before the trial was followed."
 
@@ -51,6 +51,8 @@ class Trial:
         Trials since then that were not followed.
     earlier : list of list of dict
         The levels of the trials under earlier approvals of this person, oldest first: how fast they change.
+    since : str
+        Id of the recording that `state` was found from; without one, of the approved model's.
     """
 
     test: Test
@@ -62,6 +64,7 @@ class Trial:
     state: dict[str, Any] | None
     missed: int
     earlier: list[list[dict[str, Any]]]
+    since: str
 
 
 class TrackedVersions:
@@ -98,6 +101,7 @@ class TrackedVersions:
             test, approval, text, bounds, problem, len(rows) + 1,
             followed[-1].step["state"] if followed and followed[-1].step else None,
             len(rows) - followed[-1].number if followed else len(rows), self.earlier(approval),
+            (followed[-1].recording_id if followed else None) or model.recording_id,
         )  # fmt: skip
 
     def earlier(self, approval: Approval) -> list[list[dict[str, Any]]]:
@@ -192,7 +196,7 @@ class TrackedVersions:
             document = json.loads(model_json)
             told = {
                 "approved_model_id": approval.model_id, "trial": row.number, "test_id": row.test_id,
-                "at_utc": row.at_utc, **{key: step[key] for key in TOLD},
+                "at_utc": row.at_utc, **{key: step.get(key) for key in TOLD},
                 "limits": approval.tracking, "outcome": row.outcome,
             }  # fmt: skip
         else:
@@ -277,7 +281,9 @@ class TrackedVersions:
 def told(row: Tracked) -> dict[str, Any]:
     """A trial as clients see it."""
     step = row.step or {}
-    more = {name: step.get(name) for name in ("now", "coming", "error_nm", "expected_error_nm", "disturbed_s")}
+    more = {
+        name: step.get(name) for name in ("now", "coming", "effects", "error_nm", "expected_error_nm", "disturbed_s")
+    }
     kept = ("number", "test_id", "recording_id", "at_utc", "outcome", "reason", "ask", "error_percent", "delay_s")
     return {**{name: getattr(row, name) for name in kept}, **more}
 

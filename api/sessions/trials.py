@@ -14,11 +14,11 @@ from typing import Any
 
 from api.clock import Clock
 from api.errors import ApiError
-from api.models.places import place_of
+from api.models.places import differ, place_of
 from api.models.tracked import TrackedVersions, Trial
 from api.sessions.requests import TestIn
 from api.store import Store
-from api.store.tables import Approval, Recording, Test, Tracked
+from api.store.tables import Approval, Model, Recording, Test, Tracked
 from api.workers.adviser import Adviser
 
 log = logging.getLogger("stimrig.tracking")
@@ -26,6 +26,8 @@ SEQUENCE = "sequence"
 """A test of this kind is a controller's trial; nothing is identified from it."""
 PATIENCE_S = 2.0
 """So long who fetches a tracked model waits for a trial that has just ended."""
+MOST_BETWEEN = 20
+"""So many recordings between two trials that were followed are passed through the effects."""
 ELSEWHERE = "It was played at another side, muscle or current than the approved model's test."
 
 
@@ -133,11 +135,31 @@ class Trials:
                 "track", data=recording.path, model_json=trial.model_json, bounds=trial.bounds,
                 state=trial.state, missed=trial.missed, earlier=trial.earlier,
                 reference_torque_nm=trial.test.plan.get("reference_torque_nm"),
+                between=await asyncio.to_thread(self._between, trial, recording),
             )  # fmt: skip
         except ApiError as error:
             if error.code == "worker-died":
                 self.warm(trial.test.participant)
             return {"reason": error.detail or error.title}
+
+    def _between(self, trial: Trial, recording: Recording) -> list[str]:
+        """What the muscle did since what is known of it, oldest first; nothing for a model without effects.
+
+        Where nothing was followed yet, it begins with the approved model's test.
+        """
+        model: Model = self.store.get(Model, trial.approval.model_id)
+        since: Recording | None = self.store.get(Recording, trial.since)
+        if since is None or not model.effects:
+            return []
+        conditions = (
+            Recording.participant == recording.participant, Recording.test_id.is_not(None),
+            Recording.created_utc > since.created_utc, Recording.created_utc < recording.created_utc,
+        )  # fmt: skip
+        found = self.store.all(Recording, *conditions, order=Recording.created_utc.desc(), limit=MOST_BETWEEN)[::-1]
+        tests = {row.id: row for row in self.store.all(Test, Test.id.in_([row.test_id for row in found]))}
+        own = place_of(trial.test)
+        here = [row for row in found if row.test_id in tests and not differ(place_of(tests[row.test_id]), own)]
+        return [row.path for row in (here if trial.state else [since, *here])]
 
     # ---- the service's own day ---------------------------------------------------------------------------------
 

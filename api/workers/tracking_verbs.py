@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from api.workers.diagnosis_verbs import begun
 from api.workers.json_values import clean
 
 Progress = Callable[[float, str], None]
@@ -23,6 +26,7 @@ def track(
     missed: int = 0,
     earlier: Sequence[Sequence[dict[str, Any]]] = (),
     reference_torque_nm: Sequence[float] | None = None,
+    between: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Follow one trial.
 
@@ -43,6 +47,9 @@ def track(
         The levels of the trials of this person's earlier sessions: how fast they change from trial to trial.
     reference_torque_nm : sequence of float, optional
         What the controller wanted, one value for each pulse, N·m.
+    between : sequence of str
+        Recordings of what the muscle did since `state`, oldest first; without one, since the begin of the approved
+        model's test. They are read only if the model has effects with slow states, such as fatigue.
 
     Returns
     -------
@@ -54,7 +61,7 @@ def track(
     from identify.tracking import State, begin, follow, learn_rates, model_for_next
 
     progress(0.1, "reading the recording")
-    record = identify.read(Path(data))
+    record = dated(Path(data))
     error = error_percent(record, reference_torque_nm)
     try:
         model = second_order(identify.Model.from_json(model_json))
@@ -62,12 +69,35 @@ def track(
         before = begin(model, rates) if state is None else State.from_dict(state)
         for _ in range(min(missed, MOST_MISSED)):
             before = before.ahead(rates)
+        before = worked(model, before, between)
         step = follow(model, before, record, rates)
         moved = model_for_next(model, step, bounds)
     except identify.IdentifyError as problem:
         return {"error_percent": error, "reason": " ".join(str(problem).split())}
     told = clean(step.to_dict()) | {"moved": list(bounds)}
     return {"error_percent": error, "step": told, "model": moved.to_json(None)}
+
+
+def dated(path: Path) -> Any:
+    """A recording that knows when it began, if its file says so."""
+    import identify
+
+    record = identify.read(path)
+    part = record.parts[0]
+    if len(record.parts) > 1 or part.begun_s is not None:
+        return record
+    return replace(record, parts=(replace(part, own_s=float(record.time_s[0]), begun_s=begun(path)),))
+
+
+def worked(model: Any, state: Any, between: Sequence[str]) -> Any:
+    """The state after what the muscle did in these recordings; of one that cannot be read nobody knows what it did."""
+    import identify
+    from identify.tracking import passed, slow_forms
+
+    for path in between if slow_forms(model) else ():
+        with contextlib.suppress(identify.IdentifyError, OSError):
+            state = passed(model, state, dated(Path(path)))
+    return state
 
 
 def second_order(model: Any) -> Any:
@@ -114,7 +144,6 @@ def error_percent(record: Any, reference_torque_nm: Sequence[float] | None) -> f
 
 def warm(progress: Progress, model_json: str) -> dict[str, Any]:
     """Load all that `track` needs, and follow two seconds of the model's own torque: then a trial waits for nothing."""
-    import contextlib
     import importlib
 
     import numpy as np

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -93,6 +93,8 @@ class Scene:
         Where the torque is used for fitting.
     pauses_s : ndarray or None, shape (K,)
         For the first interval of each part: the part of the pause before it that `time_s` does not contain, s.
+    states : mapping of str to float
+        By effect id, where the slow state of an effect begins (`Form.state`), 0 to 1; 0 where there is none.
     """
 
     time_s: np.ndarray
@@ -107,6 +109,7 @@ class Scene:
     reference_s: float = 0.0
     fitted: np.ndarray | None = None
     pauses_s: np.ndarray | None = None
+    states: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def rest_s(self) -> np.ndarray:
@@ -176,6 +179,9 @@ class Form:
         corrected for it beforehand.
     source : str
         Publication.
+    state : callable or None
+        For "gain" only, and for a form with a slow state between 0 (rested) and 1 that begins at `scene.states`:
+        `state(x, p, scene)`, called as a batched `apply` is, returns it after the last interval, shape (M,).
     """
 
     name: str
@@ -192,6 +198,7 @@ class Form:
     restarts: tuple[dict[str, float], ...] = ()
     fixed: bool = False
     source: str = ""
+    state: Callable[[np.ndarray, dict[str, Any], Scene], np.ndarray] | None = None
 
     def starts(self, scene: Scene) -> list[dict[str, float]]:
         """Starting values, one dict per run."""

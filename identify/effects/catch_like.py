@@ -18,16 +18,22 @@ _RECOVERY = Parameter(
 )
 
 
-def _depletes(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
-    on = np.broadcast_to(scene.on, drive.shape)
-    x = adapt(on, p["decay_s"][:, 0], p["recovery_s"][:, 0], False, scene.step_s, scene.rest_s)
-    return drive * (1.0 + p["gain"] * (1.0 - x))
+def _form(name: str, equation: str) -> Form:
+    def used(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+        by_level = name == "by_level"
+        a = np.minimum(np.abs(drive) / scene.scale_nm, 1.0) if by_level else np.broadcast_to(scene.on, drive.shape)
+        decay_s, recovery_s, begin = p["decay_s"][:, 0], p["recovery_s"][:, 0], scene.states.get("catch_like", 0.0)
+        return adapt(a, decay_s, recovery_s, by_level, scene.step_s, scene.rest_s, begin)
 
-
-def _by_level(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
-    level = np.minimum(np.abs(drive) / scene.scale_nm, 1.0)
-    x = adapt(level, p["decay_s"][:, 0], p["recovery_s"][:, 0], True, scene.step_s, scene.rest_s)
-    return drive * (1.0 + p["gain"] * (1.0 - x))
+    return Form(
+        name,
+        "gain",
+        equation,
+        (_GAIN, _DECAY, _RECOVERY),
+        lambda drive, p, scene: drive * (1.0 + p["gain"] * (1.0 - used(drive, p, scene)[0])),
+        batched=True,
+        state=lambda drive, p, scene: used(drive, p, scene)[1],
+    )
 
 
 def _after_silence(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
@@ -88,22 +94,8 @@ EFFECT = Effect(
     id="catch_like",
     name="Catch-like boost at the onset of a train",
     forms=(
-        Form(
-            "depletes",
-            "gain",
-            "w = (1 + gain (1 - x)) f(u); x' = (1 - x)/decay under pulses, -x/recovery in silence",
-            (_GAIN, _DECAY, _RECOVERY),
-            _depletes,
-            batched=True,
-        ),
-        Form(
-            "by_level",
-            "gain",
-            "w = (1 + gain (1 - x)) f(u); x' = a (1 - x)/decay - x/recovery; a = |f|/f_max",
-            (_GAIN, _DECAY, _RECOVERY),
-            _by_level,
-            batched=True,
-        ),
+        _form("depletes", "w = (1 + gain (1 - x)) f(u); x' = (1 - x)/decay under pulses, -x/recovery in silence"),
+        _form("by_level", "w = (1 + gain (1 - x)) f(u); x' = a (1 - x)/decay - x/recovery; a = |f|/f_max"),
         Form(
             "after_silence",
             "gain",

@@ -14,56 +14,43 @@ _ONSET = Parameter("onset_s", "s", 3.0, 250.0, 30.0, (15.0, 50.0), "log", about=
 _RECOVERY = Parameter("recovery_s", "s", 4.0, 400.0, 50.0, (40.0, 90.0), "log", about="time constant at rest")
 
 
-def _level(drive: np.ndarray, scene: Scene) -> np.ndarray:
-    return np.minimum(np.abs(drive) / scene.scale_nm, 1.0)
+def _form(name: str, equation: str, source: str = "") -> Form:
+    def used(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+        level = np.minimum(np.abs(drive) / scene.scale_nm, 1.0)
+        a = np.broadcast_to(scene.on, drive.shape) if name == "by_pulses" else level
+        onset_s, recovery_s, begin = p["onset_s"][:, 0], p["recovery_s"][:, 0], scene.states.get("fatigue", 0.0)
+        return adapt(a, onset_s, recovery_s, name == "compartments", scene.step_s, scene.rest_s, begin)
 
-
-def _fitness(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
-    x = adapt(_level(drive, scene), p["onset_s"][:, 0], p["recovery_s"][:, 0], False, scene.step_s, scene.rest_s)
-    return drive * (1.0 - p["depth"] * x)
-
-
-def _compartments(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
-    x = adapt(_level(drive, scene), p["onset_s"][:, 0], p["recovery_s"][:, 0], True, scene.step_s, scene.rest_s)
-    return drive * (1.0 - p["depth"] * x)
-
-
-def _by_pulses(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
-    on = np.broadcast_to(scene.on, drive.shape)
-    x = adapt(on, p["onset_s"][:, 0], p["recovery_s"][:, 0], False, scene.step_s, scene.rest_s)
-    return drive * (1.0 - p["depth"] * x)
+    return Form(
+        name,
+        "gain",
+        equation,
+        (_DEPTH, _ONSET, _RECOVERY),
+        lambda drive, p, scene: drive * (1.0 - p["depth"] * used(drive, p, scene)[0]),
+        batched=True,
+        source=source,
+        state=lambda drive, p, scene: used(drive, p, scene)[1],
+    )
 
 
 EFFECT = Effect(
     id="fatigue",
     name="Fatigue",
     forms=(
-        Form(
+        _form(
             "fitness",
-            "gain",
             "w = μ f(u); μ = 1 - depth·x; x' = a(1 - x)/onset - (1 - a) x/recovery; a = |f|/f_max",
-            (_DEPTH, _ONSET, _RECOVERY),
-            _fitness,
-            batched=True,
-            source="Riener, Quintern, Schmidt 1996, muscle fitness",
+            "Riener, Quintern, Schmidt 1996, muscle fitness",
         ),
-        Form(
+        _form(
             "compartments",
-            "gain",
             "w = (1 - depth·x) f(u); x' = a(1 - x)/onset - x/recovery",
-            (_DEPTH, _ONSET, _RECOVERY),
-            _compartments,
-            batched=True,
-            source="Ding et al. 2003 (A falls with force, recovers with one time constant); Xia, Frey-Law 2008",
+            "Ding et al. 2003 (A falls with force, recovers with one time constant); Xia, Frey-Law 2008",
         ),
-        Form(
+        _form(
             "by_pulses",
-            "gain",
             "w = μ f(u); μ = 1 - depth·x; x' = a(1 - x)/onset - (1 - a) x/recovery; a = 1 under pulses of any width, "
             "else 0",
-            (_DEPTH, _ONSET, _RECOVERY),
-            _by_pulses,
-            batched=True,
         ),
     ),
     signature="Torque above the model early in the stimulation and below it late; after a rest it is higher again.",

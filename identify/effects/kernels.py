@@ -8,9 +8,15 @@ from numba import njit
 
 @njit(cache=True, nogil=True)
 def adapt(
-    drive: np.ndarray, onset_s: np.ndarray, recovery_s: np.ndarray, constant: bool, step_s: float, rest_s: np.ndarray
-) -> np.ndarray:  # pragma: no cover
-    """State x in [0, 1] with x' = a (1 - x)/onset - (1 - a) x/recovery, from x = 0; exact for a held drive a.
+    drive: np.ndarray,
+    onset_s: np.ndarray,
+    recovery_s: np.ndarray,
+    constant: bool,
+    step_s: float,
+    rest_s: np.ndarray,
+    begin: float = 0.0,
+) -> tuple[np.ndarray, np.ndarray]:  # pragma: no cover
+    """State x in [0, 1] with x' = a (1 - x)/onset - (1 - a) x/recovery; exact for a held drive a.
 
     With `constant`, recovery also continues under stimulation: x' = a (1 - x)/onset - x/recovery.
 
@@ -26,16 +32,20 @@ def adapt(
         Length of an interval, s.
     rest_s : ndarray, shape (K,)
         Additional rest before each interval, s.
+    begin : float
+        x before the first of them.
 
     Returns
     -------
     ndarray, shape (M, K)
         Mean of x at the start and the end of each interval.
+    ndarray, shape (M,)
+        x after the last.
     """
     rows, size = drive.shape
-    out = np.empty((rows, size))
+    out, last = np.empty((rows, size)), np.empty(rows)
     for m in range(rows):
-        x = 0.0
+        x = begin
         for k in range(size):
             if rest_s[k] > 0.0:
                 x *= np.exp(-rest_s[k] / recovery_s[m])
@@ -49,7 +59,8 @@ def adapt(
                 end = goal + (x - goal) * np.exp(-rate * step_s)
             out[m, k] = 0.5 * (x + end)
             x = end
-    return out
+        last[m] = x
+    return out, last
 
 
 @njit(cache=True, nogil=True)

@@ -14,21 +14,29 @@ _ONSET = Parameter("onset_s", "s", 1.2, 80.0, 5.0, (4.0, 15.0), "log", about="ti
 _RECOVERY = Parameter("recovery_s", "s", 2.0, 400.0, 60.0, (20.0, 80.0), "log", about="time constant at rest")
 
 
-def _make(kind: str) -> Any:
-    def apply(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+def _form(name: str, equation: str) -> Form:
+    def used(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> tuple[np.ndarray, np.ndarray]:
         level = np.minimum(np.abs(drive) / scene.scale_nm, 1.0)
-        a = np.broadcast_to(scene.on, drive.shape) if kind == "by_pulses" else level
-        x = adapt(a, p["onset_s"][:, 0], p["recovery_s"][:, 0], kind == "steady_decay", scene.step_s, scene.rest_s)
-        return drive * (1.0 + p["gain"] * x)
+        a = np.broadcast_to(scene.on, drive.shape) if name == "by_pulses" else level
+        onset_s, recovery_s, begin = p["onset_s"][:, 0], p["recovery_s"][:, 0], scene.states.get("potentiation", 0.0)
+        return adapt(a, onset_s, recovery_s, name == "steady_decay", scene.step_s, scene.rest_s, begin)
 
-    return apply
+    return Form(
+        name,
+        "gain",
+        equation,
+        (_GAIN, _ONSET, _RECOVERY),
+        lambda drive, p, scene: drive * (1.0 + p["gain"] * used(drive, p, scene)[0]),
+        batched=True,
+        state=lambda drive, p, scene: used(drive, p, scene)[1],
+    )
 
 
 EFFECT = Effect(
     id="potentiation",
     name="Potentiation",
     forms=tuple(
-        Form(name, "gain", equation, (_GAIN, _ONSET, _RECOVERY), _make(name), batched=True)
+        _form(name, equation)
         for name, equation in (
             ("by_level", "w = (1 + gain·x) f(u); x' = a(1 - x)/onset - (1 - a) x/recovery; a = |f|/f_max"),
             ("steady_decay", "w = (1 + gain·x) f(u); x' = a(1 - x)/onset - x/recovery; a = |f|/f_max"),

@@ -9,6 +9,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from identify import model_schema
 from identify.dynamics import narx
 from identify.dynamics.linear import Discrete, Linear, SecondOrder
 from identify.dynamics.make_grid import make_grid
@@ -93,7 +94,8 @@ def problem_of(
     grid : Grid
         The record.
     further : sequence of (Form, sequence of float)
-        Forms that act beside the model's effects, and the values of their parameters.
+        Forms that act beside the model's effects, next to the curve (a gain before all others, what changes the widths
+        after them), and the values of their parameters.
 
     Raises
     ------
@@ -115,8 +117,10 @@ def problem_of(
         zero_nm=float(settings.get("zero_nm", 0.0)),
         sign=float(settings.get("sign", 1.0)),
         reference_s=float(settings.get("reference_s", 0.0)),
+        states={} if same_data(model, grid.record) else states_of(model),
     )
-    effects, parameters = [], []
+    effects = [(form.name, form) for form, _ in further if form.stage == "gain"]
+    parameters = [value for form, own in further if form.stage == "gain" for value in own]
     for entry in model.effects:
         try:
             effect = get(entry["id"])
@@ -133,8 +137,9 @@ def problem_of(
                 )
         effects.append((effect.id, form))
     for form, own in further:
-        effects.append((form.name, form))
-        parameters += own
+        if form.stage != "gain":
+            effects.append((form.name, form))
+            parameters += own
     problem = Problem(setup, effects)
     values = np.zeros(problem.size)
     values[:3] = model.linear.time_constant_s, model.linear.damping, model.linear.delay_s
@@ -146,6 +151,20 @@ def problem_of(
     values[problem.coefficients] = setup.sign * model.recruitment.coefficients_nm
     values[problem.coefficients.stop :] = parameters
     return problem, problem.from_physical(values)
+
+
+def states_of(model: Muscle) -> dict[str, float]:
+    """By effect id, where its slow state is at the begin of what is predicted; rested effects need not be there.
+
+    Raises
+    ------
+    BadModel
+        A state is not a number from 0 to 1.
+    """
+    given = {entry["id"]: entry["state"] for entry in model.effects if "state" in entry}
+    for effect, value in given.items():
+        model_schema.EFFECT_STATE(value, f"effects.{effect}.state")
+    return given
 
 
 def slopes(model: Muscle, grid: Grid, names: Sequence[str]) -> np.ndarray:

@@ -159,6 +159,12 @@ class Problem:
         jacobian[list(places)] = (mean[1:] - mean[0]) / np.array(steps)[:, None]
         return mean[0], jacobian
 
+    def states(self, theta: np.ndarray) -> dict[str, float]:
+        """By effect id, the slow state that each effect with one (`Form.state`) has at the record's end, 0 to 1."""
+        found: dict[str, float] = {}
+        _StagePass(self, theta, False).gained(found)
+        return found
+
     def at_samples(self, theta: np.ndarray, skip: frozenset[str] = frozenset()) -> np.ndarray:
         """Torque at the record's samples, with its sign and zero, N·m; additive effects in `skip` are left out."""
         stages = _StagePass(self, theta, False)
@@ -212,11 +218,7 @@ class _StagePass:
         """States at the ends of the intervals (torque, rate), and for each row its delay, s, and which states it
         uses."""
         setup, scene = self.setup, self.setup.scene
-        drive = self.recruit()
-        for chosen in self.forms("gain"):
-            rows, values = self.join(chosen.places)
-            drive = np.asarray(chosen.form.call(drive[rows], self.named(chosen, values), scene))
-        torque, rate = self.dynamics(drive)
+        torque, rate = self.dynamics(self.gained())
         # A delay changes where the states are read, not the states: rows that differ only in delay share them.
         owned, values = self.join(self.problem.delay)
         delay = values[:, 0]
@@ -238,6 +240,17 @@ class _StagePass:
             torque, rate = self.bend(chosen, torque[rows], rate[rows], values)
         owned = np.arange(delay.size) if bending else owned
         return torque, rate, delay, owned
+
+    def gained(self, states: dict[str, float] | None = None) -> np.ndarray:
+        """The drive behind the gain stage; with `states`, the slow states of row 0 at the end are written there."""
+        drive = self.recruit()
+        for chosen in self.forms("gain"):
+            rows, values = self.join(chosen.places)
+            drive, p = drive[rows], self.named(chosen, values)
+            if states is not None and chosen.form.state is not None:
+                states[chosen.effect] = float(chosen.form.state(drive, p, self.setup.scene)[0])
+            drive = np.asarray(chosen.form.call(drive, p, self.setup.scene))
+        return drive
 
     def recruit(self) -> np.ndarray:
         setup, problem = self.setup, self.problem

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -45,6 +46,8 @@ class Setup:
         Time at which the recruitment curve holds, if an effect makes it drift, s.
     curve_nm : ndarray, shape (n,), or float
         Prior mean of the curve's coefficients, N·m.
+    states : mapping of str to float
+        By effect id, where its slow state begins; 0 (rested) where there is none.
     """
 
     grid: Grid
@@ -60,6 +63,7 @@ class Setup:
     spread: np.ndarray | float = 1.0
     reference_s: float = 0.0
     curve_nm: np.ndarray | float = 0.0
+    states: Mapping[str, float] = field(default_factory=dict)
 
     @cached_property
     def stretches(self) -> tuple[np.ndarray, np.ndarray]:
@@ -92,7 +96,7 @@ class Setup:
         scene = self._scene((np.arange(grid.size) + mean) * grid.step_s, grid.pulse_width_us)
         pauses = np.zeros(grid.size)
         pauses[grid.begins] = [part.pause_s - part.folded_s for part in grid.record.parts]
-        return replace(scene, fitted=self.fitted, pauses_s=pauses)
+        return replace(scene, fitted=self.fitted, pauses_s=pauses, states=self.states)
 
     @cached_property
     def scene_at_ends(self) -> Scene:

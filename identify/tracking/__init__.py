@@ -1,5 +1,6 @@
 """Following an approved model from trial to trial: gain, threshold and time scale, with bands."""
 
+from identify.tracking.carried import passed, slow_forms
 from identify.tracking.follow import Outcome, Step, begin, follow, levels_of, model_for_next
 from identify.tracking.rates import learn_rates
 from identify.tracking.served import moved_model
@@ -22,4 +23,6 @@ __all__ = [
     "look",
     "model_for_next",
     "moved_model",
+    "passed",
+    "slow_forms",
 ]

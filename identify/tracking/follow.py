@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Any
 
@@ -12,6 +12,7 @@ import numpy as np
 from identify.model import Model
 from identify.records.record import Record
 from identify.simulation.predict import refuse_rate
+from identify.tracking.carried import passed, rest_before, rested, with_states
 from identify.tracking.served import largest_change, moved_model
 from identify.tracking.state import LEVELS, QUANTITIES, USUAL, Rates, State, Values, updated
 from identify.tracking.trial import Seen, curve_covariance, look
@@ -24,6 +25,9 @@ ENOUGH = 0.05
 """Of the model's largest torque: so much the expected one must vary for that to be told."""
 LITTLE = np.array([0.05, 5.0, 0.08])
 """A trial that would tell none of the levels to within such a standard deviation tells little."""
+
+USUAL_REST_S = 15.0
+"""Rest after the first trial, as it is expected: in the one before it the model was approved."""
 
 
 Bounds = Mapping[str, Sequence[float]]
@@ -59,6 +63,9 @@ class Step:
         What is expected of the next trial: of this the controller is told.
     distance : float or None
         Squared distance of what was seen from what was expected, in standard deviations; None if it moved nothing.
+    effects : dict of dict
+        By effect id, its slow state at the trial's end, `now`, and as expected at the begin of the next one, `coming`,
+        after a rest as long as the one before this trial, but at most `USUAL_REST_S` if that was the first.
     """
 
     outcome: Outcome
@@ -67,6 +74,12 @@ class Step:
     after: State
     coming: State
     distance: float | None
+    effects: dict[str, dict[str, float]] = field(default_factory=dict)
+
+    @property
+    def coming_effects(self) -> dict[str, float]:
+        """By effect id, its slow state as expected at the begin of the next trial."""
+        return {effect: states["coming"] for effect, states in self.effects.items()}
 
     @property
     def disturbed_s(self) -> list[list[float]]:
@@ -88,6 +101,7 @@ class Step:
             "torque_nm": self.seen.torque_nm,
             "disturbed_s": self.disturbed_s,
             "distance": self.distance,
+            "effects": self.effects,
             "state": self.coming.to_dict(),
         }
 
@@ -102,12 +116,17 @@ def levels_of(state: State) -> dict[str, dict[str, float]]:
     return found
 
 
-def begin(model: Model, rates: Rates = USUAL) -> State:
-    """What is expected of the first trial after the approval of a model."""
-    return State.start(curve_covariance(model), rates)
+def begin(model: Model, rates: Rates = USUAL, test: Record | None = None) -> State:
+    """What is expected of the first trial after the approval of a model; with the record of the `test` before it, what
+    that has done to the muscle.
+    """
+    state = State.start(curve_covariance(model), rates)
+    return state if test is None else passed(model, state, test)
 
 
-def follow(model: Model, state: State | None, record: Record, rates: Rates = USUAL) -> Step:
+def follow(
+    model: Model, state: State | None, record: Record, rates: Rates = USUAL, rest_s: float | None = None
+) -> Step:
     """Learn from one trial.
 
     Parameters
@@ -120,6 +139,9 @@ def follow(model: Model, state: State | None, record: Record, rates: Rates = USU
         The trial, with its rest before and after.
     rates : Rates
         How fast this person changes.
+    rest_s : float, optional
+        Rest between the end of what was seen last and this record's begin, s. None: by their clocks, `Part.begun_s`.
+        If it is not known, or no rest (negative, not a number), the muscle is taken to have recovered.
 
     Raises
     ------
@@ -131,17 +153,22 @@ def follow(model: Model, state: State | None, record: Record, rates: Rates = USU
     """
     refuse_rate(model, record)
     before = begin(model, rates) if state is None else state
-    seen = look(model, before, record)
+    rest_s = rest_before(before, record, rest_s)
+    begun = rested(model, before.effects, rest_s)
+    seen = look(with_states(model, begun), before, record)
     if seen.came < GONE and seen.wanted_nm > ENOUGH * float(np.ptp(model.recruitment.table()[1])):
-        after = replace(before, trials=before.trials + 1)
-        return Step(Outcome.NO_TORQUE, seen, before, after, after.ahead(rates), None)
-    if seen.misfit > UNEXPLAINED:
-        after = replace(before, trials=before.trials + 1, unexplained=before.unexplained + 1)
+        after, distance, outcome = replace(before, trials=before.trials + 1), None, Outcome.NO_TORQUE
+    elif seen.misfit > UNEXPLAINED:
+        after, distance = replace(before, trials=before.trials + 1, unexplained=before.unexplained + 1), None
         outcome = Outcome.CONTRADICTS if after.unexplained > 1 else Outcome.ODD
-        return Step(outcome, seen, before, after, after.ahead(rates), None)
-    after, distance = updated(before, seen.vector, seen.information)
-    outcome = Outcome.ODD if after.odd is not None else _told(seen)
-    return Step(outcome, seen, before, after, after.ahead(rates), distance)
+    else:
+        after, distance = updated(before, seen.vector, seen.information)
+        outcome = Outcome.ODD if after.odd is not None else _told(seen)
+    after = passed(model, replace(after, effects=begun), record, 0.0)
+    next_s = rest_s if before.trials or rest_s is None else min(rest_s, USUAL_REST_S)
+    coming = rested(model, after.effects, next_s)
+    effects = {effect: {"now": now, "coming": coming[effect]} for effect, now in after.effects.items()}
+    return Step(outcome, seen, before, after, after.ahead(rates), distance, effects)
 
 
 def _told(seen: Seen) -> Outcome:
@@ -166,10 +193,10 @@ def model_for_next(model: Model, step: Step, bounds: Bounds | None = None) -> Mo
     """
     coming = step.coming
     if bounds is None:
-        return moved_model(model, coming.values, coming.curve_nm)
+        return moved_model(model, coming.values, coming.curve_nm, step.coming_effects)
     values = replace(Values(), **{name: getattr(coming.values, name) for name in QUANTITIES if name in bounds})
     low, high = bounds.get("gain", (1.0, 1.0))
     # The torque of every pulse stays within what the gain may be; if it does not, the curve keeps its shape.
     away = values.gain * largest_change(model, coming.curve_nm)
     inside = low <= values.gain - away and values.gain + away <= high
-    return moved_model(model, values, coming.curve_nm if inside else 0.0)
+    return moved_model(model, values, coming.curve_nm if inside else 0.0, step.coming_effects)

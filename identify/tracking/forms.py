@@ -10,7 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from identify.dynamics.pulse_grid import Grid
 from identify.effects.base import Form, Parameter, Scene
+from identify.model import Model
+from identify.simulation.predict import problem_of
+from identify.simulation.problem import Problem
+from identify.tracking.state import LEVELS
 
 
 def _along(scene: Scene) -> np.ndarray:
@@ -52,3 +57,30 @@ def _drift(_none: None, p: dict[str, Any], scene: Scene) -> np.ndarray:
 DRIFT = Form(
     "drift", "additive", "y + drift · share of time", (Parameter("drift_nm", "N·m", -100.0, 100.0),), _drift, True
 )
+
+
+def placed(model: Model, levels: np.ndarray, grid: Grid) -> tuple[Problem, np.ndarray]:
+    """The approved model on a record, at such levels and curve, and its parameters.
+
+    The first form is the gain, the last two are the shift and the drift.
+
+    Parameters
+    ----------
+    model : Model
+        The approved one.
+    levels : ndarray, shape (3 + n,)
+        Log gain, threshold shift (µs), log time scale, and what is added to the curve's coefficients (N·m).
+    grid : Grid
+        The record.
+
+    Raises
+    ------
+    BadModel
+        As `identify.simulation.predict.problem_of`.
+    """
+    log_gain, shift_us, log_time = levels[:LEVELS].tolist()
+    forms = ((GAIN, (log_gain, 0.0)), (SHIFT, (shift_us, 0.0)), (DRIFT, (0.0,)))
+    problem, theta = problem_of(model, grid, forms)
+    theta[0] += log_time
+    theta[problem.coefficients] += levels[LEVELS:]
+    return problem, theta

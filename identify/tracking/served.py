@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from identify.errors import BadModel
 from identify.model import Model
 from identify.recruitment.curve import Curve
 from identify.recruitment.spline import SplineBasis
+from identify.tracking.carried import with_states
 from identify.tracking.state import Values
 
 EVEN = 31
@@ -58,8 +60,11 @@ def largest_change(model: Model, curve_nm: np.ndarray) -> float:
     return float(np.max(np.abs(change)) / max(np.ptp(model.recruitment.table()[1]), 1e-9))
 
 
-def moved_model(model: Model, values: Values, curve_nm: np.ndarray | float = 0.0) -> Model:
-    """The model with the levels of `values`, and with `curve_nm` added to the coefficients of its curve.
+def moved_model(
+    model: Model, values: Values, curve_nm: np.ndarray | float = 0.0, effects: Mapping[str, float] | None = None
+) -> Model:
+    """The model with the levels of `values`, with `curve_nm` added to the coefficients of its curve, and its effects
+    where `effects` says that they begin.
 
     Raises
     ------
@@ -72,4 +77,5 @@ def moved_model(model: Model, values: Values, curve_nm: np.ndarray | float = 0.0
     sign = float(model.effects[0].get("settings", {}).get("sign", 1.0)) if model.effects else 1.0
     own = replace(model.recruitment, coefficients_nm=model.recruitment.coefficients_nm + sign * curve_nm)
     # What was known of the approved model's own parameters holds for none of the moved ones.
-    return model.with_(recruitment=moved_curve(own, values), linear=linear, covariance=None, bands={})
+    begun = with_states(model, effects or {})
+    return begun.with_(recruitment=moved_curve(own, values), linear=linear, covariance=None, bands={})

@@ -11,6 +11,7 @@ One odd trial moves no level by more than its band. If the next one says the sam
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -94,6 +95,10 @@ class State:
         How far the last trial would have moved the levels, if it was odd.
     unexplained : int
         Trials since the last one that gain, threshold and speed explained.
+    effects : mapping of str to float
+        By effect id, the slow states of the approved model's effects at the end of what was seen last, 0 to 1.
+    ended_s : float or None
+        When that was, as Unix time; None: not known.
     """
 
     mean: np.ndarray
@@ -101,6 +106,8 @@ class State:
     trials: int = 0
     odd: np.ndarray | None = None
     unexplained: int = 0
+    effects: Mapping[str, float] = field(default_factory=dict)
+    ended_s: float | None = None
 
     @classmethod
     def start(cls, curve_covariance: np.ndarray, rates: Rates = USUAL) -> State:
@@ -148,6 +155,8 @@ class State:
             "trials": self.trials,
             "odd": None if self.odd is None else self.odd.tolist(),
             "unexplained": self.unexplained,
+            "effects": dict(self.effects),
+            "ended_s": self.ended_s,
         }
 
     @classmethod
@@ -160,6 +169,8 @@ class State:
             int(data["trials"]),
             None if odd is None else np.array(odd, float),
             int(data["unexplained"]),
+            dict(data.get("effects") or {}),  # not in rows of older versions
+            data.get("ended_s"),
         )
 
 

@@ -15,9 +15,8 @@ from identify.dynamics.pulse_grid import Grid, runs
 from identify.errors import BadRecord
 from identify.model import Model
 from identify.records.record import Record
-from identify.simulation.predict import problem_of
 from identify.simulation.problem import Problem
-from identify.tracking.forms import DRIFT, GAIN, SHIFT
+from identify.tracking.forms import placed
 from identify.tracking.state import LEVELS, State
 
 SHORTEST_S = 1.0
@@ -175,8 +174,8 @@ class _Asked:
 
 
 def _asked(model: Model, expected: State, grid: Grid) -> _Asked:
-    problem, theta = problem_of(model, grid, ((SHIFT, (0.0, 0.0)), (GAIN, (0.0, 0.0)), (DRIFT, (0.0,))))
-    shift, gain, drift = (chosen.first for chosen in problem.chosen[-3:])
+    problem, theta = placed(model, np.zeros(expected.seen.size), grid)
+    gain, shift, drift = (problem.chosen[place].first for place in (0, -2, -1))
     curve = range(problem.coefficients.start, problem.coefficients.stop)
     own = [gain + 1, shift + 1, *problem.delay, *problem.baselines, drift, *problem.initials]
     target = problem.setup.to_muscle(grid.torque_nm)

@@ -174,6 +174,7 @@ def tracked(arguments: dict[str, Any]) -> dict[str, Any]:
     values = {"gain": state["gain"] * 0.98, "threshold_shift_us": 0.5, "time_scale": 1.0} | wanted.get("values", {})
     levels = {name: {"value": value, "low": value - 0.01, "high": value + 0.01} for name, value in values.items()}
     after = {"trials": state["trials"] + 1, "gain": values["gain"], "missed": arguments["missed"]}
+    after["between"] = arguments["between"]
     step = {
         "outcome": wanted.get("outcome", "followed"), "trial": after["trials"], "now": levels, "coming": levels,
         "error_nm": wanted.get("error_nm", 0.04), "expected_error_nm": 0.04, "error_before_nm": 0.1, "torque_nm": 2.0,

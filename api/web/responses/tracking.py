@@ -43,6 +43,10 @@ class TrialOut(Document):
     delay_s: float | None = Field(description="from its last sample to the model being served")
     now: LevelsOut | None = Field(description="in this trial")
     coming: LevelsOut | None = Field(description="expected in the next one")
+    effects: dict[str, dict[str, float]] | None = Field(
+        description="by effect id, its slow state from 0 (rested) to 1: `now` at this trial's end, `coming` at the "
+        "next one's begin; empty if the model has no such effect"
+    )
     error_nm: float | None = Field(description="what no gain, threshold or time scale explains, N·m")
     expected_error_nm: float | None = Field(description="the same on the approved model's own recording, N·m")
     disturbed_s: list[list[float]] | None = Field(description="begin and end of stretches that do not fit, s")

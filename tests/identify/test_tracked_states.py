@@ -1,0 +1,232 @@
+"""The slow states of effects (fatigue, potentiation) are carried through the pulses and rests of a session."""
+
+from __future__ import annotations
+
+import json
+import math
+import warnings
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hardware_sim.offline import simulate
+from hardware_sim.patients import registry
+from identify.dynamics.make_grid import make_grid
+from identify.effects import registry as effects
+from identify.errors import BadModel
+from identify.fitting import fit
+from identify.model import Model
+from identify.records.record import Part, Record
+from identify.simulation.predict import predict, problem_of
+from identify.simulation.pulses import above_rest
+from identify.tracking import State, begin, follow, model_for_next, moved_model, passed
+from identify.tracking.carried import rested, slow_forms, with_states
+from tests.harness.muscle import Patient
+from tests.harness.patients import make_record
+
+SEED = 54200
+PER, RATE_HZ, CURRENT_MA = 10, 400.0, 20.0
+FORMS = [(effect.id, form.name) for effect in effects().values() for form in effect.forms if form.state is not None]
+PATIENT = Patient.with_rise(45.0, 120.0, gain=8.0, time_constant_s=0.2, damping=0.9)
+WIDTHS = np.r_[np.zeros(40), np.linspace(60.0, 200.0, 160), np.full(120, 160.0), np.zeros(120), np.full(120, 140.0)]
+
+
+@pytest.fixture(scope="module")
+def tested() -> Record:
+    return make_record(PATIENT, np.random.default_rng(SEED))[0]
+
+
+@pytest.fixture(scope="module")
+def plain(tested: Record) -> Model:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return fit(tested)
+
+
+def having(model: Model, effect_id: str, name: str, **more: Any) -> Model:
+    """The model with an effect at its starting values."""
+    form = effects()[effect_id].form(name)
+    entry = {"id": effect_id, "form": name, "parameters": {p.name: p.start[0] for p in form.parameters}}
+    return model.with_(effects=({**entry, "settings": {"scale_nm": 8.0}, **more},))
+
+
+def record_of(widths_us: np.ndarray, begun_s: float | None = None, torque_nm: np.ndarray | None = None) -> Record:
+    time_s = np.arange(widths_us.size * PER) / RATE_HZ
+    torque_nm = np.zeros(time_s.size) if torque_nm is None else torque_nm
+    names = ["trial"] * time_s.size
+    return Record.from_arrays(time_s, np.repeat(widths_us, PER), torque_nm, names, parts=(Part(begun_s=begun_s),))
+
+
+def test_forms_with_a_state_are_those_that_wear_off_slowly() -> None:
+    assert {effect for effect, _ in FORMS} == {"fatigue", "potentiation", "catch_like"}
+    assert len(FORMS) == 8
+
+
+@pytest.mark.parametrize(("effect", "form"), FORMS)
+def test_a_record_cut_in_two_with_its_state_is_the_uncut_one(plain: Model, effect: str, form: str) -> None:
+    model, cut = having(plain, effect, form), 240
+    whole = problem_of(model, make_grid(record_of(WIDTHS)))
+    first = passed(model, begin(model), record_of(WIDTHS[:cut]))
+    second = passed(model, first, record_of(WIDTHS[cut:]), 0.0)
+    assert second.effects == pytest.approx(whole[0].states(whole[1]), abs=1e-9)
+    assert 0.01 < first.effects[effect] < 1.0
+    # So is its torque, if it is cut where the muscle has come to rest; without the state it is another one.
+    quiet = 435
+    before, after = record_of(WIDTHS[:quiet]), record_of(WIDTHS[quiet:])
+    wanted = predict(model, record_of(WIDTHS))[quiet * PER :]
+    carried = with_states(model, passed(model, begin(model), before).effects)
+    assert predict(carried, after) == pytest.approx(wanted, abs=2e-3)
+    if effect != "catch_like":  # that has worn off by then
+        assert np.max(np.abs(predict(model, after) - wanted)) > 0.2
+
+
+@pytest.mark.parametrize(("effect", "form"), FORMS)
+def test_a_rest_is_as_long_as_the_same_silence(plain: Model, effect: str, form: str) -> None:
+    model = having(plain, effect, form)
+    tired = passed(model, begin(model), record_of(WIDTHS))
+    silence = passed(model, tired, record_of(np.zeros(400)), 0.0).effects
+    assert rested(model, tired.effects, 10.0) == pytest.approx(silence, abs=1e-9)
+    assert rested(model, tired.effects, 0.0) == tired.effects
+    assert rested(model, tired.effects, math.inf) == rested(model, tired.effects, None) == {effect: 0.0}
+
+
+@pytest.mark.parametrize(("effect", "form"), FORMS)
+def test_rested_is_bit_for_bit_as_without_a_state(plain: Model, effect: str, form: str) -> None:
+    record = record_of(WIDTHS)
+    absent = predict(having(plain, effect, form), record)
+    assert np.array_equal(absent, predict(having(plain, effect, form, state=0.0), record))
+    assert not np.array_equal(absent, predict(having(plain, effect, form, state=0.5), record))
+
+
+def test_a_muscle_that_is_tired_gives_less_above_rest(plain: Model) -> None:
+    torque = [np.max(above_rest(having(plain, "fatigue", "fitness", state=x), WIDTHS, 40.0)) for x in (0.0, 0.4, 0.9)]
+    assert torque[0] > torque[1] > torque[2]
+
+
+@pytest.mark.parametrize("state", [math.nan, -0.01, 1.01, math.inf, "0.5", True, None])
+def test_a_state_that_is_none_is_refused_with_place_and_mend(plain: Model, state: Any) -> None:
+    model = having(plain, "fatigue", "fitness", state=state)
+    with pytest.raises(BadModel, match=r"effects\.fatigue\.state.*rested"):
+        predict(model, record_of(WIDTHS))
+    document = {**plain.to_dict(), "effects": list(model.effects)}
+    with pytest.raises(BadModel, match=r"effects\.0\.state.*rested"):
+        Model.from_dict(document)
+
+
+def test_on_its_own_record_a_model_begins_rested(plain: Model, tested: Record) -> None:
+    model = having(plain, "fatigue", "fitness")
+    tired = with_states(model, {"fatigue": 0.8})
+    assert np.array_equal(model.predict(tested), tired.predict(tested))
+    trial = record_of(WIDTHS)
+    assert not np.array_equal(model.predict(trial), tired.predict(trial))
+
+
+def test_state_and_model_come_back_from_their_files(plain: Model) -> None:
+    model = having(plain, "fatigue", "fitness")
+    step = follow(model, begin(model, test=record_of(WIDTHS, 100.0)), trial_of(model), rest_s=20.0)
+    back = State.from_dict(json.loads(json.dumps(step.coming.to_dict())))
+    assert back.effects == step.coming.effects and back.ended_s == step.coming.ended_s
+    moved = Model.from_json(model_for_next(model, step).to_json())
+    assert moved.effects[0]["state"] == step.to_dict()["effects"]["fatigue"]["coming"] > 0.0
+    assert "state" not in model.effects[0]
+    older = {name: value for name, value in back.to_dict().items() if name not in ("effects", "ended_s")}
+    assert State.from_dict(older).effects == {} and State.from_dict(older).ended_s is None
+
+
+def trial_of(model: Model, begun_s: float | None = None) -> Record:
+    torque_nm = predict(model, record_of(WIDTHS))
+    return record_of(WIDTHS, begun_s, torque_nm + 0.05 * np.random.default_rng(SEED).standard_normal(torque_nm.size))
+
+
+def test_rests_are_told_by_the_clocks_of_the_records(plain: Model) -> None:
+    model = having(plain, "fatigue", "fitness")
+    span_s = WIDTHS.size / 40.0
+    tested = begin(model, test=record_of(WIDTHS, 1000.0))
+    assert tested.ended_s == pytest.approx(1000.0 + span_s, abs=1e-6)
+    by_clock = follow(model, tested, trial_of(model, 1000.0 + span_s + 30.0))
+    given = follow(model, tested, trial_of(model), rest_s=30.0)
+    assert by_clock.effects["fatigue"]["now"] == pytest.approx(given.effects["fatigue"]["now"], abs=1e-6)
+    rested_first = follow(model, None, trial_of(model))
+    assert given.effects["fatigue"]["now"] > 1.05 * rested_first.effects["fatigue"]["now"]
+    # A rest that nobody knows is taken for a long one; so is one that cannot be.
+    for record, rest_s in ((trial_of(model), None), (trial_of(model), math.nan), (trial_of(model, 500.0), None)):
+        assert follow(model, tested, record, rest_s=rest_s).effects["fatigue"]["now"] == pytest.approx(
+            rested_first.effects["fatigue"]["now"], abs=1e-9
+        )
+
+
+def test_the_tracked_gain_takes_part_in_what_tires(plain: Model) -> None:
+    model = having(plain, "fatigue", "fitness")
+    weak = begin(model)
+    weak = replace(weak, mean=np.r_[np.log(0.5), weak.mean[1:]])
+    usual, less = passed(model, begin(model), record_of(WIDTHS)), passed(model, weak, record_of(WIDTHS))
+    assert less.effects["fatigue"] < 0.75 * usual.effects["fatigue"]
+    served = moved_model(model, weak.values)
+    assert less.effects == pytest.approx(passed(served, begin(served), record_of(WIDTHS)).effects, abs=1e-6)
+
+
+def test_a_model_without_such_effects_is_followed_as_ever(plain: Model) -> None:
+    record = trial_of(plain, 1000.0)
+    step = follow(plain, begin(plain, test=record), record)
+    other = follow(plain, None, record, rest_s=7.0)
+    assert slow_forms(plain) == {} and step.effects == {} and step.coming.ended_s is None
+    assert step.to_dict() == other.to_dict()
+
+
+# ---- against a muscle with laws of its own ----------------------------------------------------------------------
+
+
+class Person:
+    """`hardware_sim.patients.changing` on one clock."""
+
+    def __init__(self, **changes: float) -> None:
+        self.muscle = registry.make("changing", {"natural_period_s": 0.2, **changes})
+        self.rng, self.now_s = np.random.default_rng(SEED), 0.0
+
+    def play(self, widths_us: np.ndarray, rest_s: float = 0.0) -> Record:
+        self.now_s += rest_s
+        times = self.now_s + np.arange(widths_us.size) / 40.0
+        span_s = widths_us.size / 40.0
+        clean = simulate(self.muscle, times, widths_us, CURRENT_MA, RATE_HZ, span_s, self.now_s)
+        record = record_of(widths_us, self.now_s, clean + 0.05 * self.rng.standard_normal(clean.size))
+        self.now_s += span_s
+        return record
+
+
+def _test_widths() -> np.ndarray:
+    rng = np.random.default_rng(SEED)
+    steps = np.repeat(rng.integers(60, 300, 50), 20).astype(float)
+    ramp = np.r_[np.linspace(0.0, 300.0, 240), np.linspace(300.0, 0.0, 240)]
+    return np.r_[np.zeros(60), ramp, np.zeros(60), steps, np.zeros(60), ramp, np.zeros(60)].round()
+
+
+@pytest.mark.parametrize(
+    ("effect", "changes"),
+    [
+        ("fatigue", {"fatigue_share": 0.5, "fatigue_recovery_s": 90.0}),
+        ("potentiation", {"potentiation_share": 0.4, "potentiation_recovery_s": 60.0}),
+    ],
+)
+def test_the_next_trial_is_foretold_better_with_the_states(effect: str, changes: dict[str, float]) -> None:
+    person = Person(**changes)
+    test = person.play(_test_widths())
+    model = fit(test, effects=[effect])
+    widths = np.r_[np.zeros(40), np.linspace(60.0, 170.0, 160), np.full(160, 170.0), np.full(80, 110.0), np.zeros(40)]
+    carried, forgot = begin(model, test=test), begin(model)
+    errors = []
+    for rest_s in (60.0, 10.0, 10.0, 120.0, 10.0, 150.0):
+        trial = person.play(widths, rest_s)
+        expected = [
+            moved_model(model, state.values, state.curve_nm, rested(model, state.effects, rest_s))
+            for state in (carried, forgot)
+        ]
+        errors.append([float(np.std(one.predict(trial) - trial.torque_nm)) for one in expected])
+        carried = follow(model, carried, trial).coming
+        forgot = follow(model, forgot, trial, rest_s=math.inf).coming
+        forgot = replace(forgot, effects={})
+    found = np.array(errors)
+    assert found[0, 0] < 0.85 * found[0, 1], "the first trial knows what the test did"
+    with_states_nm, without_nm = np.sqrt(np.mean(found[1:] ** 2, axis=0))
+    assert with_states_nm < 0.5 * without_nm, found
