@@ -12,7 +12,7 @@ LONGEST_S = 300.0
 MOST_SAMPLES = 60_000
 """Of a reference: the longest one at 200 a second."""
 LARGEST_NM = 1000.0
-LEAST_GAP_S, LONGEST_GAP_S = 1e-6, 1.0
+LEAST_GAP_S, LONGEST_GAP_S = 1e-9, 1.0
 """Between neighbouring samples: across a shorter one the slope is no number, across a longer one a straight line is no
 wish of anybody's."""
 RATES_HZ = (10.0, 100.0)
