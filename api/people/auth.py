@@ -150,7 +150,7 @@ class Auth:
         self._known = {}
 
     def bearer(self, text: str, address: str = "", *, forgive_age: bool = False) -> Principal:
-        """The holder of a bearer token; `forgive_age` lets one that ran out still press stop.
+        """The holder of a bearer token; `forgive_age`: one that ran out, or a revoked key, presses stop.
 
         Guesses are held to a pace by the place they come from. A token that was drawn opens all the same: nobody
         guesses its 256 bits, and others' guesses must not keep a controller out. A right token always presses stop.
@@ -178,7 +178,8 @@ class Auth:
         return found
 
     def _principal(self, token: Token | None, csrf: str | None = None, *, forgive_age: bool = False) -> Principal:
-        if token is None or token.revoked:
+        # A controller's key always presses stop: its trial may be playing when a person revokes it.
+        if token is None or (token.revoked and not (forgive_age and token.participant is not None)):
             raise unauthorized("The token is unknown or has been revoked. Ask an administrator for a new one.")
         if token.expires_utc is not None and token.expires_utc <= self.clock.utc() and not forgive_age:
             raise unauthorized("The token has expired. Ask an administrator for a new one.")

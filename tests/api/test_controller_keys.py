@@ -245,6 +245,7 @@ def test_it_ends_with_its_day_and_where_it_is_revoked_and_still_stops(
         assert admin.post(address, headers=HTML).status_code == 303
         answer = key.get("/v1/participants/P1/model")
         assert answer.status_code == 401 and "revoked" in answer.text
+        assert key.post("/v1/tests", json=TRIAL).status_code == 401 and key.post("/v1/stop").status_code == 200
     page = admin.get("/participants/P1", headers=HTML).text
     assert "revoked" in page and "expired" in page and text not in page
     context.auth._known.clear()
