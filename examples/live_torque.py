@@ -4,12 +4,15 @@
 
 The channel sends about 20 messages a second. It is for watching, not for closing a loop: what a pulse does is seen some
 hundredths of a second later, by way of a network. Control goes from trial to trial.
+
+If the program ends while the trial that it started plays, by Ctrl-C or by an error, it presses stop first.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import signal
 import sys
 from collections.abc import Iterator
 from typing import Any
@@ -35,6 +38,33 @@ def trial() -> list[dict[str, Any]]:
     return [rest, {"name": "trial", "sequence": "widths", "settings": {"pulse_width_us": widths_us}}, rest]
 
 
+def press_stop(client: Client) -> None:
+    """Stop the rig, and say whether it has stopped."""
+    try:
+        client.stop("the watching program ended")
+        print("stop was pressed; a person re-arms the rig", file=sys.stderr)
+    except ServiceError as error:
+        print(f"STOP WAS NOT CONFIRMED: use the emergency switch on the stimulator now. {error}", file=sys.stderr)
+
+
+def start(client: Client, participant: str) -> str:
+    """Start the trial at the pulse rate of the approved model; the test's id."""
+    rate_hz = client.approved_model(participant).document["pulse_rate_hz"]
+    try:
+        return client.start_test(participant, kind="sequence", segments=trial(), pulse_rate_hz=rate_hz)["id"]
+    except (ServiceError, KeyboardInterrupt) as error:
+        if getattr(error, "status", None) is None:  # no answer came: it may play all the same
+            press_stop(client)
+        raise
+
+
+def watch(client: Client, test_id: str) -> None:
+    """Print time and torque until the test ends."""
+    print("time_s,torque_min_nm,torque_max_nm", flush=True)
+    for time_s, low_nm, high_nm in torque(client, test_id):
+        print(f"{time_s:.4f},{low_nm:.4f},{high_nm:.4f}", flush=True)
+
+
 def main() -> None:
     """Play one trial and print time and torque."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -42,16 +72,24 @@ def main() -> None:
     parser.add_argument("--participant", required=True)
     parser.add_argument("--test", help="watch this test instead of starting one")
     options = parser.parse_args()
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C
     token = os.environ.get("STIMRIG_TOKEN") or sys.exit("set STIMRIG_TOKEN to a controller's key")
     with Client(options.url, token) as client:
-        test_id = options.test or client.start_test(options.participant, kind="sequence", segments=trial())["id"]
-        print("time_s,torque_min_nm,torque_max_nm")
-        for time_s, low_nm, high_nm in torque(client, test_id):
-            print(f"{time_s:.4f},{low_nm:.4f},{high_nm:.4f}", flush=True)
+        if options.test:
+            watch(client, options.test)
+            return
+        test_id = start(client, options.participant)
+        try:
+            watch(client, test_id)
+        except BaseException:
+            press_stop(client)
+            raise
 
 
 if __name__ == "__main__":
     try:
         main()
+    except KeyboardInterrupt:
+        sys.exit("interrupted")
     except ServiceError as error:
         sys.exit(str(error))

@@ -240,6 +240,10 @@ class TrackedVersions:
     def text_of(self, model_id: str) -> str:
         """MODEL.json of a version, or of one that was tracked from it. Raises ApiError (404, 500)."""
         base, approval, number = _parts(model_id)
+        if number == 0 and base != model_id:  # served before any trial moved it: the version itself, if it was approved
+            decision = self.store.get(Approval, approval)
+            known = decision is not None and decision.approved and decision.model_id == base
+            base = base if known else model_id
         if number:
             conditions = (Tracked.model_id == base, Tracked.approval_id == approval, Tracked.number == number)
             for row in self.store.all(Tracked, *conditions):

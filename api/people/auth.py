@@ -61,6 +61,8 @@ class Principal:
         The only one that a controller's key opens; None for everybody else.
     plan : dict or None
         What trials that key may play.
+    token_hash : str
+        The token's.
     """
 
     name: str
@@ -71,6 +73,7 @@ class Principal:
     locked: bool = False
     participant: str | None = None
     plan: dict[str, Any] | None = None
+    token_hash: str = ""
 
     def may(self, scope: Scope) -> bool:
         """Whether the scope is held."""
@@ -98,14 +101,18 @@ class Auth:
 
     def issue(self, name: str, scopes: list[Scope], by: str, *, text: str | None = None, origin: str = "issued",
               expires_utc: str | None = None, participant: str | None = None,
-              plan: dict[str, Any] | None = None) -> str:  # fmt: skip
-        """Make a token and return its text, which is shown this once; `participant` and `plan` as in `Principal`."""
+              plan: dict[str, Any] | None = None, made_by: str | None = None) -> str:  # fmt: skip
+        """Make a token and return its text, which is shown this once; `participant` and `plan` as in `Principal`.
+
+        With the token of the hash `made_by` it falls.
+        """
         text = text or f"stimrig_{secrets.token_urlsafe(32)}"
         now = self.clock.utc()
         with self.store.write() as session:
             row = Token(hash=digest(text), prefix=text[:12] if origin == "issued" else "(set)", name=name)
             row.scopes, row.created_utc, row.origin = [str(scope) for scope in scopes], now, origin
             row.expires_utc, row.revoked, row.participant, row.plan = expires_utc, False, participant, plan
+            row.made_by = made_by
             session.merge(row)
             bound = {} if participant is None else {"participant": participant, "plan": plan, "until": expires_utc}
             audit.write(session, now, by, "issue token", name, scopes=row.scopes, **bound)
@@ -143,7 +150,7 @@ class Auth:
         self._known = {}
 
     def bearer(self, text: str, address: str = "", *, forgive_age: bool = False) -> Principal:
-        """The holder of a bearer token; `forgive_age` lets one that ran out still press stop.
+        """The holder of a bearer token; `forgive_age`: one that ran out, or a revoked key, presses stop.
 
         Guesses are held to a pace by the place they come from. A token that was drawn opens all the same: nobody
         guesses its 256 bits, and others' guesses must not keep a controller out. A right token always presses stop.
@@ -171,11 +178,26 @@ class Auth:
         return found
 
     def _principal(self, token: Token | None, csrf: str | None = None, *, forgive_age: bool = False) -> Principal:
-        if token is None or token.revoked:
+        # A controller's key always presses stop: its trial may be playing when a person revokes it.
+        if token is None or (token.revoked and not (forgive_age and token.participant is not None)):
             raise unauthorized("The token is unknown or has been revoked. Ask an administrator for a new one.")
         if token.expires_utc is not None and token.expires_utc <= self.clock.utc() and not forgive_age:
             raise unauthorized("The token has expired. Ask an administrator for a new one.")
-        return Principal(token.name, frozenset(token.scopes), csrf, participant=token.participant, plan=token.plan)
+        if self.fallen(token) and not forgive_age:
+            raise unauthorized("Who made this key may no longer do so. Ask a person for a new one.")
+        return Principal(
+            token.name, frozenset(token.scopes), csrf, participant=token.participant, plan=token.plan,
+            token_hash=token.hash,
+        )  # fmt: skip
+
+    def fallen(self, token: Token) -> bool:
+        """Whether who made this key has been removed, or the token that made it has been revoked or has expired."""
+        if token.made_by is None:
+            return False
+        maker = self._token(token.made_by)
+        return maker is None or maker.revoked or (
+            maker.expires_utc is not None and not maker.expires_utc > self.clock.utc()
+        )  # fmt: skip
 
     def sign_in(self, token_text: str, address: str) -> str:
         """Open a page session for a token's holder; its cookie. Raises as `bearer` does; 403 for a controller's key."""

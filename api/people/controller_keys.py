@@ -7,14 +7,27 @@ from typing import Any
 
 from sqlalchemy import select
 
-from api.people.auth import Auth, Scope, digest
+from api.errors import ApiError
+from api.people.auth import Auth, Principal, Scope, digest
 from api.store.tables import Token
 
 SCOPES = [Scope.READ_MODEL, Scope.READ_LIVE, Scope.RUN_TEST]
 """Of these only what `api.web.key_guard` opens."""
 
 
-def make(auth: Auth, name: str, participant: str, plan: dict[str, Any], by: str) -> tuple[str, Token]:
+def refuse_without(who: Principal) -> None:
+    """403 to whoever lacks a scope that a key holds: it may do nothing that its maker may not."""
+    lacking = [str(scope) for scope in SCOPES if not who.may(scope)]
+    if lacking:
+        detail = (
+            f"A key holds {', '.join(SCOPES)}. Who makes one holds them all; {who.name} lacks {', '.join(lacking)}."
+        )
+        raise ApiError(403, "forbidden", "Not allowed", detail)
+
+
+def make(
+    auth: Auth, name: str, participant: str, plan: dict[str, Any], by: str, made_by: str | None = None
+) -> tuple[str, Token]:
     """A key that ends with its day: its text, shown this once, and its row.
 
     Parameters
@@ -27,10 +40,13 @@ def make(auth: Auth, name: str, participant: str, plan: dict[str, Any], by: str)
         `current_ma`, `max_pulse_width_us`, `max_duration_s`, `trials`.
     by : str
         Who makes it.
+    made_by : str, optional
+        Hash of that one's token: once it is revoked or has expired, the key opens nothing.
     """
     text = f"stimrig_{secrets.token_urlsafe(32)}"
     own = f"{name} ({digest(text)[:6]})"
-    auth.issue(own, SCOPES, by, text=text, expires_utc=auth.clock.end_of_day_utc(), participant=participant, plan=plan)
+    until = auth.clock.end_of_day_utc()
+    auth.issue(own, SCOPES, by, text=text, expires_utc=until, participant=participant, plan=plan, made_by=made_by)
     return text, auth.store.get(Token, digest(text))
 
 
@@ -44,7 +60,7 @@ def of(auth: Auth, participant: str) -> list[dict[str, Any]]:
 
 
 def _state(auth: Auth, row: Token) -> str:
-    if row.revoked:
+    if row.revoked or auth.fallen(row):
         return "revoked"
     return "expired" if row.expires_utc is not None and row.expires_utc <= auth.clock.utc() else "valid"
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 from typing import Annotated, Any
 
 from pydantic import Field, FiniteFloat
@@ -17,6 +18,15 @@ from api.store import Store
 from api.store.tables import Participant, Test
 
 LONGEST_S = 300.0
+HALTED = "The rig is stopped. A person looks at participant and rig and re-arms it."
+NEUTRAL = {
+    "rig-busy": "The rig is in use. Wait until it is free.",
+    "rig-latched": HALTED,
+    "rig-uncertain": HALTED,
+}
+"""What a key is told instead of words that may name another participant."""
+SAME_RATE = 1e-3
+"""Share by which a pulse rate may differ from the model's: what writing and reading a number leaves."""
 MOST_TRIALS = 200
 
 
@@ -52,7 +62,8 @@ async def start(runner: Runner, turn: asyncio.Lock, store: Store, who: Principal
     Raises
     ------
     ApiError
-        403: outside the key or its plan, and by how much; else as `Runner.start`.
+        403: outside the key or its plan, and by how much; 409: no model of its participant is approved; else as
+        `Runner.start`.
     """
     if who.participant is None:
         return await runner.start(body, who.name)
@@ -61,16 +72,17 @@ async def start(runner: Runner, turn: asyncio.Lock, store: Store, who: Principal
             body = await _within_plan(runner, store, who, body)
             return await runner.start(body, who.name)
         except ApiError as error:
-            if error.code != "rig-busy":
+            if error.code not in NEUTRAL:
                 raise
-            detail = "The rig is in use. Wait until it is free."
-            raise ApiError(409, "rig-busy", "Another test is running", detail) from None
+            title = "Another test is running" if error.code == "rig-busy" else error.title
+            raise ApiError(error.status, error.code, title, NEUTRAL[error.code]) from None
 
 
 async def _within_plan(runner: Runner, store: Store, who: Principal, body: TestIn) -> TestIn:
     """The test with the plan's limits, where the plan allows it."""
     plan = who.plan or {}
     _refuse_kind(who, body)
+    await asyncio.to_thread(_refuse_other_rate, runner, body)
     played = await asyncio.to_thread(_played, store, who.name)
     if played >= plan["trials"]:
         raise beyond(f"All {plan['trials']} trials of this key are played. A person can make another key")
@@ -105,9 +117,29 @@ def _refuse_kind(who: Principal, body: TestIn) -> None:
         raise beyond(f"A key sends no {wrong[0]}. Leave it out")
 
 
+def _refuse_other_rate(runner: Runner, body: TestIn) -> None:
+    """A key plays at the rate of the approved model: a person who made the key chose no other."""
+    served = runner.versions.served(body.participant)
+    if served is None:
+        raise unapproved(body.participant)
+    own_hz = float(json.loads(served.body)["pulse_rate_hz"])
+    if not abs(body.pulse_rate_hz - own_hz) <= SAME_RATE * own_hz:
+        asked = f"pulse_rate_hz {body.pulse_rate_hz:g} is not the approved model's {own_hz:g}"
+        raise beyond(f"{asked} (40, where none is sent). Send the model's pulse_rate_hz")
+
+
 def _played(store: Store, name: str) -> int:
     """Trials that a key has begun; what the rig refused was not one."""
     return len(store.all(Test, Test.requested_by == name, Test.state != "refused"))
+
+
+def unapproved(participant: str) -> ApiError:
+    """409: a key does nothing with a participant for whom no model holds."""
+    detail = (
+        f"No model of {participant} is approved now. A person approves one on its page. An approval ends with its day, "
+        "or when the model is rejected."
+    )
+    return ApiError(409, "no-approved-model", "No approved model", detail)
 
 
 def beyond(why: str) -> ApiError:

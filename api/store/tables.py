@@ -170,6 +170,8 @@ class Token(Table):
     """The only one that a controller's key opens; None: a token that is bound to nobody."""
     plan: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True), default=None)
     """What trials a controller's key may play."""
+    made_by: Mapped[str | None] = mapped_column(String(64), default=None)
+    """Hash of the token of whoever made a controller's key; it falls with that one."""
 
 
 class PageSession(Table):

@@ -47,7 +47,7 @@ def identified(request: Request) -> Principal:
     """Who asks; where it is a person's own doing, the session is not idle."""
     context = request.app.state.context
     auth, principal = context.auth, context.auth.identify(request, bound=True)
-    refuse_outside(context.store, principal, request.method, request.url.path)
+    refuse_outside(context.versions, principal, request.method, request.url.path)
     if principal.page_session is not None and by_a_person(request):
         auth.idle.acted(principal.page_session.hash)
     return principal

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import re
 
+from api.models.registry import Versions
 from api.people.auth import Principal, outside
-from api.store import Store
+from api.sessions.controller_trials import unapproved
 from api.store.tables import Model, Recording, Test
 
 STOP = "/v1/stop"
@@ -26,22 +27,25 @@ OPEN = [
         ("GET", "/v1/recordings/([^/]+)(?:/csv)?", Recording),
     )
 ]
-"""Method, path, and the table in whose row the participant stands; str: the path names it; None: the body does."""
+"""Method, path, and the table in whose row the participant stands; str: the path names it; None: the body does.
+
+Of the models it is the approved one, and what was tracked from it under the approval that holds."""
 
 
-def refuse_outside(store: Store, who: Principal, method: str, path: str) -> None:
+def refuse_outside(versions: Versions, who: Principal, method: str, path: str) -> None:
     """Let pass who is bound to nobody, and a key on what it opens.
 
     Raises
     ------
     ApiError
-        403, the same for what is another participant's, for what is not there, and for routes that no key opens.
+        403, the same for what is another participant's, for what is not there, and for routes that no key opens; 409:
+        a model is asked, and none of the key's participant is approved.
     """
-    if who.participant is not None and not _opens(store, who.participant, method, path):
+    if who.participant is not None and not _opens(versions, who.participant, method, path):
         raise outside(who.participant)
 
 
-def _opens(store: Store, participant: str, method: str, path: str) -> bool:
+def _opens(versions: Versions, participant: str, method: str, path: str) -> bool:
     for own_method, pattern, table in OPEN:
         found = pattern.fullmatch(path)
         if method != own_method or found is None:
@@ -50,9 +54,18 @@ def _opens(store: Store, participant: str, method: str, path: str) -> bool:
             return True
         if table is str:
             return found[1] == participant
-        # What is tracked from a model has the id of that model before a point.
-        own_id = found[1].partition(".")[0] if table is Model else found[1]
-        row = store.get(table, own_id)
+        if table is Model:
+            return _approved(versions, participant, found[1])
+        row = versions.store.get(table, found[1])
         of_test = table is not Recording or (row is not None and row.test_id is not None)
         return row is not None and row.participant == participant and of_test
     return False
+
+
+def _approved(versions: Versions, participant: str, model_id: str) -> bool:
+    """Whether a person allows this version today: the approved one, or one tracked from it. Raises ApiError (409)."""
+    approval = versions.approved(participant)
+    if approval is None:
+        raise unapproved(participant)
+    own = re.escape(approval.model_id)
+    return re.fullmatch(rf"{own}(\.{approval.id}\.[0-9]+)?", model_id) is not None

@@ -9,10 +9,12 @@ import numpy as np
 from identify.errors import BadRequest
 
 LONGEST_S = 300.0
-MOST_SAMPLES = 2_000_000
+MOST_SAMPLES = 60_000
+"""Of a reference: the longest one at 200 a second."""
 LARGEST_NM = 1000.0
-LONGEST_GAP_S = 1.0
-"""Between neighbouring samples: across a longer one a straight line is no wish of anybody's."""
+LEAST_GAP_S, LONGEST_GAP_S = 1e-9, 1.0
+"""Between neighbouring samples: across a shorter one the slope is no number, across a longer one a straight line is no
+wish of anybody's."""
 RATES_HZ = (10.0, 100.0)
 
 
@@ -111,13 +113,13 @@ def _times(values: object, size: int, name: str) -> np.ndarray:
     if size < 2:
         raise BadRequest("one time only", place="time_s", fix="Give two or more, or leave the times out.")
     step_s = np.diff(time_s)
-    wrong = np.flatnonzero(~((step_s > 0.0) & (step_s <= LONGEST_GAP_S)))
+    wrong = np.flatnonzero(~((step_s >= LEAST_GAP_S) & (step_s <= LONGEST_GAP_S)))
     if wrong.size:
         at = wrong[0] + 1
         raise BadRequest(
-            f"{time_s[at]:g} s after {time_s[at - 1]:g} s",
+            f"{time_s[at]:.9g} s after {time_s[at - 1]:.9g} s",
             place=f"time_s[{at}]",
-            fix=f"Times must rise, by at most {LONGEST_GAP_S:g} s.",
+            fix=f"Times must rise, by at least {LEAST_GAP_S:g} s and at most {LONGEST_GAP_S:g} s.",
         )
     if time_s[-1] - time_s[0] > LONGEST_S:
         raise BadRequest(

@@ -32,21 +32,23 @@ def read_reference(content: bytes, name: str, pulse_rate_hz: float = 40.0) -> Re
         As `Reference.of`.
     """
     encoding, _ = text.encoding_of(content, name)
-    lines = (line.strip() for line in text.lines(content, encoding, name))
-    rows = [(number, line) for number, line in enumerate(lines, 1) if line and not line.startswith(text.COMMENTS)]
-    if not rows:
+    lines = ((number, line.strip("\r\n ")) for number, line in enumerate(text.lines(content, encoding, name), 1))
+    rows = ((number, line) for number, line in lines if line.strip() and not line.startswith(text.COMMENTS))
+    number, head = next(rows, (0, ""))
+    if not head:
         raise BadRecord("empty", place=name, fix=FIX)
-    number, head = rows[0]
     separator = next((sign for sign in ";\t," if sign in head), ",")
     header = [cell.strip().strip('"').lower() for cell in head.split(separator)]
     known = [NAMES[cell] for cell in header if cell in NAMES]
     if sorted(known) not in (["time_s", "torque_nm"], ["torque_nm"]):
         raise BadRecord("no header with torque_nm", place=f"{name}, line {number}", fix=FIX)
-    if len(rows) - 1 > MOST_SAMPLES:
-        raise BadRecord(f"{len(rows) - 1} rows", place=name, fix=f"Give at most {MOST_SAMPLES}.")
     columns: dict[str, list[float]] = {column: [] for column in known}
-    for number, line in rows[1:]:
+    for count, (number, line) in enumerate(rows, 1):
+        if count > MOST_SAMPLES:
+            fix = f"Give at most {MOST_SAMPLES}: one for each pulse is enough."
+            raise BadRecord(f"more than {MOST_SAMPLES} rows", place=f"{name}, line {number}", fix=fix)
         cells = line.split(separator)
+        _refuse_wider(cells, len(header), separator, f"{name}, line {number}")
         for at, cell in enumerate(header):
             if cell in NAMES:
                 place = f"{name}, line {number}, column {cell}"
@@ -54,6 +56,15 @@ def read_reference(content: bytes, name: str, pulse_rate_hz: float = 40.0) -> Re
     return Reference.of(
         np.array(columns["torque_nm"]), columns.get("time_s"), pulse_rate_hz=pulse_rate_hz, name=f"{name}, torque_nm"
     )
+
+
+def _refuse_wider(cells: list[str], width: int, separator: str, place: str) -> None:
+    """Refuse a row with more cells than the header: the comma of a decimal makes two cells of one number."""
+    if any(cell.strip() for cell in cells[width:]):
+        fix = "Name every column."
+        if separator == ",":
+            fix = "Name every column; with decimal commas, separate the cells with semicolons, or write decimal points."
+        raise BadRecord(f"{len(cells)} cells under a header of {width}", place=place, fix=fix)
 
 
 def _number(cell: str, separator: str, place: str) -> float:

@@ -162,6 +162,7 @@ def _below(found: Layout, content: bytes, name: str) -> Layout:
     double = 2 * found.separator
     if any(f"\n{sign}".encode() in content for sign in (*COMMENTS, double)) or b"\0" in content:
         found.rows = ((line, row) for line, row in found.rows if not _is_aside(row))
+    found.rows = _no_wider(found, found.rows, name)
     first = next(found.rows, None)
     if first is None:
         return found
@@ -179,6 +180,15 @@ def _below(found: Layout, content: bytes, name: str) -> Layout:
 def _is_aside(row: list[str]) -> bool:
     """Whether a row is a comment, or holds nothing."""
     return row[0].lstrip().startswith(COMMENTS) or not any(cell.strip() for cell in row)
+
+
+def _no_wider(found: Layout, rows: Iterator[Row], name: str) -> Iterator[Row]:
+    """The rows; one further down with more cells than the header is refused as the first one is."""
+    width = len(found.header)
+    for line, row in rows:
+        if len(row) > width and any(cell.strip() for cell in row[width:]):
+            _check_width(found, line, row, name)
+        yield line, row
 
 
 def _check_width(found: Layout, line: int, row: list[str], name: str) -> None:

@@ -16,7 +16,7 @@ def model(effects: list[str]) -> dict[str, Any]:
     identity = hashlib.sha256(f"{time.time_ns()}".encode()).hexdigest()[:12]
     return {
         "schema_version": "1.0", "model_id": f"M-{identity}", "sample_rate_hz": 40.0, "method": "maximum-likelihood",
-        "created": "2026-01-01T00:00:00Z",
+        "pulse_rate_hz": 40.0, "created": "2026-01-01T00:00:00Z",
         "linear": {"b": [0.0, 0.002, 0.002], "a": [1.0, -1.93, 0.934], "delay_samples": 0,
                    "time_constant_s": 0.53, "damping": 0.64, "delay_s": 0.0},
         "recruitment": {"pulse_width_us": widths, "torque_nm": torque},

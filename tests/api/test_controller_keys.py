@@ -71,13 +71,13 @@ def made(admin: httpx.Client, code: str = "P1", **changed: str) -> str:
 
 
 @pytest.fixture
-def key(shared: Service, admin: httpx.Client) -> Iterator[httpx.Client]:
+def key(shared: Service, admin: httpx.Client, done: dict[str, Any]) -> Iterator[httpx.Client]:
     with shared.client(made(admin)) as client:
         yield client
 
 
 @pytest.fixture(scope="module")
-def one_key(admin: httpx.Client) -> str:
+def one_key(admin: httpx.Client, done: dict[str, Any]) -> str:
     return made(admin)
 
 
@@ -183,6 +183,8 @@ def test_a_trial_is_played_with_the_plans_limits_and_watched(shared: Service, ke
         ({"segments": None, "protocol": "paper"}, "segments"),
         ({"profile": {"current_ma": 16.0}}, "current_ma 16 mA is above the plan's 15 mA"),
         ({"profile": {"max_pulse_width_us": 201.0}}, "max_pulse_width_us 201 µs is above the plan's 200 µs"),
+        ({"pulse_rate_hz": 60.0}, "pulse_rate_hz 60 is not the approved model's 40"),
+        ({"pulse_rate_hz": 39.9}, "pulse_rate_hz 39.9 is not the approved model's 40"),
         ({"joins": "none"}, "joins"),
         ({"ran_by": "Somebody Else"}, "ran_by"),
     ],
@@ -192,7 +194,9 @@ def test_what_is_beyond_the_plan_is_refused_in_one_line(key: httpx.Client, chang
     assert words in detail and "\n" not in detail and detail.endswith(".")
 
 
-def test_a_trial_that_is_longer_or_wider_than_the_plan_is_not_begun(shared: Service, admin: httpx.Client) -> None:
+def test_a_trial_that_is_longer_or_wider_than_the_plan_is_not_begun(
+    shared: Service, admin: httpx.Client, done: dict[str, Any]
+) -> None:
     before = shared.rig.starts
     with shared.client(made(admin, max_duration_s="0,5")) as key:
         assert "longer than the plan's 0.5 s" in refused(key.post("/v1/tests", json=TRIAL), "beyond-plan")
@@ -201,7 +205,7 @@ def test_a_trial_that_is_longer_or_wider_than_the_plan_is_not_begun(shared: Serv
     assert shared.rig.starts == before
 
 
-def test_no_more_trials_than_planned(shared: Service, admin: httpx.Client) -> None:
+def test_no_more_trials_than_planned(shared: Service, admin: httpx.Client, done: dict[str, Any]) -> None:
     with shared.client(made(admin, trials="1")) as key:
         ended(key, key.post("/v1/tests", json=TRIAL).json()["id"])
         assert "all 1 trials" in refused(key.post("/v1/tests", json=TRIAL), "beyond-plan").lower()
@@ -209,7 +213,9 @@ def test_no_more_trials_than_planned(shared: Service, admin: httpx.Client) -> No
         assert key.post("/v1/stop").status_code == 200
 
 
-def test_limits_that_were_narrowed_after_the_key_was_made_hold(shared: Service, admin: httpx.Client) -> None:
+def test_limits_that_were_narrowed_after_the_key_was_made_hold(
+    shared: Service, admin: httpx.Client, done: dict[str, Any]
+) -> None:
     with shared.client(made(admin)) as key:
         before = admin.get("/v1/participants/P1").json()["profile"]
         admin.put("/v1/participants/P1/profile", json={"current_ma": 9.0})
@@ -219,7 +225,9 @@ def test_limits_that_were_narrowed_after_the_key_was_made_hold(shared: Service, 
     assert shared.app.state.context.store.get(Test, test_id).plan["profile"]["current_ma"] == 9.0
 
 
-def test_it_ends_with_its_day_and_where_it_is_revoked_and_still_stops(shared: Service, admin: httpx.Client) -> None:
+def test_it_ends_with_its_day_and_where_it_is_revoked_and_still_stops(
+    shared: Service, admin: httpx.Client, done: dict[str, Any]
+) -> None:
     context, text = shared.app.state.context, made(admin)
     row = context.store.get(Token, digest(text))
     assert row.expires_utc == context.clock.end_of_day_utc() and row.participant == "P1"
@@ -237,6 +245,7 @@ def test_it_ends_with_its_day_and_where_it_is_revoked_and_still_stops(shared: Se
         assert admin.post(address, headers=HTML).status_code == 303
         answer = key.get("/v1/participants/P1/model")
         assert answer.status_code == 401 and "revoked" in answer.text
+        assert key.post("/v1/tests", json=TRIAL).status_code == 401 and key.post("/v1/stop").status_code == 200
     page = admin.get("/participants/P1", headers=HTML).text
     assert "revoked" in page and "expired" in page and text not in page
     context.auth._known.clear()
@@ -255,6 +264,67 @@ def test_a_live_channel_is_its_own_participants(shared: Service, admin: httpx.Cl
             assert said["problem"]["type"] == "/problems/outside-key"
             with pytest.raises(ConnectionClosed):
                 socket.recv()
+
+
+def test_a_live_channel_tells_a_key_nothing_of_another_participants_test(
+    shared: Service, key: httpx.Client, admin: httpx.Client, done: dict[str, Any]
+) -> None:
+    """While its own test is identified, the rig may play another one."""
+    context, own = shared.app.state.context, done["P1"]["id"]
+    put(context, own, "identifying")
+    said = []
+    try:
+        url = shared.url.replace("http", "ws") + f"/v1/tests/{own}/live"
+        with connect(url, additional_headers={"Authorization": key.headers["authorization"]}) as socket:
+            assert json.loads(socket.recv())["type"] == "test"
+            other = run_test(admin, "P2")
+            context.runner.hub.send({"type": "state", "rig": {"test_id": own, "state": "sealing"}})
+            context.runner.hub.send({"type": "link", "connected": True})
+            while not said or json.loads(said[-1])["type"] != "link":
+                said.append(str(socket.recv()))
+    finally:
+        put(context, own, "completed")
+    assert not [message for message in said if "P2" in message or other["id"] in message]
+    assert [json.loads(message)["type"] for message in said] == ["state", "link"]
+
+
+def put(context: Any, test_id: str, state: str) -> None:
+    with context.store.write() as session:
+        session.get(Test, test_id).state = state
+
+
+def test_a_stopped_rig_tells_a_key_nothing_of_another_participant(
+    shared: Service, key: httpx.Client, admin: httpx.Client
+) -> None:
+    """After a crash the rig's reason names the test that ran."""
+    admin.post("/v1/stop")
+    shared.rig.reason = "the rig died during a test (test T1 of participant P2)"
+    assert "P2" in admin.post("/v1/tests", json=TRIAL).text
+    answer = key.post("/v1/tests", json=TRIAL)
+    assert answer.json()["type"] == "/problems/rig-latched" and "re-arms it" in answer.json()["detail"]
+    assert "P2" not in answer.text
+
+
+def test_after_a_rejection_it_plays_nothing_and_plans_nothing(
+    shared: Service, key: httpx.Client, admin: httpx.Client, done: dict[str, Any]
+) -> None:
+    model, before = done["P1"]["model_id"], shared.rig.starts
+    approval = shared.app.state.context.versions.approved("P1")
+    asked = {"widths": {"reference_torque_nm": [0, 1]}, "prediction": {"pulse_width_us": [0, 100]}}
+    assert admin.post(f"/v1/models/{model}/reject", json={"reason": "wrong"}).status_code == 200
+    try:
+        answers = [key.post(f"/v1/models/{model}/{path}", json=body) for path, body in asked.items()]
+        for answer in [key.post("/v1/tests", json=TRIAL), *answers]:
+            assert answer.status_code == 409 and answer.json()["type"] == "/problems/no-approved-model"
+            assert "No model of P1 is approved now." in answer.json()["detail"]
+        assert shared.rig.starts == before and key.post("/v1/stop").status_code == 200
+    finally:
+        assert admin.post(f"/v1/models/{model}/approve", json={}).status_code == 200
+    admin.post("/v1/rearm")
+    other = run_test(admin, "P1")
+    for path, body in asked.items():
+        for version in (other["model_id"], f"{model}.{approval.id}.1", f"{model}.99.0"):
+            assert "approved model" in refused(key.post(f"/v1/models/{version}/{path}", json=body))
 
 
 def test_it_signs_nobody_in_on_the_page(shared: Service, admin: httpx.Client) -> None:
@@ -289,6 +359,54 @@ def test_who_may_not_approve_makes_no_key(shared: Service) -> None:
     with shared.client(shared.token("operator", "run-test", "read-model")) as operator:
         assert operator.post("/participants/P1/keys", data=PLAN).status_code == 403
         assert "Make the key" not in operator.get("/participants/P1", headers=HTML).text
+
+
+@pytest.mark.parametrize("lacking", ["run-test", "read-live", "read-model"])
+def test_a_key_gives_no_scope_that_its_maker_lacks(shared: Service, lacking: str) -> None:
+    scopes = {"approve-model", "run-test", "read-live", "read-model"} - {lacking}
+    with shared.client(shared.token(f"lacks {lacking}", *scopes)) as clinician:
+        answer = clinician.post("/participants/P1/keys", data=PLAN, headers=HTML)
+        assert answer.status_code == 403 and lacking in answer.text and "stimrig_" not in answer.text
+        page = clinician.get("/participants/P1", headers=HTML)
+        assert "Make the key" not in page.text
+
+
+@pytest.mark.parametrize("how", ["revoked", "expired"])
+def test_it_falls_with_the_token_of_its_maker_and_still_stops(
+    shared: Service, admin: httpx.Client, done: dict[str, Any], how: str
+) -> None:
+    context = shared.app.state.context
+    text = shared.token(f"maker {how}", "approve-model", "run-test", "read-live", "read-model")
+    with shared.client(text) as maker:
+        made_key = made(maker)
+    with shared.client(made_key) as key:
+        assert key.get("/v1/participants/P1/model").status_code == 200
+        if how == "revoked":
+            assert admin.delete(f"/v1/tokens/{digest(text)[:16]}").status_code == 204
+        else:
+            with context.store.write() as session:
+                session.get(Token, digest(text)).expires_utc = context.clock.utc()
+            context.auth._known.clear()
+        for answer in (key.get("/v1/participants/P1/model"), key.post("/v1/tests", json=TRIAL)):
+            assert answer.status_code == 401 and "Who made this key" in answer.text
+        assert key.post("/v1/stop").status_code == 200
+    tokens = admin.get("/v1/tokens")
+    assert digest(text) not in tokens.text
+
+
+def test_it_falls_with_a_person_who_is_removed(shared: Service, admin: httpx.Client, done: dict[str, Any]) -> None:
+    secret = "a long passphrase"
+    scopes = ["approve-model", "run-test", "read-live", "read-model"]
+    assert admin.post("/v1/users", json={"name": "Ada", "password": secret, "scopes": scopes}).status_code == 201
+    with shared.client(token=None) as browser:
+        csrf = browser.post("/v1/sessions", json={"name": "Ada", "password": secret}).json()["csrf"]
+        answer = browser.post("/participants/P1/keys", data={**PLAN, "csrf": csrf, "password": secret}, headers=HTML)
+        assert answer.status_code == 200, answer.text
+    text = re.search(r"stimrig_[\w-]{43}", html.unescape(answer.text))[0]  # pyright: ignore
+    with shared.client(text) as key:
+        assert key.get("/v1/participants/P1/model").status_code == 200
+        assert admin.delete("/v1/users/Ada").status_code == 204
+        assert key.get("/v1/participants/P1/model").status_code == 401
 
 
 def test_key_and_trials_are_in_the_trail(shared: Service, admin: httpx.Client) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -18,12 +18,11 @@ from api.web import routes
 from api.workers.pool import WORKER
 from tests.api.conftest import Service, run_service
 from tests.api.test_worker import made_up_csv
+from tests.harness.c_program import compiled
 
 ROOT = Path(__file__).parents[2]
 TEXT = (ROOT / "docs" / "controllers.md").read_text("utf-8")
-PROGRAM = ROOT / "examples" / "controller.c"
 PLAN = {"current_ma": 20.0, "max_pulse_width_us": 300.0, "max_duration_s": 30.0, "trials": 9}
-LIBRARIES = ("-lcurl", "-lcjson", "-lm")
 
 
 def blocks(language: str) -> list[str]:
@@ -92,6 +91,28 @@ def test_live_torque_comes_while_it_is_measured(served: tuple[Service, str], tmp
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_whoever_interrupts_the_live_example_stops_its_trial(
+    served: tuple[Service, str], number: signal.Signals
+) -> None:
+    service, _ = served
+    service.rig.speed = 0.2
+    words = [sys.executable, "examples/live_torque.py", "--url", service.url, "--participant", "P017"]
+    try:
+        with subprocess.Popen(
+            words, cwd=ROOT, env=environment(served), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        ) as run:
+            assert run.stdout is not None and run.stderr is not None
+            assert run.stdout.readline().startswith("time_s") and run.stdout.readline()
+            run.send_signal(number)
+            said = run.stderr.read()
+        assert run.returncode == 1 and "stop was pressed" in said and "Traceback" not in said
+        assert service.rig.stopped_by.startswith("page (")
+    finally:
+        service.rig.speed = 12.0
+
+
+@pytest.mark.slow
 def test_every_block_of_python_runs(served: tuple[Service, str]) -> None:
     scope = {"url": served[0].url, "key": served[1], "code": "P017"}
     for block in blocks("python"):
@@ -109,26 +130,15 @@ def test_every_address_on_the_page_is_a_route() -> None:
 
 
 @pytest.fixture(scope="module")
-def compiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    gcc = shutil.which("gcc")
-    if gcc is None:
-        pytest.skip("not compiled: there is no gcc")
-    header = "#include <cjson/cJSON.h>\n#include <curl/curl.h>\n"
-    flags = os.environ.get("STIMRIG_TEST_CFLAGS", "").split()
-    there = subprocess.run([gcc, *flags, "-E", "-"], input=header, text=True, capture_output=True, check=False)
-    if there.returncode != 0:
-        pytest.skip("not compiled: libcurl4-openssl-dev and libcjson-dev are not installed")
-    out = tmp_path_factory.mktemp("c") / "controller"
-    strict = ["-std=c11", "-Wall", "-Wextra", "-Werror"]
-    subprocess.run([gcc, *strict, *flags, "-o", str(out), str(PROGRAM), *LIBRARIES], check=True)
-    return out
+def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return compiled(tmp_path_factory.mktemp("c"))
 
 
 @pytest.mark.slow
-def test_the_c_program_plays_a_trial(compiled: Path, served: tuple[Service, str], tmp_path: Path) -> None:
+def test_the_c_program_plays_a_trial(program: Path, served: tuple[Service, str], tmp_path: Path) -> None:
     time.sleep(1.0)  # the rest between two tests
     out = tmp_path / "trial.h5"
-    run = [str(compiled), served[0].url, "P017", str(out)]
+    run = [str(program), served[0].url, "P017", str(out)]
     subprocess.run(run, env=environment(served), check=True, timeout=60)
     assert out.read_bytes().startswith(b"\x89HDF")
     wrong = subprocess.run(

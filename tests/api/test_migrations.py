@@ -28,7 +28,7 @@ ADDED_SINCE = [
     ("approvals", "expires_utc"), ("recordings", "warnings"), ("participants", "side"), ("participants", "muscle"),
     ("participants", "archived_utc"), ("tests", "ran_by"), ("models", "carried_from_id"), ("models", "carried"),
     ("page_sessions", "acted_unix_s"), ("page_sessions", "locked_unix_s"), ("approvals", "tracking"),
-    ("tokens", "participant"), ("tokens", "plan"),
+    ("tokens", "participant"), ("tokens", "plan"), ("tokens", "made_by"),
 ]  # fmt: skip
 """Columns that the tables of a first database did not have."""
 NEWER = "UPDATE alembic_version SET version_num = '0900'"

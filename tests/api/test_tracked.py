@@ -118,7 +118,8 @@ def test_a_tracked_version_foretells_a_trial(client: httpx.Client, approved: str
         assert told.status_code == 200 and told.json()["model_id"] == model_id
         wanted = client.post(f"/v1/models/{model_id}/widths", json={"reference_torque_nm": [0.0, 1.0]})
         assert wanted.status_code == 200 and wanted.json()["model_id"] == model_id
-    for model_id in (f"{approved}.1.2", f"{approved}.2.1", "none.1.1", f"{approved}.1.{'9' * 30}", ".1.1"):
+    unknown = (f"{approved}.99.0", f"{approved}.0.0", "none.1.0")  # no such approval of that model
+    for model_id in (f"{approved}.1.2", f"{approved}.2.1", "none.1.1", f"{approved}.1.{'9' * 30}", ".1.1", *unknown):
         assert client.post(f"/v1/models/{model_id}/prediction", json=body).status_code == 404
         wanted = {"reference_torque_nm": [1.0]}
         assert client.post(f"/v1/models/{model_id}/widths", json=wanted).status_code == 404

@@ -77,6 +77,7 @@ def test_rounded_times_become_even(tmp_path):
         (changed(12, 0, "0.1"), HEADER, r"line 12, column time_s: time runs backwards"),
         (changed(12, 0, "0.2250"), HEADER, r"line 12, column time_s: time stands still"),
         (changed(4, 3, " "), HEADER, r"line 4, column segment: empty"),
+        (changed(5, 2, "1,5"), HEADER, r"line 5: 5 cells under a header of 4.*decimal commas"),
         ([*ROWS[:10], "0.25,1"], HEADER, r"line 12, column torque_nm: only 2 cells"),
         ([*ROWS[:10], "0.25,1,2"], HEADER, r"line 12, column segment: only 3 cells"),
         ([], HEADER, "no row under the header"),

@@ -272,6 +272,8 @@ def test_a_model_that_cannot_be_inverted_is_refused_with_the_mend():
 def test_a_table_of_other_tools_is_read(content: bytes):
     np.testing.assert_allclose(read_reference(content, "r.csv").torque_nm, np.arange(40) / 20 + 0.025)
     assert read_reference(b"torque_nm\n1\n2\n", "r.csv").torque_nm.tolist() == [1.0, 2.0]
+    assert read_reference(b"torque_nm,\n1.5,\n2, ,\n", "r.csv").torque_nm.tolist() == [1.5, 2.0]
+    assert read_reference(b"note\ttorque_nm\tother\n\t5\t7\n", "r.csv").torque_nm.tolist() == [5.0]
 
 
 @pytest.mark.parametrize(
@@ -288,6 +290,11 @@ def test_a_table_of_other_tools_is_read(content: bytes):
         (b"time_s,torque_nm\n0,1e999\n", "r.csv, line 2, column torque_nm"),
         (b"time_s,torque_nm,torque_nm\n0,1,1\n", "r.csv, line 1"),
         (b"time_s,torque_nm\n0,1\n0,2\n", "time_s[1]"),
+        (b"time_s,torque_nm\n0,1\n5e-324,2\n1e-323,3\n", "time_s[1]"),
+        (b"torque_nm\n0,5\n1,5\n2,9\n", "r.csv, line 2"),
+        (b"torque_nm\n0\n1,5\n", "r.csv, line 3"),
+        (b"torque_nm,note\n1,5,a\n", "r.csv, line 2"),
+        pytest.param(b"torque_nm\n" + b"1\n" * 60_001, "r.csv, line 60002", id="too-many-rows"),
         (b"\x89HDF\r\n\x1a\n\0\0", "r.csv, line 3"),
     ],
 )

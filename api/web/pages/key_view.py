@@ -35,13 +35,16 @@ async def make(
 ) -> Response:  # fmt: skip
     """A key that ends with its day; its text is shown on the answering page only."""
     row = await asyncio.to_thread(participants.find, context, code)
+    controller_keys.refuse_without(who)
     refuse_archived(row)
     asked = {"current_ma": current_ma, "max_pulse_width_us": max_pulse_width_us, "max_duration_s": max_duration_s}
     body = checked(
         KeyFor, name=name.strip(), trials=typed.whole(trials), **{k: _number(k, v) for k, v in asked.items()}
     )
     plan = plan_within(PlanIn(**body.model_dump(exclude={"name"})), row)
-    text, made = await asyncio.to_thread(controller_keys.make, context.auth, body.name, code, plan, who.name)
+    text, made = await asyncio.to_thread(
+        controller_keys.make, context.auth, body.name, code, plan, who.name, who.token_hash
+    )
     return await participant_view.shown(request, context, who, code, made={"text": text, "name": made.name})
 
 

@@ -13,7 +13,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from api import language
 from api.errors import ApiError, NotFoundError
-from api.people.auth import Scope
+from api.people.auth import Principal, Scope
 from api.sessions import controller_trials
 from api.sessions.refusals import other_than
 from api.sessions.requests import TestIn
@@ -107,9 +107,9 @@ async def live(socket: WebSocket, test_id: str) -> None:
     context = of(socket)
     await socket.accept()
     try:
-        await asyncio.to_thread(_admit, socket, context)
+        who = await asyncio.to_thread(_admit, socket, context)
         row = await asyncio.to_thread(find, context, test_id)
-        await _watched(socket, context, row)
+        await _watched(socket, context, row, by_key=who.participant is not None)
     except ApiError as error:
         with contextlib.suppress(WebSocketDisconnect, RuntimeError, TimeoutError):
             async with asyncio.timeout(GOODBYE_S):
@@ -119,7 +119,7 @@ async def live(socket: WebSocket, test_id: str) -> None:
         pass
 
 
-def _admit(socket: WebSocket, context: Context) -> None:
+def _admit(socket: WebSocket, context: Context) -> Principal:
     """Who may watch; a live view of a running test holds the session's lock off.
 
     Raises
@@ -128,7 +128,7 @@ def _admit(socket: WebSocket, context: Context) -> None:
         401: no valid token or session, or it is locked; 403: without the scope, or from another site's page.
     """
     principal = context.auth.identify(socket, bound=True)
-    refuse_outside(context.store, principal, "WS", socket.url.path)
+    refuse_outside(context.versions, principal, "WS", socket.url.path)
     if not principal.may(Scope.READ_LIVE):
         raise ApiError(403, "forbidden", "Not allowed", f"This needs the scope {Scope.READ_LIVE}.")
     origin = socket.headers.get("origin")
@@ -136,13 +136,14 @@ def _admit(socket: WebSocket, context: Context) -> None:
         raise ApiError(403, "forbidden", "Not allowed", "The request came from a page of another site.")
     if principal.page_session is not None:
         context.auth.idle.watches(principal.page_session.hash)
+    return principal
 
 
-async def _watched(socket: WebSocket, context: Context, row: Test) -> None:
+async def _watched(socket: WebSocket, context: Context, row: Test, by_key: bool) -> None:
     """Send until the test has ended or the page has gone. Raises ApiError once who watches no longer may."""
     queue = context.runner.hub.open()
     ends = [asyncio.create_task(work) for work in (_until_gone(socket), _until_refused(socket, context))]
-    sending = asyncio.create_task(_pump(socket, context, row, queue))
+    sending = asyncio.create_task(_pump(socket, context, row, queue, by_key))
     try:
         await asyncio.wait([sending, *ends], return_when=asyncio.FIRST_COMPLETED)
         for task in (*ends, sending):
@@ -157,7 +158,9 @@ async def _watched(socket: WebSocket, context: Context, row: Test) -> None:
         context.runner.hub.close(queue)
 
 
-async def _pump(socket: WebSocket, context: Context, row: Test, queue: asyncio.Queue[dict[str, Any]]) -> None:
+async def _pump(
+    socket: WebSocket, context: Context, row: Test, queue: asyncio.Queue[dict[str, Any]], by_key: bool
+) -> None:  # fmt: skip
     history = queue.get_nowait()
     if history["test_id"] == row.id:
         await socket.send_json(history)
@@ -172,6 +175,8 @@ async def _pump(socket: WebSocket, context: Context, row: Test, queue: asyncio.Q
             document, message = message["test"], _told(message["test"], words)
         if message["type"] in ("live", "adaptive") and message["test_id"] != row.id:
             continue
+        if by_key and message["type"] == "state" and message["rig"]["test_id"] != row.id:
+            continue  # the rig is with somebody else, or says why it stopped then
         if message["type"] == "adaptive":
             message = _in_words(message, words)
         await socket.send_json(message)

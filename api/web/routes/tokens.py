@@ -36,7 +36,8 @@ def list_tokens(context: Ctx, _who: Administrator) -> list[dict[str, Any]]:
     """All tokens, by their prefix; never their text."""
     rows = context.store.all(Token, order=Token.created_utc)
     return [
-        {key: value for key, value in row.as_dict().items() if key != "hash"} | {"id": row.hash[:16]} for row in rows
+        {key: value for key, value in row.as_dict().items() if key not in ("hash", "made_by")} | {"id": row.hash[:16]}
+        for row in rows
     ]
 
 
