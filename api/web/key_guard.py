@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 
+from api.models.tracked import parts
 from api.people.auth import Principal, outside
 from api.store import Store
 from api.store.tables import Model, Recording, Test
@@ -50,8 +51,7 @@ def _opens(store: Store, participant: str, method: str, path: str) -> bool:
             return True
         if table is str:
             return found[1] == participant
-        # What is tracked from a model has the id of that model before a point.
-        own_id = found[1].partition(".")[0] if table is Model else found[1]
+        own_id = parts(found[1])[0] if table is Model else found[1]  # what is tracked from a model opens with it
         row = store.get(table, own_id)
         of_test = table is not Recording or (row is not None and row.test_id is not None)
         return row is not None and row.participant == participant and of_test
