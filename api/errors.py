@@ -12,6 +12,7 @@ RIG_STATUS = {
     "latched": 409,
     "uncertain": 409,
     "refused": 422,
+    "rest-needed": 422,
     "bad-plan": 422,
     "disconnected": 503,
     "internal": 502,

@@ -34,6 +34,13 @@ class RefusedError(RigError):
     title = "Refused by a limit"
 
 
+class RestError(RefusedError):
+    """Too soon after the last pulse: says how long to wait, so that a program can ask again."""
+
+    code = "rest-needed"
+    title = "The muscle has to rest first"
+
+
 class BusyError(RigError):
     """A test is running: names it."""
 

@@ -271,7 +271,9 @@ Request = Annotated[
 class Problem(Message):
     """Why a request was refused. `code` is stable; the text is for people and says how to correct it."""
 
-    code: str = Field(description="busy, late, latched, uncertain, refused, bad-plan, disconnected, internal, …")
+    code: str = Field(
+        description="busy, late, latched, uncertain, refused, rest-needed, bad-plan, disconnected, internal, …"
+    )
     title: str
     detail: str
 

@@ -1,4 +1,4 @@
-"""Small pictures of what trials said: gain, threshold, time scale and tracking error over the trials."""
+"""Small pictures of what trials said: gain, threshold, time scale and error against the reference over the trials."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def panels(trials: Sequence[Mapping[str, Any]], bounds: Bounds) -> list[dict[str
         _panel(trials, *one, [factor * end for end in bounds.get(one[0], ())]) for one in shown for factor in [one[3]]
     ]
     if any(trial["error_percent"] is not None for trial in trials):
-        found.append(_panel(trials, "error_percent", _("Tracking error"), "%", 1.0, []))
+        found.append(_panel(trials, "error_percent", _("Error against the reference"), "%", 1.0, []))
     return found
 
 

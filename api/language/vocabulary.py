@@ -49,6 +49,8 @@ VOCABULARY = [
     lazy("threshold_drift"), lazy("torque_angle"), lazy("torque_velocity"), lazy("voluntary_effort"),
     # what a worker does
     lazy("tried %(effect)s"), lazy("comparing"), lazy("done"), lazy("loading"), lazy("predicting"), lazy("writing"),
+    # what a controller's trials tell
+    lazy("gain"), lazy("threshold"), lazy("time scale"),
     # limits
     lazy("rig file"), lazy("%(least)s to %(most)s µs"),
     # where in a file

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from api.models import summary
+from api.models import stored, summary
+from api.store.tables import Model
 
 Figure = dict[str, Any]
 """`value`, `sd` (None where it is not known) and `unit`; of an effect's parameter, the effect's `form` besides."""
@@ -36,6 +37,13 @@ def of(document: dict[str, Any]) -> dict[str, Figure]:
             figure = plain(given.get("value"), given.get("unit") or "1", given.get("sd"))
             found[f"{effect['id']}.{name}"] = {**figure, "form": effect.get("form") or ""}
     return found
+
+
+def threshold_us(row: Model) -> float | None:
+    """The threshold of a version's curve, µs; None where it has none. Raises ApiError (500) where it is damaged."""
+    figures = row.fit.get("figures") or of(stored.read(row))
+    value: float | None = figures["threshold_us"]["value"]
+    return value
 
 
 def structure(effects: list[str], figures: dict[str, Figure]) -> tuple[str, ...]:

@@ -132,8 +132,7 @@ class TrackedVersions:
 
     def bounds(self, approval: Approval, model: Model) -> Bounds:
         """What a person allowed, in the quantities' units."""
-        figures = model.fit.get("figures") or headline.of(stored.read(model))
-        return Limits(**(approval.tracking or {})).bounds(figures["threshold_us"]["value"])
+        return Limits(**(approval.tracking or {})).bounds(headline.threshold_us(model))
 
     def rows(self, approval_id: int) -> list[Tracked]:
         """The trials of an approval, the oldest first, without what was served."""
@@ -239,7 +238,7 @@ class TrackedVersions:
 
     def text_of(self, model_id: str) -> str:
         """MODEL.json of a version, or of one that was tracked from it. Raises ApiError (404, 500)."""
-        base, approval, number = _parts(model_id)
+        base, approval, number = parts(model_id)
         if number == 0 and base != model_id:  # served before any trial moved it: the version itself, if it was approved
             decision = self.store.get(Approval, approval)
             known = decision is not None and decision.approved and decision.model_id == base
@@ -254,7 +253,7 @@ class TrackedVersions:
 
     def version_of(self, model_id: str) -> Model:
         """The version itself, or the one from which it was tracked. Raises ApiError (404)."""
-        return self.versions.get(_parts(model_id)[0])
+        return self.versions.get(parts(model_id)[0])
 
     def asks(self, approval_id: int) -> str | None:
         """Why a new test is needed now; None where none is."""
@@ -273,7 +272,7 @@ class TrackedVersions:
             "approved_model_id": approval.model_id,
             "approved_utc": approval.at_utc,
             "limits": approval.tracking,
-            "threshold_us": (model.fit.get("figures") or headline.of(stored.read(model)))["threshold_us"]["value"],
+            "threshold_us": headline.threshold_us(model),
             "served_utc": served.at_utc if served else None,
             "served_trial": json.loads(served.body).get("tracking", {}).get("trial", 0) if served else None,
             "etag": served.etag if served else None,
@@ -285,14 +284,12 @@ class TrackedVersions:
 def told(row: Tracked) -> dict[str, Any]:
     """A trial as clients see it."""
     step = row.step or {}
-    more = {
-        name: step.get(name) for name in ("now", "coming", "effects", "error_nm", "expected_error_nm", "disturbed_s")
-    }
+    found = ("now", "coming", "effects", "error_nm", "expected_error_nm", "disturbed_s", "distance")
     kept = ("number", "test_id", "recording_id", "at_utc", "outcome", "reason", "ask", "error_percent", "delay_s")
-    return {**{name: getattr(row, name) for name in kept}, **more}
+    return {**{name: getattr(row, name) for name in kept}, **{name: step.get(name) for name in found}}
 
 
-def _parts(model_id: str) -> tuple[str, int, int]:
+def parts(model_id: str) -> tuple[str, int, int]:
     """The version, the approval and the trial of a tracked id; of any other one itself, 0 and 0."""
     base, *places = model_id.rsplit(".", 2)
     if base and len(places) == 2 and all(part.isascii() and part.isdigit() and len(part) < 10 for part in places):

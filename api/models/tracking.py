@@ -10,9 +10,10 @@ from typing import Any
 from api.errors import ApiError
 
 LEAST_PERCENT, MOST_PERCENT, USUAL_PERCENT = 0.0, 60.0, 20.0
-QUANTITIES = ("gain", "threshold_shift_us", "time_scale")
-"""As `identify.tracking` has them; named here, too, so that the service need not load it."""
-CONTRADICTS, NOT_FOLLOWED = "contradicts", "not-followed"
+QUANTITIES = {"gain": "gain", "threshold_shift_us": "threshold", "time_scale": "time scale"}
+"""The quantities of `identify.tracking`, named here, too, so that the service need not load it, and what people
+read; the same words stand in `api.language.vocabulary`."""
+CONTRADICTS, NO_TORQUE, NOT_FOLLOWED = "contradicts", "no-torque", "not-followed"
 NEW_TEST = "A new test is needed; the shortest is the adaptive test, which stops by itself."
 
 Bounds = dict[str, tuple[float, float]]
@@ -21,7 +22,7 @@ Bounds = dict[str, tuple[float, float]]
 
 @dataclass(frozen=True)
 class Limits:
-    """Each in percent, 0 to 60; 0: this is not tracked.
+    """Each in percent, 0 to 60; 0: this stays as approved.
 
     Parameters
     ----------
@@ -30,7 +31,7 @@ class Limits:
     threshold_percent : float
         Of the approved curve's threshold, the pulse width at which it has gone 5 % of its way to the plateau.
     time_scale_percent : float
-        Of the approved time constant, either way.
+        Of the approved model's time scale, either way.
 
     Raises
     ------
@@ -74,6 +75,8 @@ class Limits:
 def ask(number: int, step: Mapping[str, Any], bounds: Bounds) -> str | None:
     """Why a person has to be asked after a trial; None where the next one is expected within the bounds.
 
+    The bounds are for what is expected, not for its band.
+
     Parameters
     ----------
     number : int
@@ -83,34 +86,56 @@ def ask(number: int, step: Mapping[str, Any], bounds: Bounds) -> str | None:
     bounds : Bounds
         What a person allowed.
     """
+    words = _of_outcome(number, step) or _beyond(number, step["coming"], bounds)
+    return f"{words} {NEW_TEST}" if words else None
+
+
+def _of_outcome(number: int, step: Mapping[str, Any]) -> str | None:
+    if step["outcome"] == NO_TORQUE:
+        return (
+            f"In trial {number} the pulses gave next to no torque. Look at the electrodes and cables; if they are in "
+            "place:"
+        )
     if step["outcome"] == CONTRADICTS:
         times = step["error_nm"] / step["expected_error_nm"]
-        words = (
+        return (
             f"Trial {number} contradicts the structure of the approved model: its error is {times:.1f} times the "
             "expected one, whatever the gain, threshold and time scale are."
         )
-        return " ".join((words, NEW_TEST))
-    found = {name: step["coming"][name]["value"] for name in QUANTITIES}
-    values = {name: math.nan if value is None else float(value) for name, value in found.items()}
-    for name, (low, high) in bounds.items():
-        if not (low <= values[name] <= high):
-            return " ".join((_left(number, name, values[name], low, high), NEW_TEST))
     return None
 
 
+def _beyond(number: int, coming: Mapping[str, Any], bounds: Bounds) -> str | None:
+    """What is expected outside of its bounds; what is no number is."""
+    for name, (low, high) in bounds.items():
+        value = coming[name]["value"]
+        if value is None or not (low <= value <= high):
+            known = value is not None and math.isfinite(value)
+            return _left(number, name, float(value), low, high) if known else _unknown(number, name)
+    return None
+
+
+def _unknown(number: int, name: str) -> str:
+    return f"After trial {number} it is unknown what to expect of the {QUANTITIES[name]}."
+
+
 def _left(number: int, name: str, value: float, low: float, high: float) -> str:
-    percent, least, most = 100.0 * value, 100.0 * low, 100.0 * high
-    if name == "gain":
+    """Where rounding would write the limit itself, the sentence says "just beyond" instead of a number."""
+    if name == "threshold_shift_us":
+        moved, most = f"{value:+.1f}", f"{high:.3g}"
+        if abs(float(moved)) <= float(most):
+            return f"After trial {number} the threshold is expected just beyond the {most} µs that it may move."
         return (
-            f"After trial {number} the gain is expected to be {percent:.1f} % of the approved one; {least:.0f} to "
-            f"{most:.0f} % are allowed."
+            f"After trial {number} the threshold is expected to have moved by {moved} µs; {most} µs either way are "
+            "allowed."
         )
-    if name == "time_scale":
+    what, percent, least, most = QUANTITIES[name], f"{100.0 * value:.1f}", f"{100.0 * low:g}", f"{100.0 * high:g}"
+    if float(least) <= float(percent) <= float(most):
         return (
-            f"After trial {number} the time constant is expected to be {percent:.1f} % of the approved one; "
-            f"{least:.0f} to {most:.0f} % are allowed."
+            f"After trial {number} the {what} is expected just beyond the {least} to {most} % of the approved one that "
+            "are allowed."
         )
     return (
-        f"After trial {number} the threshold is expected to have moved by {value:+.1f} µs; {high:.1f} µs either way "
-        "are allowed."
+        f"After trial {number} the {what} is expected to be {percent} % of the approved one; {least} to {most} % are "
+        "allowed."
     )

@@ -10,10 +10,10 @@ from pydantic import Field, FiniteFloat
 
 from api.errors import ApiError
 from api.people.auth import Principal, outside
-from api.sessions.lifecycle import SEQUENCE
 from api.sessions.profiles import LIMITS
 from api.sessions.requests import Body, CurrentMa, ProfileIn, TestIn, WidthUs
 from api.sessions.runner import Runner
+from api.sessions.trials import SEQUENCE
 from api.store import Store
 from api.store.tables import Participant, Test
 

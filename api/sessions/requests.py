@@ -180,7 +180,7 @@ class TestIn(Body):
     reference_torque_nm: Annotated[list[ReferenceNm], Field(min_length=1, max_length=12_000)] | None = Field(
         default=None,
         description="kind `sequence`: the torque that the controller wants, one value for each pulse of the whole "
-        "test, N·m. Only to tell its tracking error; it changes nothing that is played",
+        "test, N·m. Only to tell the error against it; it changes nothing that is played",
     )
 
     @model_validator(mode="after")

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import Field, FiniteFloat, StringConstraints
 
-from api.models.tracking import LEAST_PERCENT, MOST_PERCENT, USUAL_PERCENT, Limits
+from api.models.tracking import USUAL_PERCENT, Limits
 from api.sessions.requests import FIRST_PROFILE, Body, Code, FirstProfileIn, Muscle, PersonName, Side
 
 
@@ -31,17 +31,14 @@ class DecisionIn(Body):
     reason: Annotated[str, StringConstraints(max_length=500)] = ""
 
 
-TrackedPercent = Annotated[FiniteFloat, Field(ge=LEAST_PERCENT, le=MOST_PERCENT)]
-
-
 class TrackingIn(Body):
-    """How far a tracked model may move from the approved one, either way, %; 0: this is not tracked."""
+    """How far a tracked model may move from the approved one, either way, 0 to 60 %; 0: this stays as approved."""
 
-    gain_percent: TrackedPercent = Field(default=USUAL_PERCENT, description="of the gain")
-    threshold_percent: TrackedPercent = Field(
+    gain_percent: FiniteFloat = Field(default=USUAL_PERCENT, description="of the gain")
+    threshold_percent: FiniteFloat = Field(
         default=USUAL_PERCENT, description="of the threshold: the width at which the curve has gone 5 % of its way"
     )
-    time_scale_percent: TrackedPercent = Field(default=USUAL_PERCENT, description="of the time constant")
+    time_scale_percent: FiniteFloat = Field(default=USUAL_PERCENT, description="of the time scale")
 
     def limits(self) -> Limits:
         """As the registry takes them."""

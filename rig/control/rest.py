@@ -16,7 +16,7 @@ from pathlib import Path
 from rig import archive, limits
 from rig.acquire.run import LEAD_S
 from rig.clock import Clock, utc_text
-from rig.errors import RecordingError, RefusedError
+from rig.errors import RecordingError, RestError
 from rig.plan import PlannedTest
 
 log = logging.getLogger("rig.rest")
@@ -66,7 +66,7 @@ class Rest:
             self.pulse_at(self._clock.now_s())
 
     def check(self, test: PlannedTest, limit: limits.Limit) -> None:
-        """Raise RefusedError if the earliest pulse follows the last one too soon."""
+        """Raise RestError if the earliest pulse follows the last one too soon."""
         first = test.first_pulse
         if self.last_pulse_s is None or first is None:
             return
@@ -74,7 +74,7 @@ class Rest:
         rest_s = self._clock.now_s() + first_s - self.last_pulse_s
         refusal = limits.check(limit, rest_s)
         if refusal is not None:
-            raise RefusedError(f"plan: {refusal}; wait {limit.lo - rest_s:.1f} s")
+            raise RestError(f"plan: {refusal}; wait {limit.lo - rest_s:.1f} s")
 
     def _read(self) -> float | None:
         """The stored time, if it certainly belongs to this boot."""

@@ -9,7 +9,9 @@ from typing import Any
 import httpx
 import pytest
 
+from api import errors
 from api.sessions import runner
+from rig.messages import Problem as RigProblem
 from tests.api.conftest import Service, run_test, wait_done
 
 GOOD_HEADER = "time_s,pulse_width_us,torque_nm,segment\n"
@@ -108,6 +110,11 @@ def test_rig_that_is_gone_and_comes_back(client: httpx.Client, service: Service,
         assert time.monotonic() < end
         time.sleep(0.05)
     assert run_test(client, participant)["state"] == "completed"
+
+
+def test_a_rest_that_is_needed_has_a_code_of_its_own() -> None:
+    told = errors.from_rig(RigProblem(code="rest-needed", title="The muscle has to rest first", detail="wait 0.3 s"))
+    assert (told.status, told.body()["type"]) == (422, "/problems/rig-rest-needed")
 
 
 def test_rig_that_dies_in_a_test_ends_the_test(client: httpx.Client, service: Service, participant: str) -> None:

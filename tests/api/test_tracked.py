@@ -132,7 +132,7 @@ def test_a_tracked_version_foretells_a_trial(client: httpx.Client, approved: str
     ("limits", "values", "words"),
     [
         ({}, {"gain": 0.79}, "the gain is expected to be 79.0 %"),
-        ({"time_scale_percent": 5.0}, {"time_scale": 1.06}, "the time constant is expected to be 106.0 %"),
+        ({"time_scale_percent": 5.0}, {"time_scale": 1.06}, "the time scale is expected to be 106.0 %"),
         ({"threshold_percent": 5.0}, {"threshold_shift_us": -20.0}, "the threshold is expected to have moved by -20.0"),
     ],
 )

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import re
-from typing import Any
+from typing import Any, get_args
 
 import httpx
 import pytest
 
 from api import language
-from api.models.tracking_words import sentences
+from api.models.tracking_words import OUTCOMES, sentences
+from api.web.pages import tracking_form
+from api.web.responses.tracking import TrialOut
 from tests.api.conftest import Service
 from tests.api.test_access import csrf, signed_in
 from tests.api.test_tracked import approved, play, say, tracked
@@ -18,33 +20,72 @@ __all__ = ["approved"]
 PAGE = "/participants/P017"
 
 
-def trial(**levels: tuple[float, float, float]) -> dict[str, Any]:
-    usual = {"gain": (1.0, 0.9, 1.1), "threshold_shift_us": (0.0, -1.0, 1.0), "time_scale": (1.0, 0.9, 1.1)}
+def trial(number: int = 1, distance: float | None = 2.0, **levels: tuple[float, float, float]) -> dict[str, Any]:
+    usual = {"gain": (1.0, 0.96, 1.04), "threshold_shift_us": (0.0, -1.0, 1.0), "time_scale": (1.0, 0.95, 1.05)}
     now = {name: dict(zip(("value", "low", "high"), level, strict=True)) for name, level in (usual | levels).items()}
-    return {"now": now, "at_utc": "2026-11-22T12:00:00.000Z", "outcome": "followed"}
+    at_utc = "2026-11-22T12:00:00.000Z"
+    return {"number": number, "now": now, "at_utc": at_utc, "outcome": "followed", "distance": distance}
+
+
+SINCE = "2026-11-22T11:05:00.000Z"
 
 
 @pytest.mark.parametrize(
     ("levels", "words"),
     [
-        ({"gain": (0.77, 0.75, 0.79)}, "The plateau is 23 % lower than at "),
-        ({"gain": (1.052, 1.01, 1.09)}, "The plateau is 5.2 % higher than at "),
-        ({"threshold_shift_us": (-3.0, -4.0, -2.0)}, "The threshold is 3.0 µs lower than at "),
-        ({"time_scale": (1.2, 1.1, 1.3)}, "The muscle is 20 % slower than at "),
-        ({"gain": (0.77, 0.5, 1.01)}, "The muscle is as it was at "),
+        ({"gain": (0.77, 0.75, 0.79)}, "In trial 2 the plateau is 23 % lower than at {}."),
+        ({"gain": (1.052, 1.01, 1.09)}, "In trial 2 the plateau is 5.2 % higher than at {}."),
+        ({"threshold_shift_us": (-3.0, -4.0, -2.0)}, "In trial 2 the threshold is 3.0 µs lower than at {}."),
+        ({"time_scale": (1.2, 1.1, 1.3)}, "In trial 2 the muscle is 20 % slower than at {}."),
+        ({}, "In trial 2 the muscle is as it was at {}."),
+        ({"gain": (0.77, 0.5, 1.01)}, "By trial 2 no change since {} is certain."),
+        ({"gain": (1.0, 0.94, 1.02)}, "By trial 2 no change since {} is certain."),
+        ({"threshold_shift_us": (0.0, -5.1, 5.1)}, "By trial 2 no change since {} is certain."),
+        ({"time_scale": (1.0, 0.89, 1.11)}, "By trial 2 no change since {} is certain."),
     ],
 )
 def test_only_what_the_bands_are_sure_of_is_said(levels: Any, words: str) -> None:
-    (said,) = sentences([trial(), trial(**levels)], "2026-11-22T11:05:00.000Z")
-    time = language.clock("2026-11-22T11:05:00.000Z")[:5]
-    assert said == f"{words}{time}."
+    (said,) = sentences([trial(), trial(2, **levels)], SINCE)
+    assert said == words.format(language.clock(SINCE)[:5])
+
+
+def test_a_trial_that_taught_the_model_nothing_changes_no_sentence() -> None:
+    """What is known after it is what was expected before."""
+    learnt = trial(1, gain=(0.8, 0.78, 0.82))
+    for outcome in ("odd", "contradicts", "no-torque"):
+        unexplained = {**trial(2, distance=None, gain=(0.7, 0.6, 0.75)), "outcome": outcome}
+        assert sentences([learnt, unexplained], SINCE) == sentences([learnt], SINCE), outcome
+        assert sentences([unexplained], SINCE) == []
 
 
 def test_a_model_of_another_day_and_no_trial() -> None:
-    said = sentences([trial(gain=(0.5, 0.4, 0.6))], "2026-11-19T11:05:00.000Z")
-    assert "19 Nov 2026" in said[0]
-    unknown = {"now": None, "at_utc": "", "outcome": "not-followed"}
-    assert sentences([], "2026-11-19T11:05:00.000Z") == sentences([unknown], "2026-11-19T11:05:00.000Z") == []
+    before, weaker = "2026-11-19T11:05:00.000Z", [trial(gain=(0.5, 0.4, 0.6))]
+    time = language.clock(before)[:5]
+    assert sentences(weaker, before) == [f"In trial 1 the plateau is 50 % lower than on 19 Nov 2026 at {time}."]
+    with language.using("de"):
+        german = f"In Durchgang 1 liegt das Plateau 50 % tiefer als am 19. Nov. 2026 um {time}."
+        assert sentences(weaker, before) == [german]
+    unsure = trial(gain=(0.77, 0.5, 1.01))
+    assert sentences([unsure], before) == [f"By trial 1 no change since 19 Nov 2026, {time} is certain."]
+    unknown = {"now": None, "at_utc": "", "outcome": "not-followed", "number": 1, "distance": None}
+    assert sentences([], before) == sentences([unknown], before) == []
+
+
+@pytest.mark.parametrize("language_code", ["en", "de"])
+def test_every_outcome_of_the_service_has_words(language_code: str) -> None:
+    told = get_args(TrialOut.model_fields["outcome"].annotation)
+    assert set(told) == set(OUTCOMES)
+    with language.using(language_code):
+        assert len({str(words) for words in OUTCOMES.values()}) == len(told)
+
+
+def test_limits_are_shown_as_they_were_typed() -> None:
+    said = tracking_form.words({"gain_percent": 12.5, "threshold_percent": 20.0, "time_scale_percent": 0.4}, 83.37)
+    assert "gain ±12.5\u00a0%, threshold ±20\u00a0% (±16.7\u00a0µs), time scale ±0.4\u00a0%" in said
+    without = tracking_form.words(None, None)
+    assert "gain ±20\u00a0%, threshold as approved, time scale ±20\u00a0%" in without, "there is no threshold to move"
+    nothing = dict.fromkeys(("gain_percent", "threshold_percent", "time_scale_percent"), "0")
+    assert "does not follow" in tracking_form.words(nothing, 80.0)
 
 
 def test_the_card_tells_the_trials_without_scripts_and_in_german(
@@ -57,14 +98,16 @@ def test_the_card_tells_the_trials_without_scripts_and_in_german(
     play(client)
     page = client.get(PAGE).text
     card = page[page.index('<section class="card trials"') :]
-    assert "The plateau is 5.9 % lower than at " in card and "as of trial 3, " in card and "(just now)" in card
-    assert card.count("<figure") == 3, "nobody sent a reference, so there is no tracking error"
+    assert "In trial 3 the plateau is 5.9 % lower than at " in card and "as of trial 3, " in card
+    assert "(just now)" in card
+    assert card.count("<figure") == 3, "nobody sent a reference, so there is no error against it"
     for unit in ("94.1 ± 1.0\u00a0%", "0.5 ± 0.0\u00a0µs", "100.0 ± 1.0\u00a0%"):
         assert unit in card, unit
     assert card.count("Number of the trial") == 3
     assert "not followed" in card and "the record is too short" in card and "Start the adaptive test" not in card
     german = client.get(PAGE, headers={"Accept-Language": "de"}).text
-    assert "Das Plateau liegt 5,9 % tiefer als um " in german and "nach Versuch 3" in german
+    assert "In Durchgang 3 liegt das Plateau 5,9 % tiefer als um " in german and "nach Durchgang 3," in german
+    assert "Versuch" not in german[german.index('class="card trials"') :]
     assert client.get(f"{PAGE}/trials").text.strip() in page
 
 
@@ -89,6 +132,8 @@ def test_a_person_sets_the_limits_with_the_approval(service: Service, client: ht
         client.post(f"/v1/models/{approved}/reject", json={"reason": "once more"})
         page = browser.get(f"/models/{approved}").text
         assert re.search(r'name="gain_percent"[^>]*value="20"', page)
+        summary = re.search(r'<details class="more tracking"><summary>(.*?)</summary>', page, re.S)
+        assert summary and "gain ±20\u00a0%, threshold ±20\u00a0% (±" in summary[1], "it is read before it is approved"
         form = {"csrf": csrf(browser), "password": "correct horse battery"}
         for wrong in ("61", "-1", "", "1e1", "nan"):
             refused = browser.post(f"/models/{approved}/approve", data={**form, "gain_percent": wrong})
@@ -97,7 +142,7 @@ def test_a_person_sets_the_limits_with_the_approval(service: Service, client: ht
         sent = {**form, "gain_percent": "12,5", "threshold_percent": "0", "time_scale_percent": "60"}
         assert browser.post(f"/models/{approved}/approve", data=sent).status_code == 303
         shown = browser.get(f"/models/{approved}").text
-    assert "gain ±12 %, threshold not tracked, time scale ±60 %" in shown
+    assert "gain ±12.5\u00a0%, threshold as approved, time scale ±60\u00a0%" in shown
     limits = client.get("/v1/participants/P017/tracking").json()["limits"]
     assert limits == {"gain_percent": 12.5, "threshold_percent": 0.0, "time_scale_percent": 60.0}
 
@@ -116,6 +161,14 @@ def test_the_card_is_renewed_while_trials_are_played(
     say(service, values={"gain": 0.7})
     play(client)
     tab.get_by_role("button", name="Start the adaptive test").first.wait_for()
+    asked = tab.locator("#trials .notice")
+    asked.wait_for()
+    assert asked.get_attribute("role") == "alert", "it is read aloud"
+    say(service, reason="the record is too short")
+    play(client)
+    tab.get_by_text("the record is too short").wait_for()
+    assert tab.evaluate("document.activeElement.tagName") == "SUMMARY", "who opened the table stays there"
+    assert asked.get_attribute("role") is None, "the same question is read aloud once"
     tab.get_by_role("button", name="Start the adaptive test").first.click()
     tab.get_by_role("button", name="Start now").wait_for()
     assert tab.errors == []

@@ -20,7 +20,8 @@ from rig.clock import utc_text
 from rig.control import core
 from rig.control.building import previewed
 from rig.control.calibration import end_of_day_s
-from rig.errors import BusyError, DeviceError, LatchedError, PlanError, RefusedError, UncertainError
+from rig.control.replies import refusal
+from rig.errors import BusyError, DeviceError, LatchedError, PlanError, RefusedError, RestError, UncertainError
 from rig.messages import CalibrateStartRequest, PreviewRequest, Profile, SegmentPlan
 from tests.rig.live import SPEED, LiveRig
 
@@ -76,8 +77,11 @@ def test_the_rest_between_two_tests_is_asked_for_and_says_how_long(make: Make):
     live.rig.start(live.plan("one", hold_s=0.5))
     live.wait("ready")
     rested = Profile(rest_between_tests_s=60.0)
-    with pytest.raises(RefusedError, match=r"rest_between_tests_s .*participant's profile, under by .*; wait 5\d"):
+    with pytest.raises(
+        RestError, match=r"rest_between_tests_s .*participant's profile, under by .*; wait 5\d"
+    ) as found:
         live.rig.start(live.plan("two", profile=rested))
+    assert refusal(2, found.value).problem.code == "rest-needed", "by this a program knows that it may ask again"
     asked = PreviewRequest(plan=live.plan("p", profile=rested))
     assert previewed(asked, live.rig.table, time.time()).duration_s == 3.0
 

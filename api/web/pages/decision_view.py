@@ -9,7 +9,7 @@ from fastapi import APIRouter, Form, Request
 from fastapi.responses import RedirectResponse, Response
 
 from api.errors import ApiError
-from api.models import advice, reasons, stored
+from api.models import advice, headline, reasons, stored
 from api.store.tables import Model
 from api.web.dependencies import Approver, Context, Ctx
 from api.web.pages import tracking_form
@@ -77,5 +77,6 @@ async def _question(
         ask_password=not await context.people.is_confirmed(session),
         typed=typed,
         sent=sent,
+        threshold_us=headline.threshold_us(row),
         what_to_write=reasons.WHAT_TO_WRITE,
     )

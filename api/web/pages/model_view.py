@@ -12,7 +12,7 @@ from api import language
 from api.charts import diagnosis_charts, model_charts
 from api.charts.overview import LARGE, overview
 from api.errors import ApiError
-from api.models import advice, carried_shown, explanation, next_step, stored, summary
+from api.models import advice, carried_shown, explanation, headline, next_step, stored, summary
 from api.people.auth import Scope
 from api.sessions.requests import TestIn
 from api.store.tables import Model
@@ -51,6 +51,7 @@ async def model(request: Request, context: Ctx, who: ModelReader, model_id: str,
         changes=await trend_view.changes_of(context, row),
         ask_password=not await context.people.is_confirmed(who.session_hash),
         recruitment=summary.recruitment(document),
+        threshold_us=headline.threshold_us(row),
         dynamics=summary.dynamics(document),
         validity=summary.validity(document),
         problem=measured["problem"],

@@ -8,10 +8,10 @@ from typing import Any
 from starlette.datastructures import FormData
 
 from api.errors import ApiError
-from api.language import _, lazy
-from api.models.tracking import LEAST_PERCENT, MOST_PERCENT, Limits
+from api.language import _, lazy, localised
+from api.models.tracking import QUANTITIES, Limits
 from api.web.pages import typed
-from api.web.pages.environment import environment, number
+from api.web.pages.environment import environment
 
 LABELS = {
     "gain_percent": lazy("Gain (± %%)"),
@@ -34,17 +34,11 @@ def read(sent: FormData) -> Limits:
         if text is None:
             continue
         try:
-            found[name] = percent = typed.number(str(text))
+            found[name] = typed.number(str(text))
         except ValueError as error:
-            raise refused(name, str(error)) from None
-        if not (LEAST_PERCENT <= percent <= MOST_PERCENT):
-            raise refused(name, f"{percent:g} % is not from {LEAST_PERCENT:g} to {MOST_PERCENT:g} %")
+            detail = f"{name}: {error}. Nothing was decided."
+            raise ApiError(422, "invalid-input", "This value cannot be used", detail) from None
     return Limits(**found)
-
-
-def refused(name: str, why: str) -> ApiError:
-    """422, in one line."""
-    return ApiError(422, "invalid-input", "This value cannot be used", f"{name}: {why}. Nothing was decided.")
 
 
 def fields(sent: Mapping[str, Any] | None = None) -> list[dict[str, Any]]:
@@ -53,14 +47,33 @@ def fields(sent: Mapping[str, Any] | None = None) -> list[dict[str, Any]]:
     return [{"name": name, "label": str(label), "text": str(given[name])[:5]} for name, label in LABELS.items()]
 
 
-def words(limits: Mapping[str, float]) -> str:
-    """What is allowed, in a sentence."""
-    said = {name: _("not tracked") if not limits[name] else "±" + number(limits[name], 0, "%") for name in LABELS}
-    if not any(limits.values()):
-        return _("It is not tracked from trial to trial.")
+def words(limits: Mapping[str, Any] | None, threshold_us: float | None) -> str:
+    """What is allowed, in a sentence.
+
+    Parameters
+    ----------
+    limits : mapping or None
+        Of `LABELS`, each in percent, or as it was typed; None: the usual ones.
+    threshold_us : float or None
+        Of the model's curve, µs; without one its threshold stays as approved, whatever the limit.
+    """
+    given = {
+        name: typed.number(str(value)) if isinstance(value, str) else value for name, value in (limits or {}).items()
+    }
+    allowed = Limits(**given)
+    bounds = allowed.bounds(threshold_us)
+    if not bounds:
+        return _("The model does not follow the muscle from trial to trial: all stays as approved.")
+    said = {
+        quantity: f"±{localised(typed.shown(percent))}\u00a0%" if quantity in bounds else _("as approved")
+        for quantity, percent in zip(QUANTITIES, allowed.to_dict().values(), strict=True)
+    }
+    if shift_us := bounds.get("threshold_shift_us", (0.0, 0.0))[1]:
+        said["threshold_shift_us"] += localised(f" (±{shift_us:.3g}\u00a0µs)")
     return _(
-        "Tracked from trial to trial: gain %(gain)s, threshold %(threshold)s, time scale %(time_scale)s.",
-        gain=said["gain_percent"], threshold=said["threshold_percent"], time_scale=said["time_scale_percent"],
+        "The model follows the muscle from trial to trial, at most: gain %(gain)s, threshold %(threshold)s, "
+        "time scale %(time_scale)s.",
+        gain=said["gain"], threshold=said["threshold_shift_us"], time_scale=said["time_scale"],
     )  # fmt: skip
 
 

@@ -35,7 +35,8 @@ class TrialOut(Document):
     at_utc: str = Field(description="when it was followed")
     outcome: Literal["followed", "little", "odd", "no-torque", "contradicts", "not-followed"] = Field(
         description="`little`: it tells little; `odd`: it is far from what was expected, and moves little; "
-        "`contradicts`: gain, threshold and time scale do not explain it; `not-followed`: `reason` says why"
+        "`contradicts`: gain, threshold and time scale do not explain it; `no-torque`: the pulses gave next to no "
+        "torque, as with a loose electrode or cable; `not-followed`: `reason` says why"
     )
     reason: str
     ask: str | None = Field(description="why a new test was needed after it, in a sentence")
@@ -49,6 +50,10 @@ class TrialOut(Document):
     )
     error_nm: float | None = Field(description="what no gain, threshold or time scale explains, N·m")
     expected_error_nm: float | None = Field(description="the same on the approved model's own recording, N·m")
+    distance: float | None = Field(
+        description="of what it said from what was expected, squared, in standard deviations; null: the model learnt "
+        "nothing from it"
+    )
     disturbed_s: list[list[float]] | None = Field(description="begin and end of stretches that do not fit, s")
 
 
