@@ -90,7 +90,7 @@ def test_patient_file_and_readable_lines(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        (["--patient", "nobody"], "calcium, paper"),
+        (["--patient", "nobody"], "calcium, changing, paper"),
         (["--patient", "nobody.toml"], "nobody.toml: cannot be read"),
         (["--noise-nm", "much"], "--noise-nm"),
         (["--noise-nm", "nan"], "--noise-nm must be between 0 and 10"),
