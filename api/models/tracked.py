@@ -39,8 +39,8 @@ class Trial:
         The one under which it was begun.
     model_json : str
         The approved MODEL.json.
-    bounds : Bounds
-        What a person allowed.
+    bounds, alarms : Bounds
+        What a person allowed, and beyond what they are asked.
     problem : str
         Why the approved model cannot be followed; empty where it can.
     number : int
@@ -59,6 +59,7 @@ class Trial:
     approval: Approval
     model_json: str
     bounds: Bounds
+    alarms: Bounds
     problem: str
     number: int
     state: dict[str, Any] | None
@@ -92,13 +93,14 @@ class TrackedVersions:
             return None
         rows = self.rows(approval.id)
         followed = [row for row in rows if row.step is not None]
-        model, text, bounds, problem = self.versions.get(approval.model_id), "", Bounds(), ""
+        model, text, bounds, alarms, problem = self.versions.get(approval.model_id), "", Bounds(), Bounds(), ""
         try:
-            text, bounds = stored.text(model), self.bounds(approval, model)
+            limits, threshold_us = Limits(**approval.tracking), headline.threshold_us(model)
+            text, bounds, alarms = stored.text(model), limits.bounds(threshold_us), limits.alarms(threshold_us)
         except ApiError as error:
             problem = error.detail
         return Trial(
-            test, approval, text, bounds, problem, len(rows) + 1,
+            test, approval, text, bounds, alarms, problem, len(rows) + 1,
             followed[-1].step["state"] if followed and followed[-1].step else None,
             len(rows) - followed[-1].number if followed else len(rows), self.earlier(approval),
             (followed[-1].recording_id if followed else None) or model.recording_id,
@@ -129,10 +131,6 @@ class TrackedVersions:
     def text(self, approval: Approval) -> str:
         """The approved MODEL.json. Raises ApiError (500) where it is damaged."""
         return stored.text(self.versions.get(approval.model_id))
-
-    def bounds(self, approval: Approval, model: Model) -> Bounds:
-        """What a person allowed, in the quantities' units."""
-        return Limits(**(approval.tracking or {})).bounds(headline.threshold_us(model))
 
     def rows(self, approval_id: int) -> list[Tracked]:
         """The trials of an approval, the oldest first, without what was served."""
@@ -174,10 +172,13 @@ class TrackedVersions:
             served = None
             if step is not None:
                 row.outcome, row.reason, row.step = step["outcome"], "", step
-                row.ask = tracking.ask(trial.number, step, trial.bounds)
-                row.document = body = self._document(trial, row, found["model"])
+                row.ask = tracking.ask(trial.number, step, trial.alarms)
+            elif trial.model_json and row.reason != SUPERSEDED and self._unfollowed_before(approval.id):
+                row.ask = tracking.not_followed(trial.number)
+            if step is not None or row.ask is not None:
+                row.document = body = self._document(trial, row, found.get("model", ""))
                 row.etag = hashlib.sha256(body).hexdigest()
-                if last_sample_unix_s is not None:
+                if step is not None and last_sample_unix_s is not None:
                     row.delay_s = round(self.clock.unix_s() - last_sample_unix_s, 3)
                 served = _served(row, approval)
             session.add(row)
@@ -190,8 +191,8 @@ class TrackedVersions:
     def _document(self, trial: Trial, row: Tracked, model_json: str) -> bytes:
         """What is served from now on: the moved model, or where a person is asked the last one within the limits."""
         approval, step = trial.approval, row.step
-        assert step is not None
         if row.ask is None:
+            assert step is not None
             document = json.loads(model_json)
             told = {
                 "approved_model_id": approval.model_id, "trial": row.number, "test_id": row.test_id,
@@ -208,6 +209,11 @@ class TrackedVersions:
         document["model_id"] = f"{approval.model_id}.{approval.id}.{told['trial']}"
         document["tracking"] = {**told, "ask": row.ask}
         return json.dumps(document, ensure_ascii=False, allow_nan=False).encode()
+
+    def _unfollowed_before(self, approval_id: int) -> bool:
+        """Whether the last trial could not be followed."""
+        rows = self.rows(approval_id)
+        return bool(rows) and rows[-1].outcome == NOT_FOLLOWED
 
     # ---- what is served ----------------------------------------------------------------------------------------
 

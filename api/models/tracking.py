@@ -71,6 +71,13 @@ class Limits:
         around = {"gain": (1.0, gain), "threshold_shift_us": (0.0, shift_us), "time_scale": (1.0, time_scale)}
         return {name: (middle - half, middle + half) for name, (middle, half) in around.items() if half > 0.0}
 
+    def alarms(self, threshold_us: float | None) -> Bounds:
+        """Beyond what a person is asked: the bounds, and the usual ones of what stays as approved.
+
+        The muscle changes all the same where the model is held.
+        """
+        return Limits(*(percent or USUAL_PERCENT for percent in self.to_dict().values())).bounds(threshold_us)
+
 
 def ask(number: int, step: Mapping[str, Any], bounds: Bounds) -> str | None:
     """Why a person has to be asked after a trial; None where the next one is expected within the bounds.
@@ -84,10 +91,20 @@ def ask(number: int, step: Mapping[str, Any], bounds: Bounds) -> str | None:
     step : mapping
         `identify.tracking.Step.to_dict()`.
     bounds : Bounds
-        What a person allowed.
+        Beyond these a person is asked (`Limits.alarms`).
     """
     words = _of_outcome(number, step) or _beyond(number, step["coming"], bounds)
     return f"{words} {NEW_TEST}" if words else None
+
+
+def not_followed(number: int) -> str:
+    """Why a person has to be asked after two trials running that could not be followed."""
+    before = number - 1
+    words = (
+        f"Trials {before} and {number} could not be followed; their table says why. Whether the model still holds is "
+        "not known."
+    )
+    return f"{words} {NEW_TEST}"
 
 
 def _of_outcome(number: int, step: Mapping[str, Any]) -> str | None:

@@ -178,6 +178,32 @@ def test_a_trial_that_contradicts_the_structure_asks_and_the_next_good_one_goes_
     assert document["tracking"]["ask"] is None and document["tracking"]["trial"] == 3
 
 
+def test_two_trials_running_that_cannot_be_followed_ask(service: Service, client: httpx.Client, approved: str) -> None:
+    play(client)
+    good = tracked(client)
+    for number in (2, 3):
+        say(service, reason="the record is too short")
+        play(client)
+        assert bool(tracked(client).json()["tracking"]["ask"]) is (number == 3)
+    document, before = tracked(client).json(), good.json()
+    assert document["tracking"]["ask"].startswith("Trials 2 and 3 could not be followed")
+    assert document["recruitment"] == before["recruitment"] and document["tracking"]["trial"] == 1
+    assert client.get(TRACKING).json()["ask"] == document["tracking"]["ask"]
+    play(client)
+    assert tracked(client).json()["tracking"]["ask"] is None, "the next one is followed again"
+
+
+def test_where_the_gain_is_held_a_person_is_asked_all_the_same(
+    service: Service, client: httpx.Client, approved: str
+) -> None:
+    client.post(f"/v1/models/{approved}/approve", json={"tracking": {"gain_percent": 0}})
+    say(service, values={"gain": 0.79})
+    play(client)
+    document = tracked(client).json()
+    assert "the gain is expected to be 79 % of the approved one" in document["tracking"]["ask"].replace("79.0", "79")
+    assert gain(document, client.get(MODEL).json()) == 1.0
+
+
 @pytest.mark.parametrize("percent", [-1, 60.5, "20", None, True, 1e400])
 def test_limits_that_are_none_are_refused_and_nothing_is_approved(
     client: httpx.Client, participant: str, percent: Any
@@ -201,7 +227,7 @@ def test_what_is_not_tracked_stays_and_nothing_tracked_means_no_trial(
     service: Service, client: httpx.Client, approved: str
 ) -> None:
     client.post(f"/v1/models/{approved}/approve", json={"tracking": {"gain_percent": 0}})
-    say(service, values={"gain": 0.5})
+    say(service, values={"gain": 0.85})
     play(client)
     document = tracked(client).json()
     assert document["tracking"]["trial"] == 1 and document["tracking"]["ask"] is None

@@ -38,6 +38,9 @@ def test_bounds_are_in_the_quantities_units() -> None:
         "gain": (0.8, 1.2), "threshold_shift_us": (-8.0, 8.0), "time_scale": (0.5, 1.5),
     }  # fmt: skip
     assert Limits(0.0, 10.0, 0.0).bounds(80.0) == {"threshold_shift_us": (-8.0, 8.0)}
+    assert Limits(0.0, 10.0, 0.0).alarms(80.0) == {
+        "gain": (0.8, 1.2), "threshold_shift_us": (-8.0, 8.0), "time_scale": (0.8, 1.2),
+    }  # fmt: skip
     for without in (None, 0.0, -3.0):
         assert "threshold_shift_us" not in Limits().bounds(without), "no threshold to be a share of"
 
