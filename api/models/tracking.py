@@ -126,9 +126,10 @@ def _beyond(number: int, coming: Mapping[str, Any], bounds: Bounds) -> str | Non
     """What is expected outside of its bounds; what is no number is."""
     for name, (low, high) in bounds.items():
         value = coming[name]["value"]
-        if value is None or not (low <= value <= high):
-            known = value is not None and math.isfinite(value)
-            return _left(number, name, float(value), low, high) if known else _unknown(number, name)
+        if value is None or not math.isfinite(value):
+            return _unknown(number, name)
+        if not (low <= value <= high):
+            return _left(number, name, float(value), low, high)
     return None
 
 
