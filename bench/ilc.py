@@ -205,7 +205,7 @@ def page(cases: dict[str, dict[str, Any]], speed: float, seconds: float) -> str:
         "reference is ten seconds of minimum-jerk moves up to 60 % of the largest torque. *Static start*: the first "
         "trial inverts f alone, as if there were no G, so that there is something to learn.",
         "",
-        "![Tracking error over trials](../img/ilc.svg)",
+        "![Error over trials](../img/ilc.svg)",
     ]
     for name, found in cases.items():
         lines += ["", f"## {name[0].upper()}{name[1:]}", ""]
@@ -247,7 +247,7 @@ def draw(path: Path, cases: dict[str, dict[str, Any]]) -> None:
         axis.set_title(name.replace(" (", "\n("), fontsize=9)
         axis.set_xlabel("trial")
         axis.legend(fontsize=6.5)
-    axes[0][0].set_ylabel("tracking error (% of the reference's rms)")
+    axes[0][0].set_ylabel("error (% of the reference's rms)")
     axes[0][0].set_ylim(0.5, 150)
     figure.tight_layout()
     path.parent.mkdir(parents=True, exist_ok=True)

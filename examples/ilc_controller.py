@@ -409,9 +409,13 @@ def main() -> None:
     parser.add_argument("--tracked", action="store_true", help="fetch the model anew after each trial, as it stands")
     parser.add_argument("--svg", help="draw here")
     options = parser.parse_args()
-    token = os.environ.get("STIMRIG_TOKEN") or sys.exit("set STIMRIG_TOKEN: read-model, read-live and run-test")
+    token = os.environ.get("STIMRIG_TOKEN") or sys.exit("set STIMRIG_TOKEN to a controller's key")
     service = Service(Client(options.url, token), options.participant)
     model = service.fetch(options.tracked)
+    if not abs(model["pulse_rate_hz"] / PULSE_RATE_HZ - 1) < 1e-3:
+        sys.exit(
+            f"the model holds for {model['pulse_rate_hz']:g} pulses a second; this controller plays {PULSE_RATE_HZ:g}"
+        )
     reference = Reference.reach(options.peak_nm or 0.6 * float(model["recruitment"]["inverse"]["torque_nm"][-1]))
     laws = list(LAWS) if options.law == "both" else [options.law]
     runs = {}
