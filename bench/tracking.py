@@ -152,8 +152,11 @@ def tables(rows: list[dict[str, Any]]) -> list[str]:
             if not errors.size:
                 cells.append("")
                 continue
-            ratio = np.nanquantile(errors / still, [0.5, 0.9]) if np.isfinite(still).any() else [np.nan] * 2
-            cells.append(f"{np.median(errors):.2f} % (× {ratio[0]:.2f}, {ratio[1]:.2f})")
+            told = f"{np.median(errors):.2f} %"
+            if np.isfinite(still).any():
+                half, most = np.nanquantile(errors / still, [0.5, 0.9])
+                told += f" (× {half:.2f}, {most:.2f})"
+            cells.append(told)
         lines.append(f"| {case} | " + " | ".join(cells) + " |")
     return lines
 

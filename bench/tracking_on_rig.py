@@ -150,6 +150,8 @@ def page(rows: list[dict[str, Any]], offline: list[dict[str, Any]]) -> str:
         "Error: rms of reference minus torque, % of the reference's rms. In a table: the tenth trial's error, the "
         "median of the muscles; in brackets its ratio to that of the same muscle and follower when nothing changes, "
         "the median and the worst tenth.",
+        f"The approval lets each quantity move by {LIMITS['gain_percent']:g} %; with the usual 20 % a new test is "
+        "asked for as soon as more of the gain is lost.",
         "*Moved beyond a band*: what is served for the next trial differs from what was served before by more than "
         "half the width of the 95 % band that was served with it.",
         "",
@@ -162,9 +164,9 @@ def page(rows: list[dict[str, Any]], offline: list[dict[str, Any]]) -> str:
         seeds = sorted({row["seed"] for row in offline})
         lines += ["", "## Simulated, without waiting", ""]
         lines += [
-            f"`python -m bench.tracking`: {len(seeds)} muscles, seeds {seeds[0]} to {seeds[-1]}, "
-            f"noise {NOISE_NM:g} N·m. The controller that is not tracked halves its share after a worse trial; this "
-            "costs it much with fatigue.",
+            f"`python -m bench.tracking --seeds {seeds[0]}:{seeds[-1] + 1}`, noise {NOISE_NM:g} N·m; developed on "
+            "seeds from 53000 and 54000. The controller that is not tracked halves its share after a worse trial; this costs "
+            "it much with fatigue.",
             "",
         ]
         lines += [*tables(offline), "", *_list(seconds_of(offline)), "", *_list(moved_lines(offline))]
