@@ -165,8 +165,8 @@ def page(rows: list[dict[str, Any]], offline: list[dict[str, Any]]) -> str:
         lines += ["", "## Simulated, without waiting", ""]
         lines += [
             f"`python -m bench.tracking --seeds {seeds[0]}:{seeds[-1] + 1}`, noise {NOISE_NM:g} N·m; developed on "
-            "seeds from 53000 and 54000. The controller that is not tracked halves its share after a worse trial; this costs "
-            "it much with fatigue.",
+            "seeds from 53000 and 54000. The controller that is not tracked halves its share after a worse trial; "
+            "this costs it much with fatigue.",
             "",
         ]
         lines += [*tables(offline), "", *_list(seconds_of(offline)), "", *_list(moved_lines(offline))]
