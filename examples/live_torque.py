@@ -72,7 +72,8 @@ def main() -> None:
     parser.add_argument("--participant", required=True)
     parser.add_argument("--test", help="watch this test instead of starting one")
     options = parser.parse_args()
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C
+    for number in (signal.SIGINT, signal.SIGTERM):  # a shell's background job ignores Ctrl-C unless it says so
+        signal.signal(number, signal.default_int_handler)
     token = os.environ.get("STIMRIG_TOKEN") or sys.exit("set STIMRIG_TOKEN to a controller's key")
     with Client(options.url, token) as client:
         if options.test:
