@@ -158,7 +158,7 @@ def follow(
     seen = look(with_states(model, begun), before, record)
     if seen.came < GONE and seen.wanted_nm > ENOUGH * float(np.ptp(model.recruitment.table()[1])):
         after, distance, outcome = replace(before, trials=before.trials + 1), None, Outcome.NO_TORQUE
-    elif seen.misfit > UNEXPLAINED:
+    elif not (seen.misfit <= UNEXPLAINED):
         after, distance = replace(before, trials=before.trials + 1, unexplained=before.unexplained + 1), None
         outcome = Outcome.CONTRADICTS if after.unexplained > 1 else Outcome.ODD
     else:
