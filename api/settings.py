@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import socket
 from pathlib import Path
 from typing import Annotated, Any
 from zoneinfo import available_timezones
@@ -36,6 +37,9 @@ class Settings(BaseSettings):
     rig_socket: Path | None = Field(default=None, description="Unix socket of the rig process")
     rig_file: Path | None = Field(default=None, description="rig.toml; default: the emulated rig")
     emulated: bool = Field(default=False, description="True: no person is connected, an emulator stands in for the rig")
+    rig_name: str | None = Field(
+        default=None, description="services of one rig on one database give it one name; default: machine and folder"
+    )
     workers: Annotated[int, Field(ge=1, le=16)] = 2
     session_hours: Annotated[float, Field(gt=0, le=24)] = 12.0
     idle_lock_min: Annotated[float, Field(ge=0, le=720)] = Field(
@@ -81,6 +85,11 @@ class Settings(BaseSettings):
     def database(self) -> str:
         """The database's SQLAlchemy URL."""
         return self.database_url or f"sqlite:///{self.data_dir.absolute() / 'stimrig.db'}"
+
+    @property
+    def rig(self) -> str:
+        """What the services of one rig call it."""
+        return self.rig_name or f"{socket.gethostname()}:{self.data_dir.absolute()}"
 
     @property
     def recordings_dir(self) -> Path:
