@@ -22,6 +22,7 @@ from api.store import Store, audit, migrations
 from api.store.tables import Approval, AuditEntry, Participant, Recording, Table, User
 from tests.api.conftest import STUB, run_service, run_test
 
+pytestmark = pytest.mark.sqlite
 ROOT = Path(__file__).parents[2]
 OLD = Path(__file__).parent / "databases"
 ADDED_SINCE = [
@@ -108,7 +109,6 @@ def test_an_upgrade_that_fails_leaves_the_database_as_it_was(tmp_path: Path) -> 
         assert list(database.iterdump()) == before
 
 
-@pytest.mark.sqlite
 def test_a_service_goes_on_with_an_older_database(tmp_path: Path, short_dir: Path) -> None:
     for service in run_service(tmp_path, short_dir, STUB):
         with service.client() as http:

@@ -25,6 +25,7 @@ from api.store import Store, lock
 from api.store.lock import HeldError, ServiceLock
 from tests.api.conftest import PATIENCE_S, TOKEN, Service, run_test
 
+pytestmark = pytest.mark.sqlite
 ROOT = Path(__file__).parents[2]
 
 
@@ -134,7 +135,6 @@ def mode(path: Path) -> int:
     return path.stat().st_mode & 0o777
 
 
-@pytest.mark.sqlite
 def test_what_a_service_keeps_is_its_owners_alone(service: Service, client: httpx.Client, participant: str) -> None:
     run_test(client, participant)
     private = ["stimrig.db", "stimrig.db-wal", "stimrig.db-shm", "service.lock", "stimrig.db.lock"]

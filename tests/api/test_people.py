@@ -284,4 +284,8 @@ def test_audit_is_verified_and_exported_by_a_command(
     capsys.readouterr()
     assert main.run(["audit", "verify", "--data", data]) == 1
     assert "broken at entry 2" in capsys.readouterr().out
+
+
+@pytest.mark.sqlite
+def test_an_audit_of_no_database_is_told(tmp_path: Path) -> None:
     assert main.run(["audit", "verify", "--data", str(tmp_path / "nowhere")]) == 2
