@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 export PYTHONUNBUFFERED = 1
 FAST := not wire and not browser and not service and not slow
 
-.PHONY: demo test check fast lint types serve bench faults soak campaigns mutation words lock clean help setup setup-test
+.PHONY: postgresql demo test check fast lint types serve bench faults soak campaigns mutation words lock clean help setup setup-test
 
 help:
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -41,6 +41,9 @@ soak: setup-test ## an hour of recording with fits beside it (docs/results/soak.
 
 campaigns: setup-test ## the tests that are too long for `make test`: whole grids, a hidden patient on the wire
 	@$(BIN)/python -m pytest --campaigns -m campaign tests
+
+postgresql: setup-test ## every test of the service on PostgreSQL instead of SQLite
+	@$(BIN)/python -m pytest -n 2 --dist worksteal --postgresql -m "service and not browser and not wire" tests/api
 
 faults: setup-test ## the fault campaign on the emulated rig (docs/results/faults.md)
 	@$(BIN)/python -m bench.faults

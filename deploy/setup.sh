@@ -57,6 +57,9 @@ $venv/bin/python -m identify.diagnosis.warm_up
 if [ "$what" = test ] && ! command -v chromium >/dev/null 2>&1; then
   debian chromium
 fi
+if [ "$what" != run ] && [ "$what" != bench ] && ! compgen -G '/usr/lib/postgresql/*/bin/postgres' >/dev/null; then
+  debian postgresql
+fi
 touch "$venv/.$what"
 # The test list holds the run list.
 if [ "$what" = test ]; then touch "$venv/.run"; fi
