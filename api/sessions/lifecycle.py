@@ -16,13 +16,11 @@ from api.sessions.adaptive_tests import AdaptiveTests
 from api.sessions.rig_client import RigClient
 from api.sessions.trials import SEQUENCE
 from api.store import Store, audit
-from api.store.tables import Model, Recording, Test
+from api.store.tables import OPEN_STATES, Model, Recording, Test
 from api.workers.pool import Call, Pool
 from rig.messages import FinishedEvent
 
 log = logging.getLogger("stimrig.outcomes")
-
-OPEN_STATES = ("requested", "running", "sealing", "identifying")
 
 
 class Lifecycle:
