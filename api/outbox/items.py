@@ -23,6 +23,7 @@ TABLES: dict[type[Table], str] = {
 """What is told of, in the order in which one transaction's rows are told."""
 LONGEST_BODY = 500_000
 LONGEST_LIST = 100
+DEEPEST = 20
 SHA256 = re.compile(r"[0-9a-f]{64}")
 
 
@@ -93,12 +94,14 @@ def _bounded(body: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in plain.items() if not isinstance(value, dict | list)}
 
 
-def _plain(value: Any) -> Any:
-    """Without what JSON or UTF-8 cannot hold: a number that is none is null."""
+def _plain(value: Any, depth: int = 0) -> Any:
+    """Without what JSON or UTF-8 cannot hold, a number that is none is null; and not nested without end."""
+    if isinstance(value, dict | list) and depth >= DEEPEST:
+        return {"left_out": len(value)}
     if isinstance(value, dict):
-        return {_plain(name): _plain(each) for name, each in value.items()}
+        return {_plain(name): _plain(each, depth + 1) for name, each in value.items()}
     if isinstance(value, list):
-        return [_plain(each) for each in value]
+        return [_plain(each, depth + 1) for each in value]
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     return value.encode(errors="replace").decode() if isinstance(value, str) else value
