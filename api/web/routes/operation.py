@@ -105,11 +105,7 @@ def _centre(context: Context) -> Iterator[Metric]:
         ("stimrig_outbox_items_waiting", "Items that the centre lacks", told.items_waiting),
         ("stimrig_outbox_files_waiting", "Files that it is known to lack", told.files_waiting),
         ("stimrig_outbox_files_damaged", "Files that cannot be sent to it", told.damaged_count),
-        (
-            "stimrig_outbox_contact_age_seconds",
-            "Time since it answered; -1: never",
-            -1.0 if since_s is None else since_s,
-        ),
+        ("stimrig_outbox_contact_age_seconds", "Time since it answered; -1: never", age_s),
     ):
         yield GaugeMetricFamily(name, words, value)
 
