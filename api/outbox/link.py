@@ -90,7 +90,7 @@ class Link:
         began_s, body = self.clock.monotonic_s(), bytearray()
         if response.headers.get("Content-Encoding", "identity") != "identity":
             raise WrongAnswerError(f"{self.url}: the answer is compressed; nobody asked for that")
-        for piece in response.iter_raw():
+        for piece in response.iter_bytes():
             body += piece
             if len(body) > LONGEST_ANSWER:
                 raise WrongAnswerError(f"{self.url}: the answer is longer than 1 MB; is it a centre?")

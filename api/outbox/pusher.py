@@ -30,7 +30,7 @@ from api.version import software_version
 HELLO_S = 30.0
 POLL_S = 1.0
 REVOKED_S = 900.0
-TOLD_S = 10.0
+TOLD_S = 30.0
 """The status is written at least so often."""
 GOOD_S = 180.0
 """One that is older was left by a pusher that does not run: a chunk on a slow line takes a while."""
@@ -94,7 +94,13 @@ class Pusher:
             log.warning("the rig's database: %s", self._database_words)
             self._write_status()
             busy = False
-        return 0.0 if busy else POLL_S
+        return 0.0 if busy else self._rest_s()
+
+    def _rest_s(self) -> float:
+        """Until what is new has to be noticed; after a failure until it is tried again, or the status is old."""
+        now_s = self.clock.monotonic_s()
+        wait_s = max(self._line_s, self._database_s) - now_s
+        return min(max(wait_s, POLL_S), TOLD_S)
 
     def _put_in_missing(self) -> bool:
         if self._missing is None:

@@ -7,10 +7,12 @@ from collections.abc import Iterator
 from itertools import islice
 from typing import Any
 
-from sqlalchemy import func, select, tuple_
+from sqlalchemy import func, inspect, select, tuple_
+from sqlalchemy.orm import Session
 
 from api.clock import Clock
 from api.outbox import chain, feed
+from api.outbox.chain import Telling
 from api.store import Store
 from api.store.tables import Approval, AuditEntry, Model, Participant, Recording, Table, Test, Tracked
 
@@ -60,14 +62,19 @@ def _keys(store: Store, table: type[Table], rank: int) -> Iterator[tuple[str, in
 def _put(store: Store, clock: Clock, keys: list[tuple[type[Table], Any]]) -> int:
     """Put in those whose newest item says something else; looked at first without keeping others from writing."""
     with store.read() as session:
-        changed = []
-        for table, key in keys:
-            row = session.get(table, key)
-            tellings = [] if row is None else list(feed.told([row]))
-            if chain.unlike_newest(session, tellings):
-                changed.append((table, key))
+        changed = {(each.kind, each.key) for each in chain.unlike_newest(session, _tellings(session, keys))}
     if not changed:
         return 0
     with store.write() as session:
-        rows = [row for table, key in changed if (row := session.get(table, key)) is not None]
-        return chain.put(session, clock.utc(), [telling for row in rows for telling in feed.told([row])])
+        tellings = [each for each in _tellings(session, keys) if (each.kind, each.key) in changed]
+        return chain.put(session, clock.utc(), tellings)
+
+
+def _tellings(session: Session, keys: list[tuple[type[Table], Any]]) -> list[Telling]:
+    """What is told of these rows, in this order."""
+    found: dict[tuple[type[Table], Any], Table] = {}
+    for table in {table for table, _ in keys}:
+        column = inspect(table).primary_key[0]
+        for row in session.scalars(select(table).where(column.in_([key for of, key in keys if of is table]))):
+            found[table, inspect(row).identity[0]] = row
+    return [telling for of in keys if of in found for telling in feed.told([found[of]])]

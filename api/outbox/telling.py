@@ -45,6 +45,8 @@ class Telling:
         self.reached: tuple[str, int] | None = None
         self._doubt: Position | None = None
         self._out_of_order = False
+        self._counted: tuple[Head | None, int, int] = (None, 0, 0)
+        """Files that the items after a place name: counted once for each."""
 
     def head(self) -> Head | None:
         """The newest item."""
@@ -97,10 +99,12 @@ class Telling:
             if head is None:
                 return (0, 0)
             seq = self.reached[1] if self.reached and self.reached[0] == head.chain else 0
-            of = select(func.count(distinct(OutboxItem.file))).where(
-                OutboxItem.chain == head.chain, OutboxItem.seq > seq, OutboxItem.file.is_not(None)
-            )
-            return (max(0, head.seq - seq), session.scalar(of) or 0 if head.seq > seq else 0)
+            if self._counted[:2] != (head, seq):
+                of = select(func.count(distinct(OutboxItem.file))).where(
+                    OutboxItem.chain == head.chain, OutboxItem.seq > seq, OutboxItem.file.is_not(None)
+                )
+                self._counted = (head, seq, session.scalar(of) or 0)
+        return (max(0, head.seq - seq), self._counted[2])
 
     def _stands(self, name: str, given: Position) -> None:
         self.at, self.reached = given, (name, given.seq)
