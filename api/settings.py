@@ -135,7 +135,8 @@ def refusal(error: ValidationError) -> str:
     first = error.errors()[0]
     name = "STIMRIG_" + "_".join(str(part) for part in first["loc"]).upper()
     says = first["msg"].removeprefix("Value error, ")
-    return f"{name}: {says}" if name.endswith(SECRET) else f"{name}: {says}, not {first['input']!r}"
+    shown = re.sub(r"//[^/]*@", "//…@", repr(first["input"]))
+    return f"{name}: {says}" if name.endswith(SECRET) else f"{name}: {says}, not {shown}"
 
 
 def loopback(host: str) -> bool:

@@ -76,6 +76,7 @@ def test_what_came_about_without_a_centre_is_told(tmp_path: Path, centre: FakeCe
     rig.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rubbish", [False, True], ids=["line", "rubbish"])
 @pytest.mark.parametrize("seed", range(6))
 def test_whatever_the_line_does_all_comes_over(tmp_path: Path, seed: int, rubbish: bool) -> None:
@@ -98,6 +99,7 @@ def test_whatever_the_line_does_all_comes_over(tmp_path: Path, seed: int, rubbis
 STEPS = ("session", "participant", "wait", "long wait", "new pusher", "backup", "older")
 
 
+@pytest.mark.slow
 @hypothesis_settings(max_examples=25)
 @given(st.lists(st.sampled_from(STEPS), max_size=12), st.integers(0, 2**32), st.sampled_from((0.0, 0.3, 0.8)))
 def test_in_any_order_of_work_failures_and_restarts(
@@ -281,6 +283,7 @@ def test_a_wrong_answer_is_one_line_and_changes_nothing(rig: Rig, centre: FakeCe
     assert rig.told() == before and requests < 40, "it waits longer and longer"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", range(len(RUBBISH)))
 @pytest.mark.parametrize("path", ["items", "files"])
 def test_rubbish_for_some_requests_only(rig: Rig, centre: FakeCentre, number: int, path: str) -> None:
@@ -296,14 +299,15 @@ def test_rubbish_for_some_requests_only(rig: Rig, centre: FakeCentre, number: in
         return RUBBISH[number]() if broken and path in request.url.path else centre.handle(request)
 
     pusher = rig.pusher(line)
-    run(pusher, 1800)
-    assert requests < 250 and state_of(rig).state in ("wrong-answer", "refused")
+    run(pusher, 300)
+    assert requests < 60 and state_of(rig).state in ("wrong-answer", "refused")
     broken = False
     run(pusher, 700)
     assert_told(rig, centre)
     assert {item.chain for item in rig.items()} == chains
 
 
+@pytest.mark.slow
 def test_days_without_a_network_wait_in_the_database(rig: Rig, centre: FakeCentre) -> None:
     """10 000 items wait; they go over in batches, with little memory."""
     rig.participant("P1")
@@ -396,6 +400,7 @@ def test_a_restored_rig_begins_anew_and_tells_everything_again(
     rig.close()
 
 
+@pytest.mark.slow
 def test_a_centre_that_is_always_ahead_makes_no_chain_after_chain(rig: Rig, centre: FakeCentre) -> None:
     rig.participant("P1")
 
