@@ -17,7 +17,7 @@ from api.sessions.following import OPEN_STATES, Follower
 from api.sessions.rig_client import RigClient
 from api.sessions.trials import SEQUENCE
 from api.store import Store, audit
-from api.store.tables import Model, Recording, Test
+from api.store.tables import OPEN_STATES, Model, Recording, Test
 from api.workers.pool import Call, Pool
 from rig.messages import FinishedEvent
 

@@ -21,6 +21,7 @@ from api.models.analyses import Analyses
 from api.models.registry import Versions
 from api.models.tracked import TrackedVersions
 from api.models.trend import Trend
+from api.outbox.feed import Feed
 from api.people.accounts import People
 from api.people.auth import Auth, Principal, Scope
 from api.people.idle_lock import FLUSH_S, IdleLock
@@ -138,6 +139,8 @@ def _build(settings: Settings, clock: Clock, worker: tuple[str, ...], lock: Serv
     if settings.time_zone:
         set_zone(settings.time_zone)
     store = Store(settings.database)
+    if settings.centre_url is not None:
+        Feed(store, clock)
     guesses = Guesses(clock)
     idle = IdleLock(store, clock, settings.idle_lock_min)
     auth = Auth(store, clock, guesses, idle, settings.session_hours)
