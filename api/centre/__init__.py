@@ -1,1 +1,1 @@
-"""The centre: takes what rigs push, keeps it whole, and shows it. It asks nothing of a rig and tells it nothing to do."""
+"""The centre: takes what rigs push, keeps it whole, and shows it. It tells no rig what to do."""

@@ -38,7 +38,7 @@ SHARED = (
     "/v1/sessions/lock", "/v1/sessions/unlock", "/v1/sessions/current", "/v1/tokens", "/v1/tokens/{token_id}",
     "/v1/audit",
 )  # fmt: skip
-"""Addresses of a rig's service that the centre has, too: signing in, people, tokens, the audit trail, what pages need."""
+"""Addresses of a rig's service that the centre has, too: signing in, people, tokens, audit trail, what pages need."""
 
 
 class CentreBodyLimit(BodyLimit):

@@ -66,7 +66,7 @@ class Projector:
         self.rig.chain = item.sent.key[:32]
         return True
 
-    def _participant(self, item: Item, body: dict[str, Any]) -> bool:
+    def _participant(self, _item: Item, body: dict[str, Any]) -> bool:
         code = clean.code(body.get("code"))
         if code is None:
             return False
@@ -156,7 +156,7 @@ class Projector:
             day.approved_by = None
         return True
 
-    def _audit(self, item: Item, body: dict[str, Any]) -> bool:
+    def _audit(self, _item: Item, body: dict[str, Any]) -> bool:
         seq, told = body.get("seq"), body.get("hash")
         if isinstance(seq, bool) or not isinstance(seq, int) or not 0 <= seq < 2**53 or not isinstance(told, str):
             return False

@@ -95,7 +95,7 @@ class Rigs:
 
 
 def still(session: Session, rig: CentreRig, hold: bool = True) -> CentreRig:
-    """The rig's row, held to the end of the transaction, if the key that opened it still does. Raises ApiError (401)."""
+    """The rig's row, held to the transaction's end, if the key that opened it still does. Raises ApiError (401)."""
     row = session.get(CentreRig, rig.id, with_for_update=hold, populate_existing=True)
     if row is None or row.revoked_utc is not None or row.key_hash != rig.key_hash:
         raise unauthorized(REFUSED)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import hashlib
 import os
@@ -64,7 +65,7 @@ class Spool:
                 have = self._append(part, offset, data, length)
                 if have < length:
                     return {"have_bytes": have, "whole": False}
-                self._finish(rig.id, part, sha256, length)
+                self._finish(part, sha256, length)
         except BucketError as error:
             raise failed(error) from error
         except OSError as error:
@@ -99,7 +100,7 @@ class Spool:
                 os.fsync(out.fileno())
         return have + len(data)
 
-    def _finish(self, rig_id: int, part: Path, sha256: str, length: int) -> None:
+    def _finish(self, part: Path, sha256: str, length: int) -> None:
         if hash_of(part) != sha256:
             part.unlink(missing_ok=True)
             raise _differs("Its content is another than its name says")
@@ -127,15 +128,10 @@ class Spool:
             elif self._length(part) == rows[0].bytes:
                 with self._held(int(rig_id), sha256) as held:
                     if self._length(held) == rows[0].bytes:
-                        self._finish_quietly(int(rig_id), held, sha256, rows[0].bytes)
+                        with contextlib.suppress(ApiError):  # it differed, is gone, and will be sent again
+                            self._finish(held, sha256, rows[0].bytes)
                         count += 1
         return count
-
-    def _finish_quietly(self, rig_id: int, part: Path, sha256: str, length: int) -> None:
-        try:
-            self._finish(rig_id, part, sha256, length)
-        except ApiError:
-            pass  # it differed, is gone, and will be sent again
 
     @contextmanager
     def _held(self, rig_id: int, sha256: str) -> Iterator[Path]:

@@ -19,10 +19,8 @@ own = environment.overlay(
     loader=ChoiceLoader([FileSystemLoader(Path(__file__).parent / "templates"), WEB, PrefixLoader({"rig": WEB})])
 )
 """The centre's templates first; `rig/…` is the rigs' one of a name that both have."""
-own.filters = {
-    **environment.filters, "warning_title": in_its_language(warning_words.title),
-    "warning_advice": in_its_language(warning_words.advice),
-}  # fmt: skip
+environment.filters["warning_title"] = in_its_language(warning_words.title)
+environment.filters["warning_advice"] = in_its_language(warning_words.advice)
 
 
 def bar(request: Request, _looking: Principal | None, principal: Principal | None) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from api import language
-from api.language import _, lazy
+from api.language import lazy
 
 TITLES: dict[str, Any] = {
     "restored": lazy("The rig was restored from a backup"),
@@ -21,6 +21,38 @@ TITLES: dict[str, Any] = {
     "unseen": lazy("The rig has not been seen for a day"),
     "bucket": lazy("The centre's bucket cannot be used"),
 }
+ADVICE: dict[str, Any] = {
+    "restored": lazy(
+        "It knows its chain up to item {seq} only. What the centre has beyond that is kept; the rig may lack it."
+    ),
+    "anew": lazy("It has begun a new chain without the one before. What the centre has is kept; the rig may lack it."),
+    "forked": lazy(
+        "Two databases push with one key, or one was changed by hand. Nothing was overwritten. See that only one rig "
+        "has this key."
+    ),
+    "damaged-at-rig": lazy(
+        "{subject} was changed after it was sealed, and is not taken. Look for a copy in the rig's backup."
+    ),
+    "damaged": lazy(
+        "{short} is not handed out. Its rigs are asked for it again; else restore it from the bucket's backup."
+    ),
+    "changed": lazy("Recording {subject}: the first file is kept. Compare both at the rig."),
+    "unreadable": lazy(
+        "It is kept as it came, and shown nowhere. Is the rig's stimrig older or newer than the centre's?"
+    ),
+    "too-long": lazy(
+        "It has {megabytes} MB, and stays at the rig. The longest that is taken is set by STIMRIG_CENTRE_MAX_FILE_MB."
+    ),
+    "audit": lazy("Its newest entry has another hash than before. Compare the rig's database with a backup."),
+    "ahead": lazy("It is {seconds} s ahead of the centre's. Set both by NTP."),
+    "behind": lazy("It is {seconds} s behind the centre's. Set both by NTP."),
+    "no-time": lazy("It tells a time that cannot be read. Set its clock by NTP."),
+    "disk": lazy("{free_gb} GB are free. When it is full, no test can be recorded."),
+    "unseen": lazy(
+        "Last on {when}. Its work goes on without the centre. See whether it is switched on and has a network."
+    ),
+    "bucket": lazy("{words}. Files wait at the rigs and in the data folder; nothing is lost."),
+}
 
 
 def title(warning: dict[str, Any]) -> str:
@@ -31,44 +63,31 @@ def title(warning: dict[str, Any]) -> str:
 def advice(warning: dict[str, Any]) -> str:
     """What it means, and what to do."""
     detail, subject = warning["detail"], str(warning["subject"])
-    known = {
-        "restored": lambda: _restored(detail.get("seq")),
-        "forked": lambda: _("Two databases push with one key, or one was changed by hand. Nothing was overwritten. See that only one rig has this key."),
-        "damaged-at-rig": lambda: _("%(file)s: it was changed after it was sealed, and is not taken. Look for a copy in the rig's backup.", file=subject[:64]),
-        "damaged": lambda: _("%(file)s: it is not handed out. The rigs are asked for it again; else restore it from the bucket's backup.", file=f"{subject[:12]}…"),
-        "changed": lambda: _("Recording %(id)s: the first file is kept. Compare both at the rig.", id=subject[:64]),
-        "unreadable": lambda: _("It is kept as it came, and shown nowhere. Is the rig's stimrig older or newer than the centre's?"),
-        "too-long": lambda: _("It has %(size)s MB. It stays at the rig. The longest that is taken is set by STIMRIG_CENTRE_MAX_FILE_MB.", size=_number(detail.get("megabytes"))),
-        "audit": lambda: _("Its newest entry has another hash than before. Compare the rig's database with a backup."),
-        "clock": lambda: _clock(detail.get("difference_s")),
-        "disk": lambda: _("%(free)s GB are free. When it is full, no test can be recorded.", free=_number(detail.get("free_gb"))),
-        "unseen": lambda: _("Last on %(when)s. Its work goes on without the centre. See whether it is switched on and has a network.", when=_when(detail.get("since_utc"))),
-        "bucket": lambda: _("%(words)s. Files wait at the rigs and in the data folder; nothing is lost.", words=str(detail.get("words") or "")[:300]),
-    }  # fmt: skip
-    return known[warning["kind"]]() if warning["kind"] in known else ""
+    words = ADVICE.get(_case(warning["kind"], detail))
+    if words is None:
+        return ""
+    return str(words).format(
+        subject=subject[:80], short=f"{subject[:12]}…", seq=detail.get("seq"),
+        megabytes=_number(detail.get("megabytes")), free_gb=_number(detail.get("free_gb")),
+        seconds=_number(detail.get("difference_s")), when=_when(detail.get("since_utc")),
+        words=str(detail.get("words") or "")[:300],
+    )  # fmt: skip
 
 
-def _restored(seq: Any) -> str:
-    if isinstance(seq, int):
-        return _(
-            "It knows its chain up to item %(seq)s only. What the centre has beyond that is kept; the rig may lack it.",
-            seq=seq,
-        )
-    return _("It has begun a new chain without the one before. What the centre has is kept; the rig may lack it.")
-
-
-def _clock(difference_s: Any) -> str:
-    if not isinstance(difference_s, int | float):
-        return _("It tells a time that cannot be read. Set its clock (NTP).")
-    if difference_s > 0:
-        return _("It is %(seconds)s s ahead of the centre's. Set both by NTP.", seconds=_number(difference_s))
-    return _("It is %(seconds)s s behind the centre's. Set both by NTP.", seconds=_number(-difference_s))
+def _case(kind: str, detail: dict[str, Any]) -> str:
+    """Which advice: some kinds have more than one."""
+    if kind == "restored" and not isinstance(detail.get("seq"), int):
+        return "anew"
+    if kind == "clock":
+        off_s = detail.get("difference_s")
+        return "no-time" if not isinstance(off_s, int | float) else "ahead" if off_s > 0 else "behind"
+    return kind
 
 
 def _number(value: Any) -> str:
     if isinstance(value, bool) or not isinstance(value, int | float):
         return "?"
-    return language.localised(f"{value:.1f}")
+    return language.localised(f"{abs(value):.1f}")
 
 
 def _when(value: Any) -> str:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Query, Request
+from fastapi import APIRouter, Query
 from fastapi.responses import Response
 
 from api.centre import clean, directory, handed_out
@@ -94,9 +95,13 @@ def page_key(before: str | None) -> tuple[str, int] | None:
 
 
 @router.get("/rigs/{rig}/models/{model_id}/file", response_class=Response)
-async def model_file(request: Request, context: Ctx, _who: ModelReader, rig: str, model_id: str) -> Response:
+async def model_file(context: Ctx, _who: ModelReader, rig: str, model_id: str) -> Response:
     """MODEL.json, as the rig made it; refused where it differs from its hash."""
-    row = context.store.get(CentreModel, (the_rig(context, rig).id, model_id[:64]))
+    row = await asyncio.to_thread(_model, context, rig, model_id[:64])
     if row is None:
         raise NotFoundError("model", model_id[:64])
     return await handed_out.file(context, row.file, f"{row.participant}-{row.id}.json", "application/json")
+
+
+def _model(context: Context, rig: str, model_id: str) -> CentreModel | None:
+    return context.store.get(CentreModel, (the_rig(context, rig).id, model_id))

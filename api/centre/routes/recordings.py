@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query
@@ -52,7 +53,8 @@ def moment(name: str, given: str | None, days: int) -> str | None:
 @router.get("/recordings/{recording_id}", response_class=Response, responses={200: {"content": {HDF5: {}}}})
 async def recording(context: Ctx, _who: ModelReader, recording_id: int) -> Response:
     """A recording, HDF5; refused where it differs from its hash."""
-    row = context.store.get(CentreRecording, recording_id) if 0 < recording_id < 2**53 else None
+    known = 0 < recording_id < 2**53
+    row = await asyncio.to_thread(context.store.get, CentreRecording, recording_id) if known else None
     if row is None:
         raise NotFoundError("recording", str(recording_id)[:40], "GET /v1/recordings lists them.")
     return await handed_out.file(context, row.file, f"{row.participant}-{row.recording_id}.h5", HDF5)

@@ -17,6 +17,7 @@ from api.store.centre_tables import CentreRig
 from api.web.openapi import problem
 from api.web.responses.base import answers
 
+BYTES = {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}
 KEY = HTTPBearer(scheme_name="rig", description="a rig's key", auto_error=False)
 PROBLEMS: dict[int | str, dict[str, Any]] = {
     400: problem("no sound JSON"), 401: problem("the key is unknown or revoked"), 409: problem("go on elsewhere"),
@@ -65,10 +66,7 @@ def files(context: Ctx, rig: Rig, limit: Annotated[int, Query(ge=1, le=MOST_LIST
     return {"files": context.spool.lacking(rig, limit)}
 
 
-@router.put(
-    "/files/{sha256}", **answers(PieceOut),
-    openapi_extra={"requestBody": {"content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}}},
-)  # fmt: skip
+@router.put("/files/{sha256}", **answers(PieceOut), openapi_extra={"requestBody": {"content": BYTES}})
 async def put(
     request: Request, context: Ctx, rig: Rig, sha256: Annotated[str, Path(pattern=r"^[0-9a-f]{64}$")],
     offset: Annotated[int, Query(ge=0, le=2**53)] = 0,

@@ -18,8 +18,9 @@ DatabaseOption = Annotated[
     typer.Option(help="URL of the database; default SQLite in the data folder, or STIMRIG_CENTRE_DATABASE_URL"),
 ]
 FilesOption = Annotated[
-    str | None, typer.Option(help="folder, file:// or s3://bucket/prefix; default in the data folder, or STIMRIG_CENTRE_FILES")
-]  # fmt: skip
+    str | None,
+    typer.Option(help="folder, or s3://bucket/prefix; default in the data folder, or STIMRIG_CENTRE_FILES"),
+]
 WHO = "command line"
 
 
