@@ -27,7 +27,9 @@ class Settings(BaseSettings):
     model_config = SettingsConfigDict(env_prefix="STIMRIG_", extra="ignore")
 
     data_dir: Path = Field(default=Path("var"), description="database, recordings, journals and logs")
-    database_url: str | None = Field(default=None, description="URL of a SQLite database; default: in the data folder")
+    database_url: str | None = Field(
+        default=None, description="URL of a SQLite or PostgreSQL database; default: SQLite in the data folder"
+    )
     host: str = Field(default="127.0.0.1", description="address to listen on")
     port: Annotated[int, Field(ge=0, le=65535)] = 8000
     admin_token: SecretStr | None = Field(default=None, description="first administrator's token; default: drawn")

@@ -14,7 +14,7 @@ from fastapi import Depends, Request
 from sqlalchemy.exc import SQLAlchemyError
 
 from api import owner_only
-from api.centre import watch
+from api.centre import warnings, watch
 from api.centre.bucket import Bucket, BucketError
 from api.centre.ingest import Ingest
 from api.centre.rigs import Rigs
@@ -52,12 +52,18 @@ class Context:
     downloads: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(MOST_DOWNLOADS))
     """So many files are read from the bucket at the same time."""
     started_s: float = field(default_factory=time.monotonic)
+    waiting_warnings: int = 0
+    """As many as were there when they were counted last: for the bar of pages, and for nothing else."""
     tasks: list[asyncio.Task[None]] = field(default_factory=list)
 
     async def open(self) -> None:
         """Begin to look after what nobody asks for."""
         every = ((FLUSH_S, self.auth.idle.flush), (watch.EVERY_S, lambda: watch.look(self)))
         self.tasks = [asyncio.create_task(_again(every_s, what)) for every_s, what in every]
+
+    async def count_warnings(self) -> None:
+        """Count those that nobody has acknowledged."""
+        self.waiting_warnings = await asyncio.to_thread(warnings.open_count, self.store)
 
     async def close(self) -> None:
         """Let everything go."""

@@ -94,6 +94,7 @@ class Runner:
         self._lock = asyncio.Lock()
         self._halted_s = -math.inf
         self._notes = ThreadPoolExecutor(2, "notes-of-stops")
+        self._telling = ThreadPoolExecutor(1, "tells-how-tests-stand")
         self._tasks: set[asyncio.Task[None]] = set()
         rig.listeners.append(self._on_event)
         rig.link_listeners.append(self._on_link)
@@ -413,10 +414,20 @@ class Runner:
     # ---- what clients see -----------------------------------------------------------------------------------
 
     def announce(self, test_id: str) -> None:
-        """Tell the listeners of the live channel how the test stands."""
+        """Tell the listeners of the live channel how the test stands; in the order in which it is called."""
+        read = asyncio.get_running_loop().run_in_executor(self._telling, self._told, test_id)
+        read.add_done_callback(self._tell)
+
+    def _told(self, test_id: str) -> dict[str, Any] | None:
         row = self.store.get(Test, test_id)
-        if row is not None:
-            self.hub.send({"type": "test", "test": self.document(row)})
+        return None if row is None else self.document(row)
+
+    def _tell(self, read: asyncio.Future[dict[str, Any] | None]) -> None:
+        if read.cancelled() or (error := read.exception()) is not None:
+            if not read.cancelled():
+                log.error("how a test stands could not be read", exc_info=error)
+        elif (document := read.result()) is not None:
+            self.hub.send({"type": "test", "test": document})
 
     def document(self, row: Test) -> dict[str, Any]:
         """A test as clients see it."""
@@ -430,3 +441,4 @@ class Runner:
         await self.adaptive.close()
         await self.trials.close()
         await asyncio.to_thread(self._notes.shutdown)
+        await asyncio.to_thread(self._telling.shutdown)

@@ -80,7 +80,7 @@ class Context:
 
     async def open(self) -> None:
         """Connect, warm the workers, take up what a restart left open."""
-        uploads.settle(self.settings.recordings_dir, self.store)
+        await asyncio.to_thread(uploads.settle, self.settings.recordings_dir, self.store)
         self.rig.start()
         self.pool.warm()
         for _ in range(20):  # a rig that is there answers within milliseconds
@@ -109,6 +109,7 @@ class Context:
         await self.pool.close()
         await self.rig.close()
         self.people.close()
+        self.auth.close()
         self.store.close()
         self.lock.release()
 
@@ -172,7 +173,7 @@ def make_folders(settings: Settings) -> None:
 
 def places(settings: Settings, store: Store) -> Places:
     """The folders that workers may reach: those of recordings, known ones of a rig that runs by itself included."""
-    reads = {settings.recordings_dir, *(Path(row.path).parent for row in store.all(Recording))}
+    reads = {settings.recordings_dir, *(Path(path).parent for path in store.all(Recording.path))}
     reads |= {settings.effects_dir} if settings.effects_dir else set()
     return Places(reads, [settings.exports_dir])
 

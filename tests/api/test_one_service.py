@@ -101,9 +101,7 @@ def test_what_cannot_be_held_is_refused(tmp_path: Path) -> None:
     os.link(tmp_path / "stimrig.db", tmp_path / "again.db")
     with pytest.raises(HeldError, match="2 names"):
         held(data_dir=tmp_path)
-    with pytest.raises(HeldError, match="leave STIMRIG_DATABASE_URL out") as caught:
-        held(data_dir=tmp_path / "b", database_url="postgresql://ann:secret@db.example/stimrig")
-    assert "secret" not in str(caught.value)
+    held(data_dir=tmp_path / "b", database_url="postgresql://ann:secret@db.example/stimrig").release()
     (tmp_path / "c").mkdir()
     (tmp_path / "c" / "service.lock").mkdir()
     with pytest.raises(HeldError, match="this user may write"):

@@ -127,7 +127,7 @@ def test_a_stop_waits_for_no_database(service: Service, participant: str, monkey
     def gone(*_: Any) -> Any:
         raise OperationalError("SELECT", {}, Exception("disk I/O error"))
 
-    with store.write_lock:  # another writer does not let go
+    with store.write():  # another writer does not let go
         monkeypatch.setattr(store, "get", gone)
         monkeypatch.setattr(store, "all", gone)
         answer = press(service, right, cookies={"stimrig_session": "old"})

@@ -25,8 +25,7 @@ environment.filters["warning_advice"] = in_its_language(warning_words.advice)
 
 def bar(request: Request, _looking: Principal | None, principal: Principal | None) -> dict[str, Any]:
     """What every page has at its top."""
-    context = request.app.state.context
-    waiting = warnings.open_count(context.store) if principal is not None else 0
+    waiting = request.app.state.context.waiting_warnings if principal is not None else 0
     return {"right": None, "current": None, "warnings": waiting, "most": warnings.MOST_OPEN}
 
 

@@ -39,6 +39,7 @@ async def participants(
         if error.status not in (404, 422):
             raise
         problem = error
+    await context.count_warnings()
     choices = await asyncio.to_thread(_choices, context)
     more = urlencode({**given, "after": last}) if last else None
     status = problem.status if problem else 200
@@ -75,6 +76,7 @@ async def participant(request: Request, context: Ctx, _who: ModelReader, code: s
         raise NotFoundError("participant", code[:40])
     found, more = await asyncio.to_thread(directory.sessions, context.store, code, page_key(before))
     stood = await asyncio.to_thread(directory.stood, context.store, code)
+    await context.count_warnings()
     documents = trend.documents(code, stood)
     return page(
         request, "participant.html", code=code, people=people, sessions=found, before=before,

@@ -29,7 +29,7 @@ FINE_STATES = ("ready", "running", "busy", "stimulating", "idle")
 async def rigs(request: Request, context: Ctx) -> Response:
     """Rigs; the sign-in form for who is not signed in."""
     try:
-        who = identified(request)
+        who = await identified(request)
     except ApiError as error:
         if error.code == LOCKED[0]:
             return problem_page(request, error)
@@ -42,6 +42,7 @@ async def rigs(request: Request, context: Ctx) -> Response:
 async def shown(request: Request, context: Context, key: dict[str, Any] | None = None) -> Response:
     """The page; with a key that was just made, the only time its text is seen."""
     rows = await asyncio.to_thread(context.rigs.all)
+    await context.count_warnings()
     now_s = context.clock.unix_s()
     listed = [{**row.as_dict(), "doubts": doubts(row, now_s)} for row in rows if row.revoked_utc is None]
     revoked = [row for row in rows if row.revoked_utc is not None]

@@ -19,6 +19,7 @@ router = APIRouter(include_in_schema=False)
 async def show(request: Request, context: Ctx, _who: ModelReader) -> Response:
     """Those that wait, and the last ones that somebody has acknowledged."""
     waiting = await asyncio.to_thread(warnings.listed, context.store)
+    await context.count_warnings()
     seen = await asyncio.to_thread(warnings.listed, context.store, True)
     return page(request, "warnings.html", waiting=waiting, seen=seen[:50])
 

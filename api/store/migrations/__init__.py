@@ -16,6 +16,7 @@ from alembic.script import ScriptDirectory
 from sqlalchemy import Connection, Engine, inspect, text
 
 from api.store import centre_tables
+from api.store.engines import WRITES
 
 FOLDER = Path(__file__).parent
 METADATA = centre_tables.Table.metadata
@@ -39,11 +40,14 @@ def bring_up(engine: Engine) -> None:
         The database is newer than the software, or lacks a column that no revision adds.
     """
     with engine.connect() as connection:
-        if MigrationContext.configure(connection).get_current_revision() != NEWEST:
-            connection.exec_driver_sql("BEGIN IMMEDIATE")  # sqlite3 itself begins no transaction before it makes tables
-            _upgrade(connection)
-        _refuse_lacking(connection)
-        connection.commit()
+        at = MigrationContext.configure(connection).get_current_revision()
+        connection.rollback()
+        if at != NEWEST:
+            with engine.execution_options(**WRITES).begin() as writer:  # one service at a time, and only once
+                _upgrade(writer)
+                _refuse_lacking(writer)
+        else:
+            _refuse_lacking(connection)
 
 
 def _upgrade(connection: Connection) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -23,6 +25,8 @@ from api.web.pages.environment import environment
 environment.filters["what_to_check"] = rig_state.what_to_check
 environment.globals["colours_media"] = colours.MEDIA
 
+LOOK_S = 1.0
+
 
 @dataclass(frozen=True)
 class Face:
@@ -41,7 +45,7 @@ BACK = {"models": "Back to the model", "participants": "Back to the participant"
 def page(request: Request, template: str, status: int = 200, **values: Any) -> HTMLResponse:
     """A page, with the bar that every page has."""
     face: Face = getattr(request.app.state, "face", RIG)
-    looking = known(request)
+    looking: Principal | None = getattr(request.state, "who", None)
     principal = None if looking is None or looking.locked else looking
     bar = {**face.bar(request, looking, principal), "version": request.app.version}
     shown = {"bar": bar, "principal": principal, "here": here(request), "zone": zone(request.app.state.context)}
@@ -56,12 +60,18 @@ def zone(context: Context) -> str:
     return offset if name in ("", offset, "Etc/UTC") else f"{name} ({offset})"
 
 
-def known(request: Request) -> Principal | None:
-    """Who looks at the page; nobody where the database does not answer: what a stop did is said all the same."""
-    try:
-        return request.app.state.context.auth.identify(request, forgive_age=True)
-    except (ApiError, SQLAlchemyError):
-        return None
+async def look(request: Request) -> None:
+    """Find out who looks at a page that anybody may see, for its bar.
+
+    Nobody, where the database does not answer at once: what a stop did is said all the same.
+    """
+    if getattr(request.state, "who", None) is not None:
+        return
+    asked = asyncio.ensure_future(request.app.state.context.auth.ask(request, forgive_age=True))
+    asked.add_done_callback(lambda done: done.cancelled() or done.exception())  # what is said too late is no matter
+    with contextlib.suppress(ApiError, SQLAlchemyError, TimeoutError):
+        async with asyncio.timeout(LOOK_S):
+            request.state.who = await asyncio.shield(asked)
 
 
 def stop_right(request: Request, principal: Principal | None) -> str | None:
