@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Set up .venv from a hash-locked list: deploy/setup.sh run|test|bench
+# Set up .venv from a hash-locked list: deploy/setup.sh run|test|bench; deploy/setup.sh centre installs PostgreSQL.
 # Debian packages are installed only where they are missing, and only as root.
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -23,6 +23,11 @@ debian() { # install Debian packages, as root, only those that are missing
   apt-get update -qq
   DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends "${missing[@]}" >/dev/null
 }
+
+if [ "$what" = centre ]; then # no list of its own: `make centre` comes after `make setup`
+  if ! compgen -G '/usr/lib/postgresql/*/bin/postgres' >/dev/null; then debian postgresql; fi
+  exit 0
+fi
 
 find_python() { # the first Python of 3.11 or later
   local candidate

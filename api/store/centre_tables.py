@@ -156,6 +156,7 @@ class CentreSession(Table):
     verdict: Mapped[str | None] = mapped_column(Word, default=None)
     approved_by: Mapped[str | None] = mapped_column(String, default=None)
     __table_args__ = (
+        Index("ix_centre_sessions_day", "day", "participant", "rig_id"),
         Index("ix_centre_sessions_rig", "participant", "rig_id", "day"),
         Index("ix_centre_sessions_verdict", "verdict", "participant", "rig_id", "day"),
     )

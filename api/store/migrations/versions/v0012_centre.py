@@ -157,6 +157,7 @@ def _sessions() -> None:
         sa.Column("verdict", WORD),
         sa.Column("approved_by", sa.String),
     )
+    op.create_index("ix_centre_sessions_day", "centre_sessions", ["day", "participant", "rig_id"])
     op.create_index("ix_centre_sessions_rig", "centre_sessions", ["participant", "rig_id", "day"])
     op.create_index("ix_centre_sessions_verdict", "centre_sessions", ["verdict", "participant", "rig_id", "day"])
 
