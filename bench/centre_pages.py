@@ -281,10 +281,11 @@ def page(given: Any, told: list[tuple[str, float, float]], scans: dict[str, list
 
 {written_by(f"python -m bench.centre_pages --recordings {given.recordings} --sessions {given.sessions} --write")}
 
-{given.recordings} recordings, {given.sessions} sessions, {RIGS} rigs, {PARTICIPANTS} participants on PostgreSQL
-{version}, on 2 processors with 32 MB of shared buffers. Filled by COPY in {filled_s:.0f} s; {size / 1e9:.2f} GB.
-Each question is asked {SEEN} times through the functions that the pages call, of participants drawn at random. Goal: a participant's page asks
-for less than {GOAL_MS:.0f} ms; its 99th percentile is {worst:.1f} ms.
+{given.recordings} recordings, {given.sessions} sessions, {RIGS} rigs, {PARTICIPANTS} participants. PostgreSQL {version}
+on 2 processors, with 32 MB of shared buffers. Filled by COPY in {filled_s:.0f} s; {size / 1e9:.2f} GB. Each question is
+asked {SEEN} times through the functions that the pages call, of participants drawn at random.
+
+Goal: a participant's page asks for less than {GOAL_MS:.0f} ms. Its 99th percentile is {worst:.1f} ms.
 
 | question | median (ms) | p99 (ms) |
 |---|---|---|

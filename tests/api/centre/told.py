@@ -85,7 +85,10 @@ class Teller:
         answer = rig.post("/v1/rig/items", json=self.batch())
         assert answer.status_code == 200, answer.text
         for lacking in rig.get("/v1/rig/files").json()["files"]:
-            data = self.files[lacking["sha256"]]
-            place = f"/v1/rig/files/{lacking['sha256']}?offset={lacking['have_bytes']}"
-            answer = rig.put(place, content=data[lacking["have_bytes"] :])
+            data, have = self.files[lacking["sha256"]], lacking["have_bytes"]
+            place = f"/v1/rig/files/{lacking['sha256']}"
+            answer = rig.put(f"{place}?offset={have}", content=data[have:])
+            if answer.status_code == 409:
+                have = answer.json()["have_bytes"]
+                answer = rig.put(f"{place}?offset={have}", content=data[have:])
             assert answer.status_code == 200 and answer.json() == {"have_bytes": len(data), "whole": True}, answer.text
