@@ -80,6 +80,10 @@ class CentreSettings(BaseSettings):
         return self.data_dir / "exports"
 
     @property
+    def centre_url(self) -> None:
+        """A centre tells no other one."""
+
+    @property
     def structure(self) -> tuple[str, ...]:
         """A centre fits nothing."""
         return ()
