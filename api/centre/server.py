@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
+import signal
 import socket
 import sys
 from collections.abc import Callable
@@ -63,6 +64,7 @@ def run(app: FastAPI, listener: socket.socket, ready: Callable[[str], object] | 
     url = address_of(listener)
     line = {"url": url, "port": listener.getsockname()[1], "drawn_token": app.state.context.drawn_token}
     server = uvicorn.Server(configuration(app))
+    signal.signal(signal.SIGTERM, lambda _number, _frame: None)  # uvicorn ends in order, and raises it once more
     with contextlib.suppress(KeyboardInterrupt):
         if ready is None:
             asyncio.run(serve(server, listener, line))
