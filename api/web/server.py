@@ -11,6 +11,7 @@ import json
 import os
 import socket
 import sys
+from typing import Protocol
 
 import uvicorn
 from starlette.types import ASGIApp
@@ -59,7 +60,20 @@ def configuration(app: ASGIApp) -> uvicorn.Config:
     )  # fmt: skip
 
 
-def refuse_open_door(settings: Settings) -> None:
+class Door(Protocol):
+    """Settings of whatever listens: a rig's service, a centre."""
+
+    @property
+    def host(self) -> str: ...
+
+    @property
+    def tls_proxy(self) -> bool: ...
+
+    @property
+    def secure_cookies(self) -> bool: ...
+
+
+def refuse_open_door(settings: Door) -> None:
     """Passwords and tokens don't travel in the clear: another address than loopback only behind a TLS proxy.
 
     Raises

@@ -120,6 +120,7 @@ def test_a_service_goes_on_with_an_older_database(tmp_path: Path, short_dir: Pat
         "DROP TABLE known_places", "DROP TABLE users", "DROP TABLE notes", "DROP TABLE tracked",
         "DROP TABLE secrets",
         "DROP TABLE outbox",
+        *(f"DROP TABLE {table}" for table in Table.metadata.tables if table.startswith("centre_")),
         *(f"ALTER TABLE {table} DROP COLUMN {column}" for table, column in ADDED_SINCE),
     )  # fmt: skip
     for service in run_service(tmp_path, short_dir, STUB):

@@ -33,7 +33,8 @@ RIG, API = unit("stimrig-rig.service"), unit("stimrig-api.service")
 
 
 @pytest.mark.parametrize(
-    "name", ["stimrig-rig.service", "stimrig-api.service", "stimrig-backup.service", "stimrig-outbox.service"]
+    "name",
+    [f"stimrig-{name}.service" for name in ("rig", "api", "backup", "outbox", "centre")],
 )
 def test_no_service_has_more_rights_than_it_needs(name: str) -> None:
     settings = unit(name)
@@ -110,6 +111,7 @@ def test_both_speak_of_the_same_socket_and_folders() -> None:
 
 def test_a_token_drawn_at_the_first_start_is_not_in_the_journal() -> None:
     assert API["StandardOutput"] == ["null"]
+    assert unit("stimrig-centre.service")["StandardOutput"] == ["null"]
 
 
 def test_devices_belong_to_the_rigs_user_alone() -> None:

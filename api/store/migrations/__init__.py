@@ -15,10 +15,12 @@ from alembic.runtime.migration import MigrationContext
 from alembic.script import ScriptDirectory
 from sqlalchemy import Connection, Engine, inspect, text
 
+from api.store import centre_tables
 from api.store.engines import WRITES
-from api.store.tables import Table
 
 FOLDER = Path(__file__).parent
+METADATA = centre_tables.Table.metadata
+"""Of all tables: the centre's, too."""
 NUMBERED = {0: "0001", 1: "0001", 2: "0002", 3: "0003", 4: "0004"}
 """The revision of each number in `schema_version`; 0: tables, but no number yet."""
 SCRIPTS = ScriptDirectory(str(FOLDER))
@@ -81,7 +83,7 @@ def _newer(found: object) -> SchemaError:
 
 def _refuse_lacking(connection: Connection) -> None:
     """Compare the database with the tables of `api.store.tables`."""
-    for difference in compare_metadata(MigrationContext.configure(connection), Table.metadata):
+    for difference in compare_metadata(MigrationContext.configure(connection), METADATA):
         if difference[0] == "add_column":
             lacking = f"table {difference[2]} lacks {difference[3].name}"
         elif difference[0] == "add_table":
