@@ -249,6 +249,11 @@ def rows_of(file: Path, columns: Sequence[str]) -> Iterator[dict[str, Any]]:
         raise CohortError(f"{file}: cannot be read ({' '.join(str(error).split())[:200]}).") from None
 
 
+def rows_in(file: Path) -> int:
+    """How many rows a table has."""
+    return pq.read_metadata(file).num_rows
+
+
 def _groups(files: Sequence[Path], kept: set[int]) -> Iterator[pa.Table]:
     """The rows that are kept, so many at a time."""
     number, waiting = 0, [SCHEMA.empty_table()]

@@ -54,6 +54,16 @@ class SourceError(Exception):
 class Source(Protocol):
     """A place with records."""
 
+    def check(self) -> None:
+        """Look whether the place is there, before workers are started for it.
+
+        Raises
+        ------
+        CohortError
+            It is not there, or does not let us in.
+        """
+        ...
+
     def entries(self, selection: Selection) -> Iterator[Entry]:
         """Every record, one after the other; those that cannot be meant may be left out.
 

@@ -21,6 +21,10 @@ class Bucket:
 
     url: str
 
+    def check(self) -> None:
+        """Whether something is at the address."""
+        next(self.entries(Selection()), None)
+
     def entries(self, selection: Selection) -> Iterator[Entry]:
         """Objects below the address, in the order of their names, one folder in memory at a time."""
         del selection  # what a file says of itself is known once it is read

@@ -25,6 +25,10 @@ class Centre:
     url: str
     token: str = field(repr=False)
 
+    def check(self) -> None:
+        """Whether the centre answers, and takes the token."""
+        next(self.entries(Selection()), None)
+
     def entries(self, selection: Selection) -> Iterator[Entry]:
         """Recordings page by page; what the selection says of participant, rig and day is asked of the centre."""
         after, seen = "", set[str]()

@@ -18,6 +18,11 @@ class Folder:
 
     path: str
 
+    def check(self) -> None:
+        """Whether the path is there."""
+        if not os.path.lexists(self.path):
+            raise CohortError(f"{self.path}: no such file or folder. Give a path, s3://… or https://…")
+
     def entries(self, selection: Selection) -> Iterator[Entry]:
         """Files as the system lists them, so that none but the present one is held in memory."""
         del selection  # what a file says of itself is known once it is read
@@ -27,7 +32,7 @@ class Folder:
         elif place.is_dir():
             yield from self._within(str(place))
         else:
-            raise CohortError(f"{self.path}: no such file or folder. Give a path, s3://… or https://…")
+            raise CohortError(f"{self.path}: neither a file nor a folder. Give a path, s3://… or https://…")
 
     def _within(self, folder: str) -> Iterator[Entry]:
         try:
