@@ -136,13 +136,14 @@ def found(path: Path, task: Task, row: dict[str, Any]) -> bool:
 
     with path.open("rb") as file:
         sealed = file.read(len(HDF5_MAGIC)) == HDF5_MAGIC
+    selection = Selection(task.select)
     if sealed:
         row |= about(path)
-    row |= {name: row.get(name) for name in SAID}  # what nobody says is known not to be said
-    selection = Selection(task.select)
-    if selection(row) is False:
-        return False
+        row |= {name: row.get(name) for name in SAID}  # what it does not say is known not to be said
+        if selection(row) is False:
+            return False
     record = identify.read(path, map=list(task.columns) if task.columns and not sealed else None)
+    row |= {name: row.get(name) for name in SAID}
     row |= {
         "duration_s": round(float(record.time_s[-1] - record.time_s[0]), 4),
         "rate_hz": round(float(record.sample_rate_hz), 4),

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
-from urllib.parse import quote
 
 from api.client.connection import Connection
 from api.client.errors import ServiceError
@@ -49,27 +48,23 @@ class Centre:
             raise CohortError(f"{self.url}: its answer is no list of recordings. Is it a centre?") from None
 
     def _entry(self, document: dict[str, Any]) -> Entry:
-        name = str(document["recording_id"])
-        sha256 = str(document.get("sha256") or "")
-        size = document.get("bytes")
-        texts = {
-            field: None if document.get(field) is None else str(document[field])
-            for field in ("participant", "rig", "kind", "test_id", "outcome")
-            if field in document
-        }
-        known: dict[str, Any] = {"name": name, "origin": self.url, "record_id": name, **texts}
-        if "created_utc" in document:
-            known["day"] = as_day(str(document["created_utc"]))
+        """A recording as the centre lists it: `file` is the SHA-256 of its file, null where the rig has not sent it."""
+        number, name = int(document["id"]), str(document["recording_id"])
+        sha256, size = str(document.get("file") or ""), document.get("file_bytes")
+        known: dict[str, Any] = {"name": name, "origin": self.url, "record_id": name}
+        known |= {key: document[key] for key in ("participant", "rig", "test_id") if isinstance(document.get(key), str)}
+        known["day"] = as_day(str(document.get("created_utc") or ""))
+        known["begun_utc"] = document.get("created_utc")
         if size is not None:
             known["bytes"] = size = int(size)
-        address = f"{self.url}/v1/recordings/{quote(name, safe='')}"
-        return Entry(address, name, name, size, sha256, sha256, known)
+        address = f"{self.url}/v1/recordings/{number}"
+        return Entry(address, name, str(number), size, sha256, sha256, known)
 
     def open(self, entry: Entry, most_bytes: int) -> bytes:
         """The recording's bytes."""
         try:
             with Connection(self.url, self.token) as line:
-                return _bounded(line, f"/v1/recordings/{quote(entry.key, safe='')}", most_bytes)
+                return _bounded(line, f"/v1/recordings/{entry.key}", most_bytes)
         except ServiceError as error:
             raise SourceError(f"cannot be fetched ({_line(error)})") from None
 
