@@ -28,6 +28,8 @@ from api.cohort.worker import COPY, LEFT_OUT, digest
 
 ROWS_A_PART = 500
 MOST_ALIKE = 1000
+KNOWN = ("ok", COPY)
+"""Of a content with a result no other is needed. Each file that failed has its own row: somebody looks for it."""
 ROWS_A_GROUP = 5000
 ROWS_AT_ONCE = 1000
 """Rows held in memory while parts are joined."""
@@ -47,7 +49,7 @@ class Done:
 
     def add(self, row: dict[str, Any]) -> None:
         """Take in a row's keys."""
-        if row.get("sha256") and row["status"] != LEFT_OUT:
+        if row.get("sha256") and row["status"] in KNOWN:
             self.contents.add(digest(row["sha256"]))
         if row.get("stamp"):
             self.places.add(digest(row["address"], row["stamp"]))
@@ -55,7 +57,7 @@ class Done:
     def read(self, row: dict[str, Any]) -> None:
         """Take in the keys of a row of an earlier run."""
         self.add(row)
-        if row["sha256"] and row["status"] != LEFT_OUT and row["bytes"] is not None:
+        if row["sha256"] and row["status"] in KNOWN and row["bytes"] is not None:
             self.earlier.setdefault(row["bytes"], []).append(digest(row["sha256"]))
 
     def has_place(self, entry: Entry) -> bool:
@@ -215,20 +217,26 @@ def _kept(files: Sequence[Path]) -> tuple[set[int], dict[str, int]]:
     by_place: dict[bytes, int] = {}
     statuses: dict[int, str] = {}
     replaced: dict[int, str] = {}
+    failed: dict[int, bytes] = {}
     copies: dict[bytes, bytes] = {}
     for number, row in enumerate(row for file in files for row in rows_of(file, KEYS)):
         place = digest(row["address"])
         if row["status"] == COPY:
             copies[place] = digest(row["sha256"])
         elif row["status"] != LEFT_OUT:
-            content = digest(row["sha256"]) if row["sha256"] else place
+            content = digest(row["sha256"]) if row["status"] == "ok" else place
             statuses.pop(by_content.get(content, -1), None)
             if (old := by_place.get(place, -1)) in statuses:
                 replaced[old] = statuses.pop(old)
             by_content[content] = by_place[place] = number
+            if row["status"] == "error" and row["sha256"]:
+                failed[number] = digest(row["sha256"])
             statuses[number] = row["status"]
     lying = {by_content.get(content, -1) for content in copies.values()}
     statuses |= {number: status for number, status in replaced.items() if number in lying}
+    for number, content in failed.items():
+        if statuses.get(by_content.get(content, -1)) == "ok":  # done elsewhere since
+            statuses.pop(number, None)
     counts = {word: sum(1 for status in statuses.values() if status == word) for word in ("ok", "error")}
     return set(statuses), {**counts, "copies": len(copies)}
 

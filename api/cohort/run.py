@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+import uuid
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from dataclasses import dataclass
@@ -90,8 +91,10 @@ class Run:
         self.results, self.tell, self.monotonic_s = results, tell, monotonic_s
         self.selection = Selection(task.select)
         self.tally = Tally()
+        self.id = uuid.uuid4().hex
         self.most_in_flight = 0
         self._ended = threading.Event()
+        self._sent: dict[str, tuple[Future, Entry]] = {}
 
     def go(self) -> Tally:
         """Do every record that is not done; then the results are whole, but not joined yet.
@@ -110,13 +113,15 @@ class Run:
         finally:
             self._ended.set()
             self.results.flush()
+            if self._sent:
+                self.client.cancel([future for future, _ in self._sent.values()])
         self.client.run(close_all)
         return self.tally
 
     def _loop(self) -> None:
         open_entries = self._open()
         came = as_completed(with_results=True, raise_errors=False)
-        sent: dict[str, Entry] = {}
+        sent = self._sent
         number, more = 0, True
         flushed_s = looked_s = self.monotonic_s()
         room = AHEAD * lanes(self.client)
@@ -128,13 +133,14 @@ class Run:
                     break
                 number += 1
                 future = self._submit(*found, number)
-                sent[future.key] = found[1]
+                sent[future.key] = (future, found[1])
                 came.add(future)
             self.most_in_flight = max(self.most_in_flight, len(sent))
             if not sent:
                 return
             future, result = next(came)
-            self._take(sent.pop(future.key), future, result)
+            _, entry = sent.pop(future.key)
+            self._take(entry, future, result)
             future.release()
             now_s = self.monotonic_s()
             if now_s - flushed_s > FLUSH_S:
@@ -145,7 +151,7 @@ class Run:
 
     def _submit(self, source: Source, entry: Entry, number: int) -> Future:
         alike = self.results.done.alike(entry)
-        key = f"record-{number}"
+        key = f"record-{self.id}-{number}"  # a scheduler may hold what another run asked of it
         return self.client.submit(run_record, source, entry, self.task, self.bounds, alike, key=key, pure=False)
 
     def _open(self) -> Iterator[tuple[Source, Entry]]:

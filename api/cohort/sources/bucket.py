@@ -68,10 +68,7 @@ class Bucket:
             return b""  # a part of nothing cannot be asked for
         try:
             files, _ = self._files()
-            if entry.bytes is None:
-                with files.open(entry.key, "rb") as file:
-                    return file.read(most_bytes + 1)
-            return files.cat_file(entry.key, 0, min(entry.bytes, most_bytes + 1))
+            return files.cat_file(entry.key, start=0, end=most_bytes + 1)
         except Exception as error:
             raise SourceError(f"cannot be fetched ({_line(error)})") from None
 
