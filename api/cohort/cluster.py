@@ -6,10 +6,12 @@ import importlib.metadata
 import importlib.util
 import logging
 import platform
+import signal
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from multiprocessing import resource_tracker
 from typing import Any
 
 import dask
@@ -98,9 +100,8 @@ def _local(workers: Workers) -> Iterator[Client]:
         "distributed.comm.timeouts.connect": "60s",  # a busy machine
         "distributed.nanny.pre-spawn-environ": {"OPENBLAS_NUM_THREADS": 1, "OMP_NUM_THREADS": 1, "MKL_NUM_THREADS": 1},
     }
-    with (
-        dask.config.set(settings),
-        LocalCluster(
+    with dask.config.set(settings), _without_ctrl_c():
+        cluster = LocalCluster(
             n_workers=workers.count,
             threads_per_worker=1,
             processes=True,
@@ -109,10 +110,23 @@ def _local(workers: Workers) -> Iterator[Client]:
             dashboard_address="127.0.0.1:0" if workers.dashboard else None,
             silence_logs=logging.CRITICAL,
             security=_keys(),
-        ) as cluster,
-        Client(cluster) as client,
-    ):
+        )
+    with dask.config.set(settings), cluster, Client(cluster) as client:
         yield client
+
+
+@contextmanager
+def _without_ctrl_c() -> Iterator[None]:
+    """Threads and processes that are started within never see Ctrl-C; here it comes when they are there.
+
+    A terminal sends it to every process. This one ends the others in order; each of them would write a traceback.
+    """
+    resource_tracker.ensure_running()  # it lets Ctrl-C through in the thread that first needs it
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _keys() -> Any:

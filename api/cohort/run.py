@@ -4,24 +4,22 @@ from __future__ import annotations
 
 import threading
 import time
-import uuid
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import CancelledError
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
-from distributed import Client, Future, as_completed
-from distributed.scheduler import KilledWorker
+from distributed import Client
 
 from api.cohort.cluster import lanes
-from api.cohort.errors import CohortError, CutOffError
+from api.cohort.errors import CohortError
+from api.cohort.flight import Flight
 from api.cohort.parent import close_all
 from api.cohort.parts import Results
 from api.cohort.select import Selection
 from api.cohort.sources import Entry, Source
 from api.cohort.tasks import Task
-from api.cohort.worker import COPY, LEFT_OUT, Bounds, identity, lost, run_record
+from api.cohort.worker import COPY, LEFT_OUT, Bounds, identity
 
 AHEAD = 3
 """Records sent for each one that is computed: a worker never waits for its next, and none sees a million."""
@@ -91,10 +89,8 @@ class Run:
         self.results, self.tell, self.monotonic_s = results, tell, monotonic_s
         self.selection = Selection(task.select)
         self.tally = Tally()
-        self.id = uuid.uuid4().hex
-        self.most_in_flight = 0
+        self.flight = Flight(client, task, bounds)
         self._ended = threading.Event()
-        self._sent: dict[str, tuple[Future, Entry]] = {}
 
     def go(self) -> Tally:
         """Do every record that is not done; then the results are whole, but not joined yet.
@@ -113,46 +109,31 @@ class Run:
         finally:
             self._ended.set()
             self.results.flush()
-            if self._sent:
-                self.client.cancel([future for future, _ in self._sent.values()])
+            self.flight.cancel()
         self.client.run(close_all)
         return self.tally
 
     def _loop(self) -> None:
-        open_entries = self._open()
-        came = as_completed(with_results=True, raise_errors=False)
-        sent = self._sent
-        number, more = 0, True
-        flushed_s = looked_s = self.monotonic_s()
+        """Keep the workers in records, and take in rows, until there are no more."""
+        open_entries, more = self._open(), True
         room = AHEAD * lanes(self.client)
+        flushed_s = looked_s = self.monotonic_s()
         while True:
-            while more and len(sent) < room:
+            while more and len(self.flight) < room:
                 found = next(open_entries, None)
                 if found is None:
                     more = False
-                    break
-                number += 1
-                future = self._submit(*found, number)
-                sent[future.key] = (future, found[1])
-                came.add(future)
-            self.most_in_flight = max(self.most_in_flight, len(sent))
-            if not sent:
+                else:
+                    self.flight.send(*found, self.results.done.alike(found[1]))
+            if not len(self.flight):
                 return
-            future, result = next(came)
-            _, entry = sent.pop(future.key)
-            self._take(entry, future, result)
-            future.release()
+            self._add(self.flight.receive())
             now_s = self.monotonic_s()
             if now_s - flushed_s > FLUSH_S:
                 self.results.flush()
                 flushed_s = now_s
             if now_s - looked_s > LANES_S:
                 room, looked_s = AHEAD * lanes(self.client), now_s
-
-    def _submit(self, source: Source, entry: Entry, number: int) -> Future:
-        alike = self.results.done.alike(entry)
-        key = f"record-{self.id}-{number}"  # a scheduler may hold what another run asked of it
-        return self.client.submit(run_record, source, entry, self.task, self.bounds, alike, key=key, pure=False)
 
     def _open(self) -> Iterator[tuple[Source, Entry]]:
         """Records that are meant, or may be, and that are not done."""
@@ -166,25 +147,6 @@ class Run:
                     self._add({**identity(entry), "sha256": entry.sha256, "bytes": entry.bytes, "status": COPY})
                 else:
                     yield source, entry
-
-    def _take(self, entry: Entry, future: Future, result: Any) -> None:
-        """A record that came back."""
-        if future.status == "finished":
-            if version := result.get("other_version"):
-                message = (
-                    f"a worker has stimrig {version}, here is {self.task.software}. Install the same version there."
-                )
-                raise CohortError(message)
-            self._add(result)
-            return
-        error = result[1] if isinstance(result, tuple) else result
-        if isinstance(error, KilledWorker):
-            self._add(lost(entry, self.task, "its workers were lost, one after the other, while it was computed."))
-        elif future.status in ("cancelled", "lost") or isinstance(error, CancelledError):
-            raise CutOffError("the scheduler is gone. What is done is kept; the same command goes on.")
-        else:
-            words = " ".join(f"{type(error).__name__}: {error}".split())[:200]
-            raise CutOffError(f"a worker cannot compute ({words}). What is done is kept; the same command goes on.")
 
     def _add(self, row: dict[str, Any]) -> None:
         status = self.results.add({**row, "computed_utc": datetime.now(UTC)})

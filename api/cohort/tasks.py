@@ -12,7 +12,7 @@ from api.cohort.errors import CohortError
 from identify.errors import IdentifyError
 
 VERBS = ("fit", "diagnose", "improve")
-AUTO = "auto"
+AUTO, METHOD = "auto", "maximum-likelihood"
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Task:
 
     verb: str
     select: str = ""
-    method: str = "maximum-likelihood"
+    method: str = METHOD
     effects: tuple[str, ...] = ()
     columns: tuple[str, ...] = ()
     software: str = ""
@@ -53,7 +53,14 @@ def _shown(value: Any) -> str:
     return ", ".join(map(str, value)) or "none" if isinstance(value, list) else str(value) if value else "none"
 
 
-def checked(verb: str, select: str, method: str, effects: Sequence[str], columns: Sequence[str], software: str) -> Task:
+def checked(
+    verb: str,
+    select: str = "",
+    method: str = METHOD,
+    effects: Sequence[str] = (),
+    columns: Sequence[str] = (),
+    software: str = "",
+) -> Task:
     """A task whose options can be used on some record.
 
     Raises

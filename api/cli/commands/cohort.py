@@ -17,6 +17,7 @@ from api.cli.terminal import Json, names, say, say_json, table, write
 
 NEEDED = ("dask", "distributed", "pyarrow", "fsspec")
 METHOD = "maximum-likelihood"
+INTERRUPTED = 130
 MOST_ROWS = 40
 """Changed records that are shown; --json gives all."""
 
@@ -171,7 +172,9 @@ def go(
                 tally = Run(client, sources, task, bounds, results, tell).go()
             counts = results.join()
     except CutOffError as error:
-        raise CommandError(f"{error}") from error
+        raise CommandError(str(error)) from error
+    except KeyboardInterrupt:
+        raise CommandError("interrupted. What is done is kept; the same command goes on.", INTERRUPTED) from None
     found = {
         "output": str(output),
         "records": counts["ok"] + counts["error"],

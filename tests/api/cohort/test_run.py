@@ -13,8 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 from distributed import Client, LocalCluster
 
-from api.cohort import run as runs
-from api.cohort import worker
+from api.cohort import flight, worker
 from api.cohort.cluster import check_versions
 from api.cohort.errors import CohortError, CutOffError
 from api.cohort.parent import close_all
@@ -56,7 +55,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def task(select: str = "") -> Task:
-    return checked("fit", Selection(select).text, "maximum-likelihood", (), (), software_version())
+    return checked("fit", Selection(select).text, software=software_version())
 
 
 def go(client: Client, sources: list[Source], output: Path, select: str = "", **more: Any) -> tuple[Run, Tally]:
@@ -76,7 +75,7 @@ def test_a_mixed_folder_gives_a_row_for_each_file(client: Client, folder: Path, 
     rows = read(tmp_path / "r.parquet")
     assert Counter(row["status"] for row in rows) == {"ok": 12, "error": 10}
     assert (tally.ok, tally.error, tally.copies) == (12, 10, 0)
-    assert run.most_in_flight <= AHEAD * LANES
+    assert run.flight.most <= AHEAD * LANES
     for row in rows:
         assert row["software"] == software_version() and row["verb"] == "fit" and row["address"] and row["took_s"] >= 0
         if row["status"] == "error":
@@ -152,7 +151,7 @@ def test_a_long_list_is_never_held_at_once(client: Client, tmp_path: Path) -> No
     ahead: list[int] = []
     run, tally = go(client, [source], tmp_path / "r.parquet", tell=lambda one: ahead.append(source.listed - one.now))
     assert tally.error == 300 and {row["error_kind"] for row in read(tmp_path / "r.parquet")} == {"unreadable"}
-    assert run.most_in_flight <= AHEAD * LANES and max(ahead) <= AHEAD * LANES
+    assert run.flight.most <= AHEAD * LANES and max(ahead) <= AHEAD * LANES
 
 
 def test_a_place_that_goes_while_it_is_listed_ends_the_run_and_keeps_what_is_done(
@@ -191,7 +190,7 @@ def broken_worker(*_: object) -> dict[str, Any]:
 def test_a_worker_that_cannot_compute_ends_the_run(
     client: Client, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(runs, "run_record", broken_worker)
+    monkeypatch.setattr(flight, "run_record", broken_worker)
     with pytest.raises(CutOffError, match="No space left"):
         go(client, sources_of([str(folder)]), tmp_path / "r.parquet")
 
