@@ -97,7 +97,7 @@ def connected(workers: Workers) -> Iterator[Client]:
 def _local(workers: Workers) -> Iterator[Client]:
     settings = {
         "distributed.scheduler.allowed-failures": LOST_WORKERS,
-        "distributed.comm.timeouts.connect": "60s",  # a busy machine
+        "distributed.comm.timeouts.connect": "10s",
         "distributed.nanny.pre-spawn-environ": {"OPENBLAS_NUM_THREADS": 1, "OMP_NUM_THREADS": 1, "MKL_NUM_THREADS": 1},
     }
     with dask.config.set(settings), _without_ctrl_c():
