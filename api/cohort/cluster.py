@@ -80,8 +80,7 @@ def connected(workers: Workers) -> Iterator[Client]:
     CohortError
         No scheduler, no worker, or workers of another version.
     """
-    for name in ("distributed", "bokeh", "tornado"):
-        logging.getLogger(name).setLevel(logging.CRITICAL)  # what matters to the person is said in one line
+    quiet()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         if workers.scheduler:
@@ -91,6 +90,13 @@ def connected(workers: Workers) -> Iterator[Client]:
         else:
             with _local(workers) as client:
                 yield client
+
+
+def quiet() -> None:
+    """Keep Dask's log from the terminal: what matters to the person is said in one line."""
+    for name in ("distributed", "bokeh", "tornado", *logging.root.manager.loggerDict):
+        if name.partition(".")[0] in ("distributed", "bokeh", "tornado"):
+            logging.getLogger(name).setLevel(logging.CRITICAL)
 
 
 @contextmanager
@@ -147,6 +153,7 @@ def _remote(workers: Workers) -> Iterator[Client]:
         words = " ".join(str(error).split())[:160].rstrip(".") or type(error).__name__
         fix = "Is `dask scheduler` running there, with the same version of Dask?"
         raise CohortError(f"--scheduler {address}: no scheduler answers ({words}). {fix}") from None
+    quiet()  # a client makes loggers of its own
     with client:
         try:
             client.wait_for_workers(1, timeout=workers.wait_s)
