@@ -105,7 +105,7 @@ def compared(old: Path, new: Path) -> Changes:
     told = [_told(old), _told(new)]
     if told[0]["verb"] != told[1]["verb"]:
         raise CohortError(f"{new}: results of {told[1]['verb']}, {old} of {told[0]['verb']}. Give two of one verb.")
-    changes = Changes(*told)
+    changes = Changes(told[0], told[1])
     unread_old, unread_new = (
         {row["address"]: row for row in rows_of(file, COLUMNS) if not row["sha256"]} for file in (old, new)
     )

@@ -105,7 +105,7 @@ def memory_mb() -> float | None:
 
 def run(call: dict[str, Any]) -> dict[str, Any]:
     """Do one call. Whatever goes wrong is a row."""
-    task = Task(**{key: tuple(value) if isinstance(value, list) else value for key, value in call["task"].items()})
+    task = Task.of(call["task"])
     name, shown = str(call["file"]), str(call["name"])
     row: dict[str, Any] = dict(call["known"])
     began_s, processor_s = time.perf_counter(), time.process_time()
@@ -162,7 +162,7 @@ def about(path: Path) -> dict[str, Any]:
     from identify.records.hdf5 import StrictFile
 
     file = StrictFile(bounds.content_of(path), str(path))
-    given = {column: file.text(name, "") for name, column in ABOUT.items()}
+    given: dict[str, Any] = {column: file.text(name, "") for name, column in ABOUT.items()}
     given["day"] = as_day(given["begun_utc"])
     return {name: value for name, value in given.items() if value}
 

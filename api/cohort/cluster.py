@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from multiprocessing import resource_tracker
 from typing import Any
 
-import dask
+from dask import config
 from dask.utils import parse_bytes
 from distributed import Client, LocalCluster
 
@@ -106,18 +106,18 @@ def _local(workers: Workers) -> Iterator[Client]:
         "distributed.comm.timeouts.connect": "10s",
         "distributed.nanny.pre-spawn-environ": {"OPENBLAS_NUM_THREADS": 1, "OMP_NUM_THREADS": 1, "MKL_NUM_THREADS": 1},
     }
-    with dask.config.set(settings), _without_ctrl_c():
+    with config.set(settings), _without_ctrl_c():
         cluster = LocalCluster(
             n_workers=workers.count,
             threads_per_worker=1,
             processes=True,
             host="127.0.0.1",
             memory_limit=max(WORKER_BYTES, workers.memory_bytes),
-            dashboard_address="127.0.0.1:0" if workers.dashboard else None,
+            dashboard_address="127.0.0.1:0" if workers.dashboard else None,  # pyright: ignore[reportArgumentType]
             silence_logs=logging.CRITICAL,
             security=_keys(),
         )
-    with dask.config.set(settings), cluster, Client(cluster) as client:
+    with config.set(settings), cluster, Client(cluster) as client:
         yield client
 
 
@@ -174,7 +174,8 @@ def check_versions(client: Client) -> None:
     asked = (("stimrig", software_version(), importlib.metadata.version, ("stimrig",)),
              ("Python", platform.python_version(), platform.python_version, ()))  # fmt: skip
     for what, mine, ask, arguments in asked:
-        for worker, theirs in client.run(ask, *arguments, on_error="return").items():
+        found: Any = client.run(ask, *arguments, on_error="return")
+        for worker, theirs in found.items():
             if not isinstance(theirs, str):
                 raise CohortError(f"worker {worker}: no {what} there. Install stimrig[cohort] {software_version()}.")
             same = theirs == mine if what == "stimrig" else theirs.split(".")[:2] == mine.split(".")[:2]
@@ -184,4 +185,5 @@ def check_versions(client: Client) -> None:
 
 def lanes(client: Client) -> int:
     """Records that are computed at the same time, now: workers may come and go."""
-    return max(1, sum(client.nthreads().values()))
+    threads: Any = client.nthreads()
+    return max(1, sum(threads.values()))

@@ -92,8 +92,13 @@ class Run:
         self.flight = Flight(client, task, bounds)
         self._ended = threading.Event()
 
-    def go(self) -> Tally:
+    def go(self, keep: bool = False) -> Tally:
         """Do every record that is not done; then the results are whole, but not joined yet.
+
+        Parameters
+        ----------
+        keep : bool
+            Leave the workers' computing processes for another run.
 
         Raises
         ------
@@ -110,7 +115,8 @@ class Run:
             self._ended.set()
             self.results.flush()
             self.flight.cancel()
-        self.client.run(close_all)
+        if not keep:
+            self.client.run(close_all)
         return self.tally
 
     def _loop(self) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -38,9 +37,10 @@ class Task:
         """The options by which results may be added to results."""
         return json.loads(json.dumps(asdict(self)))
 
-    def fingerprint(self) -> str:
-        """SHA-256 of the options."""
-        return hashlib.sha256(json.dumps(self.document(), sort_keys=True).encode()).hexdigest()
+    @classmethod
+    def of(cls, document: dict[str, Any]) -> Task:
+        """The task of a document that came as JSON."""
+        return cls(**{name: tuple(value) if isinstance(value, list) else value for name, value in document.items()})
 
     def differs(self, other: dict[str, Any]) -> str:
         """Words on how the options of another run differ; empty if they don't."""

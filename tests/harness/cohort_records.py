@@ -16,7 +16,6 @@ import numpy as np
 from hardware_sim.hidden_records import generate
 
 PULSES_HZ = 40.0
-RATE_HZ = 100.0
 NOISE_NM = 0.035
 """Of a session, beside the 0.02 N·m that the muscle was simulated with."""
 
@@ -32,24 +31,25 @@ class Session:
     effect: str | None = None
     kind: str = "pre-session"
     design: str = "short"
+    rate_hz: float = 100.0
 
 
 @lru_cache(maxsize=256)
-def muscle(seed: int, effect: str | None = None, design: str = "short") -> dict[str, Any]:
+def muscle(seed: int, effect: str | None, design: str, rate_hz: float) -> dict[str, Any]:
     """The columns of one muscle's record."""
-    return generate(effect, seed=seed, design=design, rate_hz=RATE_HZ, noise_sd_nm=0.02)
+    return generate(effect, seed=seed, design=design, rate_hz=rate_hz, noise_sd_nm=0.02)
 
 
 def write(path: Path, session: Session) -> Path:
     """A session as a sealed recording; the same session gives the same bytes of data."""
-    record = muscle(session.muscle, session.effect, session.design)
+    record, rate_hz = muscle(session.muscle, session.effect, session.design, session.rate_hz), session.rate_hz
     torque_nm = record["torque_nm"] + NOISE_NM * np.random.default_rng(session.seed).standard_normal(
         record["time_s"].size
     )
     names = np.asarray(record["segment"])
     starts = np.flatnonzero(np.r_[True, names[1:] != names[:-1]])
-    count = int(record["time_s"].size * PULSES_HZ / RATE_HZ)
-    at = np.minimum(np.ceil(np.arange(count) * RATE_HZ / PULSES_HZ - 1e-9).astype(int), names.size - 1)
+    count = int(record["time_s"].size * PULSES_HZ / rate_hz)
+    at = np.minimum(np.ceil(np.arange(count) * rate_hz / PULSES_HZ - 1e-9).astype(int), names.size - 1)
     planned_s, widths_us = np.arange(count) / PULSES_HZ, np.asarray(record["pulse_width_us"])[at]
     with h5py.File(path, "w") as file:
         file.attrs.update(
@@ -58,17 +58,20 @@ def write(path: Path, session: Session) -> Path:
             created_utc=f"{session.day}T09:00:00+00:00", software="stimrig 0", content_sha256="",
             pulse_rate_hz=PULSES_HZ,
         )  # fmt: skip
-        file["/torque/time_s"] = record["time_s"]
-        file["/torque/torque_nm"] = torque_nm
-        file["/torque/sync"] = np.full(names.size, 255, np.uint8)
+        columns = {
+            "time_s": record["time_s"], "torque_nm": torque_nm, "counter": np.arange(names.size),
+            "host_time_s": record["time_s"] + 0.001, "sync": np.full(names.size, 255, np.uint8),
+        }  # fmt: skip
+        for name, column in columns.items():  # as the rig compresses them
+            file.create_dataset(f"/torque/{name}", data=column, compression="gzip", compression_opts=1, shuffle=True)
         file["/pulses/planned_time_s"] = planned_s
         file["/pulses/sent_pulse_width_us"] = widths_us
         file["/pulses/written_time_s"] = planned_s + 0.001
         file["/pulses/acknowledged_time_s"] = planned_s + 0.003
         file["/pulses/status"] = np.where(widths_us > 0, 0, 1).astype(np.uint8)
         file["/segments/name"] = [str(names[start]) for start in starts]
-        file["/segments/start_s"] = starts / RATE_HZ
-        file["/segments/end_s"] = np.r_[starts[1:], names.size] / RATE_HZ
+        file["/segments/start_s"] = starts / rate_hz
+        file["/segments/end_s"] = np.r_[starts[1:], names.size] / rate_hz
     return path
 
 
