@@ -10,15 +10,18 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import jsonschema_rs
 import pyarrow.parquet as pq
 import pytest
 
+from api import schemas
 from api.cli import main
 from api.cohort import cluster
+from api.cohort.fields import FIELDS
 from tests.harness.cohort_records import cohort
 
 PATIENCE_S = 240.0
@@ -100,6 +103,21 @@ def test_a_scheduler_without_workers_is_one_line(capsys: pytest.CaptureFixture[s
             "--wait", "0.5",
         )  # fmt: skip
     assert "no worker within 0.5 s" in words
+
+
+def unmet(document: dict[str, Any]) -> list[str]:
+    """What a document lacks of the schema, and which keys at the top the schema does not know."""
+    schema = schemas.load("cohort")
+    check = jsonschema_rs.validator_for(schema)
+    unknown = sorted(set(document) - set(schema["properties"]))
+    return [f"{list(error.instance_path)}: {error.message[:200]}" for error in check.iter_errors(document)] + unknown
+
+
+def test_the_docs_list_the_fields_that_there_are() -> None:
+    lines = (Path(main.__file__).parents[2] / "docs" / "cohorts.md").read_text("utf-8").splitlines()
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("| `")]
+    written = {row[0].strip("`"): row[1:] for row in rows if len(row) == 3}
+    assert written == {name: [field.type, field.says] for name, field in FIELDS.items()}
 
 
 # ---- the real thing: processes that are interrupted and killed
@@ -195,6 +213,7 @@ def test_interrupted_killed_and_with_a_worker_killed_it_is_whole_in_the_end(fold
     out, err = run.communicate(timeout=PATIENCE_S)
     assert run.returncode == 0, err
     told = json.loads(out)
+    assert unmet(told) == []
     found = pq.read_table(output).to_pylist()
     names = [row["name"] for row in found]
     assert len(names) == len(set(names)) == SESSIONS + 1
@@ -214,9 +233,59 @@ def test_the_dashboard_is_told_and_people_are_given_words(
     assert re.search(r"dashboard +http://127\.0\.0\.1:\d+/status", err)
     assert "1 with a result" in out and str(output) in out
     assert main.run(["cohort", "changed", str(output), str(output), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["unchanged"] == 1
+    told = json.loads(capsys.readouterr().out)
+    assert unmet(told) == [] and told["unchanged"] == 1
     assert main.run(["cohort", "changed", str(output), str(output)]) == 0
     assert "1 records in both: 1 unchanged" in capsys.readouterr().out
     assert main.run(["cohort", "figures", str(output), "--html", str(tmp_path / "f.html"), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["records"] == 1
+    told = json.loads(capsys.readouterr().out)
+    assert unmet(told) == [] and told["records"] == 1
     assert (tmp_path / "f.html").stat().st_size > 1000
+
+
+@pytest.fixture
+def scheduler(tmp_path: Path) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
+    """A scheduler of Dask as a process of its own, with two workers; its address."""
+    file = tmp_path / "scheduler.json"
+    here = [sys.executable, "-m", "distributed.cli.dask_scheduler"]
+    quiet: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    options = ["--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(file)]
+    main_one = subprocess.Popen([*here, *options], **quiet)
+    workers = []
+    try:
+        until(file.exists, "a scheduler")
+        until(lambda: file.read_text().rstrip().endswith("}"), "its whole file")
+        address = json.loads(file.read_text())["address"]
+        command = [sys.executable, "-m", "distributed.cli.dask_worker", address, "--nthreads", "1", "--no-nanny"]
+        workers = [subprocess.Popen([*command, "--no-dashboard"], **quiet) for _ in range(2)]
+        yield address, main_one
+    finally:
+        for process in (*workers, main_one):
+            process.kill()
+            process.wait()
+
+
+@pytest.mark.slow
+def test_another_scheduler_computes_and_when_it_goes_what_is_done_is_kept(
+    folder: Path, tmp_path: Path, scheduler: tuple[str, subprocess.Popen[bytes]]
+) -> None:
+    address, process = scheduler
+    output = tmp_path / "r.parquet"
+
+    def begun() -> subprocess.Popen[str]:
+        words = ["cohort", "fit", str(folder), "-o", str(output), "--scheduler", address, "--wait", "200"]
+        command = [sys.executable, "-c", COMMAND, *words]
+        return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+    run = begun()
+    until(lambda: len(list((tmp_path / "r.parquet.parts").glob("[0-9]*.parquet"))) >= 3, "three rows", run)
+    process.kill()
+    _, err = run.communicate(timeout=PATIENCE_S)
+    said = [line for line in err.splitlines() if not line.startswith("dashboard")]
+    assert run.returncode == 1 and len(said) == 1 and "the scheduler is gone" in said[0], err
+    kept = sum(pq.read_table(part).num_rows for part in (tmp_path / "r.parquet.parts").glob("[0-9]*.parquet"))
+    assert kept >= 3
+    run = started(folder, output)
+    out, err = run.communicate(timeout=PATIENCE_S)
+    assert run.returncode == 0, err
+    assert (json.loads(out)["done_before"], json.loads(out)["records"]) == (kept, SESSIONS + 1)

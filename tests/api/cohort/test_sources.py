@@ -125,6 +125,7 @@ def s3() -> Iterator[None]:
                 os.environ[name] = value
 
 
+@pytest.mark.slow
 def test_a_bucket_lists_and_opens_its_objects(s3: None) -> None:
     bucket = pickle.loads(pickle.dumps(Bucket("s3://records")))  # as it comes to a worker
     found = listed(bucket)
@@ -136,6 +137,7 @@ def test_a_bucket_lists_and_opens_its_objects(s3: None) -> None:
     assert [entry.name for entry in listed(Bucket("s3://records/P1/a.h5"))] == ["a.h5"]
 
 
+@pytest.mark.slow
 def test_an_object_that_changes_has_another_stamp(s3: None) -> None:
     import s3fs
 
@@ -148,6 +150,7 @@ def test_an_object_that_changes_has_another_stamp(s3: None) -> None:
     s3fs.S3FileSystem(anon=False).pipe("records/P1/b.csv", b"bb")
 
 
+@pytest.mark.slow
 def test_a_bucket_that_is_not_there_is_refused_in_one_line(s3: None) -> None:
     assert "s3://nowhere" in refused("s3://nowhere")
     assert "s3://records/P9" in refused("s3://records/P9")
