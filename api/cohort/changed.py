@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from api.cohort.errors import CohortError
-from api.cohort.parts import options_of, rows_in, rows_of
+from api.cohort.read import options_of, rows_in, rows_of
 
 PROBABILITY = 0.05
 """A probability that moves by no more has not changed."""

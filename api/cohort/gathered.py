@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from api.cohort.errors import CohortError
-from api.cohort.parts import options_of, rows_of
+from api.cohort.read import options_of, rows_of
 from api.cohort.statistics import Repeatability, repeatability
 
 PROBABLE = 0.5

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import json
 import os
 import selectors
@@ -25,6 +26,7 @@ RECORDS_A_PROCESS = 500
 """After so many a fresh process is started: what a library never gives back cannot add up."""
 START_S = 300.0
 """So long a start may take on a busy machine, compiling what was never compiled there."""
+PREFIX, LOCK = "stimrig-cohort-", "lock"
 KINDS = (".h5", ".hdf5", ".csv", ".tsv", ".txt", ".mat")
 
 
@@ -43,8 +45,13 @@ class Computing:
         self.memory_bytes, self.records = memory_bytes, records
         self.process: subprocess.Popen[bytes] | None = None
         self.done = 0
+        self.left_open: dict[str, str] = {}
+        """What the process could not be shut in from, and why."""
         self._rest = b""
-        self._folder = Path(tempfile.mkdtemp(prefix="stimrig-cohort-"))
+        tidy()
+        self._folder = Path(tempfile.mkdtemp(prefix=PREFIX))
+        self._lock = (self._folder / LOCK).open("wb")
+        fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
     def compute(self, content: bytes, entry: Entry, task: Task, limit_s: float) -> dict[str, Any]:
         """The row of a record, `{"left_out": True}` where it is not meant; how the process ended is a row, too."""
@@ -96,9 +103,11 @@ class Computing:
                 start_new_session=True,  # Ctrl-C ends the run in order
             )
             self.done, self._rest = 0, b""
-            if self._line(self.process, START_S) is None:
+            ready = self._line(self.process, START_S)
+            if ready is None:
                 code = self.close_process()
                 raise RuntimeError(f"the process that computes does not start ({_how(code)})")
+            self.left_open = json.loads(ready)["left_open"]
         return self.process
 
     def _line(self, process: subprocess.Popen[bytes], patience_s: float) -> bytes | None:
@@ -137,7 +146,16 @@ class Computing:
     def close(self) -> None:
         """End the process and take away its folder."""
         self.close_process()
+        self._lock.close()
         shutil.rmtree(self._folder, ignore_errors=True)
+
+
+def tidy() -> None:
+    """Take away what workers that were killed left of people's records."""
+    for lock in Path(tempfile.gettempdir()).glob(f"{PREFIX}*/{LOCK}"):
+        with contextlib.suppress(OSError), lock.open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # held as long as its worker lives
+            shutil.rmtree(lock.parent, ignore_errors=True)
 
 
 def _ended(code: int | None, took_s: float, limit_s: float) -> dict[str, Any]:

@@ -12,7 +12,6 @@ from typing import Any
 from distributed import Client
 
 from api.cohort.cluster import lanes
-from api.cohort.errors import CohortError
 from api.cohort.flight import Flight
 from api.cohort.parent import close_all
 from api.cohort.parts import Results
@@ -42,6 +41,8 @@ class Tally:
     error: int = 0
     left_out: int = 0
     copies: int = 0
+    left_open: str = ""
+    """What the workers' computing processes could not be shut in from; empty: nothing."""
 
     @property
     def now(self) -> int:
@@ -155,6 +156,8 @@ class Run:
                     yield source, entry
 
     def _add(self, row: dict[str, Any]) -> None:
+        if (left_open := row.pop("left_open", None)) and not self.tally.left_open:
+            self.tally.left_open = ", ".join(f"{what} ({why})" for what, why in left_open.items())
         status = self.results.add({**row, "computed_utc": datetime.now(UTC)})
         name = {LEFT_OUT: "left_out", COPY: "copies"}.get(status, status)
         setattr(self.tally, name, getattr(self.tally, name) + 1)
@@ -169,6 +172,6 @@ class Run:
                     if self._ended.is_set():
                         return
                     count += self.selection(entry.known) is not False
-        except CohortError:  # the run itself meets it, and says so
+        except Exception:  # the run itself meets it, and says so
             return
         self.tally.total = count

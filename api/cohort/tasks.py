@@ -40,7 +40,10 @@ class Task:
     @classmethod
     def of(cls, document: dict[str, Any]) -> Task:
         """The task of a document that came as JSON."""
-        return cls(**{name: tuple(value) if isinstance(value, list) else value for name, value in document.items()})
+        given: dict[str, Any] = {
+            key: tuple(value) if isinstance(value, list) else value for key, value in document.items()
+        }
+        return cls(**given)
 
     def differs(self, other: dict[str, Any]) -> str:
         """Words on how the options of another run differ; empty if they don't."""

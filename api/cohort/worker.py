@@ -60,8 +60,10 @@ def run_record(
         return {**base, **_failed("hash differs", line)}
     if done and digest(sha256) in done:
         return {**base, "status": COPY}
-    found = computing(bounds.memory_bytes, bounds.records).compute(content, entry, task, bounds.limit_s)
-    return {**base, **found.get("row", {"status": LEFT_OUT}), "bytes": len(content)}
+    process = computing(bounds.memory_bytes, bounds.records)
+    found = process.compute(content, entry, task, bounds.limit_s)
+    row = {**base, **found.get("row", {"status": LEFT_OUT}), "bytes": len(content)}
+    return {**row, "left_open": process.left_open} if process.left_open else row
 
 
 def digest(*words: str) -> bytes:

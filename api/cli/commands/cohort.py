@@ -6,20 +6,20 @@ Dask and pyarrow are an extra (`pip install stimrig[cohort]`): loaded where they
 from __future__ import annotations
 
 import importlib.util
+import sys
 import time
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from api.cli.cohort_report import changed_lines, run_lines
 from api.cli.errors import CommandError, InputError
-from api.cli.terminal import Json, names, say, say_json, table, write
+from api.cli.terminal import Json, names, say, say_json, write
 
 NEEDED = ("dask", "distributed", "pyarrow", "fsspec")
 METHOD = "maximum-likelihood"
 INTERRUPTED = 130
-MOST_ROWS = 40
-"""Changed records that are shown; --json gives all."""
 
 Given = Annotated[
     list[str],
@@ -175,6 +175,11 @@ def go(
         raise CommandError(str(error)) from error
     except KeyboardInterrupt:
         raise CommandError("interrupted. What is done is kept; the same command goes on.", INTERRUPTED) from None
+    if tally.left_open:
+        print(
+            f"stimrig cohort: workers could not be shut in: {tally.left_open}. See `stimrig doctor` there.",
+            file=sys.stderr,
+        )
     found = {
         "output": str(output),
         "records": counts["ok"] + counts["error"],
@@ -186,21 +191,7 @@ def go(
         "copies": tally.copies,
         "took_s": round(time.monotonic() - began_s, 1),
     }
-    say_json(found) if as_json else say(*run_report(found))
-
-
-def run_report(found: dict[str, Any]) -> list[str]:
-    """What a person is told of a run."""
-    lines = [
-        f"records        {found['records']}: {found['ok']} with a result, {found['errors']} without "
-        "(column `error` says why)",
-        f"this run       {found['computed']} computed, {found['done_before']} done before, {found['took_s']:g} s",
-    ]
-    if found["left_out"]:
-        lines.append(f"left out       {found['left_out']} that --select does not mean")
-    if found["copies"]:
-        lines.append(f"copies         {found['copies']} files with the content of another: counted once")
-    return [*lines, f"written to     {found['output']}"]
+    say_json(found) if as_json else say(*run_lines(found))
 
 
 def changed(
@@ -214,30 +205,6 @@ def changed(
 
     found = compared(old, new).to_dict()
     say_json(found) if as_json else say(*changed_lines(found))
-
-
-def changed_lines(found: dict[str, Any]) -> list[str]:
-    """A comparison for people."""
-    old, new, limits = found["old"], found["new"], found["tolerances"]
-    lines = [
-        f"{old['verb']}: stimrig {old['software']} ({old['file']}) → stimrig {new['software']} ({new['file']})",
-        f"{found['compared']} records in both: {found['unchanged']} unchanged, {found['changed']} changed",
-        *(f"  {count:6d}  {kind}" for kind, count in found["counts"].items()),
-        f"unchanged: a probability within {limits['probability']:g}, a parameter within {limits['parameter_sd']:g} sd "
-        f"(without one {100 * limits['parameter_without_sd_relative']:g} %), held-out rms within "
-        f"{100 * limits['held_out_rms_relative']:g} %",
-    ]
-    for words, key in (("old", "only_in_old"), ("new", "only_in_new")):
-        if listed := found[key]:
-            more = f" and {len(listed) - 10} more" if len(listed) > 10 else ""
-            lines.append(f"only in {words}: {len(listed)} ({', '.join(listed[:10])}{more})")
-    rows = [
-        (row["record"], row["participant"] or "–", row["day"] or "–", "; ".join(row["why"]))
-        for row in found["records"][:MOST_ROWS]
-    ]
-    lines += ["", *table(("record", "participant", "day", "why"), rows)] if rows else []
-    hidden = len(found["records"]) - len(rows)
-    return [*lines, *([f"and {hidden} records more (--json gives all)"] if hidden else [])]
 
 
 def figures(

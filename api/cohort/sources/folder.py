@@ -43,8 +43,8 @@ class Folder:
                             yield from self._within(item.path)
                     elif is_record(item.name) and item.is_file():  # a link to a file counts; a pipe would never end
                         yield self._entry(Path(item.path))
-        except OSError as error:
-            raise CohortError(f"{folder}: {error.strerror}. Check its rights.") from None
+        except OSError:  # opened as a record it gives the reason, as its row
+            yield Entry(_sound(folder), _sound(Path(folder).name), folder, known={"origin": _sound(self.path)})
 
     def _entry(self, path: Path) -> Entry:
         whole = path.absolute()

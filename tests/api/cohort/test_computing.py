@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import tempfile
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -174,6 +175,21 @@ def test_the_environment_of_a_child_holds_no_key(
     computing.close_process()
     row(computing, good)
     assert b"secret-of" not in Path(f"/proc/{pid(computing)}/environ").read_bytes()
+
+
+def test_what_a_killed_worker_left_is_taken_away(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    living = Computing(MEMORY)
+    left = tmp_path / "stimrig-cohort-left"
+    left.mkdir()
+    (left / "lock").touch()
+    (left / "record.h5").write_bytes(b"somebody's")
+    other = Computing(MEMORY)
+    assert not left.exists()
+    assert len(list(tmp_path.iterdir())) == 2
+    living.close()
+    other.close()
+    assert list(tmp_path.iterdir()) == []
 
 
 class Given:

@@ -13,6 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from api.cohort import parts
+from api.cohort import read as read_tables
 from api.cohort.errors import CohortError
 from api.cohort.parts import Results
 from api.cohort.sources import Entry
@@ -69,6 +70,14 @@ def test_finished_results_take_in_what_is_new(output: Path) -> None:
                 results.add(made(name))
             results.join()
     assert told(output) == ["a ok", "b ok", "c ok"]
+
+
+def test_a_run_that_did_nothing_leaves_nothing(output: Path) -> None:
+    with Results(output, TASK) as results:
+        assert results.folder.exists()
+    assert list(output.parent.iterdir()) == []
+    with Results(output, Task("diagnose", software="1.0")):
+        pass
 
 
 def test_a_part_that_was_half_written_counts_for_nothing(output: Path) -> None:
@@ -187,8 +196,8 @@ def test_damaged_parts_are_one_line(output: Path) -> None:
 
 def test_many_rows_pass_in_groups(output: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(parts, "ROWS_A_PART", 7)
-    monkeypatch.setattr(parts, "ROWS_A_GROUP", 10)
-    monkeypatch.setattr(parts, "ROWS_AT_ONCE", 4)
+    monkeypatch.setattr(read_tables, "ROWS_A_GROUP", 10)
+    monkeypatch.setattr(read_tables, "ROWS_AT_ONCE", 4)
     with Results(output, TASK) as results:
         for number in range(60):
             results.add(made(str(number % 50), status="ok" if number % 3 else LEFT_OUT))

@@ -82,6 +82,26 @@ def test_a_file_that_went_is_told_when_it_is_opened(tmp_path: Path) -> None:
         Folder(str(tmp_path)).open(entry, MOST)
 
 
+def test_a_folder_that_may_not_be_read_is_told_and_ends_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "open").mkdir()
+    (tmp_path / "open" / "a.h5").write_bytes(b"x")
+    (tmp_path / "shut").mkdir()
+    known = os.scandir
+
+    def scandir(path: str) -> Any:  # whoever tests may be root, whom no rights keep out
+        if str(path).endswith("shut"):
+            raise PermissionError(13, "Permission denied")
+        return known(path)
+
+    monkeypatch.setattr(os, "scandir", scandir)
+    found = listed(Folder(str(tmp_path)))
+    assert [entry.name for entry in found] == ["a.h5", "shut"]
+    with pytest.raises(SourceError, match="cannot be read"):
+        Folder(str(tmp_path)).open(found[1], MOST)
+
+
 def test_addresses_that_cannot_be_used_are_refused(tmp_path: Path) -> None:
     assert "no such file or folder" in refused(str(tmp_path / "nowhere"))
     assert "STIMRIG_TOKEN" in refused("https://centre.example")
