@@ -18,6 +18,7 @@ MOST_LINES = 20
 """Participants whose lines are drawn: those with the most sessions."""
 MOST_PANELS = 12
 COLOURS = tuple(role(f"series-{number}") for number in range(1, 7))
+DASHES = ("solid", "dash", "dot", "dashdot")
 UNITS = {"us": "µs", "nm": "N·m", "s": "s"}
 ROW_PX = 26
 
@@ -27,7 +28,7 @@ Figure = dict[str, Any]
 def prevalence(found: Gathered) -> Figure | None:
     """Effects by how many have them, with 95 % intervals; None where no effect was found."""
     of_what, total, counts = found.prevalence()
-    counts = [(effect, count) for effect, count in counts if count][::-1]  # plotly draws from below
+    counts = counts[::-1]  # plotly draws from below
     if not counts:
         return None
     shares = [100 * count / total for _, count in counts]
@@ -97,7 +98,7 @@ def over_sessions(found: Gathered, key: tuple[str, str]) -> Figure | None:
             "x": [datetime.fromtimestamp(at_s, UTC).isoformat() for at_s, _, _ in points],
             "y": [value for _, value, _ in points],
             "error_y": {"type": "data", "array": sds, "color": colour, "thickness": 1},
-            "line": {"color": colour, "width": 1.4},
+            "line": {"color": colour, "width": 1.4, "dash": DASHES[number // len(COLOURS) % len(DASHES)]},
             "marker": {"color": colour, "size": 5},
         })  # fmt: skip
     title = f"{title_of(key)} ({unit_of(series)})"

@@ -15,6 +15,7 @@ import tempfile
 import threading
 import time
 from dataclasses import asdict
+from multiprocessing.util import Finalize
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -179,6 +180,7 @@ def _how(code: int | None) -> str:
 
 _of_thread: dict[int, Computing] = {}
 _lock = threading.Lock()
+_at_the_end: list[Finalize] = []
 
 
 def computing(memory_bytes: int, records: int = RECORDS_A_PROCESS) -> Computing:
@@ -188,6 +190,8 @@ def computing(memory_bytes: int, records: int = RECORDS_A_PROCESS) -> Computing:
         if known is not None and (known.memory_bytes, known.records) != (memory_bytes, records):
             known.close()
             known = None
+        if not _at_the_end:
+            _at_the_end.append(Finalize(None, close_all, exitpriority=10))  # as this worker ends, in either way
         if known is None:
             known = _of_thread[threading.get_ident()] = Computing(memory_bytes, records)
         return known

@@ -114,6 +114,8 @@ class Results:
         try:
             self._begin()
         except BaseException:
+            if not self._parts() and not (self.folder / "run.json").exists():
+                shutil.rmtree(self.folder, ignore_errors=True)
             self._let_go()
             raise
         return self

@@ -85,6 +85,8 @@ COLUMNS: tuple[tuple[str, pa.DataType, str, str], ...] = (
 )
 """Name, type, unit and what it says."""
 
+MISFITS = (pa.ArrowException, OverflowError, TypeError, ValueError)
+
 SCHEMA = pa.schema(
     [
         pa.field(name, kind, metadata={"description": says, **({"unit": unit} if unit else {})})
@@ -95,8 +97,23 @@ SCHEMA = pa.schema(
 
 def table_of(rows: Sequence[dict[str, Any]]) -> pa.Table:
     """Rows as a table; keys that are no column are dropped."""
-    arrays = [pa.array([_cell(row.get(field.name), field.type) for row in rows], field.type) for field in SCHEMA]
+    arrays = [_array([_cell(row.get(field.name), field.type) for row in rows], field.type) for field in SCHEMA]
     return pa.Table.from_arrays(arrays, schema=SCHEMA)
+
+
+def _array(values: list[Any], kind: pa.DataType) -> pa.Array:
+    """A column; a value that does not fit is null: what a file or a centre says must not end a run."""
+    try:
+        return pa.array(values, kind)
+    except MISFITS:
+        return pa.concat_arrays([_one(value, kind) for value in values])
+
+
+def _one(value: Any, kind: pa.DataType) -> pa.Array:
+    try:
+        return pa.array([value], kind)
+    except MISFITS:
+        return pa.nulls(1, kind)
 
 
 def _cell(value: Any, kind: pa.DataType) -> Any:

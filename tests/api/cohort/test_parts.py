@@ -177,6 +177,7 @@ def test_what_is_no_table_of_results_is_not_written_over(output: Path, tmp_path:
     assert pq.read_table(output).num_rows == 1
     with pytest.raises(CohortError, match="a folder"), Results(tmp_path, TASK):
         pass
+    assert [path.name for path in tmp_path.iterdir()] == [output.name]
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(CohortError, match="can be written"), Results(tmp_path / "file" / "x.parquet", TASK):
         pass
@@ -226,3 +227,8 @@ def test_columns_have_types_and_units(output: Path) -> None:
 def test_nonsense_in_a_record_never_ends_a_run() -> None:
     table = table_of([{**made("a"), "kind": "\ud800", "begun_utc": "yesterday", "nobody": "knows"}])
     assert table.schema.equals(SCHEMA) and table["begun_utc"][0].as_py() is None
+    table = table_of(
+        [made("a"), {**made("b"), "bytes": 2**70, "rate_hz": "fast", "begun_utc": {}, "effects": [{"x": 1}]}]
+    )
+    assert table["bytes"].to_pylist() == [3, None] and table["name"].to_pylist() == ["a", "b"]
+    assert table["rate_hz"][1].as_py() is None
