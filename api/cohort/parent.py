@@ -27,6 +27,10 @@ RECORDS_A_PROCESS = 500
 """After so many a fresh process is started: what a library never gives back cannot add up."""
 START_S = 300.0
 """So long a start may take on a busy machine, compiling what was never compiled there."""
+CHILD = (sys.executable, "-m", "api.cohort.child")
+LONGEST_BYTES = 16 * 2**20
+"""Of an answer: a process that a record has taken over could talk without an end."""
+NO_ANSWER = {"status": "error", "error_kind": "unexpected", "error": "its process gave an answer that cannot be read."}
 PREFIX, LOCK = "stimrig-cohort-", "lock"
 KINDS = (".h5", ".hdf5", ".csv", ".tsv", ".txt", ".mat")
 
@@ -79,24 +83,21 @@ class Computing:
             process.stdin.flush()
         began_s = time.monotonic()
         line = self._line(process, limit_s)
-        if line is not None:
+        took_s = round(time.monotonic() - began_s, 3)
+        if line is not None and (found := _sound(line)) is not None:
             self.done += 1
-            return json.loads(line)
-        took_s = time.monotonic() - began_s
+            return found
         code = self.close_process()
-        return {"row": {**entry.known, **_ended(code, took_s, limit_s), "took_s": round(took_s, 3)}}
+        ended = _ended(code, took_s, limit_s) if line is None else NO_ANSWER
+        return {"row": {**entry.known, **ended, "took_s": took_s}}
 
     def _running(self) -> subprocess.Popen[bytes]:
         """The process, fresh where there is none or where it has done enough."""
         if self.process is not None and (self.done >= self.records or self.process.poll() is not None):
             self.close_process()
         if self.process is None:
-            command = [
-                sys.executable, "-m", "api.cohort.child",
-                "--folder", str(self._folder), "--memory", str(self.memory_bytes),
-            ]  # fmt: skip
             self.process = subprocess.Popen(
-                command,
+                [*CHILD, "--folder", str(self._folder), "--memory", str(self.memory_bytes)],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
@@ -127,6 +128,8 @@ class Computing:
                         process.wait(5)
                     return None
                 self._rest += piece
+                if len(self._rest) > LONGEST_BYTES:
+                    return b""
         line, _, self._rest = self._rest.partition(b"\n")
         return line
 
@@ -149,6 +152,18 @@ class Computing:
         self.close_process()
         self._lock.close()
         shutil.rmtree(self._folder, ignore_errors=True)
+
+
+def _sound(line: bytes) -> dict[str, Any] | None:
+    """An answer as the child gives them; None of anything else."""
+    try:
+        found = json.loads(line)
+    except (ValueError, RecursionError):
+        return None
+    row = found.get("row") if isinstance(found, dict) else None
+    if isinstance(row, dict) and row.get("status") in ("ok", "error"):
+        return {"row": row}
+    return {"left_out": True} if found == {"left_out": True} else None
 
 
 def tidy() -> None:

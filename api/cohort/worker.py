@@ -18,6 +18,8 @@ from identify.records.bounds import LARGEST_FILE_BYTES
 
 LEFT_OUT, COPY = "left out", "copy"
 """Status of rows that are kept until the end, so that a record is not read again, and not handed out."""
+MINE = ("address", "stamp", "sha256", "bytes", "verb", "software", "origin")
+"""Columns that a record has no say in."""
 TOO_LARGE = f"more than {LARGEST_FILE_BYTES // 2**20} MB. Cut the record, or give the sealed recording."
 
 
@@ -62,8 +64,9 @@ def run_record(
         return {**base, "status": COPY}
     process = computing(bounds.memory_bytes, bounds.records)
     found = process.compute(content, entry, task, bounds.limit_s)
-    row = {**base, **found.get("row", {"status": LEFT_OUT}), "bytes": len(content)}
-    return {**row, "left_open": process.left_open} if process.left_open else row
+    row = found.get("row", {"status": LEFT_OUT})
+    mine = {name: base[name] for name in MINE if name in base}  # whatever the process says
+    return {**base, **row, **mine, "left_open": process.left_open, "other_version": None}
 
 
 def digest(*words: str) -> bytes:

@@ -167,7 +167,7 @@ def go(
     began_s = time.monotonic()
     try:
         with Table(output, task, again) as results, cluster.connected(place) as client:
-            link = client.dashboard_link if place.dashboard or place.scheduler else ""
+            link = str(client.dashboard_link) if place.dashboard or place.scheduler else ""
             with telling(link) as tell:
                 tally = Run(client, sources, task, bounds, results, tell).go()
             counts = results.join()

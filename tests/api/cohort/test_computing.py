@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import signal
+import sys
 import tempfile
 import threading
 from collections.abc import Iterator
@@ -12,6 +14,7 @@ from typing import Any
 
 import pytest
 
+from api.cohort import parent
 from api.cohort.parent import Computing
 from api.cohort.sources import Entry
 from api.cohort.tasks import Task
@@ -190,6 +193,46 @@ def test_what_a_killed_worker_left_is_taken_away(tmp_path: Path, monkeypatch: py
     living.close()
     other.close()
     assert list(tmp_path.iterdir()) == []
+
+
+EVIL = """
+import sys
+print('{"ready": true, "left_open": {}}', flush=True)
+for number, line in enumerate(sys.stdin):
+    print(sys.argv[1].replace("'", '"'), flush=True)
+"""
+
+
+@pytest.mark.parametrize(
+    "said",
+    ["no JSON", "{}", "[1]", "{'row': 3}", "{'row': {'status': 'copy'}}", "[" * 100_000, "x" * 17_000_000, "\\xff"],
+    ids=lambda said: said[:20],
+)
+def test_a_process_that_was_taken_over_cannot_end_a_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: str
+) -> None:
+    script = tmp_path / "evil.py"
+    script.write_text(EVIL.replace("sys.argv[1]", repr(said)))
+    monkeypatch.setattr(parent, "CHILD", (sys.executable, str(script)))
+    computing = Computing(MEMORY)
+    try:
+        found = row(computing, b"")
+        assert (found["status"], found["error_kind"]) == ("error", "unexpected")
+    finally:
+        computing.close()
+
+
+def test_a_process_has_no_say_in_which_record_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    forged = '{"row": {"status": "ok", "sha256": "x", "address": "x", "other_version": "9", "software": "9"}}'
+    script = tmp_path / "evil.py"
+    script.write_text(EVIL.replace("sys.argv[1]", repr(forged)))
+    monkeypatch.setattr(parent, "CHILD", (sys.executable, str(script)))
+    try:
+        found = of_worker(b"abc", Entry("address", "a", "a"))
+        assert found["address"] == "address" and found["software"] == software_version()
+        assert found["sha256"] == hashlib.sha256(b"abc").hexdigest() and not found["other_version"]
+    finally:
+        parent.close_all()
 
 
 class Given:
