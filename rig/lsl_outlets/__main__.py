@@ -1,0 +1,39 @@
+"""`python -m rig.lsl_outlets --data DIR`: sends torque and pulses of the running test to Lab Streaming Layer.
+
+It prints one JSON line on standard output when the outlets are open, and logs to standard error. It runs until SIGTERM
+or SIGINT. Exit 2: LSL is not installed, or the data folder is not suitable.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import resource
+import sys
+from pathlib import Path
+
+MAX_MEMORY_BYTES = 2 << 30
+
+
+def main() -> int:
+    """Stream until asked to end; the exit code."""
+    _modest()
+    from rig.lsl_outlets.streaming import main as stream  # after that: importing numpy takes time
+
+    return stream()
+
+
+def _modest() -> None:
+    """Run only where no other process wants to, with a limit on memory; be the first to go if memory runs out."""
+    with contextlib.suppress(OSError):
+        os.nice(19)
+    with contextlib.suppress(OSError):
+        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+    with contextlib.suppress(OSError):
+        Path("/proc/self/oom_score_adj").write_text("800")
+    with contextlib.suppress(OSError, ValueError):
+        resource.setrlimit(resource.RLIMIT_AS, (MAX_MEMORY_BYTES, MAX_MEMORY_BYTES))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
