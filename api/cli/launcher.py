@@ -22,6 +22,7 @@ from typing import Any
 
 from api import owner_only
 from api.cli.errors import LaunchError
+from api.cli.streams import Streams
 from api.settings import Settings
 from api.store.lock import HeldError, refuse_if_held
 
@@ -74,6 +75,21 @@ class Child:
         except ValueError:
             raise self.failure() from None
         return self.ready
+
+    def start_unheard(self) -> None:
+        """Start it and wait for nothing; one that cannot be started is found to have ended."""
+        self.started_s = time.monotonic()
+        with contextlib.suppress(OSError), self.log.open("ab") as log:
+            self._log_start = log.tell()
+            self.process = subprocess.Popen(
+                self.command,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=log,
+                env={**os.environ, **self.environment},
+                start_new_session=True,
+                preexec_fn=die_with_parent,
+            )
 
     def failure(self) -> LaunchError:
         """Why it is not there, in its own words."""
@@ -164,6 +180,7 @@ class Services:
         self.rig = self._child("rig", ["rig"])
         self.api = self._child("api", ["api.web.server"])
         self.admin_token = admin_token
+        self.lsl = Streams(self._child("lsl", ["rig.lsl_outlets"])) if settings.lsl else None
 
     def _child(self, name: str, module: list[str]) -> Child:
         return Child(name, [sys.executable, "-m", *module], self.settings.logs_dir / f"{name}.log")
@@ -214,15 +231,20 @@ class Services:
             self.api.environment["STIMRIG_ADMIN_TOKEN"] = self.admin_token
         self.api.start()
         self.api.environment["STIMRIG_PORT"] = str(self.api.ready["port"])  # the same one after a restart
+        if self.lsl is not None:
+            self.lsl.start([] if self.attached else self._source(), data)
 
     def _start_devices(self, data: str) -> None:
         if self.emulator is not None:
-            ready = self.emulator.start()
-            source = ["--emulator-json", json.dumps(ready)]
-        else:
-            source = ["--config", str(self.settings.rig_file)]
-        self.rig.command += [*source, "--socket", str(self.socket), "--data", data]
+            self.emulator.start()
+        self.rig.command += [*self._source(), "--socket", str(self.socket), "--data", data]
         self._start_rig()
+
+    def _source(self) -> list[str]:
+        """What says which devices there are."""
+        if self.emulator is not None:
+            return ["--emulator-json", json.dumps(self.emulator.ready)]
+        return ["--config", str(self.settings.rig_file)]
 
     def _start_rig(self) -> None:
         try:
@@ -244,7 +266,8 @@ class Services:
         if self.emulator is not None and not self.emulator.alive():
             raise self.emulator.failure()
         ours = (self.api,) if self.attached else (self.rig, self.api)
-        return [self._restart(child) for child in ours if not child.alive()]
+        events = [self._restart(child) for child in ours if not child.alive()]
+        return events + (self.lsl.watch() if self.lsl is not None else [])
 
     def _restart(self, child: Child) -> str:
         if time.monotonic() - child.started_s > 60:
@@ -262,6 +285,8 @@ class Services:
         """End what was started here: the rig first, since it stops stimulation; the service hears its test's end."""
         self.rig.end(SEAL_S)
         self.api.end()
+        if self.lsl is not None:
+            self.lsl.child.end()
         if self.emulator is not None:
             self.emulator.end()
         shutil.rmtree(self.runtime, ignore_errors=True)
