@@ -1,6 +1,6 @@
 """Records the streams of `rig.lsl_outlets` as LabRecorder does, and compares them with a sealed recording.
 
-    python -m tests.harness.lsl_recorder NAME FILE.npz
+    python -m tests.harness.lsl_recorder NAME FILE.npz [modest]
 
 It prints one JSON line when all streams are open, records until SIGTERM, and writes times (s, this machine's LSL clock:
 the clock offsets that LSL measures are added) and values. A process of its own, so that LSL's settings are its own.
@@ -48,9 +48,10 @@ def on_this_machine(folder: Path) -> Iterator[None]:
 class Recorder:
     """The recording process."""
 
-    def __init__(self, name: str, folder: Path) -> None:
+    def __init__(self, name: str, folder: Path, modest: bool = False) -> None:
         self._file = folder / f"{name}.npz"
-        self.process = Process("tests.harness.lsl_recorder", name, str(self._file), log=folder / f"{name}-recorder.log")
+        arguments = (name, str(self._file), *(["modest"] if modest else []))
+        self.process = Process("tests.harness.lsl_recorder", *arguments, log=folder / f"{name}-recorder.log")
         self.info: dict[str, str] = self.process.ready["info"]
 
     def end(self) -> dict[str, Any]:
@@ -103,6 +104,8 @@ def compare(recorded: dict[str, Any], path: str | Path) -> Compared:
 
 def main() -> int:
     """Record until SIGTERM."""
+    if "modest" in sys.argv[3:]:
+        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
     import pylsl
 
     name, out = sys.argv[1:3]
