@@ -1,0 +1,200 @@
+"""The run: records listed one after the other, a bounded number of them on the workers, their rows to the disk."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import CancelledError
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any
+
+from distributed import Client, Future, as_completed
+from distributed.scheduler import KilledWorker
+
+from api.cohort.cluster import lanes
+from api.cohort.errors import CohortError, CutOffError
+from api.cohort.parent import close_all
+from api.cohort.parts import Results
+from api.cohort.select import Selection
+from api.cohort.sources import Entry, Source
+from api.cohort.tasks import Task
+from api.cohort.worker import COPY, LEFT_OUT, Bounds, identity, lost, run_record
+
+AHEAD = 3
+"""Records sent for each one that is computed: a worker never waits for its next, and none sees a million."""
+FLUSH_S = 10.0
+"""What is lost at most, of the work done, when the run is killed."""
+LANES_S = 5.0
+
+Tell = Callable[["Tally"], None]
+
+
+@dataclass
+class Tally:
+    """How far a run is."""
+
+    total: int | None = None
+    """Records that may be meant; None until they are counted."""
+    before: int = 0
+    """Done by an earlier run."""
+    ok: int = 0
+    error: int = 0
+    left_out: int = 0
+    copies: int = 0
+
+    @property
+    def now(self) -> int:
+        """Records that came back in this run."""
+        return self.ok + self.error + self.left_out + self.copies
+
+    @property
+    def handled(self) -> int:
+        """Records that need nothing more."""
+        return self.now + self.before
+
+
+class Run:
+    """One run over a cohort.
+
+    Parameters
+    ----------
+    client : Client
+        With workers.
+    sources : sequence of Source
+        Where the records are.
+    task : Task
+        What is done with each.
+    bounds : Bounds
+        What one record may take.
+    results : Results
+        Open; takes the rows.
+    tell : callable
+        Called with the tally after every row.
+    monotonic_s : callable
+        The clock.
+    """
+
+    def __init__(
+        self,
+        client: Client,
+        sources: Sequence[Source],
+        task: Task,
+        bounds: Bounds,
+        results: Results,
+        tell: Tell = lambda _tally: None,
+        monotonic_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.client, self.sources, self.task, self.bounds = client, sources, task, bounds
+        self.results, self.tell, self.monotonic_s = results, tell, monotonic_s
+        self.selection = Selection(task.select)
+        self.tally = Tally()
+        self.most_in_flight = 0
+        self._ended = threading.Event()
+
+    def go(self) -> Tally:
+        """Do every record that is not done; then the results are whole, but not joined yet.
+
+        Raises
+        ------
+        CohortError
+            A source is not there, or a worker has another version.
+        CutOffError
+            The scheduler, or a worker's machine, cannot go on.
+        """
+        counting = threading.Thread(target=self._count, daemon=True)
+        counting.start()
+        try:
+            self._loop()
+        finally:
+            self._ended.set()
+            self.results.flush()
+        self.client.run(close_all)
+        return self.tally
+
+    def _loop(self) -> None:
+        open_entries = self._open()
+        came = as_completed(with_results=True, raise_errors=False)
+        sent: dict[str, Entry] = {}
+        number, more = 0, True
+        flushed_s = looked_s = self.monotonic_s()
+        room = AHEAD * lanes(self.client)
+        while True:
+            while more and len(sent) < room:
+                found = next(open_entries, None)
+                if found is None:
+                    more = False
+                    break
+                number += 1
+                future = self._submit(*found, number)
+                sent[future.key] = found[1]
+                came.add(future)
+            self.most_in_flight = max(self.most_in_flight, len(sent))
+            if not sent:
+                return
+            future, result = next(came)
+            self._take(sent.pop(future.key), future, result)
+            future.release()
+            now_s = self.monotonic_s()
+            if now_s - flushed_s > FLUSH_S:
+                self.results.flush()
+                flushed_s = now_s
+            if now_s - looked_s > LANES_S:
+                room, looked_s = AHEAD * lanes(self.client), now_s
+
+    def _submit(self, source: Source, entry: Entry, number: int) -> Future:
+        alike = self.results.done.alike(entry)
+        key = f"record-{number}"
+        return self.client.submit(run_record, source, entry, self.task, self.bounds, alike, key=key, pure=False)
+
+    def _open(self) -> Iterator[tuple[Source, Entry]]:
+        """Records that are meant, or may be, and that are not done."""
+        for source in self.sources:
+            for entry in source.entries(self.selection):
+                if self.selection(entry.known) is False:
+                    continue
+                if self.results.done.has_place(entry):
+                    self.tally.before += 1
+                elif self.results.done.has_content(entry.sha256):
+                    self._add({**identity(entry), "sha256": entry.sha256, "bytes": entry.bytes, "status": COPY})
+                else:
+                    yield source, entry
+
+    def _take(self, entry: Entry, future: Future, result: Any) -> None:
+        """A record that came back."""
+        if future.status == "finished":
+            if version := result.get("other_version"):
+                message = (
+                    f"a worker has stimrig {version}, here is {self.task.software}. Install the same version there."
+                )
+                raise CohortError(message)
+            self._add(result)
+            return
+        error = result[1] if isinstance(result, tuple) else result
+        if isinstance(error, KilledWorker):
+            self._add(lost(entry, self.task, "its workers were lost, one after the other, while it was computed."))
+        elif future.status in ("cancelled", "lost") or isinstance(error, CancelledError):
+            raise CutOffError("the scheduler is gone. What is done is kept; the same command goes on.")
+        else:
+            words = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+            raise CutOffError(f"a worker cannot compute ({words}). What is done is kept; the same command goes on.")
+
+    def _add(self, row: dict[str, Any]) -> None:
+        status = self.results.add({**row, "computed_utc": datetime.now(UTC)})
+        name = {LEFT_OUT: "left_out", COPY: "copies"}.get(status, status)
+        setattr(self.tally, name, getattr(self.tally, name) + 1)
+        self.tell(self.tally)
+
+    def _count(self) -> None:
+        """Count what may be meant, beside the run, so that there is a time left to tell."""
+        count = 0
+        try:
+            for source in self.sources:
+                for entry in source.entries(self.selection):
+                    if self._ended.is_set():
+                        return
+                    count += self.selection(entry.known) is not False
+        except CohortError:  # the run itself meets it, and says so
+            return
+        self.tally.total = count
