@@ -23,7 +23,7 @@ import numpy as np
 
 from bench.stamp import RESULTS, written_by
 from tests.harness.lsl_recorder import Recorder, compare, on_this_machine
-from tests.harness.processes import CLINIC_WATCH, Bench, Process, RigClient, busy_process, default_plan
+from tests.harness.processes import Bench, Process, RigClient, busy_process, default_plan
 
 
 @dataclass
@@ -39,6 +39,10 @@ class Found:
     load: list[float] = field(default_factory=list)
 
 
+class Ended(Exception):
+    """The rig ended a test: the machine stood still."""
+
+
 def one(client: RigClient, test_id: str) -> tuple[Path, np.ndarray, int]:
     """Play a test: its recording, the lateness of its pulses (s), and how many were dropped."""
     reply = client.start(default_plan(test_id))
@@ -46,7 +50,8 @@ def one(client: RigClient, test_id: str) -> tuple[Path, np.ndarray, int]:
         raise SystemExit(reply["problem"]["detail"])
     event = client.wait_finished(test_id)
     if event["outcome"] != "completed":
-        raise SystemExit(f"{test_id} ended: {event['reason']}")
+        client.ask("rearm", by="bench")
+        raise Ended(event["reason"])
     with h5py.File(event["recording_path"]) as file:
         late_s = file["pulses/written_time_s"][:] - file["pulses/planned_time_s"][:]
     return Path(event["recording_path"]), late_s[np.isfinite(late_s)], event["summary"]["dropped_pulses"]
@@ -65,10 +70,13 @@ def beside(bench: Bench, client: RigClient, test_id: str, found: Found) -> None:
     outlets = Process("rig.lsl_outlets", *source, "--name", name, log=bench.folder / f"{name}.log")
     recorder = Recorder(name, bench.folder, modest=True)
     before_s = cpu_s(outlets.popen.pid)
-    path, late_s, dropped = one(client, test_id)
-    found.cpu_percent.append((cpu_s(outlets.popen.pid) - before_s) / 38.7 * 100)
-    outlets.stop()
-    compared = compare(recorder.end(), path)
+    try:
+        path, late_s, dropped = one(client, test_id)
+        found.cpu_percent.append((cpu_s(outlets.popen.pid) - before_s) / 38.7 * 100)
+    finally:
+        outlets.stop()
+        recorded = recorder.end()
+    compared = compare(recorded, path)
     found.torque_apart_s.append(compared.torque_apart_s)
     found.pulses_apart_s.append(compared.pulses_apart_s)
     found.beside_s.append(late_s)
@@ -89,7 +97,7 @@ def measure(pairs: int, busy: int) -> Found:
         stack.enter_context(on_this_machine(Path(folder)))
         bench = Bench(Path(folder), "--noise-seed", "7", "--clock-ppm", "80")
         stack.callback(bench.close)
-        client = bench.start_rig(watch=CLINIC_WATCH)
+        client = bench.start_rig()
         client.ask("subscribe")
         for _ in range(busy):
             stack.enter_context(busy_process())
@@ -99,8 +107,11 @@ def measure(pairs: int, busy: int) -> Found:
                 lambda n=pair: without(client, f"without{n}", found),
                 lambda n=pair: beside(bench, client, f"with{n}", found),
             ]
-            for step in steps if pair % 2 == 0 else reversed(steps):
-                step()
+            try:
+                for step in steps if pair % 2 == 0 else reversed(steps):
+                    step()
+            except Ended as error:
+                raise SystemExit(f"pair {pair + 1}: the rig ended the test: {error}") from None
     return found
 
 

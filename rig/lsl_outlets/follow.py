@@ -14,7 +14,7 @@ from rig.journal import MAGIC, MARK, Kind
 AT_ONCE_BYTES = 1 << 18
 FREE_TO_READ = {0xEF53: "ext2 to ext4", 0x9123683E: "btrfs", 0x01021994: "tmpfs", 0x794C7630: "overlay"}
 """File systems, by their magic number (statfs(2)), on which reading a file never makes its writer wait. On XFS and
-over NFS a read holds the file's lock: a reader of lowest priority that is interrupted would hold up the rig."""
+over NFS a read holds the file's lock: a reader of low priority that is interrupted would hold up the rig."""
 
 
 def refuse_locking(folder: Path) -> None:

@@ -24,8 +24,8 @@ GOOD_S = 0.0003
 """Standard error of the alignment from which on samples are sent, s."""
 HOLD_S = 10.0
 """Real seconds for which the first samples are held at most until the alignment is good."""
-UPDATE_S = 0.5
-"""Real seconds between two fits of the alignment."""
+UPDATE_S, UPDATE_SHARE = 0.5, 0.05
+"""The alignment is fitted anew after so many real seconds, or this share of the test so far if that is longer."""
 MARGIN_S = 0.005
 """Real seconds: the recording's first and last sample are decided by its final alignment; those near them are sent."""
 
@@ -185,7 +185,8 @@ class LiveTest:
     def _align(self, finish: bool) -> None:
         if self._alignment is None or not self._held:
             return
-        if not finish and self._newest_s < self._updated_s + UPDATE_S * self._speed:
+        played_s = self._newest_s - (self._t0_s or 0.0) if self._good else 0.0
+        if not finish and self._newest_s < self._updated_s + max(UPDATE_S * self._speed, UPDATE_SHARE * played_s):
             return
         self._updated_s = self._newest_s
         self._alignment.update()

@@ -105,7 +105,8 @@ def compare(recorded: dict[str, Any], path: str | Path) -> Compared:
 def main() -> int:
     """Record until SIGTERM."""
     if "modest" in sys.argv[3:]:
-        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+        os.nice(10)
     import pylsl
 
     name, out = sys.argv[1:3]
@@ -132,6 +133,8 @@ def main() -> int:
         text = part == "tests"
         rows = [row[0] for row in values[part]] if text else values[part]
         content[part], content[f"{part}_s"] = np.array(rows, str if text else float), np.array(times_s[part])
+        if not text and not rows:
+            content[part] = np.empty((0, inlets[part].channel_count))
     np.savez(out, **content)
     return 0
 
