@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import json
 import os
 import tempfile
 from dataclasses import dataclass, field
@@ -22,8 +21,8 @@ import h5py
 import numpy as np
 
 from bench.stamp import RESULTS, written_by
-from tests.harness.lsl_recorder import Recorder, compare, on_this_machine
-from tests.harness.processes import Bench, Process, RigClient, busy_process, default_plan
+from tests.harness.lsl_recorder import Streams, compare, on_this_machine
+from tests.harness.processes import Bench, RigClient, busy_process, default_plan
 
 
 @dataclass
@@ -65,18 +64,12 @@ def cpu_s(pid: int) -> float:
 
 def beside(bench: Bench, client: RigClient, test_id: str, found: Found) -> None:
     """One test with outlets and a recorder."""
-    name = f"bench-{test_id}"
-    source = ("--emulator-json", json.dumps(bench.emulator.ready), "--data", str(bench.data))
-    outlets = Process("rig.lsl_outlets", *source, "--name", name, log=bench.folder / f"{name}.log")
-    recorder = Recorder(name, bench.folder, modest=True)
-    before_s = cpu_s(outlets.popen.pid)
-    try:
+    with Streams(bench, test_id, modest=True) as streams:
+        before_s = cpu_s(streams.started[0].popen.pid)
         path, late_s, dropped = one(client, test_id)
-        found.cpu_percent.append((cpu_s(outlets.popen.pid) - before_s) / 38.7 * 100)
-    finally:
-        outlets.stop()
-        recorded = recorder.end()
-    compared = compare(recorded, path)
+        streams.wait_sent(test_id)
+        found.cpu_percent.append((cpu_s(streams.started[0].popen.pid) - before_s) / 38.7 * 100)
+        compared = compare(streams.end(), path)
     found.torque_apart_s.append(compared.torque_apart_s)
     found.pulses_apart_s.append(compared.pulses_apart_s)
     found.beside_s.append(late_s)

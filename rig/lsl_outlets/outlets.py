@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import socket
 import time
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -85,9 +86,9 @@ class Outlets:
             if mark["event"] != "start":
                 self._mark(time_s, mark)
 
-    def wanted(self) -> bool:
-        """Whether anybody receives one of them."""
-        return any(outlet.have_consumers() for outlet in (self._torque, self._pulses, self._marks))
+    def wanted(self, which: Callable[[Iterable[bool]], bool] = any) -> bool:
+        """Whether somebody receives any, or all, of them."""
+        return which(outlet.have_consumers() for outlet in (self._torque, self._pulses, self._marks))
 
     def _mark(self, time_s: float, mark: dict[str, Any]) -> None:
         self._marks.push_sample([json.dumps(mark, ensure_ascii=False)], time_s)

@@ -26,6 +26,8 @@ LOOK_S = 0.2
 """Real seconds between two looks for a new test, or whether the journal is still there."""
 LAST_S = 0.5
 """Real seconds that receivers have at the end to fetch what was sent."""
+RETURN_S = 15.0
+"""Real seconds for which a test that was joined waits until those who received before have found the streams again."""
 READS_AT_END = 400
 """A test of the longest duration makes 25 MB; each read takes `follow.AT_ONCE_BYTES` at most."""
 
@@ -53,6 +55,7 @@ class Streaming:
         self._rate_hz, self._speed = sample_rate_hz, speed
         self._tail: Tail | None = None
         self._test = LiveTest()
+        self._joined = False
         self._began_s = time.monotonic()
         self._looked_s = -LOOK_S
 
@@ -70,6 +73,8 @@ class Streaming:
             return False
         for kind, payload in blocks:
             self._take(kind, payload)
+        if self._waiting():
+            return bool(blocks)
         if self._test.ended:
             self._finish()
         elif blocks:
@@ -86,6 +91,11 @@ class Streaming:
                 break
         if self._tail is not None:
             self._finish()
+
+    def _waiting(self) -> bool:
+        """After a start in the middle of a test: what is sent before the receivers are back would be lost to them."""
+        early = time.monotonic() < self._began_s + RETURN_S
+        return self._joined and early and not self._streams.wanted(all)
 
     def _due(self) -> bool:
         now_s = time.monotonic()
@@ -104,10 +114,10 @@ class Streaming:
             log.warning("%s: %s; this test is not streamed", path.name, error.strerror)
             self._journals.done(path)
             return False
-        joined = path in self._journals.old
-        since_s = self._began_s * self._speed if joined else float("-inf")
+        self._joined = path in self._journals.old
+        since_s = self._began_s * self._speed if self._joined else float("-inf")
         self._test = LiveTest(self._offset_s, since_s, self._rate_hz or 1000.0)
-        log.info("%s %s", "joins" if joined else "follows", path.name)
+        log.info("%s %s", "joins" if self._joined else "follows", path.name)
         return True
 
     def _take(self, kind: Kind, payload: bytes) -> None:

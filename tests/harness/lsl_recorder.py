@@ -23,7 +23,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from tests.harness.processes import Process
+from tests.harness.processes import Bench, Process
 
 STREAMS = ("torque", "pulses", "tests")
 SCOPE = "[multicast]\nResolveScope = machine\n[log]\nlevel = -2\n"
@@ -59,6 +59,50 @@ class Recorder:
         assert self.process.stop() == 0, self.process.log.read_text()
         with np.load(self._file) as found:
             return dict(found)
+
+
+class Streams:
+    """Outlets on a rig's data folder, and a recorder that was there from the beginning; both end with it."""
+
+    def __init__(self, bench: Bench, name: str, modest: bool = False) -> None:
+        self._bench, self._name = bench, f"{name}-{os.getpid()}-{bench.emulator.popen.pid}"
+        self._modest = modest
+        self.started: list[Process] = []
+
+    def __enter__(self) -> Streams:
+        try:
+            self.start()
+            self.recorder = Recorder(self._name, self._bench.folder, self._modest)
+        except BaseException:
+            self.__exit__()
+            raise
+        return self
+
+    def start(self) -> Process:
+        """Start outlets, once more where they were killed."""
+        log = self._bench.folder / f"{self._name}-{len(self.started)}.log"
+        source = ("--emulator-json", json.dumps(self._bench.emulator.ready), "--data", str(self._bench.data))
+        self.started.append(Process("rig.lsl_outlets", *source, "--name", self._name, log=log))
+        return self.started[-1]
+
+    def wait_sent(self, test_id: str, timeout_s: float = 60.0) -> None:
+        """Until the newest outlets have sent all of a test."""
+        end_s = time.monotonic() + timeout_s
+        while f"{test_id}.journal: " not in self.started[-1].log.read_text():
+            if time.monotonic() > end_s:
+                raise TimeoutError(self.started[-1].log.read_text())
+            time.sleep(0.05)
+
+    def end(self) -> dict[str, Any]:
+        """End the outlets, then the recorder; what it recorded."""
+        assert self.started[-1].stop() == 0, self.started[-1].log.read_text()
+        return self.recorder.end()
+
+    def __exit__(self, *_: object) -> None:
+        for process in self.started:
+            process.stop(signal.SIGKILL)
+        if hasattr(self, "recorder"):
+            self.recorder.process.stop(signal.SIGKILL)
 
 
 @dataclass(frozen=True)

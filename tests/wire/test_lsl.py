@@ -14,11 +14,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.harness.lsl_recorder import Recorder, compare, on_this_machine
-from tests.harness.processes import ROOT, Bench, Process, RigClient, short_plan
+from tests.harness.lsl_recorder import Streams, compare, on_this_machine
+from tests.harness.processes import ROOT, Bench, RigClient, short_plan
 
 pytest.importorskip("pylsl", reason="LSL is not installed: pip install stimrig[lsl]", exc_type=Exception)
 pytestmark = [pytest.mark.wire, pytest.mark.realtime, pytest.mark.slow]
+
+
+@pytest.fixture
+def bench(make_bench: Callable[..., Bench]) -> Bench:
+    bench = make_bench("--noise-seed", "7", "--clock-ppm", "150", speed=1.0)
+    bench.start_rig()
+    return bench
 
 
 @pytest.fixture(autouse=True)
@@ -27,9 +34,10 @@ def quiet(tmp_path: Path) -> Iterator[None]:
         yield
 
 
-def outlets(bench: Bench, name: str) -> Process:
-    source = ("--emulator-json", json.dumps(bench.emulator.ready), "--data", str(bench.data))
-    return Process("rig.lsl_outlets", *source, "--name", name, log=bench.folder / f"{name}.log")
+@pytest.fixture
+def streams(bench: Bench) -> Iterator[Streams]:
+    with Streams(bench, "test") as streams:
+        yield streams
 
 
 def played(client: RigClient, plan: dict) -> dict:
@@ -38,28 +46,22 @@ def played(client: RigClient, plan: dict) -> dict:
     return client.wait_finished(plan["test_id"])
 
 
-def test_a_recorder_gets_what_is_sealed(make_bench: Callable[..., Bench]):
-    """Two tests after one another, of which one is stopped; the recorder was there before the first."""
-    bench = make_bench("--noise-seed", "7", "--clock-ppm", "150", speed=1.0)
-    client = bench.start_rig()
+def test_a_recorder_gets_what_is_sealed(bench: Bench, streams: Streams):
+    """Tests after one another, of which one is stopped; the recorder was there before the first."""
+    client = bench.client()
     client.ask("subscribe")
-    name = f"stimrig-{bench.emulator.popen.pid}"
-    streams = outlets(bench, name)
-    try:
-        recorder = Recorder(name, bench.folder)
-        first = played(client, short_plan("first"))
-        assert client.start(short_plan("second"))["ok"]
-        client.wait_state("running")
-        time_s = client.status()["elapsed_s"]
-        while client.status()["elapsed_s"] < time_s + 2.0:
-            pass
-        client.ask("stop", reason="enough", by="test")
-        second = client.wait_finished("second")
-        assert client.ask("rearm", by="test")["ok"]
-        third = played(client, short_plan("third"))
-    finally:
-        assert streams.stop() == 0, streams.log.read_text()
-    recorded = recorder.end()
+    first = played(client, short_plan("first"))
+    assert client.start(short_plan("second"))["ok"]
+    client.wait_state("running")
+    time_s = client.status()["elapsed_s"]
+    while client.status()["elapsed_s"] < time_s + 2.0:
+        pass
+    client.ask("stop", reason="enough", by="test")
+    second = client.wait_finished("second")
+    assert client.ask("rearm", by="test")["ok"]
+    third = played(client, short_plan("third"))
+    streams.wait_sent("third")
+    recorded = streams.end()
     for event in (first, second, third):
         found = compare(recorded, event["recording_path"])
         assert np.median(found.torque_apart_s) < 5e-3
@@ -71,7 +73,7 @@ def test_a_recorder_gets_what_is_sealed(make_bench: Callable[..., Bench]):
     ]
     assert marks[1]["outcome"] == "completed" and marks[3]["outcome"] == "stopped"
     assert marks[1]["recording_id"] == first["recording_id"]
-    check_description(recorder.info)
+    check_description(streams.recorder.info)
 
 
 def check_description(info: dict[str, str]) -> None:
@@ -86,26 +88,23 @@ def check_description(info: dict[str, str]) -> None:
 
 
 def test_killed_and_started_again_in_a_test_nothing_is_doubled_and_the_rig_does_not_notice(
-    make_bench: Callable[..., Bench],
+    bench: Bench, streams: Streams
 ):
-    bench = make_bench("--noise-seed", "7", speed=1.0)
-    client = bench.start_rig()
+    client = bench.client()
     client.ask("subscribe")
-    name = f"stimrig-{bench.emulator.popen.pid}"
-    streams = outlets(bench, name)
-    recorder = Recorder(name, bench.folder)
     assert client.start(short_plan("one"))["ok"]
     client.wait_state("running")
-    streams.stop(signal.SIGKILL)
-    streams = outlets(bench, name)
+    streams.started[0].stop(signal.SIGKILL)
+    streams.start()
     event = client.wait_finished("one")
     assert event["outcome"] == "completed", event["reason"]
     assert event["summary"]["lost_samples"] == 0
-    assert streams.stop() == 0, streams.log.read_text()
-    recorded = recorder.end()
+    streams.wait_sent("one")
+    recorded = streams.end()
     index = recorded["pulses"][:, 2]
     assert len(np.unique(index)) == len(index)
-    assert len(np.unique(recorded["torque"])) > 0.99 * len(recorded["torque"])
+    assert "joins one.journal" in streams.started[1].log.read_text()
+    assert len(np.unique(recorded["torque"])) > 0.99 * len(recorded["torque"]) > 0
     assert np.all(np.diff(recorded["torque_s"]) >= 0)
 
 
