@@ -107,14 +107,14 @@ class Journals:
         self.old = set(self._sizes)
         """Those that were there at the start: if one grows, its test was running already."""
 
-    def following(self) -> Path | None:
-        """The oldest journal that is being written and was not followed yet, None if there is none."""
+    def following(self, besides: Path | None = None) -> Path | None:
+        """The oldest journal that is written and was not followed yet, other than that one; None: there is none."""
         listed = self._listed()
         for gone in self._sizes.keys() - {path for path, _, _ in listed}:
             del self._sizes[gone]
             self.old.discard(gone)
         for path, _, size in sorted(listed, key=lambda entry: entry[1]):
-            if size != self._sizes.get(path):
+            if size != self._sizes.get(path) and path != besides:
                 return path
         return None
 

@@ -79,7 +79,7 @@ class Streaming:
             self._finish()
         elif blocks:
             self._streams.push(self._test.ready())
-        elif self._due() and (tail.left() or self._journals.following() not in (None, tail.path)):
+        elif self._due() and (tail.left() or self._journals.following(tail.path) is not None):
             log.warning("%s: its test ended without an end in its journal", tail.path.name)
             self._finish()
         return bool(blocks)

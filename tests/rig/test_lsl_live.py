@@ -201,6 +201,29 @@ def test_a_block_of_nonsense_ends_nothing(tmp_path: Path, kind: Kind, payload: b
     streaming.close()
 
 
+def test_one_whose_end_could_not_be_written_keeps_no_later_one_from_being_sent(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """The disk was full: the journal lies there without an end, and cannot be sealed yet."""
+    monkeypatch.setattr("rig.lsl_outlets.streaming.LOOK_S", 0.0)
+    sent: list[Batch] = []
+    (tmp_path / "journals").mkdir()
+    streaming = Streaming(tmp_path, SimpleNamespace(push=sent.append), 0.0, RATE_HZ, 1.0)  # pyright: ignore
+    write_journal(tmp_path / "whole", 7, 0.6, 14.0)
+    data = (tmp_path / "whole").read_bytes()
+    (tmp_path / "journals" / "first.journal").write_bytes(data[: len(data) // 2])
+    while streaming.tick():
+        pass
+    (tmp_path / "journals" / "second.journal").write_bytes(data)
+    for _ in range(200):
+        streaming.tick()
+    marks = [mark["event"] for batch in sent for _, mark in batch.marks]
+    assert marks == ["start", "start", "end"]
+    whole = joined(streamed(tmp_path / "whole", tmp_path / "copy"))
+    assert sum(len(batch.torque_s) for batch in sent) > 1.4 * len(whole[0])
+    streaming.close()
+
+
 def test_a_journal_left_by_a_crash_is_not_followed_a_growing_one_is(tmp_path: Path):
     (tmp_path / "old.journal").write_bytes(journal.MAGIC)
     folder = Journals(tmp_path)
