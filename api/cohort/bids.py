@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from api.cohort.bids_words import DESCRIPTION, EVENTS, PARTICIPANTS, PHYSIO, README, SCANS, STIM
-from api.cohort.export import ERRORS, Days, NoExport, Put, Who, hidden
 from api.cohort.export_state import FOLDER, State
+from api.cohort.handed_on import ERRORS, Days, NoExport, Put, Who, hidden
 from api.cohort.opened import Opened
 from api.cohort.parquet_files import STATUS, record_row, segment_at
 from api.version import software_version

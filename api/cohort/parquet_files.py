@@ -12,8 +12,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from api.cohort import dictionary
-from api.cohort.export import Days, Put, Who, hidden
 from api.cohort.export_state import State
+from api.cohort.handed_on import Days, Put, Who, hidden
 from api.cohort.opened import Opened
 
 STATUS = ("acknowledged", "rest", "dropped", "refused", "unacknowledged", "device error")

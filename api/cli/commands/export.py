@@ -35,7 +35,7 @@ def export(
     if no_dates and shift_days:
         raise InputError("give --no-dates or --shift-days, not both.")
     from api.cohort.errors import CutOffError
-    from api.cohort.export import Days
+    from api.cohort.handed_on import Days
 
     try:
         found = go(data, parquet, bids, select, Days(no_dates, shift_days), columns or [], token)
@@ -55,8 +55,9 @@ def go(
 ) -> dict[str, Any]:
     """One export; what is told of it."""
     from api.cohort.bids import Bids
-    from api.cohort.export import ERRORS, Export
+    from api.cohort.export import Export
     from api.cohort.export_state import State
+    from api.cohort.handed_on import ERRORS
     from api.cohort.parquet_files import Parquet
     from api.cohort.select import Selection
     from api.cohort.sources.addresses import sources_of

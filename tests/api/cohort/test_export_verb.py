@@ -12,17 +12,20 @@ from pathlib import Path
 from typing import Any
 
 import h5py
+import jsonschema_rs
 import numpy as np
 import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 import pytest
 
 import identify
+from api import schemas
 from api.cli import main
 from api.cohort.bids import Bids
 from api.cohort.errors import CohortError, CutOffError
-from api.cohort.export import Days, Export
+from api.cohort.export import Export
 from api.cohort.export_state import FOLDER, State
+from api.cohort.handed_on import Days
 from api.cohort.parquet_files import STATUS, Parquet
 from api.cohort.select import Selection
 from api.cohort.sources.addresses import sources_of
@@ -56,11 +59,8 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def exported(data: Path, folder: Path, kind: str, *options: str) -> dict[str, Any]:
-    """The verb's own answer."""
-    code = main.run(["export", str(data), f"--{kind}", str(folder), "--json", *options])
-    assert code == 0
-    return {}
+def exported(data: Path, folder: Path, kind: str, *options: str) -> None:
+    assert main.run(["export", str(data), f"--{kind}", str(folder), "--json", *options]) == 0
 
 
 def sealed_files(data: Path) -> dict[str, Path]:
@@ -77,6 +77,7 @@ def test_parquet_reads_back_to_the_same_numbers(data: Path, tmp_path: Path, caps
     exported(data, tmp_path / "out", "parquet")
     told = json.loads(capsys.readouterr().out)
     assert (told["records"], told["errors"]) == (5, 10)
+    assert jsonschema_rs.is_valid(schemas.load("export"), told)
     samples = ds.dataset(tmp_path / "out" / "samples", partitioning="hive")
     pulses = ds.dataset(tmp_path / "out" / "pulses", partitioning="hive")
     records = pq.read_table(tmp_path / "out" / "records.parquet").to_pylist()
