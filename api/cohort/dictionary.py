@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal
 
 Kind = Literal["text", "number", "integer", "true or false", "time"]
@@ -24,7 +24,7 @@ class Column:
     source: str
 
 
-WHO = (
+WHO: tuple[tuple[str, Kind, str, str, str, str], ...] = (
     ("record_id", "text", "", "id of the recording; of a table its first 16 digits of the SHA-256", "", "recording_id"),
     ("participant", "text", "", "code of the participant, as it was given", "", "participant"),
     ("session", "text", "", "session: the day of the recording (UTC), or the label in its place", "", "created_utc"),
@@ -130,8 +130,8 @@ def as_json(title: str) -> str:
 def as_csv() -> str:
     """The dictionary as a table, for a spreadsheet."""
     text = io.StringIO()
-    fields = ("table", "name", "type", "unit", "meaning", "range", "source")
-    writer = csv.DictWriter(text, fields, lineterminator="\n")
+    names = [field.name for field in fields(Column)]
+    writer = csv.DictWriter(text, names, lineterminator="\n")
     writer.writeheader()
     writer.writerows(asdict(column) for name in COLUMNS for column in columns(name))
     return text.getvalue()
