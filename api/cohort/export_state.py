@@ -117,9 +117,9 @@ class State:
         label = "".join(letter for letter in code if letter.isascii() and letter.isalnum())
         if not label:
             raise ValueError(f"participant {code!r} has no letter and no digit for a label")
-        row = self._db.execute("SELECT code FROM labels WHERE label = ?", (label,)).fetchone()
+        row = self._db.execute("SELECT code FROM labels WHERE lower(label) = lower(?)", (label,)).fetchone()
         if row is not None and row[0] != code:
-            raise ValueError(f"participant {code!r}: its label {label} is that of {row[0]!r} already")
+            raise ValueError(f"participant {code!r}: its label {label} is that of {row[0]!r} already, capitals aside")
         with self._db:
             self._db.execute("INSERT OR IGNORE INTO labels VALUES (?, ?)", (label, code))
         return label

@@ -170,15 +170,21 @@ def _alignment(content: bytes) -> dict[str, Any]:
     """How exact the times are; nothing where the file does not plainly say it."""
     import h5py
 
-    with h5py.File(io.BytesIO(content), "r") as file:
-        if not isinstance(file.get("alignment", getlink=True), h5py.HardLink):
-            return {}
-        group = file["alignment"]
-        if not isinstance(group, h5py.Group):
-            return {}
-        found: dict[str, Any] = {}
-        for name in ALIGNMENT:
-            if name in group.attrs and isinstance(value := group.attrs[name], float | np.floating):
-                found[f"alignment_{name}"] = float(value) if np.isfinite(value) else None
-        method = group.attrs.get("method", "")
-        return {**found, **({"alignment_method": method} if method in ("sync", "regression") else {})}
+    try:
+        with h5py.File(io.BytesIO(content), "r") as file:
+            linked = isinstance(file.get("alignment", getlink=True), h5py.HardLink)
+            group = file["alignment"] if linked else None
+            said = (
+                {name: group.attrs.get(name) for name in (*ALIGNMENT, "method")}
+                if isinstance(group, h5py.Group)
+                else {}
+            )
+    except (OSError, RuntimeError, KeyError, TypeError, ValueError):
+        return {}
+    numbers = {name: value for name, value in said.items() if isinstance(value, float | np.floating)}
+    found: dict[str, Any] = {
+        f"alignment_{name}": float(value) if np.isfinite(value) else None for name, value in numbers.items()
+    }
+    method = said.get("method")
+    known = isinstance(method, str) and method in ("sync", "regression")
+    return {**found, **({"alignment_method": method} if known else {})}

@@ -66,9 +66,12 @@ class Parquet:
                 file.write(text.encode())
 
 
-def _instant(text: str) -> datetime:
+def _instant(text: str) -> datetime | None:
     found = datetime.fromisoformat(text)
-    return (found if found.tzinfo else found.replace(tzinfo=UTC)).astimezone(UTC)
+    try:
+        return (found if found.tzinfo else found.replace(tzinfo=UTC)).astimezone(UTC)
+    except OverflowError:  # the first or the last day of the calendar
+        return None
 
 
 def samples(record: Opened, who: Who) -> pa.Table:
@@ -118,7 +121,7 @@ def segment_at(record: Opened, time_s: np.ndarray) -> np.ndarray:
 def record_row(record: Opened, who: Who) -> dict[str, Any]:
     """A record's row of `records`."""
     about = record.about
-    plan = json.loads(about["configuration"]).get("plan") if about.get("configuration") else None
+    plan = _plan(about.get("configuration"))
     row = {column.name: about.get(column.name) for column in dictionary.columns("records")}
     return row | {
         "record_id": who.record_id,
@@ -133,6 +136,15 @@ def record_row(record: Opened, who: Who) -> dict[str, Any]:
         "settings": None if plan is None else json.dumps(plan, ensure_ascii=False),
         "notes": "\n".join(record.notes),
     }
+
+
+def _plan(configuration: str | None) -> Any:
+    """The plan as it was asked for; None where a file says nothing of it, or nonsense."""
+    try:
+        found = json.loads(configuration or "{}")
+    except (ValueError, RecursionError):
+        return None
+    return found.get("plan") if isinstance(found, dict) else None
 
 
 def _who(who: Who, size: int) -> dict[str, Any]:

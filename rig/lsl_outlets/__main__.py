@@ -28,6 +28,7 @@ def _modest() -> None:
 
     Not SCHED_IDLE: beside two fits it gets too little of a processor to follow a test.
     """
+    os.environ["OPENBLAS_NUM_THREADS"] = "1"  # each of its threads takes memory, and there is nothing for them to do
     with contextlib.suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
         os.nice(10)

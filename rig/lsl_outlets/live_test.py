@@ -20,8 +20,8 @@ Array = NDArray[np.float64]
 DELAY_S = 0.5
 """Real seconds for which each sample waits: longer than an ack may take, and than the rest that is measured after a
 test's end."""
-GOOD_S = 0.0003
-"""Standard error of the alignment from which on samples are sent, s."""
+GOOD_S, GOOD_SHARE = 0.0003, 0.1
+"""Standard error of the alignment from which on samples are sent: s, or this share of a sample if that is longer."""
 HOLD_S = 10.0
 """Real seconds for which the first samples are held at most until the alignment is good."""
 UPDATE_S, UPDATE_SHARE = 0.5, 0.05
@@ -193,7 +193,8 @@ class LiveTest:
         first_s, last_s = float(self._held[0][0][0]), float(self._held[-1][0][-1])
         error_s = max(self._alignment.error_s(first_s), self._alignment.error_s(last_s))
         waited_s = self._newest_s - float(self._held[0][1]["host_time_s"][0])
-        self._good = self._good or error_s < GOOD_S * self._speed or waited_s > HOLD_S * self._speed
+        enough_s = max(GOOD_S * self._speed, GOOD_SHARE / self._rate_hz)
+        self._good = self._good or error_s < enough_s or waited_s > HOLD_S * self._speed
 
     def _pass_torque(self, batch: Batch, finish: bool) -> None:
         if self._alignment is None or self._alignment.line is None:
