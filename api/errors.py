@@ -53,6 +53,11 @@ class NotFoundError(ApiError):
         super().__init__(404, "not-found", f"No such {what}", f"There is no {what} {name!r}. {fix}".strip())
 
 
+def not_answering() -> ApiError:
+    """503: the database is gone, or somebody else has been writing for long."""
+    return ApiError(503, "database", "The database does not answer", "Nothing was changed. Try again in a minute.")
+
+
 class SettingsError(Exception):
     """A setting does not hold: one line, by the name of its environment variable."""
 

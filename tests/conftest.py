@@ -22,11 +22,14 @@ settings.load_profile("shared-machine")
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--campaigns", action="store_true", help="run the tests marked `campaign`, too")
+    parser.addoption("--postgresql", action="store_true", help="services keep their data in PostgreSQL, not in SQLite")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out what only a campaign runs, and count it as deselected."""
-    left_out = [item for item in items if item.get_closest_marker("campaign")]
-    if left_out and not config.getoption("--campaigns"):
-        config.hook.pytest_deselected(items=left_out)
-        items[:] = [item for item in items if not item.get_closest_marker("campaign")]
+    """Leave out what only a campaign runs, and what is SQLite's own on PostgreSQL; count it as deselected."""
+    without = [] if config.getoption("--campaigns") else ["campaign"]
+    without += ["sqlite"] if config.getoption("--postgresql") else []
+    left_out = {item for item in items if any(item.get_closest_marker(name) for name in without)}
+    if left_out:
+        config.hook.pytest_deselected(items=list(left_out))
+        items[:] = [item for item in items if item not in left_out]

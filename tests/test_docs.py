@@ -14,6 +14,7 @@ import typer
 from fastapi.routing import APIRoute
 
 import identify
+from api.centre.settings import CentreSettings
 from api.cli.main import build
 from api.settings import Settings
 from api.web.routes import routers
@@ -146,7 +147,16 @@ def check_verb(words: str, line: str) -> None:
 @pytest.mark.parametrize("page", PAGES, ids=NAMES)
 def test_settings_of_the_environment_exist(page: Path) -> None:
     known = {f"STIMRIG_{field.upper()}" for field in Settings.model_fields}
-    elsewhere = {"STIMRIG_TOKEN", "STIMRIG_URL", "STIMRIG_EXAMPLES", "STIMRIG_SEED", "STIMRIG_SOAK_MINUTES"}
+    known |= {f"STIMRIG_CENTRE_{field.upper()}" for field in CentreSettings.model_fields}
+    elsewhere = {
+        "STIMRIG_CENTRE_URL",
+        "STIMRIG_CENTRE_KEY",
+        "STIMRIG_TOKEN",
+        "STIMRIG_URL",
+        "STIMRIG_EXAMPLES",
+        "STIMRIG_SEED",
+        "STIMRIG_SOAK_MINUTES",
+    }
     assert set(re.findall(r"STIMRIG_[A-Z_]*[A-Z]", text(page))) <= known | elsewhere
 
 

@@ -74,7 +74,7 @@ def point(session: dict[str, Any], figure: str, name: Name) -> Point:
         "noted": bool(session["notes"]),
         "words": words,
         "tip": tip(session, f"{name.words} {words}", found.get("where") or ""),
-        "href": f"/models/{session['model_id']}",
+        "href": session.get("href") or f"/models/{session['model_id']}",
     }
 
 

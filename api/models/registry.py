@@ -20,8 +20,6 @@ from api.store import Store, audit
 from api.store.tables import Approval, Model
 
 log = logging.getLogger("stimrig.models")
-LATEST = "9999"
-"""Sorts after every label of time: an approval from before approvals expired."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +29,6 @@ class Served:
     model_id: str
     body: bytes
     etag: str
-    expires_utc: str
     approval_id: int
     at_utc: str
     """Since when it holds."""
@@ -40,7 +37,8 @@ class Served:
 class Versions:
     """The models of all participants.
 
-    The approved model's bytes are kept in memory, so that a controller's fetch touches no disk.
+    Which approval holds is asked of the database each time, since another service may have changed it. The bytes that
+    it stands for never change, and are kept in memory.
     """
 
     def __init__(self, store: Store, clock: Clock) -> None:
@@ -184,7 +182,6 @@ class Versions:
         with self.store.write() as session:
             session.add(decision)
             audit.write(session, now, by, "approve" if approved else "reject", row.id, reason=reason, **allowed)
-            self._served.pop(row.participant, None)
         return decision
 
     def decision(self, model_id: str) -> Approval | None:
@@ -236,20 +233,15 @@ class Versions:
 
     def served(self, participant: str) -> Served | None:
         """What the controller gets, or None where nothing is approved. Raises ApiError (500) where that is damaged."""
-        found = self._served.get(participant)
-        if found is not None and found.expires_utc <= self.clock.utc():
-            del self._served[participant]
+        approval = self.approved(participant)
+        if approval is None:
             return None
-        if found is None:
-            with self.store.write_lock:  # no approval may slip in between reading and keeping
-                approval = self.approved(participant)
-                if approval is None:
-                    return None
-                row = self.get(approval.model_id)
-                found = self._served[participant] = Served(
-                    row.id, stored.whole(row), f'"{row.etag}"', approval.expires_utc or LATEST, approval.id,
-                    approval.at_utc,
-                )  # fmt: skip
+        found = self._served.get(participant)
+        if found is None or found.approval_id != approval.id:
+            row = self.get(approval.model_id)
+            found = self._served[participant] = Served(
+                row.id, stored.whole(row), f'"{row.etag}"', approval.id, approval.at_utc
+            )
         return found
 
     def recruitment(self, participant: str) -> dict[str, list[float]] | None:

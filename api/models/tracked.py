@@ -69,7 +69,7 @@ class Trial:
 
 
 class TrackedVersions:
-    """What was tracked under each approval; the newest version of each participant is kept in memory."""
+    """What was tracked under each approval; bytes that were served are kept in memory, and never change."""
 
     def __init__(self, store: Store, clock: Clock, versions: Versions) -> None:
         self.store, self.clock, self.versions = store, clock, versions
@@ -169,7 +169,6 @@ class TrackedVersions:
             row.participant, row.model_id = approval.participant, approval.model_id
             row.recording_id, row.error_percent = trial.test.recording_id, found.get("error_percent")
             row.outcome, row.reason = NOT_FOLLOWED, found.get("reason", "")
-            served = None
             if step is not None:
                 row.outcome, row.reason, row.step = step["outcome"], "", step
                 row.ask = tracking.ask(trial.number, step, trial.alarms)
@@ -180,12 +179,9 @@ class TrackedVersions:
                 row.etag = hashlib.sha256(body).hexdigest()
                 if step is not None and last_sample_unix_s is not None:
                     row.delay_s = round(self.clock.unix_s() - last_sample_unix_s, 3)
-                served = _served(row, approval)
             session.add(row)
             detail = {"trial": row.number, "outcome": row.outcome, "reason": row.reason, "etag": row.etag}
             audit.write(session, now, f"test {row.test_id}", "track model", row.model_id, ask=row.ask, **detail)
-        if served is not None:
-            self._served[row.participant] = served
         return row
 
     def _document(self, trial: Trial, row: Tracked, model_json: str) -> bytes:
@@ -234,12 +230,15 @@ class TrackedVersions:
         approved = self.versions.served(participant)
         if approved is None:
             return None
+        conditions = (Tracked.approval_id == approved.approval_id, Tracked.etag.is_not(None))
+        newest = self.store.all(Tracked.etag, *conditions, order=Tracked.number.desc(), limit=1)
+        if not newest:
+            return approved
         found = self._served.get(participant)
-        if found is None or found.approval_id != approved.approval_id:
-            with self.store.write_lock:  # as for the approved one: nothing comes between reading and keeping
-                row = self.newest(approved.approval_id)
-                approval = self.store.get(Approval, approved.approval_id)
-                found = self._served[participant] = approved if row is None else _served(row, approval)
+        if found is None or (found.approval_id, found.etag) != (approved.approval_id, f'"{newest[0]}"'):
+            row = self.newest(approved.approval_id)
+            assert row is not None
+            found = self._served[participant] = _served(row)
         return found
 
     def text_of(self, model_id: str) -> str:
@@ -303,8 +302,7 @@ def parts(model_id: str) -> tuple[str, int, int]:
     return model_id, 0, 0
 
 
-def _served(row: Tracked, approval: Approval) -> Served:
+def _served(row: Tracked) -> Served:
     assert row.document is not None
     told = json.loads(row.document)
-    expires_utc = approval.expires_utc or ""
-    return Served(told["model_id"], row.document, f'"{row.etag}"', expires_utc, approval.id, told["tracking"]["at_utc"])
+    return Served(told["model_id"], row.document, f'"{row.etag}"', row.approval_id, told["tracking"]["at_utc"])

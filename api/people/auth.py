@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 import secrets
+from collections import OrderedDict
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from functools import partial
 from typing import Any
 
 from sqlalchemy import delete, select
@@ -22,6 +26,8 @@ from api.store.tables import Confirmation, PageSession, Token
 COOKIE = "stimrig_session"
 LOCKED = ("locked", "This page is locked")
 """Code and title of the problem that a locked session meets."""
+MOST_SEEN = 1000
+"""So many tokens and sessions are remembered for a stop while the database is gone."""
 
 
 class Scope(StrEnum):
@@ -97,7 +103,8 @@ class Auth:
     ) -> None:
         self.store, self.clock, self.guesses, self.session_s = store, clock, guesses, session_hours * 3600
         self.idle = idle
-        self._known: dict[str, Token] = {}
+        self._seen: OrderedDict[str, str] = OrderedDict()
+        self._threads = ThreadPoolExecutor(8, "who-asks")
 
     def issue(self, name: str, scopes: list[Scope], by: str, *, text: str | None = None, origin: str = "issued",
               expires_utc: str | None = None, participant: str | None = None,
@@ -116,7 +123,6 @@ class Auth:
             session.merge(row)
             bound = {} if participant is None else {"participant": participant, "plan": plan, "until": expires_utc}
             audit.write(session, now, by, "issue token", name, scopes=row.scopes, **bound)
-        self._known = {}
         return text
 
     def revoke(self, token_id: str, by: str) -> bool:
@@ -126,8 +132,11 @@ class Auth:
             for row in found:
                 row.revoked = True
                 audit.write(session, self.clock.utc(), by, "revoke token", row.name)
-        self._known = {}
         return bool(found)
+
+    def close(self) -> None:
+        """Let the threads go."""
+        self._threads.shutdown(wait=False, cancel_futures=True)
 
     def first_administrator(self, configured: str | None) -> str | None:
         """See that an administrator exists; return the new token's text if one was drawn.
@@ -147,7 +156,6 @@ class Auth:
         with self.store.write() as session:
             for token in session.scalars(select(Token).where(Token.origin == "settings", Token.hash != keep)):
                 token.revoked = True
-        self._known = {}
 
     def bearer(self, text: str, address: str = "", *, forgive_age: bool = False) -> Principal:
         """The holder of a bearer token; `forgive_age`: one that ran out, or a revoked key, presses stop.
@@ -160,22 +168,12 @@ class Auth:
         ApiError
             401: unknown, revoked or expired; 429: too many that were none.
         """
-        token, place = self._token(digest(text)), place_of(address)
+        token, place = self.store.get(Token, digest(text)), place_of(address)
         if token is None:
             self.guesses.unknown_token(place)
         elif token.origin == "settings" and not forgive_age:  # a stop waits for no pace
             self.guesses.chosen_token(token.hash, place)
         return self._principal(token, forgive_age=forgive_age)
-
-    def _token(self, token_hash: str) -> Token | None:
-        """A token's row; kept in memory, since a controller asks often, and forgotten at every change."""
-        known = self._known  # a change puts a new one in its place: what was read before it is not kept after it
-        found = known.get(token_hash)
-        if found is None:
-            found = self.store.get(Token, token_hash)
-            if found is not None:
-                known[token_hash] = found
-        return found
 
     def _principal(self, token: Token | None, csrf: str | None = None, *, forgive_age: bool = False) -> Principal:
         # A controller's key always presses stop: its trial may be playing when a person revokes it.
@@ -194,7 +192,7 @@ class Auth:
         """Whether who made this key has been removed, or the token that made it has been revoked or has expired."""
         if token.made_by is None:
             return False
-        maker = self._token(token.made_by)
+        maker: Token | None = self.store.get(Token, token.made_by)
         return maker is None or maker.revoked or (
             maker.expires_utc is not None and not maker.expires_utc > self.clock.utc()
         )  # fmt: skip
@@ -271,12 +269,18 @@ class Auth:
             raise unauthorized(
                 "Enter the password on the page /locked, or send it to POST /v1/sessions/unlock.", *LOCKED
             )
-        token = self._token(row.token_hash)
+        token: Token | None = self.store.get(Token, row.token_hash)
         principal = replace(self._principal(token, row.csrf, forgive_age=forgive_age), page_session=row, locked=locked)
         if token is None or token.origin != "user":
             return principal
         more = {Scope.REARM} if principal.may(Scope.RUN_TEST) else set()
         return replace(principal, session_hash=row.hash, scopes=principal.scopes | more)
+
+    async def ask(self, connection: HTTPConnection, **how: bool) -> Principal:
+        """`identify`, in threads of its own: whatever else waits for the database, it does not keep this from it."""
+        return await asyncio.get_running_loop().run_in_executor(
+            self._threads, partial(self.identify, connection, **how)
+        )
 
     def identify(
         self, connection: HTTPConnection, *, forgive_age: bool = False, forgive_lock: bool = False, bound: bool = False
@@ -287,9 +291,20 @@ class Auth:
         (`bound`): `api.web.key_guard`, and stop.
         """
         who = self._identify(connection, forgive_age, forgive_lock)
+        self._remember(connection, who.name)
         if who.participant is not None and not bound:
             raise outside(who.participant)
         return who
+
+    def _remember(self, connection: HTTPConnection, name: str) -> None:
+        self._seen[_credential(connection)] = name
+        self._seen.move_to_end(_credential(connection))
+        while len(self._seen) > MOST_SEEN:
+            self._seen.popitem(last=False)
+
+    def seen(self, connection: HTTPConnection) -> str | None:
+        """Who was behind this token or session when the database was last asked: good for a stop, and nothing else."""
+        return self._seen.get(_credential(connection))
 
     def _identify(self, connection: HTTPConnection, forgive_age: bool, forgive_lock: bool) -> Principal:
         header = connection.headers.get("authorization", "")
@@ -303,6 +318,10 @@ class Auth:
         if cookie:
             return self.cookie(cookie, forgive_age=forgive_age, forgive_lock=forgive_lock)
         raise unauthorized("Send `Authorization: Bearer <token>`, or sign in on the page.")
+
+
+def _credential(connection: HTTPConnection) -> str:
+    return digest(connection.headers.get("authorization", "") or connection.cookies.get(COOKIE, ""))
 
 
 def digest(text: str) -> str:

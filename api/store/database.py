@@ -1,22 +1,22 @@
-"""One door to the database: SQLite (WAL, every commit on the disk), for its owner only."""
+"""One door to the database: SQLite by default, or PostgreSQL.
+
+Who writes has the database alone, whichever process it is in: what a transaction reads holds until it is committed.
+"""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
-from urllib.parse import unquote, urlsplit
 
-from sqlalchemy import create_engine, event, select
-from sqlalchemy.engine import URL, make_url
-from sqlalchemy.exc import ArgumentError, DatabaseError, OperationalError
+from sqlalchemy import event, select
+from sqlalchemy.engine import make_url
+from sqlalchemy.exc import ArgumentError, DatabaseError, OperationalError, SQLAlchemyError
 from sqlalchemy.orm import Session, sessionmaker
 
-from api import owner_only
 from api.errors import ApiError
-from api.store import migrations
+from api.store import engines, migrations
 
 
 class Store:
@@ -34,24 +34,21 @@ class Store:
     """
 
     def __init__(self, url: str) -> None:
+        shown = url
         try:
             parsed = make_url(url)
-            path = sqlite_file(parsed)
-            if path is not None:
-                close_to_others(path)
-            self.engine = create_engine(parsed)
-            if parsed.get_backend_name() == "sqlite":
-                event.listen(self.engine, "connect", _durable_sqlite)
+            shown = parsed.render_as_string(hide_password=True)
+            self.engine = engines.opened(parsed)
             migrations.bring_up(self.engine)
         except migrations.SchemaError as error:
             raise ApiError(503, "database", "The database has another version", str(error)) from error
-        except (ArgumentError, DatabaseError, ImportError, OSError) as error:
-            fix = "set STIMRIG_DATABASE_URL or STIMRIG_DATA_DIR to a place this user may write"
-            if isinstance(error, DatabaseError) and not isinstance(error, OperationalError):
-                fix = "restore the database from a backup, or set STIMRIG_DATA_DIR to another folder"
-            raise ApiError(503, "database", "The database cannot be opened", f"{_first_line(error)}; {fix}") from error
+        except (ArgumentError, SQLAlchemyError, ImportError, OSError) as error:
+            raise ApiError(503, "database", "The database cannot be opened", _why(error, shown)) from error
+        self.several = parsed.get_backend_name() != "sqlite"
+        """Whether other services may use it at the same time."""
         self._sessions = sessionmaker(self.engine, expire_on_commit=False)
-        self.write_lock = threading.RLock()
+        self._writing = sessionmaker(self.engine.execution_options(**engines.WRITES), expire_on_commit=False)
+        self._write_lock = threading.Lock()
 
     @contextmanager
     def read(self) -> Iterator[Session]:
@@ -61,8 +58,9 @@ class Store:
 
     @contextmanager
     def write(self) -> Iterator[Session]:
-        """A transaction: committed at the end, rolled back at an error. One writer at a time."""
-        with self.write_lock, self._sessions.begin() as session:
+        """A transaction: committed at the end, rolled back at an error. One writer at a time, of all processes."""
+        with self._write_lock, self._writing.begin() as session:
+            session.connection()  # begins it now: before anything is read
             yield session
 
     def get(self, table: type[Any], key: Any) -> Any:
@@ -71,7 +69,7 @@ class Store:
             return session.get(table, key)
 
     def all(self, table: Any, *where: Any, order: Any = None, limit: int | None = None) -> list[Any]:
-        """Rows that hold the conditions, in order."""
+        """Rows, or one column of them, that hold the conditions, in order."""
         query = select(table).where(*where)
         if order is not None:
             query = query.order_by(order)
@@ -80,33 +78,21 @@ class Store:
         with self.read() as session:
             return list(session.scalars(query))
 
+    def listen(self, event_name: str, heard: Callable[..., None]) -> None:
+        """Hear an event of every session that writes, e.g. `before_commit`."""
+        event.listen(self._writing, event_name, heard)
+
     def close(self) -> None:
         """Let the connections go."""
         self.engine.dispose()
 
 
-def sqlite_file(url: URL) -> Path | None:
-    """The file behind a URL; None where there is none."""
-    name = url.database or ""
-    if url.get_backend_name() != "sqlite" or name in ("", ":memory:") or "mode=memory" in name:
-        return None
-    return Path(unquote(urlsplit(name).path)) if name.startswith("file:") else Path(name)
-
-
-def close_to_others(path: Path) -> None:
-    """The database is for its owner only: SQLite gives what it makes beside it the same rights."""
-    owner_only.folder(path.parent)
-    owner_only.file(path)
-    for beside in ("-wal", "-shm", "-journal"):
-        owner_only.close(path.with_name(path.name + beside), 0o600)
-
-
-def _durable_sqlite(connection: Any, _record: Any) -> None:
-    cursor = connection.cursor()
-    for pragma in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON", "busy_timeout=5000"):
-        cursor.execute(f"PRAGMA {pragma}")
-    cursor.close()
-
-
-def _first_line(error: Exception) -> str:
-    return str(error).splitlines()[0]
+def _why(error: Exception, shown: str) -> str:
+    """What is wrong with the database, and the fix, in one line."""
+    first = str(error).splitlines()[0]
+    if shown.startswith("postgresql"):
+        return f"{shown}: {first}; see that it runs and that STIMRIG_DATABASE_URL names it (docs/install.md)"
+    fix = "set STIMRIG_DATABASE_URL or STIMRIG_DATA_DIR to a place this user may write"
+    if isinstance(error, DatabaseError) and not isinstance(error, OperationalError):
+        fix = "restore the database from a backup, or set STIMRIG_DATA_DIR to another folder"
+    return f"{first}; {fix}"

@@ -1,7 +1,8 @@
-"""One service on a data folder and on a database: whoever comes second is told who holds it.
+"""One service on a data folder and on a SQLite database: whoever comes second is told who holds it.
 
 Held by `flock` on two files: one in the data folder, one beside the database's own file, so that two folders that name
 one database are found, too, through whatever links. The kernel lets go when the process ends, however it ends.
+Several services may share a PostgreSQL database, each with a data folder of its own.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from sqlalchemy.exc import ArgumentError
 from api import owner_only
 from api.clock import Clock
 from api.settings import Settings
-from api.store.database import sqlite_file
+from api.store.engines import sqlite_file
 
 FOLDER_MEND = "stop it, or take another folder: --data, STIMRIG_DATA_DIR"
 DATABASE_MEND = "stop it, or take another database: STIMRIG_DATABASE_URL"
@@ -83,11 +84,8 @@ def _places(settings: Settings) -> Iterator[tuple[Path, Path, str]]:
         url = make_url(settings.database)
     except ArgumentError:
         return  # the store says what is wrong with it
-    if url.get_backend_name() != "sqlite":
-        detail = "another service on the same database would not be found; leave STIMRIG_DATABASE_URL out, or SQLite"
-        raise HeldError(f"{url.render_as_string()}: refused: {detail}")
     database = sqlite_file(url)
-    if database is None:  # in memory: nobody else's
+    if database is None:  # in memory: nobody else's; PostgreSQL: made for several
         return
     real = database.resolve()
     if real.exists() and real.stat().st_nlink > 1:

@@ -1,11 +1,14 @@
-"""The tables. Times are UTC, as ISO 8601 labels; documents are JSON."""
+"""The tables. Times are UTC, as ISO 8601 labels; documents are JSON. Lengths are checked where a text comes in."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from sqlalchemy import JSON, Boolean, Float, ForeignKey, Integer, LargeBinary, String, Text
+from sqlalchemy import JSON, BigInteger, Boolean, Float, ForeignKey, Index, Integer, LargeBinary, String, Text
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
+
+OPEN_STATES = ("requested", "running", "sealing", "identifying")
+"""States of a test that goes on; in any other it is closed."""
 
 
 class Table(DeclarativeBase):
@@ -18,13 +21,13 @@ class Table(DeclarativeBase):
 
 class Participant(Table):
     __tablename__ = "participants"
-    code: Mapped[str] = mapped_column(String(32), primary_key=True)
+    code: Mapped[str] = mapped_column(String, primary_key=True)
     profile: Mapped[dict[str, Any]] = mapped_column(JSON, default=dict)
-    created_utc: Mapped[str] = mapped_column(String(32))
-    created_by: Mapped[str] = mapped_column(String(80))
-    side: Mapped[str | None] = mapped_column(String(8), default=None)
-    muscle: Mapped[str | None] = mapped_column(String(60), default=None)
-    archived_utc: Mapped[str | None] = mapped_column(String(32), default=None)
+    created_utc: Mapped[str] = mapped_column(String)
+    created_by: Mapped[str] = mapped_column(String)
+    side: Mapped[str | None] = mapped_column(String, default=None)
+    muscle: Mapped[str | None] = mapped_column(String, default=None)
+    archived_utc: Mapped[str | None] = mapped_column(String, default=None)
 
 
 class Test(Table):
@@ -32,48 +35,52 @@ class Test(Table):
 
     __tablename__ = "tests"
     __test__ = False
-    id: Mapped[str] = mapped_column(String(40), primary_key=True)
+    id: Mapped[str] = mapped_column(String, primary_key=True)
     participant: Mapped[str] = mapped_column(ForeignKey("participants.code"), index=True)
-    kind: Mapped[str] = mapped_column(String(40))
-    state: Mapped[str] = mapped_column(String(20), index=True)
+    kind: Mapped[str] = mapped_column(String)
+    state: Mapped[str] = mapped_column(String, index=True)
     reason: Mapped[str] = mapped_column(Text, default="")
     plan: Mapped[dict[str, Any]] = mapped_column(JSON)
     summary: Mapped[dict[str, Any]] = mapped_column(JSON, default=dict)
-    recording_id: Mapped[str | None] = mapped_column(String(64), default=None)
-    model_id: Mapped[str | None] = mapped_column(String(64), default=None)
-    requested_by: Mapped[str] = mapped_column(String(80))
-    requested_utc: Mapped[str] = mapped_column(String(32), index=True)
-    finished_utc: Mapped[str | None] = mapped_column(String(32), default=None)
-    ran_by: Mapped[str | None] = mapped_column(String(80), default=None)
+    recording_id: Mapped[str | None] = mapped_column(String, default=None)
+    model_id: Mapped[str | None] = mapped_column(String, default=None)
+    requested_by: Mapped[str] = mapped_column(String)
+    requested_utc: Mapped[str] = mapped_column(String, index=True)
+    finished_utc: Mapped[str | None] = mapped_column(String, default=None)
+    ran_by: Mapped[str | None] = mapped_column(String, default=None)
     """Who ran it at the rig, if that was somebody else than `requested_by`."""
+    followed_by: Mapped[str | None] = mapped_column(String, default=None)
+    """The service that follows it to its end (`api.store.holds`)."""
+    rig: Mapped[str | None] = mapped_column(String, default=None)
+    """The rig that plays it, as its services call it (`Settings.rig_name`)."""
 
 
 class Note(Table):
     """What a person noted about a session, or at a time in a test; struck, but never deleted."""
 
     __tablename__ = "notes"
-    id: Mapped[str] = mapped_column(String(40), primary_key=True)
+    id: Mapped[str] = mapped_column(String, primary_key=True)
     participant: Mapped[str] = mapped_column(ForeignKey("participants.code"), index=True)
     test_id: Mapped[str | None] = mapped_column(ForeignKey("tests.id"), default=None, index=True)
     at_s: Mapped[float | None] = mapped_column(Float, default=None)
     """From the start of the test's signals."""
-    kind: Mapped[str] = mapped_column(String(20))
+    kind: Mapped[str] = mapped_column(String)
     text: Mapped[str] = mapped_column(Text, default="")
-    by: Mapped[str] = mapped_column(String(80))
-    at_utc: Mapped[str] = mapped_column(String(32))
-    struck_by: Mapped[str | None] = mapped_column(String(80), default=None)
-    struck_utc: Mapped[str | None] = mapped_column(String(32), default=None)
+    by: Mapped[str] = mapped_column(String)
+    at_utc: Mapped[str] = mapped_column(String)
+    struck_by: Mapped[str | None] = mapped_column(String, default=None)
+    struck_utc: Mapped[str | None] = mapped_column(String, default=None)
 
 
 class Recording(Table):
     __tablename__ = "recordings"
-    id: Mapped[str] = mapped_column(String(64), primary_key=True)
+    id: Mapped[str] = mapped_column(String, primary_key=True)
     participant: Mapped[str] = mapped_column(ForeignKey("participants.code"), index=True)
-    test_id: Mapped[str | None] = mapped_column(String(40), default=None, index=True)
+    test_id: Mapped[str | None] = mapped_column(String, default=None, index=True)
     path: Mapped[str] = mapped_column(Text)
-    file_sha256: Mapped[str] = mapped_column(String(64))
-    origin: Mapped[str] = mapped_column(String(20), default="rig")
-    created_utc: Mapped[str] = mapped_column(String(32))
+    file_sha256: Mapped[str] = mapped_column(String)
+    origin: Mapped[str] = mapped_column(String, default="rig")
+    created_utc: Mapped[str] = mapped_column(String)
     warnings: Mapped[list[str] | None] = mapped_column(JSON, default=None)
     """What is in doubt about an upload; a test's doubts stand in its summary."""
 
@@ -82,22 +89,22 @@ class Model(Table):
     """One immutable version; adding an effect makes a child."""
 
     __tablename__ = "models"
-    id: Mapped[str] = mapped_column(String(64), primary_key=True)
+    id: Mapped[str] = mapped_column(String, primary_key=True)
     participant: Mapped[str] = mapped_column(ForeignKey("participants.code"), index=True)
     recording_id: Mapped[str] = mapped_column(ForeignKey("recordings.id"), index=True)
-    parent_id: Mapped[str | None] = mapped_column(String(64), default=None)
-    added_effect: Mapped[str | None] = mapped_column(String(64), default=None)
-    carried_from_id: Mapped[str | None] = mapped_column(String(64), default=None)
+    parent_id: Mapped[str | None] = mapped_column(String, default=None)
+    added_effect: Mapped[str | None] = mapped_column(String, default=None)
+    carried_from_id: Mapped[str | None] = mapped_column(String, default=None)
     """The model of an earlier session whose structure this one was fitted with."""
     carried: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True), default=None)
     """What the new record said of that structure."""
-    method: Mapped[str] = mapped_column(String(40))
+    method: Mapped[str] = mapped_column(String)
     effects: Mapped[list[str]] = mapped_column(JSON, default=list)
     fit: Mapped[dict[str, Any]] = mapped_column(JSON, default=dict)
     document: Mapped[bytes] = mapped_column(LargeBinary)
-    etag: Mapped[str] = mapped_column(String(64))
-    created_utc: Mapped[str] = mapped_column(String(32), index=True)
-    created_by: Mapped[str] = mapped_column(String(80))
+    etag: Mapped[str] = mapped_column(String)
+    created_utc: Mapped[str] = mapped_column(String, index=True)
+    created_by: Mapped[str] = mapped_column(String)
 
 
 class Approval(Table):
@@ -109,9 +116,9 @@ class Approval(Table):
     participant: Mapped[str] = mapped_column(ForeignKey("participants.code"), index=True)
     approved: Mapped[bool] = mapped_column(Boolean)
     reason: Mapped[str] = mapped_column(Text, default="")
-    by: Mapped[str] = mapped_column(String(80))
-    at_utc: Mapped[str] = mapped_column(String(32))
-    expires_utc: Mapped[str | None] = mapped_column(String(32), default=None)
+    by: Mapped[str] = mapped_column(String)
+    at_utc: Mapped[str] = mapped_column(String)
+    expires_utc: Mapped[str | None] = mapped_column(String, default=None)
     tracking: Mapped[dict[str, float] | None] = mapped_column(JSON(none_as_null=True), default=None)
     """How far the model may be tracked, in percent (`api.models.tracking.Limits`); None: nobody has allowed it."""
 
@@ -124,10 +131,10 @@ class Tracked(Table):
     approval_id: Mapped[int] = mapped_column(ForeignKey("approvals.id"), index=True)
     participant: Mapped[str] = mapped_column(ForeignKey("participants.code"))
     model_id: Mapped[str] = mapped_column(ForeignKey("models.id"))
-    recording_id: Mapped[str | None] = mapped_column(String(64), default=None)
+    recording_id: Mapped[str | None] = mapped_column(String, default=None)
     number: Mapped[int] = mapped_column(Integer)
     """Of the approval's trials, from 1."""
-    outcome: Mapped[str] = mapped_column(String(20))
+    outcome: Mapped[str] = mapped_column(String)
     """As `identify.tracking.Outcome`, or `not-followed`."""
     reason: Mapped[str] = mapped_column(Text, default="")
     """Why it was not followed."""
@@ -138,8 +145,8 @@ class Tracked(Table):
     """Why a new test is needed."""
     document: Mapped[bytes | None] = mapped_column(LargeBinary, default=None)
     """The MODEL.json that was served after it; None: that of the trial before."""
-    etag: Mapped[str | None] = mapped_column(String(64), default=None)
-    at_utc: Mapped[str] = mapped_column(String(32))
+    etag: Mapped[str | None] = mapped_column(String, default=None)
+    at_utc: Mapped[str] = mapped_column(String)
     delay_s: Mapped[float | None] = mapped_column(Float, default=None)
     """From its last sample to its being served."""
 
@@ -149,28 +156,28 @@ class Analysis(Table):
 
     __tablename__ = "analyses"
     model_id: Mapped[str] = mapped_column(ForeignKey("models.id"), primary_key=True)
-    kind: Mapped[str] = mapped_column(String(40), primary_key=True)
+    kind: Mapped[str] = mapped_column(String, primary_key=True)
     document: Mapped[dict[str, Any]] = mapped_column(JSON)
-    created_utc: Mapped[str] = mapped_column(String(32))
+    created_utc: Mapped[str] = mapped_column(String)
 
 
 class Token(Table):
     """A bearer token: only its hash is kept."""
 
     __tablename__ = "tokens"
-    hash: Mapped[str] = mapped_column(String(64), primary_key=True)
-    prefix: Mapped[str] = mapped_column(String(16))
-    name: Mapped[str] = mapped_column(String(80), index=True)
+    hash: Mapped[str] = mapped_column(String, primary_key=True)
+    prefix: Mapped[str] = mapped_column(String)
+    name: Mapped[str] = mapped_column(String, index=True)
     scopes: Mapped[list[str]] = mapped_column(JSON)
-    created_utc: Mapped[str] = mapped_column(String(32))
-    expires_utc: Mapped[str | None] = mapped_column(String(32), default=None)
+    created_utc: Mapped[str] = mapped_column(String)
+    expires_utc: Mapped[str | None] = mapped_column(String, default=None)
     revoked: Mapped[bool] = mapped_column(Boolean, default=False)
-    origin: Mapped[str] = mapped_column(String(20), default="issued")
-    participant: Mapped[str | None] = mapped_column(String(32), default=None)
+    origin: Mapped[str] = mapped_column(String, default="issued")
+    participant: Mapped[str | None] = mapped_column(String, default=None)
     """The only one that a controller's key opens; None: a token that is bound to nobody."""
     plan: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True), default=None)
     """What trials a controller's key may play."""
-    made_by: Mapped[str | None] = mapped_column(String(64), default=None)
+    made_by: Mapped[str | None] = mapped_column(String, default=None)
     """Hash of the token of whoever made a controller's key; it falls with that one."""
 
 
@@ -178,9 +185,9 @@ class PageSession(Table):
     """A browser's session, opened by signing in with a token."""
 
     __tablename__ = "page_sessions"
-    hash: Mapped[str] = mapped_column(String(64), primary_key=True)
+    hash: Mapped[str] = mapped_column(String, primary_key=True)
     token_hash: Mapped[str] = mapped_column(ForeignKey("tokens.hash"))
-    csrf: Mapped[str] = mapped_column(String(64))
+    csrf: Mapped[str] = mapped_column(String)
     created_unix_s: Mapped[float] = mapped_column(Float)
     expires_unix_s: Mapped[float] = mapped_column(Float)
     acted_unix_s: Mapped[float | None] = mapped_column(Float, default=None)
@@ -192,13 +199,13 @@ class User(Table):
     """A person with a password; what it may do, and whether still, is said by a token that nobody holds the text of."""
 
     __tablename__ = "users"
-    name: Mapped[str] = mapped_column(String(80), primary_key=True)
-    folded_name: Mapped[str | None] = mapped_column(String(320), default=None, index=True)
+    name: Mapped[str] = mapped_column(String, primary_key=True)
+    folded_name: Mapped[str | None] = mapped_column(String, default=None, index=True)
     """The name as two people must not share it: without its case."""
-    password_hash: Mapped[str] = mapped_column(String(200))
+    password_hash: Mapped[str] = mapped_column(String)
     token_hash: Mapped[str] = mapped_column(ForeignKey("tokens.hash"))
-    created_utc: Mapped[str] = mapped_column(String(32))
-    changed_utc: Mapped[str] = mapped_column(String(32))
+    created_utc: Mapped[str] = mapped_column(String)
+    changed_utc: Mapped[str] = mapped_column(String)
 
 
 class KnownPlace(Table):
@@ -206,7 +213,7 @@ class KnownPlace(Table):
 
     __tablename__ = "known_places"
     name: Mapped[str] = mapped_column(ForeignKey("users.name"), primary_key=True)
-    place: Mapped[str] = mapped_column(String(60), primary_key=True)
+    place: Mapped[str] = mapped_column(String, primary_key=True)
     at_unix_s: Mapped[float] = mapped_column(Float)
 
 
@@ -214,8 +221,16 @@ class Confirmation(Table):
     """A signed-in person has given the password once more; good for one approval."""
 
     __tablename__ = "confirmations"
-    session_hash: Mapped[str] = mapped_column(String(64), primary_key=True)
+    session_hash: Mapped[str] = mapped_column(String, primary_key=True)
     at_unix_s: Mapped[float] = mapped_column(Float)
+
+
+class Secret(Table):
+    """What all services on a database share and nobody else knows."""
+
+    __tablename__ = "secrets"
+    name: Mapped[str] = mapped_column(String, primary_key=True)
+    value: Mapped[bytes] = mapped_column(LargeBinary)
 
 
 class AuditEntry(Table):
@@ -223,10 +238,34 @@ class AuditEntry(Table):
 
     __tablename__ = "audit"
     seq: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=False)
-    at_utc: Mapped[str] = mapped_column(String(32))
-    who: Mapped[str] = mapped_column(String(80))
-    action: Mapped[str] = mapped_column(String(60))
-    subject: Mapped[str] = mapped_column(String(120))
+    at_utc: Mapped[str] = mapped_column(String)
+    who: Mapped[str] = mapped_column(String)
+    action: Mapped[str] = mapped_column(String)
+    subject: Mapped[str] = mapped_column(String)
     detail: Mapped[dict[str, Any]] = mapped_column(JSON, default=dict)
-    previous_hash: Mapped[str] = mapped_column(String(64))
-    hash: Mapped[str] = mapped_column(String(64))
+    previous_hash: Mapped[str] = mapped_column(String)
+    hash: Mapped[str] = mapped_column(String)
+
+
+class OutboxItem(Table):
+    """What a centre is told: an append-only chain, each item holding the hash of the one before (decision 0013)."""
+
+    __tablename__ = "outbox"
+    __table_args__ = (
+        Index("ix_outbox_chain_seq", "chain", "seq", unique=True),
+        Index("ix_outbox_kind_key", "kind", "key"),
+    )
+    id: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=True)
+    """In the order they were written, over all chains: the newest one's chain is the one that is pushed."""
+    chain: Mapped[str] = mapped_column(String)
+    seq: Mapped[int] = mapped_column(Integer)
+    kind: Mapped[str] = mapped_column(String)
+    key: Mapped[str] = mapped_column(String)
+    body: Mapped[str] = mapped_column(Text)
+    """The canonical text that `sha256` is of."""
+    sha256: Mapped[str] = mapped_column(String)
+    file: Mapped[str | None] = mapped_column(String, default=None, index=True)
+    file_bytes: Mapped[int | None] = mapped_column(BigInteger, default=None)
+    at_utc: Mapped[str] = mapped_column(String)
+    previous: Mapped[str] = mapped_column(String)
+    hash: Mapped[str] = mapped_column(String)

@@ -48,7 +48,7 @@ def settle(folder: Path, store: Store) -> None:
     """
     from api.store.tables import Recording
 
-    named = {Path(row.path).name for row in store.all(Recording)}
+    named = {Path(path).name for path in store.all(Recording.path)}
     for part in _ours(folder / PARTS):
         whole = folder / part.name
         if part.name in named and not whole.exists():

@@ -54,11 +54,16 @@ class BodyLimit:
         finally:
             self._previews -= 1
 
+    def bounds(self, path: str) -> tuple[int, float]:
+        """Most bytes that a route takes, and for how long it waits for them, s."""
+        if path.rstrip("/").endswith(UPLOAD):
+            return int(self.context.settings.max_upload_mb * 1e6), UPLOAD_S
+        return BODY_BYTES, BODY_S
+
     def _bounded(self, scope: Scope, receive: Receive) -> Receive:
-        upload = scope["path"].rstrip("/").endswith(UPLOAD)
-        limit = int(self.context.settings.max_upload_mb * 1e6) if upload else BODY_BYTES
+        limit, patience_s = self.bounds(scope["path"])
         loop = asyncio.get_running_loop()
-        end_s = loop.time() + (UPLOAD_S if upload else BODY_S)
+        end_s = loop.time() + patience_s
         taken, whole = 0, False
 
         async def bounded() -> Message:

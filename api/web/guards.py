@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import hmac
 from collections.abc import Awaitable, Callable
 from typing import Annotated, Any
@@ -30,7 +31,7 @@ def require(scope: Scope) -> Callable[..., Awaitable[Principal]]:
     """A dependency: the principal, if the scope is held and a session's form carries its CSRF token."""
 
     async def check(request: Request, _token: Token, _session: Session) -> Principal:
-        principal = identified(request)
+        principal = await identified(request)
         if not principal.may(scope):
             detail = f"This needs the scope {scope}; {principal.name} holds {', '.join(sorted(principal.scopes))}."
             raise ApiError(403, "forbidden", "Not allowed", detail)
@@ -43,11 +44,13 @@ def require(scope: Scope) -> Callable[..., Awaitable[Principal]]:
     return check
 
 
-def identified(request: Request) -> Principal:
+async def identified(request: Request) -> Principal:
     """Who asks; where it is a person's own doing, the session is not idle."""
     context = request.app.state.context
-    auth, principal = context.auth, context.auth.identify(request, bound=True)
-    refuse_outside(context.versions, principal, request.method, request.url.path)
+    auth, principal = context.auth, await context.auth.ask(request, bound=True)
+    if principal.participant is not None:
+        await asyncio.to_thread(refuse_outside, context.versions, principal, request.method, request.url.path)
+    request.state.who = principal
     if principal.page_session is not None and by_a_person(request):
         auth.idle.acted(principal.page_session.hash)
     return principal
@@ -63,14 +66,14 @@ def by_a_person(request: Request) -> bool:
 
 async def anyone_signed_in(request: Request, _token: Token, _session: Session) -> Principal:
     """A dependency: anyone with a valid token or session."""
-    principal = identified(request)
+    principal = await identified(request)
     await check_csrf(request, principal)
     return principal
 
 
 async def anyone_even_locked(request: Request, _token: Token, _session: Session) -> Principal:
     """A dependency: anyone with a valid token or session, which may be locked: to unlock it, or to sign out."""
-    principal = request.app.state.context.auth.identify(request, forgive_lock=True)
+    principal = request.state.who = await request.app.state.context.auth.ask(request, forgive_lock=True)
     await check_csrf(request, principal)
     return principal
 

@@ -9,11 +9,13 @@ from typing import Any
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
+from sqlalchemy.exc import DataError, InterfaceError, OperationalError, SQLAlchemyError
+from sqlalchemy.exc import TimeoutError as PoolTimeout
 from starlette.exceptions import HTTPException
 
-from api.errors import ApiError
+from api.errors import ApiError, not_answering
 from api.web.browser_session import wants_html
-from api.web.pages.render import problem_page
+from api.web.pages.render import look, problem_page
 
 log = logging.getLogger("stimrig.api")
 
@@ -48,9 +50,10 @@ def _http_detail(error: HTTPException) -> str:
     return str(error.detail)
 
 
-def respond(request: Request, problem: ApiError) -> Response:
+async def respond(request: Request, problem: ApiError) -> Response:
     """The problem as JSON, or as a page where a browser's form asked."""
     if wants_html(request):
+        await look(request)
         return problem_page(request, problem)
     return JSONResponse(
         problem.body(str(request.url.path)),
@@ -65,18 +68,30 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(ApiError)
     async def known(request: Request, error: ApiError) -> Response:
-        return respond(request, error)
+        return await respond(request, error)
 
     @app.exception_handler(RequestValidationError)
     async def invalid(request: Request, error: RequestValidationError) -> Response:
-        return respond(request, from_validation(error))
+        return await respond(request, from_validation(error))
 
     @app.exception_handler(HTTPException)
     async def http(request: Request, error: HTTPException) -> Response:
-        return respond(request, _from_http(error))
+        return await respond(request, _from_http(error))
+
+    @app.exception_handler(OperationalError)
+    @app.exception_handler(InterfaceError)
+    @app.exception_handler(PoolTimeout)
+    async def no_database(request: Request, error: SQLAlchemyError) -> Response:
+        log.error("the database, in %s %s: %s", request.method, request.url.path, error)
+        return await respond(request, not_answering())
+
+    @app.exception_handler(DataError)
+    async def not_to_be_kept(request: Request, error: DataError) -> Response:
+        detail = f"The database takes no such value: {str(error.orig).splitlines()[0]}"
+        return await respond(request, ApiError(422, "invalid-input", "The request is not valid", detail))
 
     @app.exception_handler(Exception)
     async def unexpected(request: Request, error: Exception) -> Response:
         log.exception("unexpected error in %s %s", request.method, request.url.path, exc_info=error)
         detail = "Nothing was lost. The service's log (logs/api.log in the data folder) says more."
-        return respond(request, ApiError(500, "internal", "Something unexpected went wrong here", detail))
+        return await respond(request, ApiError(500, "internal", "Something unexpected went wrong here", detail))

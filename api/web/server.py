@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import ipaddress
 import json
 import os
 import socket
 import sys
+from typing import Protocol
 
 import uvicorn
 from starlette.types import ASGIApp
@@ -19,7 +19,7 @@ from starlette.types import ASGIApp
 from api import logs
 from api.errors import ApiError, SettingsError
 from api.models import carried_structure
-from api.settings import Settings
+from api.settings import Settings, loopback
 from api.store.lock import ServiceLock
 from api.web.app import create_app
 from api.web.connections import protocol, raise_file_limit
@@ -60,7 +60,20 @@ def configuration(app: ASGIApp) -> uvicorn.Config:
     )  # fmt: skip
 
 
-def refuse_open_door(settings: Settings) -> None:
+class Door(Protocol):
+    """Settings of whatever listens: a rig's service, a centre."""
+
+    @property
+    def host(self) -> str: ...
+
+    @property
+    def tls_proxy(self) -> bool: ...
+
+    @property
+    def secure_cookies(self) -> bool: ...
+
+
+def refuse_open_door(settings: Door) -> None:
     """Passwords and tokens don't travel in the clear: another address than loopback only behind a TLS proxy.
 
     Raises
@@ -75,14 +88,6 @@ def refuse_open_door(settings: Settings) -> None:
         "machine, set STIMRIG_TLS_PROXY=true and STIMRIG_SECURE_COOKIES=true"
     )
     raise OSError(f"{settings.host}: refused, it is not this machine's loopback; {fix}")
-
-
-def loopback(host: str) -> bool:
-    """Whether an address can be reached from this machine only."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
 
 
 def bind(host: str, port: int) -> socket.socket:

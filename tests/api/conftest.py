@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 import shutil
 import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -17,12 +18,16 @@ import httpx
 import pytest
 import uvicorn
 from argon2 import PasswordHasher
+from sqlalchemy import text
 
 from api.people import passwords
 from api.settings import Settings
+from api.store import Store
 from api.web import connections
 from api.web.app import create_app
 from tests.api.fake_rig import FakeRig, RigThread
+from tests.harness import postgres
+from tests.harness.postgres import Cluster
 
 TOKEN = "administrator-token-of-the-tests"
 PATIENCE_S = 60.0
@@ -45,6 +50,59 @@ def quick_passwords() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="session")
+def cluster() -> Iterator[Cluster]:
+    """PostgreSQL, of this test process's own."""
+    if postgres.programs() is None:
+        pytest.skip("Debian's PostgreSQL is not installed (apt-get install postgresql)")
+    with postgres.running() as cluster:
+        yield cluster
+
+
+@pytest.fixture(scope="session", autouse=True)
+def kept_in_postgresql(request: pytest.FixtureRequest) -> Iterator[Cluster | None]:
+    """With `--postgresql`: what a data folder's database is without it, one in the cluster is for the same folder."""
+    if not request.config.getoption("--postgresql"):
+        yield None
+        return
+    cluster: Cluster = request.getfixturevalue("cluster")
+
+    def database(settings: Settings) -> str:
+        return settings.database_url or cluster.database(str(settings.data_dir.absolute()))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Settings, "database", property(database))
+        yield cluster
+
+
+@pytest.fixture(autouse=True)
+def processes_keep_it_there_too(
+    kept_in_postgresql: Cluster | None, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Services that a test starts as processes read their database from the environment."""
+    if kept_in_postgresql is not None and "tmp_path" in request.fixturenames:
+        address = kept_in_postgresql.database(str(request.getfixturevalue("tmp_path")))
+        monkeypatch.setenv("STIMRIG_DATABASE_URL", address)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def no_database_on_the_event_loop() -> Iterator[None]:
+    """A database that does not answer holds up whoever asks it; on the event loop that would be every stop, too."""
+
+    def off_the_loop(ask: Callable[..., Any]) -> Callable[..., Any]:
+        def asked(store: Store) -> Any:
+            with pytest.raises(RuntimeError):
+                asyncio.get_running_loop()
+            return ask(store)
+
+        return asked
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Store, "read", off_the_loop(Store.read))
+        patch.setattr(Store, "write", off_the_loop(Store.write))
+        yield
+
+
 @dataclass
 class Service:
     """A running service and ways to it."""
@@ -62,6 +120,12 @@ class Service:
         headers = {"Authorization": f"Bearer {token}"} if token else {}
         headers |= more.pop("headers", {})
         return httpx.Client(base_url=self.url, headers=headers, **{"timeout": PATIENCE_S} | more)
+
+    def sql(self, statement: str) -> Any:
+        """Done to the database behind the service's back; what it answers."""
+        with self.app.state.context.store.write() as session:
+            done = session.execute(text(statement))
+            return done.all() if done.returns_rows else []
 
     def token(self, name: str, *scopes: str) -> str:
         with self.client() as client:

@@ -54,7 +54,7 @@ def test_a_stop_is_answered_while_every_thread_waits_for_the_database(
         with service.client() as other:
             codes.append(other.post("/v1/participants", json={"code": f"W{number}"}).status_code)
 
-    with ThreadPoolExecutor(80) as pool, store.write_lock:
+    with ThreadPoolExecutor(80) as pool, store.write():
         for number in range(80):
             pool.submit(add, number)
         time.sleep(0.5)  # they are all on their way

@@ -232,7 +232,6 @@ def test_it_ends_with_its_day_and_where_it_is_revoked_and_still_stops(
     row = context.store.get(Token, digest(text))
     assert row.expires_utc == context.clock.end_of_day_utc() and row.participant == "P1"
     with shared.client(text) as key:
-        context.auth._known.clear()
         with context.store.write() as session:
             session.get(Token, digest(text)).expires_utc = context.clock.utc()
         assert key.get("/v1/participants/P1/model").status_code == 401
@@ -248,7 +247,6 @@ def test_it_ends_with_its_day_and_where_it_is_revoked_and_still_stops(
         assert key.post("/v1/tests", json=TRIAL).status_code == 401 and key.post("/v1/stop").status_code == 200
     page = admin.get("/participants/P1", headers=HTML).text
     assert "revoked" in page and "expired" in page and text not in page
-    context.auth._known.clear()
     with context.store.write() as session:
         for row in session.scalars(select(Token).where(Token.participant == "P1")):
             row.created_utc = "2020-01-01T09:00:00.000Z"
@@ -386,7 +384,6 @@ def test_it_falls_with_the_token_of_its_maker_and_still_stops(
         else:
             with context.store.write() as session:
                 session.get(Token, digest(text)).expires_utc = context.clock.utc()
-            context.auth._known.clear()
         for answer in (key.get("/v1/participants/P1/model"), key.post("/v1/tests", json=TRIAL)):
             assert answer.status_code == 401 and "Who made this key" in answer.text
         assert key.post("/v1/stop").status_code == 200

@@ -128,7 +128,6 @@ def test_it_closes_with_its_token_and_with_no_other(service: Service, test_id: s
                     row.expires_utc = "2020-01-01T00:00:00Z"
                 else:
                     row.scopes = ["read-model"]
-            context.auth._known.clear()
         said = last(socket)
         assert said["problem"]["status"] == (403 if how == "scope" else 401)
         goes_on(others)

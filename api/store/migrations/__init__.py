@@ -15,9 +15,12 @@ from alembic.runtime.migration import MigrationContext
 from alembic.script import ScriptDirectory
 from sqlalchemy import Connection, Engine, inspect, text
 
-from api.store.tables import Table
+from api.store import centre_tables
+from api.store.engines import WRITES
 
 FOLDER = Path(__file__).parent
+METADATA = centre_tables.Table.metadata
+"""Of all tables: the centre's, too."""
 NUMBERED = {0: "0001", 1: "0001", 2: "0002", 3: "0003", 4: "0004"}
 """The revision of each number in `schema_version`; 0: tables, but no number yet."""
 SCRIPTS = ScriptDirectory(str(FOLDER))
@@ -37,11 +40,14 @@ def bring_up(engine: Engine) -> None:
         The database is newer than the software, or lacks a column that no revision adds.
     """
     with engine.connect() as connection:
-        if MigrationContext.configure(connection).get_current_revision() != NEWEST:
-            connection.exec_driver_sql("BEGIN IMMEDIATE")  # sqlite3 itself begins no transaction before it makes tables
-            _upgrade(connection)
-        _refuse_lacking(connection)
-        connection.commit()
+        at = MigrationContext.configure(connection).get_current_revision()
+        connection.rollback()
+        if at != NEWEST:
+            with engine.execution_options(**WRITES).begin() as writer:  # one service at a time, and only once
+                _upgrade(writer)
+                _refuse_lacking(writer)
+        else:
+            _refuse_lacking(connection)
 
 
 def _upgrade(connection: Connection) -> None:
@@ -77,7 +83,7 @@ def _newer(found: object) -> SchemaError:
 
 def _refuse_lacking(connection: Connection) -> None:
     """Compare the database with the tables of `api.store.tables`."""
-    for difference in compare_metadata(MigrationContext.configure(connection), Table.metadata):
+    for difference in compare_metadata(MigrationContext.configure(connection), METADATA):
         if difference[0] == "add_column":
             lacking = f"table {difference[2]} lacks {difference[3].name}"
         elif difference[0] == "add_table":

@@ -15,7 +15,7 @@ from api.sessions import directory
 from api.web.browser_session import local, same_origin, set_cookie
 from api.web.dependencies import Context, Ctx, EvenLocked
 from api.web.guards import identified
-from api.web.pages.render import page, problem_page
+from api.web.pages.render import look, page, problem_page
 
 router = APIRouter(include_in_schema=False)
 SHOWN = 50
@@ -26,7 +26,7 @@ SHOWN = 50
 async def home(request: Request, context: Ctx, q: str = "", archived: str = "", all: str = "") -> Response:
     """Participants and the rig; the sign-in form for who is not signed in."""
     try:
-        who = identified(request)
+        who = await identified(request)
     except ApiError as error:
         return await sign_in_page(request, context, "/") if error.code != LOCKED[0] else problem_page(request, error)
     asked = Asked(q[:80].strip(), archived == "1", all == "1")
@@ -57,6 +57,7 @@ async def sign_in_page(
     """The sign-in form; with what went wrong, if anything did."""
     people = await asyncio.to_thread(context.people.any)
     status = problem.status if problem else 200
+    await look(request)
     answer = page(request, "sign_in.html", status, next=local(next), problem=problem, people=people, name=name)
     answer.headers.update(problem.headers if problem else {})
     return answer

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 from urllib.parse import quote
 
 from fastapi import Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
+from jinja2 import Environment
 from sqlalchemy.exc import SQLAlchemyError
 
 from api import language
@@ -20,19 +25,32 @@ from api.web.pages.environment import environment
 environment.filters["what_to_check"] = rig_state.what_to_check
 environment.globals["colours_media"] = colours.MEDIA
 
+LOOK_S = 1.0
+
+
+@dataclass(frozen=True)
+class Face:
+    """What the pages of an application look like: its templates, and what each of them has at its top.
+
+    `bar` is asked with the request, who looks at the page, and the same where nothing keeps that from doing more.
+    """
+
+    environment: Environment
+    bar: Callable[[Request, Principal | None, Principal | None], dict[str, Any]]
+
+
 BACK = {"models": "Back to the model", "participants": "Back to the participant", "tests": "Back to the test"}
 
 
 def page(request: Request, template: str, status: int = 200, **values: Any) -> HTMLResponse:
     """A page, with the bar that every page has."""
-    context = request.app.state.context
-    looking = known(request)
-    right = stop_right(request, looking)
+    face: Face = getattr(request.app.state, "face", RIG)
+    looking: Principal | None = getattr(request.state, "who", None)
     principal = None if looking is None or looking.locked else looking
-    bar = {**bar_of(context, principal), "right": right, "version": request.app.version}
-    shown = {"bar": bar, "principal": principal, "here": here(request), "zone": zone(context)}
+    bar = {**face.bar(request, looking, principal), "version": request.app.version}
+    shown = {"bar": bar, "principal": principal, "here": here(request), "zone": zone(request.app.state.context)}
     shown["colours"] = colours.chosen(request)
-    html = environment.get_template(template).render(request=request, **shown, **values)
+    html = face.environment.get_template(template).render(request=request, **shown, **values)
     return HTMLResponse(html, status_code=status)
 
 
@@ -42,12 +60,18 @@ def zone(context: Context) -> str:
     return offset if name in ("", offset, "Etc/UTC") else f"{name} ({offset})"
 
 
-def known(request: Request) -> Principal | None:
-    """Who looks at the page; nobody where the database does not answer: what a stop did is said all the same."""
-    try:
-        return request.app.state.context.auth.identify(request, forgive_age=True)
-    except (ApiError, SQLAlchemyError):
-        return None
+async def look(request: Request) -> None:
+    """Find out who looks at a page that anybody may see, for its bar.
+
+    Nobody, where the database does not answer at once: what a stop did is said all the same.
+    """
+    if getattr(request.state, "who", None) is not None:
+        return
+    asked = asyncio.ensure_future(request.app.state.context.auth.ask(request, forgive_age=True))
+    asked.add_done_callback(lambda done: done.cancelled() or done.exception())  # what is said too late is no matter
+    with contextlib.suppress(ApiError, SQLAlchemyError, TimeoutError):
+        async with asyncio.timeout(LOOK_S):
+            request.state.who = await asyncio.shield(asked)
 
 
 def stop_right(request: Request, principal: Principal | None) -> str | None:
@@ -74,6 +98,15 @@ def bar_of(context: Context, principal: Principal | None) -> dict[str, Any]:
         "now": rig_state.now(context, principal),
         "may_rearm": principal is not None and principal.may(Scope.REARM),
     }
+
+
+def rig_bar(request: Request, looking: Principal | None, principal: Principal | None) -> dict[str, Any]:
+    """What every page of a rig's service has at its top, with what its stop button is good for."""
+    return {**bar_of(request.app.state.context, principal), "right": stop_right(request, looking)}
+
+
+RIG = Face(environment, rig_bar)
+"""The pages of a rig's service."""
 
 
 def here(request: Request) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from typing import Any
 
 from fastapi import APIRouter, Request
 from fastapi.responses import Response
@@ -11,14 +12,18 @@ from api.charts import model_charts
 from api.charts.svg import svg
 from api.language import _
 from api.models import advice, explanation, stored, summary
-from api.store.tables import Recording
-from api.web.dependencies import Ctx, ModelReader
+from api.store.tables import Model, Recording
+from api.web.dependencies import Context, Ctx, ModelReader
 from api.web.pages import session_facts
 from api.web.pages.model_view import measurement
 from api.web.pages.render import page
 
 router = APIRouter(include_in_schema=False)
 TALL, LOW = 312.0, 215.0
+
+
+def _versions(context: Context, lineage: list[Model], shown: str) -> list[dict[str, Any]]:
+    return explanation.versions([context.versions.document(version) for version in lineage], shown)
 
 
 @router.get("/models/{model_id}/report")
@@ -57,7 +62,7 @@ async def report(request: Request, context: Ctx, _who: ModelReader, model_id: st
         drawn=drawn,
         problem=measured["problem"],
         why=explanation.view(found, measured["comparison"], row.effects, leaves) if found else None,
-        versions=explanation.versions([context.versions.document(version) for version in lineage], row.id),
+        versions=await asyncio.to_thread(_versions, context, lineage, row.id),
         recording=recording,
         session=await asyncio.to_thread(session_facts.of, context, recording),
         warnings=await asyncio.to_thread(context.runner.lifecycle.warnings, row.recording_id),

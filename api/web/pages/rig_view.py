@@ -21,7 +21,7 @@ async def rig_now(request: Request, context: Ctx) -> Response:
     """The state for the bar of every page, also of one whose session has ended."""
     principal, locked = None, False
     try:
-        principal = context.auth.identify(request)
+        principal = await context.auth.ask(request)
     except ApiError as error:  # the state is told all the same
         locked = error.code == LOCKED[0]
     except SQLAlchemyError:

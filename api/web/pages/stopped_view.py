@@ -7,7 +7,7 @@ from fastapi.responses import Response
 
 from api.errors import ApiError
 from api.web.dependencies import Ctx
-from api.web.pages.render import page
+from api.web.pages.render import look, page
 
 router = APIRouter(include_in_schema=False)
 
@@ -17,6 +17,7 @@ async def stopped(request: Request, context: Ctx, key: str) -> Response:
     """The rig's evidence that stimulation has stopped, or why that is not sure."""
     told = context.stops.get(key)
     request.state.stop_right = told.right
+    await look(request)
     if isinstance(told.answer, ApiError):
         return page(request, "problem.html", told.answer.status, problem=told.answer, back=None)
     return page(request, "stop.html", told=told, evidence=told.answer)

@@ -48,7 +48,7 @@ async def approved_model(
     """
     if tracked:
         await context.runner.trials.settled()
-    served = context.tracked.served(code) if tracked else context.versions.served(code)
+    served = await asyncio.to_thread(context.tracked.served if tracked else context.versions.served, code)
     if served is None:
         await asyncio.to_thread(participants.find, context, code)
         raise none_approved(code)

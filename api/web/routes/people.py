@@ -120,7 +120,7 @@ async def sign_in(context: Ctx, request: Request) -> Response:
     given = await _given(request, form)
     address = request.client.host if request.client else ""
     cookie = await context.people.sign_in(given.name, given.password, address)
-    principal = context.auth.cookie(cookie)
+    principal = await asyncio.to_thread(context.auth.cookie, cookie)
     answer: Response
     if form:
         answer = RedirectResponse(local(str((await request.form()).get("next") or "/")), 303)

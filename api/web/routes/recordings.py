@@ -101,7 +101,8 @@ async def upload(
     data = await bounded_body(request, context.settings.max_upload_mb)
     row, model, warnings = await take_in(context, code, data, who.name, columns)
     response.headers["Location"] = f"/v1/recordings/{row.id}"
-    return {"recording_id": row.id, "model": context.versions.document(model), "warnings": warnings}
+    version = await asyncio.to_thread(context.versions.document, model)
+    return {"recording_id": row.id, "model": version, "warnings": warnings}
 
 
 async def take_in(

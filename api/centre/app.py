@@ -1,0 +1,107 @@
+"""The centre's application: an application of its own, without rig, runner, workers, tests and stop button."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+from fastapi import FastAPI
+from fastapi.routing import APIRoute
+from starlette.types import Receive, Scope, Send
+
+from api.centre import pages, routes
+from api.centre.chain import MOST_ITEM_BYTES
+from api.centre.context import Context, build
+from api.centre.pages.face import FACE
+from api.centre.settings import CentreSettings
+from api.centre.spool import MOST_PIECE_BYTES
+from api.clock import Clock
+from api.version import software_version
+from api.web import openapi, problems
+from api.web import pages as web_pages
+from api.web import routes as web_routes
+from api.web.app import Service
+from api.web.body_limit import BODY_BYTES, BODY_S, BodyLimit
+from api.web.strict_body import StrictBody
+
+DESCRIPTION = """
+Rigs push with their own keys to `/v1/rig/…`; everything else is for people and programs, who only read: programs send
+`Authorization: Bearer <token>`, browsers have a session's cookie. Every error is `application/problem+json` (RFC 9457).
+"""
+RIG_SIDE = "/v1/rig/"
+PIECE_S = 300.0
+SHARED = (
+    "/sign-in", "/sign-out", "/locked", "/unlock", "/lock", "/rig/acted", "/language", "/colours", "/static/{name}",
+    "/docs", "/administration", "/administration/users", "/administration/users/{name}/password",
+    "/administration/users/{name}/remove", "/administration/keys", "/administration/tokens/{token_id}/revoke",
+    "/administration/audit.jsonl", "/v1/users", "/v1/users/{name}/password", "/v1/users/{name}", "/v1/sessions",
+    "/v1/sessions/lock", "/v1/sessions/unlock", "/v1/sessions/current", "/v1/tokens", "/v1/tokens/{token_id}",
+    "/v1/audit",
+)  # fmt: skip
+"""Addresses of a rig's service that the centre has, too: signing in, people, tokens, audit trail, what pages need."""
+
+
+class CentreBodyLimit(BodyLimit):
+    """Batches of items and pieces of files may be longer than a person's requests."""
+
+    def bounds(self, path: str) -> tuple[int, float]:
+        """Most bytes that a route takes, and for how long it waits for them, s."""
+        if path.startswith(f"{RIG_SIDE}files/"):
+            return MOST_PIECE_BYTES, PIECE_S
+        if path.rstrip("/") == f"{RIG_SIDE}items":
+            return MOST_ITEM_BYTES, PIECE_S
+        return BODY_BYTES, BODY_S
+
+
+class CentreStrictBody(StrictBody):
+    """What rigs send is read strictly by its route: in a thread, and only after the key."""
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] == "http" and scope["path"].startswith(RIG_SIDE):
+            await self.app(scope, receive, send)
+        else:
+            await super().__call__(scope, receive, send)
+
+
+def create_app(settings: CentreSettings | None = None, clock: Clock | None = None) -> FastAPI:
+    """The application.
+
+    Raises
+    ------
+    ApiError
+        The database cannot be opened.
+    SettingsError
+        The bucket is not there, or a package is missing.
+    """
+    context = build(settings or CentreSettings(), clock)
+    app = Service(
+        title="stimrig centre", version=software_version(), summary="What rigs have pushed.", description=DESCRIPTION,
+        lifespan=_lifespan(context), docs_url=None, redoc_url=None, openapi_url="/openapi.json",
+    )  # fmt: skip
+    app.state.context, app.state.face = context, FACE
+    app.add_middleware(CentreStrictBody)
+    app.add_middleware(CentreBodyLimit, context=context)  # the last one added stands outside
+    problems.install(app)
+    for router in [*routes.routers(), *pages.routers()]:
+        app.include_router(router)
+    app.router.routes.extend(shared())
+    openapi.describe(app)
+    return app
+
+
+def shared() -> list[APIRoute]:
+    """The routes of a rig's service that the centre has, too."""
+    there = [route for router in [*web_routes.routers(), *web_pages.routers()] for route in router.routes]
+    return [route for route in there if isinstance(route, APIRoute) and route.path in SHARED]
+
+
+def _lifespan(context: Context):
+    @asynccontextmanager
+    async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
+        await context.open()
+        try:
+            yield
+        finally:
+            await context.close()
+
+    return lifespan

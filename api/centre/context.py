@@ -1,0 +1,146 @@
+"""The centre's parts, made once and handed to its routes; what those of `api.web` ask of theirs is here, too."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import shutil
+import time
+from dataclasses import dataclass, field
+from typing import Annotated
+
+from fastapi import Depends, Request
+from sqlalchemy.exc import SQLAlchemyError
+
+from api import owner_only
+from api.centre import warnings, watch
+from api.centre.bucket import Bucket, BucketError
+from api.centre.ingest import Ingest
+from api.centre.rigs import Rigs
+from api.centre.settings import CentreSettings
+from api.centre.spool import Spool
+from api.clock import Clock, set_zone
+from api.errors import ApiError, SettingsError
+from api.models.registry import Versions
+from api.people.accounts import People
+from api.people.auth import Auth
+from api.people.idle_lock import FLUSH_S, IdleLock
+from api.people.pace import Guesses
+from api.store import Store
+
+log = logging.getLogger("stimrig.centre")
+MOST_DOWNLOADS = 4
+
+
+@dataclass
+class Context:
+    """Everything a route of the centre may need."""
+
+    settings: CentreSettings
+    clock: Clock
+    store: Store
+    auth: Auth
+    people: People
+    rigs: Rigs
+    ingest: Ingest
+    bucket: Bucket
+    spool: Spool
+    versions: Versions
+    """Of no use here but to the guard of controllers' keys, which open nothing at a centre."""
+    drawn_token: str | None = None
+    downloads: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(MOST_DOWNLOADS))
+    """So many files are read from the bucket at the same time."""
+    started_s: float = field(default_factory=time.monotonic)
+    waiting_warnings: int = 0
+    """As many as were there when they were counted last: for the bar of pages, and for nothing else."""
+    tasks: list[asyncio.Task[None]] = field(default_factory=list)
+
+    async def open(self) -> None:
+        """Begin to look after what nobody asks for."""
+        every = ((FLUSH_S, self.auth.idle.flush), (watch.EVERY_S, lambda: watch.look(self)))
+        self.tasks = [asyncio.create_task(_again(every_s, what)) for every_s, what in every]
+
+    async def count_warnings(self) -> None:
+        """Count those that nobody has acknowledged."""
+        self.waiting_warnings = await asyncio.to_thread(warnings.open_count, self.store)
+
+    async def close(self) -> None:
+        """Let everything go."""
+        for task in self.tasks:
+            task.cancel()
+        with contextlib.suppress(SQLAlchemyError):
+            await asyncio.to_thread(self.auth.idle.flush)
+        self.people.close()
+        self.store.close()
+
+
+async def _again(every_s: float, what) -> None:
+    while True:
+        await asyncio.sleep(every_s)
+        try:
+            await asyncio.to_thread(what)
+        except (SQLAlchemyError, OSError, BucketError):  # the next time has it all
+            log.exception("what the centre looks after by itself could not be done")
+
+
+def build(settings: CentreSettings, clock: Clock | None = None) -> Context:
+    """Make the parts.
+
+    Raises
+    ------
+    ApiError
+        The database cannot be opened.
+    SettingsError
+        The bucket is not there, or a package is missing.
+    """
+    clock = clock or Clock()
+    try:
+        owner_only.folder(settings.data_dir)
+        owner_only.folder(settings.spool_dir)
+        shutil.rmtree(settings.exports_dir, ignore_errors=True)
+        owner_only.folder(settings.exports_dir)
+    except OSError as error:
+        detail = f"{settings.data_dir}: {error.strerror}; set STIMRIG_CENTRE_DATA_DIR to a folder this user may write"
+        raise SettingsError(detail) from error
+    if settings.time_zone:
+        set_zone(settings.time_zone)
+    bucket = ready_bucket(settings)
+    store = opened(settings)
+    guesses = Guesses(clock)
+    auth = Auth(store, clock, guesses, IdleLock(store, clock, settings.idle_lock_min), settings.session_hours)
+    drawn = auth.first_administrator(settings.admin_token.get_secret_value() if settings.admin_token else None)
+    return Context(
+        settings, clock, store, auth, People(store, clock, auth, guesses), Rigs(store, clock, guesses),
+        Ingest(store, clock, int(settings.max_file_mb * 1e6)), bucket,
+        Spool(settings.spool_dir, store, clock, bucket), Versions(store, clock), drawn,
+    )  # fmt: skip
+
+
+def ready_bucket(settings: CentreSettings) -> Bucket:
+    """The bucket, which is there. Raises SettingsError."""
+    if settings.files is None:
+        owner_only.folder(settings.data_dir / "files")
+    bucket = Bucket(settings.bucket)
+    try:
+        bucket.ready(begin=True)
+    except BucketError as error:
+        raise SettingsError(f"STIMRIG_CENTRE_FILES: {error}; give a folder or bucket that can be written") from error
+    return bucket
+
+
+def opened(settings: CentreSettings) -> Store:
+    """The database. Raises ApiError, in whose line the centre's settings stand."""
+    try:
+        return Store(settings.database)
+    except ApiError as error:
+        error.args = (str(error).replace("STIMRIG_DA", "STIMRIG_CENTRE_DA"),)
+        raise
+
+
+async def from_request(request: Request) -> Context:
+    """The application's context, as a dependency."""
+    return request.app.state.context
+
+
+Ctx = Annotated[Context, Depends(from_request)]

@@ -1,0 +1,193 @@
+"""What the pages ask: participants, sessions, recordings. Every query by an index; paged by key, never by offset."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from sqlalchemy import Select, exists, select, tuple_
+
+from api.centre import clean
+from api.errors import ApiError
+from api.store import Store
+from api.store.centre_tables import (
+    CentreDecision,
+    CentreEffect,
+    CentreModel,
+    CentreParticipant,
+    CentreRecording,
+    CentreRig,
+    CentreSession,
+    CentreTest,
+)  # fmt: skip
+
+PARTICIPANTS, SESSIONS = 50, 12
+MOST_IN_A_SESSION = 400
+"""Recordings, tests, models of a page of sessions."""
+LAST = "\U0010ffff"
+"""Sorts after every text."""
+
+
+@dataclass(frozen=True)
+class Search:
+    """What participants are searched for; None: whatever."""
+
+    q: str = ""
+    rig_id: int | None = None
+    from_day: str | None = None
+    to_day: str | None = None
+    effect: str | None = None
+    verdict: str | None = None
+    after: str = ""
+
+
+def participants(store: Store, asked: Search, limit: int = PARTICIPANTS) -> tuple[list[dict[str, Any]], str | None]:
+    """A page of participants, by code; the code after which the next page begins, or None."""
+    query = _codes(asked).order_by(CentreParticipant.code).distinct().limit(limit + 1)
+    with store.read() as session:
+        codes = list(session.scalars(query))
+        of = select(CentreParticipant, CentreRig.name).join(CentreRig, CentreRig.id == CentreParticipant.rig_id)
+        rows = session.execute(of.where(CentreParticipant.code.in_(codes[:limit]))).all()
+    found: dict[str, dict[str, Any]] = {}
+    for row, rig in sorted(rows, key=lambda pair: (pair[0].code, pair[0].last_utc or "")):
+        one = found.setdefault(row.code, {"code": row.code, "rigs": [], "sessions": 0, "recordings": 0})
+        one["rigs"].append(rig)
+        one["sessions"] += row.sessions
+        one["recordings"] += row.recordings
+        one.update(last_utc=row.last_utc, verdict=row.verdict, side=row.side, muscle=row.muscle)
+    return list(found.values()), codes[limit - 1] if len(codes) > limit else None
+
+
+def _codes(asked: Search) -> Select[tuple[str]]:
+    own, past, held = CentreParticipant, CentreSession, CentreEffect
+    query = select(own.code).where(own.code > asked.after)
+    if asked.q:
+        query = query.where(own.code >= asked.q, own.code < asked.q + LAST)
+    if asked.rig_id is not None:
+        query = query.where(own.rig_id == asked.rig_id)
+    if asked.from_day or asked.to_day or asked.verdict:
+        same = [past.participant == own.code, past.rig_id == own.rig_id]
+        same += [past.day >= asked.from_day] if asked.from_day else []
+        same += [past.day <= asked.to_day] if asked.to_day else []
+        same += [past.verdict == asked.verdict] if asked.verdict else []
+        query = query.where(exists().where(*same))
+    if asked.effect:
+        same = [held.effect == asked.effect, held.participant == own.code, held.rig_id == own.rig_id]
+        query = query.where(exists().where(*same))
+    return query
+
+
+def person(store: Store, code: str) -> list[dict[str, Any]]:
+    """A participant at each of its rigs; empty where there is none."""
+    of = select(CentreParticipant, CentreRig.name).join(CentreRig, CentreRig.id == CentreParticipant.rig_id)
+    with store.read() as session:
+        rows = session.execute(of.where(CentreParticipant.code == code)).all()
+    return [{**row.as_dict(), "rig": name} for row, name in rows]
+
+
+def sessions(
+    store: Store, code: str, before: tuple[str, int] | None = None, limit: int = SESSIONS
+) -> tuple[list[dict[str, Any]], tuple[str, int] | None]:
+    """A participant's sessions over all rigs, newest first, with what was made in them; the key of the next page."""
+    own = CentreSession
+    query = select(own, CentreRig.name).join(CentreRig, CentreRig.id == own.rig_id).where(own.participant == code)
+    if before is not None:
+        query = query.where(tuple_(own.day, own.rig_id) < tuple_(*before))
+    with store.read() as session:
+        rows = session.execute(query.order_by(own.day.desc(), own.rig_id.desc()).limit(limit + 1)).all()
+    more = (rows[limit - 1][0].day, rows[limit - 1][0].rig_id) if len(rows) > limit else None
+    found = [{**row.as_dict(), "rig": name} for row, name in rows[:limit]]
+    _fill(store, code, found)
+    return found, more
+
+
+def _fill(store: Store, code: str, found: list[dict[str, Any]]) -> None:
+    """Put tests, recordings, models and decisions to their sessions."""
+    if not found:
+        return
+    first, last = min(one["at_utc"] for one in found), max(one["day"] for one in found)
+    parts: dict[str, tuple[Any, Any]] = {
+        "made_tests": (CentreTest, CentreTest.requested_utc),
+        "made_recordings": (CentreRecording, CentreRecording.created_utc),
+        "models": (CentreModel, CentreModel.created_utc),
+        "decisions": (CentreDecision, CentreDecision.at_utc),
+    }
+    by_day = {(one["day"], one["rig_id"]): one for one in found}
+    for name, (table, at) in parts.items():
+        for one in found:
+            one[name] = []
+        held = select(table).where(table.participant == code, at >= first, at < _day_after(last))
+        with store.read() as session:
+            rows = session.scalars(held.order_by(at.desc()).limit(MOST_IN_A_SESSION)).all()
+        for row in rows:
+            one = by_day.get((clean.day(getattr(row, at.key)), row.rig_id))
+            if one is not None:
+                one[name].append(row)
+
+
+def _day_after(day: str) -> str:
+    """A label behind all of a day's, in whatever time zone the day is."""
+    return f"{clean.days_later(day, 2)}T"
+
+
+def stood(store: Store, code: str, limit: int = 200) -> list[dict[str, Any]]:
+    """A participant's newest sessions with a model, each with that model, oldest first: what a trend is drawn from."""
+    own, made = CentreSession, CentreModel
+    query = (
+        select(own, made, CentreRig.name)
+        .join(made, (made.rig_id == own.rig_id) & (made.id == own.model_id))
+        .join(CentreRig, CentreRig.id == own.rig_id)
+        .where(own.participant == code, own.model_id.is_not(None))
+        .order_by(own.day.desc(), own.rig_id.desc())
+        .limit(limit)
+    )
+    with store.read() as session:
+        rows = session.execute(query).all()
+    return [{"session": one, "model": model, "rig": rig} for one, model, rig in reversed(rows)]
+
+
+@dataclass(frozen=True)
+class Cohort:
+    """Which recordings are asked for; None: whichever. `after` is the last one's key."""
+
+    participant: str | None = None
+    rig_id: int | None = None
+    from_utc: str | None = None
+    to_utc: str | None = None
+    after: str | None = None
+
+
+def recordings(store: Store, asked: Cohort, limit: int) -> tuple[list[dict[str, Any]], str | None]:
+    """Recordings in order of time; the key of the next page, or None."""
+    own = CentreRecording
+    query = select(own, CentreRig.name).join(CentreRig, CentreRig.id == own.rig_id)
+    query = query.where(own.participant == asked.participant) if asked.participant else query
+    query = query.where(own.rig_id == asked.rig_id) if asked.rig_id is not None else query
+    query = query.where(own.created_utc >= asked.from_utc) if asked.from_utc else query
+    query = query.where(own.created_utc < asked.to_utc) if asked.to_utc else query
+    if asked.after:
+        query = query.where(tuple_(own.created_utc, own.id) > tuple_(*_key(asked.after)))
+    with store.read() as session:
+        rows: Sequence[Any] = session.execute(query.order_by(own.created_utc, own.id).limit(limit + 1)).all()
+    found = [document(row, rig) for row, rig in rows[:limit]]
+    last = rows[limit - 1][0] if len(rows) > limit else None
+    return found, f"{last.created_utc}~{last.id}" if last is not None else None
+
+
+def document(row: CentreRecording, rig: str) -> dict[str, Any]:
+    """A recording as REST tells it."""
+    held = {name: value for name, value in row.as_dict().items() if name != "rig_id"}
+    return {**held, "rig": rig, "url": f"/v1/recordings/{row.id}"}
+
+
+def _key(after: str) -> tuple[str, int]:
+    label, mark, number = after.partition("~")
+    if not mark or not number.isdecimal() or len(number) > 18 or clean.label(label, "") != label:
+        raise ApiError(422, "invalid-input", "The request is not valid", "after: give it as the last page gave it")
+    return label, int(number)
+
+
+def narrowed(asked: Search, **more: Any) -> Search:
+    """The same search with something else."""
+    return replace(asked, **more)

@@ -1,0 +1,168 @@
+"""What rigs tell: a greeting, and batches of items, each batch one transaction."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from api.centre import clean, rigs, warnings
+from api.centre.chain import GENESIS, BatchIn, HelloIn, Item, ItemIn, Place, checked
+from api.centre.project import Projector
+from api.clock import Clock, unix_of
+from api.errors import ApiError
+from api.store import Store
+from api.store.centre_tables import CentreChain, CentreItem, CentreRig
+
+MOST_CLOCK_S = 2.0
+LEAST_DISK_SHARE, LEAST_DISK_BYTES = 0.05, 5_000_000_000
+"""A disk is nearly full below both of them."""
+MOST_DAMAGED = 50
+"""Files that one greeting warns of."""
+
+
+class Ingest:
+    """Takes what rigs push.
+
+    Parameters
+    ----------
+    store : Store
+        The centre's database.
+    clock : Clock
+        Rigs' clocks are compared with it.
+    most_file_bytes : int
+        A longer file is not asked for.
+    """
+
+    def __init__(self, store: Store, clock: Clock, most_file_bytes: int) -> None:
+        self.store, self.clock, self.most_file_bytes = store, clock, most_file_bytes
+
+    def hello(self, rig: CentreRig, told: HelloIn) -> dict[str, Any]:
+        """Note how the rig is; where the centre stands in its chain."""
+        now_s = self.clock.unix_s()
+        now = self.clock.utc()
+        with self.store.write() as session:
+            row = rigs.still(session, rig)
+            row.seen_utc, row.version = now, clean.text(told.version, 80)
+            row.state, row.reason = clean.text(told.state, 40), clean.text(told.reason, 400)
+            row.disk_free_bytes, row.disk_total_bytes = told.disk_free_bytes, told.disk_total_bytes
+            row.waiting_items, row.waiting_files = told.waiting_items, told.waiting_files
+            label = clean.label(told.utc, "")
+            row.clock_difference_s = round(unix_of(label) - now_s, 3) if label else None
+            place = at(session, rig.id, told.chain)
+            if place.seq > told.seq or (place.seq == told.seq and place.hash != told.hash):
+                warnings.tell(session, now, rig.id, "restored", told.chain, seq=told.seq, centre=place.seq)
+            self._states(session, row, now)
+            for name in told.damaged[:MOST_DAMAGED]:
+                warnings.tell(session, now, rig.id, "damaged-at-rig", clean.text(name, 80) or "?")
+        return {"seq": place.seq, "hash": place.hash, "utc": now}
+
+    def _states(self, session: Session, row: CentreRig, now: str) -> None:
+        off_s = row.clock_difference_s
+        clock_off = off_s is None or abs(off_s) > MOST_CLOCK_S
+        warnings.holds(session, now, row.id, "clock", clock_off, difference_s=off_s)
+        free, total = row.disk_free_bytes, row.disk_total_bytes
+        full = free is not None and total is not None and free < min(LEAST_DISK_SHARE * total, LEAST_DISK_BYTES)
+        warnings.holds(session, now, row.id, "disk", full, free_gb=round((free or 0) / 1e9, 2))
+        warnings.end(session, now, row.id, "unseen")
+
+    def take(self, rig: CentreRig, batch: BatchIn) -> Place:
+        """All items of a batch, or none; where the chain stands then.
+
+        Raises
+        ------
+        ApiError
+            401: the key was revoked meanwhile; 409 `out-of-order`, `forked`; 422 `hash-differs`.
+        """
+        items = [checked(sent) for sent in batch.items]  # before the database is held
+        now = self.clock.utc()
+        try:
+            with self.store.write() as session:
+                return self._take(session, rigs.still(session, rig), batch.chain, items, now)
+        except _Forked as fork:
+            with self.store.write() as session:
+                warnings.tell(session, now, rig.id, "forked", batch.chain, seq=fork.seq)
+            raise ApiError(
+                409, "forked", "The chain has forked",
+                f"Item {fork.seq} is known with another hash. Begin a new chain.", seq=fork.at.seq, hash=fork.at.hash,
+            ) from None  # fmt: skip
+
+    def _take(self, session: Session, rig: CentreRig, chain: str, items: list[Item], now: str) -> Place:
+        row = session.get(CentreChain, (rig.id, chain))
+        place = Place(row.seq, row.hash) if row else Place()
+        begun = place
+        new = []
+        for item in items:
+            sent = item.sent
+            if sent.seq <= begun.seq:
+                known = session.get(CentreItem, (rig.id, chain, sent.seq))
+                if known is None or known.hash != sent.hash:
+                    raise _Forked(sent.seq, begun)
+                continue
+            if sent.seq != place.seq + 1:
+                raise out_of_order(begun)
+            if sent.previous != place.hash or (sent.seq == 1 and sent.key != chain):
+                raise _Forked(sent.seq, begun)
+            place = Place(sent.seq, sent.hash)
+            new.append(item)
+        if not new:
+            return place
+        self._keep(session, rig.id, chain, new, now)
+        if row is None:
+            session.add(CentreChain(rig_id=rig.id, chain=chain, seq=place.seq, hash=place.hash, begun_utc=now))
+        else:
+            row.seq, row.hash = place.seq, place.hash
+        projector = Projector(session, rig, now, self.most_file_bytes)
+        with session.no_autoflush:
+            for item in new:
+                projector.take(item)
+        return place
+
+    def _keep(self, session: Session, rig_id: int, chain: str, items: list[Item], now: str) -> None:
+        """The items as they came; of a body that was told before, only its hash."""
+        known = _told(session, rig_id, [item.sent for item in items])
+        rows = []
+        for item in items:
+            sent = item.sent
+            told = (sent.kind, sent.key, sent.sha256)
+            fields = sent.model_dump(exclude={"body"})
+            rows.append({
+                **fields, "key": storable(sent.key), "at_utc": storable(sent.at_utc), "rig_id": rig_id, "chain": chain,
+                "received_utc": now, "body": None if told in known else item.text,
+            })  # fmt: skip
+            known.add(told)
+        session.execute(CentreItem.__table__.insert(), rows)
+
+
+class _Forked(Exception):
+    """An item is known with another hash, or does not follow the one before."""
+
+    def __init__(self, seq: int, at: Place) -> None:
+        super().__init__(seq)
+        self.seq, self.at = seq, at
+
+
+def out_of_order(place: Place) -> ApiError:
+    """409: where to go on from."""
+    detail = f"The centre stands at item {place.seq}. Go on with the next one."
+    return ApiError(409, "out-of-order", "Items are missing", detail, seq=place.seq, hash=place.hash)
+
+
+def at(session: Session, rig_id: int, chain: str) -> Place:
+    """Where a rig's chain stands."""
+    row = session.get(CentreChain, (rig_id, chain))
+    return Place(row.seq, row.hash) if row else Place(0, GENESIS)
+
+
+def storable(text: str) -> str:
+    """A text that every database holds."""
+    return text.replace("\x00", "\ufffd")
+
+
+def _told(session: Session, rig_id: int, sent: list[ItemIn]) -> set[tuple[str, str, str]]:
+    """Kind, key and hash of what was told before, on this chain or another."""
+    keys = sorted({storable(one.key) for one in sent})
+    columns = (CentreItem.kind, CentreItem.key, CentreItem.sha256)
+    of = select(*columns).where(CentreItem.rig_id == rig_id, CentreItem.kind.in_({one.kind for one in sent}))
+    return {tuple(row) for row in session.execute(of.where(CentreItem.key.in_(keys)).distinct())}  # pyright: ignore[reportReturnType]

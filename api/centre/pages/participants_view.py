@@ -1,0 +1,85 @@
+"""Participants across rigs: a search, and each one's page with sessions and trends."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+from urllib.parse import urlencode
+
+from fastapi import APIRouter, Query, Request
+from fastapi.responses import Response
+from sqlalchemy import select
+
+from api.centre import directory, trend
+from api.centre.context import Context, Ctx
+from api.centre.routes.participants import VERDICT_NAMES, asked, page_key
+from api.charts import trend_charts
+from api.effect_words import effect_words
+from api.errors import ApiError, NotFoundError
+from api.store.centre_tables import CentreEffect
+from api.web.dependencies import ModelReader
+from api.web.pages.render import page
+
+router = APIRouter(include_in_schema=False)
+MOST_EFFECTS = 100
+
+
+@router.get("/participants")
+async def participants(
+    request: Request, context: Ctx, _who: ModelReader, q: str = "", rig: str = "", from_: str = Query("", alias="from"),
+    to: str = "", effect: str = "", verdict: str = "", after: str = "",
+) -> Response:  # fmt: skip
+    """The search and what it finds."""
+    given = {"q": q.strip()[:32], "rig": rig, "from": from_, "to": to, "effect": effect, "verdict": verdict}
+    problem, found, last = None, [], None
+    try:
+        search = await asyncio.to_thread(asked, context, q, rig, from_, to, effect, verdict, after)
+        found, last = await asyncio.to_thread(directory.participants, context.store, search)
+    except ApiError as error:
+        if error.status not in (404, 422):
+            raise
+        problem = error
+    await context.count_warnings()
+    choices = await asyncio.to_thread(_choices, context)
+    more = urlencode({**given, "after": last}) if last else None
+    status = problem.status if problem else 200
+    return page(
+        request, "participants.html", status, found=found, more=more, given=given, problem=problem, after=after,
+        verdicts=VERDICT_NAMES, **choices,
+    )  # fmt: skip
+
+
+def _choices(context: Context) -> dict[str, Any]:
+    return {"rigs": [row.name for row in context.rigs.all()], "effects": known_effects(context)}
+
+
+def known_effects(context: Context) -> list[tuple[str, str]]:
+    """Effects that any model holds, with their titles: one step in the index for each."""
+    found: list[str] = []
+    with context.store.read() as session:
+        while len(found) < MOST_EFFECTS:
+            after = CentreEffect.effect > (found[-1] if found else "")
+            one = session.scalars(
+                select(CentreEffect.effect).where(after).order_by(CentreEffect.effect).limit(1)
+            ).first()
+            if one is None:
+                break
+            found.append(one)
+    return sorted(((effect, effect_words(effect)) for effect in found), key=lambda pair: pair[1])
+
+
+@router.get("/participants/{code}")
+async def participant(request: Request, context: Ctx, _who: ModelReader, code: str, before: str = "") -> Response:
+    """Sessions over all rigs, newest first, and the trend of their figures."""
+    people = await asyncio.to_thread(directory.person, context.store, code[:40])
+    if not people:
+        raise NotFoundError("participant", code[:40])
+    found, more = await asyncio.to_thread(directory.sessions, context.store, code, page_key(before))
+    stood = await asyncio.to_thread(directory.stood, context.store, code)
+    await context.count_warnings()
+    documents = trend.documents(code, stood)
+    return page(
+        request, "participant.html", code=code, people=people, sessions=found, before=before,
+        more=f"{more[0]}~{more[1]}" if more else None, panels=trend_charts.panels(documents) if documents else [],
+        count=sum(one["sessions"] for one in people), recordings=sum(one["recordings"] for one in people),
+    )  # fmt: skip

@@ -1,0 +1,76 @@
+"""The first page: rigs; adding one, revoking its key."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Form, Request
+from fastapi.responses import RedirectResponse, Response
+
+from api.centre.context import Context, Ctx
+from api.centre.ingest import LEAST_DISK_BYTES, LEAST_DISK_SHARE, MOST_CLOCK_S
+from api.centre.routes.rigs import made
+from api.centre.watch import UNSEEN_S
+from api.clock import unix_of
+from api.errors import ApiError
+from api.people.auth import LOCKED, Scope
+from api.store.centre_tables import CentreRig
+from api.web.dependencies import Administrator
+from api.web.guards import identified
+from api.web.pages.home import sign_in_page
+from api.web.pages.render import page, problem_page
+
+router = APIRouter(include_in_schema=False)
+FINE_STATES = ("ready", "running", "busy", "stimulating", "idle")
+
+
+@router.get("/")
+async def rigs(request: Request, context: Ctx) -> Response:
+    """Rigs; the sign-in form for who is not signed in."""
+    try:
+        who = await identified(request)
+    except ApiError as error:
+        if error.code == LOCKED[0]:
+            return problem_page(request, error)
+        return await sign_in_page(request, context, "/")  # pyright: ignore[reportArgumentType]
+    if not who.may(Scope.READ_MODEL):
+        return problem_page(request, ApiError(403, "forbidden", "Not allowed", "This needs the scope read-model."))
+    return await shown(request, context)
+
+
+async def shown(request: Request, context: Context, key: dict[str, Any] | None = None) -> Response:
+    """The page; with a key that was just made, the only time its text is seen."""
+    rows = await asyncio.to_thread(context.rigs.all)
+    await context.count_warnings()
+    now_s = context.clock.unix_s()
+    listed = [{**row.as_dict(), "doubts": doubts(row, now_s)} for row in rows if row.revoked_utc is None]
+    revoked = [row for row in rows if row.revoked_utc is not None]
+    address = str(request.base_url).rstrip("/")
+    return page(request, "rigs.html", rigs=listed, revoked=revoked, key=key, address=address)
+
+
+def doubts(row: CentreRig, now_s: float) -> set[str]:
+    """What of a rig a person should look at."""
+    free, total = row.disk_free_bytes, row.disk_total_bytes
+    found = {
+        "seen": row.seen_utc is not None and now_s - unix_of(row.seen_utc) > UNSEEN_S,
+        "clock": row.seen_utc is not None and not abs(row.clock_difference_s or 0.0) <= MOST_CLOCK_S,
+        "disk": free is not None and total is not None and free < min(LEAST_DISK_SHARE * total, LEAST_DISK_BYTES),
+        "state": row.state is not None and row.state not in FINE_STATES,
+    }
+    return {name for name, so in found.items() if so}
+
+
+@router.post("/rigs")
+async def add(request: Request, context: Ctx, who: Administrator, name: Annotated[str, Form()] = "") -> Response:
+    """A new rig; its key is shown on the answering page only."""
+    key = await asyncio.to_thread(made, context, name.strip()[:80], who.name)
+    return await shown(request, context, key)
+
+
+@router.post("/rigs/{name}/revoke")
+async def revoke(context: Ctx, who: Administrator, name: str) -> Response:
+    """Its key opens nothing any more."""
+    await asyncio.to_thread(context.rigs.revoke, name, who.name)
+    return RedirectResponse("/", 303)

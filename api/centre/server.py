@@ -1,0 +1,77 @@
+"""`python -m api.centre.server`: the centre's process. Prints one JSON line when it answers; ends at SIGTERM.
+
+Exit 2: a setting does not hold, the port is taken, the database does not open, the bucket is not there.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import signal
+import socket
+import sys
+from collections.abc import Callable
+
+import uvicorn
+from fastapi import FastAPI
+
+from api import logs
+from api.centre.app import create_app
+from api.centre.settings import CentreSettings
+from api.errors import ApiError, SettingsError
+from api.web.connections import raise_file_limit
+from api.web.server import address_of, bind, configuration, refuse_open_door, serve
+
+
+def main() -> int:
+    """Run the centre; the exit code."""
+    logs.configure()
+    try:
+        app, listener = prepared(CentreSettings())
+    except (ApiError, SettingsError, OSError) as error:
+        print(f"stimrig: {error}", file=sys.stderr)
+        return 2
+    run(app, listener)
+    return 0
+
+
+def prepared(settings: CentreSettings) -> tuple[FastAPI, socket.socket]:
+    """The application, and the address it will answer at.
+
+    Raises
+    ------
+    ApiError, SettingsError, OSError
+        One line each: what is wrong, and the fix.
+    """
+    raise_file_limit()
+    os.umask(os.umask(0o077) | 0o077)  # what the centre writes is for its user only
+    try:
+        refuse_open_door(settings)
+    except OSError as error:
+        fixed = str(error).replace("STIMRIG_", "STIMRIG_CENTRE_")
+        raise OSError(fixed) from error
+    listener = bind(settings.host, settings.port)
+    try:
+        return create_app(settings), listener
+    except BaseException:
+        listener.close()
+        raise
+
+
+def run(app: FastAPI, listener: socket.socket, ready: Callable[[str], object] | None = None) -> None:
+    """Serve until SIGTERM or Ctrl-C; `ready` is told the address, else a JSON line."""
+    url = address_of(listener)
+    line = {"url": url, "port": listener.getsockname()[1], "drawn_token": app.state.context.drawn_token}
+    server = uvicorn.Server(configuration(app))
+    signal.signal(signal.SIGTERM, lambda _number, _frame: None)  # uvicorn ends in order, and raises it once more
+    with contextlib.suppress(KeyboardInterrupt):
+        if ready is None:
+            asyncio.run(serve(server, listener, line))
+        else:
+            ready(url)
+            asyncio.run(server.serve(sockets=[listener]))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

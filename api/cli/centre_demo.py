@@ -1,0 +1,176 @@
+"""A whole centre on one machine: PostgreSQL, a folder as the bucket, two emulated rigs that push."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+import signal
+import socket
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+from api import owner_only
+from api.centre.context import opened
+from api.centre.postgres import Cluster
+from api.centre.rigs import Rigs
+from api.centre.settings import CentreSettings
+from api.cli.errors import LaunchError
+from api.cli.launcher import Child
+from api.cli.terminal import say
+from api.client.errors import ServiceError
+from api.client.rest import Client
+from api.clock import Clock
+from api.people.pace import Guesses
+
+RIGS = (("Ward 1", "paper", "P001"), ("Ward 2", "calcium", "P002"))
+"""Name, emulated muscle and participant of each rig."""
+BETWEEN_S = 5.0
+WATCH_S = 0.5
+
+
+class Ended(Exception):
+    """Ctrl-C or SIGTERM."""
+
+
+class EmulatedRig:
+    """A rig with its service, which pushes to the centre; a thread plays one test after the other on it."""
+
+    def __init__(self, folder: Path, name: str, patient: str, code: str, centre_url: str, key: str) -> None:
+        self.name, self.code, self.token = name, code, secrets.token_urlsafe(24)
+        self.port = free_port()
+        command = [sys.executable, "-m", "api.cli", "serve", "--data", str(folder), "--port", str(self.port)]
+        log = owner_only.folder(folder) / "service.log"
+        self.child = Child(name, [*command, "--emulate", f"--patient {patient}"], log, {
+            "STIMRIG_CENTRE_URL": centre_url, "STIMRIG_CENTRE_KEY": key, "STIMRIG_ADMIN_TOKEN": self.token,
+            "PYTHONUNBUFFERED": "1",
+        })  # fmt: skip
+        self.ending = threading.Event()
+        self.player = threading.Thread(target=self._play, daemon=True)
+
+    @property
+    def url(self) -> str:
+        """Its own page."""
+        return f"http://127.0.0.1:{self.port}"
+
+    def start(self) -> None:
+        """Start its processes, and what plays on it."""
+        start_unheard(self.child)
+        self.player.start()
+
+    def _play(self) -> None:
+        """One test after the other, each approved, until the end; a rig that is stopped waits for a person."""
+        while not self.ending.wait(BETWEEN_S):
+            with contextlib.suppress(ServiceError), Client(self.url, self.token) as client:
+                client.ensure_participant(self.code)
+                test = client.run_test(self.code)
+                if test["model_id"]:
+                    client.approve(test["model_id"], "demo")
+
+    def stop(self) -> None:
+        """End it."""
+        self.ending.set()
+        self.child.end(45.0)
+
+
+def play(folder: Path, port: int) -> None:
+    """All of it, until Ctrl-C or SIGTERM.
+
+    Raises
+    ------
+    LaunchError
+        A process did not come up, or ended.
+    SettingsError
+        PostgreSQL is not installed, or cannot be set up.
+    """
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, _end)
+    folder = folder.absolute()
+    folder.mkdir(parents=True, exist_ok=True, mode=0o711)  # PostgreSQL's user passes through it
+    with contextlib.ExitStack() as stack, contextlib.suppress(Ended):
+        cluster = Cluster(folder / "postgres", free_port())
+        stack.callback(cluster.stop)
+        say("starting PostgreSQL, the centre and two emulated rigs")
+        cluster.start()
+        token = secrets.token_urlsafe(24)
+        centre = _centre(folder, port, cluster.url, token)
+        stack.callback(centre.end)
+        url = str(centre.start()["url"])
+        rigs = []
+        for name, patient, code in RIGS:
+            key = _key(folder, cluster.url, name)
+            rig = EmulatedRig(folder / name.lower().replace(" ", "-"), name, patient, code, url, key)
+            stack.callback(rig.stop)
+            rig.start()
+            rigs.append(rig)
+        say(f"the centre's page: {url}/sign-in#token={token}", *_rig_lines(rigs), f"files and logs in {folder}")
+        say("each rig plays a test of about a minute, and pushes it by itself; Ctrl-C ends all")
+        _watch([centre, *(rig.child for rig in rigs)])
+    say("ended; what was recorded is kept")
+
+
+def _centre(folder: Path, port: int, database: str, token: str) -> Child:
+    data = owner_only.folder(folder / "centre")
+    (folder / "bucket").mkdir(exist_ok=True, mode=0o700)
+    environment = {
+        "STIMRIG_CENTRE_DATA_DIR": str(data), "STIMRIG_CENTRE_DATABASE_URL": database,
+        "STIMRIG_CENTRE_FILES": str(folder / "bucket"), "STIMRIG_CENTRE_PORT": str(port),
+        "STIMRIG_CENTRE_ADMIN_TOKEN": token, "STIMRIG_CENTRE_HOST": "127.0.0.1",
+    }  # fmt: skip
+    return Child("centre", [sys.executable, "-m", "api.centre.server"], folder / "centre.log", environment)
+
+
+def _key(folder: Path, database: str, name: str) -> str:
+    """A new key for a rig; one from before is revoked."""
+    store = opened(CentreSettings(data_dir=folder / "centre", database_url=database))
+    try:
+        rigs = Rigs(store, Clock(), Guesses(Clock()))
+        if rigs.named(name) is not None:
+            rigs.revoke(name, "demo")
+        return rigs.add(name, "demo")
+    finally:
+        store.close()
+
+
+def _rig_lines(rigs: list[EmulatedRig]) -> Iterator[str]:
+    for rig in rigs:
+        yield f"{rig.name}: {rig.url}/sign-in#token={rig.token}"
+
+
+def _watch(children: list[Child]) -> None:
+    """Until the end; a process that ends by itself ends all."""
+    waiting = threading.Event()
+    while not waiting.wait(WATCH_S):
+        for child in children:
+            if not child.alive():
+                raise LaunchError(
+                    f"{child.name} has ended: {child.last_words() or 'without a message'} (log: {child.log})"
+                )
+
+
+def start_unheard(child: Child) -> None:
+    """Start a process that prints no ready line: what it says goes to its log."""
+    import subprocess
+    import time
+
+    from api.cli.launcher import die_with_parent
+
+    child.started_s = time.monotonic()
+    with child.log.open("ab") as log:
+        child.process = subprocess.Popen(
+            child.command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env={**os.environ, **child.environment},
+            start_new_session=True, preexec_fn=die_with_parent,
+        )  # fmt: skip
+
+
+def free_port() -> int:
+    """A port on which nobody listens now."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def _end(_number: int, _frame: object) -> None:
+    raise Ended

@@ -1,0 +1,176 @@
+"""`stimrig centre`: serves a centre; adds and revokes rigs; reads the bucket's files again."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from tqdm import tqdm
+
+from api.cli.errors import InputError, ReportedError
+from api.cli.terminal import say
+
+DataOption = Annotated[Path | None, typer.Option(help="data folder; default ./centre, or STIMRIG_CENTRE_DATA_DIR")]
+DatabaseOption = Annotated[
+    str | None,
+    typer.Option(help="URL of the database; default SQLite in the data folder, or STIMRIG_CENTRE_DATABASE_URL"),
+]
+FilesOption = Annotated[
+    str | None,
+    typer.Option(help="folder, or s3://bucket/prefix; default in the data folder, or STIMRIG_CENTRE_FILES"),
+]
+WHO = "command line"
+
+
+def register(app: typer.Typer) -> None:
+    """Add the verb."""
+    centre = typer.Typer(name="centre", help="A centre that rigs push to.", invoke_without_command=True)
+    centre.callback()(serve)
+    centre.command("add-rig")(add_rig)
+    centre.command("revoke-rig")(revoke_rig)
+    centre.command("check")(check)
+    app.add_typer(centre)
+
+
+def serve(
+    context: typer.Context,
+    port: Annotated[int | None, typer.Option(min=0, max=65535, help="default 8100, or STIMRIG_CENTRE_PORT")] = None,
+    host: Annotated[str | None, typer.Option(help="default 127.0.0.1, or STIMRIG_CENTRE_HOST")] = None,
+    data: DataOption = None,
+    database: DatabaseOption = None,
+    files: FilesOption = None,
+    demo: Annotated[bool, typer.Option("--demo", help="with PostgreSQL and two emulated rigs of its own")] = False,
+) -> None:
+    """The centre and its page, until Ctrl-C or SIGTERM."""
+    if context.invoked_subcommand is not None:
+        given = {"port": port, "host": host, "data_dir": data, "database_url": database, "files": files}
+        context.obj = given
+        return
+    if demo:
+        from api.cli.centre_demo import play
+
+        if database or files:
+            raise InputError("--demo makes its own database and bucket: leave --database and --files out.")
+        play(data or Path("centre-demo"), 8100 if port is None else port)
+        return
+    from api.centre.server import prepared, run
+
+    settings = settings_of(port=port, host=host, data_dir=data, database_url=database, files=files)
+    try:
+        app, listener = prepared(settings)
+    except OSError as error:
+        raise InputError(str(error)) from error
+    drawn = app.state.context.drawn_token
+    run(app, listener, lambda url: say(*welcome(url, drawn, bool(settings.admin_token), settings.bucket)))
+
+
+def settings_of(**given):
+    """The centre's settings. Raises InputError, SettingsError."""
+    from api.centre.settings import CentreSettings
+
+    return CentreSettings(**{name: value for name, value in given.items() if value is not None})
+
+
+def welcome(url: str, drawn: str | None, configured: bool, bucket: str) -> list[str]:
+    """Where it is, and how to get in."""
+    lines = [f"stimrig centre: {url}/ with files in {bucket}"]
+    if drawn:
+        lines += [f"first administrator's token, shown this once: {drawn}", f"sign in: {url}/sign-in#token={drawn}"]
+    elif configured:
+        lines.append("the administrator's token is the one in STIMRIG_CENTRE_ADMIN_TOKEN")
+    else:
+        lines.append("sign in with a token issued before (set STIMRIG_CENTRE_ADMIN_TOKEN to replace a lost one)")
+    return lines
+
+
+def _opened(context: typer.Context, data: Path | None, database: str | None):
+    """Settings, and the database of the centre."""
+    from api.centre.context import opened
+
+    outer = context.obj or {}
+    given = {
+        **outer,
+        **{name: one for name, one in (("data_dir", data), ("database_url", database)) if one is not None},
+    }
+    settings = settings_of(**given)
+    return settings, opened(settings)
+
+
+def _rigs(store):
+    from api.centre.rigs import Rigs
+    from api.clock import Clock
+    from api.people.pace import Guesses
+
+    return Rigs(store, Clock(), Guesses(Clock()))
+
+
+def add_rig(
+    context: typer.Context,
+    name: Annotated[str, typer.Argument(help="as people call it: Ward 3")],
+    url: Annotated[str, typer.Option(help="where rigs reach the centre")] = "https://CENTRE",
+    data: DataOption = None,
+    database: DatabaseOption = None,
+) -> None:
+    """A new rig, or a new key for a revoked one; prints the key this once."""
+    _settings, store = _opened(context, data, database)
+    try:
+        key = _rigs(store).add(name, WHO)
+    finally:
+        store.close()
+    say("settings for the rig's service, shown this once:", f"STIMRIG_CENTRE_URL={url}", f"STIMRIG_CENTRE_KEY={key}")
+
+
+def revoke_rig(
+    context: typer.Context, name: Annotated[str, typer.Argument()], data: DataOption = None,
+    database: DatabaseOption = None,
+) -> None:  # fmt: skip
+    """The rig's key opens nothing any more; what it pushed stays."""
+    _settings, store = _opened(context, data, database)
+    try:
+        _rigs(store).revoke(name, WHO)
+    finally:
+        store.close()
+    say(f"the key of {name} is revoked; what it pushed stays")
+
+
+def check(
+    context: typer.Context,
+    since: Annotated[
+        str | None, typer.Option(help="go on with what was not checked since, as 2026-11-23T08:00:00Z")
+    ] = None,
+    data: DataOption = None,
+    database: DatabaseOption = None,
+    files: FilesOption = None,
+) -> None:
+    """Read the bucket's files again and compare them with their hashes; exit 1 where one differs."""
+    from api.centre import check as checking
+    from api.centre import clean
+    from api.centre.bucket import BucketError
+    from api.centre.context import ready_bucket
+    from api.clock import Clock
+
+    clock = Clock()
+    begun = since or clock.utc()
+    if clean.label(begun, "") != begun:
+        raise InputError(f"--since {begun}: give a time as 2026-11-23T08:00:00Z")
+    settings, store = _opened(context, data, database)
+    settings = settings.model_copy(update={"files": files}) if files else settings
+    count = lost = 0
+    try:
+        bucket = ready_bucket(settings)
+        print(f"stimrig centre check: if this is cut off, go on with --since {begun}", file=sys.stderr)
+        with tqdm(unit="B", unit_scale=True, desc="read", disable=not sys.stderr.isatty()) as bar:
+            for found in checking.check(store, bucket, clock, begun, bar.update):
+                count += 1
+                if not found.ok:
+                    lost += 1
+                    tqdm.write(f"{found.sha256}: {found.words}")
+    except BucketError as error:
+        raise ReportedError(f"{error}; {count} files were checked, go on with --since {begun}") from error
+    finally:
+        store.close()
+    say(f"{count} files checked, {lost} differ" + ("; their rigs are asked for them again" if lost else ""))
+    if lost:
+        raise typer.Exit(1)

@@ -1,0 +1,18 @@
+// A part of the page that is read again and again: whoever looks at it sees what rigs say now.
+"use strict";
+{
+  const live = document.getElementById("live");
+  const busy = () => live.querySelector("details[open]") || live.contains(document.activeElement);
+
+  async function renew() {
+    if (document.hidden || busy()) return;
+    try {
+      const answer = await fetch("/", { cache: "no-store", headers: { Accept: "text/html" } });
+      if (answer.redirected) { location.replace(answer.url); return; } // locked, or signed out
+      const fresh = new DOMParser().parseFromString(await answer.text(), "text/html").getElementById("live");
+      if (fresh && !busy()) live.replaceChildren(...fresh.childNodes); else if (!fresh) location.replace("/");
+    } catch { /* the next time */ }
+  }
+
+  if (live) setInterval(renew, 1000 * live.dataset.everyS);
+}
