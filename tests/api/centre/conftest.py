@@ -15,6 +15,22 @@ from api.centre.settings import CentreSettings
 from api.clock import Clock
 from api.store.centre_tables import CentreRig
 from tests.api.conftest import PATIENCE_S, TOKEN, Server
+from tests.harness.postgres import Cluster
+
+
+@pytest.fixture(scope="session", autouse=True)
+def centres_keep_it_there_too(kept_in_postgresql: Cluster | None) -> Iterator[None]:
+    """With `--postgresql`: a centre's database is one in the tests' cluster, another one for each data folder."""
+    if kept_in_postgresql is None:
+        yield
+        return
+
+    def database(settings: CentreSettings) -> str:
+        return settings.database_url or kept_in_postgresql.database(str(settings.data_dir.absolute()))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(CentreSettings, "database", property(database))
+        yield
 
 
 class SetClock(Clock):
