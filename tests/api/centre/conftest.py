@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -77,7 +78,8 @@ class Centre:
 def run_centre(data: Path, **more: Any) -> Iterator[Centre]:
     clock = SetClock()
     settings = CentreSettings(**{"data_dir": data, "admin_token": TOKEN, "port": 0} | more)
-    app = create_app(settings, clock)
+    with ThreadPoolExecutor(1) as apart:  # a browser's driver keeps an event loop in this one
+        app = apart.submit(create_app, settings, clock).result()
     with Server(app) as url:
         yield Centre(url, app, data, clock)
 
