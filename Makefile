@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 export PYTHONUNBUFFERED = 1
 FAST := not wire and not browser and not service and not slow
 
-.PHONY: demo centre test check fast lint types serve bench faults soak campaigns mutation words lock clean help setup setup-test setup-centre
+.PHONY: demo centre test check fast lint types serve bench postgresql faults soak campaigns mutation words lock clean help setup setup-test setup-centre
 
 help:
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -45,6 +45,9 @@ soak: setup-test ## an hour of recording with fits beside it (docs/results/soak.
 campaigns: setup-test ## the tests that are too long for `make test`: whole grids, a hidden patient on the wire
 	@$(BIN)/python -m pytest --campaigns -m campaign tests
 
+postgresql: setup-test ## every test of the service on PostgreSQL instead of SQLite
+	@$(BIN)/python -m pytest -n 2 --dist worksteal --postgresql -m "service and not browser and not wire" tests/api
+
 faults: setup-test ## the fault campaign on the emulated rig (docs/results/faults.md)
 	@$(BIN)/python -m bench.faults
 
@@ -54,8 +57,7 @@ mutation: setup-test ## which changes of the rig's safety code no test sees (doc
 
 setup: $(VENV)/.run ## the virtual environment from the hash-locked list
 
-setup-centre: setup ## what `make centre` needs: Debian's PostgreSQL, where it is missing
-	@bash deploy/setup.sh centre
+setup-centre: $(VENV)/.centre ## what `make centre` needs, Debian's PostgreSQL included
 
 setup-test: $(VENV)/.test ## what tests need, a browser included
 
@@ -64,6 +66,9 @@ $(VENV)/.run: requirements/run.txt pyproject.toml deploy/setup.sh
 
 $(VENV)/.test: requirements/test.txt pyproject.toml deploy/setup.sh
 	@bash deploy/setup.sh test
+
+$(VENV)/.centre: requirements/centre.txt pyproject.toml deploy/setup.sh
+	@bash deploy/setup.sh centre
 
 $(VENV)-bench/.bench: requirements/bench.txt pyproject.toml deploy/setup.sh
 	@bash deploy/setup.sh bench

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import os
-import secrets
 import stat
 from pathlib import Path
-
-KEY_BYTES = 32
 
 
 def close(path: Path, mode: int) -> None:
@@ -30,21 +27,3 @@ def file(path: Path) -> None:
     with contextlib.suppress(FileExistsError):
         os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600))
     close(path, 0o600)
-
-
-def key(path: Path) -> bytes:
-    """A secret of the service: read, or drawn at the first start."""
-    with contextlib.suppress(FileNotFoundError):
-        close(path, 0o600)
-        kept = path.read_bytes()
-        if len(kept) == KEY_BYTES:
-            return kept
-    drawn, new = secrets.token_bytes(KEY_BYTES), path.with_suffix(".new")
-    new.unlink(missing_ok=True)
-    file(new)
-    with new.open("wb") as out:
-        out.write(drawn)
-        out.flush()
-        os.fsync(out.fileno())
-    new.replace(path)
-    return drawn

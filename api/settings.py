@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import ipaddress
 import re
+import socket
 from pathlib import Path
 from typing import Annotated, Any
+from urllib.parse import urlsplit
 from zoneinfo import available_timezones
 
-from pydantic import Field, SecretStr, ValidationError, field_validator
+from pydantic import Field, SecretStr, ValidationError, ValidationInfo, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 from api.errors import SettingsError
+
+SECRET = ("_KEY", "_TOKEN")
+"""How the names of settings end whose values are not shown."""
 
 
 class Settings(BaseSettings):
@@ -36,6 +42,9 @@ class Settings(BaseSettings):
     rig_socket: Path | None = Field(default=None, description="Unix socket of the rig process")
     rig_file: Path | None = Field(default=None, description="rig.toml; default: the emulated rig")
     emulated: bool = Field(default=False, description="True: no person is connected, an emulator stands in for the rig")
+    rig_name: str | None = Field(
+        default=None, description="services of one rig on one database give it one name; default: machine and folder"
+    )
     workers: Annotated[int, Field(ge=1, le=16)] = 2
     session_hours: Annotated[float, Field(gt=0, le=24)] = 12.0
     idle_lock_min: Annotated[float, Field(ge=0, le=720)] = Field(
@@ -48,6 +57,10 @@ class Settings(BaseSettings):
     effects_dir: Path | None = Field(default=None, description="folder of the users' own effects")
     structure: Annotated[tuple[str, ...], NoDecode] = Field(
         default=(), description="effects, comma-separated, that a new participant's models begin with; default: none"
+    )
+    centre_url: str | None = Field(default=None, description="where the centre answers; default: there is none")
+    centre_key: SecretStr | None = Field(
+        default=None, validate_default=True, description="this rig's key, as the centre has made it"
     )
 
     def __init__(self, **given: Any) -> None:
@@ -77,10 +90,40 @@ class Settings(BaseSettings):
             raise ValueError("no such time zone on this machine; take one like Europe/Berlin or UTC")
         return given or None
 
+    @field_validator("centre_url")
+    @classmethod
+    def _safe_address(cls, given: str | None) -> str | None:
+        """An address that a key may be sent to."""
+        if not given:
+            return None
+        parts = urlsplit(given)
+        if parts.scheme not in ("http", "https") or not parts.hostname or parts.username or parts.query:
+            raise ValueError("it is no address of a centre; give one like https://centre.example.org")
+        if parts.scheme == "http" and not loopback(parts.hostname):
+            raise ValueError("a key is not sent in the clear; give an address that begins with https://")
+        _ = parts.port  # raises where it is none
+        return given.rstrip("/")
+
+    @field_validator("centre_key")
+    @classmethod
+    def _key_for_the_centre(cls, given: SecretStr | None, info: ValidationInfo) -> SecretStr | None:
+        """A key where there is a centre; one that a header can hold."""
+        key = given.get_secret_value() if given else ""
+        if info.data.get("centre_url") and not key:
+            raise ValueError("STIMRIG_CENTRE_URL names a centre; give the key that it has made for this rig")
+        if not re.fullmatch(r"[!-~]*", key):
+            raise ValueError("a key holds letters, digits and signs only, no spaces; copy it once more")
+        return given if key else None
+
     @property
     def database(self) -> str:
         """The database's SQLAlchemy URL."""
         return self.database_url or f"sqlite:///{self.data_dir.absolute() / 'stimrig.db'}"
+
+    @property
+    def rig(self) -> str:
+        """What the services of one rig call it."""
+        return self.rig_name or f"{socket.gethostname()}:{self.data_dir.absolute()}"
 
     @property
     def recordings_dir(self) -> Path:
@@ -102,4 +145,14 @@ def refusal(error: ValidationError) -> str:
     """Which setting does not hold, in one line, by the name of its environment variable."""
     first = error.errors()[0]
     name = "STIMRIG_" + "_".join(str(part) for part in first["loc"]).upper()
-    return f"{name}: {first['msg'].removeprefix('Value error, ')}, not {first['input']!r}"
+    says = first["msg"].removeprefix("Value error, ")
+    shown = re.sub(r"//[^/]*@", "//…@", repr(first["input"]))
+    return f"{name}: {says}" if name.endswith(SECRET) else f"{name}: {says}, not {shown}"
+
+
+def loopback(host: str) -> bool:
+    """Whether an address can be reached from this machine only."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"

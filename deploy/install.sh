@@ -109,8 +109,8 @@ place deploy/systemd/stimrig.tmpfiles.conf /usr/lib/tmpfiles.d/stimrig.conf 0644
 run systemd-tmpfiles --create /usr/lib/tmpfiles.d/stimrig.conf
 release
 settings
-for unit in stimrig-rig.service stimrig-api.service stimrig-can@.service stimrig-backup.service stimrig-backup.timer \
-  stimrig-centre.service; do
+for unit in stimrig-rig.service stimrig-api.service stimrig-outbox.service stimrig-centre.service \
+  stimrig-can@.service stimrig-backup.service stimrig-backup.timer; do
   place "deploy/systemd/$unit" "/etc/systemd/system/$unit" 0644
 done
 place deploy/udev/70-stimrig.rules /etc/udev/rules.d/70-stimrig.rules 0644

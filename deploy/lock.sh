@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Resolve the three locked lists: hashes of every wheel for Python 3.11 and later, no index lines.
+# Resolve the locked lists: hashes of every wheel for Python 3.11 and later, no index lines.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 compile() { # name, extras…
@@ -15,5 +15,6 @@ pins=$(mktemp); trap 'rm -f "$pins"' EXIT
 grep -E '^[a-z0-9_-]+==' requirements/run.txt | sed 's/ \\$//' > "$pins"
 constraint=(-c "$pins") # tests run with the very versions that users run
 compile test build test
+compile centre build centre cohort lsl
 constraint=() # the peers ask for an older scipy: the bench has an environment of its own
 compile bench build bench

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Set up .venv from a hash-locked list: deploy/setup.sh run|test|bench; deploy/setup.sh centre installs PostgreSQL.
+# Set up .venv from a hash-locked list: deploy/setup.sh run|test|centre|bench
 # Debian packages are installed only where they are missing, and only as root.
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -23,11 +23,6 @@ debian() { # install Debian packages, as root, only those that are missing
   apt-get update -qq
   DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends "${missing[@]}" >/dev/null
 }
-
-if [ "$what" = centre ]; then # no list of its own: `make centre` comes after `make setup`
-  if ! compgen -G '/usr/lib/postgresql/*/bin/postgres' >/dev/null; then debian postgresql; fi
-  exit 0
-fi
 
 find_python() { # the first Python of 3.11 or later
   local candidate
@@ -62,7 +57,10 @@ $venv/bin/python -m identify.diagnosis.warm_up
 if [ "$what" = test ] && ! command -v chromium >/dev/null 2>&1; then
   debian chromium
 fi
+if [ "$what" != run ] && [ "$what" != bench ] && ! compgen -G '/usr/lib/postgresql/*/bin/postgres' >/dev/null; then
+  debian postgresql
+fi
 touch "$venv/.$what"
-# The test list holds the run list.
-if [ "$what" = test ]; then touch "$venv/.run"; fi
+# The lists of tests and of a centre hold the run list.
+if [ "$what" = test ] || [ "$what" = centre ]; then touch "$venv/.run"; fi
 say "ready"

@@ -13,9 +13,19 @@ import time
 
 PROCESSORS = os.cpu_count() or 1
 SIDE_BY_SIDE = ("--dist", "worksteal", "-n")
+ON_POSTGRESQL = ("access", "archive", "controller_keys", "idle_lock", "names", "notes", "people", "session", "tracked")
 LANES = {
     # one process more than processors: some tests wait for a page or a service
     "pure": ("-m", "not wire", *SIDE_BY_SIDE, str(PROCESSORS + 1), "tests"),
+    # what several services share, and what the database decides; `make postgresql` runs all of it there
+    "postgresql": (
+        "--postgresql",
+        "-m",
+        "service and not browser and not wire and not slow",
+        *SIDE_BY_SIDE,
+        str(PROCESSORS + 1),
+        *(f"tests/api/test_{name}.py" for name in ON_POSTGRESQL),
+    ),
     # two emulated rigs leave half of two processors idle
     "wire": ("-m", "wire and not realtime", *SIDE_BY_SIDE, "2", "tests"),
     "realtime": ("-m", "realtime", "tests"),
@@ -23,6 +33,7 @@ LANES = {
 
 CAMPAIGNS = {
     "make campaigns": "whole grids, of which one of each kind is run here; a hidden patient on the wire",
+    "make postgresql": "every test of the service on PostgreSQL, of which nine files are run here",
     "make soak": "an hour of recording with fits beside it, of which 30 s are run here",
     "make faults": "every fault in every phase of a test, of which seven are run here",
     "make mutation": "changes of the rig's safety code, one by one: which of them no test sees",

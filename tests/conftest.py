@@ -29,7 +29,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     """Leave out what only a campaign runs, and what is SQLite's own on PostgreSQL; count it as deselected."""
     without = [] if config.getoption("--campaigns") else ["campaign"]
     without += ["sqlite"] if config.getoption("--postgresql") else []
-    left_out = [item for item in items if any(item.get_closest_marker(name) for name in without)]
+    left_out = {item for item in items if any(item.get_closest_marker(name) for name in without)}
     if left_out:
-        config.hook.pytest_deselected(items=left_out)
-        items[:] = [item for item in items if not item.get_closest_marker("campaign")]
+        config.hook.pytest_deselected(items=list(left_out))
+        items[:] = [item for item in items if item not in left_out]

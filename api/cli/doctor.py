@@ -214,6 +214,25 @@ def check_database(settings: Settings) -> Iterator[Finding]:
         yield Finding("database", "fails", f"the audit trail is broken at entry {broken}", fix)
 
 
+def check_centre(settings: Settings) -> Iterator[Finding]:
+    """Does a centre hear of this rig? Nothing where none is configured."""
+    from api.clock import Clock
+    from api.outbox import status
+
+    told = status.read(settings, Clock().unix_s())
+    if told is None:
+        return
+    says = f"{told.centre}: {status.WORDS[told.state]}"
+    if told.detail:
+        says += f" ({told.detail})"
+    says += f" {told.items_waiting} items and {told.files_waiting} files wait"
+    says += f"; last contact {told.last_contact_utc or 'never'}"
+    if told.damaged_count:
+        says += f"; {told.damaged_count} files are missing or damaged, the first: {told.damaged[0]}"
+    fix = status.FIXES.get(told.state, "see outbox.log in the folder of the logs")
+    yield Finding("centre", "ok" if told.state in status.GOOD else "care", says, fix)
+
+
 def check_clock(_settings: Settings) -> Iterator[Finding]:
     """Is UTC a label to be trusted, and does this machine wake up in time?"""
     tool = shutil.which("timedatectl")

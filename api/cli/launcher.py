@@ -30,6 +30,9 @@ END_S = 6.0
 SEAL_S = 35.0
 """The rig may still have a test to seal."""
 RESTART_S = (0.2, 0.5, 1.0, 2.0, 5.0)
+OUTBOX_RESTART_S = (1.0, 5.0, 30.0, 300.0)
+STEADY_S = 600.0
+"""What ran for so long is started again at once."""
 LIBC = ctypes.CDLL(None, use_errno=True)
 PR_SET_PDEATHSIG = 1
 
@@ -74,6 +77,21 @@ class Child:
         except ValueError:
             raise self.failure() from None
         return self.ready
+
+    def start_unheard(self) -> None:
+        """Start it and wait for nothing; one that cannot be started is found to have ended."""
+        self.started_s = time.monotonic()
+        with contextlib.suppress(OSError), self.log.open("ab") as log:
+            self._log_start = log.tell()
+            self.process = subprocess.Popen(
+                self.command,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=log,
+                env={**os.environ, **self.environment},
+                start_new_session=True,
+                preexec_fn=die_with_parent,
+            )
 
     def failure(self) -> LaunchError:
         """Why it is not there, in its own words."""
@@ -163,6 +181,7 @@ class Services:
             self.emulator = self._child("emulator", ["hardware_sim", *arguments])
         self.rig = self._child("rig", ["rig"])
         self.api = self._child("api", ["api.web.server"])
+        self.outbox = None if settings.centre_url is None else self._child("outbox", ["api.outbox"])
         self.admin_token = admin_token
 
     def _child(self, name: str, module: list[str]) -> Child:
@@ -214,6 +233,9 @@ class Services:
             self.api.environment["STIMRIG_ADMIN_TOKEN"] = self.admin_token
         self.api.start()
         self.api.environment["STIMRIG_PORT"] = str(self.api.ready["port"])  # the same one after a restart
+        if self.outbox is not None:
+            self.outbox.environment = {"STIMRIG_DATA_DIR": data}
+            self.outbox.start_unheard()
 
     def _start_devices(self, data: str) -> None:
         if self.emulator is not None:
@@ -244,7 +266,22 @@ class Services:
         if self.emulator is not None and not self.emulator.alive():
             raise self.emulator.failure()
         ours = (self.api,) if self.attached else (self.rig, self.api)
-        return [self._restart(child) for child in ours if not child.alive()]
+        events = [self._restart(child) for child in ours if not child.alive()]
+        return events + self._keep_telling()
+
+    def _keep_telling(self) -> list[str]:
+        """Start what tells the centre again where it has ended, at longer and longer intervals; it ends nobody else."""
+        child = self.outbox
+        if child is None or child.alive():
+            return []
+        up_s = time.monotonic() - child.started_s
+        if up_s < OUTBOX_RESTART_S[min(child.restarts, len(OUTBOX_RESTART_S) - 1)]:
+            return []
+        words = child.last_words()
+        child.end()
+        child.restarts = 1 if up_s > STEADY_S else child.restarts + 1
+        child.start_unheard()
+        return [f"outbox had ended ({words or 'without a message'}) and was started again"]
 
     def _restart(self, child: Child) -> str:
         if time.monotonic() - child.started_s > 60:
@@ -262,6 +299,8 @@ class Services:
         """End what was started here: the rig first, since it stops stimulation; the service hears its test's end."""
         self.rig.end(SEAL_S)
         self.api.end()
+        if self.outbox is not None:
+            self.outbox.end()
         if self.emulator is not None:
             self.emulator.end()
         shutil.rmtree(self.runtime, ignore_errors=True)

@@ -15,6 +15,7 @@ from api.sessions.requests import Body, CurrentMa, ProfileIn, TestIn, WidthUs
 from api.sessions.runner import Runner
 from api.sessions.trials import SEQUENCE
 from api.store import Store
+from api.store.holds import Turn
 from api.store.tables import Participant, Test
 
 LONGEST_S = 300.0
@@ -56,7 +57,7 @@ def plan_within(plan: PlanIn, participant: Participant) -> dict[str, Any]:
     return plan.model_dump()
 
 
-async def start(runner: Runner, turn: asyncio.Lock, store: Store, who: Principal, body: TestIn) -> Test:
+async def start(runner: Runner, turn: Turn, store: Store, who: Principal, body: TestIn) -> Test:
     """Start a test; where a controller's key asks for it, within its plan.
 
     Raises

@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from api.sessions.adaptive_tests import AdaptiveTests
-from api.sessions.lifecycle import OPEN_STATES, Lifecycle
+from api.sessions.following import OPEN_STATES
+from api.sessions.lifecycle import Lifecycle
 from api.sessions.live import Hub
 from api.store.tables import Test
 

@@ -13,16 +13,15 @@ from api.errors import ApiError
 from api.models.analyses import Analyses
 from api.models.registry import Versions
 from api.sessions.adaptive_tests import AdaptiveTests
+from api.sessions.following import OPEN_STATES, Follower
 from api.sessions.rig_client import RigClient
 from api.sessions.trials import SEQUENCE
 from api.store import Store, audit
-from api.store.tables import Model, Recording, Test
+from api.store.tables import OPEN_STATES, Model, Recording, Test
 from api.workers.pool import Call, Pool
 from rig.messages import FinishedEvent
 
 log = logging.getLogger("stimrig.outcomes")
-
-OPEN_STATES = ("requested", "running", "sealing", "identifying")
 
 
 class Lifecycle:
@@ -36,12 +35,12 @@ class Lifecycle:
 
     def __init__(
         self, store: Store, clock: Clock, rig: RigClient, pool: Pool, versions: Versions,
-        analyses: Analyses, adaptive: AdaptiveTests, recordings_dir: Path,
+        analyses: Analyses, adaptive: AdaptiveTests, recordings_dir: Path, follower: Follower,
         on_progress: Callable[[str], None],
     ) -> None:  # fmt: skip
         self.store, self.clock, self.rig, self.pool, self.versions = store, clock, rig, pool, versions
         self.analyses, self.recordings_dir, self.on_progress = analyses, recordings_dir, on_progress
-        self.adaptive = adaptive
+        self.adaptive, self.follower = adaptive, follower
         self.calls: dict[str, Call] = {}
         self._ahead: set[asyncio.Task[None]] = set()
 
@@ -67,10 +66,10 @@ class Lifecycle:
             self.update(test_id, state="failed", reason=" ".join(str(error).split()) or type(error).__name__)
 
     def take_recording(self, event: FinishedEvent) -> Test | None:
-        """Write down how a test ended and where its recording lies; None where that had been done."""
+        """Write down how a test ended and where its recording lies; None where that is done, or another service's."""
         with self.store.write() as session:
             row = session.get(Test, event.test_id)
-            if row is None or row.recording_id is not None:
+            if row is None or row.recording_id is not None or not self.follower.mine(row):
                 return None
             if event.recording_path and event.recording_id:
                 recording = self._recording(row, event)

@@ -22,7 +22,8 @@ from api.models.registry import Versions
 from api.sessions import document, profiles
 from api.sessions.adaptive_plan import ADAPTIVE
 from api.sessions.adaptive_tests import AdaptiveTests, Planned
-from api.sessions.lifecycle import OPEN_STATES, Lifecycle
+from api.sessions.following import Follower
+from api.sessions.lifecycle import Lifecycle
 from api.sessions.limits import limits_of
 from api.sessions.live import Hub
 from api.sessions.refusals import Current, busy, not_what_was_seen, other_than, refuse_archived
@@ -30,6 +31,7 @@ from api.sessions.requests import TestIn
 from api.sessions.rig_client import AnyEvent, RigClient
 from api.sessions.trials import SEQUENCE, Trials
 from api.store import Store, audit
+from api.store.holds import LIMITS_TURN
 from api.store.tables import Participant, Test
 from api.workers.adviser import Adviser
 from api.workers.pool import Pool
@@ -81,21 +83,21 @@ class Runner:
 
     def __init__(
         self, store: Store, clock: Clock, rig: RigClient, pool: Pool, versions: Versions, analyses: Analyses,
-        adviser: Adviser, trials: Trials, recordings_dir: Path,
+        adviser: Adviser, trials: Trials, recordings_dir: Path, follower: Follower,
     ) -> None:  # fmt: skip
         self.store, self.clock, self.rig, self.versions, self.pool = store, clock, rig, versions, pool
         self.hub = Hub(clock)
         self.adaptive = AdaptiveTests(clock, rig, versions, adviser, self.hub.send)
-        self.trials = trials
+        self.trials, self.follower = trials, follower
         self.current: Current | None = None
         self.lifecycle = Lifecycle(
-            store, clock, rig, pool, versions, analyses, self.adaptive, recordings_dir, self.announce
+            store, clock, rig, pool, versions, analyses, self.adaptive, recordings_dir, follower, self.announce
         )
-        self._lock = asyncio.Lock()
         self._halted_s = -math.inf
         self._notes = ThreadPoolExecutor(2, "notes-of-stops")
         self._telling = ThreadPoolExecutor(1, "tells-how-tests-stand")
         self._tasks: set[asyncio.Task[None]] = set()
+        self._watching: asyncio.Task[None] | None = None
         rig.listeners.append(self._on_event)
         rig.link_listeners.append(self._on_link)
         rig.poll_listeners.append(self._on_poll)
@@ -123,8 +125,9 @@ class Runner:
         self.refuse_second()
         if body.kind == ADAPTIVE:  # what it can reach is computed now, and not while others wait, and then remembered
             await self._planned(body, await self._participant(body))
-        async with self._lock:
+        async with self.follower.rig_turn():
             self.refuse_second()
+            await self._refuse_beside_another_service()
             return await self._start(body, await self._participant(body), by, seen)
 
     def plays(self, test_id: str | None) -> bool:
@@ -136,6 +139,11 @@ class Runner:
         """409 while a test runs, its holder named."""
         if self.current is not None:
             raise busy(self.current)
+
+    async def _refuse_beside_another_service(self) -> None:
+        row = await asyncio.to_thread(self.follower.played_by_another)
+        if row is not None:
+            raise busy(Current(row.id, row.participant, row.requested_by))
 
     async def _participant(self, body: TestIn) -> Participant:
         participant = await asyncio.to_thread(self.store.get, Participant, body.participant)
@@ -177,12 +185,13 @@ class Runner:
     async def _command(self, planned: Planned, body: TestIn, version: str) -> None:
         plan = planned.plan
         try:
-            if profiles.version((await self._participant(body)).profile) != version:
-                raise not_what_was_seen(f"The limits of {plan.participant} were changed meanwhile.")
-            self._refuse_overtaken(
-                asked_s.get(self.clock.monotonic_s())
-            )  # nothing is waited for between this and the command
-            await self.rig.ask(StartRequest(plan=plan, key=self.adaptive.begin(planned)), timeout_s=ANSWER_S)
+            async with self.follower.holds.turn(LIMITS_TURN):
+                if profiles.version((await self._participant(body)).profile) != version:
+                    raise not_what_was_seen(f"The limits of {plan.participant} were changed meanwhile.")
+                self._refuse_overtaken(
+                    asked_s.get(self.clock.monotonic_s())
+                )  # nothing is waited for between this and the command
+                await self.rig.ask(StartRequest(plan=plan, key=self.adaptive.begin(planned)), timeout_s=ANSWER_S)
         except ApiError as error:
             if error.code == "rig-unreachable":  # it may have heard us all the same
                 await self._stop_quietly(f"start of {plan.test_id} was not answered")
@@ -248,6 +257,7 @@ class Runner:
         kept |= planned.kept() | self.trials.kept(body, len(preview["pulse_width_us"]))
         row.plan, row.summary, row.reason = {**plan.model_dump(), "preview": preview, **kept}, {}, ""
         row.requested_by, row.requested_utc, row.ran_by = by, now, other_than(by, body.ran_by)
+        self.follower.mark(row)
         with self.store.write() as session:
             session.add(row)
             audit.write(session, now, by, "start test", plan.test_id, participant=plan.participant, kind=plan.kind)
@@ -308,6 +318,8 @@ class Runner:
 
     def _on_event(self, event: AnyEvent) -> None:
         if isinstance(event, LiveEvent):
+            if self.current is None and event.test_id not in (None, self.hub.test_id):
+                self.hub.begin(event.test_id)  # another service began it
             self.hub.live(event)
         elif isinstance(event, FinishedEvent):
             self._follow(event.test_id, self._finish(event))
@@ -389,9 +401,13 @@ class Runner:
     # ---- after a restart ------------------------------------------------------------------------------------
 
     async def resume(self) -> None:
-        """Take up what a restart of the service left open."""
+        """Take up what a restart of the service left open, and from now on what another service leaves."""
         self.trials.resume()
-        for row in await asyncio.to_thread(self.store.all, Test, Test.state.in_(OPEN_STATES)):
+        self._take_up(await asyncio.to_thread(self.follower.left))
+        self._watching = asyncio.create_task(self.follower.watch(self._take_up, self.trials.resume))
+
+    def _take_up(self, left: list[Test]) -> None:
+        for row in left:
             status = self.rig.status
             if (
                 status is not None
@@ -423,9 +439,10 @@ class Runner:
         return None if row is None else self.document(row)
 
     def _tell(self, read: asyncio.Future[dict[str, Any] | None]) -> None:
-        if read.cancelled() or (error := read.exception()) is not None:
-            if not read.cancelled():
-                log.error("how a test stands could not be read", exc_info=error)
+        if read.cancelled():
+            return
+        if (error := read.exception()) is not None:
+            log.error("how a test stands could not be read", exc_info=error)
         elif (document := read.result()) is not None:
             self.hub.send({"type": "test", "test": document})
 
@@ -435,9 +452,10 @@ class Runner:
 
     async def close(self) -> None:
         """Leave what runs to the next start of the service."""
-        for task in list(self._tasks):
+        tasks = [*self._tasks, *([self._watching] if self._watching else [])]
+        for task in tasks:
             task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await asyncio.gather(*tasks, return_exceptions=True)
         await self.adaptive.close()
         await self.trials.close()
         await asyncio.to_thread(self._notes.shutdown)

@@ -6,7 +6,7 @@ Who writes has the database alone, whichever process it is in: what a transactio
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -77,6 +77,10 @@ class Store:
             query = query.limit(limit)
         with self.read() as session:
             return list(session.scalars(query))
+
+    def listen(self, event_name: str, heard: Callable[..., None]) -> None:
+        """Hear an event of every session of this store, e.g. `before_commit`."""
+        event.listen(self._sessions, event_name, heard)
 
     def close(self) -> None:
         """Let the connections go."""

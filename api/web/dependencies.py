@@ -21,10 +21,12 @@ from api.models.analyses import Analyses
 from api.models.registry import Versions
 from api.models.tracked import TrackedVersions
 from api.models.trend import Trend
+from api.outbox.feed import Feed
 from api.people.accounts import People
 from api.people.auth import Auth, Principal, Scope
 from api.people.idle_lock import FLUSH_S, IdleLock
 from api.people.pace import Guesses
+from api.sessions.following import Follower
 from api.sessions.notes import Notes
 from api.sessions.questions import Questions
 from api.sessions.rig_client import RigClient
@@ -33,7 +35,8 @@ from api.sessions.stop_log import StopLog
 from api.sessions.stop_right import StopRights
 from api.sessions.trials import Trials
 from api.settings import Settings
-from api.store import Store, uploads
+from api.store import Store, holds, secrets, uploads
+from api.store.holds import Holds
 from api.store.lock import ServiceLock
 from api.store.tables import Recording
 from api.web.guards import anyone_even_locked, anyone_signed_in, require
@@ -68,12 +71,8 @@ class Context:
     lock: ServiceLock
     questions: Questions
     notes: Notes
+    holds: Holds
     drawn_token: str | None = None
-    limits_turn: asyncio.Lock = field(default_factory=asyncio.Lock)
-    """Who changes a participant's limits, and who lets a calibration send by them, take turns: once a change is
-    answered nothing begins with what was before."""
-    key_turn: asyncio.Lock = field(default_factory=asyncio.Lock)
-    """Trials of controllers' keys are counted and begun one after the other."""
     stops: StopLog = field(default_factory=StopLog)
     started_s: float = field(default_factory=time.monotonic)
     flushing: asyncio.Task[None] | None = None
@@ -108,6 +107,7 @@ class Context:
         await self.jobs.close()
         await self.pool.close()
         await self.rig.close()
+        self.holds.close()
         self.people.close()
         self.auth.close()
         self.store.close()
@@ -139,6 +139,8 @@ def _build(settings: Settings, clock: Clock, worker: tuple[str, ...], lock: Serv
     if settings.time_zone:
         set_zone(settings.time_zone)
     store = Store(settings.database)
+    if settings.centre_url is not None:
+        Feed(store, clock)
     guesses = Guesses(clock)
     idle = IdleLock(store, clock, settings.idle_lock_min)
     auth = Auth(store, clock, guesses, idle, settings.session_hours)
@@ -151,14 +153,16 @@ def _build(settings: Settings, clock: Clock, worker: tuple[str, ...], lock: Serv
     adviser = Adviser(worker, places(settings, store))  # its own: a folder that the pool learns ends no test
     tracked = TrackedVersions(store, clock, versions)
     trials = Trials(store, clock, tracked, Adviser(worker, places(settings, store)))
-    runner = Runner(store, clock, rig, pool, versions, analyses, adviser, trials, settings.recordings_dir)
+    held = holds.of(store)
+    follower = Follower(store, held, settings.rig)
+    runner = Runner(store, clock, rig, pool, versions, analyses, adviser, trials, settings.recordings_dir, follower)
     jobs = Jobs(pool)
     people = People(store, clock, auth, guesses)
-    rights = StopRights(owner_only.key(settings.data_dir / "stop-right.key"), clock)
+    rights = StopRights(secrets.shared(store, "stop-right", settings.data_dir / "stop-right.key"), clock)
     questions = Questions(clock)
     return Context(
         settings, clock, store, auth, people, rights, rig, pool, versions, tracked, runner, analyses,
-        Trend(store, clock, pool), jobs, lock, questions, Notes(store, clock), drawn
+        Trend(store, clock, pool), jobs, lock, questions, Notes(store, clock), held, drawn
     )  # fmt: skip
 
 

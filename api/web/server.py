@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import ipaddress
 import json
 import os
 import socket
@@ -20,7 +19,7 @@ from starlette.types import ASGIApp
 from api import logs
 from api.errors import ApiError, SettingsError
 from api.models import carried_structure
-from api.settings import Settings
+from api.settings import Settings, loopback
 from api.store.lock import ServiceLock
 from api.web.app import create_app
 from api.web.connections import protocol, raise_file_limit
@@ -89,14 +88,6 @@ def refuse_open_door(settings: Door) -> None:
         "machine, set STIMRIG_TLS_PROXY=true and STIMRIG_SECURE_COOKIES=true"
     )
     raise OSError(f"{settings.host}: refused, it is not this machine's loopback; {fix}")
-
-
-def loopback(host: str) -> bool:
-    """Whether an address can be reached from this machine only."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
 
 
 def bind(host: str, port: int) -> socket.socket:

@@ -93,6 +93,7 @@ class FakeRig:
         self.starts = 0
         self.stopped_by: str | None = None
         self.loses_ends = False
+        self.finished: m.FinishedEvent | None = None
         self.warnings: list[str] = []
         self.torque_age_s = 0.004
         self.cell_speaks = True
@@ -124,6 +125,7 @@ class FakeRig:
             torque_age_s=self.torque_age_s, torque_nm=0.01,
             calibration=self.calibration and told_next(self.calibration),
             limits=self.limits, require_calibration=self.require_calibration,
+            finished=self.finished,
         )  # fmt: skip
 
     async def serve(self) -> None:
@@ -387,6 +389,10 @@ class FakeRig:
             torque_nm=[torque[k] for k in counter],
         )  # fmt: skip
 
+    def _finish(self, event: m.FinishedEvent) -> None:
+        self.finished = event
+        self._send(event)
+
     async def _end(self, plan: m.TestPlan, widths: list[float], torque: list[float], score: FakeScore) -> None:
         stopped = self._stop.is_set()
         outcome = "stopped" if stopped else "completed"
@@ -397,7 +403,7 @@ class FakeRig:
         self._send(m.StateEvent(status=self.status()))
         if self.loses_ends:
             return
-        self._send(
+        self._finish(
             m.FinishedEvent(
                 test_id=plan.test_id, outcome=outcome, reason=self.reason, recording_path=str(path),
                 recording_id=path.stem, file_sha256=digest, last_sample_unix_s=time.time(),

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 import re
-import sqlite3
 from collections.abc import Callable
 from pathlib import Path
 
@@ -103,8 +102,7 @@ def test_rig_that_is_not_there_or_stands_still(service: Service, tmp_path: Path)
 
 def test_tampered_trail_is_found(service: Service) -> None:
     assert finding("database", data_dir=service.data).verdict == "ok"
-    with sqlite3.connect(service.data / "stimrig.db") as database:
-        database.execute("UPDATE audit SET who = 'nobody' WHERE seq = 1")
+    service.sql("UPDATE audit SET who = 'nobody' WHERE seq = 1")
     assert finding("database", data_dir=service.data).verdict == "fails"
 
 

@@ -22,6 +22,7 @@ from api.store import Store, audit, migrations
 from api.store.tables import Approval, AuditEntry, Participant, Recording, Table, User
 from tests.api.conftest import STUB, run_service, run_test
 
+pytestmark = pytest.mark.sqlite
 ROOT = Path(__file__).parents[2]
 OLD = Path(__file__).parent / "databases"
 ADDED_SINCE = [
@@ -118,6 +119,7 @@ def test_a_service_goes_on_with_an_older_database(tmp_path: Path, short_dir: Pat
         tmp_path / "stimrig.db", "DROP TABLE alembic_version", "DROP TABLE schema_version", "DROP TABLE confirmations",
         "DROP TABLE known_places", "DROP TABLE users", "DROP TABLE notes", "DROP TABLE tracked",
         "DROP TABLE secrets",
+        "DROP TABLE outbox",
         *(f"DROP TABLE {table}" for table in Table.metadata.tables if table.startswith("centre_")),
         *(f"ALTER TABLE {table} DROP COLUMN {column}" for table, column in ADDED_SINCE),
     )  # fmt: skip

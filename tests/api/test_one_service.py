@@ -25,6 +25,7 @@ from api.store import Store, lock
 from api.store.lock import HeldError, ServiceLock
 from tests.api.conftest import PATIENCE_S, TOKEN, Service, run_test
 
+pytestmark = pytest.mark.sqlite
 ROOT = Path(__file__).parents[2]
 
 
@@ -136,7 +137,7 @@ def mode(path: Path) -> int:
 
 def test_what_a_service_keeps_is_its_owners_alone(service: Service, client: httpx.Client, participant: str) -> None:
     run_test(client, participant)
-    private = ["stimrig.db", "stimrig.db-wal", "stimrig.db-shm", "stop-right.key", "service.lock", "stimrig.db.lock"]
+    private = ["stimrig.db", "stimrig.db-wal", "stimrig.db-shm", "service.lock", "stimrig.db.lock"]
     assert {name: mode(service.data / name) for name in private} == dict.fromkeys(private, 0o600)
     assert mode(service.data / "exports") == 0o700 and not mode(service.data / "recordings") & 0o007
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import json
 import re
-import sqlite3
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ import argon2
 import httpx
 import pytest
 from fastapi.routing import APIRoute
+from sqlalchemy import inspect
 
 from api.cli import main
 from api.clock import Clock
@@ -104,10 +104,10 @@ def test_a_password_costs_what_rfc_9106_asks_for(monkeypatch: pytest.MonkeyPatch
 
 def test_password_is_kept_as_argon2id_only(service: Service, clinician: httpx.Client) -> None:
     assert clinician.get("/v1/rig").status_code == 200
-    with sqlite3.connect(service.data / "stimrig.db") as database:
-        (kept,) = database.execute("SELECT password_hash FROM users").fetchone()
+    ((kept,),) = service.sql("SELECT password_hash FROM users")
     assert kept.startswith("$argon2id$")
-    assert PASSWORD.encode() not in (service.data / "stimrig.db").read_bytes()
+    tables = inspect(service.app.state.context.store.engine).get_table_names()
+    assert not any(PASSWORD in str(service.sql(f"SELECT * FROM {table}")) for table in tables)
 
 
 def test_writes_need_the_csrf_token_and_administration_is_refused(clinician: httpx.Client) -> None:
@@ -280,9 +280,12 @@ def test_audit_is_verified_and_exported_by_a_command(
         assert main.run(["audit", "verify", "--file", str(out)]) == 1
     out.write_text(lines[0] + "\n")
     assert main.run(["audit", "verify", "--file", str(out), "--head", found["head"]]) == 1, "a cut end is found"
-    with sqlite3.connect(service.data / "stimrig.db") as database:
-        database.execute("UPDATE audit SET who = 'somebody else' WHERE seq = 2")
+    service.sql("UPDATE audit SET who = 'somebody else' WHERE seq = 2")
     capsys.readouterr()
     assert main.run(["audit", "verify", "--data", data]) == 1
     assert "broken at entry 2" in capsys.readouterr().out
+
+
+@pytest.mark.sqlite
+def test_an_audit_of_no_database_is_told(tmp_path: Path) -> None:
     assert main.run(["audit", "verify", "--data", str(tmp_path / "nowhere")]) == 2

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import concurrent.futures
 import json
-import sqlite3
 import time
 from typing import Any
 
@@ -195,12 +194,12 @@ def test_every_deed_is_in_the_audit_trail_and_the_chain_holds(
     assert trail["whole"]
     assert ("administrator", "start test", document["id"]) in deeds
     assert ("administrator", "approve", document["model_id"]) in deeds
-    with sqlite3.connect(service.data / "stimrig.db") as database:
-        database.execute("UPDATE audit SET who = 'nobody' WHERE seq = 3")
+    service.sql("UPDATE audit SET who = 'nobody' WHERE seq = 3")
     broken = client.get("/v1/audit").json()
     assert not broken["whole"] and broken["first_broken"] == 3
 
 
+@pytest.mark.sqlite
 def test_database_is_durable(service: Service) -> None:
     with service.app.state.context.store.engine.connect() as connection:
         assert connection.exec_driver_sql("PRAGMA journal_mode").scalar() == "wal"

@@ -6,6 +6,7 @@ import re
 import socket
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -13,10 +14,10 @@ import httpx
 import pytest
 from sqlalchemy.exc import OperationalError
 
-from api import owner_only
 from api.clock import Clock
 from api.people.auth import Scope
 from api.sessions.stop_right import RIGHT_S, StopRights
+from api.store import Store, secrets
 from tests.api.conftest import TOKEN, Service
 from tests.api.test_people import standing_still
 
@@ -189,12 +190,19 @@ def test_a_right_lasts_a_day_or_as_long_as_its_test() -> None:
 
 
 def test_a_restart_of_the_service_keeps_the_rights_of_open_pages(service: Service) -> None:
-    path = service.data / "stop-right.key"
-    right = service.app.state.context.stop_rights.give("Ada", None)
-    assert path.stat().st_mode & 0o777 == 0o600
-    path.chmod(0o644)
-    assert StopRights(owner_only.key(path), Clock()).holder(right) == "Ada"
-    assert path.stat().st_mode & 0o777 == 0o600
+    context = service.app.state.context
+    right, gone = context.stop_rights.give("Ada", None), service.data / "stop-right.key"
+    assert StopRights(secrets.shared(context.store, "stop-right", gone), Clock()).holder(right) == "Ada"
+
+
+def test_the_upgrade_keeps_them_too(tmp_path: Path) -> None:
+    """An older version kept their key in a file."""
+    path, store = tmp_path / "stop-right.key", Store(f"sqlite:///{tmp_path}/stimrig.db")
+    path.write_bytes(bytes(range(32)))
+    for _ in range(2):
+        assert secrets.shared(store, "stop-right", path) == bytes(range(32)) and not path.exists()
+    assert len(set(secrets.shared(store, "another", path))) > 1
+    store.close()
 
 
 def test_a_token_that_ran_out_in_a_test_still_stops(service: Service, client: httpx.Client) -> None:

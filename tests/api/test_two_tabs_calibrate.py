@@ -11,6 +11,7 @@ from typing import Any
 import httpx
 import pytest
 
+from api.store.holds import LIMITS_TURN
 from tests.api.conftest import Service
 from tests.api.test_access import csrf, signed_in
 from tests.api.test_calibration import WHERE, up
@@ -36,7 +37,7 @@ def trains(service: Service) -> int:
 def at_once(service: Service, press: Any, count: int = 2) -> list[httpx.Response]:
     """Press so often; all requests stand at the turn before the first of them gets it."""
     context = service.app.state.context
-    turn, loop = context.limits_turn, context.rig._task.get_loop()
+    turn, loop = context.holds._turns[LIMITS_TURN], context.rig._task.get_loop()
     asyncio.run_coroutine_threadsafe(turn.acquire(), loop).result(10)
     answers: list[httpx.Response] = []
     pressing = [threading.Thread(target=lambda: answers.append(press())) for _ in range(count)]

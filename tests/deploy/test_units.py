@@ -33,7 +33,8 @@ RIG, API = unit("stimrig-rig.service"), unit("stimrig-api.service")
 
 
 @pytest.mark.parametrize(
-    "name", ["stimrig-rig.service", "stimrig-api.service", "stimrig-backup.service", "stimrig-centre.service"]
+    "name",
+    [f"stimrig-{name}.service" for name in ("rig", "api", "backup", "outbox", "centre")],
 )
 def test_no_service_has_more_rights_than_it_needs(name: str) -> None:
     settings = unit(name)
@@ -54,6 +55,15 @@ def test_the_service_reaches_no_device_and_none_of_the_rigs_files() -> None:
     assert API["ReadWritePaths"] == ["/var/lib/stimrig/api"]
     assert API["BindReadOnlyPaths"][0].startswith("/var/lib/stimrig/rig/recordings:")
     assert "AF_CAN" not in API["RestrictAddressFamilies"][0]
+
+
+def test_what_talks_to_a_centre_cannot_reach_the_rig() -> None:
+    outbox = unit("stimrig-outbox.service")
+    assert outbox["User"] == API["User"] and outbox["Group"] == API["Group"]
+    assert outbox["InaccessiblePaths"] == [f"-/run/{RIG['RuntimeDirectory'][0]}"]
+    assert "RIG_SOCKET" not in " ".join(outbox["Environment"]) and outbox["PrivateDevices"] == ["yes"]
+    assert outbox["ReadWritePaths"] == API["ReadWritePaths"] and outbox["BindReadOnlyPaths"] == API["BindReadOnlyPaths"]
+    assert outbox["RestartPreventExitStatus"] == ["2"]
 
 
 def test_the_rig_reaches_its_devices_and_no_network() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
+import signal
 import socket
 import subprocess
 import tempfile
@@ -63,6 +64,7 @@ class Cluster:
             [str(self.place / "postgres"), "-D", str(self.folder / "data"), "-p", str(self.port), "-h", "127.0.0.1",
              "-k", str(self.folder), *more],
             user=self.user, cwd=self.folder, stderr=subprocess.DEVNULL, stdin=subprocess.DEVNULL,
+            start_new_session=True,
         )  # fmt: skip
         end = time.monotonic() + STARTS_S
         while True:
@@ -94,6 +96,28 @@ class Cluster:
         with psycopg.connect(self.address("postgres"), autocommit=True) as connection:
             connection.execute(f"CREATE DATABASE {name}")
         return self.address(name)
+
+    def freeze(self) -> None:
+        """All its processes stand still, as on a machine that is gone."""
+        self._signal(signal.SIGSTOP)
+
+    def thaw(self) -> None:
+        """They go on."""
+        self._signal(signal.SIGCONT)
+
+    def _signal(self, number: signal.Signals) -> None:
+        """To every process of it: each backend leads a session of its own."""
+        assert self.process is not None
+        listed = subprocess.run(["ps", "-e", "-o", "pid=,ppid="], capture_output=True, text=True, check=True).stdout
+        for line in listed.splitlines():
+            pid, parent = map(int, line.split())
+            if self.process.pid in (pid, parent):
+                os.kill(pid, number)
+
+    def restart(self) -> None:
+        """As after a crash of it: all connections are cut."""
+        self.stop()
+        self.start()
 
     def stop(self) -> None:
         """End it at once."""

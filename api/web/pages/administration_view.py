@@ -10,6 +10,7 @@ from fastapi import APIRouter, Form, Request
 from fastapi.responses import PlainTextResponse, RedirectResponse, Response
 
 from api.language import lazy
+from api.outbox import status
 from api.people.auth import Scope
 from api.store import audit
 from api.store.tables import AuditEntry
@@ -53,13 +54,15 @@ async def shown(request: Request, context: Context, key: dict[str, Any] | None =
             "entries": entries[: -NEWEST - 1 : -1],
             "count": len(entries),
             "broken": audit.first_broken(entries),
+            "centre": status.read(context.settings, context.clock.unix_s()),
         }
 
     found = await asyncio.to_thread(gather)
     structure = context.settings.structure
     return page(
-        request, "administration.html", **found, key=key, roles=MAY, now_utc=context.clock.utc(), structure=structure
-    )
+        request, "administration.html", **found, key=key, roles=MAY, now_utc=context.clock.utc(), structure=structure,
+        centre_words=status.WORDS, centre_good=status.GOOD,
+    )  # fmt: skip
 
 
 def role_of(scopes: list[str]) -> str:

@@ -8,7 +8,7 @@ from fastapi import APIRouter
 
 from api import language
 from api.models import next_step
-from api.sessions.lifecycle import OPEN_STATES
+from api.sessions.following import OPEN_STATES
 from api.sessions.trials import SEQUENCE
 from api.store.tables import Model, Participant, Test
 from api.web.dependencies import Context, Ctx, Tester

@@ -9,6 +9,7 @@ from fastapi import APIRouter
 
 from api.errors import ApiError, NotFoundError
 from api.store import audit
+from api.store.holds import LIMITS_TURN
 from api.store.tables import Participant
 from api.web.dependencies import PROBLEM, Context, Ctx, Tester
 from api.web.responses.base import answers
@@ -25,7 +26,7 @@ async def put(context: Context, code: str, archived: bool, by: str) -> Participa
     ApiError
         404 no such participant; 409 a test or a calibration of it is under way.
     """
-    async with context.limits_turn:  # no calibration begins meanwhile; a start looks once more before its command
+    async with context.holds.turn(LIMITS_TURN):  # nothing begins meanwhile
         if archived:
             refuse_busy(context, code)
         return await asyncio.to_thread(_put, context, code, archived, by)

@@ -15,6 +15,7 @@ from api.sessions import profiles
 from api.sessions.refusals import refuse_archived
 from api.sessions.requests import CalibrationIn, FinishIn, MarkIn, StepIn
 from api.store import audit
+from api.store.holds import LIMITS_TURN
 from api.store.tables import Participant
 from api.web.dependencies import PROBLEM, Context, Ctx, Tester
 from api.web.responses.base import answers
@@ -41,7 +42,7 @@ async def begin(
 
     It is bound to the limits that it is begun with; `seen`, their version that a person was shown.
     """
-    async with context.limits_turn:
+    async with context.holds.turn(LIMITS_TURN):
         row = await asyncio.to_thread(participants.find, context, code)
         refuse_archived(row)
         context.runner.refuse_second()
@@ -104,7 +105,7 @@ NOT_SAID = Shown()
 
 async def step(context: Context, code: str, body: StepIn, shown: Shown = NOT_SAID) -> dict[str, Any]:
     """Play one train. Looking and playing are one turn: of two presses on the same sight one plays."""
-    async with context.limits_turn:
+    async with context.holds.turn(LIMITS_TURN):
         shown.check(await sound(context, code))
         await context.rig.ask(CalibrateStepRequest(direction=body.direction, shown_us=body.shown_us))
     return await standing(context, code)
@@ -112,7 +113,7 @@ async def step(context: Context, code: str, body: StepIn, shown: Shown = NOT_SAI
 
 async def mark(context: Context, code: str, threshold: Any, by: str, shown: Shown = NOT_SAID) -> dict[str, Any]:
     """Mark the last train's width; no train comes between looking and marking."""
-    async with context.limits_turn:
+    async with context.holds.turn(LIMITS_TURN):
         found = await sound(context, code)
         shown.check(found)
         await context.rig.ask(CalibrateMarkRequest(threshold=threshold))
@@ -124,7 +125,7 @@ async def finish(
     context: Context, code: str, discard: bool, by: str, shown: Shown = NOT_SAID
 ) -> dict[str, Any]:  # fmt: skip
     """Close it; unless discarded, what it found is the participant's profile for the day."""
-    async with context.limits_turn:
+    async with context.holds.turn(LIMITS_TURN):
         found = await (standing if discard else sound)(context, code)
         shown.check(found)
         result = await context.rig.ask_for(CalibrationResult, CalibrateFinishRequest(by=by, discard=discard))

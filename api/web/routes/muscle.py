@@ -11,6 +11,7 @@ from api.errors import ApiError, NotFoundError
 from api.sessions import profiles
 from api.sessions.requests import MuscleIn
 from api.store import audit
+from api.store.holds import LIMITS_TURN
 from api.store.tables import Participant
 from api.web.dependencies import PROBLEM, Context, Ctx, Tester
 from api.web.responses.base import answers
@@ -29,7 +30,7 @@ async def change(context: Context, code: str, body: MuscleIn, by: str, voids: bo
         404 no such participant; 409 a test or calibration of it is under way, or the calibration would be lost and
         that was not allowed.
     """
-    async with context.limits_turn:
+    async with context.holds.turn(LIMITS_TURN):
         refuse_busy(context, code)
         return await asyncio.to_thread(_change, context, code, body, by, voids)
 

@@ -16,6 +16,7 @@ from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4
 from prometheus_client.registry import Collector
 from sqlalchemy import func, select, text
 
+from api.outbox import status
 from api.store.tables import AuditEntry, Model, Participant, Test
 from api.web.dependencies import Context, Ctx
 from api.web.responses.base import answers
@@ -29,12 +30,12 @@ def health(context: Ctx) -> dict[str, Any]:
     """`ok` where database and rig answer; `degraded` says what does not. Holds nothing of any participant."""
     with context.store.read() as session:
         session.execute(text("SELECT 1"))
-    status = context.rig.status
+    newest = context.rig.status
     rig = {
         "connected": context.rig.connected,
-        "state": status.state if status and context.rig.connected else "disconnected",
+        "state": newest.state if newest and context.rig.connected else "disconnected",
         "age_s": context.rig.age_s,
-        "torque_age_s": status.torque_age_s if status else None,
+        "torque_age_s": newest.torque_age_s if newest else None,
     }
     return {
         "status": "ok" if context.rig.connected else "degraded",
@@ -89,6 +90,24 @@ class _Figures(Collector):
             ("stimrig_jobs_busy_seconds_total", "Time in analyses", context.pool.busy_s),
         ):
             yield CounterMetricFamily(name, words, value)
+        yield from _centre(context)
+
+
+def _centre(context: Context) -> Iterator[Metric]:
+    """How telling the centre goes; nothing where there is none."""
+    now_s = context.clock.unix_s()
+    told = status.read(context.settings, now_s)
+    if told is None:
+        return
+    since_s = told.since_contact_s(now_s)
+    age_s = -1.0 if since_s is None else since_s
+    for name, words, value in (
+        ("stimrig_outbox_items_waiting", "Items that the centre lacks", told.items_waiting),
+        ("stimrig_outbox_files_waiting", "Files that it is known to lack", told.files_waiting),
+        ("stimrig_outbox_files_damaged", "Files that cannot be sent to it", told.damaged_count),
+        ("stimrig_outbox_contact_age_seconds", "Time since it answered; -1: never", age_s),
+    ):
+        yield GaugeMetricFamily(name, words, value)
 
 
 def _approved(context: Context) -> int:

@@ -13,6 +13,7 @@ from api.errors import ApiError, NotFoundError
 from api.sessions import directory, profiles
 from api.sessions.requests import ProfileIn
 from api.store import audit
+from api.store.holds import LIMITS_TURN
 from api.store.tables import Participant, Test
 from api.web.dependencies import PROBLEM, Context, Ctx, Tester
 from api.web.headers import entity_tags
@@ -84,7 +85,7 @@ async def change_profile(context: Context, code: str, change: Change, by: str) -
         404 no such participant; 412 the limits were changed meanwhile; 422 beyond what the rig takes, or the first ones
         are not whole; 409 the calibration would be lost, and that was not allowed.
     """
-    async with context.limits_turn:
+    async with context.holds.turn(LIMITS_TURN):
         return await asyncio.to_thread(_change, context, code, change, by)
 
 

@@ -18,6 +18,7 @@ from api.sessions import controller_trials
 from api.sessions.refusals import other_than
 from api.sessions.requests import TestIn
 from api.store import audit
+from api.store.holds import KEY_TURN
 from api.store.tables import Test
 from api.web import page_language
 from api.web.dependencies import PROBLEM, Context, Ctx, LiveReader, Tester, of
@@ -45,7 +46,7 @@ def find(context: Context, test_id: str) -> Test:
 @router.post("", status_code=202, **answers(TestOut, 202, "begun; see `Location`"))
 async def start_test(context: Ctx, who: Tester, body: TestIn, response: Response) -> dict[str, Any]:
     """Start a test; `Location` is where its progress is read. One at a time: 409 names the holder."""
-    row = await controller_trials.start(context.runner, context.key_turn, context.store, who, body)
+    row = await controller_trials.start(context.runner, context.holds.turn(KEY_TURN), context.store, who, body)
     response.headers["Location"] = f"/v1/tests/{row.id}"
     return context.runner.document(row)
 

@@ -1,0 +1,49 @@
+"""`python -m api.outbox`: tells the centre what the rig has sealed, until SIGTERM.
+
+Exit 2: no centre is configured, a setting does not hold, or the database does not open.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+
+from api import logs
+from api.clock import Clock
+from api.errors import ApiError, SettingsError
+from api.outbox.feed import Feed
+from api.outbox.link import Link
+from api.outbox.pusher import Pusher
+from api.settings import Settings
+from api.store import Store
+
+NICENESS = 10
+"""It gives way to the rig, the service and its workers."""
+
+
+def main() -> int:
+    """Run the pusher; the exit code."""
+    logs.configure()
+    os.umask(os.umask(0o077) | 0o077)
+    os.nice(NICENESS)
+    clock = Clock()
+    try:
+        settings = Settings()
+        if settings.centre_url is None or settings.centre_key is None:
+            raise SettingsError(
+                "STIMRIG_CENTRE_URL: names no centre; set it and STIMRIG_CENTRE_KEY, or start no outbox"
+            )
+        store = Store(settings.database)
+    except (ApiError, SettingsError, OSError) as error:
+        print(f"outbox: {error}", file=sys.stderr)
+        return 2
+    Feed(store, clock)  # what it writes itself is told, too
+    link = Link(settings.centre_url, settings.centre_key.get_secret_value(), clock)
+    with contextlib.suppress(KeyboardInterrupt):
+        Pusher(store, settings, clock, link).run()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

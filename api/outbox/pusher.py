@@ -1,0 +1,254 @@
+"""The pusher: hello, items, files, wait; after a failure a longer wait.
+
+It keeps no marks of what was sent: the centre says what it has.
+"""
+
+from __future__ import annotations
+
+import logging
+import random
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from sqlalchemy.exc import SQLAlchemyError
+
+from api.clock import Clock, utc_label
+from api.outbox import reconcile, rig_state, status
+from api.outbox.backoff import Backoff
+from api.outbox.errors import KeyRefusedError, PushError, UnreachableError
+from api.outbox.files import Files
+from api.outbox.link import Link
+from api.outbox.sending import Sending
+from api.outbox.status import Status
+from api.outbox.telling import Telling
+from api.settings import Settings
+from api.store import Store
+from api.version import software_version
+
+HELLO_S = 30.0
+POLL_S = 1.0
+REVOKED_S = 900.0
+TOLD_S = 30.0
+"""The status is written at least so often."""
+GOOD_S = 180.0
+"""One that is older was left by a pusher that does not run: a chunk on a slow line takes a while."""
+LEAST_SHARE = 1 / 32
+MOST_DAMAGED_TOLD, MOST_DAMAGED_SHOWN = 1000, 20
+log = logging.getLogger("stimrig.outbox")
+
+
+class Pusher:
+    """Tells a centre what the outbox holds.
+
+    Parameters
+    ----------
+    sleep : callable
+        Waits so many seconds.
+    chance : random.Random, optional
+        Spreads the waits after failures.
+    """
+
+    def __init__(
+        self, store: Store, settings: Settings, clock: Clock, link: Link,
+        sleep: Callable[[float], None] = time.sleep, chance: random.Random | None = None,
+    ) -> None:  # fmt: skip
+        self.store, self.settings, self.clock, self.link, self.sleep = store, settings, clock, link, sleep
+        chance = chance or random.Random()
+        self.files = Files(store)
+        self.telling = Telling(store, clock, link, self._about)
+        self.sending = Sending(link, self.files)
+        self.line, self.bucket, self.database = Backoff(chance), Backoff(chance), Backoff(chance)
+        self.share = 1.0
+        """Of the largest batch or chunk: less on a line that breaks."""
+        self._missing: Iterator[int] | None = reconcile.batches(store, clock)
+        self._hello_s = self._line_s = self._files_s = self._database_s = self.clock.monotonic_s()
+        """When each may be tried next."""
+        self._wrong: PushError | None = None
+        self._wrong_files: PushError | None = None
+        self._database_words = ""
+        self._contact_utc: str | None = None
+        self._told: tuple[float, Status] | None = None
+        self._take_up()
+
+    def run(self) -> None:
+        """Go on for ever."""
+        while True:
+            self.sleep(self.turn())
+
+    def turn(self) -> float:
+        """Do a bounded piece of work; how long to wait before the next one, s."""
+        busy = False
+        try:
+            if self.clock.monotonic_s() >= self._database_s:
+                busy = self._put_in_missing()
+                busy = self._push() or busy
+                self.database.reset()
+                self._database_words = ""
+            self._tell()
+        except SQLAlchemyError as error:
+            self._database_s = self.clock.monotonic_s() + self.database.next_s()
+            self._missing = reconcile.batches(self.store, self.clock)
+            self._database_words = str(error).splitlines()[0][:200]
+            log.warning("the rig's database: %s", self._database_words)
+            self._write_status()
+            busy = False
+        return 0.0 if busy else self._rest_s()
+
+    def _rest_s(self) -> float:
+        """Until what is new has to be noticed; after a failure until it is tried again, or the status is old."""
+        now_s = self.clock.monotonic_s()
+        wait_s = max(self._line_s, self._database_s) - now_s
+        return min(max(wait_s, POLL_S), TOLD_S)
+
+    def _put_in_missing(self) -> bool:
+        if self._missing is None:
+            return False
+        if next(self._missing, None) is None:
+            self._missing = None
+            return False
+        return True
+
+    # ---- the line ----------------------------------------------------------------------------------------------
+
+    def _push(self) -> bool:
+        if self.clock.monotonic_s() < self._line_s:
+            return False
+        try:
+            busy = self._step()
+        except PushError as error:
+            self._failed(error)
+            return False
+        if busy:
+            self.share = min(1.0, self.share * 1.5)
+        return busy
+
+    def _step(self) -> bool:
+        """One request, if one is due; whether there may be more at once."""
+        if self.telling.at is None or self.clock.monotonic_s() >= self._hello_s:
+            self._hello()
+            return True
+        if self.telling.send(self.share):
+            self._went_well()
+            self.sending.asked = False
+            return True
+        busy = self._step_files()
+        if busy or not self.sending.queue:
+            self._went_well()
+        return busy
+
+    def _hello(self) -> None:
+        if self.telling.hello():
+            self._missing = reconcile.batches(self.store, self.clock)
+        self._hello_s = self.clock.monotonic_s() + HELLO_S
+        if not self.sending.queue:
+            self.sending.asked = False  # the centre may have lost one
+        self._contact_utc = self.clock.utc()
+
+    def _went_well(self) -> None:
+        """It took what it was sent, or there is nothing to send: that it answers a hello is not enough."""
+        self._contact_utc = self.clock.utc()
+        self.line.reset()
+        if self._wrong is not None:
+            log.info("the centre answers again")
+        self._wrong = None
+
+    def _step_files(self) -> bool:
+        """Files have waits of their own: a bucket that is full keeps no item back."""
+        if self.clock.monotonic_s() < self._files_s:
+            return False
+        try:
+            busy = self.sending.step(self.share)
+        except (UnreachableError, KeyRefusedError):
+            raise
+        except PushError as error:
+            self._files_s = self.clock.monotonic_s() + self.bucket.next_s()
+            if self._wrong_files is None or self._wrong_files.state != error.state:
+                log.warning("%s", error)
+            self._wrong_files = error
+            return False
+        except OSError as error:  # it is gone, or cannot be read: the next look finds it damaged
+            log.warning("a file for the centre: %s", error)
+            self._files_s = self.clock.monotonic_s() + self.bucket.next_s()
+            return False
+        self.bucket.reset()
+        self._wrong_files = None
+        return busy
+
+    def _failed(self, error: PushError) -> None:
+        wait_s = self.line.next_s()
+        if isinstance(error, KeyRefusedError):
+            wait_s = REVOKED_S * self.line.chance.uniform(0.7, 1.0)
+        if isinstance(error, UnreachableError):
+            self.share = max(LEAST_SHARE, self.share / 2)
+        if self._wrong is None or self._wrong.state != error.state:
+            log.warning("%s; nothing is lost, it is tried again", error)
+        self._wrong = error
+        self.telling.at = None
+        self._line_s = self.clock.monotonic_s() + wait_s
+
+    # ---- what is told of itself -----------------------------------------------------------------------------------
+
+    def _about(self) -> dict[str, Any]:
+        """What hello says beside the chain."""
+        items, files = self.telling.waiting()
+        disk = shutil.disk_usage(self.settings.data_dir)
+        return {
+            "version": software_version(),
+            "utc": self.clock.utc(),
+            "disk_free_bytes": disk.free,
+            "disk_total_bytes": disk.total,
+            **rig_state.of(self.settings),
+            "damaged": sorted(self.files.damaged)[:MOST_DAMAGED_TOLD],
+            "waiting_items": items,
+            "waiting_files": files + len(self.sending.queue),
+        }
+
+    def _take_up(self) -> None:
+        """What a pusher before this one has written is where people go on reading; the centre is asked all the same."""
+        before = status.last(self.settings)
+        if before is not None:
+            self._contact_utc = before.last_contact_utc
+            self.telling.reached = (before.chain, before.seq) if before.chain else None
+
+    def _tell(self) -> None:
+        if self._told is None or self.clock.monotonic_s() >= self._told[0] + POLL_S:
+            self._write_status()
+
+    def _write_status(self) -> None:
+        """Write it where it has changed, or is old."""
+        new = self._status()
+        if self._told is not None:
+            told_s, old = self._told
+            of = (old.state, old.detail, old.items_waiting, old.files_waiting, old.damaged_count)
+            same = of == (new.state, new.detail, new.items_waiting, new.files_waiting, new.damaged_count)
+            if same and self.clock.monotonic_s() < told_s + TOLD_S:
+                return
+        try:
+            status.write(self.settings.data_dir, new)
+        except OSError as error:
+            log.warning("the status: %s", error)
+        self._told = (self.clock.monotonic_s(), new)
+
+    def _status(self) -> Status:
+        items = files = 0
+        if not self._database_words:
+            items, files = self.telling.waiting()
+        files += len(self.sending.queue)
+        wrong = self._wrong or self._wrong_files
+        if self._database_words:
+            state, detail = "database", self._database_words
+        elif wrong is not None:
+            state, detail = wrong.state, str(wrong)
+        elif self._contact_utc is None or self.telling.at is None:
+            state, detail = "starting", ""
+        elif items or files:
+            state, detail = "sending", ""
+        else:
+            state, detail = ("damaged" if self.files.damaged else "current"), ""
+        chain, seq = self.telling.reached or (None, 0)
+        return Status(
+            state, detail, self.link.url, self.clock.utc(), utc_label(self.clock.unix_s() + GOOD_S), self._contact_utc,
+            chain, seq, items, files, tuple(sorted(self.files.damaged)[:MOST_DAMAGED_SHOWN]), len(self.files.damaged),
+        )  # fmt: skip

@@ -1,0 +1,80 @@
+"""Puts in whatever row's content is not its newest item: from before a centre was configured, or from past the feed."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterator
+from itertools import islice
+from typing import Any
+
+from sqlalchemy import func, inspect, select, tuple_
+from sqlalchemy.orm import Session
+
+from api.clock import Clock
+from api.outbox import chain, feed
+from api.outbox.chain import Telling
+from api.store import Store
+from api.store.tables import Approval, AuditEntry, Model, Participant, Recording, Table, Test, Tracked
+
+BATCH = 50
+PAGE = 1000
+TIMES: dict[type[Table], tuple[Any, Any]] = {
+    Participant: (Participant.created_utc, Participant.code),
+    Recording: (Recording.created_utc, Recording.id),
+    Model: (Model.created_utc, Model.id),
+    Test: (func.coalesce(Test.finished_utc, Test.requested_utc), Test.id),
+    Approval: (Approval.at_utc, Approval.id),
+    Tracked: (Tracked.at_utc, Tracked.test_id),
+}
+"""When a row came about, and its key."""
+
+
+def batches(store: Store, clock: Clock) -> Iterator[int]:
+    """Put in what is missing, in order of time; after each batch of rows how many items were put in.
+
+    Nothing is held open in between: neither a transaction nor more than a page of keys for each table.
+    """
+    rows = heapq.merge(*(_keys(store, table, rank) for rank, table in enumerate(TIMES)))
+    while batch := list(islice(rows, BATCH)):
+        yield _put(store, clock, [(list(TIMES)[rank], key) for _at, rank, key in batch])
+    newest = store.all(AuditEntry, order=AuditEntry.seq.desc(), limit=1)
+    if newest:
+        yield _put(store, clock, [(AuditEntry, newest[0].seq)])
+
+
+def _keys(store: Store, table: type[Table], rank: int) -> Iterator[tuple[str, int, Any]]:
+    """Time, rank and key of a table's rows, in order of time; read page by page."""
+    at, key = TIMES[table]
+    after: tuple[Any, Any] | None = None
+    while True:
+        query = select(at, key).order_by(at, key).limit(PAGE)
+        if after is not None:
+            query = query.where(tuple_(at, key) > tuple_(*after))
+        with store.read() as session:
+            page = [tuple(row) for row in session.execute(query)]
+        for when, one in page:
+            yield str(when), rank, one
+        if len(page) < PAGE:
+            return
+        after = page[-1]
+
+
+def _put(store: Store, clock: Clock, keys: list[tuple[type[Table], Any]]) -> int:
+    """Put in those whose newest item says something else; looked at first without keeping others from writing."""
+    with store.read() as session:
+        changed = {(each.kind, each.key) for each in chain.unlike_newest(session, _tellings(session, keys))}
+    if not changed:
+        return 0
+    with store.write() as session:
+        tellings = [each for each in _tellings(session, keys) if (each.kind, each.key) in changed]
+        return chain.put(session, clock.utc(), tellings)
+
+
+def _tellings(session: Session, keys: list[tuple[type[Table], Any]]) -> list[Telling]:
+    """What is told of these rows, in this order."""
+    found: dict[tuple[type[Table], Any], Table] = {}
+    for table in {table for table, _ in keys}:
+        column = inspect(table).primary_key[0]
+        for row in session.scalars(select(table).where(column.in_([key for of, key in keys if of is table]))):
+            found[table, getattr(row, column.key)] = row
+    return [telling for of in keys if of in found for telling in feed.told([found[of]])]

@@ -1,0 +1,164 @@
+"""What one service at a time has, of all that share a database: a turn, and that it lives.
+
+On SQLite there is one service (`api.store.lock`). On PostgreSQL both are advisory locks of a connection: the server
+lets go when the connection ends, so whatever a service held is free as soon as it is dead.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import logging
+import secrets
+from collections import defaultdict
+from collections.abc import AsyncIterator
+from contextlib import AbstractAsyncContextManager, asynccontextmanager
+from typing import Protocol
+
+from sqlalchemy import Connection, Engine
+from sqlalchemy.exc import SQLAlchemyError
+
+from api.errors import not_answering
+from api.store.database import Store
+
+log = logging.getLogger("stimrig.store")
+Turn = AbstractAsyncContextManager[None]
+LIMITS_TURN = "limits"
+"""Who changes a participant's limits, and who lets a calibration or a test send by them, take turns: once a change is
+answered nothing begins with what was before."""
+KEY_TURN = "keys"
+"""Trials of controllers' keys are counted and begun one after the other."""
+DEAD_AFTER = 2
+"""A service is dead that was seen neither at this look nor at the one before: it may just be connecting again."""
+
+
+class Holds(Protocol):
+    """A service among those that share a database."""
+
+    me: str
+    """Drawn when the service starts."""
+
+    def turn(self, name: str) -> Turn:
+        """Around what no two may do at once. Raises ApiError: 503 where the database does not answer."""
+        ...
+
+    def keep(self) -> None:
+        """Show that this service lives; to be called again and again."""
+        ...
+
+    def dead(self, services: set[str]) -> set[str]:
+        """Those that live no more; this one is asked for again and again, too."""
+        ...
+
+    def close(self) -> None:
+        """Let everything go."""
+        ...
+
+
+class Alone:
+    """The one service of a SQLite database: every other is dead."""
+
+    def __init__(self) -> None:
+        self.me = secrets.token_hex(8)
+        self._turns: defaultdict[str, asyncio.Lock] = defaultdict(asyncio.Lock)
+
+    def turn(self, name: str) -> Turn:
+        """As `Holds`."""
+        return self._turns[name]
+
+    def keep(self) -> None:
+        """As `Holds`."""
+
+    def dead(self, services: set[str]) -> set[str]:
+        """As `Holds`."""
+        return services - {self.me}
+
+    def close(self) -> None:
+        """As `Holds`."""
+
+
+class Among:
+    """One of several services on a PostgreSQL database."""
+
+    def __init__(self, engine: Engine) -> None:
+        self.me = secrets.token_hex(8)
+        self._engine = engine.execution_options(isolation_level="AUTOCOMMIT")
+        self._alive: Connection | None = None
+        self._missed: defaultdict[str, int] = defaultdict(int)
+        self._turns: defaultdict[str, asyncio.Lock] = defaultdict(asyncio.Lock)
+        self.keep()
+
+    @asynccontextmanager
+    async def turn(self, name: str) -> AsyncIterator[None]:
+        """As `Holds`."""
+        async with self._turns[name]:  # within a service no connection waits
+            try:
+                held = await asyncio.to_thread(self._take, f"turn {name}")
+            except SQLAlchemyError as error:
+                log.error("the turn %s was not had: %s", name, error)
+                raise not_answering() from error
+            try:
+                yield
+            finally:
+                await asyncio.shield(asyncio.to_thread(self._give_back, held, f"turn {name}"))
+
+    def _take(self, name: str) -> Connection:
+        connection = self._engine.connect()
+        try:
+            connection.exec_driver_sql(f"SELECT pg_advisory_lock({key(name)})")
+        except BaseException:
+            connection.close()
+            raise
+        return connection
+
+    def _give_back(self, connection: Connection, name: str) -> None:
+        try:
+            connection.exec_driver_sql(f"SELECT pg_advisory_unlock({key(name)})")
+            connection.close()
+        except SQLAlchemyError:  # a connection that is gone holds nothing
+            connection.invalidate()
+
+    def keep(self) -> None:
+        """As `Holds`."""
+        try:
+            if self._alive is None:
+                self._alive = self._take(f"service {self.me}")
+            self._alive.exec_driver_sql("SELECT 1")
+        except SQLAlchemyError:
+            log.warning("the database does not answer; this service connects again")
+            if self._alive is not None:
+                self._alive.invalidate()
+                self._alive.close()
+            self._alive = None
+
+    def dead(self, services: set[str]) -> set[str]:
+        """As `Holds`."""
+        others = services - {self.me}
+        for service in others:
+            self._missed[service] = 0 if self._lives(service) else self._missed[service] + 1
+        return {service for service in others if self._missed[service] >= DEAD_AFTER}
+
+    def _lives(self, service: str) -> bool:
+        number = key(f"service {service}") & (2**64 - 1)
+        where = f"classid = {number >> 32} AND objid = {number & 0xFFFFFFFF} AND objsubid = 1 AND granted"
+        here = "database = (SELECT oid FROM pg_database WHERE datname = current_database())"
+        query = f"SELECT 1 FROM pg_locks WHERE locktype = 'advisory' AND {here} AND {where}"
+        with self._engine.connect() as connection:
+            return connection.exec_driver_sql(query).first() is not None
+
+    def close(self) -> None:
+        """As `Holds`."""
+        if self._alive is not None:
+            self._alive.invalidate()
+            self._alive.close()
+            self._alive = None
+
+
+def of(store: Store) -> Holds:
+    """What a service on this database has."""
+    return Among(store.engine) if store.several else Alone()
+
+
+def key(name: str) -> int:
+    """The number of an advisory lock: 64 bits, with a sign."""
+    return int.from_bytes(hashlib.sha256(f"stimrig {name}".encode()).digest()[:8], "big", signed=True)
