@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from sqlalchemy import select
+from sqlalchemy import event, select
 from sqlalchemy.engine import make_url
 from sqlalchemy.exc import ArgumentError, DatabaseError, OperationalError, SQLAlchemyError
 from sqlalchemy.orm import Session, sessionmaker
@@ -79,8 +79,8 @@ class Store:
             return list(session.scalars(query))
 
     def listen(self, event_name: str, heard: Callable[..., None]) -> None:
-        """Hear an event of every session of this store, e.g. `before_commit`."""
-        event.listen(self._sessions, event_name, heard)
+        """Hear an event of every session that writes, e.g. `before_commit`."""
+        event.listen(self._writing, event_name, heard)
 
     def close(self) -> None:
         """Let the connections go."""
