@@ -51,7 +51,7 @@ def test_from_no_rig_to_a_download(page: Any, centre: Centre) -> None:
     page.goto(centre.url)
     page.get_by_label("Name of the rig").fill("Ward 1")
     page.get_by_role("button", name="Add, and show its key").click()
-    shown = page.locator("pre.key").inner_text()
+    shown = page.locator("pre.secret").inner_text()
     looked_at(page, "the key")
     key = re.findall(r"STIMRIG_CENTRE_KEY=(\S+)", shown)[0]
     told = Teller()
