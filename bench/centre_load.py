@@ -1,4 +1,4 @@
-"""A centre under a day's load of many rigs: lines cut at random, processes killed at random; figures: docs/results/centre.md.
+"""A centre under many rigs' load: lines cut at random, processes killed; figures: docs/results/centre.md.
 
     python -m bench.centre_load --rigs 20 --seed 1 [--sessions 5] [--recordings 11] [--megabytes 1.2] [--postgres]
 
@@ -243,13 +243,15 @@ def table(seen: Seen, figures: dict[str, str]) -> str:
 def document(command: str, options: argparse.Namespace, words: str) -> str:
     """The results file."""
     kind = "PostgreSQL" if options.postgres else "SQLite"
+    sizes = f"{options.sessions} sessions of {options.recordings} recordings of {options.megabytes:g} MB"
     return f"""# A centre under a day's load
 
 {written_by(command)}
 
-{options.rigs} rigs, each its service and its pusher; {options.sessions} sessions of {options.recordings} recordings of {options.megabytes:g} MB each, uploaded through REST, as fast as
-this machine takes them. No stimulator is connected, and the worker fits nothing, so there are no tests among the items. The centre's database is {kind}; its bucket
-is a folder. Meanwhile each rig's line is cut or stalls for 1 to 10 s, again and again, and services, pushers and the centre are killed (-9) at random and started again.
+{options.rigs} rigs, each its service and its pusher; {sizes} each, uploaded through REST as fast as this
+machine takes them. No stimulator is connected, and the worker fits nothing, so there are no tests among the items.
+The centre's database is {kind}; its bucket is a folder. Meanwhile each rig's line is cut or stalls for 1 to 10 s,
+again and again, and services, pushers and the centre are killed (-9) at random and started again.
 
 {words}
 """

@@ -17,6 +17,7 @@ import time
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -112,9 +113,8 @@ class Lines:
     def _run(self) -> None:
         asyncio.set_event_loop(self._loop)
         for port in self.ports:
-            self._loop.run_until_complete(
-                asyncio.start_server(lambda r, w, p=port: self._serve(p, r, w), "127.0.0.1", port)
-            )
+            serve = partial(self._serve, port)
+            self._loop.run_until_complete(asyncio.start_server(serve, "127.0.0.1", port))
             self._loop.create_task(self._weather(port))
         self._ready.set()
         self._loop.run_forever()

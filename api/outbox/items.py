@@ -24,6 +24,8 @@ TABLES: dict[type[Table], str] = {
 LONGEST_BODY = 500_000
 LONGEST_LIST = 100
 DEEPEST = 20
+OF_SERVICES = ("followed_by", "rig")
+"""Columns of a test that say which service follows it, and at which socket."""
 SHA256 = re.compile(r"[0-9a-f]{64}")
 
 
@@ -50,7 +52,8 @@ def _test(row: Test) -> dict[str, Any]:
     preview = plan.get("preview")
     if isinstance(preview, dict):
         plan["preview"] = {name: value for name, value in preview.items() if not isinstance(value, list)}
-    return {**row.as_dict(), "plan": plan}
+    body = {**row.as_dict(), "plan": plan}
+    return {name: value for name, value in body.items() if name not in OF_SERVICES}
 
 
 def _recording(row: Recording) -> Telling:

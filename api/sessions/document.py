@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from api.sessions.adaptive_tests import AdaptiveTests
-from api.sessions.following import OPEN_STATES
 from api.sessions.lifecycle import Lifecycle
 from api.sessions.live import Hub
-from api.store.tables import Test
+from api.store.tables import OPEN_STATES, Test
 
 
 def of(row: Test, hub: Hub, lifecycle: Lifecycle, adaptive: AdaptiveTests) -> dict[str, Any]:

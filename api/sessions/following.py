@@ -11,10 +11,9 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from api.store import Store
 from api.store.holds import Holds, Turn
-from api.store.tables import Test
+from api.store.tables import OPEN_STATES, Test
 
 log = logging.getLogger("stimrig.trials")
-OPEN_STATES = ("requested", "running", "sealing", "identifying")
 PLAYED_STATES = OPEN_STATES[:3]
 LOOK_S = 3.0
 """How often it is looked for what a service that died has left."""

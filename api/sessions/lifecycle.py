@@ -13,7 +13,7 @@ from api.errors import ApiError
 from api.models.analyses import Analyses
 from api.models.registry import Versions
 from api.sessions.adaptive_tests import AdaptiveTests
-from api.sessions.following import OPEN_STATES, Follower
+from api.sessions.following import Follower
 from api.sessions.rig_client import RigClient
 from api.sessions.trials import SEQUENCE
 from api.store import Store, audit

@@ -8,9 +8,8 @@ from fastapi import APIRouter
 
 from api import language
 from api.models import next_step
-from api.sessions.following import OPEN_STATES
 from api.sessions.trials import SEQUENCE
-from api.store.tables import Model, Participant, Test
+from api.store.tables import OPEN_STATES, Model, Participant, Test
 from api.web.dependencies import Context, Ctx, Tester
 from api.web.pages import rig_state, starting
 from api.web.routes import participants
