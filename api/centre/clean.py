@@ -55,6 +55,12 @@ def number(value: Any) -> float | None:
     return found if math.isfinite(found) and abs(found) < 1e15 else None
 
 
+def current_ma(plan: Any) -> float | None:
+    """The current of a test's pulses."""
+    profile = plan.get("profile") if isinstance(plan, dict) else None
+    return number(profile.get("current_ma")) if isinstance(profile, dict) else None
+
+
 def effects(value: Any) -> list[str]:
     """Ids of effects, each once."""
     listed = value[: 10 * MOST_EFFECTS] if isinstance(value, list) else []

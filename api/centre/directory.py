@@ -59,7 +59,7 @@ def participants(store: Store, asked: Search, limit: int = PARTICIPANTS) -> tupl
     return list(found.values()), codes[limit - 1] if len(codes) > limit else None
 
 
-def _codes(asked: Search) -> Select[tuple[str]]:
+def _codes(asked: Search) -> Select[Any]:
     own, past, held = CentreParticipant, CentreSession, CentreEffect
     query = select(own.code).where(own.code > asked.after)
     if asked.q:

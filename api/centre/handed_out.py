@@ -43,7 +43,7 @@ async def file(context: Context, sha256: str | None, name: str, kind: str) -> Re
 
 
 def _read(context: Context, sha256: str) -> IO[bytes]:
-    copy = tempfile.SpooledTemporaryFile(IN_MEMORY, dir=context.settings.exports_dir)  # noqa: SIM115
+    copy = tempfile.SpooledTemporaryFile(IN_MEMORY, dir=str(context.settings.exports_dir))  # noqa: SIM115
     try:
         if context.bucket.copy(sha256, copy):
             return copy  # pyright: ignore[reportReturnType]

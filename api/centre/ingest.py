@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from sqlalchemy import select
+from sqlalchemy import insert, select
 from sqlalchemy.orm import Session
 
 from api.centre import clean, rigs, warnings
@@ -132,7 +132,7 @@ class Ingest:
                 "received_utc": now, "body": None if told in known else item.text,
             })  # fmt: skip
             known.add(told)
-        session.execute(CentreItem.__table__.insert(), rows)
+        session.execute(insert(CentreItem), rows)
 
 
 class _Forked(Exception):

@@ -84,6 +84,7 @@ class Projector:
         if row is None:
             row = self._add(CentreTest(rig_id=self.rig.id, id=key, requested_utc=at_utc), (self.rig.id, key))
             self._day(code, at_utc).tests += 1
+            self._day(code, at_utc).current_ma = clean.current_ma(body.get("plan"))
         row.participant, row.requested_utc = code, at_utc
         row.kind, row.state = clean.text(body.get("kind"), 40), clean.text(body.get("state"), 20)
         row.reason, row.finished_utc = clean.text(body.get("reason"), 400), clean.text(body.get("finished_utc"), 32)

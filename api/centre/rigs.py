@@ -62,8 +62,8 @@ class Rigs:
             if row is None:
                 raise NotFoundError("rig", name[:80], "GET /v1/rigs lists them.")
             if row.revoked_utc is None:
-                row.revoked_utc = self.clock.utc()
-                audit.write(session, row.revoked_utc, by, "revoke rig", name)
+                row.revoked_utc = now = self.clock.utc()
+                audit.write(session, now, by, "revoke rig", name)
 
     def all(self) -> list[CentreRig]:
         """All rigs, by name."""

@@ -20,7 +20,7 @@ def _document(code: str, session: Any, model: Any, rig: str) -> dict[str, Any]:
     found = followed(model.fit)
     figures["follows_percent"] = {**_plain(found.percent, "%"), "where": found.where}
     figures["noise_sd_nm"] = _plain(model.fit.get("noise_sd_nm"), "N·m")
-    figures["current_ma"] = _plain(None, "mA")
+    figures["current_ma"] = _plain(session.current_ma, "mA")
     here = f"{session.day}~{session.rig_id}"
     return {
         "at_utc": session.at_utc, "model_id": model.id, "approved": session.approved_by is not None,

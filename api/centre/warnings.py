@@ -81,5 +81,6 @@ def acknowledge(store: Store, clock: Clock, warning_id: int, by: str) -> None:
         if row is None:
             raise NotFoundError("warning", str(warning_id), "GET /v1/warnings lists them.")
         if row.acknowledged_utc is None:
-            row.acknowledged_by, row.acknowledged_utc = by, clock.utc()
-            audit.write(session, row.acknowledged_utc, by, "acknowledge warning", str(row.id), kind=row.kind)
+            now = clock.utc()
+            row.acknowledged_by, row.acknowledged_utc = by, now
+            audit.write(session, now, by, "acknowledge warning", str(row.id), kind=row.kind)

@@ -37,11 +37,15 @@ def panels(sessions: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     sessions : sequence of dict
         As `Session.shown` gives them, the oldest first.
     """
+    return [panel(name, sessions) for name in order(sessions)]
+
+
+def order(sessions: Sequence[dict[str, Any]]) -> list[str]:
+    """The figures that sessions have, in the order in which they are shown."""
     names = dict.fromkeys(name for one in sessions for name in one["figures"])
     first = [name for name in trend_words.NAMES if name not in trend_words.LAST]
     effects = [name for name in names if "." in name]
-    shown = [*first, *effects, *trend_words.LAST]
-    return [panel(name, sessions) for name in shown if name in names]
+    return [name for name in (*first, *effects, *trend_words.LAST) if name in names]
 
 
 def panel(figure: str, sessions: Sequence[dict[str, Any]]) -> dict[str, Any]:

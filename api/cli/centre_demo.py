@@ -45,7 +45,7 @@ class EmulatedRig:
         log = owner_only.folder(folder) / "service.log"
         self.child = Child(name, [*command, "--emulate", f"--patient {patient}"], log, {
             "STIMRIG_CENTRE_URL": centre_url, "STIMRIG_CENTRE_KEY": key, "STIMRIG_ADMIN_TOKEN": self.token,
-            "PYTHONUNBUFFERED": "1",
+            "PYTHONUNBUFFERED": "1", "STIMRIG_WORKERS": "1",
         })  # fmt: skip
         self.ending = threading.Event()
         self.player = threading.Thread(target=self._play, daemon=True)

@@ -155,6 +155,8 @@ class CentreSession(Table):
     model_utc: Mapped[str | None] = mapped_column(String, default=None)
     verdict: Mapped[str | None] = mapped_column(Word, default=None)
     approved_by: Mapped[str | None] = mapped_column(String, default=None)
+    current_ma: Mapped[float | None] = mapped_column(Float, default=None)
+    """Of its last test: of which the figures of the curve depend."""
     __table_args__ = (
         Index("ix_centre_sessions_day", "day", "participant", "rig_id"),
         Index("ix_centre_sessions_rig", "participant", "rig_id", "day"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,22 @@ from api.centre.settings import CentreSettings
 from api.clock import Clock
 from api.store.centre_tables import CentreRig
 from tests.api.conftest import PATIENCE_S, TOKEN, Server
+from tests.harness.postgres import Cluster
+
+
+@pytest.fixture(scope="session", autouse=True)
+def centres_keep_it_there_too(kept_in_postgresql: Cluster | None) -> Iterator[None]:
+    """With `--postgresql`: a centre's database is one in the tests' cluster, another one for each data folder."""
+    if kept_in_postgresql is None:
+        yield
+        return
+
+    def database(settings: CentreSettings) -> str:
+        return settings.database_url or kept_in_postgresql.database(str(settings.data_dir.absolute()))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(CentreSettings, "database", property(database))
+        yield
 
 
 class SetClock(Clock):
@@ -61,7 +78,8 @@ class Centre:
 def run_centre(data: Path, **more: Any) -> Iterator[Centre]:
     clock = SetClock()
     settings = CentreSettings(**{"data_dir": data, "admin_token": TOKEN, "port": 0} | more)
-    app = create_app(settings, clock)
+    with ThreadPoolExecutor(1) as apart:  # a browser's driver keeps an event loop in this one
+        app = apart.submit(create_app, settings, clock).result()
     with Server(app) as url:
         yield Centre(url, app, data, clock)
 

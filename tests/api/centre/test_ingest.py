@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import copy
 import json
+import sqlite3
+from contextlib import closing
+from pathlib import Path
 
 import httpx
 import pytest
 
 from api.store.centre_tables import CentreItem, CentreRecording
-from tests.api.centre.conftest import Centre
+from tests.api.centre.conftest import Centre, run_centre
 from tests.api.centre.told import AT, ZEROS, Teller, canonical, sha256
 
 
@@ -252,3 +255,31 @@ def test_kinds_of_a_newer_rig_are_kept_and_shown_nowhere(centre: Centre, rig: ht
     told.push(rig)
     assert counts(centre) == (2, 0) and centre.warnings() == []
     assert centre.context.store.all(CentreItem)[-1].body == canonical({"what": "a newer version tells"})
+
+
+@pytest.mark.sqlite
+def test_a_centre_restored_from_its_backup_gets_again_what_it_lost(tmp_path: Path) -> None:
+    told, key = Teller(), ""
+    first, second = told.session(), b""
+    backup = tmp_path / "backup.db"
+    for centre in run_centre(tmp_path / "centre"):
+        key = centre.key()
+        with centre.client(key) as rig:
+            told.push(rig)
+        with closing(sqlite3.connect(centre.data / "centre.db")) as there, closing(sqlite3.connect(backup)) as copied:
+            there.backup(copied)
+        second = told.session(number=1)
+        with centre.client(key) as rig:
+            told.push(rig)
+    for path in (tmp_path / "centre").glob("centre.db*"):
+        path.unlink()
+    backup.rename(tmp_path / "centre" / "centre.db")
+    for centre in run_centre(tmp_path / "centre"):
+        with centre.client(key) as rig, centre.client() as http:
+            greeted = rig.post("/v1/rig/hello", json=told.hello(centre.clock.utc())).json()
+            assert (greeted["seq"], greeted["hash"]) == (6, told.items[5]["hash"])
+            assert rig.post("/v1/rig/items", json=told.batch(7)).json()["seq"] == 11
+            told.push(rig)
+            listed = http.get("/v1/recordings").json()["recordings"]
+            assert [http.get(one["url"]).content for one in listed] == [first, second]
+        assert counts(centre) == (11, 2) and centre.warnings() == []

@@ -115,6 +115,7 @@ def test_a_missing_extra_is_told(
     assert "pip install 'stimrig[centre]'" in capsys.readouterr().err
 
 
+@pytest.mark.sqlite
 def test_a_database_of_another_version_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for centre in [tmp_path / "data"]:
         assert run(["centre", "add-rig", "Ward 1", "--data", str(centre)]) == 0

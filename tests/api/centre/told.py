@@ -63,6 +63,7 @@ class Teller:
         self.add("test", f"t-{name}", {
             "id": f"t-{name}", "participant": code, "kind": "pre-session", "state": "completed", "reason": "",
             "recording_id": f"r-{name}", "model_id": f"m-{name}", "requested_utc": at,
+            "plan": {"profile": {"current_ma": 40.0}},
         }, at=at)  # fmt: skip
         self.add("decision", str(len(self.items)), {
             "model_id": f"m-{name}", "participant": code, "approved": True, "by": "Ada", "at_utc": at,

@@ -156,6 +156,7 @@ def _sessions() -> None:
         sa.Column("model_utc", sa.String),
         sa.Column("verdict", WORD),
         sa.Column("approved_by", sa.String),
+        sa.Column("current_ma", sa.Float),
     )
     op.create_index("ix_centre_sessions_day", "centre_sessions", ["day", "participant", "rig_id"])
     op.create_index("ix_centre_sessions_rig", "centre_sessions", ["participant", "rig_id", "day"])
