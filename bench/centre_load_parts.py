@@ -25,7 +25,7 @@ import httpx
 from sqlalchemy import create_engine, text
 
 ROOT = Path(__file__).parents[1]
-PATIENCE_S = 120.0
+PATIENCE_S = 300.0
 FIELDS = ("seq", "kind", "key", "sha256", "file", "file_bytes", "at_utc", "previous")
 
 
@@ -60,7 +60,7 @@ class Kept:
             with contextlib.suppress(httpx.HTTPError):
                 if httpx.get(self.health, timeout=5).status_code < 500:
                     return
-            if time.monotonic() > end:
+            if time.monotonic() > end or (self.popen is not None and self.popen.poll() is not None):
                 raise RuntimeError(f"{self.health} does not answer; its log: {self.log.read_text()[-2000:]}")
             time.sleep(0.2)
 
