@@ -150,7 +150,7 @@ class Lines:
             finally:
                 self._open[port].discard(back)
                 back.transport.abort()
-        except OSError:
+        except (OSError, asyncio.CancelledError):  # it is cut, or the bench ends
             pass
         finally:
             self._open[port].discard(writer)
