@@ -124,6 +124,21 @@ def test_a_cohort_that_moved_is_not_computed_again(client: Client, tmp_path: Pat
     assert len(read(tmp_path / "r.parquet")) == 3
 
 
+def test_a_bucket_is_computed_as_a_folder_is(client: Client, folder: Path, tmp_path: Path, s3: Any) -> None:
+    s3.mkdir("cohort")
+    for name in ("P001/session-00000.h5", "P002/session-00001.h5", "half.h5"):
+        s3.pipe(f"cohort/{name}", (folder / name).read_bytes())
+    for _ in range(2):
+        _, tally = go(client, sources_of(["s3://cohort"]), tmp_path / "r.parquet")
+    assert (tally.before, tally.now) == (3, 0)
+    rows = {row["address"]: row["status"] for row in read(tmp_path / "r.parquet")}
+    assert rows == {
+        "s3://cohort/P001/session-00000.h5": "ok",
+        "s3://cohort/P002/session-00001.h5": "ok",
+        "s3://cohort/half.h5": "error",
+    }
+
+
 class Endless:
     """A source of which nobody may want more at once than fits."""
 

@@ -115,63 +115,39 @@ def test_addresses_that_cannot_be_used_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def s3() -> Iterator[None]:
-    """A server of S3 in this process, and the variables by which fsspec and botocore find it."""
-    from moto.server import ThreadedMotoServer
-
-    server = ThreadedMotoServer("127.0.0.1", 0, verbose=False)
-    server.start()
-    host, port = server.get_host_and_port()
-    given = {
-        "AWS_ACCESS_KEY_ID": "testing", "AWS_SECRET_ACCESS_KEY": "testing", "AWS_DEFAULT_REGION": "us-east-1",
-        "AWS_ENDPOINT_URL": f"http://{host}:{port}",
-    }  # fmt: skip
-    kept = {name: os.environ.get(name) for name in given}
-    os.environ.update(given)
-    try:
-        import s3fs
-
-        files = s3fs.S3FileSystem(anon=False)
-        files.mkdir("records")
-        for key, content in {"P1/a.h5": b"aaaa", "P1/b.csv": b"bb", "P2/c.h5": b"", "P2/readme.pdf": b"x"}.items():
-            files.pipe(f"records/{key}", content)
-        yield
-    finally:
-        server.stop()
-        for name, value in kept.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
+def bucket(s3: Any) -> Any:
+    """Some objects."""
+    s3.mkdir("records")
+    for key, content in {"P1/a.h5": b"aaaa", "P1/b.csv": b"bb", "P2/c.h5": b"", "P2/readme.pdf": b"x"}.items():
+        s3.pipe(f"records/{key}", content)
+    return s3
 
 
 @pytest.mark.slow
-def test_a_bucket_lists_and_opens_its_objects(s3: None) -> None:
-    bucket = pickle.loads(pickle.dumps(Bucket("s3://records")))  # as it comes to a worker
-    found = listed(bucket)
+def test_a_bucket_lists_and_opens_its_objects(bucket: Any) -> None:
+    source = pickle.loads(pickle.dumps(Bucket("s3://records")))  # as it comes to a worker
+    found = listed(source)
     assert [entry.address for entry in found] == [f"s3://records/{key}" for key in ("P1/a.h5", "P1/b.csv", "P2/c.h5")]
-    assert [bucket.open(entry, MOST) for entry in found] == [b"aaaa", b"bb", b""]
-    assert len(bucket.open(found[0], 2)) == 3
+    assert [source.open(entry, MOST) for entry in found] == [b"aaaa", b"bb", b""]
+    assert len(source.open(found[0], 2)) == 3
     assert all(entry.stamp for entry in found) and found[0].bytes == 4
     assert [entry.name for entry in listed(Bucket("s3://records/P2"))] == ["c.h5"]
     assert [entry.name for entry in listed(Bucket("s3://records/P1/a.h5"))] == ["a.h5"]
 
 
 @pytest.mark.slow
-def test_an_object_that_changes_has_another_stamp(s3: None) -> None:
-    import s3fs
-
+def test_an_object_that_changes_has_another_stamp(bucket: Any) -> None:
     before = listed(Bucket("s3://records/P1/b.csv"))[0]
-    s3fs.S3FileSystem(anon=False).pipe("records/P1/b.csv", b"cc")
+    bucket.pipe("records/P1/b.csv", b"cc")
     assert listed(Bucket("s3://records/P1/b.csv"))[0].stamp != before.stamp
-    s3fs.S3FileSystem(anon=False).rm("records/P1/b.csv")
+    bucket.rm("records/P1/b.csv")
     with pytest.raises(SourceError, match="cannot be fetched"):
         Bucket("s3://records").open(before, MOST)
-    s3fs.S3FileSystem(anon=False).pipe("records/P1/b.csv", b"bb")
+    bucket.pipe("records/P1/b.csv", b"bb")
 
 
 @pytest.mark.slow
-def test_a_bucket_that_is_not_there_is_refused_in_one_line(s3: None) -> None:
+def test_a_bucket_that_is_not_there_is_refused_in_one_line(bucket: Any) -> None:
     assert "s3://nowhere" in refused("s3://nowhere")
     assert "s3://records/P9" in refused("s3://records/P9")
 
