@@ -54,6 +54,7 @@ class Settings(BaseSettings):
     secure_cookies: bool = Field(default=False, description="True behind a TLS proxy: cookies over HTTPS only")
     tls_proxy: bool = Field(default=False, description="True: a TLS proxy stands in front; needed to leave loopback")
     max_upload_mb: Annotated[float, Field(gt=0)] = 64.0
+    lsl: bool = Field(default=False, description="True: torque and pulses go to Lab Streaming Layer, see docs/lsl.md")
     effects_dir: Path | None = Field(default=None, description="folder of the users' own effects")
     structure: Annotated[tuple[str, ...], NoDecode] = Field(
         default=(), description="effects, comma-separated, that a new participant's models begin with; default: none"

@@ -160,7 +160,7 @@ def play(folder: Path, options: argparse.Namespace, ends: ExitStack) -> tuple[Se
         ends.callback(cluster.stop)
         cluster.start()
         database = cluster.url
-    (folder / "centre").mkdir()
+    (folder / "centre" / "files").mkdir(parents=True)
     environment = {
         "STIMRIG_CENTRE_DATA_DIR": str(folder / "centre"), "STIMRIG_CENTRE_PORT": str(port),
         "STIMRIG_CENTRE_ADMIN_TOKEN": TOKEN, "STIMRIG_CENTRE_DATABASE_URL": database,

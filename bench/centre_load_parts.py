@@ -25,7 +25,7 @@ import httpx
 from sqlalchemy import create_engine, text
 
 ROOT = Path(__file__).parents[1]
-PATIENCE_S = 120.0
+PATIENCE_S = 300.0
 FIELDS = ("seq", "kind", "key", "sha256", "file", "file_bytes", "at_utc", "previous")
 
 
@@ -60,7 +60,7 @@ class Kept:
             with contextlib.suppress(httpx.HTTPError):
                 if httpx.get(self.health, timeout=5).status_code < 500:
                     return
-            if time.monotonic() > end:
+            if time.monotonic() > end or (self.popen is not None and self.popen.poll() is not None):
                 raise RuntimeError(f"{self.health} does not answer; its log: {self.log.read_text()[-2000:]}")
             time.sleep(0.2)
 
@@ -107,8 +107,16 @@ class Lines:
         self._ready.wait(PATIENCE_S)
 
     def close(self) -> None:
+        asyncio.run_coroutine_threadsafe(self._end(), self._loop).result(10)
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join(10)
+        self._loop.close()
+
+    async def _end(self) -> None:
+        others = asyncio.all_tasks() - {asyncio.current_task()}
+        for task in others:
+            task.cancel()
+        await asyncio.gather(*others, return_exceptions=True)
 
     def _run(self) -> None:
         asyncio.set_event_loop(self._loop)
@@ -142,7 +150,7 @@ class Lines:
             finally:
                 self._open[port].discard(back)
                 back.transport.abort()
-        except OSError:
+        except (OSError, asyncio.CancelledError):  # it is cut, or the bench ends
             pass
         finally:
             self._open[port].discard(writer)

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Software of unknown provenance (SOUP): docs/safety/soup.md from requirements/run.txt and deploy/soup.toml.
+"""Software of unknown provenance (SOUP): docs/safety/soup.md from the locked lists and deploy/soup.toml.
 
 soup.py           write the list
 soup.py --check   exit 1 and one line where it is out of date
@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
-LOCK = ROOT / "requirements" / "run.txt"
+LOCK, EXTRAS = ROOT / "requirements" / "run.txt", ROOT / "requirements" / "centre.txt"
 NOTES = ROOT / "deploy" / "soup.toml"
 LIST = ROOT / "docs" / "safety" / "soup.md"
 PIN = re.compile(r"^(?P<name>[A-Za-z0-9._-]+)==(?P<version>[^\s;]+)(?:\s*;\s*(?P<marker>.*?))?\s*\\?$")
@@ -25,7 +25,7 @@ class SoupError(Exception):
     """One line: what does not hold."""
 
 
-def pins(text: str) -> list[tuple[str, str, str]]:
+def pins(text: str, name: str = LOCK.name) -> list[tuple[str, str, str]]:
     """Name, version and marker of each package in a locked list.
 
     Raises
@@ -40,7 +40,7 @@ def pins(text: str) -> list[tuple[str, str, str]]:
             continue
         match = PIN.match(stripped)
         if match is None:
-            raise SoupError(f"{LOCK.name}:{number}: not a pin: {stripped}")
+            raise SoupError(f"{name}:{number}: not a pin: {stripped}")
         found.append((match["name"], match["version"], match["marker"] or ""))
     return found
 
@@ -59,25 +59,29 @@ def render() -> str:
         A package without a note, a note without a package, or an unknown class.
     """
     written, locked = notes(), pins(LOCK.read_text("utf-8"))
-    names, packages = {name for name, _, _ in locked}, written["package"]
-    for what, missing in (("no note for", names - packages.keys()), ("no longer locked", packages.keys() - names)):
-        if missing:
-            raise SoupError(f"deploy/soup.toml: {what}: {', '.join(sorted(missing))}")
-    for name, note in (packages | written["below"]).items():
+    packages, extras = written["package"], written["extra"]
+    more = [pin for pin in pins(EXTRAS.read_text("utf-8"), EXTRAS.name) if pin[0] not in packages]
+    for listed, told in ((locked, packages), (more, extras)):
+        names = {name for name, _, _ in listed}
+        for what, missing in (("no note for", names - told.keys()), ("no longer locked", told.keys() - names)):
+            if missing:
+                raise SoupError(f"deploy/soup.toml: {what}: {', '.join(sorted(missing))}")
+    for name, note in (packages | extras | written["below"]).items():
         if note["class"] not in CLASSES or not note["for"].strip():
             raise SoupError(f"deploy/soup.toml: {name}: class must be one of {', '.join(CLASSES)}, with a purpose")
-    lines = [
-        written["head"],
-        f"## Locked packages ({len(names)})\n",
-        "| package | version | class | what for |",
-        "|---|---|---|---|",
-    ]
-    for name, version, marker in sorted(locked, key=lambda pin: (CLASSES.index(packages[pin[0]]["class"]), pin)):
-        where = f" ({marker})" if marker else ""
-        lines.append(f"| {name} | {version}{where} | {packages[name]['class']} | {packages[name]['for']} |")
+    lines = [written["head"], f"## Locked packages ({len(packages)})\n", *_table(locked, packages)]
+    lines += ["", f"## Only with an extra ({len(extras)})", "", *_table(more, extras)]
     lines += ["", "## Below them", "", "| software | version | class | what for |", "|---|---|---|---|"]
     lines += [f"| {name} | {n['version']} | {n['class']} | {n['for']} |" for name, n in written["below"].items()]
     return "\n".join(lines) + "\n"
+
+
+def _table(locked: list[tuple[str, str, str]], told: dict[str, Any]) -> list[str]:
+    lines = ["| package | version | class | what for |", "|---|---|---|---|"]
+    for name, version, marker in sorted(locked, key=lambda pin: (CLASSES.index(told[pin[0]]["class"]), pin)):
+        where = f" ({marker})" if marker else ""
+        lines.append(f"| {name} | {version}{where} | {told[name]['class']} | {told[name]['for']} |")
+    return lines
 
 
 def main(arguments: list[str]) -> int:

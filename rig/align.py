@@ -46,13 +46,16 @@ class Alignment:
 
 
 @dataclass(frozen=True, slots=True)
-class _Line:
+class Line:
+    """The test's clock as a line over the cell's; the offset holds at `centre_s`, `error_s` is its standard error."""
+
     offset_s: float
     rate: float
     centre_s: float
     error_s: float
 
     def at(self, cell_s: Array) -> Array:
+        """Times on the test's clock, s."""
         return self.offset_s + self.centre_s + self.rate * (cell_s - self.centre_s)
 
 
@@ -87,13 +90,13 @@ def align(
     """
     if len(cell_s) < 2:
         return host_s.copy(), Alignment("regression", float("nan"), 0.0, 0.0)
-    envelope = _lower_envelope(cell_s, host_s)
-    pairs = _edges(cell_s, sync, written_s, envelope, sample_rate_hz)
+    envelope = lower_envelope(cell_s, host_s)
+    pairs = paired(rising_edges(cell_s, sync, sample_rate_hz), written_s, envelope)
     if pairs is not None and len(pairs[0]) >= MIN_EDGES:
         *pairs, sure = pairs
-        line, method = _robust_line(*pairs), "sync"
+        line, method = robust_line(*pairs), "sync"
         misfit_s = _misfit(line, *pairs)
-        coarse_s = 0.0 if sure else _misfit(envelope, *_earliest(cell_s, host_s))
+        coarse_s = 0.0 if sure else _misfit(envelope, *earliest(cell_s, host_s))
         if coarse_s > COARSE_MISFIT_S:  # then edges may have been matched to the wrong pulses
             misfit_s = max(misfit_s, coarse_s)
         # Pulses are often synchronous with the samples, so a pulse's position in its sample does not average out.
@@ -101,13 +104,13 @@ def align(
         error_s = float(np.hypot(error_s, misfit_s))
     else:
         line, method = envelope, "regression"
-        error_s = float(np.hypot(envelope.error_s, _misfit(envelope, *_earliest(cell_s, host_s))))
+        error_s = float(np.hypot(envelope.error_s, _misfit(envelope, *earliest(cell_s, host_s))))
     time_s = line.at(cell_s)
     delay_ms = float(np.median(host_s - time_s)) * 1e3
     return time_s, Alignment(method, error_s * 1e3, delay_ms, (line.rate - 1) * 1e6)
 
 
-def _robust_line(cell_s: Array, host_s: Array) -> _Line:
+def robust_line(cell_s: Array, host_s: Array) -> Line:
     """host ≈ offset + rate × cell through points of which up to a quarter may be far off."""
     centre_s = float(np.mean(cell_s))
     lead_s = host_s - cell_s
@@ -123,7 +126,7 @@ def _robust_line(cell_s: Array, host_s: Array) -> _Line:
     )  # no sample arrives before it is taken
     spread_s = 1.4826 * float(np.median(np.abs(residual_s - offset_s)))
     error_s = MEDIAN_EFFICIENCY * spread_s / np.sqrt(len(cell_s)) if known else np.nan
-    return _Line(offset_s, 1 + slope, centre_s, float(error_s))
+    return Line(offset_s, 1 + slope, centre_s, float(error_s))
 
 
 def _median_slope(x: Array, y: Array) -> float:
@@ -133,7 +136,7 @@ def _median_slope(x: Array, y: Array) -> float:
     return float(np.median((y[j] - y[i])[apart] / (x[j] - x[i])[apart]))
 
 
-def _misfit(line: _Line, cell_s: Array, host_s: Array) -> float:
+def _misfit(line: Line, cell_s: Array, host_s: Array) -> float:
     """Largest slow deviation from the line (a clock with a drifting rate), s: the worst of the windows' medians.
 
     The scatter that medians of so few points have by chance is subtracted.
@@ -148,30 +151,31 @@ def _misfit(line: _Line, cell_s: Array, host_s: Array) -> float:
     return max(0.0, worst_s - by_chance_s)
 
 
-def _lower_envelope(cell_s: Array, host_s: Array) -> _Line:
+def lower_envelope(cell_s: Array, host_s: Array) -> Line:
     """A line under the receive times: through the earliest sample of each of many windows."""
-    return _robust_line(*_earliest(cell_s, host_s))
+    return robust_line(*earliest(cell_s, host_s))
 
 
-def _earliest(cell_s: Array, host_s: Array) -> tuple[Array, Array]:
+def earliest(cell_s: Array, host_s: Array) -> tuple[Array, Array]:
+    """The sample of each of many windows that came with the shortest delay: its times on both clocks."""
     windows = int(np.clip((cell_s[-1] - cell_s[0]) / 0.5, 1, MAX_POINTS))
     lead_s = host_s - cell_s
     edges = np.searchsorted(cell_s, np.linspace(cell_s[0], cell_s[-1], windows + 1)[1:-1])
     parts = [part for part in np.split(np.arange(len(cell_s)), edges) if len(part)]
-    earliest = np.array([part[np.argmin(lead_s[part])] for part in parts])
-    return cell_s[earliest], host_s[earliest]
+    first = np.array([part[np.argmin(lead_s[part])] for part in parts])
+    return cell_s[first], host_s[first]
 
 
-def _edges(
-    cell_s: Array, sync: NDArray[np.uint8], written_s: Array, envelope: _Line, sample_rate_hz: float
-) -> tuple[Array, Array, bool] | None:
-    """Pairs (cell's time of a pulse, host's time of writing it), and whether the match is sure; None: no sync."""
-    if len(written_s) < MIN_EDGES or not np.any(sync == 1):
-        return None
+def rising_edges(cell_s: Array, sync: NDArray[np.uint8], sample_rate_hz: float) -> Array:
+    """When the sync line rose, s on the cell's clock: half a sample before the sample that shows it."""
     period_s = 1 / sample_rate_hz
     rising = (sync[1:] == 1) & (sync[:-1] == 0) & (np.diff(cell_s) < 1.5 * period_s)
-    edge_s = cell_s[1:][rising] - period_s / 2
-    if len(edge_s) == 0:
+    return cell_s[1:][rising] - period_s / 2
+
+
+def paired(edge_s: Array, written_s: Array, envelope: Line) -> tuple[Array, Array, bool] | None:
+    """Pairs (cell's time of a pulse, host's time of writing it), and whether the match is sure; None: no sync."""
+    if len(written_s) < MIN_EDGES or len(edge_s) == 0:
         return None
     if len(edge_s) == len(written_s) and _in_step(edge_s, written_s):
         return edge_s, written_s, True
@@ -188,5 +192,5 @@ def _in_step(edge_s: Array, written_s: Array) -> bool:
 
     A stall of the host bends the envelope, and the nearest pulse may then be the wrong one.
     """
-    lead_s = written_s - _robust_line(edge_s, written_s).at(edge_s)
+    lead_s = written_s - robust_line(edge_s, written_s).at(edge_s)
     return float(np.quantile(np.abs(lead_s), 0.9)) < 0.25 * float(np.min(np.diff(written_s)))

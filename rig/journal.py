@@ -29,7 +29,7 @@ MAGIC = b"STIMRIG\x01"
 _BLOCK = struct.Struct("<4sBxHII")
 """Mark, kind, (spare), sequence number (16 bits), length, CRC-32 over the fields before it and the payload."""
 _LENGTH = struct.Struct("<I")
-_MARK = b"\xa5BLK"
+MARK = b"\xa5BLK"
 _CRC_AT = 12
 MAX_PAYLOAD = 64 * 1024 * 1024
 
@@ -138,7 +138,7 @@ class Journal:
         with self._lock:
             if self._failure:
                 raise JournalError(self._failure)
-            head = _BLOCK.pack(_MARK, kind, self._number & 0xFFFF, len(payload), 0)[:_CRC_AT]
+            head = _BLOCK.pack(MARK, kind, self._number & 0xFFFF, len(payload), 0)[:_CRC_AT]
             crc = zlib.crc32(payload, zlib.crc32(head))
             try:
                 self._put(head + struct.pack("<I", crc) + payload)
@@ -226,9 +226,9 @@ def read(path: Path) -> JournalContents:
     at, missing, expected = len(MAGIC), 0, 0
     damaged = sum(a != b for a, b in zip(data[:at], MAGIC, strict=False)) if len(data) > at else 0
     while at < len(data):
-        block = _block_at(data, at)
+        block = block_at(data, at)
         if block is None:
-            found = data.find(_MARK, at + 1)
+            found = data.find(MARK, at + 1)
             following = found if found >= 0 else len(data)
             damaged += following - at
             at = following
@@ -242,12 +242,13 @@ def read(path: Path) -> JournalContents:
     return JournalContents(path, blocks, damaged, missing)
 
 
-def _block_at(data: bytes, at: int) -> tuple[Kind, int, bytes, int] | None:
+def block_at(data: bytes, at: int) -> tuple[Kind, int, bytes, int] | None:
+    """Kind, number and payload of the block at a place, and the place after it; None: there is no whole one."""
     if at + _BLOCK.size > len(data):
         return None
     mark, kind, number, length, crc = _BLOCK.unpack_from(data, at)
     start = at + _BLOCK.size
-    if mark != _MARK or length > MAX_PAYLOAD or start + length > len(data):
+    if mark != MARK or length > MAX_PAYLOAD or start + length > len(data):
         return None
     payload = data[start : start + length]
     if zlib.crc32(payload, zlib.crc32(data[at : at + _CRC_AT])) != crc:

@@ -22,6 +22,7 @@ from typing import Any
 
 from api import owner_only
 from api.cli.errors import LaunchError
+from api.cli.streams import Streams
 from api.settings import Settings
 from api.store.lock import HeldError, refuse_if_held
 
@@ -183,6 +184,7 @@ class Services:
         self.api = self._child("api", ["api.web.server"])
         self.outbox = None if settings.centre_url is None else self._child("outbox", ["api.outbox"])
         self.admin_token = admin_token
+        self.lsl = Streams(self._child("lsl", ["rig.lsl_outlets"])) if settings.lsl else None
 
     def _child(self, name: str, module: list[str]) -> Child:
         return Child(name, [sys.executable, "-m", *module], self.settings.logs_dir / f"{name}.log")
@@ -236,15 +238,20 @@ class Services:
         if self.outbox is not None:
             self.outbox.environment = {"STIMRIG_DATA_DIR": data}
             self.outbox.start_unheard()
+        if self.lsl is not None:
+            self.lsl.start([] if self.attached else self._source(), data)
 
     def _start_devices(self, data: str) -> None:
         if self.emulator is not None:
-            ready = self.emulator.start()
-            source = ["--emulator-json", json.dumps(ready)]
-        else:
-            source = ["--config", str(self.settings.rig_file)]
-        self.rig.command += [*source, "--socket", str(self.socket), "--data", data]
+            self.emulator.start()
+        self.rig.command += [*self._source(), "--socket", str(self.socket), "--data", data]
         self._start_rig()
+
+    def _source(self) -> list[str]:
+        """What says which devices there are."""
+        if self.emulator is not None:
+            return ["--emulator-json", json.dumps(self.emulator.ready)]
+        return ["--config", str(self.settings.rig_file)]
 
     def _start_rig(self) -> None:
         try:
@@ -267,7 +274,7 @@ class Services:
             raise self.emulator.failure()
         ours = (self.api,) if self.attached else (self.rig, self.api)
         events = [self._restart(child) for child in ours if not child.alive()]
-        return events + self._keep_telling()
+        return events + self._keep_telling() + (self.lsl.watch() if self.lsl is not None else [])
 
     def _keep_telling(self) -> list[str]:
         """Start what tells the centre again where it has ended, at longer and longer intervals; it ends nobody else."""
@@ -301,6 +308,8 @@ class Services:
         self.api.end()
         if self.outbox is not None:
             self.outbox.end()
+        if self.lsl is not None:
+            self.lsl.child.end()
         if self.emulator is not None:
             self.emulator.end()
         shutil.rmtree(self.runtime, ignore_errors=True)

@@ -1,6 +1,7 @@
 """`python -m api.outbox`: tells the centre what the rig has sealed, until SIGTERM.
 
-Exit 2: no centre is configured, a setting does not hold, or the database does not open.
+Exit 2: no centre is configured, a setting does not hold, or the database does not open. Exit 1: it is not there yet.
+Exit 0: it was replaced; to be started again.
 """
 
 from __future__ import annotations
@@ -34,7 +35,11 @@ def main() -> int:
             raise SettingsError(
                 "STIMRIG_CENTRE_URL: names no centre; set it and STIMRIG_CENTRE_KEY, or start no outbox"
             )
+        refuse_missing(settings)
         store = Store(settings.database)
+    except FileNotFoundError as error:  # it is looked again: whoever started this starts it again
+        print(f"outbox: {error}", file=sys.stderr)
+        return 1
     except (ApiError, SettingsError, OSError) as error:
         print(f"outbox: {error}", file=sys.stderr)
         return 2
@@ -43,6 +48,19 @@ def main() -> int:
     with contextlib.suppress(KeyboardInterrupt):
         Pusher(store, settings, clock, link).run()
     return 0
+
+
+def refuse_missing(settings: Settings) -> None:
+    """The service makes its database, and a restore puts it into its place: not this process.
+
+    Raises
+    ------
+    FileNotFoundError
+        There is none yet.
+    """
+    place = settings.data_dir / "stimrig.db"
+    if settings.database_url is None and not place.exists():
+        raise FileNotFoundError(f"{place}: no database there yet; start the service first")
 
 
 if __name__ == "__main__":

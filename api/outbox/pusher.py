@@ -10,6 +10,7 @@ import random
 import shutil
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 from sqlalchemy.exc import SQLAlchemyError
@@ -70,12 +71,14 @@ class Pusher:
         self._database_words = ""
         self._contact_utc: str | None = None
         self._told: tuple[float, Status] | None = None
+        self._file = _file_of(store)
         self._take_up()
 
     def run(self) -> None:
-        """Go on for ever."""
-        while True:
+        """Go on until the database is another one: a backup was restored, and what is open here is the old one."""
+        while _file_of(self.store) == self._file:
             self.sleep(self.turn())
+        log.warning("the database was replaced or is gone: to be started anew")
 
     def turn(self) -> float:
         """Do a bounded piece of work; how long to wait before the next one, s."""
@@ -84,14 +87,17 @@ class Pusher:
             if self.clock.monotonic_s() >= self._database_s:
                 busy = self._put_in_missing()
                 busy = self._push() or busy
-                self.database.reset()
                 self._database_words = ""
             self._tell()
+            if not self._database_words:
+                self.database.reset()
         except SQLAlchemyError as error:
+            first = self.database.failures == 0
             self._database_s = self.clock.monotonic_s() + self.database.next_s()
             self._missing = reconcile.batches(self.store, self.clock)
             self._database_words = str(error).splitlines()[0][:200]
-            log.warning("the rig's database: %s", self._database_words)
+            if first:
+                log.warning("the rig's database: %s", self._database_words)
             self._write_status()
             busy = False
         return 0.0 if busy else self._rest_s()
@@ -252,3 +258,13 @@ class Pusher:
             state, detail, self.link.url, self.clock.utc(), utc_label(self.clock.unix_s() + GOOD_S), self._contact_utc,
             chain, seq, items, files, tuple(sorted(self.files.damaged)[:MOST_DAMAGED_SHOWN]), len(self.files.damaged),
         )  # fmt: skip
+
+
+def _file_of(store: Store) -> tuple[int, int] | None:
+    """Which file the database is; None where it is none, or gone."""
+    url = store.engine.url
+    try:
+        found = Path(url.database or "").stat() if url.get_backend_name() == "sqlite" else None
+    except OSError:
+        return None
+    return None if found is None else (found.st_dev, found.st_ino)

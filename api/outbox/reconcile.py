@@ -76,5 +76,5 @@ def _tellings(session: Session, keys: list[tuple[type[Table], Any]]) -> list[Tel
     for table in {table for table, _ in keys}:
         column = inspect(table).primary_key[0]
         for row in session.scalars(select(table).where(column.in_([key for of, key in keys if of is table]))):
-            found[table, getattr(row, column.key)] = row
+            found[table, getattr(row, str(column.key))] = row
     return [telling for of in keys if of in found for telling in feed.told([found[of]])]

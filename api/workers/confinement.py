@@ -43,16 +43,20 @@ FORBIDDEN = {
 """System calls that reach a network or another process, by processor, with the processor's number for the filter."""
 
 
-def confine(reads: Iterable[Path] = (), writes: Iterable[Path] = ()) -> dict[str, str]:
+def confine(
+    reads: Iterable[Path] = (), writes: Iterable[Path] = (), memory_bytes: int = MEMORY_BYTES
+) -> dict[str, str]:
     """Shut this process in, for good; what could not be shut, and why.
 
     Parameters
     ----------
     reads, writes : iterable of Path
         Folders that stay open, beside those of Python and of the system's libraries.
+    memory_bytes : int
+        Addresses that it may take, those of its libraries included.
     """
     for kind, most in (
-        (resource.RLIMIT_AS, MEMORY_BYTES), (resource.RLIMIT_FSIZE, FILE_BYTES),
+        (resource.RLIMIT_AS, memory_bytes), (resource.RLIMIT_FSIZE, FILE_BYTES),
         (resource.RLIMIT_NOFILE, OPEN_FILES), (resource.RLIMIT_CORE, 0),
     ):  # fmt: skip
         hard = resource.getrlimit(kind)[1]

@@ -75,7 +75,7 @@ def test_a_journal_cut_anywhere_or_without_a_laid_block_loses_no_pulse(tmp_path:
         intents = sum(kind == Kind.INTENT for kind, _ in contents.blocks)
         assert np.sum(np.nan_to_num(columns["pulses/current_ma"]) > 0) == intents
         assert np.sum(np.nan_to_num(columns["pulses/sent_pulse_width_us"]) > 0) == intents
-    at = [place for place in range(len(whole)) if whole.startswith(journal._MARK + bytes([Kind.LAID]), place)]
+    at = [place for place in range(len(whole)) if whole.startswith(journal.MARK + bytes([Kind.LAID]), place)]
     assert len(at) == 3
     for lost in ([0], [1], [2], [0, 1], [0, 1, 2]):
         spoiled = bytearray(whole)

@@ -60,7 +60,7 @@ def blocks_of(data: bytes, *kinds: Kind) -> list[int]:
     """Where the blocks of these kinds begin."""
     found, at = [], len(journal.MAGIC)
     while at < len(data):
-        block = journal._block_at(data, at)
+        block = journal.block_at(data, at)
         assert block is not None
         if block[0] in kinds:
             found.append(at)

@@ -32,9 +32,12 @@ def serve(
     ] = None,
     data: Annotated[Path | None, typer.Option(help="data folder; default ./var, or STIMRIG_DATA_DIR")] = None,
     emulate: Annotated[str, typer.Option(help='options for the emulator, e.g. "--hidden 7"')] = "",
+    lsl: Annotated[
+        bool | None, typer.Option("--lsl/--no-lsl", help="torque and pulses to Lab Streaming Layer; or STIMRIG_LSL")
+    ] = None,
 ) -> None:
     """The service and the page, until Ctrl-C or SIGTERM."""
-    given = {"port": port, "host": host, "rig_file": rig, "rig_socket": rig_socket, "data_dir": data}
+    given = {"port": port, "host": host, "rig_file": rig, "rig_socket": rig_socket, "data_dir": data, "lsl": lsl}
     settings = Settings(**{key: value for key, value in given.items() if value is not None})
     found = attachable(settings, emulate) if settings.rig_socket else None
     ended: list[int] = []

@@ -46,7 +46,7 @@ class Rig:
     def __init__(self, folder: Path, *, feed: bool = True, seed: int = 1) -> None:
         self.folder, self.chance = folder, random.Random(seed)
         (folder / "recordings").mkdir(parents=True, exist_ok=True)
-        self.settings = Settings(data_dir=folder, centre_url=URL, centre_key=KEY)  # pyright: ignore[reportArgumentType]
+        self.settings = Settings(data_dir=folder, database_url=None, centre_url=URL, centre_key=KEY)  # pyright: ignore[reportArgumentType]
         self.clock = VirtualClock()
         self.store = Store(self.settings.database)
         self.number = 0

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from sqlalchemy import inspect
 
-from api.outbox import chain, reconcile
+from api.outbox import chain, items, reconcile
 from api.outbox.feed import Feed
 from api.store import audit, uploads
 from api.store.tables import Approval, Model, Note, OutboxItem, Participant, Recording, Test
@@ -109,8 +109,6 @@ def test_a_savepoint_that_is_rolled_back_is_not_told(rig: Rig) -> None:
 
 
 def test_a_row_that_cannot_be_told_keeps_nobody_from_working(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
-    from api.outbox import items
-
     def broken(*_: object) -> None:
         raise ValueError("on purpose")
 
@@ -143,13 +141,15 @@ def test_what_json_cannot_hold_and_what_is_too_long_are_left_out(rig: Rig) -> No
     for _ in range(60):
         deep = [deep]
     test_id = rig.begin_test("P1")
+    summary = {"nan": float("nan"), "long": [0.5] * 200_000, "deep": deep, "n": 1, "surrogate": "\ud800"}
+    told = items.telling(Test(id="T0", state="completed", plan={}, summary=summary))
+    assert told is not None and told.body["summary"]["nan"] is None and told.body["summary"]["surrogate"] == "?"
     with rig.store.write() as session:
         row = session.get(Test, test_id)
         assert row is not None
-        row.state, row.summary = "completed", {"nan": float("nan"), "long": [0.5] * 200_000, "deep": deep, "n": 1}
+        row.state, row.summary = "completed", {"long": [0.5] * 200_000, "deep": deep, "n": 1}
     body = body_of(rig, "test")
-    assert body["summary"]["nan"] is None and body["summary"]["n"] == 1
-    assert body["summary"]["long"] == {"left_out": 200_000}
+    assert body["summary"]["long"] == {"left_out": 200_000} and body["summary"]["n"] == 1
     assert len(rig.items()[-1].body) < 500_000
     assert_chain(as_items(rig))
 

@@ -141,6 +141,15 @@ def test_a_wrong_setting_is_one_line_and_exit_code_2(tmp_path: Path, given: dict
     assert done.returncode == 2 and len(lines) == 1 and words in lines[0], done.stderr
 
 
+@pytest.mark.slow
+def test_it_makes_no_database_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("STIMRIG_DATABASE_URL", raising=False)
+    running = start(tmp_path, "http://127.0.0.1:9")
+    assert running.wait(PATIENCE_S) == 1
+    assert "start the service first" in (tmp_path / "outbox.log").read_text()
+    assert not (tmp_path / "stimrig.db").exists()
+
+
 @pytest.mark.parametrize(
     ("url", "key", "words"),
     [

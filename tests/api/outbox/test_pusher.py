@@ -8,12 +8,14 @@ import shutil
 import tracemalloc
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import httpx
 import pytest
 from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
+from sqlalchemy.exc import OperationalError
 
 from api.outbox import status
 from api.outbox.pusher import HELLO_S, REVOKED_S
@@ -372,6 +374,8 @@ def restored(rig: Rig, saved: Path) -> Rig:
 def test_a_restored_rig_begins_anew_and_tells_everything_again(
     rig: Rig, centre: FakeCentre, tmp_path: Path, sessions_after: int
 ) -> None:
+    if rig.store.engine.dialect.name != "sqlite":
+        pytest.skip("the backup is SQLite's")
     rig.participant("P1")
     rig.session("P1")
     run(rig.pusher(centre.handle), 5)
@@ -415,6 +419,41 @@ def test_a_centre_that_is_always_ahead_makes_no_chain_after_chain(rig: Rig, cent
     assert state_of(rig).state == "wrong-answer" and "another rig's key" in state_of(rig).detail
     run(rig.pusher(line), 6 * 3600)
     assert len({item.chain for item in rig.items()}) <= 9
+
+
+def test_a_pusher_whose_database_was_replaced_ends(rig: Rig, centre: FakeCentre, tmp_path: Path) -> None:
+    """What it has open is the old one: it would tell nothing new for ever. Whoever started it starts it again."""
+    if rig.store.engine.dialect.name != "sqlite":
+        pytest.skip("no file is replaced")
+    rig.participant("P1")
+
+    def line(request: httpx.Request) -> httpx.Response:
+        if len(centre.hellos) == 2:
+            (tmp_path / "new.db").touch()
+            (tmp_path / "new.db").replace(tmp_path / "stimrig.db")
+        return centre.handle(request)
+
+    rig.pusher(line).run()
+    assert len(centre.hellos) >= 2
+
+
+def test_a_database_that_fails_is_said_and_tried_again(
+    rig: Rig, centre: FakeCentre, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken() -> Any:
+        raise OperationalError("SELECT 1", {}, OSError("disk I/O error"))
+
+    rig.participant("P1")
+    pusher = rig.pusher(centre.handle)
+    run(pusher, 5)
+    with monkeypatch.context() as patch:
+        patch.setattr(rig.store, "read", broken)
+        run(pusher, 120)
+        assert state_of(rig).state == "database" and "disk I/O error" in state_of(rig).detail
+    rig.session("P1")
+    run(pusher, 400)
+    assert_told(rig, centre)
+    assert state_of(rig).state == "current"
 
 
 def test_a_centre_that_was_restored_gets_again_what_it_lost(rig: Rig, centre: FakeCentre) -> None:

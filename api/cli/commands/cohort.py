@@ -1,0 +1,243 @@
+"""`stimrig cohort`: one verb over many recordings, two runs compared, figures over a cohort.
+
+Dask and pyarrow are an extra (`pip install stimrig[cohort]`): loaded where they are used, so that the verb can say so.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from api.cli.cohort_report import changed_lines, run_lines
+from api.cli.errors import CommandError, InputError
+from api.cli.terminal import Json, names, say, say_json, write
+
+NEEDED = ("dask", "distributed", "pyarrow", "fsspec")
+METHOD = "maximum-likelihood"
+INTERRUPTED = 130
+
+Given = Annotated[
+    list[str],
+    typer.Argument(
+        help="files, folders, addresses that fsspec knows (s3://…), or a centre (https://…)",
+        metavar="DATA…",
+        show_default=False,
+    ),
+]
+Output = Annotated[
+    Path, typer.Option("-o", "--output", help="results (Parquet); a run that is cut off goes on with the same command")
+]
+Select = Annotated[
+    str,
+    typer.Option(
+        help='which records, as \'participant in ("P001", "P002") and day >= "2026-01-01"\'; default: all '
+        "(docs/cohorts.md lists the fields)"
+    ),
+]
+Scheduler = Annotated[
+    str, typer.Option(help="address of a Dask scheduler, as tcp://host:8786; default: processes of this machine")
+]
+Workers = Annotated[int, typer.Option(min=1, max=1024, help="processes on this machine, one thread each")]
+Memory = Annotated[str, typer.Option(help="what a record may take beyond the libraries")]
+Limit = Annotated[float, typer.Option(min=1.0, max=86400.0, help="what a record may take, s; then it is a row")]
+Renew = Annotated[int, typer.Option(min=1, help="after so many records a worker's computing process is started anew")]
+Dashboard = Annotated[bool, typer.Option("--dashboard", help="Dask's dashboard on this machine; its address is shown")]
+Wait = Annotated[float, typer.Option(min=0.1, help="with --scheduler: how long to wait for its first worker, s")]
+Again = Annotated[bool, typer.Option("--again", help="do anew what timed out, was killed or could not be read")]
+Token = Annotated[str, typer.Option(help="of a centre", envvar="STIMRIG_TOKEN", show_envvar=True, show_default=False)]
+Columns = Annotated[
+    list[str] | None,
+    typer.Option("--map", help="columns of another tool's files, as in `stimrig fit`", show_default=False),
+]
+Results = Annotated[Path, typer.Argument(metavar="RESULTS.parquet", show_default=False)]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the verb and what it can do."""
+    verbs = typer.Typer(no_args_is_help=True, help="Fit or diagnose many recordings, compare two runs, draw a cohort.")
+    for command in (fit, diagnose, improve, changed, figures):
+        verbs.command(command.__name__)(command)
+    app.add_typer(verbs, name="cohort")
+
+
+def fit(
+    data: Given,
+    output: Output,
+    select: Select = "",
+    method: Annotated[str, typer.Option(help="as in `stimrig fit`")] = METHOD,
+    effects: Annotated[str, typer.Option(help="effects of the models, comma-separated, or `auto`")] = "",
+    scheduler: Scheduler = "",
+    workers: Workers = 2,
+    memory: Memory = "1GB",
+    limit: Limit = 600.0,
+    renew: Renew = 500,
+    dashboard: Dashboard = False,
+    wait: Wait = 60.0,
+    again: Again = False,
+    token: Token = "",
+    columns: Columns = None,
+    as_json: Json = False,
+) -> None:
+    """Fit a model to every selected record; one row each in Parquet."""
+    chosen = {"method": method, "effects": names(effects), "columns": columns or ()}
+    where = {"scheduler": scheduler, "count": workers, "dashboard": dashboard, "wait_s": wait}
+    go("fit", data, output, select, chosen, where, memory, limit, renew, again, token, as_json)
+
+
+def diagnose(
+    data: Given,
+    output: Output,
+    select: Select = "",
+    scheduler: Scheduler = "",
+    workers: Workers = 2,
+    memory: Memory = "1GB",
+    limit: Limit = 600.0,
+    renew: Renew = 500,
+    dashboard: Dashboard = False,
+    wait: Wait = 60.0,
+    again: Again = False,
+    token: Token = "",
+    columns: Columns = None,
+    as_json: Json = False,
+) -> None:
+    """What is missing in the plain structure, for every selected record; one row each in Parquet."""
+    where = {"scheduler": scheduler, "count": workers, "dashboard": dashboard, "wait_s": wait}
+    go("diagnose", data, output, select, {"columns": columns or ()}, where, memory, limit, renew, again, token, as_json)
+
+
+def improve(
+    data: Given,
+    output: Output,
+    select: Select = "",
+    scheduler: Scheduler = "",
+    workers: Workers = 2,
+    memory: Memory = "1GB",
+    limit: Limit = 600.0,
+    renew: Renew = 500,
+    dashboard: Dashboard = False,
+    wait: Wait = 60.0,
+    again: Again = False,
+    token: Token = "",
+    columns: Columns = None,
+    as_json: Json = False,
+) -> None:
+    """Add effects as long as the evidence lasts, for every selected record; one row each in Parquet."""
+    where = {"scheduler": scheduler, "count": workers, "dashboard": dashboard, "wait_s": wait}
+    go("improve", data, output, select, {"columns": columns or ()}, where, memory, limit, renew, again, token, as_json)
+
+
+def go(
+    verb: str,
+    data: list[str],
+    output: Path,
+    select: str,
+    chosen: dict[str, Any],
+    where: dict[str, Any],
+    memory: str,
+    limit_s: float,
+    records: int,
+    again: bool,
+    token: str,
+    as_json: bool,
+) -> None:
+    """One run."""
+    need_extra()
+    from api.cohort import cluster
+    from api.cohort.errors import CutOffError
+    from api.cohort.parts import Results as Table
+    from api.cohort.run import Run
+    from api.cohort.select import Selection
+    from api.cohort.sources.addresses import sources_of
+    from api.cohort.tasks import checked
+    from api.cohort.tells import telling
+    from api.cohort.worker import Bounds
+    from api.version import software_version
+
+    task = checked(verb, select=Selection(select).text, software=software_version(), **chosen)
+    sources = sources_of(data, token)
+    place = cluster.Workers(memory_bytes=cluster.memory_of(memory), **where)
+    bounds = Bounds(limit_s, place.memory_bytes, records)
+    for source in sources:
+        source.check()
+    began_s = time.monotonic()
+    try:
+        with Table(output, task, again) as results, cluster.connected(place) as client:
+            link = str(client.dashboard_link) if place.dashboard or place.scheduler else ""
+            with telling(link) as tell:
+                tally = Run(client, sources, task, bounds, results, tell).go()
+            counts = results.join()
+    except CutOffError as error:
+        raise CommandError(str(error)) from error
+    except KeyboardInterrupt:
+        raise CommandError("interrupted. What is done is kept; the same command goes on.", INTERRUPTED) from None
+    if tally.left_open:
+        print(
+            f"stimrig cohort: workers could not be shut in: {tally.left_open}. See `stimrig doctor` there.",
+            file=sys.stderr,
+        )
+    found = {
+        "output": str(output),
+        "records": counts["ok"] + counts["error"],
+        "ok": counts["ok"],
+        "errors": counts["error"],
+        "computed": tally.ok + tally.error,
+        "done_before": tally.before,
+        "left_out": tally.left_out,
+        "copies": tally.copies,
+        "took_s": round(time.monotonic() - began_s, 1),
+    }
+    say_json(found) if as_json else say(*run_lines(found))
+
+
+def changed(
+    old: Annotated[Path, typer.Argument(metavar="OLD.parquet", show_default=False)],
+    new: Annotated[Path, typer.Argument(metavar="NEW.parquet", show_default=False)],
+    as_json: Json = False,
+) -> None:
+    """Whose results differ between two runs, and why: what a new release is judged by before it is used on people."""
+    need_extra()
+    from api.cohort.changed import compared
+
+    found = compared(old, new).to_dict()
+    say_json(found) if as_json else say(*changed_lines(found))
+
+
+def figures(
+    results: Results,
+    html: Annotated[Path, typer.Option("-o", "--html", help="file to write: works offline, in any browser")],
+    as_json: Json = False,
+) -> None:
+    """Draw a cohort: effects by prevalence, parameters over sessions, repeatability, errors by reason."""
+    need_extra()
+    from api.cohort import drawn, page
+    from api.cohort.gathered import gather
+
+    found = gather(results)
+    write(html, page.html(found, results.name))
+    of_what, total, counts = found.prevalence()
+    if as_json:
+        say_json({
+            "output": str(html), "records": found.records, "ok": found.ok, "errors": dict(found.errors),
+            "participants": len(found.people), "verdicts": dict(found.verdicts), "counted": of_what, "of": total,
+            "effects": dict(counts), "repeatability": drawn.repeats(found),
+        })  # fmt: skip
+        return
+    say(f"{found.records} records, {found.ok} with a result, {len(found.people)} participants", f"written to {html}")
+
+
+def need_extra() -> None:
+    """Refuse without the extra.
+
+    Raises
+    ------
+    InputError
+        A package is missing.
+    """
+    missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
+    if missing:
+        raise InputError(f"needs `pip install stimrig[cohort]` ({', '.join(missing)} is missing)")

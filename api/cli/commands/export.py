@@ -1,0 +1,100 @@
+"""`stimrig export`: a cohort as Parquet with a data dictionary, or as a BIDS-style folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from api.cli.commands.cohort import Columns, Given, Select, Token, need_extra
+from api.cli.errors import CommandError, InputError
+from api.cli.terminal import Json, say, say_json
+
+
+def register(app: typer.Typer) -> None:
+    """Add the verb."""
+    app.command("export")(export)
+
+
+def export(
+    data: Given,
+    parquet: Annotated[Path | None, typer.Option(help="folder for Parquet files", show_default=False)] = None,
+    bids: Annotated[Path | None, typer.Option(help="folder in the manner of BIDS", show_default=False)] = None,
+    select: Select = "",
+    no_dates: Annotated[bool, typer.Option("--no-dates", help="leave out days and times")] = False,
+    shift_days: Annotated[int, typer.Option(min=-80000, max=80000, help="move every day by so many days")] = 0,
+    columns: Columns = None,
+    token: Token = "",
+    as_json: Json = False,
+) -> None:
+    """Hand records on: Parquet or a BIDS-style folder; one that is cut off goes on with the same command."""
+    need_extra()
+    if (parquet is None) == (bids is None):
+        raise InputError("give --parquet FOLDER or --bids FOLDER, one of them.")
+    if no_dates and shift_days:
+        raise InputError("give --no-dates or --shift-days, not both.")
+    from api.cohort.errors import CutOffError
+    from api.cohort.handed_on import Days
+
+    try:
+        found = go(data, parquet, bids, select, Days(no_dates, shift_days), columns or [], token)
+    except CutOffError as error:
+        raise CommandError(f"{error}") from error
+    say_json(found) if as_json else say(*report(found))
+
+
+def go(
+    data: list[str],
+    parquet: Path | None,
+    bids: Path | None,
+    select: str,
+    days: Any,
+    columns: list[str],
+    token: str,
+) -> dict[str, Any]:
+    """One export; what is told of it."""
+    from api.cohort.bids import Bids
+    from api.cohort.export import Export
+    from api.cohort.export_state import State
+    from api.cohort.handed_on import ERRORS
+    from api.cohort.parquet_files import Parquet
+    from api.cohort.select import Selection
+    from api.cohort.sources.addresses import sources_of
+    from api.progress_bar import progress_bar
+
+    selection, sources = Selection(select), sources_of(data, token)
+    writer = Parquet(days) if parquet is not None else Bids(days)
+    folder = parquet or bids
+    assert folder is not None
+    for source in sources:
+        source.check()
+    options = {"format": writer.name, "hide": days.hide, "shift_days": days.shift_days, "columns": columns}
+    state = State(folder, options)
+    try:
+        with progress_bar() as bar:
+            told = Export(sources, selection, state, writer, days, columns, lambda t: bar(0.0, _words(t))).go()
+        return {
+            "output": str(folder), "format": writer.name, "records": state.count("done"),
+            "errors": state.count("failed"), "written": told.written, "done_before": told.before,
+            "left_out": told.left_out, "copies": told.copies, "errors_file": str(folder / ERRORS),
+        }  # fmt: skip
+    finally:
+        state.close()
+
+
+def _words(tally: Any) -> str:
+    failed = f", {tally.failed} failed" if tally.failed else ""
+    return f"{tally.written + tally.before} records{failed}"
+
+
+def report(found: dict[str, Any]) -> list[str]:
+    """What a person is told of an export."""
+    lines = [f"records        {found['records']}: {found['written']} written now, {found['done_before']} done before"]
+    if found["errors"]:
+        lines.append(f"not exported   {found['errors']}; {found['errors_file']} says why")
+    if found["left_out"]:
+        lines.append(f"left out       {found['left_out']} that --select does not mean")
+    if found["copies"]:
+        lines.append(f"copies         {found['copies']} files with the content of another: exported once")
+    return [*lines, f"written to     {found['output']}"]

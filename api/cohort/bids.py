@@ -1,0 +1,191 @@
+"""A BIDS-style folder: `sub-…/ses-…/beh/` with torque as physio, pulse widths as stim, pulses and segments as events.
+
+BIDS 1.9: continuous recordings are gzipped tables without a header and with an even rate; their sidecar says columns,
+units, rate and start. Labels are letters and digits.
+"""
+
+from __future__ import annotations
+
+import gzip
+import json
+from collections.abc import Iterable, Iterator
+from itertools import groupby
+from typing import Any
+
+import numpy as np
+
+from api.cohort.bids_words import DESCRIPTION, EVENTS, PARTICIPANTS, PHYSIO, README, SCANS, STIM
+from api.cohort.export_state import FOLDER, State
+from api.cohort.handed_on import ERRORS, Days, NoExport, Put, Who, hidden
+from api.cohort.opened import Opened
+from api.cohort.parquet_files import STATUS, record_row, segment_at
+from api.version import software_version
+
+MOST_ROWS = 20_000_000
+EVEN_S = 1e-6
+"""Samples further from an even grid than this have a column of their own with their times."""
+SCAN_COLUMNS = ("kind", "outcome", "duration_s", "sample_rate_hz", "record_id", "sha256")
+
+
+class Bids:
+    """Writes the folder.
+
+    Parameters
+    ----------
+    days : Days
+        What becomes of dates.
+    """
+
+    name = "bids"
+
+    def __init__(self, days: Days) -> None:
+        self._days = days
+
+    def write(self, record: Opened, who: Who, put: Put) -> dict[str, Any]:
+        """The record's files; its row of `scans.tsv`."""
+        record = hidden(record, self._days)
+        task = "".join(c for c in str(record.about.get("kind") or "") if c.isascii() and c.isalnum()) or "test"
+        stem = f"sub-{who.label}_ses-{who.session}_task-{task}_acq-{who.key}"
+        folder = f"sub-{who.label}/ses-{who.session}/beh"
+        rate_hz, start_s, at, exact = grid(record)
+        head = {
+            "SamplingFrequency": rate_hz,
+            "StartTime": start_s,
+            "TaskName": record.about.get("kind") or "test",
+            "RecordingID": who.record_id,
+            "SHA256": record.sha256,
+            "PulseRate": record.about.get("pulse_rate_hz"),
+            **{f"Alignment_{key.removeprefix('alignment_')}": value for key, value in record.about.items()
+               if key.startswith("alignment_")},
+        }  # fmt: skip
+        physio = [name for name in PHYSIO if name in record.samples and (name != "time_s" or not exact)]
+        self._continuous(put, f"{folder}/{stem}_physio", record, physio, at, {**head, **_described(PHYSIO, physio)})
+        stim = [name for name in STIM if name in record.samples]
+        self._continuous(put, f"{folder}/{stem}_stim", record, stim, at, {**head, **_described(STIM, stim)})
+        with put(f"{folder}/{stem}_events.tsv") as file:
+            file.writelines(line.encode() for line in tsv(EVENTS, events(record)))
+        _json(put, f"{folder}/{stem}_events.json", {**EVENTS, "TaskName": head["TaskName"]})
+        return {**record_row(record, who), "label": who.label, "file": f"beh/{stem}_physio.tsv.gz"}
+
+    def _continuous(
+        self, put: Put, place: str, record: Opened, names: list[str], at: np.ndarray, head: dict[str, Any]
+    ) -> None:
+        columns = []
+        for name in names:
+            cells = np.full(int(at[-1]) + 1, "n/a", object)
+            cells[at] = [cell(value) for value in record.samples[name].tolist()]
+            columns.append(cells)
+        with put(f"{place}.tsv.gz") as file, gzip.GzipFile("", "wb", 6, file, mtime=0) as packed:
+            packed.write(("\n".join(map("\t".join, zip(*columns, strict=True))) + "\n").encode())
+        _json(put, f"{place}.json", head)
+
+    def finish(self, state: State, put: Put) -> None:
+        """What describes the whole, and the lists of participants and scans."""
+        codes = {code: label for label, code in state.labels()}
+        people: list[dict[str, Any]] = []
+        for participant, sessions in groupby(state.rows(), key=lambda row: row[0]):
+            label, number, count = codes[participant], 0, 0
+            for session, rows in groupby(sessions, key=lambda row: row[1]):
+                scans = list(self._scans(rows))
+                number, count = number + 1, count + len(scans)
+                stem = f"sub-{label}/ses-{session}/sub-{label}_ses-{session}_scans"
+                with put(f"{stem}.tsv") as file:
+                    file.writelines(line.encode() for line in tsv(SCANS, scans))
+                _json(put, f"{stem}.json", SCANS)
+            people.append(
+                {"participant_id": f"sub-{label}", "code": participant, "sessions": number, "recordings": count}
+            )
+        with put("participants.tsv") as file:
+            file.writelines(line.encode() for line in tsv(PARTICIPANTS, people))
+        _json(put, "participants.json", PARTICIPANTS)
+        made_by = [{"Name": "stimrig", "Version": software_version()}]
+        _json(put, "dataset_description.json", {**DESCRIPTION, "GeneratedBy": made_by})
+        for name, text in (("README", README), (".bidsignore", f"{ERRORS}\n{FOLDER}/\n")):
+            with put(name) as file:
+                file.write(text.encode())
+
+    def _scans(self, rows: Iterable[tuple[str, str, dict[str, Any]]]) -> Iterator[dict[str, Any]]:
+        for _, _, row in sorted(rows, key=lambda row: str(row[2]["begun_utc"])):
+            begun = row["begun_utc"]
+            told = {name: row[name] for name in SCAN_COLUMNS}
+            yield {"filename": row["file"], "acq_time": begun and begun.replace("+00:00", "Z"), **told}
+
+
+def grid(record: Opened) -> tuple[float, float, np.ndarray, bool]:
+    """Rate (Hz), start (s), each sample's place on the even grid, and whether the grid gives the times back.
+
+    Raises
+    ------
+    NoExport
+        The samples lie on no even grid, or it would be longer than any record.
+    """
+    time_s = record.samples["time_s"]
+    rate_hz, start_s = record.sample_rate_hz, float(time_s[0])
+    if (time_s[-1] - start_s) * rate_hz > MOST_ROWS:
+        raise NoExport(
+            "not even", f"{(time_s[-1] - start_s) / 3600:.0f} h with its pauses: too long for one even table"
+        )
+    at = np.round((time_s - start_s) * rate_hz).astype(np.int64)
+    if np.any(np.diff(at) < 1):
+        raise NoExport("not even", "its samples are not even: two of them fall on one place of an even grid")
+    exact = bool(np.max(np.abs(start_s + at / rate_hz - time_s)) < EVEN_S)
+    return rate_hz, start_s, at, exact
+
+
+def events(record: Opened) -> list[dict[str, Any]]:
+    """Segments and pulses in the order of their onsets."""
+    found: list[dict[str, Any]] = [
+        {"onset": start_s, "duration": end_s - start_s, "trial_type": "segment", "segment": name}
+        for name, start_s, end_s in record.segments
+    ]
+    columns = {name: column.tolist() for name, column in record.pulses.items()}
+    planned_s = columns.get("planned_time_s", [])
+    segments = segment_at(record, np.array(planned_s)) if planned_s else []
+    nothing = [float("nan")] * len(planned_s)
+    for index, due_s in enumerate(planned_s):
+        row = {name: columns.get(name, nothing)[index] for name in columns}
+        status = row.get("status", float("nan"))
+        if status == STATUS.index("rest"):
+            continue
+        sent = row.get("written_time_s", due_s) == row.get("written_time_s", due_s)
+        place = segments[index]
+        found.append({
+            "onset": row.get("written_time_s", due_s) if sent else due_s,
+            "duration": 0,
+            "trial_type": "pulse" if sent else "pulse_not_sent",
+            "segment": record.segments[place][0] if place >= 0 else None,
+            "pulse_index": index,
+            "pulse_width": row.get("sent_pulse_width_us"),
+            "planned_pulse_width": row.get("pulse_width_us"),
+            "current": row.get("current_ma"),
+            "planned_onset": due_s,
+            "acknowledged": row.get("acknowledged_time_s"),
+            "status": STATUS[int(status)] if status in range(len(STATUS)) else None,
+        })  # fmt: skip
+    return sorted(found, key=lambda event: (event["onset"], event["trial_type"] != "segment"))
+
+
+def cell(value: Any) -> str:
+    """A value as BIDS writes it; numbers as short as they can be read back unchanged."""
+    if value is None or value != value:
+        return "n/a"
+    if isinstance(value, float):
+        return repr(int(value)) if value.is_integer() and abs(value) < 1e15 else repr(value)
+    return " ".join(str(value).split()) or "n/a"
+
+
+def tsv(columns: Iterable[str], rows: Iterable[dict[str, Any]]) -> Iterator[str]:
+    """Lines of a table with a header."""
+    columns = list(columns)
+    yield "\t".join(columns) + "\n"
+    for row in rows:
+        yield "\t".join(cell(row.get(name)) for name in columns) + "\n"
+
+
+def _described(words: dict[str, dict[str, Any]], names: list[str]) -> dict[str, Any]:
+    return {"Columns": names, **{name: words[name] for name in names}}
+
+
+def _json(put: Put, place: str, content: dict[str, Any]) -> None:
+    with put(place) as file:
+        file.write((json.dumps(content, ensure_ascii=False, indent=2) + "\n").encode())

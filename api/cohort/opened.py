@@ -1,0 +1,190 @@
+"""A record read for handing on: what the file itself holds, and what `identify` makes of it."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from api.cohort.child import SAID, about
+from api.cohort.fields import Known
+from identify.records.read import HDF5_MAGIC
+
+TORQUE = {"counter": "/torque/counter", "host_time_s": "/torque/host_time_s", "sync": "/torque/sync"}
+PULSES = {
+    "planned_time_s": "/pulses/planned_time_s",
+    "pulse_width_us": "/pulses/pulse_width_us",
+    "sent_pulse_width_us": "/pulses/sent_pulse_width_us",
+    "current_ma": "/pulses/current_ma",
+    "written_time_s": "/pulses/written_time_s",
+    "acknowledged_time_s": "/pulses/acknowledged_time_s",
+    "status": "/pulses/status",
+}
+NUMBERS = ("pulse_rate_hz", "sample_rate_hz", "sample_rate_measured_hz", "current_ma")
+TEXTS = ("reason", "content_sha256", "journal_note", "ended_by", "laid", "events", "configuration")
+ALIGNMENT = ("error_ms", "delay_ms", "rate_ppm")
+NO_SYNC = 255
+
+
+@dataclass
+class Opened:
+    """One record.
+
+    Attributes
+    ----------
+    about : dict
+        Fields of `api.cohort.fields` and attributes of the recording.
+    samples : dict of ndarray, each of shape (N,)
+        All torque samples, those outside of every segment, too; a column that the record lacks is not there.
+    pulses : dict of ndarray, each of shape (P,)
+        What was planned, sent and heard of each pulse; empty for a record without a list of its pulses.
+    segments : list of (name, start_s, end_s)
+        End exclusive.
+    notes : tuple of str
+        What was assumed when it was read.
+    """
+
+    sha256: str
+    about: dict[str, Any]
+    samples: dict[str, NDArray[Any]]
+    pulses: dict[str, NDArray[np.float64]] = field(default_factory=dict)
+    segments: list[tuple[str, float, float]] = field(default_factory=list)
+    notes: tuple[str, ...] = ()
+
+    @property
+    def sample_rate_hz(self) -> float:
+        """Samples a second, gaps aside."""
+        time_s = self.samples["time_s"]
+        steps = np.diff(time_s)
+        if not len(steps):
+            return float(self.about.get("sample_rate_hz") or self.about["pulse_rate_hz"])
+        steps = steps[steps < 1.5 * np.median(steps)]
+        return float(len(steps) / np.sum(steps))
+
+
+def opened(content: bytes, path: Path, known: Mapping[str, Any], columns: Sequence[str] | None = None) -> Opened:
+    """Read a record whose bytes lie at `path`, too.
+
+    Raises
+    ------
+    BadRecord
+        As `identify.read` does.
+    """
+    import identify
+
+    sealed = content.startswith(HDF5_MAGIC)
+    record = identify.read(path, map=list(columns) if columns and not sealed else None)
+    said: dict[str, Any] = {**known, **(about(path) if sealed else {})}
+    said |= {name: said.get(name) for name in SAID}
+    said |= {
+        "duration_s": round(float(record.time_s[-1] - record.time_s[0]), 4),
+        "rate_hz": round(float(record.sample_rate_hz), 4),
+        "pulse_rate_hz": float(record.pulse_rate_hz),
+        "bytes": len(content),
+        "format": "sealed recording" if sealed else "table",
+    }
+    found = Opened(hashlib.sha256(content).hexdigest(), said, {}, notes=tuple(record.notes))
+    if sealed:
+        _sealed(found, record, content, path)
+    else:
+        _table(found, record)
+    return found
+
+
+def said_of(content: bytes, path: Path, known: Known) -> dict[str, Any]:
+    """What is known of a record before all of it is read."""
+    if not content.startswith(HDF5_MAGIC):
+        return dict(known)
+    said = {**known, **about(path)}
+    return {**said, **{name: said.get(name) for name in SAID}}
+
+
+def _sealed(found: Opened, record: Any, content: bytes, path: Path) -> None:
+    """Everything that the file holds; what `identify` made of it beside the samples that it took."""
+    from identify.records.hdf5 import StrictFile
+
+    file = StrictFile(content, str(path))
+    found.about |= {name: number for name in NUMBERS if np.isfinite(number := file.number(name, np.nan))}
+    found.about |= {name: text for name in TEXTS if (text := file.text(name, ""))}
+    found.about |= _alignment(content)
+    time_s = file.numbers("/torque/time_s")
+    size = len(time_s)
+    taken = np.searchsorted(time_s, record.time_s)  # they are some of these times, unchanged
+    found.samples = {
+        "time_s": time_s,
+        "torque_nm": file.numbers("/torque/torque_nm"),
+        "pulse_width_us": _spread(record.pulse_width_us, taken, size, np.nan),
+        "segment": _spread(record.segment, taken, size, -1),
+        "late_s": _spread(np.zeros(len(taken)) if record.late_s is None else record.late_s, taken, size, np.nan),
+        "doubted": _spread(np.zeros(len(taken)) if record.doubted is None else record.doubted, taken, size, np.nan),
+        "part": np.zeros(size),
+    }
+    for name, place in TORQUE.items():
+        if file.has(place) and len(column := file.numbers(place)) == size:
+            found.samples[name] = np.where(column == {"sync": NO_SYNC, "counter": -1}.get(name), np.nan, column)
+    planned = file.numbers("/pulses/planned_time_s") if file.has("/pulses/planned_time_s") else np.empty(0)
+    for name, place in PULSES.items():
+        if file.has(place) and len(column := file.numbers(place)) == len(planned):
+            found.pulses[name] = column
+    names = tuple(record.segment_names)
+    rows = zip(
+        file.names("/segments/name"), file.numbers("/segments/start_s"), file.numbers("/segments/end_s"), strict=True
+    )
+    found.segments = [(name, float(start), float(end)) for name, start, end in rows]
+    found.about["segment_names"] = list(names)
+
+
+def _table(found: Opened, record: Any) -> None:
+    size = len(record.time_s)
+    found.samples = {
+        "time_s": record.time_s,
+        "torque_nm": record.torque_nm,
+        "pulse_width_us": record.pulse_width_us,
+        "segment": record.segment.astype(float),
+        "part": record.part.astype(float),
+        **{name: np.asarray(column, float) for name, column in record.columns().items()},
+    }
+    starts = np.flatnonzero(np.r_[True, np.diff(record.segment) != 0])
+    ends = np.r_[starts[1:], size]
+    step_s = 1 / record.sample_rate_hz
+    found.segments = [
+        (record.segment_names[record.segment[a]], float(record.time_s[a]), float(record.time_s[b - 1]) + step_s)
+        for a, b in zip(starts, ends, strict=True)
+    ]
+    found.about["segment_names"] = list(record.segment_names)
+
+
+def _spread(values: NDArray[Any], places: NDArray[np.int64], size: int, elsewhere: float) -> NDArray[np.float64]:
+    column = np.full(size, elsewhere, float)
+    column[places] = values
+    return column
+
+
+def _alignment(content: bytes) -> dict[str, Any]:
+    """How exact the times are; nothing where the file does not plainly say it."""
+    import h5py
+
+    try:
+        with h5py.File(io.BytesIO(content), "r") as file:
+            linked = isinstance(file.get("alignment", getlink=True), h5py.HardLink)
+            group = file["alignment"] if linked else None
+            said = (
+                {name: group.attrs.get(name) for name in (*ALIGNMENT, "method")}
+                if isinstance(group, h5py.Group)
+                else {}
+            )
+    except (OSError, RuntimeError, KeyError, TypeError, ValueError):
+        return {}
+    numbers = {name: value for name, value in said.items() if isinstance(value, float | np.floating)}
+    found: dict[str, Any] = {
+        f"alignment_{name}": float(value) if np.isfinite(value) else None for name, value in numbers.items()
+    }
+    method = said.get("method")
+    known = isinstance(method, str) and method in ("sync", "regression")
+    return {**found, **({"alignment_method": method} if known else {})}

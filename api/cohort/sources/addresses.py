@@ -1,0 +1,43 @@
+"""From what is typed as DATA to its source."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from urllib.parse import urlsplit
+
+from api.cohort.errors import CohortError
+from api.cohort.sources import Source
+from api.cohort.sources.bucket import Bucket
+from api.cohort.sources.centre import Centre
+from api.cohort.sources.folder import Folder
+
+LOOPBACK = ("localhost", "127.0.0.1", "::1")
+
+
+def sources_of(addresses: Sequence[str], token: str = "") -> list[Source]:
+    """A source for each address.
+
+    Raises
+    ------
+    CohortError
+        An address that cannot be used, or a centre without a token.
+    """
+    if not addresses:
+        raise CohortError("DATA is missing. Give files, folders, s3://… or the https://… of a centre.")
+    return [_source(address, token) for address in addresses]
+
+
+def _source(address: str, token: str) -> Source:
+    protocol, separator, rest = address.partition("://")
+    if not separator:
+        return Folder(str(Path(address)))
+    if protocol in ("http", "https"):
+        if not token:
+            raise CohortError(f"{address}: a centre needs a token. Set STIMRIG_TOKEN, or give --token.")
+        if protocol == "http" and urlsplit(address).hostname not in LOOPBACK:
+            raise CohortError(f"{address}: the token would be sent in the clear. Give https://…")
+        return Centre(address.rstrip("/"), token)
+    if protocol == "file":
+        return Folder(rest)
+    return Bucket(address)

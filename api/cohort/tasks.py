@@ -1,0 +1,86 @@
+"""What is done with a record: the verb and its options, and what identifies a run by them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from api.cohort.errors import CohortError
+from identify.errors import IdentifyError
+
+VERBS = ("fit", "diagnose", "improve")
+AUTO, METHOD = "auto", "maximum-likelihood"
+
+
+@dataclass(frozen=True)
+class Task:
+    """One verb with its options, the same for every record.
+
+    Attributes
+    ----------
+    select : str
+        The selection's text: a record whose listing leaves it open is judged once it has been read.
+    software : str
+        Version of stimrig that asked; a worker of another one refuses.
+    """
+
+    verb: str
+    select: str = ""
+    method: str = METHOD
+    effects: tuple[str, ...] = ()
+    columns: tuple[str, ...] = ()
+    software: str = ""
+
+    def document(self) -> dict[str, Any]:
+        """The options by which results may be added to results."""
+        return json.loads(json.dumps(asdict(self)))
+
+    @classmethod
+    def of(cls, document: dict[str, Any]) -> Task:
+        """The task of a document that came as JSON."""
+        given: dict[str, Any] = {
+            key: tuple(value) if isinstance(value, list) else value for key, value in document.items()
+        }
+        return cls(**given)
+
+    def differs(self, other: dict[str, Any]) -> str:
+        """Words on how the options of another run differ; empty if they don't."""
+        mine = self.document()
+        names = [name for name in mine if mine[name] != other.get(name)]
+        return ", ".join(f"{name} {_shown(other.get(name))}, now {_shown(mine[name])}" for name in names)
+
+
+def _shown(value: Any) -> str:
+    return ", ".join(map(str, value)) or "none" if isinstance(value, list) else str(value) if value else "none"
+
+
+def checked(
+    verb: str,
+    select: str = "",
+    method: str = METHOD,
+    effects: Sequence[str] = (),
+    columns: Sequence[str] = (),
+    software: str = "",
+) -> Task:
+    """A task whose options can be used on some record.
+
+    Raises
+    ------
+    CohortError
+        An unknown method or effect, a column that cannot be meant.
+    """
+    from identify.effects import get
+    from identify.methods import method_of
+    from identify.records.columns import parsed
+
+    try:
+        method_of(method)
+        for name in effects:
+            if name != AUTO:
+                get(name.partition(":")[0])
+        parsed(list(columns) or None)
+    except IdentifyError as error:
+        raise CohortError(str(error)) from error
+    return Task(verb, select, method, tuple(effects), tuple(columns), software)

@@ -1,0 +1,255 @@
+"""What a cohort costs: throughput of one worker and of two, memory over the records, cost of a record, and a plan.
+
+    python -m bench.cohort --records 10000 [--pairs 200] [--costs 12] [--renew 500] [--json FILE]
+
+`--records` short recordings (23 s at 100 samples/s) of simulated muscles are fitted by two workers: the memory of the
+workers and of their computing processes over the records. `--pairs` of them are fitted, and a tenth as many diagnosed,
+by one worker and by two, each after a warm-up, twice in turn. `--costs` recordings as the rig seals them (48 s at 1600
+samples/s) are fitted and diagnosed by one worker: processor time and bytes of one, and from these the plan for two
+million on paper.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pyarrow.parquet as pq
+
+from api.cohort.cluster import Workers, connected
+from api.cohort.parts import Results
+from api.cohort.run import Run
+from api.cohort.sources.addresses import sources_of
+from api.cohort.tasks import checked
+from api.cohort.worker import Bounds
+from api.version import software_version
+from bench.stamp import written_by
+from tests.harness.cohort_records import Session, write
+
+MUSCLES = 100
+"""Simulated; sessions of one differ by their noise."""
+EFFECTS = (None, "fatigue", "threshold_drift", None, "asymmetric_relaxation")
+PEOPLE = 40
+PLANNED = 2_000_000
+CORES = 100
+MB = 1e6
+
+
+def make(folder: Path, count: int, **more: Any) -> Path:
+    """Recordings in subfolders of a thousand."""
+    for number in range(count):
+        muscle = number % MUSCLES
+        place = folder / f"{number // 1000:04d}"
+        place.mkdir(parents=True, exist_ok=True)
+        effect = EFFECTS[muscle % len(EFFECTS)]
+        session = Session(f"P{number % PEOPLE:03d}", seed=number, muscle=muscle, effect=effect, **more)
+        write(place / f"{number:06d}.h5", session)
+        if number and number % 1000 == 0:
+            print(f"made {number} of {count}", file=sys.stderr, flush=True)
+    return folder
+
+
+class Watch:
+    """Memory of the run's processes: workers of Dask and who asked, MB, sampled as rows come."""
+
+    def __init__(self, every: int) -> None:
+        self.every, self.samples = max(1, every), []
+
+    def __call__(self, tally: Any) -> None:
+        """Sample at some of the rows."""
+        if tally.now % self.every == 0:
+            own = psutil.Process()
+            workers = [child for child in own.children() if "spawn_main" in " ".join(child.cmdline())]
+            sizes = [child.memory_info().rss / MB for child in workers]
+            self.samples.append({"rows": tally.now, "client_mb": own.memory_info().rss / MB, "worker_mb": max(sizes)})
+
+
+def run(
+    folder: Path, output: Path, verb: str, workers: int, renew: int, watch: Any = None, warm: Path | None = None
+) -> tuple[list[dict[str, Any]], float]:
+    """The rows of a run, and its time without starting the workers, s."""
+    bounds = Bounds(600.0, 10**9, renew)
+    with connected(Workers(count=workers)) as client:
+        if warm is not None:
+            once(client, warm, output.with_name(f"warm-{output.name}"), verb, bounds)
+        took_s = once(client, folder, output, verb, bounds, watch)
+    return pq.read_table(output).to_pylist(), took_s
+
+
+def once(client: Any, folder: Path, output: Path, verb: str, bounds: Bounds, watch: Any = None) -> float:
+    """One run over a folder with workers that are there; its time, s."""
+    task = checked(verb, software=software_version())
+    with Results(output, task) as results:
+        began_s = time.perf_counter()
+        Run(client, sources_of([str(folder)]), task, bounds, results, watch or (lambda _tally: None)).go(keep=True)
+        took_s = time.perf_counter() - began_s
+        results.join()
+    return took_s
+
+
+def throughput(folder: Path, place: Path, verb: str, count: int) -> dict[str, Any]:
+    """Records a second with one worker and with two, in turn, so that other work on the machine meets both."""
+    short, warm = make(folder / f"pairs-{verb}", count), make(folder / "warm", 8)
+    paces: dict[int, list[float]] = {1: [], 2: []}
+    for turn in range(2):
+        for workers in (1, 2):
+            output = place / f"pairs-{verb}-{workers}-{turn}.parquet"
+            paces[workers].append(count / run(short, output, verb, workers, 10**6, warm=warm)[1])
+    one, two = (statistics.median(paces[workers]) for workers in (1, 2))
+    return {"records": count, "one_per_s": paces[1], "two_per_s": paces[2], "ratio": two / one}
+
+
+def memory(folder: Path, place: Path, count: int, renew: int) -> dict[str, Any]:
+    """Memory over many records with two workers: of the first tenth and of the last."""
+    watch = Watch(count // 100)
+    rows, took_s = run(make(folder / "many", count), place / "many.parquet", "fit", 2, renew, watch)
+    rows.sort(key=lambda row: row["computed_utc"])
+    sizes = [row["worker_memory_mb"] for row in rows]
+    tenth = max(1, count // 10)
+    samples = watch.samples[1:]
+    return {
+        "records": count,
+        "ok": sum(row["status"] == "ok" for row in rows),
+        "took_s": took_s,
+        "records_per_s": count / took_s,
+        "renewed_after": renew,
+        "computing_mb": [statistics.fmean(sizes[:tenth]), statistics.fmean(sizes[-tenth:]), max(sizes)],
+        "worker_mb": ends(samples, "worker_mb"),
+        "client_mb": ends(samples, "client_mb"),
+    }
+
+
+def ends(samples: list[dict[str, float]], name: str) -> list[float]:
+    """Mean of the first tenth, of the last tenth, and the largest."""
+    values = [sample[name] for sample in samples] or [float("nan")]
+    tenth = max(1, len(values) // 10)
+    return [statistics.fmean(values[:tenth]), statistics.fmean(values[-tenth:]), max(values)]
+
+
+def costs(folder: Path, place: Path, count: int) -> dict[str, Any]:
+    """Processor time, time and bytes of a recording as the rig seals it, for fit and diagnose."""
+    full = make(folder / "full", count, design="full", rate_hz=1600.0)
+    found = {}
+    for verb in ("fit", "diagnose"):
+        rows = run(full, place / f"{verb}.parquet", verb, 1, 10**6)[0]
+        rows = [row for row in rows if row["status"] == "ok"]
+        rows.sort(key=lambda row: row["computed_utc"])
+        rows = rows[1:]  # the first one loads what was compiled
+        found[verb] = {
+            "records": len(rows),
+            "processor_s": statistics.fmean(row["processor_s"] for row in rows),
+            "longest_processor_s": max(row["processor_s"] for row in rows),
+            "took_s": statistics.fmean(row["took_s"] for row in rows),
+            "read_mb": statistics.fmean(row["bytes"] for row in rows) / MB,
+            "memory_mb": max(row["worker_memory_mb"] for row in rows),
+        }
+    return found
+
+
+def plan(cost: dict[str, Any]) -> dict[str, float]:
+    """Two million recordings on paper."""
+    hours = PLANNED * cost["processor_s"] / 3600
+    read_tb = PLANNED * cost["read_mb"] * MB / 1e12
+    return {"processor_h": hours, "wall_h": hours / CORES, "read_tb": read_tb,
+            "read_mb_per_s": read_tb * 1e6 / (3600 * hours / CORES)}  # fmt: skip
+
+
+def report(found: dict[str, Any]) -> list[str]:
+    """The figures as a page."""
+    pace, mem, cost = found["throughput"], found["memory"], found["costs"]
+    load = ", ".join(f"{value:.1f}" for value in found["load"])
+    return [
+        f"{found['processors']} processors, load average {load} at the start and "
+        f"{', '.join(f'{value:.1f}' for value in found['load_after'])} at the end.",
+        "",
+        "| throughput, records a second, two runs each | fit | diagnose |",
+        "|---|---|---|",
+        *(
+            f"| {words} | {' | '.join(both(pace[verb][name]) for verb in ('fit', 'diagnose'))} |"
+            for words, name in (("one worker", "one_per_s"), ("two workers", "two_per_s"))
+        ),
+        f"| ratio (goal 1.8) | {pace['fit']['ratio']:.2f} | {pace['diagnose']['ratio']:.2f} |",
+        f"| short recordings a run | {pace['fit']['records']} | {pace['diagnose']['records']} |",
+        "",
+        f"| memory over {mem['records']} records, 2 workers, MB | first tenth | last tenth | largest |",
+        "|---|---|---|---|",
+        *(
+            f"| {words} | {mem[name][0]:.0f} | {mem[name][1]:.0f} | {mem[name][2]:.0f} |"
+            for words, name in (
+                (f"process that computes, renewed after {mem['renewed_after']} records", "computing_mb"),
+                ("worker of Dask", "worker_mb"),
+                ("the run itself, with the scheduler", "client_mb"),
+            )
+        ),
+        "",
+        f"{mem['ok']} of {mem['records']} with a result, {mem['records_per_s']:.1f} a second.",
+        "",
+        "| cost of a recording (48 s at 1600 samples/s) | fit | diagnose |",
+        "|---|---|---|",
+        *(
+            f"| {words} | {cost['fit'][name]:.3g} | {cost['diagnose'][name]:.3g} |"
+            for words, name in (
+                ("recordings measured", "records"),
+                ("processor time, s, mean", "processor_s"),
+                ("processor time, s, longest", "longest_processor_s"),
+                ("time, s, mean", "took_s"),
+                ("read, MB, mean", "read_mb"),
+                ("memory of its process, MB, largest", "memory_mb"),
+            )
+        ),
+        "",
+        f"| {PLANNED:,}".replace(",", " ") + " such recordings, on paper | fit | diagnose |",
+        "|---|---|---|",
+        *(
+            f"| {words} | {found['plan']['fit'][name]:.3g} | {found['plan']['diagnose'][name]:.3g} |"
+            for words, name in (
+                ("processor time, h", "processor_h"),
+                (f"time with {CORES} cores, h", "wall_h"),
+                ("read, TB", "read_tb"),
+                ("read by all together, MB/s", "read_mb_per_s"),
+            )
+        ),
+    ]
+
+
+def both(values: list[float]) -> str:
+    """Paces of two runs."""
+    return ", ".join(f"{value:.3g}" for value in values)
+
+
+def main() -> int:
+    """Print the page."""
+    parser = argparse.ArgumentParser(prog="python -m bench.cohort", description=__doc__.partition("\n")[0])
+    parser.add_argument("--records", type=int, default=10_000, help="of the run over which memory is looked at")
+    parser.add_argument("--pairs", type=int, default=200, help="of each run that compares one worker with two")
+    parser.add_argument("--costs", type=int, default=12, help="recordings as sealed, fitted and diagnosed")
+    parser.add_argument("--renew", type=int, default=500, help="records after which a computing process is renewed")
+    parser.add_argument("--json", type=Path, help="write the figures here, too")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="stimrig-bench-cohort-") as scratch:
+        folder, place = Path(scratch) / "records", Path(scratch) / "results"
+        place.mkdir()
+        found: dict[str, Any] = {"load": os.getloadavg(), "processors": os.cpu_count()}
+        found["costs"] = costs(folder, place, options.costs)
+        counts = {"fit": options.pairs, "diagnose": max(4, options.pairs // 10)}
+        found["throughput"] = {verb: throughput(folder, place, verb, count) for verb, count in counts.items()}
+        found["memory"] = memory(folder, place, options.records, options.renew)
+    found["plan"] = {verb: plan(cost) for verb, cost in found["costs"].items()}
+    found["load_after"] = os.getloadavg()
+    command = f"python -m bench.cohort --records {options.records} --pairs {options.pairs} --costs {options.costs}"
+    print(written_by(command), "", *report(found), sep="\n")
+    if options.json is not None:
+        options.json.write_text(json.dumps(found, indent=1))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

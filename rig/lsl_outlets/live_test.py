@@ -1,0 +1,226 @@
+"""One test, from the blocks of its growing journal: what can be sent by now, with times of LSL's clock."""
+
+from __future__ import annotations
+
+import json
+import struct
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig import journal
+from rig.journal import Kind
+from rig.lsl_outlets.alignment import LiveAlignment
+from rig.signals import SAMPLE
+
+Array = NDArray[np.float64]
+
+DELAY_S = 0.5
+"""Real seconds for which each sample waits: longer than an ack may take, and than the rest that is measured after a
+test's end."""
+GOOD_S, GOOD_SHARE = 0.0003, 0.1
+"""Standard error of the alignment from which on samples are sent: s, or this share of a sample if that is longer."""
+HOLD_S = 10.0
+"""Real seconds for which the first samples are held at most until the alignment is good."""
+UPDATE_S, UPDATE_SHARE = 0.5, 0.05
+"""The alignment is fitted anew after so many real seconds, or this share of the test so far if that is longer."""
+MARGIN_S = 0.005
+"""Real seconds: the recording's first and last sample are decided by its final alignment; those near them are sent."""
+
+
+@dataclass(slots=True)
+class Batch:
+    """What is to be sent: torque (N·m), pulses (width µs, current mA, index) and marks, with LSL times (s)."""
+
+    torque_s: Array = field(default_factory=lambda: np.empty(0))
+    torque_nm: Array = field(default_factory=lambda: np.empty(0))
+    pulse_s: list[float] = field(default_factory=list)
+    pulses: list[tuple[float, float, int]] = field(default_factory=list)
+    marks: list[tuple[float, dict[str, Any]]] = field(default_factory=list)
+
+
+@dataclass(slots=True)
+class _Pulse:
+    width_us: float
+    current_ma: float
+    written_s: float = np.nan
+    acked_s: float = np.nan
+
+
+class LiveTest:
+    """Takes blocks, gives batches; knows no LSL and no files.
+
+    Parameters
+    ----------
+    offset_s
+        LSL's clock minus the machine's monotonic clock, s.
+    since_s
+        Only what came after it is sent, rig time (s): another process sent what was before.
+    sample_rate_hz
+        Used if the journal does not say it.
+    """
+
+    def __init__(self, offset_s: float = 0.0, since_s: float = -np.inf, sample_rate_hz: float = 1000.0) -> None:
+        self._offset_s, self._since_s = offset_s, since_s
+        self._rate_hz, self._speed = sample_rate_hz, 1.0
+        self._header: dict[str, Any] = {}
+        self._t0_s: float | None = None
+        self._told = self.ended = False
+        self._end: dict[str, Any] = {}
+        self._alignment: LiveAlignment | None = None
+        self._held: list[tuple[Array, NDArray[Any]]] = []
+        self._pulses: dict[int, _Pulse] = {}
+        self._good, self._updated_s, self._newest_s, self._last_s = False, -np.inf, -np.inf, -np.inf
+        self.sent_samples = self.sent_pulses = 0
+
+    def take(self, kind: Kind, payload: bytes) -> None:
+        """Take the next block.
+
+        Raises
+        ------
+        ValueError, KeyError, TypeError, struct.error
+            Its content is not valid.
+        """
+        if kind == Kind.TORQUE:
+            self._torque(np.frombuffer(payload, SAMPLE))
+        elif kind in (Kind.INTENT, Kind.WRITTEN, Kind.SKIPPED, Kind.ACKED):
+            self._pulse(kind, payload)
+        elif kind == Kind.HEADER and not self._header:
+            self._head(json.loads(payload))
+        elif kind == Kind.START:
+            self._t0_s = float(json.loads(payload)["t0_s"])
+        elif kind == Kind.END:
+            content = json.loads(payload)
+            self._end, self.ended = {**content, "time_s": float(content["time_s"])}, True
+
+    def ready(self, finish: bool = False) -> Batch:
+        """What can be sent by now; with `finish` everything that is left."""
+        batch, finish = Batch(), finish or self.ended
+        if self._t0_s is None:
+            return batch
+        self._begin(batch)
+        self._pass_pulses(batch, finish)
+        self._align(finish)
+        if self._good or finish:
+            self._pass_torque(batch, finish)
+        if self.ended:
+            batch.marks.append((self._lsl_s(self._end["time_s"]), self._last_mark()))
+        return batch
+
+    def _head(self, header: dict[str, Any]) -> None:
+        self._header = header
+        self._rate_hz = float(header["sample_rate_hz"]) or self._rate_hz
+        self._speed = float(header.get("configuration", {}).get("clock_speed", 1.0))
+
+    def _torque(self, samples: NDArray[Any]) -> None:
+        if len(samples) == 0:
+            return
+        if self._alignment is None:
+            self._alignment = LiveAlignment(self._rate_hz, self._speed)
+        self._held.append((self._alignment.samples(samples), samples))
+        self._newest_s = max(self._newest_s, float(samples["host_time_s"][-1]))
+
+    def _pulse(self, kind: Kind, payload: bytes) -> None:
+        index = struct.unpack_from("<i", payload)[0]
+        if kind == Kind.INTENT:
+            _, _, due_s, width_us, current_ma = journal.INTENT.unpack(payload)
+            self._pulses[index] = _Pulse(width_us, current_ma)
+            if self._t0_s is None and self._header:  # the block of the start is damaged
+                self._t0_s = due_s - index / float(self._header["plan"]["pulse_rate_hz"])
+        elif kind == Kind.SKIPPED:
+            self._pulses.pop(index, None)
+        elif (pulse := self._pulses.get(index)) is None:
+            return
+        elif kind == Kind.WRITTEN:
+            pulse.written_s = journal.WRITTEN.unpack(payload)[2]
+        else:
+            pulse.acked_s = journal.ACKED.unpack_from(payload)[1]
+
+    def _begin(self, batch: Batch) -> None:
+        if self._told:
+            return
+        self._told = True
+        assert self._t0_s is not None
+        batch.marks.append((self._lsl_s(self._t0_s), {"event": "start", **self._names()}))
+
+    def _names(self) -> dict[str, Any]:
+        plan = self._header.get("plan", {})
+        names = {name: plan.get(name) for name in ("test_id", "participant", "kind")}
+        return {"recording_id": self._header.get("recording_id"), **names}
+
+    def _last_mark(self) -> dict[str, Any]:
+        assert self._t0_s is not None
+        return {
+            "event": "end",
+            **self._names(),
+            "outcome": self._end.get("outcome"),
+            "duration_s": self._end["time_s"] - self._t0_s,
+            "samples_sent": self.sent_samples,
+            "pulses_sent": self.sent_pulses,
+        }
+
+    def _pass_pulses(self, batch: Batch, finish: bool) -> None:
+        """Pass on what was written and acknowledged, in order; an ack may still correct the time of writing."""
+        for index in list(self._pulses):
+            pulse = self._pulses[index]
+            settled = finish or np.isfinite(pulse.acked_s) or self._newest_s > pulse.written_s + DELAY_S * self._speed
+            unwritten = not np.isfinite(pulse.written_s)
+            if unwritten and not finish and index == next(reversed(self._pulses)):
+                return
+            if not unwritten and not settled:
+                return
+            del self._pulses[index]
+            if unwritten:  # its blocks are damaged, or the rig ended between intent and write
+                continue
+            written_s = min(pulse.written_s, pulse.acked_s) if np.isfinite(pulse.acked_s) else pulse.written_s
+            if self._alignment is not None:
+                self._alignment.pulse(written_s)
+            if written_s >= self._since_s:
+                batch.pulse_s.append(self._lsl_s(written_s))
+                batch.pulses.append((pulse.width_us, pulse.current_ma, index))
+                self.sent_pulses += 1
+
+    def _align(self, finish: bool) -> None:
+        if self._alignment is None or not self._held:
+            return
+        played_s = self._newest_s - (self._t0_s or 0.0) if self._good else 0.0
+        if not finish and self._newest_s < self._updated_s + max(UPDATE_S * self._speed, UPDATE_SHARE * played_s):
+            return
+        self._updated_s = self._newest_s
+        self._alignment.update()
+        first_s, last_s = float(self._held[0][0][0]), float(self._held[-1][0][-1])
+        error_s = max(self._alignment.error_s(first_s), self._alignment.error_s(last_s))
+        waited_s = self._newest_s - float(self._held[0][1]["host_time_s"][0])
+        enough_s = max(GOOD_S * self._speed, GOOD_SHARE / self._rate_hz)
+        self._good = self._good or error_s < enough_s or waited_s > HOLD_S * self._speed
+
+    def _pass_torque(self, batch: Batch, finish: bool) -> None:
+        if self._alignment is None or self._alignment.line is None:
+            return
+        until_s = np.inf if finish else self._newest_s - DELAY_S * self._speed
+        passing = 0
+        while passing < len(self._held) and self._held[passing][1]["host_time_s"][-1] <= until_s:
+            passing += 1
+        if passing == 0:
+            return
+        cell_s = np.concatenate([held[0] for held in self._held[:passing]])
+        samples = np.concatenate([held[1] for held in self._held[:passing]])
+        del self._held[:passing]
+        time_s = self._alignment.line.at(cell_s)
+        keep = self._inside(time_s) & (samples["host_time_s"] >= self._since_s)
+        time_s = np.maximum.accumulate(np.maximum(time_s[keep], self._last_s))
+        if len(time_s):
+            self._last_s = float(time_s[-1])
+        batch.torque_s, batch.torque_nm = self._lsl_s(time_s), samples["torque_nm"][keep]
+        self.sent_samples += len(time_s)
+
+    def _inside(self, time_s: Array) -> NDArray[np.bool_]:
+        assert self._t0_s is not None
+        margin_s = MARGIN_S * self._speed
+        end_s = self._end["time_s"] if self.ended else np.inf
+        return (time_s >= self._t0_s - margin_s) & (time_s < end_s + margin_s)
+
+    def _lsl_s(self, rig_s: Any) -> Any:
+        return rig_s / self._speed + self._offset_s

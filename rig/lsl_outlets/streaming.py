@@ -1,0 +1,202 @@
+"""Follows one test after another and sends what its journal holds; the command line of `python -m rig.lsl_outlets`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import signal
+import struct
+import sys
+import threading
+import time
+from pathlib import Path
+
+from rig import config as configuration
+from rig.errors import ConfigError, RigError
+from rig.journal import Kind
+from rig.lsl_outlets import outlets
+from rig.lsl_outlets.follow import Journals, Tail, refuse_locking
+from rig.lsl_outlets.live_test import LiveTest
+
+log = logging.getLogger("rig.lsl")
+
+TICK_S = 0.05
+LOOK_S = 0.2
+"""Real seconds between two looks for a new test, or whether the journal is still there."""
+LAST_S = 0.5
+"""Real seconds that receivers have at the end to fetch what was sent."""
+RETURN_S = 15.0
+"""Real seconds for which a test that was joined waits until those who received before have found the streams again."""
+READS_AT_END = 400
+"""A test of the longest duration makes 25 MB; each read takes `follow.AT_ONCE_BYTES` at most."""
+
+
+class Streaming:
+    """Follows one test after another and sends what they hold.
+
+    Parameters
+    ----------
+    folder
+        Data folder of the rig.
+    streams
+        Where it goes.
+    offset_s
+        LSL's clock minus the monotonic clock, s.
+    sample_rate_hz, speed
+        By the rig file; the journal says both again.
+    """
+
+    def __init__(
+        self, folder: Path, streams: outlets.Outlets, offset_s: float, sample_rate_hz: float, speed: float
+    ) -> None:
+        self._journals = Journals(folder / "journals")
+        self._streams, self._offset_s = streams, offset_s
+        self._rate_hz, self._speed = sample_rate_hz, speed
+        self._tail: Tail | None = None
+        self._test = LiveTest()
+        self._joined = False
+        self._began_s = time.monotonic()
+        self._looked_s = -LOOK_S
+
+    def tick(self) -> bool:
+        """Take and send what came; whether there was anything."""
+        if self._tail is None and not self._found():
+            return False
+        tail = self._tail
+        assert tail is not None
+        try:
+            blocks = tail.blocks()
+        except OSError as error:
+            log.warning("%s: %s; nothing more of this test is streamed", tail.path.name, error.strerror)
+            self._finish()
+            return False
+        for kind, payload in blocks:
+            self._take(kind, payload)
+        if self._waiting():
+            return bool(blocks)
+        if self._test.ended:
+            self._finish()
+        elif blocks:
+            self._streams.push(self._test.ready())
+        elif self._due() and (tail.left() or self._journals.following(tail.path) is not None):
+            log.warning("%s: its test ended without an end in its journal", tail.path.name)
+            self._finish()
+        return bool(blocks)
+
+    def close(self) -> None:
+        """Send what is left."""
+        for _ in range(READS_AT_END):  # a rig that goes on writes faster than this could come to an end
+            if self._tail is None or not self.tick():
+                break
+        if self._tail is not None:
+            self._finish()
+
+    def _waiting(self) -> bool:
+        """After a start in the middle of a test: what is sent before the receivers are back would be lost to them."""
+        early = time.monotonic() < self._began_s + RETURN_S
+        return self._joined and early and not self._streams.wanted(all)
+
+    def _due(self) -> bool:
+        now_s = time.monotonic()
+        if now_s < self._looked_s + LOOK_S:
+            return False
+        self._looked_s = now_s
+        return True
+
+    def _found(self) -> bool:
+        path = self._journals.following() if self._due() else None
+        if path is None:
+            return False
+        try:
+            self._tail = Tail(path)
+        except OSError as error:
+            log.warning("%s: %s; this test is not streamed", path.name, error.strerror)
+            self._journals.done(path)
+            return False
+        self._joined = path in self._journals.old
+        since_s = self._began_s * self._speed if self._joined else float("-inf")
+        self._test = LiveTest(self._offset_s, since_s, self._rate_hz or 1000.0)
+        log.info("%s %s", "joins" if self._joined else "follows", path.name)
+        return True
+
+    def _take(self, kind: Kind, payload: bytes) -> None:
+        try:
+            self._test.take(kind, payload)
+        except (ValueError, KeyError, TypeError, IndexError, struct.error) as error:
+            log.warning("a block (%s) is not valid and is passed over: %r", kind.name, error)
+
+    def _finish(self) -> None:
+        assert self._tail is not None
+        self._streams.push(self._test.ready(finish=True))
+        name = self._tail.path.name
+        if self._tail.damaged_bytes:
+            log.warning("%s: %d bytes are damaged; what they held was not streamed", name, self._tail.damaged_bytes)
+        log.info("%s: %d samples and %d pulses sent", name, self._test.sent_samples, self._test.sent_pulses)
+        self._tail.close()
+        self._journals.done(self._tail.path)
+        self._tail = None
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Stream until asked to end; the exit code."""
+    options = _parser().parse_args(arguments)
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s lsl: %(message)s", stream=sys.stderr, force=True)
+    try:
+        config = _configuration(options)
+        folder = options.data or (config.data_dir if config is not None else None)
+        if folder is None:
+            raise ConfigError("lsl: give the rig's data folder with --data, or its rig file with --config")
+        if not folder.is_dir():
+            raise ConfigError(f"lsl: {folder}: no such folder; give the rig's data folder")
+        refuse_locking(folder)
+        _stream(folder, config, options.name)
+    except RigError as error:
+        print(f"lsl: {str(error).removeprefix('lsl: ')}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def _stream(folder: Path, config: configuration.RigConfig | None, name: str) -> None:
+    ended = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: ended.set())
+    lsl = outlets.library()
+    rate_hz, speed, devices = _of(config)
+    streams = outlets.Outlets(lsl, rate_hz * speed, devices, name)
+    streaming = Streaming(folder, streams, outlets.clock_offset_s(lsl), rate_hz, speed)
+    print(json.dumps({"streams": streams.names}), flush=True)
+    while not ended.is_set():
+        streaming.tick()
+        ended.wait(TICK_S)
+    streaming.close()
+    if streams.wanted():
+        time.sleep(LAST_S)
+
+
+def _of(config: configuration.RigConfig | None) -> tuple[float, float, dict[str, str]]:
+    """Nominal sample rate (0: not known), the clock's speed, and the devices' names."""
+    if config is None:
+        return 0.0, 1.0, {}
+    rate_hz = float(config.load_cell.model_dump().get("sample_rate_hz", 0.0))
+    devices = {"load_cell": config.load_cell.device, "stimulator": config.stimulator.device}
+    return rate_hz, config.clock_speed, devices
+
+
+def _configuration(options: argparse.Namespace) -> configuration.RigConfig | None:
+    places = {"data_dir": options.data, "socket": Path("none")}  # the rig's socket is not used
+    if options.config is not None:
+        return configuration.load(options.config, **places)
+    if options.emulator_json is not None:
+        return configuration.for_emulator(options.emulator_json, **places)
+    return None
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m rig.lsl_outlets", description="Torque and pulses for LSL.")
+    source = parser.add_mutually_exclusive_group()
+    source.add_argument("--config", type=Path, metavar="FILE", help="rig file: says rate and devices")
+    source.add_argument("--emulator-json", metavar="LINE", help="JSON line of `stimrig emulate`, or a file with it")
+    parser.add_argument("--data", type=Path, metavar="DIR", help="data folder of the rig; overrides the rig file")
+    parser.add_argument("--name", default="stimrig", help="what the streams' names begin with (default: stimrig)")
+    return parser

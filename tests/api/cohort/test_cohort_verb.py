@@ -1,0 +1,291 @@
+"""`stimrig cohort` as it is typed: one line for wrong input; killed, interrupted, its workers killed, and whole."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import jsonschema_rs
+import pyarrow.parquet as pq
+import pytest
+
+from api import schemas
+from api.cli import main
+from api.cohort import cluster
+from api.cohort.fields import FIELDS
+from tests.harness.cohort_records import cohort
+
+PATIENCE_S = 240.0
+SESSIONS = 50
+COMMAND = "import api.cohort.run as run; run.FLUSH_S = 0.0; from api.cli.main import main; main()"
+"""Every row to the disk at once: the test sees how far it is."""
+
+
+def refused(capsys: pytest.CaptureFixture[str], *arguments: str, code: int = 2) -> str:
+    capsys.readouterr()
+    assert main.run(["cohort", *arguments]) == code
+    out, err = capsys.readouterr()
+    assert out == "" and err.count("\n") == 1 and err.startswith("stimrig cohort: "), err
+    return err
+
+
+def test_without_the_extra_it_says_what_to_install(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    known = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *more: None if name == "dask" else known(name, *more))
+    for words in (["fit", str(tmp_path), "-o", "x.parquet"], ["changed", "a", "b"], ["figures", "a", "-o", "b"]):
+        assert "pip install stimrig[cohort]" in refused(capsys, *words)
+
+
+def test_the_verb_loads_without_the_extra() -> None:
+    code = (
+        "import sys; from api.cli.main import build; build('cohort'); "
+        "print([name for name in ('dask', 'distributed', 'pyarrow', 'fsspec') if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (["--select", "patient == 'x'"], "'patient'"),
+        (["--select", "__import__('os').abort()"], "--select, character 1"),
+        (["--method", "magic"], "magic"),
+        (["--effects", "magic"], "magic"),
+        (["--memory", "much"], "--memory much"),
+        (["--memory", "1MB"], "--memory 1MB"),
+        (["--map", "torque_nm"], "torque_nm"),
+        (["--limit", "0"], "--limit"),
+        (["--workers", "0"], "--workers"),
+    ],
+)
+def test_wrong_options_are_one_line(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, options: list[str], named: str
+) -> None:
+    assert named in refused(capsys, "fit", str(tmp_path), "-o", str(tmp_path / "r.parquet"), *options)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_data_that_is_not_there_is_one_line(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    missing = str(tmp_path / "nowhere")
+    assert missing in refused(capsys, "fit", missing, "-o", str(tmp_path / "r.parquet"))
+    assert "STIMRIG_TOKEN" in refused(capsys, "diagnose", "https://centre.example", "-o", str(tmp_path / "r.parquet"))
+    assert "no such file" in refused(capsys, "changed", missing, missing)
+    assert "no such file" in refused(capsys, "figures", missing, "-o", str(tmp_path / "f.html"))
+
+
+def test_a_scheduler_that_is_not_there_is_one_line(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(cluster, "CONNECT_S", 1.0)
+    for address in ("tcp://127.0.0.1:9", "nonsense://x", "127.0.0.1:notaport"):
+        words = refused(capsys, "fit", str(tmp_path), "-o", str(tmp_path / "r.parquet"), "--scheduler", address)
+        assert address in words and "no scheduler answers" in words
+
+
+def test_a_scheduler_without_workers_is_one_line(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    from distributed import LocalCluster
+
+    with LocalCluster(n_workers=0, processes=False, protocol="tcp", dashboard_address=None) as empty:
+        words = refused(
+            capsys, "fit", str(tmp_path), "-o", str(tmp_path / "r.parquet"), "--scheduler", empty.scheduler_address,
+            "--wait", "0.5",
+        )  # fmt: skip
+    assert "no worker within 0.5 s" in words
+
+
+def unmet(document: dict[str, Any]) -> list[str]:
+    """What a document lacks of the schema, and which keys at the top the schema does not know."""
+    schema = schemas.load("cohort")
+    check = jsonschema_rs.validator_for(schema)
+    unknown = sorted(set(document) - set(schema["properties"]))
+    return [f"{list(error.instance_path)}: {error.message[:200]}" for error in check.iter_errors(document)] + unknown
+
+
+def test_the_docs_list_the_fields_that_there_are() -> None:
+    lines = (Path(main.__file__).parents[2] / "docs" / "cohorts.md").read_text("utf-8").splitlines()
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("| `")]
+    written = {row[0].strip("`"): row[1:] for row in rows if len(row) == 3}
+    assert written == {name: [field.type, field.says] for name, field in FIELDS.items()}
+
+
+# ---- the real thing: processes that are interrupted and killed
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    place = tmp_path_factory.mktemp("sessions")
+    cohort(place, SESSIONS)
+    (place / "broken.h5").write_bytes(b"no recording")
+    return place
+
+
+def started(folder: Path, output: Path) -> subprocess.Popen[str]:
+    command = [
+        sys.executable,
+        "-c",
+        COMMAND,
+        "cohort",
+        "fit",
+        str(folder),
+        "-o",
+        str(output),
+        "--json",
+        "--renew",
+        "20",
+    ]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
+
+
+def below(pid: int) -> list[int]:
+    """Every process below one."""
+    parents: dict[int, list[int]] = {}
+    for place in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = place.read_text().rpartition(")")[2].split()
+        except OSError:
+            continue
+        parents.setdefault(int(fields[1]), []).append(int(place.parent.name))
+    found, waiting = [], [pid]
+    while waiting:
+        children = parents.get(waiting.pop(), [])
+        found += children
+        waiting += children
+    return found
+
+
+def until(reached: Callable[[], Any], what: str, run: subprocess.Popen[str] | None = None) -> None:
+    ends_s = time.monotonic() + PATIENCE_S
+    while not reached():
+        assert run is None or run.poll() is None, f"ended before {what}: {run.communicate()}"
+        assert time.monotonic() < ends_s, what
+        time.sleep(0.01)
+
+
+def alive(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+@pytest.mark.slow
+def test_interrupted_killed_and_with_a_worker_killed_it_is_whole_in_the_end(folder: Path, tmp_path: Path) -> None:
+    output = tmp_path / "r.parquet"
+    parts = tmp_path / "r.parquet.parts"
+
+    def rows() -> int:
+        return len(list(parts.glob("[0-9]*.parquet")))
+
+    run = started(folder, output)
+    until(lambda: rows() >= 4, "four rows", run)
+    os.killpg(run.pid, signal.SIGINT)  # as a terminal does it: to every process of the group
+    _, err = run.communicate(timeout=PATIENCE_S)
+    assert run.returncode == 130 and err.count("\n") == 1 and "the same command goes on" in err, err
+
+    kept = rows()
+    run = started(folder, output)
+    until(lambda: rows() >= kept + 4, "four rows more", run)
+    family = below(run.pid)
+    assert len(family) >= 4, "two workers, and a process that computes for each"
+    run.kill()
+    run.communicate()
+    until(lambda: not any(map(alive, family)), "the end of every process that the killed run had started")
+
+    kept = rows()
+    assert kept < SESSIONS
+    run = started(folder, output)
+    until(lambda: rows() >= kept + 2, "two rows more", run)
+    workers = [pid for pid in below(run.pid) if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+    assert workers
+    os.kill(workers[0], signal.SIGKILL)
+    out, err = run.communicate(timeout=PATIENCE_S)
+    assert run.returncode == 0, err
+    told = json.loads(out)
+    assert unmet(told) == []
+    found = pq.read_table(output).to_pylist()
+    names = [row["name"] for row in found]
+    assert len(names) == len(set(names)) == SESSIONS + 1
+    assert (told["ok"], told["errors"], told["done_before"]) == (SESSIONS, 1, kept)
+    assert told["computed"] == SESSIONS + 1 - kept
+    assert not parts.exists()
+
+
+@pytest.mark.slow
+def test_the_dashboard_is_told_and_people_are_given_words(
+    capsys: pytest.CaptureFixture[str], folder: Path, tmp_path: Path
+) -> None:
+    output = tmp_path / "r.parquet"
+    one = str(next((folder / "P001").iterdir()))
+    assert main.run(["cohort", "fit", one, "-o", str(output), "--workers", "1", "--dashboard"]) == 0
+    out, err = capsys.readouterr()
+    assert re.search(r"dashboard +http://127\.0\.0\.1:\d+/status", err)
+    assert "1 with a result" in out and str(output) in out
+    assert main.run(["cohort", "changed", str(output), str(output), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert unmet(told) == [] and told["unchanged"] == 1
+    assert main.run(["cohort", "changed", str(output), str(output)]) == 0
+    assert "1 records in both: 1 unchanged" in capsys.readouterr().out
+    assert main.run(["cohort", "figures", str(output), "--html", str(tmp_path / "f.html"), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert unmet(told) == [] and told["records"] == 1
+    assert (tmp_path / "f.html").stat().st_size > 1000
+
+
+@pytest.fixture
+def scheduler(tmp_path: Path) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
+    """A scheduler of Dask as a process of its own, with two workers; its address."""
+    file = tmp_path / "scheduler.json"
+    here = [sys.executable, "-m", "distributed.cli.dask_scheduler"]
+    quiet: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    options = ["--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(file)]
+    main_one = subprocess.Popen([*here, *options], **quiet)
+    workers = []
+    try:
+        until(file.exists, "a scheduler")
+        until(lambda: file.read_text().rstrip().endswith("}"), "its whole file")
+        address = json.loads(file.read_text())["address"]
+        command = [sys.executable, "-m", "distributed.cli.dask_worker", address, "--nthreads", "1", "--no-nanny"]
+        workers = [subprocess.Popen([*command, "--no-dashboard"], **quiet) for _ in range(2)]
+        yield address, main_one
+    finally:
+        for process in (*workers, main_one):
+            process.kill()
+            process.wait()
+
+
+@pytest.mark.slow
+def test_another_scheduler_computes_and_when_it_goes_what_is_done_is_kept(
+    folder: Path, tmp_path: Path, scheduler: tuple[str, subprocess.Popen[bytes]]
+) -> None:
+    address, process = scheduler
+    output = tmp_path / "r.parquet"
+
+    def begun() -> subprocess.Popen[str]:
+        words = ["cohort", "fit", str(folder), "-o", str(output), "--scheduler", address, "--wait", "200"]
+        command = [sys.executable, "-c", COMMAND, *words]
+        return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+    run = begun()
+    until(lambda: len(list((tmp_path / "r.parquet.parts").glob("[0-9]*.parquet"))) >= 3, "three rows", run)
+    process.kill()
+    _, err = run.communicate(timeout=PATIENCE_S)
+    said = [line for line in err.splitlines() if not line.startswith("dashboard")]
+    assert run.returncode == 1 and len(said) == 1 and "the scheduler is gone" in said[0], err
+    kept = sum(pq.read_table(part).num_rows for part in (tmp_path / "r.parquet.parts").glob("[0-9]*.parquet"))
+    assert kept >= 3
+    run = started(folder, output)
+    out, err = run.communicate(timeout=PATIENCE_S)
+    assert run.returncode == 0, err
+    assert (json.loads(out)["done_before"], json.loads(out)["records"]) == (kept, SESSIONS + 1)

@@ -1,0 +1,261 @@
+"""The process that computes: whatever a record does to it is a row, and the next record is computed."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import signal
+import sys
+import tempfile
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from api.cohort import parent
+from api.cohort.parent import Computing
+from api.cohort.sources import Entry
+from api.cohort.tasks import Task
+from api.cohort.worker import Bounds, run_record
+from api.version import software_version
+from tests.harness.cohort_records import Session, write
+from tests.harness.hostile_shapes import SECRET, hdf5_shapes
+
+pytestmark = pytest.mark.slow
+
+MEMORY = 10**9
+PATIENCE_S = 300.0
+FIT = Task("fit")
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    return write(tmp_path_factory.mktemp("good") / "good.h5", Session(muscle=2, seed=5)).read_bytes()
+
+
+@pytest.fixture(scope="module")
+def computing() -> Iterator[Computing]:
+    one = Computing(MEMORY)
+    yield one
+    one.close()
+
+
+def entry(name: str = "good.h5", **known: Any) -> Entry:
+    return Entry(f"/data/{name}", name, f"/data/{name}", known={"name": name, **known})
+
+
+def row(
+    computing: Computing, content: bytes, task: Task = FIT, limit_s: float = PATIENCE_S, **more: Any
+) -> dict[str, Any]:
+    return computing.compute(content, entry(**more), task, limit_s)["row"]
+
+
+def pid(computing: Computing) -> int:
+    assert computing.process is not None
+    return computing.process.pid
+
+
+def test_a_fit_gives_what_the_verb_gives(computing: Computing, good: bytes, tmp_path: Path) -> None:
+    import identify
+
+    found = row(computing, good)
+    (tmp_path / "good.h5").write_bytes(good)
+    model = identify.fit(identify.read(tmp_path / "good.h5")).to_dict()
+    assert (found["status"], found["participant"], found["day"]) == ("ok", "P001", "2026-01-05")
+    assert found["record_id"] == "R-P001-5" and found["kind"] == "pre-session" and found["rig"] is None
+    assert found["fit_percent"] == pytest.approx(model["fit"]["fit_percent"])
+    assert found["verdict"] == model["quality"]["verdict"]
+    values = {entry["name"]: entry for entry in found["parameters"]}
+    assert values["time_constant_s"]["value"] == pytest.approx(model["linear"]["time_constant_s"])
+    assert values["threshold_us"]["unit"] == "µs" and values["threshold_us"]["sd"] > 0
+    assert found["duration_s"] == pytest.approx(22.69) and found["rate_hz"] == pytest.approx(100)
+
+
+def test_diagnosis_and_improvement_name_what_is_missing(computing: Computing, tmp_path: Path) -> None:
+    tired = write(tmp_path / "t.h5", Session(muscle=1, effect="fatigue")).read_bytes()
+    found = row(computing, tired, Task("diagnose"))
+    assert found["verdict"] in ("effect_missing", "nothing_missing", "unexplained_structure")
+    assert 0 <= found["probability"] <= 1 and found["fit_percent"] < found["ceiling_percent"] + 1
+    assert all({"of", "name", "value", "sd", "unit"} == set(entry) for entry in found["parameters"])
+    assert {entry["of"] for entry in found["parameters"]} <= {entry["effect"] for entry in found["effects"]}
+    improved = row(computing, tired, Task("improve"))
+    assert improved["verdict"] == found["verdict"]
+    assert improved["steps"][0]["added"] is None
+    assert len(improved["steps"]) == 1 + len(improved["effects"])
+
+
+def test_a_selection_is_judged_once_the_record_is_read(computing: Computing, good: bytes) -> None:
+    def left_out(select: str, content: bytes = good) -> bool:
+        return "left_out" in computing.compute(content, entry(), Task("fit", select), PATIENCE_S)
+
+    assert left_out('participant == "P002"') and left_out("duration_s > 100") and left_out('kind != "pre-session"')
+    assert not left_out('participant == "P001" and day == "2026-01-05"')
+    # Nobody knows whose the broken one is: it is told, not dropped.
+    assert not left_out('participant == "P002"', good[:5000])
+
+
+def test_a_record_that_hangs_is_ended_and_the_next_is_computed(computing: Computing, good: bytes) -> None:
+    row(computing, good)
+    first = pid(computing)
+    found = row(computing, good, Task("diagnose"), limit_s=0.01)
+    assert (found["status"], found["error_kind"]) == ("error", "timeout") and "--limit" in found["error"]
+    assert row(computing, good)["status"] == "ok"
+    assert pid(computing) != first
+    with pytest.raises(ProcessLookupError):
+        os.kill(first, 0)
+
+
+def test_a_process_that_is_killed_is_a_row(computing: Computing, good: bytes) -> None:
+    row(computing, good)
+    assert computing.process is not None
+    os.kill(pid(computing), signal.SIGSTOP)  # it takes the record, and computes for ever
+    killer = threading.Timer(0.5, os.kill, (pid(computing), signal.SIGKILL))
+    killer.start()
+    found = row(computing, good)
+    killer.join()
+    assert found["error_kind"] == "killed" and "\n" not in found["error"]
+    assert row(computing, good)["status"] == "ok"
+
+
+def test_a_process_that_ended_between_records_costs_none(computing: Computing, good: bytes) -> None:
+    row(computing, good)
+    assert computing.process is not None
+    computing.process.kill()
+    computing.process.wait()
+    assert row(computing, good)["status"] == "ok"
+
+
+def test_a_record_beyond_the_memory_is_a_row(good: bytes) -> None:
+    table = b"time_s,pulse_width_us,torque_nm,segment\n"
+    table += b"".join(b"%.4f,%d,%.3f,prbs\n" % (k / 400, 100 * (k // 200 % 2), k % 7) for k in range(400_000))
+    small = Computing(24 * 2**20)
+    try:
+        found = row(small, table, name="large.csv")
+        assert found["error_kind"] in ("out of memory", "killed"), found
+        assert "\n" not in found["error"]
+    finally:
+        small.close()
+
+
+def test_a_process_is_renewed_after_some_records(good: bytes) -> None:
+    computing = Computing(MEMORY, records=2)
+    try:
+        pids = []
+        for _ in range(5):
+            assert row(computing, good)["status"] == "ok"
+            pids.append(pid(computing))
+        assert len(set(pids)) == 3
+    finally:
+        computing.close()
+
+
+def test_hostile_files_are_rows_and_give_nothing_away(computing: Computing, tmp_path: Path) -> None:
+    (tmp_path / "secret.txt").write_bytes(SECRET)
+    (tmp_path / "other.h5").write_bytes(b"")
+    shapes = [hostile for hostile in hdf5_shapes(tmp_path) if hostile.refused]
+    for hostile in shapes[::6]:
+        found = row(computing, hostile.content, name="x.h5")
+        assert (found["status"], found["error_kind"]) == ("error", "bad record"), hostile.name
+        assert SECRET[:20].decode() not in str(found) and "\n" not in found["error"]
+        assert "record.h5" not in found["error"], "the name that the person knows"
+
+
+def test_no_file_of_the_machine_can_be_read(computing: Computing, good: bytes, tmp_path: Path) -> None:
+    """The child is shut in before it reads: what the harness of hostile files tries, tried directly."""
+    row(computing, good)
+    status = Path(f"/proc/{pid(computing)}/status").read_text()
+    assert "NoNewPrivs:\t1" in status
+    assert "Seccomp:\t2" in status
+
+
+def test_the_environment_of_a_child_holds_no_key(
+    computing: Computing, good: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "secret-of-the-bucket")
+    monkeypatch.setenv("STIMRIG_TOKEN", "secret-of-the-centre")
+    computing.close_process()
+    row(computing, good)
+    assert b"secret-of" not in Path(f"/proc/{pid(computing)}/environ").read_bytes()
+
+
+def test_what_a_killed_worker_left_is_taken_away(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    living = Computing(MEMORY)
+    left = tmp_path / "stimrig-cohort-left"
+    left.mkdir()
+    (left / "lock").touch()
+    (left / "record.h5").write_bytes(b"somebody's")
+    other = Computing(MEMORY)
+    assert not left.exists()
+    assert len(list(tmp_path.iterdir())) == 2
+    living.close()
+    other.close()
+    assert list(tmp_path.iterdir()) == []
+
+
+EVIL = """
+import sys
+print('{"ready": true, "left_open": {}}', flush=True)
+for number, line in enumerate(sys.stdin):
+    print(sys.argv[1].replace("'", '"'), flush=True)
+"""
+
+
+@pytest.mark.parametrize(
+    "said",
+    ["no JSON", "{}", "[1]", "{'row': 3}", "{'row': {'status': 'copy'}}", "[" * 100_000, "x" * 17_000_000, "\\xff"],
+    ids=lambda said: said[:20],
+)
+def test_a_process_that_was_taken_over_cannot_end_a_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: str
+) -> None:
+    script = tmp_path / "evil.py"
+    script.write_text(EVIL.replace("sys.argv[1]", repr(said)))
+    monkeypatch.setattr(parent, "CHILD", (sys.executable, str(script)))
+    computing = Computing(MEMORY)
+    try:
+        found = row(computing, b"")
+        assert (found["status"], found["error_kind"]) == ("error", "unexpected")
+    finally:
+        computing.close()
+
+
+def test_a_process_has_no_say_in_which_record_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    forged = '{"row": {"status": "ok", "sha256": "x", "address": "x", "other_version": "9", "software": "9"}}'
+    script = tmp_path / "evil.py"
+    script.write_text(EVIL.replace("sys.argv[1]", repr(forged)))
+    monkeypatch.setattr(parent, "CHILD", (sys.executable, str(script)))
+    try:
+        found = of_worker(b"abc", Entry("address", "a", "a"))
+        assert found["address"] == "address" and found["software"] == software_version()
+        assert found["sha256"] == hashlib.sha256(b"abc").hexdigest() and not found["other_version"]
+    finally:
+        parent.close_all()
+
+
+class Given:
+    """A source of one content."""
+
+    def __init__(self, content: bytes) -> None:
+        self.content = content
+
+    def open(self, _entry: Entry, most_bytes: int) -> bytes:
+        return self.content[: most_bytes + 1]
+
+
+def of_worker(content: bytes, one: Entry, software: str | None = None) -> dict[str, Any]:
+    task = Task("fit", software=software_version() if software is None else software)
+    return run_record(Given(content), one, task, Bounds(PATIENCE_S, MEMORY, 10))  # pyright: ignore[reportArgumentType]
+
+
+def test_a_wrong_hash_or_size_is_a_row_without_a_look_inside(good: bytes) -> None:
+    found = of_worker(good, Entry("a", "a", "a", sha256="0" * 64))
+    assert found["error_kind"] == "hash differs" and "000000000000" in found["error"]
+    found = of_worker(good, Entry("a", "a", "a", bytes=10**12))
+    assert found["error_kind"] == "bad record" and "256 MB" in found["error"]
+
+
+def test_a_worker_of_another_version_refuses(good: bytes) -> None:
+    assert of_worker(good, Entry("a", "a", "a"), software="9.9") == {"other_version": software_version()}

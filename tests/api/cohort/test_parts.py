@@ -1,0 +1,234 @@
+"""Results on disk: whole or not there, resumable, nothing doubled, nothing lost."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from datetime import UTC, date, datetime
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from api.cohort import parts
+from api.cohort import read as read_tables
+from api.cohort.errors import CohortError
+from api.cohort.parts import Results
+from api.cohort.sources import Entry
+from api.cohort.table import SCHEMA, table_of
+from api.cohort.tasks import Task
+from api.cohort.worker import COPY, LEFT_OUT
+
+TASK = Task("fit", software="1.0")
+
+
+def made(name: str, content: str | None = None, status: str = "ok", **more: Any) -> dict[str, Any]:
+    sha256 = None if content == "" else hashlib.sha256((content or name).encode()).hexdigest()
+    row = {"address": f"/d/{name}", "name": name, "stamp": f"s-{content or name}", "sha256": sha256, "bytes": 3}
+    return {**row, "status": status, **more}
+
+
+def entry(name: str, content: str | None = None) -> Entry:
+    return Entry(f"/d/{name}", name, name, 3, f"s-{content or name}")
+
+
+def read(output: Path) -> list[dict[str, Any]]:
+    return pq.read_table(output).to_pylist()
+
+
+def told(output: Path) -> list[str]:
+    return sorted(f"{row['name']} {row['status']}" for row in read(output))
+
+
+@pytest.fixture
+def output(tmp_path: Path) -> Path:
+    return tmp_path / "results.parquet"
+
+
+def test_a_run_that_was_cut_off_goes_on(output: Path) -> None:
+    with Results(output, TASK) as results:
+        results.add(made("a"))
+        results.add(made("b", status="error", error_kind="bad record"))
+        results.add(made("c", status=LEFT_OUT))
+    assert not output.exists()
+    with Results(output, TASK) as results:
+        assert all(results.done.has_place(entry(name)) for name in "abc")
+        assert not results.done.has_place(entry("a", "changed")) and not results.done.has_place(entry("d"))
+        assert results.done.has_content(made("a")["sha256"]) and not results.done.has_content(made("c")["sha256"])
+        results.add(made("d"))
+        assert results.join() == {"ok": 2, "error": 1, "copies": 0}
+    assert told(output) == ["a ok", "b error", "d ok"]
+    assert not results.folder.exists()
+
+
+def test_finished_results_take_in_what_is_new(output: Path) -> None:
+    for names in ("ab", "c"):
+        with Results(output, TASK) as results:
+            for name in names:
+                results.add(made(name))
+            results.join()
+    assert told(output) == ["a ok", "b ok", "c ok"]
+
+
+def test_a_run_that_did_nothing_leaves_nothing(output: Path) -> None:
+    with Results(output, TASK) as results:
+        assert results.folder.exists()
+    assert list(output.parent.iterdir()) == []
+    with Results(output, Task("diagnose", software="1.0")):
+        pass
+
+
+def test_a_part_that_was_half_written_counts_for_nothing(output: Path) -> None:
+    with Results(output, TASK) as results:
+        results.add(made("a"))
+    (results.folder / "00000001.parquet.new").write_bytes(b"PAR1half")
+    with Results(output, TASK) as results:
+        results.add(made("b"))
+        results.join()
+    assert told(output) == ["a ok", "b ok"]
+
+
+def test_killed_between_the_join_and_the_tidying(output: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with Results(output, TASK) as results, monkeypatch.context() as patch:
+        results.add(made("a"))
+        patch.setattr(parts.shutil, "rmtree", lambda *_, **__: None)
+        results.join()
+    assert results.folder.exists()
+    with Results(output, TASK) as results:
+        results.join()
+    assert told(output) == ["a ok"]
+
+
+def test_a_content_counts_once_wherever_it_lies(output: Path) -> None:
+    with Results(output, TASK) as results:
+        assert results.add(made("a", "x")) == "ok"
+        assert results.add(made("b", "x")) == COPY
+        assert results.join()["copies"] == 1
+    assert told(output) == ["a ok"]
+
+
+def test_a_file_that_was_replaced_takes_its_old_row_with_it(output: Path) -> None:
+    with Results(output, TASK) as results:
+        results.add(made("a", "old"))
+        results.add(made("b", "moved"))
+        results.join()
+    with Results(output, TASK) as results:
+        results.add(made("a", "new"))
+        results.add(made("b", "other"))
+        assert results.add(made("c", "moved")) == COPY
+        results.join()
+    contents = {row["stamp"] for row in read(output)}
+    assert contents == {"s-new", "s-other", "s-moved"}
+
+
+def test_what_failed_is_done_again_if_asked(output: Path) -> None:
+    with Results(output, TASK) as results:
+        results.add(made("slow", status="error", error_kind="timeout"))
+        results.add(made("far", "", status="error", error_kind="unreadable"))
+        results.add(made("bad", status="error", error_kind="bad record"))
+        results.join()
+    with Results(output, TASK) as results:
+        assert results.done.has_place(entry("slow"))
+    with Results(output, TASK, again=True) as results:
+        assert not results.done.has_place(entry("slow")) and results.done.has_place(entry("bad"))
+        assert results.add(made("slow")) == "ok"
+        assert results.add(made("far")) == "ok"
+        results.join()
+    assert told(output) == ["bad error", "far ok", "slow ok"]
+
+
+@pytest.mark.parametrize(
+    ("other", "named"),
+    [
+        (Task("diagnose", software="1.0"), "verb fit, now diagnose"),
+        (Task("fit", software="2.0"), "software 1.0, now 2.0"),
+        (Task("fit", effects=("fatigue",), software="1.0"), "effects none, now fatigue"),
+        (Task("fit", 'rig == "R"', software="1.0"), "select none"),
+    ],
+)
+@pytest.mark.parametrize("joined", [False, True])
+def test_other_options_are_refused(output: Path, other: Task, named: str, joined: bool) -> None:
+    with Results(output, TASK) as results:
+        results.add(made("a"))
+        if joined:
+            results.join()
+    with pytest.raises(CohortError, match=named), Results(output, other):
+        pass
+    with Results(output, TASK) as results:
+        assert results.done.has_place(entry("a"))
+
+
+def test_two_runs_never_write_one_output(output: Path) -> None:
+    with Results(output, TASK), pytest.raises(CohortError, match="another run"), Results(output, TASK):
+        pass
+    with Results(output, TASK):
+        pass
+
+
+def test_what_is_no_table_of_results_is_not_written_over(output: Path, tmp_path: Path) -> None:
+    output.write_bytes(b"somebody's letter")
+    with pytest.raises(CohortError, match="no table of results"), Results(output, TASK):
+        pass
+    pq.write_table(pa.table({"a": [1]}), output)
+    with pytest.raises(CohortError, match="no results of a cohort"), Results(output, TASK):
+        pass
+    assert pq.read_table(output).num_rows == 1
+    with pytest.raises(CohortError, match="a folder"), Results(tmp_path, TASK):
+        pass
+    assert [path.name for path in tmp_path.iterdir()] == [output.name]
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(CohortError, match="can be written"), Results(tmp_path / "file" / "x.parquet", TASK):
+        pass
+
+
+def test_damaged_parts_are_one_line(output: Path) -> None:
+    with Results(output, TASK) as results:
+        results.add(made("a"))
+    part = next(results.folder.glob("*.parquet"))
+    part.write_bytes(part.read_bytes()[:-20])
+    with pytest.raises(CohortError, match="cannot be read"), Results(output, TASK):
+        pass
+    (results.folder / "run.json").write_bytes(b"{")
+    with pytest.raises(CohortError, match="Remove the folder"), Results(output, TASK):
+        pass
+
+
+def test_many_rows_pass_in_groups(output: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(parts, "ROWS_A_PART", 7)
+    monkeypatch.setattr(read_tables, "ROWS_A_GROUP", 10)
+    monkeypatch.setattr(read_tables, "ROWS_AT_ONCE", 4)
+    with Results(output, TASK) as results:
+        for number in range(60):
+            results.add(made(str(number % 50), status="ok" if number % 3 else LEFT_OUT))
+        results.join()
+    assert told(output) == sorted({f"{number % 50} ok" for number in range(60) if number % 3})
+    assert pq.read_metadata(output).num_row_groups > 2
+
+
+def test_columns_have_types_and_units(output: Path) -> None:
+    row = made(
+        "a", day="2026-01-31", begun_utc="2026-01-31T10:00:00+02:00", computed_utc=datetime(2026, 2, 1, tzinfo=UTC),
+        parameters=[{"of": "model", "name": "damping", "value": 1.0, "sd": None, "unit": "1"}], took_s=0.5,
+    )  # fmt: skip
+    with Results(output, TASK) as results:
+        results.add(row)
+        results.join()
+    table = pq.read_table(output)
+    assert table.schema.field("rms_nm").metadata[b"unit"] == "N·m".encode()
+    assert all(field.metadata[b"description"] for field in table.schema)
+    found = table.to_pylist()[0]
+    assert found["day"] == date(2026, 1, 31) and found["begun_utc"] == datetime(2026, 1, 31, 8, tzinfo=UTC)
+    assert found["parameters"][0]["value"] == 1.0
+    assert json.loads(table.schema.metadata[b"options"]) == TASK.document()
+
+
+def test_nonsense_in_a_record_never_ends_a_run() -> None:
+    table = table_of([{**made("a"), "kind": "\ud800", "begun_utc": "yesterday", "nobody": "knows"}])
+    assert table.schema.equals(SCHEMA) and table["begun_utc"][0].as_py() is None
+    table = table_of(
+        [made("a"), {**made("b"), "bytes": 2**70, "rate_hz": "fast", "begun_utc": {}, "effects": [{"x": 1}]}]
+    )
+    assert table["bytes"].to_pylist() == [3, None] and table["name"].to_pylist() == ["a", "b"]
+    assert table["rate_hz"][1].as_py() is None

@@ -1,0 +1,201 @@
+"""A whole run on Dask in this process: a mixed folder, a bounded number in flight, cut off and resumed."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+import pytest
+from distributed import Client, LocalCluster
+
+from api.cohort import flight, worker
+from api.cohort.cluster import check_versions
+from api.cohort.errors import CohortError, CutOffError
+from api.cohort.parent import close_all
+from api.cohort.parts import Results
+from api.cohort.run import AHEAD, Run, Tally
+from api.cohort.select import Selection
+from api.cohort.sources import Entry, Source
+from api.cohort.sources.addresses import sources_of
+from api.cohort.tasks import Task, checked
+from api.cohort.tells import duration, words
+from api.version import software_version
+from tests.harness.cohort_records import broken, cohort
+
+pytestmark = pytest.mark.slow
+
+BOUNDS = worker.Bounds(300.0, 10**9, 500)
+LANES = 2
+
+
+@pytest.fixture(scope="module")
+def client() -> Iterator[Client]:
+    """Two workers of one thread each, in this process; their computing processes are processes of their own."""
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    with (
+        LocalCluster(n_workers=LANES, threads_per_worker=1, processes=False, dashboard_address=None) as cluster,
+        Client(cluster) as client,
+    ):
+        yield client
+        client.run(close_all)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Twelve sessions of three people, and ten files that are no recording."""
+    place = tmp_path_factory.mktemp("cohort")
+    made = cohort(place, 12)
+    broken(place, made[0])
+    return place
+
+
+def task(select: str = "") -> Task:
+    return checked("fit", Selection(select).text, software=software_version())
+
+
+def go(client: Client, sources: list[Source], output: Path, select: str = "", **more: Any) -> tuple[Run, Tally]:
+    with Results(output, task(select)) as results:
+        run = Run(client, sources, task(select), BOUNDS, results, **more)
+        tally = run.go()
+        results.join()
+    return run, tally
+
+
+def read(output: Path) -> list[dict[str, Any]]:
+    return pq.read_table(output).to_pylist()
+
+
+def test_a_mixed_folder_gives_a_row_for_each_file(client: Client, folder: Path, tmp_path: Path) -> None:
+    run, tally = go(client, sources_of([str(folder)]), tmp_path / "r.parquet")
+    rows = read(tmp_path / "r.parquet")
+    assert Counter(row["status"] for row in rows) == {"ok": 12, "error": 10}
+    assert (tally.ok, tally.error, tally.copies) == (12, 10, 0)
+    assert run.flight.most <= AHEAD * LANES
+    for row in rows:
+        assert row["software"] == software_version() and row["verb"] == "fit" and row["address"] and row["took_s"] >= 0
+        if row["status"] == "error":
+            assert row["error_kind"] == "bad record" and "\n" not in row["error"], row["error"]
+            assert row["name"] in row["error"], "a person finds the file by it"
+            assert row["fit_percent"] is None
+        else:
+            assert row["participant"] in ("P001", "P002", "P003") and row["fit_percent"] > 50
+            assert {entry["unit"] for entry in row["parameters"]} >= {"µs", "N·m", "s"}
+
+
+def test_a_selection_leaves_the_others_out(client: Client, folder: Path, tmp_path: Path) -> None:
+    select = 'participant == "P002" and day < "2026-01-20" and "session" in name'
+    _, tally = go(client, sources_of([str(folder)]), tmp_path / "r.parquet", select)
+    rows = read(tmp_path / "r.parquet")
+    assert sorted(str(row["day"]) for row in rows) == ["2026-01-05", "2026-01-12", "2026-01-19"]
+    assert tally.left_out == 9, "the broken ones' names say enough"
+
+
+def test_a_run_that_is_interrupted_goes_on_where_it_was(client: Client, folder: Path, tmp_path: Path) -> None:
+    output = tmp_path / "r.parquet"
+
+    def enough(tally: Tally) -> None:
+        if tally.now == 9:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        go(client, sources_of([str(folder)]), output, tell=enough)
+    assert not output.exists()
+    _, tally = go(client, sources_of([str(folder)]), output)
+    assert (tally.before, tally.now) == (9, 13)
+    names = [row["name"] for row in read(output)]
+    assert len(names) == len(set(names)) == 22
+    _, tally = go(client, sources_of([str(folder)]), output)
+    assert (tally.before, tally.now) == (22, 0)
+    assert len(read(output)) == 22
+
+
+def test_a_cohort_that_moved_is_not_computed_again(client: Client, tmp_path: Path) -> None:
+    cohort(tmp_path / "a", 2)
+    go(client, sources_of([str(tmp_path / "a")]), tmp_path / "r.parquet")
+    (tmp_path / "a").rename(tmp_path / "b")
+    cohort(tmp_path / "b", 3)
+    _, tally = go(client, sources_of([str(tmp_path / "b")]), tmp_path / "r.parquet")
+    assert (tally.copies, tally.ok) == (2, 1)
+    assert len(read(tmp_path / "r.parquet")) == 3
+
+
+class Endless:
+    """A source of which nobody may want more at once than fits."""
+
+    def __init__(self, count: int) -> None:
+        self.count, self.listed, self.peak = count, 0, 0
+
+    def check(self) -> None:
+        pass
+
+    def entries(self, _selection: Selection) -> Iterator[Entry]:
+        counting = threading.current_thread() is not threading.main_thread()
+        for number in range(self.count):
+            if not counting:
+                self.listed += 1
+            yield Entry(
+                f"endless:{number}", f"{number}.csv", str(number), stamp=str(number), known={"name": str(number)}
+            )
+
+    def open(self, _entry: Entry, _most_bytes: int) -> bytes:
+        raise worker.SourceError("it is not there")
+
+
+def test_a_long_list_is_never_held_at_once(client: Client, tmp_path: Path) -> None:
+    source = Endless(300)
+    ahead: list[int] = []
+    run, tally = go(client, [source], tmp_path / "r.parquet", tell=lambda one: ahead.append(source.listed - one.now))
+    assert tally.error == 300 and {row["error_kind"] for row in read(tmp_path / "r.parquet")} == {"unreadable"}
+    assert run.flight.most <= AHEAD * LANES and max(ahead) <= AHEAD * LANES
+
+
+def test_a_place_that_goes_while_it_is_listed_ends_the_run_and_keeps_what_is_done(
+    client: Client, folder: Path, tmp_path: Path
+) -> None:
+    class Gone(Endless):
+        def entries(self, selection: Selection) -> Iterator[Entry]:
+            yield from super().entries(selection)
+            raise CohortError("bucket: gone")
+
+    with pytest.raises(CohortError, match="gone"):
+        go(client, [Gone(20)], tmp_path / "r.parquet")
+    with Results(tmp_path / "r.parquet", task()) as results:
+        assert len(results.done.places) > 0
+
+
+def test_a_worker_of_another_version_ends_the_run(
+    client: Client, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(worker, "software_version", lambda: "9.9")
+    with pytest.raises(CohortError, match=r"a worker has stimrig 9\.9"):
+        go(client, sources_of([str(folder)]), tmp_path / "r.parquet")
+
+
+def test_versions_are_compared_before_the_first_record(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
+    check_versions(client)
+    monkeypatch.setattr("api.cohort.cluster.software_version", lambda: "9.9")
+    with pytest.raises(CohortError, match=r"stimrig .*, here 9\.9"):
+        check_versions(client)
+
+
+def broken_worker(*_: object) -> dict[str, Any]:
+    raise OSError(28, "No space left on device")
+
+
+def test_a_worker_that_cannot_compute_ends_the_run(
+    client: Client, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(flight, "run_record", broken_worker)
+    with pytest.raises(CutOffError, match="No space left"):
+        go(client, sources_of([str(folder)]), tmp_path / "r.parquet")
+
+
+def test_words_on_how_far_it_is() -> None:
+    assert words(Tally(before=3), 0.0) == "3"
+    assert words(Tally(total=100, ok=10, error=2, before=8), 10.0) == "20 of 100, 2 failed, 1.2/s, 1 min left"
+    assert [duration(seconds) for seconds in (5, 90, 5000, 7300)] == ["5 s", "2 min", "83 min", "2 h 2 min"]

@@ -1,0 +1,262 @@
+"""Folders, a bucket (moto's server) and a centre (a double): what they list and open, what is wrong with them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import pickle
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from threading import Thread
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+import pytest
+
+from api.cohort.errors import CohortError
+from api.cohort.select import Selection
+from api.cohort.sources import Entry, Source, SourceError
+from api.cohort.sources.addresses import sources_of
+from api.cohort.sources.bucket import Bucket
+from api.cohort.sources.centre import Centre
+from api.cohort.sources.folder import Folder
+
+MOST = 1000
+
+
+def listed(source: Source, select: str = "") -> list[Entry]:
+    return sorted(source.entries(Selection(select)), key=lambda entry: entry.address)
+
+
+def refused(*addresses: str, token: str = "") -> str:
+    with pytest.raises(CohortError) as caught:
+        for source in sources_of(addresses, token):
+            source.check()
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+# ---- folders
+
+
+def test_a_folder_lists_records_and_nothing_else(tmp_path: Path) -> None:
+    for name in ("a.h5", "sub/b.CSV", "sub/deeper/c.mat", ".hidden.h5", ".git/d.h5", "notes.pdf", "_part.csv", "e"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_bytes(name.encode())
+    os.mkfifo(tmp_path / "pipe.csv")
+    (tmp_path / "gone.h5").symlink_to(tmp_path / "nowhere")
+    (tmp_path / "round").symlink_to(tmp_path)
+    found = listed(Folder(str(tmp_path)))
+    assert [entry.name for entry in found] == ["a.h5", "b.CSV", "c.mat"]
+    assert found[0].known == {"name": "a.h5", "origin": str(tmp_path), "bytes": 4}
+    assert Folder(str(tmp_path)).open(found[0], MOST) == b"a.h5"
+    assert len(Folder(str(tmp_path)).open(found[0], 2)) == 3
+
+
+def test_a_named_file_is_taken_whatever_its_name(tmp_path: Path) -> None:
+    (tmp_path / "record.dat").write_bytes(b"x")
+    assert [entry.name for entry in listed(Folder(str(tmp_path / "record.dat")))] == ["record.dat"]
+
+
+def test_a_file_that_changes_has_another_stamp(tmp_path: Path) -> None:
+    (tmp_path / "a.h5").write_bytes(b"x")
+    before = listed(Folder(str(tmp_path)))[0].stamp
+    os.utime(tmp_path / "a.h5", ns=(1, 1))
+    assert listed(Folder(str(tmp_path)))[0].stamp != before
+
+
+def test_a_name_that_is_no_utf8_can_be_read_and_told(tmp_path: Path) -> None:
+    (Path(os.fsdecode(os.fsencode(tmp_path) + b"/a\xff.h5"))).write_bytes(b"x")
+    (entry,) = listed(Folder(str(tmp_path)))
+    assert entry.name.encode("utf-8")
+    assert Folder(str(tmp_path)).open(entry, MOST) == b"x"
+
+
+def test_a_file_that_went_is_told_when_it_is_opened(tmp_path: Path) -> None:
+    (tmp_path / "a.h5").write_bytes(b"x")
+    (entry,) = listed(Folder(str(tmp_path)))
+    (tmp_path / "a.h5").unlink()
+    with pytest.raises(SourceError, match="No such file"):
+        Folder(str(tmp_path)).open(entry, MOST)
+
+
+def test_a_folder_that_may_not_be_read_is_told_and_ends_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "open").mkdir()
+    (tmp_path / "open" / "a.h5").write_bytes(b"x")
+    (tmp_path / "shut").mkdir()
+    known = os.scandir
+
+    def scandir(path: str) -> Any:  # whoever tests may be root, whom no rights keep out
+        if str(path).endswith("shut"):
+            raise PermissionError(13, "Permission denied")
+        return known(path)
+
+    monkeypatch.setattr(os, "scandir", scandir)
+    found = listed(Folder(str(tmp_path)))
+    assert [entry.name for entry in found] == ["a.h5", "shut"]
+    with pytest.raises(SourceError, match="cannot be read"):
+        Folder(str(tmp_path)).open(found[1], MOST)
+
+
+def test_addresses_that_cannot_be_used_are_refused(tmp_path: Path) -> None:
+    assert "no such file or folder" in refused(str(tmp_path / "nowhere"))
+    assert "STIMRIG_TOKEN" in refused("https://centre.example")
+    assert "in the clear" in refused("http://centre.example", token="t")
+    assert "gibberish://" in refused("gibberish://x/y")
+    assert "cannot be reached" in refused("http://127.0.0.1:9", token="t")
+    assert "DATA is missing" in refused()
+
+
+# ---- a bucket
+
+
+@pytest.fixture(scope="module")
+def s3() -> Iterator[None]:
+    """A server of S3 in this process, and the variables by which fsspec and botocore find it."""
+    from moto.server import ThreadedMotoServer
+
+    server = ThreadedMotoServer("127.0.0.1", 0, verbose=False)
+    server.start()
+    host, port = server.get_host_and_port()
+    given = {
+        "AWS_ACCESS_KEY_ID": "testing", "AWS_SECRET_ACCESS_KEY": "testing", "AWS_DEFAULT_REGION": "us-east-1",
+        "AWS_ENDPOINT_URL": f"http://{host}:{port}",
+    }  # fmt: skip
+    kept = {name: os.environ.get(name) for name in given}
+    os.environ.update(given)
+    try:
+        import s3fs
+
+        files = s3fs.S3FileSystem(anon=False)
+        files.mkdir("records")
+        for key, content in {"P1/a.h5": b"aaaa", "P1/b.csv": b"bb", "P2/c.h5": b"", "P2/readme.pdf": b"x"}.items():
+            files.pipe(f"records/{key}", content)
+        yield
+    finally:
+        server.stop()
+        for name, value in kept.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+@pytest.mark.slow
+def test_a_bucket_lists_and_opens_its_objects(s3: None) -> None:
+    bucket = pickle.loads(pickle.dumps(Bucket("s3://records")))  # as it comes to a worker
+    found = listed(bucket)
+    assert [entry.address for entry in found] == [f"s3://records/{key}" for key in ("P1/a.h5", "P1/b.csv", "P2/c.h5")]
+    assert [bucket.open(entry, MOST) for entry in found] == [b"aaaa", b"bb", b""]
+    assert len(bucket.open(found[0], 2)) == 3
+    assert all(entry.stamp for entry in found) and found[0].bytes == 4
+    assert [entry.name for entry in listed(Bucket("s3://records/P2"))] == ["c.h5"]
+    assert [entry.name for entry in listed(Bucket("s3://records/P1/a.h5"))] == ["a.h5"]
+
+
+@pytest.mark.slow
+def test_an_object_that_changes_has_another_stamp(s3: None) -> None:
+    import s3fs
+
+    before = listed(Bucket("s3://records/P1/b.csv"))[0]
+    s3fs.S3FileSystem(anon=False).pipe("records/P1/b.csv", b"cc")
+    assert listed(Bucket("s3://records/P1/b.csv"))[0].stamp != before.stamp
+    s3fs.S3FileSystem(anon=False).rm("records/P1/b.csv")
+    with pytest.raises(SourceError, match="cannot be fetched"):
+        Bucket("s3://records").open(before, MOST)
+    s3fs.S3FileSystem(anon=False).pipe("records/P1/b.csv", b"bb")
+
+
+@pytest.mark.slow
+def test_a_bucket_that_is_not_there_is_refused_in_one_line(s3: None) -> None:
+    assert "s3://nowhere" in refused("s3://nowhere")
+    assert "s3://records/P9" in refused("s3://records/P9")
+
+
+# ---- a centre
+
+
+class CentreDouble(BaseHTTPRequestHandler):
+    """`GET /v1/recordings` in pages of two, and `GET /v1/recordings/{id}`, as a centre answers them."""
+
+    files: tuple[bytes, ...] = (b"one", b"two", b"three", b"four", b"five")
+    asked: list[dict[str, list[str]]]
+
+    def do_GET(self) -> None:
+        url = urlsplit(self.path)
+        if self.headers["Authorization"] != "Bearer right":
+            self.answer(401, json.dumps({"type": "/problems/unauthorized", "title": "Not signed in", "status": 401}))
+        elif url.path == "/v1/recordings":
+            asked = parse_qs(url.query)
+            type(self).asked.append(asked)
+            begin = int(asked.get("after", ["0"])[0])
+            rows = [self.row(number) for number in range(begin, min(begin + 2, 5))]
+            after = str(begin + 2) if begin + 2 < 5 else None
+            self.answer(200, json.dumps({"recordings": rows, "after": after}))
+        elif (number := url.path.rpartition("/")[2]).isdecimal() and int(number) < 4:
+            self.answer(200, self.files[int(number)])
+        else:
+            self.answer(404, json.dumps({"type": "/problems/not-found", "title": "No such recording", "status": 404}))
+
+    def row(self, number: int) -> dict[str, Any]:
+        content = self.files[number]
+        return {
+            "id": number, "rig": "R1", "recording_id": f"rec-{number}", "participant": f"P{number}", "test_id": None,
+            "origin": None, "created_utc": f"2026-01-0{number + 1}T10:00:00.000Z", "url": f"/v1/recordings/{number}",
+            "file": hashlib.sha256(content).hexdigest(), "file_bytes": len(content),
+        }  # fmt: skip
+
+    def answer(self, status: int, body: str | bytes) -> None:
+        body = body.encode() if isinstance(body, str) else body
+        self.send_response(status)
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, format: str, *args: object) -> None:
+        pass
+
+
+@pytest.fixture
+def centre() -> Iterator[str]:
+    CentreDouble.asked = []
+    server = ThreadingHTTPServer(("127.0.0.1", 0), CentreDouble)
+    thread = Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    yield f"http://127.0.0.1:{server.server_address[1]}"
+    server.shutdown()
+    server.server_close()
+    thread.join()
+
+
+def test_a_centre_is_read_page_by_page(centre: str) -> None:
+    source = Centre(centre, "right")
+    found = listed(source)
+    assert [entry.name for entry in found] == [f"rec-{number}" for number in range(5)]
+    assert [asked.get("after") for asked in CentreDouble.asked] == [None, ["2"], ["4"]]
+    assert found[1].known == {
+        "name": "rec-1", "origin": centre, "record_id": "rec-1", "participant": "P1", "rig": "R1", "day": "2026-01-02",
+        "begun_utc": "2026-01-02T10:00:00.000Z", "bytes": 3,
+    }  # fmt: skip
+    assert found[1].sha256 == hashlib.sha256(b"two").hexdigest()
+    assert source.open(found[1], MOST) == b"two"
+    assert len(source.open(found[2], 3)) >= 4
+    with pytest.raises(SourceError, match="No such recording"):
+        source.open(found[4], MOST)
+
+
+def test_a_centre_is_asked_for_what_the_selection_says(centre: str) -> None:
+    listed(Centre(centre, "right"), 'participant == "P1" and day >= "2026-01-02" and "x" in name')
+    assert CentreDouble.asked[0] == {"participant": ["P1"], "from": ["2026-01-02"]}
+
+
+def test_a_wrong_token_or_what_is_no_centre_is_one_line(centre: str) -> None:
+    assert "Not signed in" in refused(centre, token="wrong")
+    assert "Is it a centre?" in refused(f"{centre}/v1/recordings/1?", token="right")
+
+
+def test_a_token_is_not_shown() -> None:
+    assert "secret" not in repr(Centre("https://centre.example", "secret"))
