@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-from sqlalchemy import select
+from sqlalchemy import func, select
 
 from api.centre import warnings
 from api.centre.bucket import Bucket, MissingError
@@ -31,6 +31,13 @@ def pending(store: Store, before_utc: str, after: str = "") -> list[CentreFile]:
     """Files that were not checked since a time, in order of their names."""
     checked = (CentreFile.checked_utc.is_(None)) | (CentreFile.checked_utc < before_utc)
     return store.all(CentreFile, CentreFile.sha256 > after, checked, order=CentreFile.sha256, limit=PAGE)
+
+
+def left_bytes(store: Store, before_utc: str) -> int:
+    """How much is to be read."""
+    checked = (CentreFile.checked_utc.is_(None)) | (CentreFile.checked_utc < before_utc)
+    with store.read() as session:
+        return int(session.scalar(select(func.sum(CentreFile.bytes)).where(checked)) or 0)
 
 
 def check(

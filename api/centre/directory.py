@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 from sqlalchemy import Select, exists, select, tuple_
@@ -186,8 +186,3 @@ def _key(after: str) -> tuple[str, int]:
     if not mark or not number.isdecimal() or len(number) > 18 or clean.label(label, "") != label:
         raise ApiError(422, "invalid-input", "The request is not valid", "after: give it as the last page gave it")
     return label, int(number)
-
-
-def narrowed(asked: Search, **more: Any) -> Search:
-    """The same search with something else."""
-    return replace(asked, **more)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import importlib.util
 import os
 import secrets
 import shutil
@@ -23,7 +24,9 @@ STARTS_S, ENDS_S = 60.0, 30.0
 
 
 def programs() -> Path:
-    """The folder of the newest PostgreSQL that is installed. Raises SettingsError."""
+    """The folder of the newest PostgreSQL that is installed. Raises SettingsError, also where its driver is missing."""
+    if importlib.util.find_spec("psycopg") is None:
+        raise SettingsError("the centre needs more packages: pip install 'stimrig[centre]'")
     found = sorted(PROGRAMS.glob("*/bin/postgres"), key=lambda path: path.parts[-3].zfill(4))
     if not found:
         raise SettingsError("PostgreSQL is not installed: as root, apt-get install postgresql")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import secrets
 import signal
 import socket
@@ -57,7 +56,7 @@ class EmulatedRig:
 
     def start(self) -> None:
         """Start its processes, and what plays on it."""
-        start_unheard(self.child)
+        self.child.start_unheard()
         self.player.start()
 
     def _play(self) -> None:
@@ -148,21 +147,6 @@ def _watch(children: list[Child]) -> None:
                 raise LaunchError(
                     f"{child.name} has ended: {child.last_words() or 'without a message'} (log: {child.log})"
                 )
-
-
-def start_unheard(child: Child) -> None:
-    """Start a process that prints no ready line: what it says goes to its log."""
-    import subprocess
-    import time
-
-    from api.cli.launcher import die_with_parent
-
-    child.started_s = time.monotonic()
-    with child.log.open("ab") as log:
-        child.process = subprocess.Popen(
-            child.command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env={**os.environ, **child.environment},
-            start_new_session=True, preexec_fn=die_with_parent,
-        )  # fmt: skip
 
 
 def free_port() -> int:

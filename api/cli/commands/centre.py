@@ -161,7 +161,8 @@ def check(
     try:
         bucket = ready_bucket(settings)
         print(f"stimrig centre check: if this is cut off, go on with --since {begun}", file=sys.stderr)
-        with tqdm(unit="B", unit_scale=True, desc="read", disable=not sys.stderr.isatty()) as bar:
+        total = checking.left_bytes(store, begun)
+        with tqdm(total=total, unit="B", unit_scale=True, desc="read", disable=not sys.stderr.isatty()) as bar:
             for found in checking.check(store, bucket, clock, begun, bar.update):
                 count += 1
                 if not found.ok:
