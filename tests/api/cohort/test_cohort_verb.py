@@ -77,6 +77,7 @@ def test_wrong_options_are_one_line(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_data_that_is_not_there_is_one_line(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     missing = str(tmp_path / "nowhere")
     assert missing in refused(capsys, "fit", missing, "-o", str(tmp_path / "r.parquet"))
@@ -85,6 +86,7 @@ def test_data_that_is_not_there_is_one_line(capsys: pytest.CaptureFixture[str], 
     assert "no such file" in refused(capsys, "figures", missing, "-o", str(tmp_path / "f.html"))
 
 
+@pytest.mark.slow
 def test_a_scheduler_that_is_not_there_is_one_line(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -94,6 +96,7 @@ def test_a_scheduler_that_is_not_there_is_one_line(
         assert address in words and "no scheduler answers" in words
 
 
+@pytest.mark.slow
 def test_a_scheduler_without_workers_is_one_line(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     from distributed import LocalCluster
 
