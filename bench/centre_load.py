@@ -12,6 +12,8 @@ import argparse
 import io
 import os
 import random
+import shutil
+import signal
 import sys
 import tempfile
 import threading
@@ -123,6 +125,8 @@ def chaos(rigs: list[Rig], centre: Kept, chance: random.Random, busy: threading.
             time.sleep(chance.uniform(0.5, 4.0))
         victim.kill()
         time.sleep(chance.uniform(0.1, 2.0))
+        if victim.ended:
+            return
         victim.start()
 
 
@@ -138,6 +142,15 @@ def main() -> None:
     options = parser.parse_args()
     began_s = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="centre-load-") as name, ExitStack() as ends:
+
+        def leave(number: int, _frame: object) -> None:
+            """Ctrl-C or SIGTERM: the days of the rigs are not waited for."""
+            ends.close()
+            shutil.rmtree(name, ignore_errors=True)
+            os._exit(128 + number)
+
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, leave)
         seen, figures = play(Path(name), options, ends)
     wall_s = time.monotonic() - began_s
     words = table(seen, {**figures, "wall time": f"{wall_s / 60:.1f} min"})

@@ -45,6 +45,7 @@ class Kept:
     health: str | None = None
     popen: subprocess.Popen[bytes] | None = None
     kills: int = 0
+    ended: bool = False
 
     def start(self) -> None:
         with self.log.open("ab") as log:
@@ -72,6 +73,7 @@ class Kept:
             self.kills += 1
 
     def end(self) -> None:
+        self.ended = True
         if self.popen is not None and self.popen.poll() is None:
             self.popen.terminate()
             try:
