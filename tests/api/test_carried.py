@@ -138,7 +138,7 @@ def test_restart_goes_on_after_the_plain_version(
     test = run_test(client, participant)
     plain, _ = versions(client, participant, test)
     context = service.app.state.context
-    context.runner.lifecycle.update(test["id"], state="identifying", model_id=plain["id"])
+    context.runner.lifecycle.update(test["id"], state="identifying", model_id=plain["id"], followed_by="dead")
     asyncio.run_coroutine_threadsafe(context.runner.resume(), context.rig._task.get_loop()).result(30)
     test = wait_done(client, test["id"])
     rows = versions(client, participant, test)

@@ -20,7 +20,7 @@ def fails(*_args: Any, **_more: Any) -> Any:
 def reopened(service: Service, ended: dict[str, Any], **fields: Any) -> Any:
     """What a restarted service finds: the test is open; gives the function that takes it up."""
     context = service.app.state.context
-    context.runner.lifecycle.update(ended["id"], state="identifying", model_id=None, **fields)
+    context.runner.lifecycle.update(ended["id"], state="identifying", model_id=None, followed_by="dead", **fields)
 
     def resume() -> None:
         asyncio.run_coroutine_threadsafe(context.runner.resume(), context.rig._task.get_loop()).result(30)
