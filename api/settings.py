@@ -112,6 +112,8 @@ class Settings(BaseSettings):
         key = given.get_secret_value() if given else ""
         if info.data.get("centre_url") and not key:
             raise ValueError("STIMRIG_CENTRE_URL names a centre; give the key that it has made for this rig")
+        if key and info.data.get("centre_url") is None and "centre_url" in info.data:
+            raise ValueError("a key for a centre, and no centre; set STIMRIG_CENTRE_URL, too")
         if not re.fullmatch(r"[!-~]*", key):
             raise ValueError("a key holds letters, digits and signs only, no spaces; copy it once more")
         return given if key else None

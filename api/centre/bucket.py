@@ -16,6 +16,7 @@ from api.errors import ApiError, SettingsError
 PIECE = 2**20
 PROBE = "stimrig-centre"
 """A small file that says whether the bucket can be written."""
+GONE = "it is gone, or not mounted"
 
 
 class BucketError(Exception):
@@ -69,7 +70,7 @@ class Bucket:
         with self._told():
             mark = f"{self.root}/{PROBE}"
             if not begin and not self.fs.exists(mark):
-                raise FileNotFoundError(2, "it is gone, or not mounted")
+                raise FileNotFoundError(2, GONE)
             self.fs.pipe_file(mark, b"stimrig\n")
 
     def put(self, path: Path, sha256: str) -> None:
@@ -82,7 +83,7 @@ class Bucket:
 
     def _put_local(self, path: Path, final: Path) -> None:
         if not (Path(self.root) / PROBE).exists():
-            raise FileNotFoundError(2, "it is gone, or not mounted")
+            raise FileNotFoundError(2, GONE)
         final.parent.mkdir(mode=0o700, exist_ok=True)
         part = final.with_name(f"{final.name}.{secrets.token_hex(4)}.part")
         try:
@@ -106,18 +107,32 @@ class Bucket:
 
         Raises
         ------
+        MissingError
+            The bucket is there, and the file is not in it.
         BucketError
-            It is not there, or cannot be read.
+            The bucket is gone, or cannot be read.
         """
         found = hashlib.sha256()
-        with self._told(), self.fs.open(self.name(sha256), "rb") as file:
-            while piece := file.read(PIECE):
-                found.update(piece)
-                if out is not None:
-                    out.write(piece)
-                if seen is not None:
-                    seen(len(piece))
+        try:
+            with self._told(), self.fs.open(self.name(sha256), "rb") as file:
+                while piece := file.read(PIECE):
+                    found.update(piece)
+                    if out is not None:
+                        out.write(piece)
+                    if seen is not None:
+                        seen(len(piece))
+        except MissingError as error:
+            self._here(error)
+            raise
         return found.hexdigest() == sha256
+
+    def _here(self, missing: MissingError) -> None:
+        """Where the mark lacks, too, no file is lost: the disk is not mounted. Raises BucketError."""
+        with self._told():
+            here = self.fs.exists(f"{self.root}/{PROBE}")
+        if not here:
+            self.trouble = f"{self.url}: {GONE}"
+            raise BucketError(self.trouble) from missing
 
     @contextlib.contextmanager
     def _told(self):

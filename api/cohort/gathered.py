@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from array import array
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from api.cohort.answers import MODEL
 from api.cohort.errors import CohortError
 from api.cohort.read import options_of, rows_of
 from api.cohort.statistics import Repeatability, repeatability
@@ -57,7 +58,7 @@ class Gathered:
     people_effects: dict[str, Counter[str]] = field(default_factory=dict)
     """The same by effect."""
     series: dict[tuple[str, str], Series] = field(default_factory=dict)
-    """By what the parameter belongs to, and its name."""
+    """By what the parameter belongs to (`model`, or an effect with its form), and its name."""
 
     @property
     def ok(self) -> int:
@@ -111,7 +112,8 @@ def _take(found: Gathered, row: Mapping[str, Any], numbers: dict[str, int]) -> N
     if who:
         found.people_records[who] += 1
         numbers.setdefault(who, len(numbers))
-    for effect in set(_effects(row)):
+    forms = _effects(row)
+    for effect in forms:
         found.effects[effect] += 1
         if who:
             found.people_effects.setdefault(effect, Counter())[who] += 1
@@ -119,19 +121,25 @@ def _take(found: Gathered, row: Mapping[str, Any], numbers: dict[str, int]) -> N
     if not who or at_s is None:
         return
     for entry in row["parameters"] or []:
-        if entry["value"] is not None:
-            series = found.series.setdefault((entry["of"], entry["name"]), Series(entry["unit"]))
+        of = entry["of"] if entry["of"] == MODEL else forms.get(entry["of"])
+        if of is not None and entry["value"] is not None:
+            series = found.series.setdefault((of, entry["name"]), Series(entry["unit"]))
             series.who.append(numbers[who])
             series.at_s.append(at_s)
             series.value.append(entry["value"])
             series.sd.append(float("nan") if entry["sd"] is None else entry["sd"])
 
 
-def _effects(row: Mapping[str, Any]) -> Iterator[str]:
-    """Effects that count: of a model all, of a diagnosis those that are probable."""
-    for entry in row["effects"] or []:
-        if entry["probability"] is None or entry["probability"] >= PROBABLE:
-            yield entry["effect"]
+def _effects(row: Mapping[str, Any]) -> dict[str, str]:
+    """Effects that count: of a model all, of a diagnosis those that are probable.
+
+    Each with its form: what bears the same name in two forms of an effect is not the same quantity.
+    """
+    return {
+        entry["effect"]: f"{entry['effect']} ({entry['form']})" if entry["form"] else entry["effect"]
+        for entry in row["effects"] or []
+        if entry["probability"] is None or entry["probability"] >= PROBABLE
+    }
 
 
 def _at_s(row: Mapping[str, Any]) -> float | None:

@@ -32,8 +32,8 @@ class Repeatability:
         Over all sessions.
     within_sd : float
         Standard deviation between sessions of one participant, pooled.
-    between_sd : float
-        Standard deviation between participants, the part that sessions don't explain.
+    between_sd : float or None
+        Standard deviation between participants, the part that sessions don't explain; None with one participant.
     cv_percent : float or None
         `within_sd` of the mean, %; None where values of both signs make it mean nothing.
     icc : float or None
@@ -44,7 +44,7 @@ class Repeatability:
     sessions: int
     mean: float
     within_sd: float
-    between_sd: float
+    between_sd: float | None
     cv_percent: float | None
     icc: float | None
 
@@ -69,7 +69,7 @@ def repeatability(groups: Sequence[Sequence[float]]) -> Repeatability | None:
     positive = min(min(group) for group in several) > 0 or max(max(group) for group in several) < 0
     cv = 100 * math.sqrt(within) / abs(mean) if positive else None
     if count < 2:
-        return Repeatability(count, total, mean, math.sqrt(within), 0.0, cv, None)
+        return Repeatability(count, total, mean, math.sqrt(within), None, cv, None)
     between = sum(size * (own - mean) ** 2 for size, own in zip(sizes, means, strict=True)) / (count - 1)
     usual = (total - sum(size**2 for size in sizes) / total) / (count - 1)
     of_people = max(0.0, (between - within) / usual)

@@ -10,6 +10,7 @@ from api.language.words import lazy
 VOCABULARY = [
     # roles of people
     lazy("administrator"), lazy("clinician"), lazy("engineer"), lazy("researcher"), lazy("controller"),
+    lazy("reader"),
     # states of a test
     lazy("requested"), lazy("running"), lazy("sealing"), lazy("identifying"), lazy("completed"), lazy("stopped"),
     lazy("fault"), lazy("failed"), lazy("refused"), lazy("cancelled"),

@@ -22,7 +22,8 @@ from api.web.pages.home import sign_in_page
 from api.web.pages.render import page, problem_page
 
 router = APIRouter(include_in_schema=False)
-FINE_STATES = ("ready", "running", "busy", "stimulating", "idle")
+FINE_STATES = ("ready", "calibrating", "arming", "running", "sealing", "stopping")
+"""Of `rig.messages.RigState`. Any other one, also of a newer rig, is something to look at."""
 
 
 @router.get("/")

@@ -95,6 +95,10 @@ def _opened(context: typer.Context, data: Path | None, database: str | None):
         **{name: one for name, one in (("data_dir", data), ("database_url", database)) if one is not None},
     }
     settings = settings_of(**given)
+    if not {"data_dir", "database_url"} & settings.model_fields_set and not (settings.data_dir / "centre.db").exists():
+        raise InputError(
+            "no centre in ./centre. Give --data or --database as the centre has it, or its settings (docs/centre.md)."
+        )
     return settings, opened(settings)
 
 

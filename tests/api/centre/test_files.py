@@ -14,7 +14,7 @@ import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 
 from api.centre import check, watch
-from api.centre.bucket import Bucket
+from api.centre.bucket import Bucket, BucketError
 from api.centre.spool import MOST_PARTS, MOST_PIECE_BYTES
 from api.store.centre_tables import CentreFile, CentreItem, CentreWanted
 from tests.api.centre.conftest import Centre, run_centre
@@ -192,6 +192,27 @@ def test_a_folder_that_is_not_mounted_any_more_takes_nothing(centre: Centre, rig
     assert list(bucket.iterdir()) == []
     watch.look(centre.context)
     assert (None, "bucket") in centre.warnings()
+
+
+def test_a_folder_that_is_not_mounted_is_no_damage_of_its_files(
+    centre: Centre, rig: httpx.Client, http: httpx.Client
+) -> None:
+    told = Teller()
+    data = told.session()
+    told.push(rig)
+    [recording] = http.get("/v1/recordings").json()["recordings"]
+    bucket, elsewhere, context = centre.data / "files", centre.data / "elsewhere", centre.context
+    bucket.rename(elsewhere)
+    bucket.mkdir()  # the place where it was mounted
+    refused = http.get(recording["url"])
+    assert (refused.status_code, refused.json()["type"]) == (503, "/problems/bucket-failed")
+    assert "not mounted" in refused.json()["detail"] and http.get("/health").json()["files"] == "failed"
+    with pytest.raises(BucketError, match="not mounted"):
+        next(check.check(context.store, context.bucket, context.clock, "2099-01-01T00:00:00Z"))
+    assert not [kind for _, kind in centre.warnings() if kind == "damaged"] and not context.store.all(CentreWanted)
+    bucket.rmdir()
+    elsewhere.rename(bucket)
+    assert http.get(recording["url"]).content == data
 
 
 def test_a_file_that_was_changed_is_refused_told_and_asked_for_again(

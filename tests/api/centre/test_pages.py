@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import get_args
 
 import httpx
 import pytest
@@ -14,6 +15,9 @@ from fastapi.routing import APIRoute
 
 from api.centre import app as centre_app
 from api.centre import pages, routes
+from api.centre.pages.rigs_view import doubts
+from api.store.centre_tables import CentreRig
+from rig.messages import RigState
 from tests.api.centre.conftest import Centre, run_centre
 from tests.api.centre.told import Teller
 from tests.api.conftest import TOKEN
@@ -327,3 +331,9 @@ def test_a_field_that_does_not_hold_is_named(rig: httpx.Client, change: dict[str
     refused = rig.post("/v1/rig/items", content=json.dumps(batch))
     assert refused.status_code == status, refused.text
     assert "\n" not in refused.json()["detail"]
+
+
+def test_a_rig_at_work_is_no_rig_to_look_at() -> None:
+    fine = set(get_args(RigState)) - {"disconnected", "uncertain", "latched"}
+    for state in [*get_args(RigState), "unreachable", "silent", "of a newer rig"]:
+        assert ("state" in doubts(CentreRig(state=state), 0.0)) == (state not in fine), state

@@ -72,6 +72,20 @@ def test_a_rig_is_added_and_revoked(centre: Centre, capsys: pytest.CaptureFixtur
     assert run(["centre", "add-rig", "Ward 3", *data]) == 2
 
 
+def test_a_shell_without_the_centres_settings_makes_no_second_centre(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its keys would open nothing at the real one."""
+    monkeypatch.chdir(tmp_path)
+    for words in (["add-rig", "Ward 3"], ["revoke-rig", "Ward 3"], ["check"]):
+        assert run(["centre", *words]) == 2
+        said = capsys.readouterr()
+        assert "no centre in ./centre" in said.err and "KEY" not in said.out and said.err.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+    monkeypatch.setenv("STIMRIG_CENTRE_DATA_DIR", str(tmp_path / "set"))
+    assert run(["centre", "add-rig", "Ward 3"]) == 0
+
+
 def test_check_says_what_differs(centre: Centre, rig: httpx.Client, capsys: pytest.CaptureFixture[str]) -> None:
     told = Teller()
     data = told.session()

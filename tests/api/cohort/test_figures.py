@@ -74,6 +74,22 @@ def test_repeatability_is_that_of_the_sessions(results: Path) -> None:
     assert (plateau["participants"], plateau["sessions"], plateau["few"]) == (6, 12, False)
 
 
+def test_parameters_are_those_of_effects_that_count_each_form_by_itself(tmp_path: Path) -> None:
+    """What is called the same in two forms of an effect is two quantities; what is improbable counts nowhere."""
+
+    def made(week: int, form: str, chance: float | None) -> dict[str, Any]:
+        reach = {"of": "recruitment_hysteresis", "name": "reach_us", "value": 70.0 + week, "sd": 1.0, "unit": "µs"}
+        effect = {"effect": "recruitment_hysteresis", "form": form, "probability": chance}
+        return {**session(0, week), "effects": [effect], "parameters": [reach]}
+
+    rows = [made(0, "gain", 0.9), made(1, "two_curves", 0.9), made(2, "gain", 0.45), made(3, "gain", None)]
+    found = gather(written(tmp_path / "r.parquet", *rows))
+    gain, curves = (("recruitment_hysteresis (" + form + ")", "reach_us") for form in ("gain", "two_curves"))
+    assert {key: list(series.value) for key, series in found.series.items()} == {gain: [70.0, 73.0], curves: [71.0]}
+    assert drawn.title_of(curves) == "recruitment hysteresis (two curves): reach"
+    assert [one["between_sd"] for one in drawn.repeats(found)] == [None], "of one person"
+
+
 def test_the_page_stands_alone_and_a_code_is_never_a_link(results: Path, tmp_path: Path) -> None:
     text = page.html(gather(results), "<b>r</b>.parquet")
     assert "<b>r</b>" not in text and "ICC" in text and text.count("<h2>") == 4

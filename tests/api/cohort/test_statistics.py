@@ -32,7 +32,7 @@ def test_too_few_say_less() -> None:
     assert repeatability([[1.0], [2.0]]) is None
     one = repeatability([[1.0, 3.0], [7.0]])
     assert one is not None
-    assert (one.participants, one.sessions, one.icc) == (1, 2, None)
+    assert (one.participants, one.sessions, one.between_sd, one.icc) == (1, 2, None, None)
     assert one.within_sd == pytest.approx(2**0.5)
     both_signs = repeatability([[-1.0, 1.0], [0.5, -0.5]])
     assert both_signs is not None and both_signs.cv_percent is None

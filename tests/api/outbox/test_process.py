@@ -160,9 +160,11 @@ def test_it_makes_no_database_of_its_own(tmp_path: Path, monkeypatch: pytest.Mon
         ("https://centre.example.org", "key two", "no spaces"),
         ("https://centre.example.org", "ключ", "no spaces"),
         ("https://centre.example.org", "", "give the key"),
+        (None, KEY, "set STIMRIG_CENTRE_URL, too"),
+        ("", KEY, "set STIMRIG_CENTRE_URL, too"),
     ],
 )
-def test_settings_that_do_not_hold_are_refused_and_no_key_is_shown(url: str, key: str, words: str) -> None:
+def test_settings_that_do_not_hold_are_refused_and_no_key_is_shown(url: str | None, key: str, words: str) -> None:
     with pytest.raises(SettingsError, match=words) as refused:
         Settings(centre_url=url, centre_key=key)  # pyright: ignore[reportArgumentType]
     said = str(refused.value)
