@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import random
 import shutil
+import sqlite3
 import tracemalloc
 from collections import Counter
 from pathlib import Path
@@ -379,8 +381,8 @@ def test_a_restored_rig_begins_anew_and_tells_everything_again(
     rig.participant("P1")
     rig.session("P1")
     run(rig.pusher(centre.handle), 5)
-    with rig.store.engine.connect() as connection:
-        connection.exec_driver_sql(f"VACUUM INTO '{tmp_path}/backup.db'")
+    with contextlib.closing(sqlite3.connect(rig.folder / "stimrig.db")) as connection:
+        connection.execute(f"VACUUM INTO '{tmp_path}/backup.db'")
     for _ in range(2):
         rig.session("P1")
     run(rig.pusher(centre.handle), 5)
