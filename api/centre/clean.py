@@ -40,7 +40,7 @@ def label(value: Any, otherwise: str) -> str:
             datetime.fromisoformat(value.replace("Z", "+00:00"))
         except ValueError:
             return otherwise
-        return value if value > "1970-01-03" else otherwise  # a day in any time zone
+        return value if "1970-01-03" < value < "9999" else otherwise  # days around it are days in any time zone
     return otherwise
 
 

@@ -7,8 +7,12 @@ import contextlib
 import logging
 import shutil
 import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import Annotated
+from functools import partial
+from typing import Annotated, Any
 
 from fastapi import Depends, Request
 from sqlalchemy.exc import SQLAlchemyError
@@ -30,7 +34,7 @@ from api.people.pace import Guesses
 from api.store import Store
 
 log = logging.getLogger("stimrig.centre")
-MOST_DOWNLOADS = 4
+MOST_DOWNLOADS, MOST_PUTS, MOST_PUTS_OF_A_RIG = 4, 8, 3
 
 
 @dataclass
@@ -51,6 +55,14 @@ class Context:
     drawn_token: str | None = None
     downloads: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(MOST_DOWNLOADS))
     """So many files are read from the bucket at the same time."""
+    bucket_threads: ThreadPoolExecutor = field(
+        default_factory=lambda: ThreadPoolExecutor(MOST_DOWNLOADS + MOST_PUTS, "bucket")
+    )
+    """For the bucket alone: one that does not answer keeps neither pages nor items waiting."""
+    puts: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(MOST_PUTS))
+    """So many pieces of files are taken at the same time."""
+    putting: Counter[int] = field(default_factory=Counter)
+    """Of each rig, how many are on their way."""
     started_s: float = field(default_factory=time.monotonic)
     waiting_warnings: int = 0
     """As many as were there when they were counted last: for the bar of pages, and for nothing else."""
@@ -60,6 +72,27 @@ class Context:
         """Begin to look after what nobody asks for."""
         every = ((FLUSH_S, self.auth.idle.flush), (watch.EVERY_S, lambda: watch.look(self)))
         self.tasks = [asyncio.create_task(_again(every_s, what)) for every_s, what in every]
+
+    @contextlib.contextmanager
+    def one_more_of(self, rig_id: int) -> Iterator[None]:
+        """Around a piece of a rig's file: a rig sends one, and one more after a line that broke; each is in memory.
+
+        Raises
+        ------
+        ApiError
+            503: there are as many.
+        """
+        if self.putting[rig_id] >= MOST_PUTS_OF_A_RIG:
+            raise ApiError(503, "crowded", "Too many pieces at once", "Send one after the other. Try again later.")
+        self.putting[rig_id] += 1
+        try:
+            yield
+        finally:
+            self.putting[rig_id] -= 1
+
+    async def with_bucket(self, what: Callable[..., Any], *given: Any) -> Any:
+        """Do what may wait for the bucket."""
+        return await asyncio.get_running_loop().run_in_executor(self.bucket_threads, partial(what, *given))
 
     async def count_warnings(self) -> None:
         """Count those that nobody has acknowledged."""
@@ -71,6 +104,7 @@ class Context:
             task.cancel()
         with contextlib.suppress(SQLAlchemyError):
             await asyncio.to_thread(self.auth.idle.flush)
+        self.bucket_threads.shutdown(wait=False, cancel_futures=True)
         self.people.close()
         self.store.close()
 

@@ -32,7 +32,7 @@ async def file(context: Context, sha256: str | None, name: str, kind: str) -> Re
     if row is None or sha256 is None:
         raise NotFoundError("file", name, "The rig has not sent it yet; what is waiting stands on the page of rigs.")
     async with context.downloads:
-        copy = await asyncio.to_thread(_read, context, sha256)
+        copy = await context.with_bucket(_read, context, sha256)
     length = copy.seek(0, os.SEEK_END)
     copy.seek(0)
     safe = re.sub(r"[^A-Za-z0-9_.-]", "_", name)

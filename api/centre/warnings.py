@@ -17,7 +17,7 @@ KINDS = (
     "unseen", "bucket",
 )  # fmt: skip
 MOST_OPEN = 1000
-"""Of a rig and a kind: a hostile rig fills no page."""
+"""Of a rig and a kind, as long as nobody has acknowledged them: a hostile rig fills no page."""
 SHOWN = 200
 
 
@@ -30,7 +30,8 @@ def tell(session: Session, now_utc: str, rig_id: int | None, kind: str, subject:
     if row is not None:
         row.again_utc, row.times, row.detail = now_utc, min(row.times + 1, 2**31 - 1), detail
         return
-    if len(session.scalars(select(CentreWarning.id).where(*of).limit(MOST_OPEN)).all()) >= MOST_OPEN:
+    waiting = select(CentreWarning.id).where(*of, CentreWarning.acknowledged_utc.is_(None)).limit(MOST_OPEN)
+    if len(session.scalars(waiting).all()) >= MOST_OPEN:
         return
     session.add(
         CentreWarning(

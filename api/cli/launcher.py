@@ -32,6 +32,8 @@ SEAL_S = 35.0
 """The rig may still have a test to seal."""
 RESTART_S = (0.2, 0.5, 1.0, 2.0, 5.0)
 OUTBOX_RESTART_S = (1.0, 5.0, 30.0, 300.0)
+LAST_BYTES = 100_000
+"""So much of a log's end is read for a process's last words."""
 STEADY_S = 600.0
 """What ran for so long is started again at once."""
 LIBC = ctypes.CDLL(None, use_errno=True)
@@ -108,14 +110,20 @@ class Child:
         return LaunchError(f"{self.name}: {words} (log: {self.log})")
 
     def last_words(self) -> str:
-        """The last line of its log that is meant for people."""
-        with self.log.open("rb") as log:
-            log.seek(self._log_start)
-            lines = [line for line in log.read().decode(errors="replace").splitlines() if line.strip()]
+        """The last line of its log that is meant for people; empty where there is none, or no log any more."""
+        try:
+            with self.log.open("rb") as log:
+                log.seek(max(self._log_start, log.seek(0, os.SEEK_END) - LAST_BYTES))
+                lines = [line for line in log.read().decode(errors="replace").splitlines() if line.strip()]
+        except OSError:
+            return ""
         for line in reversed(lines):
             if not line.startswith("{"):
                 return line.strip()
-        return json.loads(lines[-1]).get("message", "") if lines else ""
+        try:
+            return str(json.loads(lines[-1])["message"]) if lines else ""
+        except (ValueError, KeyError):  # cut off in the middle, as on a disk that is full
+            return ""
 
     def alive(self) -> bool:
         """Whether it runs."""

@@ -136,9 +136,17 @@ def _without_ctrl_c() -> Iterator[None]:
 
 
 def _keys() -> Any:
-    """Keys for this run alone: whoever reaches an open scheduler's port runs programs as its user."""
+    """Keys for this run alone: whoever reaches an open scheduler's port runs programs as its user.
+
+    Raises
+    ------
+    CohortError
+        They cannot be made.
+    """
     if importlib.util.find_spec("cryptography") is None:
-        return None
+        raise CohortError(
+            "Without keys every user of this machine could run programs as you. Make them: pip install cryptography"
+        )
     from distributed.security import Security
 
     return Security.temporary()

@@ -105,11 +105,15 @@ def options_of(file: Path) -> dict[str, Any] | None:
         return None
     fix = "Give a file written by `stimrig cohort fit`, `diagnose` or `improve`."
     try:
-        about = pq.read_schema(file).metadata or {}
+        schema = pq.read_schema(file)
+        about = schema.metadata or {}
         if about.get(b"format") != FORMAT.encode():
             raise CohortError(f"{file}: Parquet, but no results of a cohort. {fix}")
         if about.get(b"format_version") != FORMAT_VERSION.encode():
             raise CohortError(f"{file}: format version {about.get(b'format_version', b'?').decode()}. Update stimrig.")
+        types = dict(zip(schema.names, schema.types, strict=True))
+        if odd := [column.name for column in SCHEMA if types.get(column.name) != column.type]:
+            raise CohortError(f"{file}: its column {odd[0]} is missing or of another type. {fix}")
         return dict(json.loads(about[b"options"]))
-    except (pa.ArrowException, OSError, KeyError, ValueError, TypeError) as error:
+    except (pa.ArrowException, OSError, KeyError, ValueError, TypeError, RecursionError) as error:
         raise CohortError(f"{file}: no table of results ({' '.join(str(error).split())[:120]}). {fix}") from None

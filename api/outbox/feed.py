@@ -15,6 +15,7 @@ from api.store import Store
 from api.store.tables import AuditEntry, Table
 
 CHANGED = "changed-for-outbox"
+UNTELLABLE = (ValueError, TypeError, AttributeError, RecursionError)
 log = logging.getLogger("stimrig.outbox")
 
 
@@ -60,7 +61,7 @@ def told(rows: Iterable[Table]) -> Iterator[Telling]:
             continue
         try:
             telling = items.telling(row)
-        except (ValueError, TypeError, AttributeError):  # a row that cannot be told keeps nobody from working
+        except UNTELLABLE:  # a row that cannot be told keeps nobody from working
             log.exception("a row of %s could not be told to the centre", row.__tablename__)
             continue
         if telling is not None:

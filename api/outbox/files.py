@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,8 @@ from api.store.tables import Model, OutboxItem, Recording, Tracked
 
 PIECE = 65536
 MOST_COPIES = 20
+MOST_UNKNOWN = 1000
+"""Files that a centre asks for and no item names are remembered up to so many: as many as it may ask for at once."""
 Signature = tuple[int, int, int]
 
 
@@ -53,6 +56,7 @@ class Files:
         self.store = store
         self.damaged: dict[str, tuple[Signature | None, ...]] = {}
         self._whole: tuple[str, Path, Signature] | None = None
+        self._unknown: deque[str] = deque()
 
     def source_known(self, sha256: str) -> bool:
         """Whether it is worth a look: not damaged, or changed since that was found."""
@@ -69,8 +73,20 @@ class Files:
             if found is not None:
                 self.damaged.pop(sha256, None)
                 return found
-        self.damaged[sha256] = seen
+        self._note(sha256, seen)
         return None
+
+    def _note(self, sha256: str, seen: tuple[Signature | None, ...]) -> None:
+        """It is damaged; of those that the rig knows nothing of, the oldest one is forgotten where they are many."""
+        self.damaged[sha256] = seen
+        if not seen:
+            self._unknown.append(sha256)
+            if len(self._unknown) > MOST_UNKNOWN:
+                self.damaged.pop(self._unknown.popleft(), None)
+
+    def unknown(self, sha256: str) -> bool:
+        """Whether it was looked for, and no item names it."""
+        return self.damaged.get(sha256) == ()
 
     def doubt(self, sha256: str) -> None:
         """The centre got something else: look through it once more."""

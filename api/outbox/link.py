@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from http.cookiejar import CookieJar
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -21,6 +22,13 @@ LONGEST_S = 120.0
 TIMEOUT = httpx.Timeout(30.0, connect=10.0)
 
 
+class NoCookies(CookieJar):
+    """Keeps none: a centre that sets more and more of them fills no memory, and gets none back."""
+
+    def extract_cookies(self, response: Any, request: Any) -> None:
+        """As `CookieJar`."""
+
+
 class Link:
     """Asks a centre.
 
@@ -33,13 +41,13 @@ class Link:
     """
 
     def __init__(self, url: str, key: str, clock: Clock, transport: httpx.BaseTransport | None = None) -> None:
-        self.url, self.clock = url, clock
+        self.url, self.clock, self._key = url, clock, key
         headers = {"Authorization": f"Bearer {key}", "Accept-Encoding": "identity", "Accept": "application/json"}
         # A proxy of the environment is for the way out only: on loopback a key would pass it in the clear.
         trusted = not loopback(urlsplit(url).hostname or "")
         self.http = httpx.Client(
             base_url=url, headers=headers, timeout=TIMEOUT, transport=transport, follow_redirects=False,
-            trust_env=trusted,
+            trust_env=trusted, cookies=NoCookies(),
         )  # fmt: skip
 
     def hello(self, said: dict[str, Any]) -> Position:
@@ -71,7 +79,7 @@ class Link:
             with self.http.stream(method, path, **given) as response:
                 body = self._read(response)
         except (httpx.HTTPError, httpx.InvalidURL) as error:
-            words = answers.text(error) or type(error).__name__
+            words = self._words(error) or type(error).__name__
             raise UnreachableError(f"{self.url}: {words}") from error
         status = response.status_code
         if status == 401:
@@ -104,7 +112,11 @@ class Link:
         except WrongAnswerError:  # a proxy in between says it in its own way
             said = {}
         code = answers.text(said.get("type")).rpartition("/")[2]
-        words = answers.text(f"{said.get('title') or 'refused'}: {said.get('detail') or status}")
+        words = self._words(f"{said.get('title') or 'refused'}: {said.get('detail') or status}")
         if status == 507:
             return BucketError(f"{self.url}: the centre's bucket is full or gone ({words})")
         return RefusedError(f"{self.url}: {words} ({status})", code, said)
+
+    def _words(self, said: object) -> str:
+        """What came, for people; without the key, which something in between may have sent back."""
+        return answers.text(str(said or "").replace(self._key, "…"))

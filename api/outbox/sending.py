@@ -40,7 +40,11 @@ class Sending:
         self.asked = len(wanted) < limit  # else there is more after these
 
     def step(self, share: float = 1.0) -> bool:
-        """Send a chunk, at most `share` of the largest; whether there was anything to do."""
+        """Send a chunk, at most `share` of the largest; whether there may be more to do at once.
+
+        Not at once after what cost a look at the disk and sent nothing: a centre that asks for the same again and
+        again has no file read faster than one a rest.
+        """
         if not self.queue:
             if self.asked:
                 return False
@@ -52,12 +56,12 @@ class Sending:
         source = self.files.source(wanted.sha256)
         if source is None:
             self.queue.popleft()
-            return True
+            return not self.files.unknown(wanted.sha256)
         if wanted.have > source.size:
             self.queue.popleft()
             raise WrongAnswerError(f"{self.link.url}: has more of {wanted.sha256[:12]}… than there is")
         self._send(wanted, source, max(1, int(CHUNK * share)))
-        return True
+        return wanted.have < source.size
 
     def _send(self, wanted: Wanted, source: Source, most: int) -> None:
         length = min(most, source.size - wanted.have)

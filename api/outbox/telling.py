@@ -9,7 +9,7 @@ from typing import Any
 
 from sqlalchemy import distinct, func, select
 
-from api.clock import Clock, unix_of
+from api.clock import Clock, unix_of, utc_label
 from api.outbox import chain
 from api.outbox.answers import whole_number
 from api.outbox.chain import NOWHERE, Head, Position
@@ -24,6 +24,8 @@ AROUND_ITEM = 700
 """Bytes of an item beside its body, at most."""
 ANEW_AFTER_S = 3600.0
 """A chain that began after a backup is not given up for the next one sooner: a centre may be wrong, too."""
+ANEW_LONGER, LATE_S = 4.0, 30 * 86400.0
+"""The next one has to wait so many times longer, for each that began in these last days: all is kept here each time."""
 COLUMNS = ("seq", "kind", "key", "body", "sha256", "file", "file_bytes", "at_utc", "previous", "hash")
 log = logging.getLogger("stimrig.outbox")
 
@@ -43,7 +45,6 @@ class Telling:
         self.store, self.clock, self.link, self.about = store, clock, link, about
         self.at: Position | None = None
         self.reached: tuple[str, int] | None = None
-        self._doubt: Position | None = None
         self._out_of_order = False
         self._counted: tuple[Head | None, int, int] = (None, 0, 0)
         """Files that the items after a place name: counted once for each."""
@@ -54,7 +55,15 @@ class Telling:
             return chain.head(session)
 
     def hello(self) -> bool:
-        """Say who is there and learn where the centre stands; whether a chain was begun anew."""
+        """Say who is there and learn where the centre stands; whether a chain was begun anew.
+
+        Before so much is sent again it is asked once more. Raises WrongAnswerError where it then says something else.
+        """
+        begun = self._hello(None)
+        return begun if isinstance(begun, bool) else bool(self._hello(begun))
+
+    def _hello(self, before: Position | None) -> bool | Position:
+        """`before`: a place that the rig does not know, as the centre has just said it; such a place as the answer."""
         head = self.head() or self._first()
         self.at = None
         given = self.link.hello({"chain": head.chain, "seq": head.seq, "hash": head.hash, **self.about()})
@@ -62,12 +71,11 @@ class Telling:
             known = chain.at(session, head.chain, given.seq)
         if known == given.hash:
             self._stands(head.chain, given)
-            self._doubt = None
             return False
-        if self._doubt != given:  # asked once more before so much is sent again
-            self._doubt = given
-            return self.hello()
-        self._doubt = None
+        if before is None:
+            return given
+        if before != given:
+            raise WrongAnswerError(f"{self.link.url}: says each time that it stands elsewhere, never in the chain")
         self._begin_anew(head, given)
         return True
 
@@ -151,7 +159,7 @@ class Telling:
             if self._anew_lately(session, head):
                 raise WrongAnswerError(
                     f"{self.link.url}: stands at item {given.seq}, which the rig does not have, though its chain began "
-                    "anew less than an hour ago; is it another rig's key?"
+                    "anew a short while ago; is it another rig's key?"
                 )
             begun = chain.begin(session, now, head)
             said = {"after": head.chain, "after_seq": head.seq, "centre_seq": given.seq}
@@ -160,6 +168,11 @@ class Telling:
         self._stands(begun.chain, NOWHERE)
 
     def _anew_lately(self, session: Any, head: Head) -> bool:
-        of = select(OutboxItem.body, OutboxItem.at_utc).where(OutboxItem.chain == head.chain, OutboxItem.seq == 1)
-        body, at_utc = session.execute(of).one()
-        return json.loads(body)["after"] is not None and self.clock.unix_s() - unix_of(at_utc) < ANEW_AFTER_S
+        """Whether the chain began anew a short while ago; each time of late makes this longer."""
+        since = utc_label(self.clock.unix_s() - LATE_S)
+        of = select(OutboxItem.body).where(OutboxItem.kind == chain.BEGIN, OutboxItem.at_utc > since)
+        times = sum(json.loads(body)["after"] is not None for body in session.scalars(of))
+        began = select(OutboxItem.body, OutboxItem.at_utc).where(OutboxItem.chain == head.chain, OutboxItem.seq == 1)
+        body, at_utc = session.execute(began).one()
+        wait_s = ANEW_AFTER_S * ANEW_LONGER ** max(0, times - 1)
+        return json.loads(body)["after"] is not None and self.clock.unix_s() - unix_of(at_utc) < wait_s

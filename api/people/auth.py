@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import secrets
+import threading
 from collections import OrderedDict
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -104,6 +105,7 @@ class Auth:
         self.store, self.clock, self.guesses, self.session_s = store, clock, guesses, session_hours * 3600
         self.idle = idle
         self._seen: OrderedDict[str, str] = OrderedDict()
+        self._remembering = threading.Lock()
         self._threads = ThreadPoolExecutor(8, "who-asks")
 
     def issue(self, name: str, scopes: list[Scope], by: str, *, text: str | None = None, origin: str = "issued",
@@ -297,10 +299,11 @@ class Auth:
         return who
 
     def _remember(self, connection: HTTPConnection, name: str) -> None:
-        self._seen[_credential(connection)] = name
-        self._seen.move_to_end(_credential(connection))
-        while len(self._seen) > MOST_SEEN:
-            self._seen.popitem(last=False)
+        with self._remembering:  # many threads ask
+            self._seen[_credential(connection)] = name
+            self._seen.move_to_end(_credential(connection))
+            while len(self._seen) > MOST_SEEN:
+                self._seen.popitem(last=False)
 
     def seen(self, connection: HTTPConnection) -> str | None:
         """Who was behind this token or session when the database was last asked: good for a stop, and nothing else."""

@@ -24,6 +24,10 @@ from rig.messages import FinishedEvent
 log = logging.getLogger("stimrig.outcomes")
 
 
+class LeftError(Exception):
+    """Another service follows the test now: this one was thought dead."""
+
+
 class Lifecycle:
     """Takes over what a test leaves behind.
 
@@ -114,6 +118,9 @@ class Lifecycle:
         try:
             model = await self._first_version(row, recording, parent, take, dict(how))
             model = await self.analyses.carried_structure.carry(model, recording.path, take, **how)
+        except LeftError:
+            log.warning("left to the service that took it up", extra={"test_id": test_id})
+            return
         except ApiError as error:
             reason = f"identification: {error.detail or error.title}"
             await asyncio.to_thread(self.update, test_id, state="failed", reason=reason)
@@ -136,6 +143,8 @@ class Lifecycle:
             return await asyncio.to_thread(self.versions.get, row.model_id)
         how |= await asyncio.to_thread(self.adaptive.fit_options, row)
         found, warning = await self.analyses.carried_structure.fit(row.participant, recording.path, take, **how)
+        if not self.follower.mine(await asyncio.to_thread(self.store.get, Test, row.id)):
+            raise LeftError  # one recording, one model
         by = f"test {row.id}"
         model = await asyncio.to_thread(self.versions.add, found["json"], row.participant, recording.id, by, parent)
         summary = dict(row.summary)

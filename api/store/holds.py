@@ -92,8 +92,12 @@ class Among:
     async def turn(self, name: str) -> AsyncIterator[None]:
         """As `Holds`."""
         async with self._turns[name]:  # within a service no connection waits
+            taking = asyncio.get_running_loop().run_in_executor(None, self._take, f"turn {name}")
             try:
-                held = await asyncio.to_thread(self._take, f"turn {name}")
+                held = await asyncio.shield(taking)
+            except asyncio.CancelledError:  # it would come to who no longer wants it, and stay there
+                taking.add_done_callback(lambda taken: self._let_go(taken, f"turn {name}"))
+                raise
             except SQLAlchemyError as error:
                 log.error("the turn %s was not had: %s", name, error)
                 raise not_answering() from error
@@ -110,6 +114,10 @@ class Among:
             connection.close()
             raise
         return connection
+
+    def _let_go(self, taken: asyncio.Future[Connection], name: str) -> None:
+        if not taken.cancelled() and taken.exception() is None:
+            taken.get_loop().run_in_executor(None, self._give_back, taken.result(), name)
 
     def _give_back(self, connection: Connection, name: str) -> None:
         try:

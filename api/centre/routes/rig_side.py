@@ -22,7 +22,7 @@ KEY = HTTPBearer(scheme_name="rig", description="a rig's key", auto_error=False)
 PROBLEMS: dict[int | str, dict[str, Any]] = {
     400: problem("no sound JSON"), 401: problem("the key is unknown or revoked"), 409: problem("go on elsewhere"),
     413: problem("too long"), 422: problem("it does not hold, or differs from its hash"),
-    507: problem("the bucket is full or gone"),
+    503: problem("too many pieces of this rig at once"), 507: problem("the bucket is full or gone"),
 }  # fmt: skip
 router = APIRouter(prefix="/v1/rig", tags=["rigs push"], responses=PROBLEMS)
 
@@ -72,7 +72,9 @@ async def put(
     offset: Annotated[int, Query(ge=0, le=2**53)] = 0,
 ) -> dict[str, Any]:  # fmt: skip
     """A piece of a file, from `offset` on."""
-    data = await request.body()
-    if len(data) > MOST_PIECE_BYTES:
-        raise ApiError(413, "content-too-large", "Too long", f"At most {MOST_PIECE_BYTES} bytes are taken at once.")
-    return await asyncio.to_thread(context.spool.put, rig, sha256, offset, data)
+    with context.one_more_of(rig.id):
+        data = await request.body()
+        if len(data) > MOST_PIECE_BYTES:
+            raise ApiError(413, "content-too-large", "Too long", f"At most {MOST_PIECE_BYTES} bytes are taken at once.")
+        async with context.puts:
+            return await context.with_bucket(context.spool.put, rig, sha256, offset, data)

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import errno
 import os
+import threading
+import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +22,7 @@ from api.centre.spool import MOST_PARTS, MOST_PIECE_BYTES
 from api.store.centre_tables import CentreFile, CentreItem, CentreWanted
 from tests.api.centre.conftest import Centre, run_centre
 from tests.api.centre.told import Teller, sha256
+from tests.api.conftest import PATIENCE_S
 
 
 class TroubledFiles(MemoryFileSystem):
@@ -300,3 +304,45 @@ def test_on_s3(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
                 assert http.get(recording["url"]).json()["type"] == "/problems/file-damaged"
     finally:
         server.stop()
+
+
+def test_a_bucket_that_does_not_answer_keeps_neither_items_nor_pages_waiting(
+    centre: Centre, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    holding, let_go = threading.Semaphore(0), threading.Event()
+
+    def held(*_given: Any) -> None:
+        holding.release()
+        assert let_go.wait(PATIENCE_S)
+
+    monkeypatch.setattr(centre.context.bucket, "put", held)
+    keys, rigs = [centre.key(f"Ward {number}") for number in range(12)], []
+    for key in keys:
+        told = Teller()
+        told.session()
+        rig = centre.client(key)
+        assert rig.post("/v1/rig/items", json=told.batch()).status_code == 200
+        rigs.append((rig, told))
+
+    def send(of: tuple[httpx.Client, Teller], file: int) -> int:
+        rig, told = of
+        name, data = list(told.files.items())[file]
+        return rig.put(f"/v1/rig/files/{name}?offset=0", content=data).status_code
+
+    with ThreadPoolExecutor(40) as threads:
+        sent = [threads.submit(send, of, file) for of in rigs for file in (0, 1, 0)]
+        try:
+            assert holding.acquire(timeout=PATIENCE_S)
+            end_s = time.monotonic() + PATIENCE_S
+            while sum(centre.context.putting.values()) < len(sent) and time.monotonic() < end_s:
+                time.sleep(0.05)
+            rig, told = rigs[0]
+            assert rig.post("/v1/rig/hello", json=told.hello("2026-03-02T08:00:00Z")).status_code == 200
+            assert send(rigs[0], 0) == 503, "three of this rig are under way"
+            with centre.client() as http:
+                assert http.get("/").status_code == 200 and http.get("/participants").status_code == 200
+        finally:
+            let_go.set()
+        assert {future.result() for future in sent} <= {200, 409}
+    for rig, _told in rigs:
+        rig.close()

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import random
 import shutil
 import sqlite3
 import tracemalloc
 from collections import Counter
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -381,7 +381,7 @@ def test_a_restored_rig_begins_anew_and_tells_everything_again(
     rig.participant("P1")
     rig.session("P1")
     run(rig.pusher(centre.handle), 5)
-    with closing(sqlite3.connect(str(rig.store.engine.url.database))) as connection:
+    with contextlib.closing(sqlite3.connect(rig.folder / "stimrig.db")) as connection:
         connection.execute(f"VACUUM INTO '{tmp_path}/backup.db'")
     for _ in range(2):
         rig.session("P1")
