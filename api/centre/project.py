@@ -124,7 +124,10 @@ class Projector:
         row.parent_id, row.method = clean.text(body.get("parent_id"), 64), clean.text(body.get("method"), 40)
         row.effects, row.fit = clean.effects(body.get("effects")), clean.fit(body.get("fit"))
         row.verdict = row.fit["verdict"]
-        row.file, row.file_bytes = item.sent.file or row.file, item.sent.file_bytes or row.file_bytes
+        if row.file is None:
+            row.file, row.file_bytes = item.sent.file, item.sent.file_bytes
+        elif item.sent.file not in (None, row.file):  # a version never changes
+            self._tell("changed", key, kept=row.file[:12], told=str(item.sent.file)[:12])
         for effect in row.effects:
             if self._get(CentreEffect, (effect, code, self.rig.id)) is None:
                 new = CentreEffect(effect=effect, participant=code, rig_id=self.rig.id)

@@ -14,7 +14,7 @@ from typing import Any
 from sqlalchemy import delete, select
 
 from api import owner_only
-from api.centre import rigs
+from api.centre import rigs, warnings
 from api.centre.bucket import PIECE, Bucket, BucketError, failed, first_line
 from api.clock import Clock
 from api.errors import ApiError, NotFoundError
@@ -109,6 +109,7 @@ class Spool:
         with self.store.write() as session:
             session.merge(CentreFile(sha256=sha256, bytes=length, whole_utc=now, checked_utc=now, ok=True))
             session.execute(delete(CentreWanted).where(CentreWanted.sha256 == sha256))
+            warnings.mended(session, now, "damaged", sha256)
         part.unlink(missing_ok=True)
 
     def settle(self) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from sqlalchemy import select
+from sqlalchemy import ColumnElement, select
 from sqlalchemy.orm import Session
 
 from api.clock import Clock
@@ -43,7 +43,15 @@ def tell(session: Session, now_utc: str, rig_id: int | None, kind: str, subject:
 
 def end(session: Session, now_utc: str, rig_id: int | None, kind: str) -> None:
     """It holds no longer: what comes after is told anew."""
-    of = CentreWarning.rig_id.is_(rig_id) if rig_id is None else CentreWarning.rig_id == rig_id
+    _end(session, now_utc, kind, CentreWarning.rig_id.is_(rig_id) if rig_id is None else CentreWarning.rig_id == rig_id)
+
+
+def mended(session: Session, now_utc: str, kind: str, subject: str) -> None:
+    """It holds no longer, of whichever rig it was told."""
+    _end(session, now_utc, kind, CentreWarning.subject == subject)
+
+
+def _end(session: Session, now_utc: str, kind: str, of: ColumnElement[bool]) -> None:
     query = select(CentreWarning).where(of, CentreWarning.kind == kind, CentreWarning.ended_utc.is_(None))
     for row in session.scalars(query):
         row.ended_utc = now_utc

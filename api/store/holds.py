@@ -16,9 +16,9 @@ from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from typing import Protocol
 
 from sqlalchemy import Connection, Engine
-from sqlalchemy.exc import SQLAlchemyError
+from sqlalchemy.exc import OperationalError, SQLAlchemyError
 
-from api.errors import not_answering
+from api.errors import ApiError, not_answering
 from api.store.database import Store
 
 log = logging.getLogger("stimrig.store")
@@ -28,6 +28,7 @@ LIMITS_TURN = "limits"
 answered nothing begins with what was before."""
 KEY_TURN = "keys"
 """Trials of controllers' keys are counted and begun one after the other."""
+LOCK_NOT_AVAILABLE = "55P03"
 DEAD_AFTER = 2
 """A service is dead that was seen neither at this look nor at the one before: it may just be connecting again."""
 
@@ -98,6 +99,12 @@ class Among:
             except asyncio.CancelledError:  # it would come to who no longer wants it, and stay there
                 taking.add_done_callback(lambda taken: self._let_go(taken, f"turn {name}"))
                 raise
+            except OperationalError as error:
+                log.error("the turn %s was not had: %s", name, error)
+                if getattr(error.orig, "sqlstate", "") != LOCK_NOT_AVAILABLE:
+                    raise not_answering() from error
+                detail = "Another service has begun what this must wait for. Nothing was changed. Try again."
+                raise ApiError(503, "busy", "Somebody else is at it", detail) from error
             except SQLAlchemyError as error:
                 log.error("the turn %s was not had: %s", name, error)
                 raise not_answering() from error

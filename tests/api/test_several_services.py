@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import signal
@@ -166,6 +167,7 @@ def test_what_a_living_service_follows_is_left_to_it(tmp_path: Path, short_dir: 
         assert app.state.context.store.get(Test, test_id).followed_by == me
 
 
+@pytest.mark.slow
 def test_a_turn_is_had_by_one_and_given_back_by_the_dead(cluster: Cluster, address: str) -> None:
     taking = (
         "import asyncio, sys\nfrom api.store import Store, holds\n"
@@ -183,6 +185,8 @@ def test_a_turn_is_had_by_one_and_given_back_by_the_dead(cluster: Cluster, addre
         with store.engine.connect() as connection:
             query = f"SELECT pg_try_advisory_lock({holds.key('turn limits')})"
             assert connection.exec_driver_sql(query).scalar() is False
+            with pytest.raises(ApiError, match="Another service has begun what this must wait for"):
+                asyncio.run(taken(held))
             process.kill()
             process.wait(20)
             soon(lambda: connection.exec_driver_sql(query).scalar())
@@ -234,6 +238,11 @@ def test_the_audit_chain_is_whole_under_eight_writers(
     assert audit.first_broken(entries) is None
     assert len({(entry.who, entry.detail["number"]) for entry in entries}) == len(entries) == 8 * 40
     store.close()
+
+
+async def taken(held: holds.Holds) -> None:
+    async with held.turn("limits"):
+        pass
 
 
 def test_no_column_holds_a_text_to_a_length(cluster: Cluster, address: str) -> None:

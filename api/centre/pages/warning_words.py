@@ -12,7 +12,7 @@ TITLES: dict[str, Any] = {
     "forked": lazy("The rig's chain has forked"),
     "damaged-at-rig": lazy("A file at the rig differs from its hash"),
     "damaged": lazy("A file of the centre differs from its hash"),
-    "changed": lazy("A recording was told twice, with another file"),
+    "changed": lazy("A recording or model was told twice, with another file"),
     "unreadable": lazy("Something that the rig told cannot be read"),
     "too-long": lazy("A file is too long to be taken"),
     "audit": lazy("The rig's audit trail has changed"),
@@ -36,7 +36,7 @@ ADVICE: dict[str, Any] = {
     "damaged": lazy(
         "{short} is not handed out. Its rigs are asked for it again; else restore it from the bucket's backup."
     ),
-    "changed": lazy("Recording {subject}: the first file is kept. Compare both at the rig."),
+    "changed": lazy("{subject}: the first file is kept. Compare both at the rig."),
     "unreadable": lazy(
         "It is kept as it came, and shown nowhere. Is the rig's stimrig older or newer than the centre's?"
     ),

@@ -19,7 +19,7 @@ from fsspec.implementations.memory import MemoryFileSystem
 from api.centre import check, watch
 from api.centre.bucket import Bucket, BucketError
 from api.centre.spool import MOST_PARTS, MOST_PIECE_BYTES
-from api.store.centre_tables import CentreFile, CentreItem, CentreWanted
+from api.store.centre_tables import CentreFile, CentreItem, CentreModel, CentreWanted
 from tests.api.centre.conftest import Centre, run_centre
 from tests.api.centre.told import Teller, sha256
 from tests.api.conftest import PATIENCE_S
@@ -235,6 +235,8 @@ def test_a_file_that_was_changed_is_refused_told_and_asked_for_again(
         assert [one["sha256"] for one in rig.get("/v1/rig/files").json()["files"]] == [name]
         told.push(rig)
         assert http.get(recording["url"]).content == data, "the rig has sent it again"
+        told_of = [one for one in http.get("/v1/warnings").json() if one["kind"] == "damaged"]
+        assert told_of and all(one["ended_utc"] for one in told_of), "and the warning says so"
 
 
 def test_check_reads_every_file_and_goes_on_where_it_was_cut(centre: Centre, rig: httpx.Client) -> None:
@@ -254,6 +256,15 @@ def test_check_reads_every_file_and_goes_on_where_it_was_cut(centre: Centre, rig
     assert len(first) + len(rest) == 12 and not {one.sha256 for one in first} & {one.sha256 for one in rest}
     assert [one.sha256 for one in [*first, *rest] if not one.ok] == [name]
     assert [row.sha256 for row in context.store.all(CentreWanted)] == [name]
+
+
+def test_a_model_that_is_told_with_another_file_keeps_its_first(centre: Centre, rig: httpx.Client) -> None:
+    told = Teller()
+    for data in (b"first", b"other"):
+        told.add("model", "m1", {"participant": "P1", "recording_id": "r1", "fit": {}}, data)
+    assert rig.post("/v1/rig/items", json=told.batch()).status_code == 200
+    assert [row.file for row in centre.context.store.all(CentreModel)] == [sha256(b"first")]
+    assert ("Ward 1", "changed") in centre.warnings()
 
 
 def test_a_file_that_is_too_long_is_not_asked_for(tmp_path: Path) -> None:
