@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import re
 import socket
 import time
@@ -95,6 +96,28 @@ def locked_out(browser: httpx.Client, client: httpx.Client, service: Service) ->
         service.client(f"guess {number}").get("/v1/rig")
         browser.post("/sign-in", data={"name": "Ada", "password": "wrong"})
     assert browser.post("/sign-in", data={"name": "Ada", "password": PASSWORD}).status_code == 429
+
+
+async def too_late(*_: object, **__: object) -> None:
+    await asyncio.sleep(60)
+
+
+async def gone(*_: object, **__: object) -> None:
+    raise OperationalError("SELECT", {}, Exception("database is locked"))
+
+
+@pytest.mark.parametrize("database", [too_late, gone])
+def test_a_page_has_its_stop_button_while_the_database_does_not_answer(
+    service: Service, client: httpx.Client, participant: str, database: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    browser, stranger = person(service), service.client(token=None, headers=HTML)
+    browser.get("/")
+    running(service, participant)
+    monkeypatch.setattr(service.app.state.context.auth, "ask", database)
+    shown = browser.get("/nowhere")
+    assert shown.status_code == 404
+    assert CONFIRMED in press(service, right_on(shown.text)).text
+    assert 'action="/v1/stop"' not in stranger.get("/nowhere").text, "nobody who was not signed in before"
 
 
 @pytest.mark.parametrize("end", [sign_out, run_out, new_password, remove, locked_out])

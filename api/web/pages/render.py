@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -63,24 +62,35 @@ def zone(context: Context) -> str:
 async def look(request: Request) -> None:
     """Find out who looks at a page that anybody may see, for its bar.
 
-    Nobody, where the database does not answer at once: what a stop did is said all the same.
+    Nobody, where the database does not answer at once: what a stop did is said all the same, and the stop button is
+    there for who was signed in when the database last answered.
     """
     if getattr(request.state, "who", None) is not None:
         return
-    asked = asyncio.ensure_future(request.app.state.context.auth.ask(request, forgive_age=True))
+    context = request.app.state.context
+    asked = asyncio.ensure_future(context.auth.ask(request, forgive_age=True))
     asked.add_done_callback(lambda done: done.cancelled() or done.exception())  # what is said too late is no matter
-    with contextlib.suppress(ApiError, SQLAlchemyError, TimeoutError):
+    try:
         async with asyncio.timeout(LOOK_S):
             request.state.who = await asyncio.shield(asked)
+    except ApiError:
+        return
+    except (SQLAlchemyError, TimeoutError):
+        name = context.auth.seen(request)
+        if name is not None and getattr(request.state, "stop_right", None) is None:
+            request.state.stop_right = _right_of(context, name)
 
 
 def stop_right(request: Request, principal: Principal | None) -> str | None:
     """What the page's stop button is good for; the answer to a stop keeps the right that was used, and no longer."""
-    context = request.app.state.context
     if principal is None:
         return getattr(request.state, "stop_right", None)
+    return _right_of(request.app.state.context, principal.name)
+
+
+def _right_of(context: Context, name: str) -> str:
     current = context.runner.current
-    return context.stop_rights.give(principal.name, current.test_id if current else None)
+    return context.stop_rights.give(name, current.test_id if current else None)
 
 
 def fragment(context: Context, template: str, principal: Principal, place: str) -> str:
