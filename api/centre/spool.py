@@ -23,8 +23,11 @@ from api.store.centre_tables import CentreFile, CentreRig, CentreWanted
 
 MOST_PIECE_BYTES = 8_000_000
 MOST_LISTED = 1000
-MOST_PARTS = 8
-"""Files of one rig on their way at the same time; the oldest is thrown away, and is sent again."""
+MOST_PARTS, MOST_BYTES = 8, 8_000_000_000
+"""Files of one rig on their way at the same time, and their bytes beside the one that grows.
+
+The oldest is thrown away, and is sent again.
+"""
 
 
 class Spool:
@@ -142,8 +145,9 @@ class Spool:
         with (part.parent / "lock").open("a") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
             others = sorted(part.parent.glob("*.part"), key=lambda path: path.stat().st_mtime)
-            for old in [path for path in others if path != part][: max(0, len(others) - MOST_PARTS + 1)]:
-                old.unlink(missing_ok=True)
+            others = [path for path in others if path != part]
+            while others and (len(others) >= MOST_PARTS or sum(map(self._length, others)) > MOST_BYTES):
+                others.pop(0).unlink(missing_ok=True)
             yield part
 
     def _length(self, part: Path) -> int:

@@ -21,6 +21,8 @@ def run_lines(found: dict[str, Any]) -> list[str]:
         lines.append(f"left out       {found['left_out']} that --select does not mean")
     if found["copies"]:
         lines.append(f"copies         {found['copies']} files with the content of another: counted once")
+    if not found["records"] + found["left_out"]:
+        lines.append("Nothing was found. A folder is searched for .h5, .hdf5, .csv, .tsv, .txt and .mat files.")
     return [*lines, f"written to     {found['output']}"]
 
 
@@ -29,6 +31,7 @@ def changed_lines(found: dict[str, Any]) -> list[str]:
     old, new, limits = found["old"], found["new"], found["tolerances"]
     lines = [
         f"{old['verb']}: stimrig {old['software']} ({old['file']}) → stimrig {new['software']} ({new['file']})",
+        *([f"made with other options: {found['other_options']}"] if found["other_options"] else []),
         f"{found['compared']} records in both: {found['unchanged']} unchanged, {found['changed']} changed",
         *(f"  {count:6d}  {kind}" for kind, count in found["counts"].items()),
         f"unchanged: a probability within {limits['probability']:g}, a parameter within {limits['parameter_sd']:g} sd "

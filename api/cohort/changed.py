@@ -10,6 +10,7 @@ from typing import Any
 
 from api.cohort.errors import CohortError
 from api.cohort.read import options_of, rows_in, rows_of
+from api.cohort.tasks import OPTIONS, differing
 
 PROBABILITY = 0.05
 """A probability that moves by no more has not changed."""
@@ -39,6 +40,8 @@ class Changes:
 
     Attributes
     ----------
+    options : str
+        How their options differ, apart from the version of stimrig: then not only that may be the cause.
     same : int
         Records in both whose results do not differ by more than the tolerances.
     rows : list of dict
@@ -49,6 +52,7 @@ class Changes:
 
     old: dict[str, Any]
     new: dict[str, Any]
+    options: str = ""
     same: int = 0
     rows: list[dict[str, Any]] = field(default_factory=list)
     only_old: list[str] = field(default_factory=list)
@@ -78,6 +82,7 @@ class Changes:
         return {
             "old": self.old,
             "new": self.new,
+            "other_options": self.options,
             "compared": self.same + len(self.rows),
             "unchanged": self.same,
             "changed": len(self.rows),
@@ -102,10 +107,11 @@ def compared(old: Path, new: Path) -> Changes:
     CohortError
         A file is no table of results, or they are of two verbs.
     """
-    told = [_told(old), _told(new)]
-    if told[0]["verb"] != told[1]["verb"]:
-        raise CohortError(f"{new}: results of {told[1]['verb']}, {old} of {told[0]['verb']}. Give two of one verb.")
-    changes = Changes(told[0], told[1])
+    before, after = _options(old), _options(new)
+    if before["verb"] != after["verb"]:
+        raise CohortError(f"{new}: results of {after['verb']}, {old} of {before['verb']}. Give two of one verb.")
+    options = differing({**before, "software": after["software"]}, after)
+    changes = Changes({"file": str(old), **before}, {"file": str(new), **after}, options)
     unread_old, unread_new = (
         {row["address"]: row for row in rows_of(file, COLUMNS) if not row["sha256"]} for file in (old, new)
     )
@@ -133,11 +139,11 @@ def _share(file: Path, share: int, shares: int) -> Iterator[Row]:
             yield row
 
 
-def _told(file: Path) -> dict[str, Any]:
+def _options(file: Path) -> dict[str, Any]:
     options = options_of(file)
     if options is None:
         raise CohortError(f"{file}: no such file. Give the -o of `stimrig cohort fit`, `diagnose` or `improve`.")
-    return {"file": str(file), **{name: options.get(name) for name in ("verb", "software", "select", "effects")}}
+    return {name: options.get(name) for name in OPTIONS}
 
 
 def _shown(row: Row) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from api.cohort.errors import CohortError
@@ -47,9 +47,16 @@ class Task:
 
     def differs(self, other: dict[str, Any]) -> str:
         """Words on how the options of another run differ; empty if they don't."""
-        mine = self.document()
-        names = [name for name in mine if mine[name] != other.get(name)]
-        return ", ".join(f"{name} {_shown(other.get(name))}, now {_shown(mine[name])}" for name in names)
+        return differing(other, self.document())
+
+
+OPTIONS = tuple(field.name for field in fields(Task))
+
+
+def differing(before: dict[str, Any], now: dict[str, Any]) -> str:
+    """Words on how the options of two runs differ; empty if they don't."""
+    names = [name for name in OPTIONS if now.get(name) != before.get(name)]
+    return ", ".join(f"{name} {_shown(before.get(name))}, now {_shown(now.get(name))}" for name in names)
 
 
 def _shown(value: Any) -> str:

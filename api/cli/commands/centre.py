@@ -10,7 +10,7 @@ import typer
 from tqdm import tqdm
 
 from api.cli.errors import InputError, ReportedError
-from api.cli.terminal import say
+from api.cli.terminal import say, say_json
 
 DataOption = Annotated[Path | None, typer.Option(help="data folder; default ./centre, or STIMRIG_CENTRE_DATA_DIR")]
 DatabaseOption = Annotated[
@@ -147,6 +147,7 @@ def check(
     data: DataOption = None,
     database: DatabaseOption = None,
     files: FilesOption = None,
+    as_json: Annotated[bool, typer.Option("--json", help="print what was found as JSON")] = False,
 ) -> None:
     """Read the bucket's files again and compare them with their hashes; exit 1 where one differs."""
     from api.centre import check as checking
@@ -161,7 +162,7 @@ def check(
         raise InputError(f"--since {begun}: give a time as 2026-11-23T08:00:00Z")
     settings, store = _opened(context, data, database)
     settings = settings.model_copy(update={"files": files}) if files else settings
-    count = lost = 0
+    count, lost = 0, dict[str, str]()
     try:
         bucket = ready_bucket(settings)
         print(f"stimrig centre check: if this is cut off, go on with --since {begun}", file=sys.stderr)
@@ -170,12 +171,15 @@ def check(
             for found in checking.check(store, bucket, clock, begun, bar.update):
                 count += 1
                 if not found.ok:
-                    lost += 1
-                    tqdm.write(f"{found.sha256}: {found.words}")
+                    lost[found.sha256] = found.words
+                    tqdm.write(f"{found.sha256}: {found.words}", file=sys.stderr if as_json else sys.stdout)
     except BucketError as error:
         raise ReportedError(f"{error}; {count} files were checked, go on with --since {begun}") from error
     finally:
         store.close()
-    say(f"{count} files checked, {lost} differ" + ("; their rigs are asked for them again" if lost else ""))
+    if as_json:
+        say_json({"since": begun, "checked": count, "differ": lost})
+    else:
+        say(f"{count} files checked, {len(lost)} differ" + ("; their rigs are asked for them again" if lost else ""))
     if lost:
         raise typer.Exit(1)

@@ -159,8 +159,8 @@ def go(
     from api.version import software_version
 
     task = checked(verb, select=Selection(select).text, software=software_version(), **chosen)
-    sources = sources_of(data, token)
     place = cluster.Workers(memory_bytes=cluster.memory_of(memory), **where)
+    sources = sources_of(data, token, place.scheduler)
     bounds = Bounds(limit_s, place.memory_bytes, records)
     for source in sources:
         source.check()

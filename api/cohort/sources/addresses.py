@@ -15,17 +15,30 @@ from api.cohort.sources.folder import Folder
 LOOPBACK = ("localhost", "127.0.0.1", "::1")
 
 
-def sources_of(addresses: Sequence[str], token: str = "") -> list[Source]:
-    """A source for each address.
+def sources_of(addresses: Sequence[str], token: str = "", scheduler: str = "") -> list[Source]:
+    """A source for each address; `scheduler`: where they are sent to, with the token; empty: to this machine only.
 
     Raises
     ------
     CohortError
-        An address that cannot be used, or a centre without a token.
+        An address that cannot be used, a centre without a token, or a token that would travel in the clear.
     """
     if not addresses:
         raise CohortError("DATA is missing. Give files, folders, s3://… or the https://… of a centre.")
-    return [_source(address, token) for address in addresses]
+    sources = [_source(address, token) for address in addresses]
+    if any(isinstance(source, Centre) for source in sources) and not _private(scheduler):
+        raise CohortError(
+            f"--scheduler {scheduler}: the token would go to the workers in the clear. "
+            "Start the scheduler with TLS and give tls://… (docs/cohorts.md)."
+        )
+    return sources
+
+
+def _private(scheduler: str) -> bool:
+    """Whether nobody on the network reads what is sent there."""
+    protocol, separator, rest = scheduler.partition("://")
+    there = urlsplit(f"//{rest if separator else scheduler}").hostname
+    return not scheduler or protocol == "tls" or there in LOOPBACK
 
 
 def _source(address: str, token: str) -> Source:

@@ -140,6 +140,22 @@ def test_so_many_parts_of_a_rig_and_no_more(centre: Centre, rig: httpx.Client) -
     assert whole_files(centre) == set(names)
 
 
+def test_so_many_bytes_of_a_rigs_parts_and_no_more(
+    centre: Centre, rig: httpx.Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A rig that begins one large file after the other fills no disk of the centre."""
+    monkeypatch.setattr("api.centre.spool.MOST_BYTES", 50)
+    told = Teller()
+    data = [b"%03d" % n * 10 for n in range(6)]
+    names = [told.add("recording", f"r{n}", {"participant": "P1"}, one)["file"] for n, one in enumerate(data)]
+    rig.post("/v1/rig/items", json=told.batch())
+    for name, one in zip(names, data, strict=True):
+        assert put(rig, name, 0, one[:20]).json()["have_bytes"] == 20
+    assert sum(path.stat().st_size for path in centre.data.glob("spool/*/*.part")) <= 50 + 20
+    told.push(rig)
+    assert whole_files(centre) == set(names)
+
+
 @pytest.mark.parametrize("trouble", [errno.ENOSPC, errno.EIO])
 def test_a_bucket_that_is_full_or_gone_loses_nothing(troubled: Centre, trouble: int) -> None:
     told = Teller()

@@ -98,6 +98,9 @@ def test_check_says_what_differs(centre: Centre, rig: httpx.Client, capsys: pyte
     (centre.data / "files" / name[:2] / name).write_bytes(b"damaged")
     assert run(arguments) == 1
     assert "2 files checked, 1 differ" in capsys.readouterr().out
+    assert run([*arguments, "--json"]) == 1
+    found = json.loads(capsys.readouterr().out)
+    assert found["checked"] == 2 and list(found["differ"]) == [name]
     assert ("Ward 1", "damaged") in centre.warnings()
     assert run([*arguments[:-1], "yesterday"]) == 2
 

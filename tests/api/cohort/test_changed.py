@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from api.cli.cohort_report import changed_lines
 from api.cohort import changed
 from api.cohort.changed import compared
 from api.cohort.errors import CohortError
@@ -124,6 +125,18 @@ def test_counts_and_who_is_in_one_only(tmp_path: Path, monkeypatch: pytest.Monke
     assert [one["record"] for one in found["records"]] == ["far", "c", "b"]
     assert (found["only_in_old"], found["only_in_new"]) == (["d", "y"], ["e", "z"])
     assert (found["old"]["software"], found["new"]["software"]) == ("1.0", "2.0")
+    assert found["other_options"] == ""
+
+
+def test_other_options_are_told(tmp_path: Path) -> None:
+    """What changed need not be the new version's doing."""
+    old, new = written(tmp_path / "o.parquet", row("a")), tmp_path / "n.parquet"
+    with Results(new, Task("diagnose", method="ridge", effects=("auto",), software="2.0")) as results:
+        results.add(row("a"))
+        results.join()
+    found = compared(old, new).to_dict()
+    assert found["other_options"] == "method maximum-likelihood, now ridge, effects none, now auto"
+    assert f"made with other options: {found['other_options']}" in changed_lines(found)
 
 
 def test_results_of_two_verbs_are_refused(tmp_path: Path) -> None:

@@ -82,7 +82,7 @@ def test_what_came_about_without_a_centre_is_told(tmp_path: Path, centre: FakeCe
 
 @pytest.mark.slow
 @pytest.mark.parametrize("rubbish", [False, True], ids=["line", "rubbish"])
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.campaign) for seed in range(2, 6))])
 def test_whatever_the_line_does_all_comes_over(tmp_path: Path, seed: int, rubbish: bool) -> None:
     """Answers dropped, bodies cut, answered twice, restored from an older state, rubbish: at the end all is there."""
     rig, line = Rig(tmp_path, seed=seed), BadLine(FakeCentre(), random.Random(seed), 0.6, rubbish)
@@ -104,7 +104,7 @@ STEPS = ("session", "participant", "wait", "long wait", "new pusher", "backup", 
 
 
 @pytest.mark.slow
-@hypothesis_settings(max_examples=25)
+@hypothesis_settings(max_examples=12)
 @given(st.lists(st.sampled_from(STEPS), max_size=12), st.integers(0, 2**32), st.sampled_from((0.0, 0.3, 0.8)))
 def test_in_any_order_of_work_failures_and_restarts(
     tmp_path_factory: pytest.TempPathFactory, steps: list[str], seed: int, harm: float
@@ -313,10 +313,10 @@ def test_rubbish_for_some_requests_only(rig: Rig, centre: FakeCentre, number: in
 
 @pytest.mark.slow
 def test_days_without_a_network_wait_in_the_database(rig: Rig, centre: FakeCentre) -> None:
-    """10 000 items wait; they go over in batches, with little memory."""
+    """4000 items wait; they go over in batches, with little memory."""
     rig.participant("P1")
     with rig.store.write() as session:
-        for number in range(10_000):
+        for number in range(4000):
             session.add(Participant(code=f"C{number}", profile={"a": "x" * 200}, created_utc=rig.now, created_by="A"))
     requests = 0
 
@@ -326,9 +326,9 @@ def test_days_without_a_network_wait_in_the_database(rig: Rig, centre: FakeCentr
         raise httpx.ConnectError("no route to host")
 
     pusher = rig.pusher(down)
-    run(pusher, 86400)
-    assert requests < 86400 / 140, "at most every 5 min, by chance up to half sooner"
-    assert state_of(rig).state == "unreachable" and state_of(rig).items_waiting == 10_003
+    run(pusher, 30_000)
+    assert requests < 30_000 / 140, "at most every 5 min, by chance up to half sooner"
+    assert state_of(rig).state == "unreachable" and state_of(rig).items_waiting == 4003
     taken = Counter[str]()
 
     def up(request: httpx.Request) -> httpx.Response:  # keeps the last hash only: what is measured is the pusher
@@ -344,8 +344,8 @@ def test_days_without_a_network_wait_in_the_database(rig: Rig, centre: FakeCentr
     run(again, 30)
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert taken["participant"] == 10_001 and state_of(rig).items_waiting == 0
-    assert peak < 60_000_000
+    assert taken["participant"] == 4001 and state_of(rig).items_waiting == 0
+    assert peak < 25_000_000
 
 
 def test_a_stopped_pusher_is_seen(rig: Rig, centre: FakeCentre) -> None:
