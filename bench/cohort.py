@@ -5,14 +5,16 @@
 `--records` short recordings (23 s at 100 samples/s) of simulated muscles are fitted by two workers: the memory of the
 workers and of their computing processes over the records. `--pairs` of them are fitted, as many as the rig seals them
 (48 s at 1600 samples/s) fitted, and a tenth as many short ones diagnosed, by one worker and by two, each after a
-warm-up, twice in turn. `--costs` recordings as the rig seals them are fitted and diagnosed by one worker: processor
-time and bytes of one, and from these the plan for two million on paper.
+warm-up, twice in turn, and by bare processes as a reference. `--costs` recordings as the rig
+seals them are fitted and diagnosed by one worker: processor time and bytes of one, and from these the plan for two
+million on paper.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import multiprocessing
 import os
 import statistics
 import sys
@@ -24,6 +26,7 @@ from typing import Any
 import psutil
 import pyarrow.parquet as pq
 
+from api.cohort import child
 from api.cohort.cluster import Workers, connected
 from api.cohort.parts import Results
 from api.cohort.run import Run
@@ -101,13 +104,34 @@ def throughput(folder: Path, place: Path, verb: str, count: int, **more: Any) ->
     """Records a second with one worker and with two, in turn, so that other work on the machine meets both."""
     here = folder / f"pairs-{len(list(folder.iterdir()))}"
     given, warm = make(here / "records", count, **more), make(here / "warm", 8, **more)
-    paces: dict[int, list[float]] = {1: [], 2: []}
+    paces: dict[int, list[float]] = {1: [], 2: [], -1: [], -2: []}
     for turn in range(2):
         for workers in (1, 2):
             output = place / f"{here.name}-{workers}-{turn}.parquet"
             paces[workers].append(count / run(given, output, verb, workers, 10**6, warm=warm)[1])
-    one, two = (statistics.median(paces[workers]) for workers in (1, 2))
-    return {"records": count, "one_per_s": paces[1], "two_per_s": paces[2], "ratio": two / one}
+            paces[-workers].append(count / plain(given, warm, verb, workers))
+    found = {"records": count}
+    for words, one, two in (("", 1, 2), ("plain_", -1, -2)):
+        ratio = statistics.median(paces[two]) / statistics.median(paces[one])
+        found |= {f"{words}one_per_s": paces[one], f"{words}two_per_s": paces[two], f"{words}ratio": ratio}
+    return found
+
+
+def plain(folder: Path, warm: Path, verb: str, processes: int) -> float:
+    """The reference, s: the same records computed by bare processes, no Dask, no results written."""
+    document = checked(verb, software=software_version()).document()
+    jobs, first = ([(str(path), document) for path in sorted(place.rglob("*.h5"))] for place in (folder, warm))
+    with multiprocessing.get_context("spawn").Pool(processes, initializer=child.load) as pool:
+        pool.starmap(bare, first, chunksize=1)
+        began_s = time.perf_counter()
+        pool.starmap(bare, jobs, chunksize=1)
+        return time.perf_counter() - began_s
+
+
+def bare(file: str, document: dict[str, Any]) -> None:
+    """One record of the reference."""
+    row = child.run({"file": file, "name": file, "known": {}, "task": document, "limit_s": 600.0})["row"]
+    assert row["status"] == "ok", row
 
 
 def memory(folder: Path, place: Path, count: int, renew: int) -> dict[str, Any]:
@@ -177,9 +201,15 @@ def report(found: dict[str, Any]) -> list[str]:
         "|---" * (1 + len(pace)) + "|",
         *(
             f"| {words} | {' | '.join(both(one[name]) for one in pace.values())} |"
-            for words, name in (("one worker", "one_per_s"), ("two workers", "two_per_s"))
+            for words, name in (
+                ("one worker", "one_per_s"),
+                ("two workers", "two_per_s"),
+                ("reference: one bare process", "plain_one_per_s"),
+                ("reference: two bare processes", "plain_two_per_s"),
+            )
         ),
         f"| ratio (goal 1.8) | {' | '.join(format(one['ratio'], '.2f') for one in pace.values())} |",
+        f"| ratio of the reference | {' | '.join(format(one['plain_ratio'], '.2f') for one in pace.values())} |",
         f"| recordings a run | {' | '.join(str(one['records']) for one in pace.values())} |",
         "",
         f"| memory over {mem['records']} records, 2 workers, MB | first tenth | last tenth | largest |",

@@ -162,7 +162,7 @@ def check(
         raise InputError(f"--since {begun}: give a time as 2026-11-23T08:00:00Z")
     settings, store = _opened(context, data, database)
     settings = settings.model_copy(update={"files": files}) if files else settings
-    count, lost = 0, dict[str, str]()
+    count, lost = 0, list[dict[str, str]]()
     try:
         bucket = ready_bucket(settings)
         print(f"stimrig centre check: if this is cut off, go on with --since {begun}", file=sys.stderr)
@@ -171,7 +171,7 @@ def check(
             for found in checking.check(store, bucket, clock, begun, bar.update):
                 count += 1
                 if not found.ok:
-                    lost[found.sha256] = found.words
+                    lost.append({"sha256": found.sha256, "says": found.words})
                     tqdm.write(f"{found.sha256}: {found.words}", file=sys.stderr if as_json else sys.stdout)
     except BucketError as error:
         raise ReportedError(f"{error}; {count} files were checked, go on with --since {begun}") from error

@@ -13,8 +13,10 @@ from contextlib import closing
 from pathlib import Path
 
 import httpx
+import jsonschema_rs
 import pytest
 
+from api import schemas
 from api.cli.main import run
 from tests.api.centre.conftest import Centre
 from tests.api.centre.told import Teller, sha256
@@ -100,7 +102,8 @@ def test_check_says_what_differs(centre: Centre, rig: httpx.Client, capsys: pyte
     assert "2 files checked, 1 differ" in capsys.readouterr().out
     assert run([*arguments, "--json"]) == 1
     found = json.loads(capsys.readouterr().out)
-    assert found["checked"] == 2 and list(found["differ"]) == [name]
+    jsonschema_rs.validator_for(schemas.load("centre")).validate(found)
+    assert found["checked"] == 2 and [one["sha256"] for one in found["differ"]] == [name]
     assert ("Ward 1", "damaged") in centre.warnings()
     assert run([*arguments[:-1], "yesterday"]) == 2
 
