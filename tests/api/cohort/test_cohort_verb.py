@@ -26,8 +26,16 @@ from tests.harness.cohort_records import cohort
 
 PATIENCE_S = 240.0
 SESSIONS = 50
-COMMAND = "import api.cohort.run as run; run.FLUSH_S = 0.0; from api.cli.main import main; main()"
-"""Every row to the disk at once: the test sees how far it is."""
+COMMAND = """
+import time
+import api.cohort.run as run
+from api.cli.main import main
+
+take, run.FLUSH_S = run.Run._add, 0.0
+run.Run._add = lambda self, row: (time.sleep(0.1), take(self, row))
+main()
+"""
+"""Every row to the disk at once, and not too fast: the test sees how far it is, and is in time to disturb."""
 
 
 def refused(capsys: pytest.CaptureFixture[str], *arguments: str, code: int = 2) -> str:
