@@ -156,7 +156,10 @@ def started(folder: Path, output: Path) -> subprocess.Popen[str]:
         "--renew",
         "20",
     ]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    return subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # ignored where the tests run behind `&`
+    )  # fmt: skip
 
 
 def below(pid: int) -> list[int]:
