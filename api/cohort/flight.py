@@ -1,8 +1,9 @@
-"""The records that are on the workers: sent, come back as rows, sent again where a worker was lost."""
+"""The records that are on the workers: sent in parcels, come back as rows, sent again where a worker was lost."""
 
 from __future__ import annotations
 
 import uuid
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,23 +11,22 @@ from distributed import Client, Future, as_completed
 from distributed.scheduler import KilledWorker
 
 from api.cohort.errors import CohortError, CutOffError
-from api.cohort.sources import Entry, Source
 from api.cohort.tasks import Task
-from api.cohort.worker import Bounds, lost, run_record
+from api.cohort.worker import Bounds, Done, Record, lost, run_parcel
 
 TRIES = 3
 """A record with which so many workers were lost is a row that says so."""
+PARCEL_S, LARGEST_PARCEL = 0.5, 8
+"""A parcel ends after so long: sending a record alone costs more than reading it. Long records travel alone."""
 GOES_ON = "What is done is kept; the same command goes on."
 
 
 @dataclass
 class Sent:
-    """One record on its way."""
+    """Records on their way together."""
 
     future: Future
-    source: Source
-    entry: Entry
-    alike: tuple[bytes, ...]
+    records: Sequence[Record]
     tries: int
 
 
@@ -43,6 +43,8 @@ class Flight:
 
     def __init__(self, client: Client, task: Task, bounds: Bounds) -> None:
         self.client, self.task, self.bounds = client, task, bounds
+        self.size = 1
+        """How many records the next parcel should hold: more while they come back soon."""
         self.most = 0
         self._run = uuid.uuid4().hex
         self._number = 0
@@ -50,19 +52,22 @@ class Flight:
         self._came = as_completed(with_results=True, raise_errors=False)
 
     def __len__(self) -> int:
+        """Parcels on their way."""
         return len(self._sent)
 
-    def send(self, source: Source, entry: Entry, alike: tuple[bytes, ...] = (), tries: int = 1) -> None:
-        """Send a record to a worker; contents that are `alike` it need not be computed again."""
+    def send(self, records: Sequence[Record], tries: int = 1) -> None:
+        """Send records to a worker, in one parcel."""
         self._number += 1
-        key = f"record-{self._run}-{self._number}"  # a scheduler may hold what another run asked of it
-        future = self.client.submit(run_record, source, entry, self.task, self.bounds, alike, key=key, pure=False)
-        self._sent[key] = Sent(future, source, entry, alike, tries)
+        key = f"parcel-{self._run}-{self._number}"  # a scheduler may hold what another run asked of it
+        future = self.client.submit(
+            run_parcel, list(records), self.task, self.bounds, PARCEL_S, key=key, pure=False
+        )  # fmt: skip
+        self._sent[key] = Sent(future, records, tries)
         self._came.add(future)
         self.most = max(self.most, len(self._sent))
 
-    def receive(self) -> dict[str, Any]:
-        """The next row that comes back.
+    def receive(self) -> list[dict[str, Any]]:
+        """The rows of the next parcel that comes back; none where its records were sent again.
 
         Raises
         ------
@@ -71,31 +76,43 @@ class Flight:
         CutOffError
             The scheduler is gone, or a worker cannot compute at all.
         """
-        while True:
-            future, result = next(self._came)
-            one = self._sent.pop(future.key)
-            row = self._row(one, result)
-            future.release()
-            if row is not None:
-                return row
+        future, result = next(self._came)
+        one = self._sent.pop(future.key)
+        rows = self._came_back(one, result) if isinstance(result, Done) else self._lost(one, result)
+        future.release()
+        return rows
 
-    def _row(self, one: Sent, result: Any) -> dict[str, Any] | None:
-        """The row of what came back; None where the record was sent again."""
-        if isinstance(result, dict):
-            if version := result.get("other_version"):
-                here = self.task.software
-                raise CohortError(f"a worker has stimrig {version}, here is {here}. Install the same version there.")
-            return result
+    def _came_back(self, one: Sent, done: Done) -> list[dict[str, Any]]:
+        """The rows; what was not begun is sent again, each record alone."""
+        if done.other_version:
+            here = self.task.software
+            raise CohortError(
+                f"a worker has stimrig {done.other_version}, here is {here}. Install the same version there."
+            )
+        left = one.records[len(done.rows) :]
+        if left:
+            self.size = 1
+        elif done.took_s < PARCEL_S / 2 and len(one.records) == self.size:
+            self.size = min(2 * self.size, LARGEST_PARCEL)
+        for record in left:
+            self.send([record], one.tries)
+        return done.rows
+
+    def _lost(self, one: Sent, result: Any) -> list[dict[str, Any]]:
+        """A worker was lost with the parcel: its records are sent again, each alone, or have had their tries."""
         error = result[1] if isinstance(result, tuple) else result
         if one.future.status == "error" and not isinstance(error, KilledWorker):
             words = " ".join(f"{type(error).__name__}: {error}".split())[:200]
             raise CutOffError(f"a worker cannot compute ({words}). {GOES_ON}")
-        if isinstance(error, KilledWorker) or one.tries >= TRIES:
-            return lost(one.entry, self.task, "its workers were lost, one after the other, while it was computed.")
+        alone = len(one.records) == 1
+        if alone and (isinstance(error, KilledWorker) or one.tries >= TRIES):
+            _source, entry, _alike = one.records[0]
+            return [lost(entry, self.task, "its workers were lost, one after the other, while it was computed.")]
         if self.client.status != "running":
             raise CutOffError(f"the scheduler is gone. {GOES_ON}")
-        self.send(one.source, one.entry, one.alike, one.tries + 1)  # its worker was lost with the row
-        return None
+        for record in one.records:
+            self.send([record], one.tries + 1)
+        return []
 
     def cancel(self) -> None:
         """Leave what is still on the workers."""

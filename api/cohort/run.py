@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from itertools import islice
 from typing import Any
 
 from distributed import Client
@@ -16,12 +17,12 @@ from api.cohort.flight import Flight
 from api.cohort.parent import close_all
 from api.cohort.parts import Results
 from api.cohort.select import Selection
-from api.cohort.sources import Entry, Source
+from api.cohort.sources import Source
 from api.cohort.tasks import Task
-from api.cohort.worker import COPY, LEFT_OUT, Bounds, identity
+from api.cohort.worker import COPY, LEFT_OUT, Bounds, Record, identity
 
 AHEAD = 3
-"""Records sent for each one that is computed: a worker never waits for its next, and none sees a million."""
+"""Parcels sent for each that is computed: a worker never waits for its next, and none sees a million records."""
 FLUSH_S = 10.0
 """What is lost at most, of the work done, when the run is killed."""
 LANES_S = 5.0
@@ -127,14 +128,15 @@ class Run:
         flushed_s = looked_s = self.monotonic_s()
         while True:
             while more and len(self.flight) < room:
-                found = next(open_entries, None)
-                if found is None:
-                    more = False
+                parcel = list(islice(open_entries, self.flight.size))
+                if parcel:
+                    self.flight.send(parcel)
                 else:
-                    self.flight.send(*found, self.results.done.alike(found[1]))
+                    more = False
             if not len(self.flight):
                 return
-            self._add(self.flight.receive())
+            for row in self.flight.receive():
+                self._add(row)
             now_s = self.monotonic_s()
             if now_s - flushed_s > FLUSH_S:
                 self.results.flush()
@@ -142,7 +144,7 @@ class Run:
             if now_s - looked_s > LANES_S:
                 room, looked_s = AHEAD * lanes(self.client), now_s
 
-    def _open(self) -> Iterator[tuple[Source, Entry]]:
+    def _open(self) -> Iterator[Record]:
         """Records that are meant, or may be, and that are not done."""
         for source in self.sources:
             for entry in source.entries(self.selection):
@@ -153,7 +155,7 @@ class Run:
                 elif self.results.done.has_content(entry.sha256):
                     self._add({**identity(entry), "sha256": entry.sha256, "bytes": entry.bytes, "status": COPY})
                 else:
-                    yield source, entry
+                    yield source, entry, self.results.done.alike(entry)
 
     def _add(self, row: dict[str, Any]) -> None:
         if (left_open := row.pop("left_open", None)) and not self.tally.left_open:

@@ -1,4 +1,4 @@
-"""What a worker of Dask does with one record: fetch it, hash it, have it computed; a row in any case.
+"""What a worker of Dask does with a record: fetch it, hash it, have it computed; a row in any case.
 
 The worker itself never looks into a record: that is done by a process that is shut in (`api.cohort.child`).
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import platform
+import time
 from dataclasses import dataclass
 from typing import Any
 
@@ -37,15 +38,36 @@ def versions() -> dict[str, str]:
     return {"stimrig": software_version(), "python": ".".join(platform.python_version_tuple()[:2])}
 
 
+Record = tuple[Source, Entry, tuple[bytes, ...]]
+"""A record, and digests of contents that it need not be computed again."""
+
+
+@dataclass(frozen=True)
+class Done:
+    """What a worker did of a parcel: the rows of its first records, and how long that took."""
+
+    rows: list[dict[str, Any]]
+    took_s: float
+    other_version: str = ""
+    """The worker's version, where it is another than that of who asks; then there are no rows."""
+
+
+def run_parcel(records: list[Record], task: Task, bounds: Bounds, patience_s: float) -> Done:
+    """Records one after the other, the first in any case, until `patience_s` is over; the others are not begun."""
+    began_s, rows = time.monotonic(), list[dict[str, Any]]()
+    if software_version() != task.software:
+        return Done(rows, 0.0, software_version())
+    for source, entry, done in records:
+        rows.append(run_record(source, entry, task, bounds, done))
+        if time.monotonic() - began_s > patience_s:
+            break
+    return Done(rows, time.monotonic() - began_s)
+
+
 def run_record(
     source: Source, entry: Entry, task: Task, bounds: Bounds, done: tuple[bytes, ...] = ()
 ) -> dict[str, Any]:
-    """One record's row; its `status` is `ok`, `error`, `left out` of the selection, or `copy` of what is in `done`.
-
-    `{"other_version": …}` where this worker has another version than who asks.
-    """
-    if software_version() != task.software:
-        return {"other_version": software_version()}
+    """One record's row; its `status` is `ok`, `error`, `left out` of the selection, or `copy` of what is in `done`."""
     base: dict[str, Any] = {**entry.known, **identity(entry), "verb": task.verb, "software": task.software}
     try:
         if entry.bytes is not None and entry.bytes > LARGEST_FILE_BYTES:
@@ -66,7 +88,7 @@ def run_record(
     found = process.compute(content, entry, task, bounds.limit_s)
     row = found.get("row", {"status": LEFT_OUT})
     mine = {name: base[name] for name in MINE if name in base}  # whatever the process says
-    return {**base, **row, **mine, "left_open": process.left_open, "other_version": None}
+    return {**base, **row, **mine, "left_open": process.left_open}
 
 
 def digest(*words: str) -> bytes:

@@ -18,7 +18,7 @@ from api.cohort import parent
 from api.cohort.parent import Computing
 from api.cohort.sources import Entry
 from api.cohort.tasks import Task
-from api.cohort.worker import Bounds, run_record
+from api.cohort.worker import Bounds, Done, run_parcel, run_record
 from api.version import software_version
 from tests.harness.cohort_records import Session, write
 from tests.harness.hostile_shapes import SECRET, hdf5_shapes
@@ -230,7 +230,7 @@ def test_a_process_has_no_say_in_which_record_it_was(tmp_path: Path, monkeypatch
     try:
         found = of_worker(b"abc", Entry("address", "a", "a"))
         assert found["address"] == "address" and found["software"] == software_version()
-        assert found["sha256"] == hashlib.sha256(b"abc").hexdigest() and not found["other_version"]
+        assert found["sha256"] == hashlib.sha256(b"abc").hexdigest()
     finally:
         parent.close_all()
 
@@ -245,9 +245,16 @@ class Given:
         return self.content[: most_bytes + 1]
 
 
-def of_worker(content: bytes, one: Entry, software: str | None = None) -> dict[str, Any]:
-    task = Task("fit", software=software_version() if software is None else software)
+def of_worker(content: bytes, one: Entry) -> dict[str, Any]:
+    task = Task("fit", software=software_version())
     return run_record(Given(content), one, task, Bounds(PATIENCE_S, MEMORY, 10))  # pyright: ignore[reportArgumentType]
+
+
+def parcel(content: bytes, patience_s: float, software: str = "") -> Done:
+    records: Any = [(Given(content), Entry(name, name, name), ()) for name in "abc"]
+    return run_parcel(
+        records, Task("fit", software=software or software_version()), Bounds(PATIENCE_S, MEMORY, 10), patience_s
+    )
 
 
 def test_a_wrong_hash_or_size_is_a_row_without_a_look_inside(good: bytes) -> None:
@@ -258,4 +265,12 @@ def test_a_wrong_hash_or_size_is_a_row_without_a_look_inside(good: bytes) -> Non
 
 
 def test_a_worker_of_another_version_refuses(good: bytes) -> None:
-    assert of_worker(good, Entry("a", "a", "a"), software="9.9") == {"other_version": software_version()}
+    found = parcel(good, 60.0, software="9.9")
+    assert (found.rows, found.other_version) == ([], software_version())
+
+
+def test_a_parcel_ends_in_time_with_what_is_done() -> None:
+    """The first record is done in any case: nothing is sent round for ever."""
+    for patience_s, names in ((60.0, ["a", "b", "c"]), (0.0, ["a"])):
+        found = parcel(b"no record", patience_s)
+        assert [row["address"] for row in found.rows] == names and found.took_s > 0

@@ -7,15 +7,18 @@ import threading
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
 from distributed import Client, LocalCluster
+from distributed.scheduler import KilledWorker
 
 from api.cohort import flight, worker
 from api.cohort.cluster import check_versions
 from api.cohort.errors import CohortError, CutOffError
+from api.cohort.flight import LARGEST_PARCEL
 from api.cohort.parent import close_all
 from api.cohort.parts import Results
 from api.cohort.run import AHEAD, Run, Tally
@@ -166,7 +169,38 @@ def test_a_long_list_is_never_held_at_once(client: Client, tmp_path: Path) -> No
     ahead: list[int] = []
     run, tally = go(client, [source], tmp_path / "r.parquet", tell=lambda one: ahead.append(source.listed - one.now))
     assert tally.error == 300 and {row["error_kind"] for row in read(tmp_path / "r.parquet")} == {"unreadable"}
-    assert run.flight.most <= AHEAD * LANES and max(ahead) <= AHEAD * LANES
+    assert run.flight.most <= AHEAD * LANES and max(ahead) <= AHEAD * LANES * LARGEST_PARCEL
+    assert max(ahead) > AHEAD * LANES, "records that come back at once travel together"
+
+
+def test_long_records_travel_alone(client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(flight, "PARCEL_S", 0.0)
+    run, tally = go(client, [Endless(30)], tmp_path / "r.parquet")
+    assert run.flight.size == 1 and tally.error == 30 and len(read(tmp_path / "r.parquet")) == 30
+
+
+def test_what_was_not_begun_is_sent_again(client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def impatient(records: list[Any], task: Task, bounds: worker.Bounds, _patience_s: float) -> worker.Done:
+        return worker.run_parcel(records, task, bounds, 0.0 if len(records) > 3 else 60.0)
+
+    monkeypatch.setattr(flight, "run_parcel", impatient)
+    _, tally = go(client, [Endless(100)], tmp_path / "r.parquet")
+    names = [row["name"] for row in read(tmp_path / "r.parquet")]
+    assert tally.error == 100 and sorted(names, key=int) == [str(number) for number in range(100)]
+
+
+def test_of_a_parcel_with_which_workers_are_lost_only_the_culprit_is(
+    client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def deadly(records: list[Any], *more: Any) -> worker.Done:
+        if any(entry.key == "17" for _, entry, _ in records):
+            raise KilledWorker("it", SimpleNamespace(address="tcp://gone"), 0)  # pyright: ignore[reportArgumentType]
+        return worker.run_parcel(records, *more)
+
+    monkeypatch.setattr(flight, "run_parcel", deadly)
+    go(client, [Endless(40)], tmp_path / "r.parquet")
+    kinds = {row["name"]: row["error_kind"] for row in read(tmp_path / "r.parquet")}
+    assert len(kinds) == 40 and [name for name, kind in kinds.items() if kind == "killed"] == ["17"]
 
 
 def test_a_place_that_goes_while_it_is_listed_ends_the_run_and_keeps_what_is_done(
@@ -205,7 +239,7 @@ def broken_worker(*_: object) -> dict[str, Any]:
 def test_a_worker_that_cannot_compute_ends_the_run(
     client: Client, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(flight, "run_record", broken_worker)
+    monkeypatch.setattr(flight, "run_parcel", broken_worker)
     with pytest.raises(CutOffError, match="No space left"):
         go(client, sources_of([str(folder)]), tmp_path / "r.parquet")
 
