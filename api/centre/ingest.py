@@ -14,6 +14,7 @@ from api.clock import Clock, unix_of
 from api.errors import ApiError
 from api.store import Store
 from api.store.centre_tables import CentreChain, CentreItem, CentreRig
+from api.store.texts import storable
 
 MOST_CLOCK_S = 2.0
 LEAST_DISK_SHARE, LEAST_DISK_BYTES = 0.05, 5_000_000_000
@@ -153,11 +154,6 @@ def at(session: Session, rig_id: int, chain: str) -> Place:
     """Where a rig's chain stands."""
     row = session.get(CentreChain, (rig_id, chain))
     return Place(row.seq, row.hash) if row else Place(0, GENESIS)
-
-
-def storable(text: str) -> str:
-    """A text that every database holds."""
-    return text.replace("\x00", "\ufffd")
 
 
 def _told(session: Session, rig_id: int, sent: list[ItemIn]) -> set[tuple[str, str, str]]:

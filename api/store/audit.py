@@ -10,6 +10,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from api.store.tables import AuditEntry
+from api.store.texts import storable
 
 GENESIS = "0" * 64
 
@@ -26,9 +27,9 @@ def write(session: Session, at_utc: str, who: str, action: str, subject: str, **
     fields = {
         "seq": last.seq + 1 if last else 1,
         "at_utc": at_utc,
-        "who": who,
+        "who": storable(who),
         "action": action,
-        "subject": subject,
+        "subject": storable(subject),
         "detail": detail,
         "previous_hash": last.hash if last else GENESIS,
     }

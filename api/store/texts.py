@@ -1,0 +1,8 @@
+"""Texts that every database holds."""
+
+from __future__ import annotations
+
+
+def storable(text: str) -> str:
+    """The text without the character that PostgreSQL does not take, so that what somebody sent can be written down."""
+    return text.replace("\x00", "\ufffd")
