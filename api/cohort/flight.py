@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import uuid
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,7 +25,7 @@ class Sent:
     """Records on their way together."""
 
     future: Future
-    records: Sequence[Record]
+    records: list[Record]
     tries: int
 
 
@@ -55,13 +54,11 @@ class Flight:
         """Parcels on their way."""
         return len(self._sent)
 
-    def send(self, records: Sequence[Record], tries: int = 1) -> None:
+    def send(self, records: list[Record], tries: int = 1) -> None:
         """Send records to a worker, in one parcel."""
         self._number += 1
         key = f"parcel-{self._run}-{self._number}"  # a scheduler may hold what another run asked of it
-        future = self.client.submit(
-            run_parcel, list(records), self.task, self.bounds, PARCEL_S, key=key, pure=False
-        )  # fmt: skip
+        future = self.client.submit(run_parcel, records, self.task, self.bounds, PARCEL_S, key=key, pure=False)
         self._sent[key] = Sent(future, records, tries)
         self._came.add(future)
         self.most = max(self.most, len(self._sent))

@@ -6,7 +6,6 @@ The worker itself never looks into a record: that is done by a process that is s
 from __future__ import annotations
 
 import hashlib
-import platform
 import time
 from dataclasses import dataclass
 from typing import Any
@@ -31,11 +30,6 @@ class Bounds:
     limit_s: float
     memory_bytes: int
     records: int
-
-
-def versions() -> dict[str, str]:
-    """What must agree between the workers and who asks."""
-    return {"stimrig": software_version(), "python": ".".join(platform.python_version_tuple()[:2])}
 
 
 Record = tuple[Source, Entry, tuple[bytes, ...]]

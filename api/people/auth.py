@@ -284,6 +284,13 @@ class Auth:
             self._threads, partial(self.identify, connection, **how)
         )
 
+    async def ask_within(self, connection: HTTPConnection, patience_s: float, **how: bool) -> Principal:
+        """`ask`, given up after a while; what the database says later is no matter. Raises TimeoutError, too."""
+        asked = asyncio.ensure_future(self.ask(connection, **how))
+        asked.add_done_callback(lambda done: done.cancelled() or done.exception())
+        async with asyncio.timeout(patience_s):
+            return await asyncio.shield(asked)
+
     def identify(
         self, connection: HTTPConnection, *, forgive_age: bool = False, forgive_lock: bool = False, bound: bool = False
     ) -> Principal:

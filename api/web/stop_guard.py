@@ -14,7 +14,6 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
 from api.errors import ApiError, not_answering
-from api.people.auth import Principal
 from api.sessions.requests import StopIn
 from api.web.guards import Session, Token
 
@@ -61,22 +60,13 @@ async def anyone_who_may_stop(request: Request, _token: Token, _session: Session
 async def _signed_in(request: Request, reason: str) -> Press:
     """Who is signed in; where the database does not say so at once, who was when it last did. Raises ApiError."""
     auth = request.app.state.context.auth
-    asked = asyncio.ensure_future(auth.ask(request, forgive_age=True, bound=True))
     try:
-        async with asyncio.timeout(PATIENCE_S):
-            who = await asyncio.shield(asked)
+        who = await auth.ask_within(request, PATIENCE_S, forgive_age=True, bound=True)
         return Press(who.name, reason, who.participant is not None)
     except (TimeoutError, SQLAlchemyError):
-        asked.add_done_callback(_forget)
         if (name := auth.seen(request)) is not None:
             return Press(name, reason, by_key=True)  # whether a key asks is not known: then nobody else is named
         raise not_answering() from None
-
-
-def _forget(asked: asyncio.Future[Principal]) -> None:
-    """What the database says too late changes nothing."""
-    if not asked.cancelled():
-        asked.exception()
 
 
 async def _within(patience_s: float, request: Request, coming: asyncio.Task[tuple[str, str]]) -> tuple[str, str | None]:

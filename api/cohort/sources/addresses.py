@@ -11,8 +11,7 @@ from api.cohort.sources import Source
 from api.cohort.sources.bucket import Bucket
 from api.cohort.sources.centre import Centre
 from api.cohort.sources.folder import Folder
-
-LOOPBACK = ("localhost", "127.0.0.1", "::1")
+from api.settings import loopback
 
 
 def sources_of(addresses: Sequence[str], token: str = "", scheduler: str = "") -> list[Source]:
@@ -38,7 +37,7 @@ def _private(scheduler: str) -> bool:
     """Whether nobody on the network reads what is sent there."""
     protocol, separator, rest = scheduler.partition("://")
     there = urlsplit(f"//{rest if separator else scheduler}").hostname
-    return not scheduler or protocol == "tls" or there in LOOPBACK
+    return not scheduler or protocol == "tls" or loopback(there or "")
 
 
 def _source(address: str, token: str) -> Source:
@@ -48,7 +47,7 @@ def _source(address: str, token: str) -> Source:
     if protocol in ("http", "https"):
         if not token:
             raise CohortError(f"{address}: a centre needs a token. Set STIMRIG_TOKEN, or give --token.")
-        if protocol == "http" and urlsplit(address).hostname not in LOOPBACK:
+        if protocol == "http" and not loopback(urlsplit(address).hostname or ""):
             raise CohortError(f"{address}: the token would be sent in the clear. Give https://…")
         return Centre(address.rstrip("/"), token)
     if protocol == "file":

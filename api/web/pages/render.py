@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -68,11 +67,8 @@ async def look(request: Request) -> None:
     if getattr(request.state, "who", None) is not None:
         return
     context = request.app.state.context
-    asked = asyncio.ensure_future(context.auth.ask(request, forgive_age=True))
-    asked.add_done_callback(lambda done: done.cancelled() or done.exception())  # what is said too late is no matter
     try:
-        async with asyncio.timeout(LOOK_S):
-            request.state.who = await asyncio.shield(asked)
+        request.state.who = await context.auth.ask_within(request, LOOK_S, forgive_age=True)
     except ApiError:
         return
     except (SQLAlchemyError, TimeoutError):

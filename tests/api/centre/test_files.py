@@ -214,13 +214,19 @@ def test_a_folder_that_is_not_mounted_any_more_takes_nothing(centre: Centre, rig
     assert (None, "bucket") in centre.warnings()
 
 
-def test_a_folder_that_is_not_mounted_is_no_damage_of_its_files(
-    centre: Centre, rig: httpx.Client, http: httpx.Client
-) -> None:
+def kept(rig: httpx.Client, http: httpx.Client) -> tuple[Teller, bytes, dict[str, Any]]:
+    """A session at the centre: its recording's bytes, and how it is listed."""
     told = Teller()
     data = told.session()
     told.push(rig)
     [recording] = http.get("/v1/recordings").json()["recordings"]
+    return told, data, recording
+
+
+def test_a_folder_that_is_not_mounted_is_no_damage_of_its_files(
+    centre: Centre, rig: httpx.Client, http: httpx.Client
+) -> None:
+    _, data, recording = kept(rig, http)
     bucket, elsewhere, context = centre.data / "files", centre.data / "elsewhere", centre.context
     bucket.rename(elsewhere)
     bucket.mkdir()  # the place where it was mounted
@@ -238,10 +244,8 @@ def test_a_folder_that_is_not_mounted_is_no_damage_of_its_files(
 def test_a_file_that_was_changed_is_refused_told_and_asked_for_again(
     centre: Centre, rig: httpx.Client, http: httpx.Client
 ) -> None:
-    told = Teller()
-    data = told.session()
-    told.push(rig)
-    name, [recording] = sha256(data), http.get("/v1/recordings").json()["recordings"]
+    told, data, recording = kept(rig, http)
+    name = sha256(data)
     place = centre.data / "files" / name[:2] / name
     for damage in (lambda: place.write_bytes(b"X" + data[1:]), place.unlink):
         damage()
