@@ -98,7 +98,8 @@ class Settings(BaseSettings):
         if not given:
             return None
         parts = urlsplit(given)
-        if parts.scheme not in ("http", "https") or not parts.hostname or "@" in parts.netloc or parts.query:
+        odd = "@" in parts.netloc or parts.query or parts.fragment or re.search(r"\s", given)
+        if parts.scheme not in ("http", "https") or not parts.hostname or odd:
             raise ValueError("it is no address of a centre; give one like https://centre.example.org")
         if parts.scheme == "http" and not loopback(parts.hostname):
             raise ValueError("a key is not sent in the clear; give an address that begins with https://")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import uuid
+from asyncio import CancelledError
 from dataclasses import dataclass
 from typing import Any
 
@@ -45,10 +46,11 @@ class Flight:
         self.size = 1
         """How many records the next parcel should hold: more while they come back soon."""
         self.most = 0
+        """So many records were on their way at the same time."""
         self._run = uuid.uuid4().hex
         self._number = 0
         self._sent: dict[str, Sent] = {}
-        self._came = as_completed(with_results=True, raise_errors=False)
+        self._came = as_completed()  # with results it would never give back what a lost worker took along
 
     def __len__(self) -> int:
         """Parcels on their way."""
@@ -61,7 +63,7 @@ class Flight:
         future = self.client.submit(run_parcel, records, self.task, self.bounds, PARCEL_S, key=key, pure=False)
         self._sent[key] = Sent(future, records, tries)
         self._came.add(future)
-        self.most = max(self.most, len(self._sent))
+        self.most = max(self.most, sum(len(one.records) for one in self._sent.values()))
 
     def receive(self) -> list[dict[str, Any]]:
         """The rows of the next parcel that comes back; none where its records were sent again.
@@ -73,9 +75,14 @@ class Flight:
         CutOffError
             The scheduler is gone, or a worker cannot compute at all.
         """
-        future, result = next(self._came)
+        future = next(self._came)
         one = self._sent.pop(future.key)
-        rows = self._came_back(one, result) if isinstance(result, Done) else self._lost(one, result)
+        try:
+            rows = self._came_back(one, future.result())
+        except CohortError:
+            raise
+        except (Exception, CancelledError) as error:
+            rows = self._lost(one, error)
         future.release()
         return rows
 
@@ -95,9 +102,8 @@ class Flight:
             self.send([record], one.tries)
         return done.rows
 
-    def _lost(self, one: Sent, result: Any) -> list[dict[str, Any]]:
+    def _lost(self, one: Sent, error: BaseException) -> list[dict[str, Any]]:
         """A worker was lost with the parcel: its records are sent again, each alone, or have had their tries."""
-        error = result[1] if isinstance(result, tuple) else result
         if one.future.status == "error" and not isinstance(error, KilledWorker):
             words = " ".join(f"{type(error).__name__}: {error}".split())[:200]
             raise CutOffError(f"a worker cannot compute ({words}). {GOES_ON}")

@@ -22,13 +22,14 @@ from typing import Any
 from api.cohort.sources import Entry
 from api.cohort.tasks import Task
 from api.workers.process import environment
+from identify.strict_json import BadJson, parse
 
 RECORDS_A_PROCESS = 500
 """After so many a fresh process is started: what a library never gives back cannot add up."""
 START_S = 300.0
 """So long a start may take on a busy machine, compiling what was never compiled there."""
 CHILD = (sys.executable, "-m", "api.cohort.child")
-LONGEST_BYTES = 16 * 2**20
+LONGEST_BYTES, DEEPEST = 16 * 2**20, 20
 """Of an answer: a process that a record has taken over could talk without an end."""
 NO_ANSWER = {"status": "error", "error_kind": "unexpected", "error": "its process gave an answer that cannot be read."}
 PREFIX, LOCK = "stimrig-cohort-", "lock"
@@ -93,7 +94,9 @@ class Computing:
 
     def _running(self) -> subprocess.Popen[bytes]:
         """The process, fresh where there is none or where it has done enough."""
-        if self.process is not None and (self.done >= self.records or self.process.poll() is not None):
+        if self.process is not None and (
+            self.done >= self.records or self.process.poll() is not None or self._spoke(self.process)
+        ):
             self.close_process()
         if self.process is None:
             self.process = subprocess.Popen(
@@ -111,6 +114,13 @@ class Computing:
                 raise RuntimeError(f"the process that computes does not start ({_how(code)})")
             self.left_open = json.loads(ready)["left_open"]
         return self.process
+
+    def _spoke(self, process: subprocess.Popen[bytes]) -> bool:
+        """Whether it says something that nobody asked: it would be taken for the answer on the next record."""
+        assert process.stdout is not None
+        with selectors.DefaultSelector() as ready:
+            ready.register(process.stdout, selectors.EVENT_READ)
+            return bool(self._rest or ready.select(0))
 
     def _line(self, process: subprocess.Popen[bytes], patience_s: float) -> bytes | None:
         """The next line; None where the process ended, or none came in time."""
@@ -157,8 +167,8 @@ class Computing:
 def _sound(line: bytes) -> dict[str, Any] | None:
     """An answer as the child gives them; None of anything else."""
     try:
-        found = json.loads(line)
-    except (ValueError, RecursionError):
+        found = parse(line, deepest=DEEPEST, finite=False)
+    except BadJson:
         return None
     row = found.get("row") if isinstance(found, dict) else None
     if isinstance(row, dict) and row.get("status") in ("ok", "error"):

@@ -118,8 +118,11 @@ def _one(value: Any, kind: pa.DataType) -> pa.Array:
 
 def _cell(value: Any, kind: pa.DataType) -> Any:
     """A value as the column holds it; None where a file says nonsense, which must not end a run."""
-    if kind == pa.date32():
-        return date.fromisoformat(value) if isinstance(value, str) else value
+    if kind == pa.date32() and isinstance(value, str):
+        try:
+            return date.fromisoformat(value)
+        except ValueError:
+            return None
     if kind == INSTANT and isinstance(value, str):
         try:
             found = datetime.fromisoformat(value)

@@ -299,7 +299,12 @@ class Auth:
         A controller's key, which is bound to a participant, is refused (403) unless whoever asks looks after that
         (`bound`): `api.web.key_guard`, and stop.
         """
-        who = self._identify(connection, forgive_age, forgive_lock)
+        try:
+            who = self._identify(connection, forgive_age, forgive_lock)
+        except ApiError as error:
+            if forgive_age and error.status == 401:  # it would not even stop
+                self._forget(connection)
+            raise
         self._remember(connection, who.name)
         if who.participant is not None and not bound:
             raise outside(who.participant)
@@ -312,9 +317,17 @@ class Auth:
             while len(self._seen) > MOST_SEEN:
                 self._seen.popitem(last=False)
 
+    def _forget(self, connection: HTTPConnection) -> None:
+        with self._remembering:
+            self._seen.pop(_credential(connection), None)
+
     def seen(self, connection: HTTPConnection) -> str | None:
         """Who was behind this token or session when the database was last asked: good for a stop, and nothing else."""
         return self._seen.get(_credential(connection))
+
+    def seen_on_page(self, connection: HTTPConnection) -> str | None:
+        """`seen`, for a page's session only: a controller's key opens no page, so no page gives it a right."""
+        return None if connection.headers.get("authorization") else self.seen(connection)
 
     def _identify(self, connection: HTTPConnection, forgive_age: bool, forgive_lock: bool) -> Principal:
         header = connection.headers.get("authorization", "")
@@ -331,7 +344,8 @@ class Auth:
 
 
 def _credential(connection: HTTPConnection) -> str:
-    return digest(connection.headers.get("authorization", "") or connection.cookies.get(COOKIE, ""))
+    header = connection.headers.get("authorization", "")
+    return digest(f"header {header}" if header else f"cookie {connection.cookies.get(COOKIE, '')}")
 
 
 def digest(text: str) -> str:

@@ -120,6 +120,22 @@ def test_a_page_has_its_stop_button_while_the_database_does_not_answer(
     assert 'action="/v1/stop"' not in stranger.get("/nowhere").text, "nobody who was not signed in before"
 
 
+def test_no_page_gives_a_right_to_a_key_or_to_who_was_told_no_since(
+    service: Service, client: httpx.Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A right outlives what a key may do, and says more of a stop than a key is told."""
+    key, removed = service.token("ctl", "read-live"), person(service)
+    by_key = service.client(key, headers=HTML)
+    as_cookie = service.client(token=None, headers=HTML, cookies={"stimrig_session": f"Bearer {key}"})
+    assert by_key.get("/v1/rig", headers={"Accept": "application/json"}).status_code == 200
+    assert removed.get("/").status_code == 200
+    remove(removed, client, service)
+    assert 'action="/v1/stop"' not in removed.get("/nowhere").text
+    monkeypatch.setattr(service.app.state.context.auth, "ask", gone)
+    for stranger in (by_key, as_cookie, removed):
+        assert 'action="/v1/stop"' not in stranger.get("/nowhere").text
+
+
 @pytest.mark.parametrize("end", [sign_out, run_out, new_password, remove, locked_out])
 @pytest.mark.parametrize("shown", ["test", "home"])
 def test_a_page_that_shows_the_button_stops_whatever_became_of_its_session(

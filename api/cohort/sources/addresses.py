@@ -25,19 +25,12 @@ def sources_of(addresses: Sequence[str], token: str = "", scheduler: str = "") -
     if not addresses:
         raise CohortError("DATA is missing. Give files, folders, s3://… or the https://… of a centre.")
     sources = [_source(address, token) for address in addresses]
-    if any(isinstance(source, Centre) for source in sources) and not _private(scheduler):
+    if any(isinstance(source, Centre) for source in sources) and scheduler and not scheduler.startswith("tls://"):
         raise CohortError(
-            f"--scheduler {scheduler}: the token would go to the workers in the clear. "
+            f"--scheduler {scheduler}: the token would go on to the workers in the clear, wherever they are. "
             "Start the scheduler with TLS and give tls://… (docs/cohorts.md)."
         )
     return sources
-
-
-def _private(scheduler: str) -> bool:
-    """Whether nobody on the network reads what is sent there."""
-    protocol, separator, rest = scheduler.partition("://")
-    there = urlsplit(f"//{rest if separator else scheduler}").hostname
-    return not scheduler or protocol == "tls" or loopback(there or "")
 
 
 def _source(address: str, token: str) -> Source:

@@ -72,7 +72,7 @@ async def look(request: Request) -> None:
     except ApiError:
         return
     except (SQLAlchemyError, TimeoutError):
-        name = context.auth.seen(request)
+        name = context.auth.seen_on_page(request)
         if name is not None and getattr(request.state, "stop_right", None) is None:
             request.state.stop_right = _right_of(context, name)
 

@@ -205,7 +205,17 @@ for number, line in enumerate(sys.stdin):
 
 @pytest.mark.parametrize(
     "said",
-    ["no JSON", "{}", "[1]", "{'row': 3}", "{'row': {'status': 'copy'}}", "[" * 100_000, "x" * 17_000_000, "\\xff"],
+    [
+        "no JSON",
+        "{}",
+        "[1]",
+        "{'row': 3}",
+        "{'row': {'status': 'copy'}}",
+        "[" * 100_000,
+        "x" * 17_000_000,
+        "\\xff",
+        "{'row': {'status': 'ok', 'notes': " + "[" * 700 + "]" * 700 + "}}",
+    ],
     ids=lambda said: said[:20],
 )
 def test_a_process_that_was_taken_over_cannot_end_a_run(
@@ -218,6 +228,24 @@ def test_a_process_that_was_taken_over_cannot_end_a_run(
     try:
         found = row(computing, b"")
         assert (found["status"], found["error_kind"]) == ("error", "unexpected")
+    finally:
+        computing.close()
+
+
+def test_a_second_answer_is_nobody_elses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    twice = """
+import sys
+print('{"ready": true, "left_open": {}}', flush=True)
+for number, line in enumerate(sys.stdin):
+    print('{"row": {"status": "ok", "participant": "P%d"}}\\n' % number * 2, end="", flush=True)
+"""
+    script = tmp_path / "twice.py"
+    script.write_text(twice)
+    monkeypatch.setattr(parent, "CHILD", (sys.executable, str(script)))
+    computing = Computing(MEMORY)
+    try:
+        found = [row(computing, b"")["participant"] for _ in range(3)]
+        assert found == ["P0"] * 3, "a fresh process each time, for the one before said what nobody asked"
     finally:
         computing.close()
 

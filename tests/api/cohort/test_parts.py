@@ -225,8 +225,9 @@ def test_columns_have_types_and_units(output: Path) -> None:
 
 
 def test_nonsense_in_a_record_never_ends_a_run() -> None:
-    table = table_of([{**made("a"), "kind": "\ud800", "begun_utc": "yesterday", "nobody": "knows"}])
+    table = table_of([{**made("a"), "kind": "\ud800", "begun_utc": "yesterday", "day": "garbage", "nobody": "knows"}])
     assert table.schema.equals(SCHEMA) and table["begun_utc"][0].as_py() is None
+    assert table["day"][0].as_py() is None
     table = table_of(
         [made("a"), {**made("b"), "bytes": 2**70, "rate_hz": "fast", "begun_utc": {}, "effects": [{"x": 1}]}]
     )

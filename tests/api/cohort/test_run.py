@@ -18,7 +18,7 @@ from distributed.scheduler import KilledWorker
 from api.cohort import flight, worker
 from api.cohort.cluster import check_versions
 from api.cohort.errors import CohortError, CutOffError
-from api.cohort.flight import LARGEST_PARCEL
+from api.cohort.flight import LARGEST_PARCEL, Flight
 from api.cohort.parent import close_all
 from api.cohort.parts import Results
 from api.cohort.run import AHEAD, Run, Tally
@@ -79,7 +79,7 @@ def test_a_mixed_folder_gives_a_row_for_each_file(client: Client, folder: Path, 
     rows = read(tmp_path / "r.parquet")
     assert Counter(row["status"] for row in rows) == {"ok": 12, "error": 10}
     assert (tally.ok, tally.error, tally.copies) == (12, 10, 0)
-    assert run.flight.most <= AHEAD * LANES
+    assert run.flight.most <= AHEAD * LANES * LARGEST_PARCEL
     for row in rows:
         assert row["software"] == software_version() and row["verb"] == "fit" and row["address"] and row["took_s"] >= 0
         if row["status"] == "error":
@@ -165,12 +165,13 @@ class Endless:
         raise worker.SourceError("it is not there")
 
 
-def test_a_long_list_is_never_held_at_once(client: Client, tmp_path: Path) -> None:
+def test_a_long_list_is_never_held_at_once(client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(flight, "PARCEL_S", 60.0)  # however busy the machine is
     source = Endless(300)
     ahead: list[int] = []
     run, tally = go(client, [source], tmp_path / "r.parquet", tell=lambda one: ahead.append(source.listed - one.now))
     assert tally.error == 300 and {row["error_kind"] for row in read(tmp_path / "r.parquet")} == {"unreadable"}
-    assert run.flight.most <= AHEAD * LANES and max(ahead) <= AHEAD * LANES * LARGEST_PARCEL
+    assert max(run.flight.most, *ahead) <= AHEAD * LANES * LARGEST_PARCEL
     assert max(ahead) > AHEAD * LANES, "records that come back at once travel together"
 
 
@@ -192,28 +193,53 @@ def test_long_records_travel_alone(client: Client, tmp_path: Path, monkeypatch: 
     assert run.flight.size == 1 and tally.error == 30 and len(read(tmp_path / "r.parquet")) == 30
 
 
+def sent(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
+    """The keys of the records of each parcel, as they are sent."""
+    parcels: list[list[str]] = []
+    send = Flight.send
+
+    def noted(self: Flight, records: list[worker.Record], tries: int = 1) -> None:
+        parcels.append([entry.key for _, entry, _ in records])
+        send(self, records, tries)
+
+    monkeypatch.setattr(Flight, "send", noted)
+    return parcels
+
+
 def test_what_was_not_begun_is_sent_again(client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    parcels = sent(monkeypatch)
+
     def impatient(records: list[Any], task: Task, bounds: worker.Bounds, _patience_s: float) -> worker.Done:
         return worker.run_parcel(records, task, bounds, 0.0 if len(records) > 3 else 60.0)
 
     monkeypatch.setattr(flight, "run_parcel", impatient)
+    monkeypatch.setattr(flight, "PARCEL_S", 60.0)
     _, tally = go(client, [Endless(100)], tmp_path / "r.parquet")
     names = [row["name"] for row in read(tmp_path / "r.parquet")]
-    assert tally.error == 100 and sorted(names, key=int) == [str(number) for number in range(100)]
+    assert (
+        max(map(len, parcels)) > 3
+        and tally.error == 100
+        and sorted(names, key=int) == [str(number) for number in range(100)]
+    )
 
 
 def test_of_a_parcel_with_which_workers_are_lost_only_the_culprit_is(
     client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    parcels = sent(monkeypatch)
+
     def deadly(records: list[Any], *more: Any) -> worker.Done:
         if any(entry.key == "17" for _, entry, _ in records):
             raise KilledWorker("it", SimpleNamespace(address="tcp://gone"), 0)  # pyright: ignore[reportArgumentType]
         return worker.run_parcel(records, *more)
 
     monkeypatch.setattr(flight, "run_parcel", deadly)
+    monkeypatch.setattr(flight, "PARCEL_S", 60.0)
     go(client, [Endless(40)], tmp_path / "r.parquet")
     kinds = {row["name"]: row["error_kind"] for row in read(tmp_path / "r.parquet")}
     assert len(kinds) == 40 and [name for name, kind in kinds.items() if kind == "killed"] == ["17"]
+    with_it = [names for names in parcels if "17" in names]
+    assert len(with_it[0]) > 1 and with_it[-1] == ["17"]
 
 
 def test_a_place_that_goes_while_it_is_listed_ends_the_run_and_keeps_what_is_done(
