@@ -23,8 +23,10 @@ from identify.estimation.uncertainty import bands
 from identify.model import Covariance, Model, Noise
 from identify.noise.ar1 import ar1_or_white
 from identify.recruitment.curve import Curve
+from identify.simulation.joint_surface import joint_tables
 from identify.simulation.predict import fingerprint, predict_on
 
+AT_WORK = 0.05
 EASED = 0.98
 """Share of the penalty that is removed to see how far it holds the curve back."""
 
@@ -76,7 +78,19 @@ def finish(
     model = model.with_(
         bands=bands(model, _unpenalised_change(fitted)), valid_for=valid_for(model, setup.grid, setup.fitted)
     )
+    model = model.with_(joint=_joint(model, setup.grid, setup.fitted))
     return model.with_(quality=quality(model, setup.grid, setup.fitted, fitted.converged))
+
+
+def _joint(model: Model, grid: Grid, rows: np.ndarray) -> dict[str, Any]:
+    """g and h over the angles and velocities of the fitted rows; empty without an angle, or where nothing asks for one.
+
+    Rows with less than `AT_WORK` of the largest torque show the passive part alone.
+    """
+    if grid.angle_rad is None or grid.velocity_rad_s is None:
+        return {}
+    level = np.abs(model.recruitment(grid.pulse_width_us[rows]))
+    return joint_tables(model, grid.angle_rad[rows], grid.velocity_rad_s[rows], level > AT_WORK * float(level.max()))
 
 
 def _parts(fitted: Fitted) -> dict[str, Any]:
@@ -135,6 +149,7 @@ def _covariance(fitted: Fitted, known: int) -> Covariance:
 def _effect(fitted: Fitted, index: int) -> dict[str, Any]:
     chosen = fitted.problem.chosen[index]
     setup = fitted.problem.setup
+    joint = {"reference_rad": setup.reference_rad, "angle_range_rad": setup.angle_range_rad}
     return {
         "id": chosen.effect,
         "form": chosen.form.name,
@@ -147,7 +162,8 @@ def _effect(fitted: Fitted, index: int) -> dict[str, Any]:
             "zero_nm": setup.zero_nm,
             "sign": setup.sign,
             "reference_s": setup.reference_s,
-        },
+        }
+        | {name: value for name, value in joint.items() if value is not None},
     }
 
 
