@@ -15,6 +15,8 @@ from identify.dynamics.variable_speed import SpeedLaw
 STAGES = ("pulse_width", "gain", "speed", "branch", "delay", "filter", "output", "additive", "sensor")
 """The stages at which a form can act, in the order in which the signal passes them: see `Form`."""
 
+JOINT = ("angle_rad", "velocity_rad_s")
+"""Columns that tell where the joint is."""
 LEAST_RANGE_RAD = 0.1
 """A smaller range of angles counts as this one: of a joint that is held, noise is no shape."""
 
@@ -322,6 +324,18 @@ class Effect:
     def stage(self) -> str:
         """The stage of its first form."""
         return self.forms[0].stage
+
+    @property
+    def moves_with_joint(self) -> bool:
+        """Whether it depends on the angle or the velocity of the joint."""
+        return any(need in JOINT for need in self.needs)
+
+    @property
+    def part(self) -> str:
+        """Where it stands in the paper's Fig. 2: "f", "G", "g" or "h"; "" where that has no place for it."""
+        if self.moves_with_joint:
+            return "h" if self.stage == "additive" else "g"
+        return {"pulse_width": "f", "gain": "f", "additive": "", "sensor": "", "output": ""}.get(self.stage, "G")
 
     def form(self, name: str) -> Form:
         """A form by its name; the first form if the name is empty."""

@@ -90,7 +90,9 @@ def _joint(model: Model, grid: Grid, rows: np.ndarray) -> dict[str, Any]:
     if grid.angle_rad is None or grid.velocity_rad_s is None:
         return {}
     level = np.abs(model.recruitment(grid.pulse_width_us[rows]))
-    return joint_tables(model, grid.angle_rad[rows], grid.velocity_rad_s[rows], level > AT_WORK * float(level.max()))
+    return joint_tables(
+        model, model.covariance, grid.angle_rad[rows], grid.velocity_rad_s[rows], level > AT_WORK * float(level.max())
+    )
 
 
 def _parts(fitted: Fitted) -> dict[str, Any]:

@@ -33,7 +33,7 @@ class Reference:
         Pulses per second.
     angle_rad : ndarray or None, shape (K,)
         Angle of the joint, rad, mean over each pulse interval, where it moves. The torque is then the whole torque that
-        the cell measures, passive torque included, above that of a joint at rest at the model's own angle.
+        the cell measures, passive torque included, above that of a joint at rest at the first angle.
     """
 
     torque_nm: np.ndarray

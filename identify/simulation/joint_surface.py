@@ -22,24 +22,25 @@ SPEEDS = (0.0, 0.01, 0.03, 0.06, 0.12, 0.25, 0.5, 0.75, 1.0)
 """Velocities of the table, as shares of the largest one: closer together near 0, where dry friction turns."""
 POINTWISE = 1.959964
 INERTIA = "inertia_nm_s2_per_rad"
-JOINT = ("angle_rad", "velocity_rad_s")
 STEP = 1e-4
 FORMULA = "T = baseline + g(x, v) y + h(x, v) + inertia a; y = G f(u); x: angle, v: velocity, a: acceleration"
 
 
 class Muscle(Protocol):
-    """The attributes of a model that its surfaces need."""
+    """The attribute of a model that its surfaces need."""
 
     @property
     def effects(self) -> tuple[dict[str, Any], ...]: ...
 
+
+class Covariance(Protocol):
+    """What bands need of a covariance: the parameters' names, and the matrix."""
+
     @property
-    def covariance(self) -> Any: ...
+    def names(self) -> tuple[str, ...]: ...
 
-
-def of_the_joint(effect: Effect) -> bool:
-    """Whether an effect depends on the joint's angle or velocity."""
-    return any(need in JOINT for need in effect.needs)
+    @property
+    def matrix(self) -> np.ndarray: ...
 
 
 @dataclass(frozen=True)
@@ -89,7 +90,7 @@ class Surfaces:
                 raise BadModel(
                     f"{error}", place=f"effects.{entry.get('id')}", fix="Install the effect's file."
                 ) from error
-            if of_the_joint(effect):
+            if effect.moves_with_joint:
                 acting.append(_Acting(effect, form, values))
         if not acting:
             return None
@@ -172,14 +173,20 @@ class Surfaces:
 
 
 def joint_tables(
-    model: Muscle, angle_rad: np.ndarray, velocity_rad_s: np.ndarray, at_work: np.ndarray
+    model: Muscle,
+    covariance: Covariance | None,
+    angle_rad: np.ndarray,
+    velocity_rad_s: np.ndarray,
+    at_work: np.ndarray,
 ) -> dict[str, Any]:
     """What MODEL.json has under `joint`: g and h on a grid, with 95 % bands, and how long each cell was seen.
 
     Parameters
     ----------
     model : Muscle
-        A model with its covariance.
+        The model.
+    covariance : Covariance or None
+        Of its parameters; without it there are no bands.
     angle_rad, velocity_rad_s : ndarray, shape (K,)
         Angle and velocity of each fitted pulse interval.
     at_work : ndarray of bool, shape (K,)
@@ -215,13 +222,13 @@ def joint_tables(
         "seen_g": _seen(angles, velocities, angle_rad[at_work], velocity_rad_s[at_work]),
         "seen_h": _seen(angles, velocities, angle_rad, velocity_rad_s),
     }
-    if model.covariance is not None:
-        found |= _bands(surfaces, model.covariance, x, v, found["g"], found["h_nm"])
+    if covariance is not None:
+        found |= _bands(surfaces, covariance, x, v, found["g"], found["h_nm"])
     return found
 
 
 def _bands(
-    surfaces: Surfaces, covariance: Any, x: np.ndarray, v: np.ndarray, g: np.ndarray, h_nm: np.ndarray
+    surfaces: Surfaces, covariance: Covariance, x: np.ndarray, v: np.ndarray, g: np.ndarray, h_nm: np.ndarray
 ) -> dict[str, Any]:
     rows = [place for place, name in enumerate(covariance.names) if "." in name]
     matrix = covariance.matrix[np.ix_(rows, rows)]

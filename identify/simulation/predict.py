@@ -19,7 +19,6 @@ from identify.effects.base import Form
 from identify.errors import BadModel
 from identify.records.record import Record
 from identify.recruitment.curve import Curve
-from identify.simulation.joint_surface import of_the_joint
 from identify.simulation.problem import Problem
 from identify.simulation.setup import Setup
 
@@ -165,7 +164,7 @@ def _own_angles(model: Muscle, record: Record, settings: Mapping[str, Any]) -> d
     """
     if "reference_rad" in settings:
         return {"reference_rad": settings["reference_rad"], "angle_range_rad": tuple(settings["angle_range_rad"])}
-    if any(of_the_joint(get(entry["id"])) for entry in model.effects) and not same_data(model, record):
+    if any(get(entry["id"]).moves_with_joint for entry in model.effects) and not same_data(model, record):
         raise BadModel(
             "the model does not say at which angle its curve holds",
             place="effects.0.settings.reference_rad",

@@ -60,7 +60,7 @@ def above_rest(
 
     What the same model gives without any pulse is taken off: voluntary effort, tremor, hum and drift of the day of the
     test are no answer to a stimulus, and won't be there again. Of a joint that moves its passive torque stays: only
-    what there is at rest at the model's own angle is taken off.
+    what there is at rest at the movement's first angle is taken off, as by the rest before a trial.
 
     Parameters
     ----------
@@ -80,8 +80,7 @@ def above_rest(
     """
     rest = round(REST_S * pulse_rate_hz)
     widths = np.asarray(pulse_width_us, float)
-    surfaces = Surfaces.of(model)
-    if surfaces is not None and motion is None:
+    if motion is None and Surfaces.of(model) is not None:
         raise BadModel(
             "the model depends on the angle of the joint", place="angle_rad", fix="Give the angle at each pulse."
         )
@@ -93,5 +92,5 @@ def above_rest(
         record = Record.from_arrays(time_s, held, np.zeros(held.size), pulse_rate_hz=pulse_rate_hz, **columns)
         return predict(model, record).reshape(-1, SAMPLES_A_PULSE).mean(axis=1)[rest:]
 
-    at_rest = motion if surfaces is None else Motion.held(surfaces.reference_rad, widths.size)
+    at_rest = None if motion is None else Motion.held(float(motion.angle_rad[0]), widths.size)
     return torque_of(widths, motion) - torque_of(np.zeros(widths.size), at_rest)
