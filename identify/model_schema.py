@@ -185,13 +185,16 @@ SETTINGS = {
     "zero_nm": number(-PLAUSIBLE, PLAUSIBLE),
     "sign": sign,
     "reference_s": number(-PLAUSIBLE, PLAUSIBLE),
+}
+JOINT_SETTINGS = {
     "reference_rad": number(-1e3, 1e3),
     "angle_range_rad": several(number(-1e3, 1e3), 2, 2, rising=True),
 }
+"""Of a record with an angle."""
 EFFECT_STATE = number(0.0, 1.0, "Give a number from 0 (rested) to 1, or leave it out: rested.")
 EFFECT = fields(
     {"id": text, "parameters": each(lambda value, place: ANY(parameter_value(value), place))},
-    {"form": text, "settings": fields({}, SETTINGS), "state": EFFECT_STATE},
+    {"form": text, "settings": fields({}, SETTINGS | JOINT_SETTINGS), "state": EFFECT_STATE},
 )
 WHOLE = number(0, LONGEST)
 _NARX = fields(

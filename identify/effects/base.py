@@ -97,6 +97,8 @@ class Scene:
         the record's start.
     angle_range_rad : tuple of float or None
         Smallest and largest angle that the model was fitted on, rad. None: those of the record.
+    begins : ndarray of bool or None, shape (K,)
+        Where a recording begins; None: at the first time alone.
     noise_sd_nm : float
         White noise of a sample, N·m.
     zero_nm : float
@@ -121,6 +123,7 @@ class Scene:
     acceleration_rad_s2: np.ndarray | None = None
     reference_rad: float | None = None
     angle_range_rad: tuple[float, float] | None = None
+    begins: np.ndarray | None = None
     noise_sd_nm: float = 0.0
     zero_nm: float = 0.0
     reference_s: float = 0.0

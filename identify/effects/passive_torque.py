@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from identify.effects.base import Effect, Form, Parameter, Scene
+from identify.effects.kernels import relaxed
 
 SURFACE = "surface"
 _VISCOUS = Parameter(
@@ -41,11 +42,9 @@ def _two_sided(_: None, p: dict[str, Any], scene: Scene) -> np.ndarray:
     )
 
 
-SHAPES = 8
+SHAPES = 12
 """Polynomials of the elastic part; the end of a joint's range bends within a tenth of it."""
-SIZES = (3.0, 3.0, 2.0, 2.0, 1.5, 1.0, 1.0, 1.0)
-DRY_RAD_S = 0.05
-"""Velocity at which dry friction is three quarters of its largest value."""
+SIZES = (3.0, 3.0, 2.0, 2.0, 1.5, 1.0, 1.0, 1.0, 0.7, 0.5, 0.4, 0.3)
 
 
 def _surface(_: None, p: dict[str, Any], scene: Scene) -> np.ndarray:
@@ -55,7 +54,17 @@ def _surface(_: None, p: dict[str, Any], scene: Scene) -> np.ndarray:
         p["viscosity_nm_s_per_rad"] + p["tilt_nm_s_per_rad"] * place + p["bow_nm_s_per_rad"] * place**2
     ) * velocity
     acceleration = 0.0 if scene.acceleration_rad_s2 is None else scene.acceleration_rad_s2
-    return elastic + viscous + p["dry_nm"] * np.tanh(velocity / DRY_RAD_S) + p["inertia_nm_s2_per_rad"] * acceleration
+    dry = p["dry_nm"] * np.tanh(velocity / p["dry_below_rad_s"])
+    return elastic + viscous + dry + _relaxing(p, scene) + p["inertia_nm_s2_per_rad"] * acceleration
+
+
+def _relaxing(p: dict[str, Any], scene: Scene) -> np.ndarray:
+    """A spring behind a dashpot: tissue that gives way (standard linear solid)."""
+    away = scene.away_rad
+    begins = np.zeros(away.size, bool) if scene.begins is None else scene.begins
+    time_constants, row = np.unique(p["relaxation_s"], return_inverse=True)
+    followed = relaxed(away, scene.time_s, begins, time_constants)
+    return p["relaxing_nm_per_rad"] * (away - followed[row.ravel()])
 
 
 _STIFF = Parameter(
@@ -118,7 +127,8 @@ EFFECT = Effect(
             SURFACE,
             "additive",
             "y + Σ elastic_k (T_k(x) - T_k(reference)) + (viscosity + tilt·x + bow·x²)·velocity + "
-            "dry·tanh(velocity/0.05 rad/s) + inertia·acceleration, x: place in the fitted range, -1 to 1",
+            "dry·tanh(velocity/below) + relaxing·(Δ - z) + inertia·acceleration, z' = (Δ - z)/relaxation, "
+            "x: place in the fitted range, -1 to 1",
             (
                 *(
                     Parameter(
@@ -138,6 +148,11 @@ EFFECT = Effect(
                 replace(_VISCOUS, name="tilt_nm_s_per_rad", about="viscosity's slope over the range"),
                 replace(_VISCOUS, name="bow_nm_s_per_rad", about="viscosity's curvature over the range"),
                 Parameter("dry_nm", "N·m", -0.5, 0.5, 0.0, (0.0,), "linear", "torque", "dry friction"),
+                Parameter(
+                    "dry_below_rad_s", "rad/s", 0.01, 0.5, 0.07, (0.07,), "log", about="where it is less than that"
+                ),
+                replace(_STIFF, name="relaxing_nm_per_rad", start=(0.0,), about="stiffness that gives way"),
+                Parameter("relaxation_s", "s", 0.3, 10.0, 1.0, (1.0,), "log", about="time in which it does"),
                 Parameter(
                     "inertia_nm_s2_per_rad", "N·m·s²/rad", -0.5, 0.5, 0.0, (0.0,), about="of what the cell moves"
                 ),

@@ -27,7 +27,7 @@ def _bell(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
 
 
 SMOOTH = "smooth"
-SIZES = (1.5, 1.5, 1.0, 1.0, 0.7, 0.5)
+SIZES = (1.5, 1.5, 1.0, 1.0, 0.7, 0.5, 0.4, 0.3, 0.25, 0.2)
 
 
 def _smooth(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:

@@ -124,7 +124,10 @@ class Surfaces:
         return (torque / large).reshape(np.shape(angle_rad))
 
     def h_nm(self, angle_rad: np.ndarray, velocity_rad_s: np.ndarray) -> np.ndarray:
-        """Passive torque, 0 at rest at the reference angle, with the record's sign, N·m; of the inputs' shape."""
+        """Passive torque, 0 at rest at the reference angle, with the record's sign, N·m; of the inputs' shape.
+
+        Of tissue that has been there for long: what of it relaxes is not in it.
+        """
         scene = self._scene(angle_rad, velocity_rad_s)
         total = np.zeros((1, scene.time_s.size))
         for one in self.acting:
@@ -145,6 +148,7 @@ class Surfaces:
             velocity_rad_s=velocity,
             reference_rad=self.reference_rad,
             angle_range_rad=None if known is None else (float(known[0]), float(known[1])),
+            begins=np.ones(angle.size, bool),
         )
 
     def _with(self, name: str, value: float) -> Surfaces:

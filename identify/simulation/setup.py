@@ -103,7 +103,7 @@ class Setup:
         grid = self.grid
         mean = np.bincount(grid.interval, grid.fraction, minlength=grid.size) / np.maximum(grid.count, 1)
         mean = np.where(grid.count > 0, mean, 0.5)
-        scene = self._scene((np.arange(grid.size) + mean) * grid.step_s, grid.pulse_width_us)
+        scene = self._scene((np.arange(grid.size) + mean) * grid.step_s, grid.pulse_width_us, grid.begins)
         pauses = np.zeros(grid.size)
         pauses[grid.begins] = [part.pause_s - part.folded_s for part in grid.record.parts]
         return replace(scene, fitted=self.fitted, pauses_s=pauses, states=self.states)
@@ -112,16 +112,18 @@ class Setup:
     def scene_at_ends(self) -> Scene:
         """At the ends of the intervals, shape (K + 1,)."""
         grid = self.grid
-        return self._scene(np.arange(grid.size + 1) * grid.step_s, np.r_[grid.pulse_width_us, grid.pulse_width_us[-1]])
+        widths_us = np.r_[grid.pulse_width_us, grid.pulse_width_us[-1]]
+        return self._scene(np.arange(grid.size + 1) * grid.step_s, widths_us, grid.begins)
 
     @cached_property
     def scene_at_samples(self) -> Scene:
         """At the record's samples, shape (N,)."""
         grid = self.grid
         time_s = (grid.interval + grid.fraction) * grid.step_s
-        return self._scene(time_s, grid.pulse_width_us[grid.interval])
+        first = np.array([part.first for part in grid.record.parts])
+        return self._scene(time_s, grid.pulse_width_us[grid.interval], first)
 
-    def _scene(self, time_s: np.ndarray, width_us: np.ndarray) -> Scene:
+    def _scene(self, time_s: np.ndarray, width_us: np.ndarray, first: np.ndarray) -> Scene:
         grid, record = self.grid, self.grid.record
         angle, velocity = record.angle_rad, record.velocity_rad_s
         own = record.time_s - grid.start_s
@@ -139,6 +141,7 @@ class Setup:
             acceleration_rad_s2=None if acceleration is None else np.interp(time_s, own, acceleration),
             reference_rad=self.reference_rad,
             angle_range_rad=self.angle_range_rad,
+            begins=np.isin(np.arange(time_s.size), first),
             noise_sd_nm=self.noise_sd_nm,
             zero_nm=self.zero_nm,
             reference_s=self.reference_s,
