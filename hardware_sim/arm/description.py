@@ -7,6 +7,15 @@
     from_deg = 30
     to_deg = 120
     deg_s = 20
+    [mechanics]           # what `hardware_sim.arm.mechanics` says of the forearm
+    weight_nm = 2.8
+    [passive]             # the law of each place, and its parameters
+    law = "linear_friction"
+    dry_nm = 0.3
+    [torque_angle]
+    law = "moment_arm"
+    [torque_velocity]
+    law = "none"
 """
 
 from __future__ import annotations
@@ -20,18 +29,21 @@ from pathlib import Path
 from typing import Any
 
 from hardware_sim.arm import registry
+from hardware_sim.arm.mechanics import Mechanics
 from hardware_sim.arm.motion import LARGEST_DEG, SMALLEST_DEG, within
+from hardware_sim.arm.tissue import DEFAULT_LAWS, PLACES, Tissue, built, law
 from hardware_sim.errors import ArmError
 
-KEYS = ("mode", "movement")
+KEYS = ("mode", "movement", "mechanics", *PLACES)
 
 
 @dataclass(frozen=True)
 class Arm:
-    """What moves it at first and how."""
+    """What moves it at first and how, and its tissue."""
 
     mode: str = "held"
     movement: Mapping[str, Any] = field(default_factory=dict)
+    tissue: Tissue = field(default_factory=Tissue)
 
     @property
     def start_deg(self) -> float:
@@ -77,7 +89,20 @@ def _from_file(path: Path) -> Arm:
         raise ArmError(f"{path}: not valid {'JSON' if path.suffix == '.json' else 'TOML'}: {error}") from None
     if not isinstance(described, dict) or set(described) - set(KEYS):
         raise ArmError(f"{path}: an arm's file is a table of {', '.join(KEYS)}")
-    movement = described.get("movement", {})
-    if not isinstance(movement, dict):
-        raise ArmError(f"{path}: 'movement' must be a table of the mode's settings")
-    return Arm(str(described.get("mode", "held")), movement)
+    tables = {key: described.get(key, {}) for key in KEYS[1:]}
+    for key, table in tables.items():
+        if not isinstance(table, dict):
+            raise ArmError(f"{path}: '{key}' must be a table")
+    try:
+        return Arm(str(described.get("mode", "held")), tables.pop("movement"), _tissue(tables))
+    except ArmError as error:
+        raise ArmError(f"{path}: {error}") from None
+
+
+def _tissue(tables: dict[str, dict[str, Any]]) -> Tissue:
+    mechanics = built(Mechanics, "mechanics", tables.pop("mechanics"))
+    laws = {}
+    for place, table in tables.items():
+        parameters = {key: value for key, value in table.items() if key != "law"}
+        laws[place] = law(place, str(table.get("law", DEFAULT_LAWS[place])), parameters)
+    return Tissue(**laws, mechanics=mechanics)

@@ -2,17 +2,17 @@
 
 Of the forearm: I ẍ = active + passive + gravity − cell. So the cell measures
 
-    T = active(f, G, x, ẋ) + passive(x, ẋ) + gravity(x) − I ẍ,    flexion positive,
+    T = g(x, ẋ) · isometric(f, G) + h(x, ẋ) − I ẍ,    flexion positive,
 
-where I is that of forearm, hand and all that moves with them on the muscle's side of the cell. What the holder's side
-of the cell weighs does not appear. A forearm that nobody holds loads no cell: T = 0 and I ẍ = active + passive +
-gravity.
+where `isometric` is the muscle's torque at the reference angle, h is passive torque, stops and gravity, and I is the
+inertia of forearm, hand and all that moves with them on the muscle's side of the cell. What the holder's side of the
+cell weighs does not appear. A forearm that nobody holds loads no cell: T = 0, and I ẍ is the sum of the others.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from hardware_sim.arm import registry
@@ -21,17 +21,23 @@ from hardware_sim.arm.motion import Begin, Motion
 from hardware_sim.patients.muscle import Muscle
 
 LONGEST_STEP_S = 1.0 / 1600.0
-INERTIA_KG_M2 = 0.07
 
 
 class Limb:
-    """A muscle whose joint moves; it implements the `Muscle` protocol for load cell and electrodes."""
+    """A muscle whose joint moves; it implements the `Muscle` protocol for load cell and electrodes.
+
+    Time advances in steps of at most 1/1600 s. A muscle that itself depends on the joint has a method
+    `joint(angle_rad, velocity_rad_s)`, which is told of each step before the muscle takes it.
+    """
 
     def __init__(self, muscle: Muscle, arm: Arm, seed: int = 0) -> None:
         self._seed = seed
         self.motion = Motion(math.radians(arm.start_deg))
         self.converted_nm = getattr(muscle, "converted_nm", None)
-        self._muscle = muscle
+        self._muscle, self._tissue = muscle, arm.tissue
+        self._tell_joint: Callable[[float, float], None] | None = getattr(muscle, "joint", None)
+        self._inertia_kg_m2 = arm.tissue.mechanics.inertia_kg_m2
+        self._memory = arm.tissue.passive.begin(self.motion.angle_rad)
         self._time_s = 0.0
         self._isometric_nm = 0.0
         self.move(arm.mode, arm.movement)
@@ -58,7 +64,8 @@ class Limb:
         self._advance(time_s)
         if not self._mover.holds:
             return 0.0
-        return self._net_nm(*self.motion[:2]) - INERTIA_KG_M2 * self.motion.acceleration_rad_s2
+        angle_rad, velocity_rad_s, acceleration_rad_s2 = self.motion
+        return self._net_nm(angle_rad, velocity_rad_s) - self._inertia_kg_m2 * acceleration_rad_s2
 
     def angle_deg(self, time_s: float) -> float:
         """Advance to `time_s` and give the true angle there, degrees."""
@@ -84,11 +91,17 @@ class Limb:
 
     def _step_to(self, time_s: float) -> None:
         self.motion = self._mover.advance(time_s, self._acceleration_rad_s2)
+        angle_rad, velocity_rad_s, _ = self.motion
+        self._memory = self._tissue.passive.step(self._memory, angle_rad, time_s - self._time_s)
+        if self._tell_joint is not None:
+            self._tell_joint(angle_rad, velocity_rad_s)
         self._isometric_nm = self._muscle.torque_nm(time_s)
         self._time_s = time_s
 
     def _acceleration_rad_s2(self, angle_rad: float, velocity_rad_s: float) -> float:
-        return self._net_nm(angle_rad, velocity_rad_s) / INERTIA_KG_M2
+        return self._net_nm(angle_rad, velocity_rad_s) / self._inertia_kg_m2
 
-    def _net_nm(self, angle_rad: float, velocity_rad_s: float) -> float:  # noqa: ARG002
-        return self._isometric_nm
+    def _net_nm(self, angle_rad: float, velocity_rad_s: float) -> float:
+        active_nm = self._tissue.g(angle_rad, velocity_rad_s) * self._isometric_nm
+        remembered_nm = self._tissue.passive.remembered_nm(self._memory, angle_rad)
+        return float(active_nm + self._tissue.h_nm(angle_rad, velocity_rad_s) + remembered_nm)
