@@ -21,7 +21,7 @@ class Mover:
         to_deg: float = 120.0,
         deg_s: float = 30.0,
         pause_s: float = 0.5,
-        bandwidth_hz: float = 4.0,
+        bandwidth_hz: float = 2.5,
         damping: float = 0.9,
         limit_deg_s: float = 180.0,
     ) -> None:
