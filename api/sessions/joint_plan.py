@@ -9,15 +9,15 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-PASSIVE, HELD, MOVING = "passive", "held", "moving"
+from api.sessions.angles import TOLERANCE_RAD
+from rig.messages import HELD, MOVING, PASSIVE
+
 KINDS = (PASSIVE, HELD, MOVING)
 """Kinds of guided tests."""
-TOLERANCE_RAD = 0.09
-"""How near to its angle a held joint must be (5°)."""
 ROUND_RAD = math.radians(5)
 """Angles to hold are whole multiples: a goniometer is read so."""
 LEAST_RANGE_RAD = math.radians(30)
@@ -85,7 +85,7 @@ class Curve:
         return float(low)
 
 
-def curve_of(table: dict[str, Sequence[float]] | None, largest_us: float, motor_us: float | None) -> Curve:
+def curve_of(table: Mapping[str, Sequence[float]] | None, largest_us: float, motor_us: float | None) -> Curve:
     """The approved model's recruitment curve; where there is none, a straight line from the motor threshold on.
 
     Parameters
@@ -103,7 +103,7 @@ def curve_of(table: dict[str, Sequence[float]] | None, largest_us: float, motor_
     return Curve((begin_us, largest_us), (0.0, 1.0), False)
 
 
-def _rises(table: dict[str, Sequence[float]], largest_us: float) -> bool:
+def _rises(table: Mapping[str, Sequence[float]], largest_us: float) -> bool:
     """Whether a model's curve can be planned with: it pulls the joint at the widest pulse."""
     curve = Curve(tuple(table["pulse_width_us"]), tuple(table["torque_nm"]), True)
     return len(curve.torque_nm) > 1 and curve.torque(largest_us) > 0.0

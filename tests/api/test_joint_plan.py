@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import pytest
 from hypothesis import given, settings
@@ -10,12 +11,14 @@ from hypothesis import strategies as st
 
 from api.sessions import joint_plan
 from api.sessions.joint_plan import Curve, curve_of, layout, targets, torque_time, widths_of
-from rig.messages import Profile, TestPlan
 from rig.limits import HARD_LIMITS, for_profile
+from rig.messages import Profile, TestPlan
 from rig.plan import build
 
 RATE_HZ = 40.0
-TEST = TestPlan(test_id="T1", participant="P1", profile=Profile(current_ma=20, max_pulse_width_us=300, max_torque_nm=30))
+TEST = TestPlan(
+    test_id="T1", participant="P1", profile=Profile(current_ma=20, max_pulse_width_us=300, max_torque_nm=30)
+)
 
 
 def paper_us(largest_us: float) -> list[float]:
@@ -66,7 +69,7 @@ def test_three_to_five_angles_by_the_range(degrees: float, count: int) -> None:
 def test_angles_rise_and_keep_off_the_ends(low: float, width: float) -> None:
     found = targets((low, low + width))
     assert found == sorted(found) and 3 <= len(found) <= 5
-    assert all(b - a > joint_plan.TOLERANCE_RAD / 2 for a, b in zip(found, found[1:], strict=False))
+    assert all(b - a > joint_plan.TOLERANCE_RAD / 2 for a, b in pairwise(found))
     margin = min(2 * joint_plan.TOLERANCE_RAD, width / 6)
     assert found[0] >= low + margin - 1e-6 and found[-1] <= low + width - margin + 1e-6
 
