@@ -197,7 +197,8 @@ class JobOut(Document):
 
     id: str
     kind: str
-    model_id: str
+    model_id: str | None = Field(description="of which it is; null of `fit-recordings`")
+    participant: str | None = Field(description="of `fit-recordings`")
     state: Literal["running", "completed", "failed", "cancelled"]
     done: bool
     progress: float
