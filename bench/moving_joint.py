@@ -22,9 +22,8 @@ import numpy as np
 from bench.stamp import written_by
 from hardware_sim.arm_patient import ArmPatient, arm_patient
 from hardware_sim.arm_records import held_angles_rad, record
-from identify.fitting import fit
+from identify.fitting import MOVING_JOINT, fit
 from identify.model import Model
-from identify.moving import EFFECTS
 from identify.records.join import join
 from identify.records.record import Record
 from identify.simulation.predict import predict
@@ -65,7 +64,7 @@ def one(seed: int) -> dict[str, Any]:
     told["isometric"] = active_errors(arm, alone, arm.reference_rad)
     for name, made in (("guided", guided), ("all", [isometric, *guided])):
         began = time.process_time()
-        model = fit(joined(made), effects=EFFECTS)
+        model = fit(joined(made), effects=MOVING_JOINT)
         told[name] = {"cpu_s": time.process_time() - began, **judged(arm, Model.from_json(model.to_json()), unseen)}
     return told
 
@@ -81,7 +80,7 @@ def laws(arm: ArmPatient) -> dict[str, Any]:
 
 
 def judged(arm: ArmPatient, model: Model, unseen: dict[str, Any]) -> dict[str, Any]:
-    """Errors of g and h where they were seen, coverage of their bands, and the error of an unseen trial over its noise."""
+    """Errors of g and h where they were seen, what their bands hold, and an unseen trial's error over its noise."""
     known = {name: np.asarray(value) for name, value in model.joint.items() if name != "formula"}
     reference = float(known["reference_angle_rad"])
     x, v = np.meshgrid(known["angle_rad"], known["velocity_rad_s"], indexing="ij")
