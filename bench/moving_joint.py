@@ -19,17 +19,17 @@ from typing import Any
 
 import numpy as np
 
+from api.sessions import joint_plan
 from bench.stamp import written_by
 from hardware_sim.arm_patient import ArmPatient, arm_patient
-from hardware_sim.arm_records import held_angles_rad, record
+from hardware_sim.arm_records import record
 from identify.fitting import MOVING_JOINT, fit
 from identify.model import Model
 from identify.records.join import join
 from identify.records.record import Record
 from identify.simulation.predict import predict
 
-PASSIVE_S, MOVING_S, UNSEEN_S = 66.0, 24.0, 30.0
-HELD = 4
+PASSIVE_S, UNSEEN_S, RATE_HZ = 66.0, 30.0, 40.0
 COLUMNS = ("time_s", "pulse_width_us", "torque_nm")
 
 
@@ -54,19 +54,35 @@ def one(seed: int) -> dict[str, Any]:
     """One arm: what was found of it, beside the truth."""
     arm = arm_patient(seed)
     isometric = record(arm, "isometric", seed)
-    guided = [record(arm, "passive", seed, duration_s=PASSIVE_S)]
-    guided += [record(arm, "held", seed + place, angle_rad=x) for place, x in enumerate(held_angles_rad(arm, HELD))]
-    guided.append(record(arm, "moving", seed, duration_s=MOVING_S))
+    alone = fit(as_record(isometric))
+    guided = guided_tests(arm, alone, isometric, seed)
     unseen = record(arm, "unseen", seed, duration_s=UNSEEN_S)
     dose = {"paper": torque_time_nms(arm, isometric), "guided": sum(torque_time_nms(arm, each) for each in guided)}
     told = {"seed": seed, "laws": laws(arm), "dose": dose}
-    alone = fit(as_record(isometric))
     told["isometric"] = active_errors(arm, alone, arm.reference_rad)
     for name, made in (("guided", guided), ("all", [isometric, *guided])):
         began = time.process_time()
         model = fit(joined(made), effects=MOVING_JOINT)
         told[name] = {"cpu_s": time.process_time() - began, **judged(arm, Model.from_json(model.to_json()), unseen)}
     return told
+
+
+def guided_tests(arm: ArmPatient, model: Model, isometric: dict[str, Any], seed: int) -> list[dict[str, Any]]:
+    """The three tests as the service plans them with the model of the isometric test: passive, held, moving."""
+    width_us, torque_nm = model.recruitment.table()
+    top_us = float(arm.largest_width_us)
+    curve = joint_plan.curve_of({"pulse_width_us": list(width_us), "torque_nm": list(torque_nm)}, top_us, None)
+    every = round(isometric["time_s"].size / (isometric["time_s"][-1] * RATE_HZ))
+    layout = joint_plan.layout(arm.range_rad, curve, top_us, isometric["pulse_width_us"][::every], RATE_HZ)
+    made = [record(arm, "passive", seed, duration_s=PASSIVE_S)]
+    for place, x in enumerate(layout.targets_rad):
+        made.append(record(arm, "held", 10 * seed + place, angle_rad=x, parts=parts_of(layout.held)))
+    return [*made, record(arm, "moving", seed, parts=parts_of(layout.moving))]
+
+
+def parts_of(segments: list[dict[str, Any]]) -> list[tuple[str, np.ndarray]]:
+    """Segments of a plan, as records are made of them."""
+    return [(each["name"], np.array(each["settings"]["pulse_width_us"])) for each in segments]
 
 
 def joined(made: list[dict[str, Any]]) -> Record:

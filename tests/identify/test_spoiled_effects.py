@@ -13,6 +13,7 @@ import pytest
 import identify
 from identify.effects import registry
 from identify.effects.base import Form, Scene
+from identify.model_schema import JOINT_SETTINGS
 from tests.identify import hidden_muscles
 
 pytestmark = pytest.mark.slow
