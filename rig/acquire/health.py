@@ -34,6 +34,7 @@ class Watch:
     stale_disk_s: float = 3.0
     stuck_torque_s: float = 0.5
     clipped_torque_s: float = 3.0
+    stale_angle_s: float = 0.1
 
 
 DEFAULT_WATCH = Watch()
