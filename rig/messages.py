@@ -28,6 +28,11 @@ Direction = Literal["up", "fine", "repeat", "down"]
 
 TestOutcome = Literal["completed", "stopped", "fault"]
 
+Range = Annotated[tuple[float, float], Field(strict=False)]
+"""Lowest and highest; a list of two numbers in JSON and in Python."""
+
+PASSIVE, HELD, MOVING = "passive", "held", "moving"
+"""Kinds of tests with a joint's angle: without any pulse, at a held angle, with a movement."""
 
 LONGEST_LINE = 1_900_000
 """Bytes of a request. The rig refuses longer ones."""
@@ -75,6 +80,26 @@ class Profile(Message):
     set_at_utc: str | None = Field(default=None, description="when the calibration was finished, ISO 8601")
     expires_at_utc: str | None = Field(default=None, description="end of that day in the rig's time zone, ISO 8601")
     rest_between_tests_s: float | None = Field(default=None, description="shortest rest after a test's last pulse, s")
+    angle_range_rad: Range | None = Field(
+        default=None, description="joint angles that are comfortable today, rad; elbow: 0 is straight, flexion positive"
+    )
+
+
+class AnglePlan(Message):
+    """What a test asks of the joint's angle; refused on a rig without an angle sensor.
+
+    Only a test that has it is stopped by the angle: outside its range, away from its target, without a movement, or
+    where the sensor gives no reliable angle.
+    """
+
+    range_rad: Range = Field(description="outside it the test stops; the profile and the rig file may be tighter, rad")
+    target_rad: float | None = Field(
+        default=None, description="of a held test: it starts only here, and stops at more than twice the tolerance, rad"
+    )
+    tolerance_rad: float = Field(default=0.09, gt=0, le=0.6, description="around the target, at the start, rad")
+    still_s: float | None = Field(
+        default=None, gt=0, description="of a passive or moving test: it stops after so long without a movement, s"
+    )
 
 
 class AdaptivePlan(Message):
@@ -105,6 +130,7 @@ class TestPlan(Message):
     max_pulse_width_us: float | None = Field(default=None, description="for this test only, if tighter, µs")
     max_torque_nm: float | None = Field(default=None, description="for this test only, if tighter, N·m")
     adaptive: AdaptivePlan | None = Field(default=None, description="the test may be extended while it plays")
+    angle: AnglePlan | None = Field(default=None, description="what it asks of the joint's angle")
 
     @property
     def largest_us(self) -> float:
@@ -250,6 +276,19 @@ class CalibrateFinishRequest(Message):
     discard: bool = False
 
 
+class AnglePoseRequest(Message):
+    """Tell the angle that a goniometer shows while the joint is held still. Reply: `Status` with `angle`.
+
+    The first pose begins a calibration of the angle sensor, the second, at least 0.5 rad away, completes it. The next
+    one begins a new calibration; the old one holds until that is complete, too.
+    """
+
+    kind: Literal["angle_pose"] = "angle_pose"
+    id: int = 0
+    angle_rad: float = Field(description="elbow: 0 is straight, flexion positive, rad")
+    by: str
+
+
 Request = Annotated[
     StatusRequest
     | SubscribeRequest
@@ -263,7 +302,8 @@ Request = Annotated[
     | CalibrateStartRequest
     | CalibrateStepRequest
     | CalibrateMarkRequest
-    | CalibrateFinishRequest,
+    | CalibrateFinishRequest
+    | AnglePoseRequest,
     Field(discriminator="kind"),
 ]
 
@@ -283,7 +323,7 @@ class Reply(Message):
     ok: bool
     problem: Problem | None = None
     body: dict[str, Any] = Field(default_factory=dict)
-    """status, subscribe, start, rearm, calibrate-start, -step and -mark: a `Status`; preview: a `Preview`;
+    """status, subscribe, start, rearm, calibrate-start, -step and -mark, angle_pose: a `Status`; preview: a `Preview`;
     sequences: a `Sequences`; stop: a `StopEvidence`; calibrate-finish: a `CalibrationResult`; extend and enough: an
     `Extended`."""
 
@@ -336,6 +376,38 @@ class Bound(Message):
     owner: str = Field(description="who set it: hard limit or rig file")
 
 
+class AnglePose(Message):
+    """One pose of a calibration of the angle sensor."""
+
+    angle_rad: float = Field(description="what the goniometer showed")
+    raw: float = Field(description="what the sensor gave, in its unit")
+
+
+class AngleCalibration(Message):
+    """Two poses and what follows from them: angle_rad = direction × radians_per_unit × (raw − offset)."""
+
+    poses: list[AnglePose]
+    offset: float = Field(description="raw value of a straight arm, in the sensor's unit")
+    direction: Literal[-1, 1]
+    radians_per_unit: float
+    by: str
+    set_at_utc: str
+
+
+class AngleStatus(Message):
+    """The joint's angle now, as the rig's angle sensor gives it."""
+
+    present: bool = Field(default=False, description="whether the rig file names an angle sensor")
+    angle_rad: float | None = None
+    velocity_rad_s: float | None = Field(default=None, description="of the last 50 ms, so 25 ms late")
+    age_s: float | None = Field(default=None, description="age of the newest angle; None: there was none")
+    calibrated: bool = Field(default=False, description="by two poses")
+    range_rad: Range | None = Field(default=None, description="that this rig allows in a test; None: no sensor")
+    problem: str = Field(default="", description="why the sensor gives nothing; empty: nothing is wrong")
+    pose: AnglePose | None = Field(default=None, description="first pose of a calibration that waits for its second")
+    calibration: AngleCalibration | None = None
+
+
 class Status(Message):
     state: RigState
     reason: str = Field("", description="why the rig is latched, uncertain or disconnected")
@@ -348,6 +420,7 @@ class Status(Message):
     load_cell: dict[str, Any] = Field(default_factory=dict, description="device, measured sample rate, bus")
     torque_age_s: float | None = Field(None, description="age of the newest torque sample; None: there was none")
     torque_nm: float | None = None
+    angle: AngleStatus = Field(default_factory=AngleStatus)
     calibration: CalibrationStatus | None = Field(None, description="while a guided calibration is open")
     limits: dict[str, Bound] = Field(default_factory=dict, description="limits of this rig by name")
     require_calibration: bool | None = Field(None, description="None: unknown")
@@ -473,7 +546,14 @@ class LiveEvent(Message):
         default_factory=list,
         description="pulses that were sent more than 2 ms late; adaptive tests only, for who subscribed with `samples`",
     )
+    angle_rad: float | None = Field(None, description="the newest; None without a sensor, or where it gives nothing")
+    velocity_rad_s: float | None = Field(None, description="of the last 50 ms, so 25 ms late")
     samples: TorqueSamples | None = Field(None, description="for who subscribed with `samples`")
+    angle: list[list[float | None]] | None = Field(
+        None,
+        description="for who subscribed with `samples`: time on the test's clock (s, when the host received it), angle "
+        "(rad) and velocity (rad/s, of the 50 ms before) of every sample since the last live event; None: no sensor",
+    )
 
 
 class FinishedEvent(Message):
@@ -489,7 +569,8 @@ class FinishedEvent(Message):
         default_factory=dict,
         description="duration_s, samples, lost_samples, pulses, dropped_pulses, lateness_ms {median, p99, max}, "
         "ack_delay_ms {median, p99, max}, charge_uc, torque_time_nms, ended_by, alignment {method, error_ms}, "
-        "sample_rate_hz, torque_peak_nm, cpu_percent, warnings (sentences for people about possible errors)",
+        "sample_rate_hz, torque_peak_nm, angle (with a sensor: samples, lost_samples, range_rad, error_ms), "
+        "cpu_percent, warnings (sentences for people about possible errors)",
     )
 
 

@@ -71,6 +71,45 @@ class TorqueBlock:
         return len(self.samples)
 
 
+ANGLE_SAMPLE = np.dtype(
+    [
+        ("host_time_s", "<f8"),
+        ("stamp_s", "<f8"),
+        ("raw", "<f8"),
+        ("angle_rad", "<f8"),
+        ("counter", "<i8"),
+        ("fault", "u1"),
+    ]
+)
+"""One angle sample: as `SAMPLE`, with the sensor's own value, the joint's angle in rad (from a device by the rig file,
+after the receiver by the calibration), and its fault bit (255: none)."""
+
+
+@dataclass(frozen=True, slots=True)
+class AngleBlock:
+    """Angle samples in the order of arrival, dtype `ANGLE_SAMPLE`, shape (n,); n may be 0."""
+
+    samples: NDArray[np.void]
+    malformed: int = 0
+    error_frames: int = 0
+
+    def __len__(self) -> int:
+        return len(self.samples)
+
+
+@dataclass(frozen=True, slots=True)
+class AngleScale:
+    """From a sensor's value to the joint's angle: `direction` × `radians_per_unit` × (raw − `offset`)."""
+
+    offset: float = 0.0
+    direction: int = 1
+    radians_per_unit: float = 1.0
+
+    def angle_rad(self, raw: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The joint's angles, rad, shape of `raw`."""
+        return self.direction * self.radians_per_unit * (raw - self.offset)
+
+
 @dataclass(slots=True)
 class Recorded:
     """Counts that the run keeps while it records."""

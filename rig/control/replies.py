@@ -12,7 +12,7 @@ from pydantic import BaseModel, ValidationError
 from rig.errors import RigError
 from rig.messages import Problem, Reply
 
-_HEAD = re.compile(rb'\s*\{\s*"kind"\s*:\s*"([a-z-]{1,40})"\s*,\s*"id"\s*:\s*(\d{1,15})\s*[,}]')
+_HEAD = re.compile(rb'\s*\{\s*"kind"\s*:\s*"([a-z_-]{1,40})"\s*,\s*"id"\s*:\s*(\d{1,15})\s*[,}]')
 
 
 def head_of(line: bytes) -> tuple[str, int] | None:
