@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from hardware_sim.patients.hidden.draw import Scenario
     from hardware_sim.patients.hidden.live import HiddenMuscle
 
-__all__ = ["make", "movement", "reveal", "scenario"]
+__all__ = ["drawn", "make", "movement", "reveal"]
 
 NOISE_SD_NM = 0.04
 
@@ -80,6 +80,6 @@ def reveal(seed: int, moving: bool = False) -> dict[str, Any]:
     return _scenario(seed, moving).truth(NOISE_SD_NM) | {"seed": seed}
 
 
-def scenario(seed: int, moving: bool = False) -> Scenario:
+def drawn(seed: int, moving: bool = False) -> Scenario:
     """The patient with its design, for records off line."""
     return _scenario(seed, moving)
