@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from api.language import _, lazy
@@ -14,6 +16,8 @@ SEGMENTS: dict[str, Any] = {
     "opening": lazy("First look"),
     "hold": lazy("Level"),
     "step": lazy("Step"),
+    "passive": lazy("No stimulation"),
+    "moving": lazy("Level while moving"),
 }
 VERDICTS: dict[str, Any] = {
     "usable": lazy("usable"),
@@ -26,6 +30,9 @@ TEST_KINDS: dict[str, Any] = {
     "next-experiment": lazy("next experiment"),
     "sequence": lazy("trial of a controller"),
     "adaptive": lazy("test that stops itself"),
+    "passive": lazy("passive movement"),
+    "held": lazy("held angle"),
+    "moving": lazy("movement under stimulation"),
 }
 ADAPTIVE_ENDS: dict[str, Any] = {
     "known-enough": lazy("Enough is known"),
@@ -34,6 +41,15 @@ ADAPTIVE_ENDS: dict[str, Any] = {
     "time": lazy("The time is used up"),
     "limit": lazy("A limit of the whole test was reached"),
     "fixed-rest": lazy("The fixed plan was played to its end"),
+    "stopped": lazy("Stopped"),
+    "fault": lazy("Ended by a fault"),
+}
+JOINT_ENDS: dict[str, Any] = {
+    "covered": lazy("Enough was seen"),
+    "enough": lazy("A person said that it is enough"),
+    "torque-time": lazy("The torque-time is used up"),
+    "time": lazy("The time is used up"),
+    "completed": lazy("It was played to its end"),
     "stopped": lazy("Stopped"),
     "fault": lazy("Ended by a fault"),
 }
@@ -76,6 +92,33 @@ def test_state_words(state: str) -> str:
 def adaptive_end_words(ended: str) -> str:
     """Why a test that stops itself ended."""
     return str(ADAPTIVE_ENDS.get(ended, ended))
+
+
+def joint_end_words(ended: str) -> str:
+    """Why a guided test of a joint ended."""
+    return str(JOINT_ENDS.get(ended, ended))
+
+
+def missing_words(missing: Sequence[Mapping[str, Any]] | None) -> list[str]:
+    """What is still to be done with the joint, a sentence for each stretch of angles."""
+    return [_stretch(each) for each in missing or ()]
+
+
+def _stretch(each: Mapping[str, Any]) -> str:
+    low, high = (degrees(each[name]) for name in ("from_rad", "to_rad"))
+    bends, slow = each["direction"] == "flexion", each["speed"] == "slow"
+    if bends and slow:
+        return _("Bend slowly from %(low)s to %(high)s.", low=low, high=high)
+    if bends:
+        return _("Bend faster from %(low)s to %(high)s.", low=low, high=high)
+    if slow:
+        return _("Straighten slowly from %(high)s to %(low)s.", low=low, high=high)
+    return _("Straighten faster from %(high)s to %(low)s.", low=low, high=high)
+
+
+def degrees(angle_rad: float | None) -> str:
+    """An angle for people: whole degrees; a dash where there is none."""
+    return "–" if angle_rad is None else f"{math.degrees(angle_rad):.0f}°".replace("-", "−")
 
 
 def decision_words(decision: str | None) -> str:

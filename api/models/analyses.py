@@ -7,7 +7,7 @@ import hashlib
 import json
 import logging
 import secrets
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -262,28 +262,36 @@ class Analyses:
 
     # ---- several recordings ---------------------------------------------------------------------------------
 
-    async def join(self, older: str, newer: str, participant: str) -> Recording:
-        """Two recordings as one, itself a recording (`origin` joined), to which all else applies."""
-        paths = [await asyncio.to_thread(self.path, part) for part in (older, newer)]
+    async def join(self, parts: Sequence[str], participant: str, needs: Sequence[str] = ()) -> Recording:
+        """Recordings as one, itself a recording (`origin` joined), to which all else applies.
+
+        Parameters
+        ----------
+        parts : sequence of str
+            Their ids; where all begins are known the order is that of time.
+        needs : sequence of str
+            Columns that each of them must have, such as `angle_rad`; one that a part lacks is left out of the whole.
+        """
+        paths = [await asyncio.to_thread(self.path, part) for part in parts]
         identity = f"{uploads.JOINED}{secrets.token_hex(8)}"
         made = self.settings.exports_dir / f"{identity}.csv"  # all that a worker may write to
         kept = self.settings.recordings_dir / made.name
         try:
-            call = self.pool.submit("join", urgent=True, parts=paths, out=str(made))
+            call = self.pool.submit("join", urgent=True, parts=paths, out=str(made), needs=list(needs))
             digest = (await asyncio.shield(call.result))["file_sha256"]
             await asyncio.to_thread(made.replace, uploads.part_of(kept))
         except BaseException:
             made.unlink(missing_ok=True)
             raise
-        stored = asyncio.to_thread(self._store_joined, kept, digest, participant, older, newer)
+        stored = asyncio.to_thread(self._store_joined, kept, digest, participant, list(parts))
         return await asyncio.shield(stored)
 
-    def _store_joined(self, kept: Path, digest: str, participant: str, older: str, newer: str) -> Recording:
+    def _store_joined(self, kept: Path, digest: str, participant: str, parts: list[str]) -> Recording:
         now, identity = self.clock.utc(), kept.stem
         row = Recording(id=identity, participant=participant, path=str(kept), file_sha256=digest, origin="joined")
         row.test_id, row.created_utc = None, now
         with uploads.taken_in(kept), self.store.write() as session:
             session.add(row)
             session.flush()
-            audit.write(session, now, "service", "join recordings", identity, parts=[older, newer], sha256=digest)
+            audit.write(session, now, "service", "join recordings", identity, parts=parts, sha256=digest)
         return row

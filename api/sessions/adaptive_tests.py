@@ -7,7 +7,7 @@ import contextlib
 import hashlib
 from collections import OrderedDict
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Any
 
 from api.clock import Clock
@@ -18,11 +18,12 @@ from api.models.registry import Versions
 from api.sessions import adaptive_plan
 from api.sessions.adaptive import Follower, Told
 from api.sessions.adaptive_plan import ADAPTIVE, PIECE_S
+from api.sessions.planned import Planned
 from api.sessions.requests import TestIn
 from api.sessions.rig_client import RigClient
 from api.store.tables import Participant, Test
 from api.workers.adviser import Adviser
-from rig.messages import SAFE_END_S, EnoughRequest, Extended, FinishedEvent, PreviewRequest, TestPlan
+from rig.messages import SAFE_END_S, FinishedEvent, PreviewRequest, TestPlan
 
 KEPT = 20
 """Outlooks that are remembered: the question before a test and its start need the same one."""
@@ -30,21 +31,6 @@ MOST_MODELS = 10
 """Sessions from which is learnt how much a person changes between two."""
 ENDS = {"torque_time": "torque-time", "plan": "fixed-rest"}
 """Why a test ended, by the rig's reason, where it is told by another name."""
-
-
-@dataclass(frozen=True)
-class Planned:
-    """A plan, and of a test that stops itself what it shall reach, and what it probably will; None of another kind."""
-
-    plan: TestPlan
-    how: dict[str, Any] | None = None
-    reach: dict[str, Any] | None = None
-
-    def kept(self) -> dict[str, Any]:
-        """What is kept beside the plan; nothing of a test of another kind."""
-        if self.how is None or self.plan.adaptive is None:
-            return {}
-        return {"target": self.how["target"], "reach": self.reach, "bounds": self.plan.adaptive.model_dump()}
 
 
 class AdaptiveTests:
@@ -141,19 +127,11 @@ class AdaptiveTests:
         if follower is not None:
             self.tell({"type": "adaptive", "test_id": follower.plan.test_id, **self._view(follower)})
 
-    async def enough(self, row: Test, by: str) -> Extended:
-        """End a running test well: enough is known, or enough was borne.
-
-        Raises
-        ------
-        ApiError
-            409: it does not run, or is ending; 422: it has a fixed plan.
-        """
-        found = await self.rig.ask_for(Extended, EnoughRequest(test_id=row.id, by=by, at_once=True))
-        if (follower := self._of(row.id)) is not None:
+    def said_enough(self, test_id: str) -> None:
+        """A person has ended it well."""
+        if (follower := self._of(test_id)) is not None:
             follower.told.state, follower.told.ended = "ending", follower.told.ended or "enough"
             self._tell()
-        return found
 
     def leave(self) -> None:
         """Follow no test any more."""

@@ -88,15 +88,16 @@ async def _within_plan(runner: Runner, store: Store, who: Principal, body: TestI
     if played >= plan["trials"]:
         raise beyond(f"All {plan['trials']} trials of this key are played. A person can make another key")
     participant: Participant = await asyncio.to_thread(store.get, Participant, who.participant)
-    limits = {}
+    limits: dict[str, Any] = {}
     for name in ("current_ma", "max_pulse_width_us"):
         asked = body.profile.sent().get(name) if body.profile else None
         unit = LIMITS[name].unit
         if asked is not None and not asked <= plan[name]:
             raise beyond(f"{name} {asked:g} {unit} is above the plan's {plan[name]:g} {unit}")
         limits[name] = min(value for value in (asked, plan[name], participant.profile.get(name)) if value is not None)
-    torque = {"max_torque_nm": body.profile.max_torque_nm} if body.profile and body.profile.max_torque_nm else {}
-    narrowed = body.model_copy(update={"profile": ProfileIn(**limits, **torque)})
+    if body.profile and body.profile.max_torque_nm:
+        limits["max_torque_nm"] = body.profile.max_torque_nm
+    narrowed = body.model_copy(update={"profile": ProfileIn(**limits)})
     preview = await runner.preview(narrowed)
     if not preview["duration_s"] <= plan["max_duration_s"] + 1e-9:
         raise beyond(f"{preview['duration_s']:g} s is longer than the plan's {plan['max_duration_s']:g} s")

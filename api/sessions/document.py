@@ -5,12 +5,16 @@ from __future__ import annotations
 from typing import Any
 
 from api.sessions.adaptive_tests import AdaptiveTests
+from api.sessions.joint_tests import JointTests
 from api.sessions.lifecycle import Lifecycle
 from api.sessions.live import Hub
 from api.store.tables import OPEN_STATES, Test
 
+KEPT = ("adaptive", "joint")
+"""What is kept with a summary, and told beside it."""
 
-def of(row: Test, hub: Hub, lifecycle: Lifecycle, adaptive: AdaptiveTests) -> dict[str, Any]:
+
+def of(row: Test, hub: Hub, lifecycle: Lifecycle, adaptive: AdaptiveTests, joint: JointTests) -> dict[str, Any]:
     """What became of it so far; while it runs also where it is, as the rig tells it."""
     planned = {key: value for key, value in row.plan.get("preview", {}).items() if key != "pulse_width_us"}
     running = row.state in ("requested", "running")
@@ -45,7 +49,8 @@ def of(row: Test, hub: Hub, lifecycle: Lifecycle, adaptive: AdaptiveTests) -> di
         "joins": row.plan.get("joins"),
         "model_id": row.model_id,
         "model_url": f"/v1/models/{row.model_id}" if row.model_id else None,
-        "summary": {name: value for name, value in row.summary.items() if name != "adaptive"},
+        "summary": {name: value for name, value in row.summary.items() if name not in KEPT},
         "adaptive": adaptive.document(row),
+        "joint": joint.document(row),
         "fit": lifecycle.versions.document(model) if model else None,
     }

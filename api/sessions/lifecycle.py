@@ -14,6 +14,8 @@ from api.models.analyses import Analyses
 from api.models.registry import Versions
 from api.sessions.adaptive_tests import AdaptiveTests
 from api.sessions.following import Follower
+from api.sessions.joint_plan import KINDS
+from api.sessions.joint_tests import JointTests
 from api.sessions.rig_client import RigClient
 from api.sessions.trials import SEQUENCE
 from api.store import Store, audit
@@ -22,6 +24,8 @@ from api.workers.pool import Call, Pool
 from rig.messages import FinishedEvent
 
 log = logging.getLogger("stimrig.outcomes")
+NOT_FITTED = (SEQUENCE, *KINDS)
+"""Kinds of tests that give no model by themselves: a trial is followed, a guided test is fitted with others."""
 
 
 class LeftError(Exception):
@@ -39,12 +43,12 @@ class Lifecycle:
 
     def __init__(
         self, store: Store, clock: Clock, rig: RigClient, pool: Pool, versions: Versions,
-        analyses: Analyses, adaptive: AdaptiveTests, recordings_dir: Path, follower: Follower,
+        analyses: Analyses, adaptive: AdaptiveTests, joint: JointTests, recordings_dir: Path, follower: Follower,
         on_progress: Callable[[str], None],
     ) -> None:  # fmt: skip
         self.store, self.clock, self.rig, self.pool, self.versions = store, clock, rig, pool, versions
         self.analyses, self.recordings_dir, self.on_progress = analyses, recordings_dir, on_progress
-        self.adaptive, self.follower = adaptive, follower
+        self.adaptive, self.joint, self.follower = adaptive, joint, follower
         self.calls: dict[str, Call] = {}
         self._ahead: set[asyncio.Task[None]] = set()
 
@@ -80,10 +84,10 @@ class Lifecycle:
                 session.add(recording)
                 session.flush()
                 row.recording_id = event.recording_id
-            identifies = event.outcome == "completed" and row.recording_id is not None and row.kind != SEQUENCE
+            identifies = event.outcome == "completed" and row.recording_id is not None and row.kind not in NOT_FITTED
             row.state = "identifying" if identifies else event.outcome
             row.reason = event.reason
-            row.summary = {**event.summary, **self.adaptive.outcome(row, event)}
+            row.summary = {**event.summary, **self.adaptive.outcome(row, event), **self.joint.outcome(row, event)}
             row.finished_utc = now = self.clock.utc()
             audit.write(session, now, "rig", f"test {event.outcome}", row.id, reason=event.reason)
         log.info("the rig: test %s", event.outcome, extra={"test_id": row.id})
@@ -171,7 +175,7 @@ class Lifecycle:
         if joins is None:
             return recording, None
         model = await asyncio.to_thread(self.versions.get, joins)
-        return await self.analyses.join(model.recording_id, recording.id, row.participant), model.id
+        return await self.analyses.join([model.recording_id, recording.id], row.participant), model.id
 
     def warnings(self, recording_id: str) -> list[str]:
         """What was found doubtful about a recording, in sentences: by the rig, or when its first model was made."""

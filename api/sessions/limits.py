@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from api.errors import ApiError
+from api.sessions import angles
 from api.sessions.profiles import LIMITS
 from api.sessions.requests import TestIn
 from rig.messages import Profile
@@ -37,13 +38,22 @@ def limits_of(body: TestIn, own: dict[str, Any] | None) -> dict[str, Any]:
         raise ApiError(422, "no-limits", "The participant has no limits", detail)
     assert own is not None
     profile = Profile(**own)
-    wider = [words for name, value in asked.items() if (words := _wider(name, value, getattr(profile, name)))]
+    wider = [words for name in LIMITS if name in asked if (words := _wider(name, asked[name], getattr(profile, name)))]
+    range_rad = angles.of(asked)
+    if range_rad is not None and not angles.within(range_rad, profile.angle_range_rad):
+        own_words = angles.words(profile.angle_range_rad or ())
+        wider.append(f"{angles.RANGE} {angles.words(range_rad)} is beyond the participant's {own_words}")
     if wider:
         detail = "; ".join(wider) + ". A test may narrow them; to widen them, calibrate anew or set the participant's."
         errors = [{"field": f"profile.{words.split()[0]}", "detail": words} for words in wider]
         raise ApiError(422, "wider-profile", "Wider than the participant's limits", detail, errors=errors)
     return {
-        "profile": profile.model_copy(update={"current_ma": asked.get("current_ma", profile.current_ma)}),
+        "profile": profile.model_copy(
+            update={
+                "current_ma": asked.get("current_ma", profile.current_ma),
+                angles.RANGE: range_rad or profile.angle_range_rad,
+            }
+        ),
         "max_pulse_width_us": tighter(width_us, asked.get("max_pulse_width_us")),
         "max_torque_nm": tighter(torque_nm, asked.get("max_torque_nm")),
     }

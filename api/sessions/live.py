@@ -10,6 +10,11 @@ from rig.messages import LiveEvent
 
 QUEUE_LENGTH = 200
 SERIES = ("time_s", "torque_min_nm", "torque_max_nm", "pulse_time_s", "pulse_width_us")
+ANGLES = ("angle_time_s", "angle_rad", "velocity_rad_s")
+"""Of a rig with an angle sensor: one of each for each frame."""
+
+ANGLE_OLD_S = 0.5
+"""An older angle is not shown as that of now."""
 
 
 def within_test(event: LiveEvent) -> LiveEvent:
@@ -27,27 +32,37 @@ class Hub:
     def __init__(self, clock: Clock) -> None:
         self.clock = clock
         self._torque: tuple[float, float] | None = None
+        self._angle: tuple[float, float] | None = None
         self.test_id: str | None = None
-        self.history: dict[str, list[float]] = {name: [] for name in SERIES}
+        self.history: dict[str, list[float]] = {name: [] for name in (*SERIES, *ANGLES)}
         self.newest: LiveEvent | None = None
         self._queues: set[asyncio.Queue[dict[str, Any]]] = set()
 
     def begin(self, test_id: str) -> None:
         """A new test: forget the last one's curves."""
         self.test_id, self.newest = test_id, None
-        self.history = {name: [] for name in SERIES}
+        self.history = {name: [] for name in (*SERIES, *ANGLES)}
 
     def live(self, event: LiveEvent) -> None:
         """Take a frame, keep it, pass it on."""
         if event.torque_max_nm:
             middle_nm = (event.torque_min_nm[-1] + event.torque_max_nm[-1]) / 2
             self._torque = middle_nm, self.clock.monotonic_s() - event.torque_age_s
+        if event.angle_rad is not None:
+            self._angle = event.angle_rad, self.clock.monotonic_s()
         if event.test_id == self.test_id and event.test_id is not None:
             event = within_test(event)
             self.newest = event
             for name in SERIES:
                 self.history[name].extend(getattr(event, name))
+            self._keep_angle(event)
         self.send({"type": "live", **event.model_dump(exclude={"event"})})
+
+    def _keep_angle(self, event: LiveEvent) -> None:
+        if event.angle_rad is not None and event.velocity_rad_s is not None:
+            values = event.elapsed_s, event.angle_rad, event.velocity_rad_s
+            for name, value in zip(ANGLES, values, strict=True):
+                self.history[name].append(value)
 
     def torque(self) -> tuple[float | None, float | None]:
         """The newest torque, N·m, and its age, s; None for both where none ever came."""
@@ -55,6 +70,12 @@ class Hub:
             return None, None
         torque_nm, measured_s = self._torque
         return torque_nm, self.clock.monotonic_s() - measured_s
+
+    def angle(self) -> float | None:
+        """The joint's angle of now, rad; None where none came lately."""
+        if self._angle is None or not (self.clock.monotonic_s() - self._angle[1] <= ANGLE_OLD_S):
+            return None
+        return self._angle[0]
 
     def position(self, test_id: str) -> tuple[float, float, str | None] | None:
         """Elapsed and total seconds, and the segment, of the running test."""

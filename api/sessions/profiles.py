@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from api.clock import unix_of
+from api.sessions import angles
 from rig.messages import Bound
 
 Profile = Mapping[str, Any]
@@ -63,7 +64,7 @@ def calibration(profile: Profile, now_utc: str) -> Literal["none", "valid", "exp
     return "valid" if valid else "expired"
 
 
-def changed(profile: Profile, asked: Mapping[str, float]) -> tuple[dict[str, Any], str]:
+def changed(profile: Profile, asked: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
     """The profile with some limits changed, and what that voids.
 
     What a calibration found stays where no limit is wider than it was; it goes where one is, and where the comfort
@@ -77,6 +78,8 @@ def changed(profile: Profile, asked: Mapping[str, float]) -> tuple[dict[str, Any
         Why the calibration does not hold with it; empty where nothing is lost.
     """
     new = {**profile, **asked}
+    if angles.RANGE in asked and asked[angles.RANGE] is None:
+        del new[angles.RANGE]
     if all(profile.get(name) is None for name in FOUND):
         return new, ""
     voids = next((_above(name, new[name], profile[name]) for name in LIMITS if not (new[name] <= profile[name])), "")
@@ -127,7 +130,7 @@ def takes(name: str, limits: Mapping[str, Bound]) -> str:
     return f"at least {limit.least:g}, at most {most:g} {limit.unit} ({owner})"
 
 
-def outside(asked: Mapping[str, float], profile: Profile, limits: Mapping[str, Bound]) -> dict[str, str]:
+def outside(asked: Mapping[str, Any], profile: Profile, limits: Mapping[str, Bound]) -> dict[str, str]:
     """Which of the limits that are asked for this rig would refuse, by name, in words.
 
     Parameters
@@ -140,7 +143,8 @@ def outside(asked: Mapping[str, float], profile: Profile, limits: Mapping[str, B
         As the rig tells them; where it has not, the widest of any rig.
     """
     found = {}
-    for name, value in asked.items():
+    for name in [name for name in LIMITS if name in asked]:
+        value = asked[name]
         limit, (most, owner) = LIMITS[name], highest(limits, name)
         if not (limit.least <= value <= most):
             bounds = f"at least {limit.least:g} and at most {most:g} {limit.unit}"

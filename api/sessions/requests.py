@@ -19,7 +19,9 @@ from pydantic import (
 )
 
 from api.people import names
+from api.sessions import angles
 from api.sessions.profiles import LIMITS
+from rig.messages import HELD, MOVING, PASSIVE
 
 LONGEST_NOTE = 500
 Side = Literal["left", "right"]
@@ -58,6 +60,12 @@ def _limit(name: str, description: str) -> Any:
 CurrentMa = Annotated[FiniteFloat, _limit("current_ma", "fixed current of every pulse, mA")]
 WidthUs = Annotated[FiniteFloat, _limit("max_pulse_width_us", "comfort maximum, µs")]
 TorqueNm = Annotated[FiniteFloat, _limit("max_torque_nm", "torque at which a test stops, N·m")]
+AngleRad = Annotated[FiniteFloat, Field(ge=angles.LEAST_RAD, le=angles.MOST_RAD)]
+RangeRad = Annotated[
+    tuple[AngleRad, AngleRad],
+    AfterValidator(angles.rising),
+    Field(strict=False, description="lowest and highest joint angle, rad; elbow: 0 is straight, flexion is positive"),
+]
 ReferenceNm = Annotated[FiniteFloat, Field(ge=-LIMITS["max_torque_nm"].most, le=LIMITS["max_torque_nm"].most)]
 
 
@@ -74,6 +82,7 @@ class FirstProfileIn(Body):
     current_ma: CurrentMa
     max_pulse_width_us: WidthUs
     max_torque_nm: TorqueNm
+    angle_range_rad: RangeRad | None = None
 
 
 FIRST_PROFILE = FirstProfileIn(current_ma=20.0, max_pulse_width_us=300.0, max_torque_nm=30.0)
@@ -86,17 +95,21 @@ class ProfileIn(Body):
     current_ma: CurrentMa | None = None
     max_pulse_width_us: WidthUs | None = None
     max_torque_nm: TorqueNm | None = None
+    angle_range_rad: RangeRad | None = Field(default=None, description="null: the participant has none any more")
 
-    @field_validator("*", mode="before")
+    @field_validator("current_ma", "max_pulse_width_us", "max_torque_nm", mode="before")
     @classmethod
     def _no_null(cls, value: Any) -> Any:
         if value is None:
             raise ValueError("give a number, or leave the field out: then it keeps its value")
         return value
 
-    def sent(self) -> dict[str, float]:
-        """The limits that were sent."""
-        return self.model_dump(exclude_unset=True)
+    def sent(self) -> dict[str, Any]:
+        """The limits that were sent, as a profile keeps them."""
+        sent = self.model_dump(exclude_unset=True)
+        if (own := sent.get(angles.RANGE)) is not None:
+            sent[angles.RANGE] = list(own)
+        return sent
 
 
 SETTINGS = {
@@ -129,6 +142,33 @@ class TargetIn(Body):
 
     curve_percent: Percent = Field(default=2.0, description="of the recruitment curve, % of its plateau")
     step_percent: Percent = Field(default=2.0, description="of the response to a unit step, %")
+
+
+class AngleIn(Body):
+    """What a test of a joint that moves asks of its angle, beside the participant's range."""
+
+    target_rad: AngleRad | None = Field(
+        default=None, description="kind `held`: the angle to hold; null: the next one that is open"
+    )
+    tolerance_rad: Annotated[FiniteFloat, Field(ge=0.02, le=0.35, description="around the target, at the start")] = (
+        angles.TOLERANCE_RAD
+    )
+    still_s: FiniteFloat | None = Field(
+        default=None, ge=1, le=60, description="kinds `passive` and `moving`: the test stops after so long without a "
+        "movement, s; null: 8 and 5"
+    )  # fmt: skip
+
+
+OWN_FIELDS: dict[str, set[str]] = {
+    "adaptive": {"target", "max_duration_s", "max_torque_time_nm_s", "anyway"},
+    "sequence": {"reference_torque_nm"},
+    PASSIVE: {"angle", "max_duration_s"},
+    HELD: {"angle"},
+    MOVING: {"angle", "max_duration_s", "max_torque_time_nm_s"},
+}
+"""Fields that only tests of some kinds have."""
+PLANNED_BY_ITSELF = {"segments", "protocol", "joins"}
+"""What is not chosen for a test that chooses its own segments."""
 
 
 class TestIn(Body):
@@ -165,18 +205,21 @@ class TestIn(Body):
         default=TargetIn(), description="kind `adaptive`: what must be known before the test stops"
     )
     max_duration_s: FiniteFloat | None = Field(
-        default=None, ge=5, le=300, description="kind `adaptive`: the longest test, s; None: 50"
-    )
+        default=None, ge=5, le=300, description="the longest test, s; None: 50 of the kind `adaptive`, 90 of "
+        "`passive`, 60 of `moving`"
+    )  # fmt: skip
     max_torque_time_nm_s: FiniteFloat | None = Field(
         default=None,
         gt=0,
         le=10_000,
-        description="kind `adaptive`: the largest torque-time, N·m·s; None: 12 s at the torque that stops a test",
+        description="kinds `adaptive` and `moving`: the largest torque-time, N·m·s; None: 12 s at the torque that "
+        "stops a test, of `moving` what the paper's test is expected to take, where a model is approved",
     )
     anyway: StrictBool = Field(
         default=False, description="kind `adaptive`: play it although the target is out of reach"
     )
 
+    angle: AngleIn | None = Field(default=None, description="kinds `passive`, `held` and `moving`")
     reference_torque_nm: Annotated[list[ReferenceNm], Field(min_length=1, max_length=12_000)] | None = Field(
         default=None,
         description="kind `sequence`: the torque that the controller wants, one value for each pulse of the whole "
@@ -185,14 +228,19 @@ class TestIn(Body):
 
     @model_validator(mode="after")
     def _of_its_kind(self) -> TestIn:
-        own = {"target", "max_duration_s", "max_torque_time_nm_s", "anyway"}
         sent = {name for name in self.model_fields_set if getattr(self, name) is not None}
-        wrong = sorted(sent & {"segments", "protocol", "joins"} if self.kind == "adaptive" else sent & own)
-        if self.reference_torque_nm is not None and self.kind != "sequence":
+        others = set().union(*OWN_FIELDS.values()) - OWN_FIELDS.get(self.kind, set())
+        planned = self.kind in ("adaptive", PASSIVE, HELD, MOVING)
+        if "reference_torque_nm" in sent & others:
             raise ValueError("reference_torque_nm: only a test of the kind sequence has one; leave it out")
+        which = "has no such thing" if planned else "has a fixed plan"
+        wrong = sorted(sent & others)
+        if planned and (chosen := sorted(sent & PLANNED_BY_ITSELF)):
+            wrong, which = chosen, "chooses its own segments"
         if wrong:
-            which = "chooses its own segments" if self.kind == "adaptive" else "has a fixed plan"
             raise ValueError(f"{', '.join(wrong)}: a test of the kind {self.kind} {which}; leave it out")
+        if self.angle is not None and self.angle.target_rad is not None and self.kind != HELD:
+            raise ValueError("angle.target_rad: only a test of the kind held has a target; leave it out")
         return self
 
     @model_validator(mode="after")

@@ -21,11 +21,14 @@ from api.models.analyses import Analyses
 from api.models.registry import Versions
 from api.sessions import document, profiles
 from api.sessions.adaptive_plan import ADAPTIVE
-from api.sessions.adaptive_tests import AdaptiveTests, Planned
+from api.sessions.adaptive_tests import AdaptiveTests
 from api.sessions.following import Follower
+from api.sessions.joint_plan import KINDS
+from api.sessions.joint_tests import JointTests
 from api.sessions.lifecycle import Lifecycle
 from api.sessions.limits import limits_of
 from api.sessions.live import Hub
+from api.sessions.planned import Planned
 from api.sessions.refusals import Current, busy, not_what_was_seen, other_than, refuse_archived
 from api.sessions.requests import TestIn
 from api.sessions.rig_client import AnyEvent, RigClient
@@ -36,6 +39,8 @@ from api.store.tables import Participant, Test
 from api.workers.adviser import Adviser
 from api.workers.pool import Pool
 from rig.messages import (
+    EnoughRequest,
+    Extended,
     FinishedEvent,
     LiveEvent,
     PreviewRequest,
@@ -88,10 +93,21 @@ class Runner:
         self.store, self.clock, self.rig, self.versions, self.pool = store, clock, rig, versions, pool
         self.hub = Hub(clock)
         self.adaptive = AdaptiveTests(clock, rig, versions, adviser, self.hub.send)
+        self.joint = JointTests(clock, rig, versions, self.hub.send)
         self.trials, self.follower = trials, follower
         self.current: Current | None = None
         self.lifecycle = Lifecycle(
-            store, clock, rig, pool, versions, analyses, self.adaptive, recordings_dir, follower, self.announce
+            store,
+            clock,
+            rig,
+            pool,
+            versions,
+            analyses,
+            self.adaptive,
+            self.joint,
+            recordings_dir,
+            follower,
+            self.announce,
         )
         self._halted_s = -math.inf
         self._notes = ThreadPoolExecutor(2, "notes-of-stops")
@@ -174,7 +190,7 @@ class Runner:
             current.started = True
         except BaseException:
             self.current = None
-            self.adaptive.leave()
+            self._leave()
             raise
         try:
             return await asyncio.to_thread(self.lifecycle.update, row.id, state="running")
@@ -191,7 +207,8 @@ class Runner:
                 self._refuse_overtaken(
                     asked_s.get(self.clock.monotonic_s())
                 )  # nothing is waited for between this and the command
-                await self.rig.ask(StartRequest(plan=plan, key=self.adaptive.begin(planned)), timeout_s=ANSWER_S)
+                key = self.adaptive.begin(planned) or self.joint.begin(planned)
+                await self.rig.ask(StartRequest(plan=plan, key=key), timeout_s=ANSWER_S)
         except ApiError as error:
             if error.code == "rig-unreachable":  # it may have heard us all the same
                 await self._stop_quietly(f"start of {plan.test_id} was not answered")
@@ -235,7 +252,16 @@ class Runner:
             pulse_rate_hz=body.pulse_rate_hz,
             **limits_of(body, participant.profile),
         )
+        if body.kind in KINDS:
+            return await self.joint.planned(body, plan, PREVIEW_S)
         return await self.adaptive.planned(body, plan, PREVIEW_S)
+
+    async def joint_overview(self, participant: Participant) -> dict[str, Any]:
+        """What is open of today's guided tests of a joint. Raises ApiError where the rig cannot be asked."""
+        body = TestIn(participant=participant.code)
+        limits = limits_of(body, participant.profile)
+        plan = TestPlan(test_id=self._new_id(), participant=participant.code, **limits)
+        return await self.joint.overview(plan, PREVIEW_S)
 
     def _check_joins(self, body: TestIn) -> None:
         """The model whose recording the new one is to be joined to is the participant's own."""
@@ -300,6 +326,19 @@ class Runner:
             detail = f"{EMERGENCY} The rig says: {evidence.detail}"
             raise ApiError(503, "stop-not-confirmed", NOT_CONFIRMED, detail, evidence=evidence.model_dump())
         return evidence
+
+    async def enough(self, row: Test, by: str) -> Extended:
+        """End a running test that may be ended early well: enough is known, was seen, or was borne.
+
+        Raises
+        ------
+        ApiError
+            409: it does not run, or is ending; 422: it has a fixed plan.
+        """
+        found = await self.rig.ask_for(Extended, EnoughRequest(test_id=row.id, by=by, at_once=True))
+        self.adaptive.said_enough(row.id)
+        self.joint.said_enough(row.id)
+        return found
 
     async def _note(self, by: str, action: str, subject: str, **detail: Any) -> None:
         """Write a stop down; a database that is slow or gone does not keep its answer back."""
@@ -396,7 +435,11 @@ class Runner:
         """The rig is free again; the identification goes on beside it."""
         if self.current is not None and self.current.test_id == test_id:
             self.current = None
-            self.adaptive.leave()
+            self._leave()
+
+    def _leave(self) -> None:
+        self.adaptive.leave()
+        self.joint.leave()
 
     # ---- after a restart ------------------------------------------------------------------------------------
 
@@ -448,7 +491,7 @@ class Runner:
 
     def document(self, row: Test) -> dict[str, Any]:
         """A test as clients see it."""
-        return document.of(row, self.hub, self.lifecycle, self.adaptive)
+        return document.of(row, self.hub, self.lifecycle, self.adaptive, self.joint)
 
     async def close(self) -> None:
         """Leave what runs to the next start of the service."""
@@ -457,6 +500,7 @@ class Runner:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
         await self.adaptive.close()
+        await self.joint.close()
         await self.trials.close()
         await asyncio.to_thread(self._notes.shutdown)
         await asyncio.to_thread(self._telling.shutdown)

@@ -106,8 +106,11 @@ def improve(data: str, progress: Progress, force: Sequence[str] = (), model_json
     return {**identify.improve(record, progress, force=tuple(force), model=model).to_dict(), "structure": structure}
 
 
-def joined(parts: Sequence[str], out: str, progress: Progress) -> dict[str, Any]:
-    """Recordings as the parts of one, written to `out` as CSV that `identify.read` reads; its SHA-256."""
+def joined(parts: Sequence[str], out: str, progress: Progress, needs: Sequence[str] = ()) -> dict[str, Any]:
+    """Recordings as the parts of one, written to `out` as CSV that `identify.read` reads; its SHA-256.
+
+    `needs` are columns that each of them must have.
+    """
     import hashlib
 
     import identify
@@ -116,9 +119,24 @@ def joined(parts: Sequence[str], out: str, progress: Progress) -> dict[str, Any]
 
     progress(0.1, "joining the recordings")
     records = [identify.read(Path(part)) for part in parts]
+    check_columns(records, needs)
     parts_csv.write(join(records, [begun(Path(part)) for part in parts]), Path(out))
     with Path(out).open("rb") as file:
         return {"file_sha256": hashlib.file_digest(file, "sha256").hexdigest()}
+
+
+def check_columns(records: Sequence[Any], needs: Sequence[str]) -> None:
+    """Refuse a record that lacks a column which the model needs. Raises BadRecord, which names the record's number."""
+    import identify
+
+    for number, record in enumerate(records, start=1):
+        lacking = [name for name in needs if getattr(record, name) is None]
+        if lacking:
+            raise identify.BadRecord(
+                f"it has no {', '.join(lacking)}, which an effect of the model needs",
+                place=f"recording {number}",
+                fix="Leave it out, or record it anew on a rig with an angle sensor.",
+            )
 
 
 def begun(path: Path) -> float | None:

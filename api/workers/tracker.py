@@ -13,6 +13,8 @@ from api.errors import ApiError, NotFoundError
 from api.workers.pool import Call, Pool
 
 log = logging.getLogger("stimrig.jobs")
+FIT_TOGETHER = "fit-recordings"
+"""Kind of a job whose subject is a participant and not a model."""
 KEPT = 200
 """So many finished jobs are remembered."""
 
@@ -24,9 +26,9 @@ class Job:
     Parameters
     ----------
     kind : str
-        diagnosis, add-effects or improve.
+        diagnosis, add-effects, improve or fit-recordings.
     subject : str
-        The model's id.
+        The model's id; of fit-recordings the participant's code.
     """
 
     id: str
@@ -49,7 +51,8 @@ class Job:
         return {
             "id": self.id,
             "kind": self.kind,
-            "model_id": self.subject,
+            "model_id": None if self.kind == FIT_TOGETHER else self.subject,
+            "participant": self.subject if self.kind == FIT_TOGETHER else None,
             "requested_by": self.by,
             "state": self.state,
             "done": self.state != "running",

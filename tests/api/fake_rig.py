@@ -24,6 +24,7 @@ import numpy as np
 from pydantic import TypeAdapter
 
 from rig import messages as m
+from tests.api.fake_arm import FakeArm
 from tests.api.fake_score import PULSE_RATE_HZ, FakeScore
 from tests.harness.muscle import Patient
 
@@ -110,6 +111,7 @@ class FakeRig:
         self._writers: dict[asyncio.StreamWriter, bool] = {}
         """Who subscribed, and whether with samples."""
         self.key = ""
+        self.arm = FakeArm()
         self.score: FakeScore | None = None
         self.last_segments: list[dict[str, Any]] = []
         self.refuses_extensions = False
@@ -125,7 +127,7 @@ class FakeRig:
             torque_age_s=self.torque_age_s, torque_nm=0.01,
             calibration=self.calibration and told_next(self.calibration),
             limits=self.limits, require_calibration=self.require_calibration,
-            finished=self.finished,
+            finished=self.finished, angle=self.arm.status(self.elapsed_s),
         )  # fmt: skip
 
     async def serve(self) -> None:
@@ -141,7 +143,7 @@ class FakeRig:
                 self._send(m.LiveEvent(
                     test_id=None, segment=None, elapsed_s=0.0, duration_s=0.0, time_s=[0.0], torque_min_nm=[0.42],
                     torque_max_nm=[0.44], pulse_time_s=[], pulse_width_us=[], torque_age_s=self.torque_age_s,
-                    lost_samples=0, dropped_pulses=0,
+                    lost_samples=0, dropped_pulses=0, **self.arm.now(time.monotonic()),
                 ))  # fmt: skip
 
     def become(self, state: Any, reason: str = "") -> None:
@@ -193,7 +195,7 @@ class FakeRig:
                 raise m_refusal(
                     "bad-plan", "No such sequence", f"{segment.sequence!r}; there are prbs, ramp, rest, widths."
                 )
-        if plan.kind == "sequence" and plan.segments:
+        if plan.kind in ("sequence", "held") and plan.segments:
             return trial_widths(plan.segments)
         if plan.adaptive is None:
             return default_widths()
@@ -223,6 +225,8 @@ class FakeRig:
         if self.state != "ready":
             raise m_refusal(self.state, "The rig stands still", f"{self.reason}. Re-arm it.")
         self._widths(request.plan)
+        if why := self.arm.refuses(request.plan, time.monotonic()):
+            raise m_refusal("refused", "Not at this angle", why)
         self.starts += 1
         self.last_plan = request.plan
         self.plan, self.state, self.reason, self.key = request.plan, "running", "", request.key
@@ -302,6 +306,13 @@ class FakeRig:
         )  # fmt: skip
         return m.CalibrationResult(profile=profile, recordings=["C1.001"]).model_dump()
 
+    async def _on_angle_pose(self, request: Any, writer: Any) -> dict[str, Any]:
+        if self.state != "ready":
+            raise m_refusal("busy", "Not now", f"the rig is {self.state}")
+        if why := self.arm.pose(request.angle_rad, request.by, time.monotonic()):
+            raise m_refusal("bad-plan", "Not taken", why)
+        return self.status().model_dump()
+
     async def _on_stop(self, request: Any, writer: Any) -> dict[str, Any]:
         self.stopped_by = request.by
         self._stop.set()
@@ -378,7 +389,7 @@ class FakeRig:
                 sent_pulses=sum(1 for width in widths[:last] if width),
                 charge_uc=sum(widths[:last]) * plan.profile.current_ma / 1000, **score.live(),
                 torque_time_nms=sum(map(abs, torque[: round(end * self.rate_hz)])) / self.rate_hz,
-                samples=self._samples(torque, start, end),
+                samples=self._samples(torque, start, end), **self.arm.live(start, end),
             )
         )  # fmt: skip
 

@@ -51,6 +51,7 @@ def comparison() -> dict[str, Any]:
     }  # fmt: skip
 
 
+JOINT = ("passive_torque", "torque_angle", "torque_velocity")
 WHERE = [{
     "segment": "prbs", "start_s": 3.0, "end_s": 4.5, "pulse_width_us": [0.0, 300.0], "direction": "falling",
     "share_of_excess": 0.31,
@@ -248,10 +249,13 @@ def answer(verb: str, arguments: dict[str, Any], say: Any) -> dict[str, Any]:
                            "unreachable": lacks, "fit_percent": 90.0, "whole_fit_percent": 80.0,
                            "tolerance_nm": 0.1}}  # fmt: skip
     if verb == "join":
+        if arguments["needs"] and (Path(arguments["parts"][0]).parent / "no-angle").exists():
+            detail = "recording 2: it has no angle_rad, which an effect of the model needs. Leave it out."
+            return {"error": {"expected": True, "detail": detail, "place": "recording 2"}}
         Path(arguments["out"]).write_text("\n".join(arguments["parts"]))
         return {"result": {"file_sha256": "0" * 64}}
     if verb == "effects":
-        names = ("fatigue", "tremor", "threshold_drift", "slow", "die", "bad")
+        names = ("fatigue", "tremor", "threshold_drift", "slow", "die", "bad", *JOINT)
         words = dict.fromkeys(("name", "stage", "equation", "source", "signature", "separated_by", "plain"), "made up")
         lists = {name: [] for name in ("parameters", "forms", "confused_with", "needs")}
         return {"result": {"effects": [{"id": name, **words, **lists, "predictable": True} for name in names]}}

@@ -65,7 +65,7 @@ def test_a_test_that_was_taken_up_during_the_fit_is_left_to_who_did(tmp_path: Pa
     nothing: Any = SimpleNamespace(fit_options=lambda _row: {}, add=add)
     follower = Follower(store, holds, "rig")
     lifecycle = Lifecycle(
-        store, Clock(), nothing, nothing, nothing, analyses, nothing, tmp_path, follower, lambda _test_id: None
+        store, Clock(), nothing, nothing, nothing, analyses, nothing, nothing, tmp_path, follower, lambda _test_id: None
     )
     asyncio.run(lifecycle.identify("T1"))
     row = store.get(Test, "T1")

@@ -44,7 +44,7 @@ def bare(schema: dict[str, Any], place: str) -> Iterator[str]:
     unnamed = schema.get("additionalProperties", True) is True and not set(schema) & {"properties", "anyOf", "allOf"}
     if schema.get("type") == "object" and unnamed:
         yield f"{place}: an object without keys"
-    if schema.get("type") == "array" and "items" not in schema:
+    if schema.get("type") == "array" and not {"items", "prefixItems"} & set(schema):
         yield f"{place}: a list of anything"
     for name, part in schema.get("properties", {}).items():
         yield from bare(part, f"{place}.{name}")

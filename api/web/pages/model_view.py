@@ -22,10 +22,11 @@ from api.web.pages.checked import checked
 from api.web.pages.render import page
 from api.web.requests import EffectsIn
 from api.web.routes import criticism, participants
-from api.workers.tracker import Job
+from api.workers.tracker import FIT_TOGETHER, Job
 
 router = APIRouter(include_in_schema=False)
-TITLES = {"diagnosis": "Diagnosing", "add-effects": "Adding the effect", "improve": "Improving the model"}
+TITLES = {"diagnosis": "Diagnosing", "add-effects": "Adding the effect", "improve": "Improving the model",
+          FIT_TOGETHER: "Fitting one model to all recordings"}  # fmt: skip
 
 
 @router.get("/models/{model_id}")
@@ -235,4 +236,6 @@ async def cancel(context: Ctx, _who: Tester, job_id: str) -> Response:
     """Cancel it."""
     job = context.jobs.get(job_id)
     context.jobs.cancel(job)
+    if job.kind == FIT_TOGETHER:
+        return RedirectResponse(f"/participants/{job.subject}/joint", 303)
     return RedirectResponse(f"/models/{job.subject}#why", 303)

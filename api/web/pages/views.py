@@ -57,7 +57,7 @@ async def enough(context: Ctx, who: Tester, test_id: str) -> Response:
     """End a test that stops itself well; where it has ended just before the press, its page shows what came of it."""
     row = await asyncio.to_thread(tests.find, context, test_id)
     try:
-        await context.runner.adaptive.enough(row, who.name)
+        await context.runner.enough(row, who.name)
     except ApiError as error:
         if error.code != "rig-late":
             raise

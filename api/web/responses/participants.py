@@ -22,6 +22,7 @@ class ProfileOut(Document):
     set_at_utc: str | None = Field(None, description="when the calibration was finished")
     expires_at_utc: str | None = Field(None, description="when the calibration expires: the end of its day")
     rest_between_tests_s: float | None = Field(None, description="shortest rest between two tests, s")
+    angle_range_rad: list[float] | None = Field(None, description="joint angles that are comfortable today, rad")
 
 
 class ParticipantOut(Document):

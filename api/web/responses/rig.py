@@ -7,8 +7,9 @@ from typing import Literal
 from pydantic import Field
 
 from api.web.responses.base import Document, Holder, SegmentOut
+from api.web.responses.joint import JointOut
 from api.web.responses.models import VersionOut
-from rig.messages import Bound, CalibrationStatus, RigState, StopEvidence
+from rig.messages import AngleStatus, Bound, CalibrationStatus, RigState, StopEvidence
 
 
 class DeviceOut(Document):
@@ -34,6 +35,7 @@ class RigOut(Document):
     load_cell: DeviceOut = Field(DeviceOut(), description="device, measured sample rate, bus")
     torque_nm: float | None = Field(None, description="newest torque, N·m")
     torque_age_s: float | None = Field(None, description="its age, s")
+    angle: AngleStatus = Field(AngleStatus(), description="of the joint, where the rig has an angle sensor")
     calibration: CalibrationStatus | None = None
     limits: dict[str, Bound] = Field({}, description="what this rig takes, by quantity")
     require_calibration: bool | None = None
@@ -250,6 +252,7 @@ class TestOut(Document):
     model_url: str | None
     summary: TestSummary
     adaptive: AdaptiveOut | None = Field(description="of a test that stops itself; null for another")
+    joint: JointOut | None = Field(description="of a guided test of a joint that moves; null for another")
     fit: VersionOut | None = Field(description="the model's version, once it is identified")
 
 

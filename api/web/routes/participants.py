@@ -10,7 +10,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Header, Query, Response
 
 from api.errors import ApiError, NotFoundError
-from api.sessions import directory, profiles
+from api.sessions import angles, directory, profiles
 from api.sessions.requests import ProfileIn
 from api.store import audit
 from api.store.holds import LIMITS_TURN
@@ -34,7 +34,7 @@ CHANGED: dict[int | str, dict[str, Any]] = {
 def create(context: Context, body: ParticipantIn, by: str) -> Participant:
     """A new participant; 409 where the code is taken, 422 where this rig would refuse its limits."""
     now = context.clock.utc()
-    profile = body.profile.model_dump()
+    profile = body.profile.model_dump(exclude_none=True)
     if "profile" in body.model_fields_set:
         check_asked(context, profile, profile)
     with context.store.write() as session:
@@ -71,7 +71,7 @@ class Change:
         Whether a calibration may be lost by it.
     """
 
-    asked: dict[str, float]
+    asked: dict[str, Any]
     seen: Collection[str] | None = None
     voids: bool = False
 
@@ -108,12 +108,13 @@ def _change(context: Context, code: str, change: Change, by: str) -> Participant
     return row
 
 
-def check_asked(context: Context, profile: dict[str, Any], asked: dict[str, float]) -> None:
+def check_asked(context: Context, profile: dict[str, Any], asked: dict[str, Any]) -> None:
     """Refuse first limits that are not whole, and what this rig would refuse."""
     if lacking := [name for name in profiles.LIMITS if {**profile, **asked}.get(name) is None]:
         raise ApiError(422, "invalid-input", "Some limits are missing", f"Send {', '.join(lacking)}, too.")
     status = context.rig.status
-    if found := profiles.outside(asked, profile, status.limits if status else {}):
+    found = profiles.outside(asked, profile, status.limits if status else {})
+    if found := found | angles.outside(asked, status.angle.range_rad if status else None):
         errors = [{"field": name, "detail": words} for name, words in found.items()]
         detail = "; ".join(f"{name}: {words}" for name, words in found.items()) + ". Nothing was changed."
         raise ApiError(422, "invalid-input", "These limits cannot be used", detail, errors=errors)

@@ -12,6 +12,7 @@ from fastapi import APIRouter, Response, WebSocket, WebSocketDisconnect
 from sqlalchemy.exc import SQLAlchemyError
 
 from api import language
+from api.clinical_words import missing_words
 from api.errors import ApiError, NotFoundError
 from api.people.auth import Principal, Scope
 from api.sessions import controller_trials
@@ -93,9 +94,9 @@ async def keep_plain(context: Ctx, _who: Tester, test_id: str) -> dict[str, Any]
 
 @router.post("/{test_id}/enough", **answers(LeftOut))
 async def enough(context: Ctx, who: Tester, test_id: str) -> dict[str, Any]:
-    """End a running adaptive test well, at the next pulse: its recording is identified like any other."""
+    """End a running adaptive, passive or moving test well, at the next pulse: what was measured is used."""
     row = await asyncio.to_thread(find, context, test_id)
-    return (await context.runner.adaptive.enough(row, who.name)).model_dump()
+    return (await context.runner.enough(row, who.name)).model_dump()
 
 
 @router.websocket("/{test_id}/live")
@@ -174,12 +175,14 @@ async def _pump(
             if message["test"]["id"] != row.id:
                 continue
             document, message = message["test"], _told(message["test"], words)
-        if message["type"] in ("live", "adaptive") and message["test_id"] != row.id:
+        if message["type"] in ("live", "adaptive", "joint") and message["test_id"] != row.id:
             continue
         if by_key and message["type"] == "state" and message["rig"]["test_id"] != row.id:
             continue  # the rig is with somebody else, or says why it stopped then
         if message["type"] == "adaptive":
             message = _in_words(message, words)
+        if message["type"] == "joint":
+            message = _what_is_missing(message, words)
         await socket.send_json(message)
 
 
@@ -218,6 +221,13 @@ def _in_words(message: dict[str, Any], language_code: str) -> dict[str, Any]:
     """How an adaptive test stands, its sentences in the language of the page."""
     with language.using(language_code):
         return {**message, **{name: language.plain(message[name]) for name in ("words", "problem")}}
+
+
+def _what_is_missing(message: dict[str, Any], language_code: str) -> dict[str, Any]:
+    """How a guided test stands, with what is still to be done, in the language of the page."""
+    with language.using(language_code):
+        problem, words = language.plain(message["problem"]), missing_words((message["coverage"] or {}).get("missing"))
+    return {**message, "problem": problem, "words": words}
 
 
 async def _until_gone(socket: WebSocket) -> None:

@@ -1,0 +1,250 @@
+"""The three guided tests of a joint that moves: which angles, which widths, for how long, at what torque-time. Pure.
+
+Together they cost at most what the paper's test costs: what that one is expected to take is shared out, and each
+staircase and each steady level is as long as its share allows. All is counted with the same recruitment curve at the
+angle of the isometric test; how the torque changes with angle and velocity is what these tests are to find out.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from api.sessions.angles import TOLERANCE_RAD
+from rig.messages import HELD, MOVING, PASSIVE
+
+KINDS = (PASSIVE, HELD, MOVING)
+"""Kinds of guided tests."""
+ROUND_RAD = math.radians(5)
+"""Angles to hold are whole multiples: a goniometer is read so."""
+LEAST_RANGE_RAD = math.radians(30)
+"""A smaller range has no three angles that can be told apart."""
+RANGES_RAD = (math.radians(60), math.radians(90))
+"""From the first on there are four angles to hold, from the second on five."""
+
+HELD_SHARE = 0.45
+"""Of the paper's torque-time, for all held tests together; the moving one has what is left."""
+STAIRS = (0.25, 0.5, 0.75)
+"""Steps of a held test, as shares of the torque at the widest pulse."""
+LONGEST_STAIR_S = 1.0
+LEVELS = (0.6, 0.3)
+"""Steady levels of a moving test, as shares of that torque, one after the other."""
+LEVEL_S, PAUSE_S = 4.0, 1.5
+RISE_S = 0.3
+"""From one width to the next: no jump that startles."""
+QUIET_S = 1.0
+"""Without stimulation, before and after the steps of a held test, and before the first level of a moving one."""
+PASSIVE_S, MOVING_S = 90.0, 60.0
+"""The longest passive and moving test, where nobody says."""
+STILL_S = {PASSIVE: 8.0, MOVING: 5.0}
+"""So long the joint may stand still before such a test ends: then nobody moves it, or the sensor is stuck."""
+SEEN_S = {PASSIVE: 0.2, MOVING: 0.1}
+"""Time in a cell of angle and velocity after which it counts as seen."""
+UNKNOWN_MOTOR_SHARE = 0.3
+"""Where a muscle begins to pull, as a share of the widest pulse, where neither model nor calibration say."""
+
+Segment = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Steady torque over pulse width, rising: a model's, or a stand-in whose torque at the widest pulse is 1.
+
+    Parameters
+    ----------
+    known : bool
+        Whether it is a model's, in N·m.
+    """
+
+    pulse_width_us: tuple[float, ...]
+    torque_nm: tuple[float, ...]
+    known: bool
+
+    def torque(self, width_us: float) -> float:
+        """Steady torque at a width; 0 without a pulse, level beyond the ends."""
+        widths, torques = self.pulse_width_us, self.torque_nm
+        if not (width_us > 0.0):
+            return 0.0
+        if width_us >= widths[-1]:
+            return torques[-1]
+        k = bisect_right(widths, width_us)
+        if k == 0:
+            return torques[0]
+        share = (width_us - widths[k - 1]) / (widths[k] - widths[k - 1])
+        return torques[k - 1] + share * (torques[k] - torques[k - 1])
+
+    def width(self, torque_nm: float, largest_us: float) -> float:
+        """The smallest width that gives a torque, in steps of a µs; never above the largest."""
+        low, high = 0, math.floor(largest_us)
+        while low < high:
+            middle = (low + high) // 2
+            low, high = (low, middle) if self.torque(middle) >= torque_nm else (middle + 1, high)
+        return float(low)
+
+
+def curve_of(table: Mapping[str, Sequence[float]] | None, largest_us: float, motor_us: float | None) -> Curve:
+    """The approved model's recruitment curve; where there is none, a straight line from the motor threshold on.
+
+    Parameters
+    ----------
+    table : dict or None
+        `pulse_width_us` and `torque_nm`.
+    largest_us : float
+        The widest pulse of the tests, µs.
+    motor_us : float or None
+        What the calibration found, µs.
+    """
+    if table is not None and _rises(table, largest_us):
+        return Curve(tuple(table["pulse_width_us"]), tuple(max(0.0, t) for t in table["torque_nm"]), True)
+    begin_us = motor_us if motor_us is not None and 0 < motor_us < largest_us else UNKNOWN_MOTOR_SHARE * largest_us
+    return Curve((begin_us, largest_us), (0.0, 1.0), False)
+
+
+def _rises(table: Mapping[str, Sequence[float]], largest_us: float) -> bool:
+    """Whether a model's curve can be planned with: it pulls the joint at the widest pulse."""
+    curve = Curve(tuple(table["pulse_width_us"]), tuple(table["torque_nm"]), True)
+    return len(curve.torque_nm) > 1 and curve.torque(largest_us) > 0.0
+
+
+def torque_time(widths_us: Sequence[float], rate_hz: float, curve: Curve) -> float:
+    """Expected torque-time of a plan, N·m·s (with a stand-in: s at the torque of the widest pulse)."""
+    return sum(map(curve.torque, widths_us)) / rate_hz
+
+
+def targets(range_rad: Sequence[float]) -> list[float]:
+    """The angles to hold, rad: 3 to 5, evenly over the range, far enough from its ends that none is left by accident.
+
+    Empty where the range is too small.
+    """
+    low, high = range_rad
+    width = high - low
+    if not (width >= LEAST_RANGE_RAD - 1e-9):
+        return []
+    count = 3 + sum(width >= edge - 1e-9 for edge in RANGES_RAD)
+    margin = min(2.0 * TOLERANCE_RAD, width / 6)
+    first, last = low + margin, high - margin
+    return [_rounded(first + (last - first) * k / (count - 1), low + margin, high - margin) for k in range(count)]
+
+
+def _rounded(angle_rad: float, low: float, high: float) -> float:
+    """The nearest multiple of 5° that lies in the range; the angle itself where none does."""
+    near = round(angle_rad / ROUND_RAD) * ROUND_RAD
+    inside = [value for value in (near, near + ROUND_RAD, near - ROUND_RAD) if low - 1e-9 <= value <= high + 1e-9]
+    return inside[0] if inside else angle_rad
+
+
+def held(curve: Curve, largest_us: float, stair_s: float, rate_hz: float) -> list[Segment]:
+    """A short staircase with rest around it."""
+    top = curve.torque(largest_us)
+    return [
+        _still("rest", QUIET_S, rate_hz),
+        *_levels("hold", [curve.width(share * top, largest_us) for share in STAIRS], [stair_s] * len(STAIRS), rate_hz),
+        _still("rest", QUIET_S, rate_hz),
+    ]
+
+
+def moving(curve: Curve, largest_us: float, most: float, longest_s: float, rate_hz: float) -> list[Segment]:
+    """Steady levels with pauses, until their torque-time or the time is used up."""
+    top, found = curve.torque(largest_us), [_still("passive", QUIET_S, rate_hz)]
+    widths = [curve.width(share * top, largest_us) for share in LEVELS]
+    left, left_s, number = most, longest_s - QUIET_S, 0
+    while True:
+        width_us = widths[number % len(widths)]
+        hold_s = min(LEVEL_S, left / max(curve.torque(width_us), 1e-9), left_s)
+        if hold_s < 2 * RISE_S:
+            return found
+        number += 1
+        (level,) = _levels("moving", [width_us], [hold_s], rate_hz, number)
+        spent = torque_time(level["settings"]["pulse_width_us"], rate_hz, curve)
+        found += [level, _still("passive", PAUSE_S, rate_hz)]
+        left, left_s = left - spent, left_s - hold_s - PAUSE_S
+
+
+def passive(longest_s: float, rate_hz: float) -> list[Segment]:
+    """No pulse at all."""
+    return [_still("passive", longest_s, rate_hz)]
+
+
+def _levels(
+    name: str, widths_us: Sequence[float], each_s: Sequence[float], rate_hz: float, number: int = 1
+) -> list[Segment]:
+    """Steps one after the other, each reached within its own time."""
+    found, before = [], 0.0
+    for k, (width_us, hold_s) in enumerate(zip(widths_us, each_s, strict=True)):
+        count, rise = math.floor(hold_s * rate_hz + 1e-6), max(round(RISE_S * rate_hz), 1)
+        rising = [before + (width_us - before) * min((i + 1) / rise, 1.0) for i in range(count)]
+        found.append(_segment(f"{name} {number + k}", [math.floor(10.0 * value) / 10.0 for value in rising]))
+        before = width_us
+    return found
+
+
+def _still(name: str, seconds: float, rate_hz: float) -> Segment:
+    return _segment(name, [0.0] * max(round(seconds * rate_hz), 1))
+
+
+def _segment(name: str, widths_us: list[float]) -> Segment:
+    return {"name": name, "sequence": "widths", "settings": {"pulse_width_us": widths_us}}
+
+
+def widths_of(segments: Sequence[Segment]) -> list[float]:
+    """All pulses of segments of this module, µs."""
+    return [width for segment in segments for width in segment["settings"]["pulse_width_us"]]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The guided tests of a participant.
+
+    Parameters
+    ----------
+    targets_rad : list of float
+        Angles to hold.
+    held, moving : list of dict
+        Segments of one held test, and of the moving one.
+    doses : dict
+        Expected torque-time: of the paper's test, one held test, all of them, the moving one, and all together; N·m·s,
+        with a stand-in curve only good for being compared.
+    known : bool
+        Whether the doses are N·m·s.
+    """
+
+    targets_rad: list[float]
+    held: list[Segment]
+    moving: list[Segment]
+    doses: dict[str, float]
+    known: bool
+
+    @property
+    def share(self) -> float:
+        """Of the paper's torque-time."""
+        return self.doses["total"] / self.doses["paper"] if self.doses["paper"] > 0 else 0.0
+
+
+def layout(
+    range_rad: Sequence[float], curve: Curve, largest_us: float, paper_us: Sequence[float], rate_hz: float,
+    moving_s: float = MOVING_S,
+) -> Layout:  # fmt: skip
+    """Share out the paper's torque-time among the held tests and the moving one.
+
+    Parameters
+    ----------
+    range_rad : sequence of float
+        The participant's lowest and highest angle, rad.
+    paper_us : sequence of float
+        Every width of the paper's test with these limits, µs.
+    moving_s : float
+        The longest moving test without its safe end, s.
+    """
+    angles, paper = targets(range_rad), torque_time(paper_us, rate_hz, curve)
+    one = torque_time(widths_of(held(curve, largest_us, LONGEST_STAIR_S, rate_hz)), rate_hz, curve)
+    fits = HELD_SHARE * paper / (one * len(angles)) if angles and one > 0 else 0.0
+    stairs = held(curve, largest_us, LONGEST_STAIR_S * min(1.0, fits), rate_hz)
+    each = torque_time(widths_of(stairs), rate_hz, curve)
+    levels = moving(curve, largest_us, max(paper - each * len(angles), 0.0), moving_s, rate_hz)
+    doses = {"paper": paper, "held_each": each, "held": each * len(angles)}
+    doses["moving"] = torque_time(widths_of(levels), rate_hz, curve)
+    doses["total"] = doses["held"] + doses["moving"]
+    return Layout(angles, stairs, levels, doses, curve.known)

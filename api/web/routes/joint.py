@@ -1,0 +1,142 @@
+"""A joint that moves: the angle sensor and its calibration, what is open of the guided tests, one model of them all."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Query, Response
+from pydantic import AfterValidator, Field, StringConstraints
+
+from api.errors import ApiError
+from api.models import together
+from api.sessions import angles
+from api.sessions.requests import AngleRad, Body
+from api.store import audit
+from api.store.tables import Model, Participant
+from api.web.dependencies import PROBLEM, Context, Ctx, LiveReader, Tester
+from api.web.responses.base import answers
+from api.web.responses.joint import AngleOut, JointOverviewOut
+from api.web.responses.models import VersionOut
+from api.web.routes import participants
+from api.web.routes.criticism import LATER, later
+from api.workers.tracker import FIT_TOGETHER, Job
+from rig.messages import AnglePoseRequest, AngleStatus, Status
+
+router = APIRouter(prefix="/v1", tags=["joint"], responses=PROBLEM)
+
+NOTHING_OPEN: dict[str, Any] = {
+    "targets": [], "next_rad": None, "tests": {"passive": None, "moving": None}, "doses": None, "known": False,
+    "share_of_paper": None,
+}  # fmt: skip
+
+
+class PoseIn(Body):
+    """What a goniometer shows while the joint is held still."""
+
+    angle_rad: AngleRad = Field(description="elbow: 0 is straight, flexion is positive, rad")
+
+
+def _once(recordings: list[str]) -> list[str]:
+    if len(set(recordings)) != len(recordings):
+        raise ValueError("a recording is named twice")
+    return recordings
+
+
+RecordingId = Annotated[str, StringConstraints(min_length=1, max_length=80)]
+EffectId = Annotated[str, StringConstraints(pattern=r"^[a-z0-9_]{1,64}$")]
+
+
+class TogetherIn(Body):
+    """Recordings of one participant that are to be fitted as one."""
+
+    recordings: Annotated[list[RecordingId], Field(min_length=1, max_length=together.MOST), AfterValidator(_once)]
+    effects: Annotated[list[EffectId], Field(max_length=20)] = Field(
+        default=list(together.JOINT_EFFECTS), description="of the model; needs the joint's angle in each recording"
+    )
+
+
+async def take_pose(context: Context, angle_rad: float, by: str) -> AngleStatus:
+    """Tell the rig a pose; the second one completes a calibration.
+
+    Raises
+    ------
+    ApiError
+        409: no sensor, a test runs, or the joint moved; 422: the poses are too near to one another.
+    """
+    sensor(context)
+    before = context.rig.status.angle.calibration if context.rig.status else None
+    status = await context.rig.ask_for(Status, AnglePoseRequest(angle_rad=angle_rad, by=by))
+    context.rig.status = status
+    done = status.angle.calibration if status.angle.calibration != before else None
+
+    def note() -> None:
+        with context.store.write() as session:
+            now = context.clock.utc()
+            audit.write(session, now, by, "pose of the angle sensor", "rig", angle_rad=round(angle_rad, 4))
+            if done is not None:
+                audit.write(session, now, by, "calibrate the angle sensor", "rig", **done.model_dump(exclude={"by"}))
+
+    await asyncio.to_thread(note)
+    return status.angle
+
+
+def sensor(context: Context) -> AngleStatus:
+    """The rig's angle sensor; 409 where it has none."""
+    status = context.rig.status
+    if status is None or not status.angle.present:
+        detail = "This rig has no angle sensor. The rig file names one under [angle_sensor]."
+        raise ApiError(409, "no-angle-sensor", "There is no angle sensor", detail)
+    return status.angle
+
+
+async def overview_of(context: Context, row: Participant) -> dict[str, Any]:
+    """What is open of today's guided tests, and the sensor; nothing of tests where there is no sensor or no range."""
+    status = context.rig.status
+    told = (status.angle if status is not None else AngleStatus()).model_dump()
+    if not told["present"] or angles.of(row.profile) is None:
+        return {"sensor": told, "range_rad": row.profile.get(angles.RANGE), **NOTHING_OPEN}
+    return {"sensor": told, **await context.runner.joint_overview(row)}
+
+
+def begin_fit(context: Context, code: str, body: TogetherIn, by: str) -> Job:
+    """Fit them while the person looks on."""
+
+    async def work(job: Job) -> str:
+        model = await together.fit(context.analyses, code, body.recordings, body.effects, by, job.take)
+        return f"/v1/models/{model.id}"
+
+    return context.jobs.start(FIT_TOGETHER, code, by, work)
+
+
+@router.get("/rig/angle", **answers(AngleOut))
+async def angle(context: Ctx, _who: LiveReader) -> dict[str, Any]:
+    """The joint's angle now, and the sensor's calibration: both poses, who and when; `present` is false without one."""
+    return (await context.rig.fresh_status()).angle.model_dump()
+
+
+@router.post("/rig/angle/pose", **answers(AngleOut))
+async def pose(context: Ctx, who: Tester, body: PoseIn) -> dict[str, Any]:
+    """Tell the angle that a goniometer shows, at two poses at least 0.5 rad apart; a third one begins anew."""
+    return (await take_pose(context, body.angle_rad, who.name)).model_dump()
+
+
+@router.get("/participants/{code}/joint", **answers(JointOverviewOut))
+async def overview(context: Ctx, _who: Tester, code: str) -> dict[str, Any]:
+    """Today's guided tests: which angles are still to be held, what was done, and the torque-time of all of them."""
+    row = await asyncio.to_thread(participants.find, context, code)
+    return await overview_of(context, row)
+
+
+@router.post("/participants/{code}/models", status_code=201, response_model=VersionOut, responses=LATER)
+async def fit_together(
+    context: Ctx, who: Tester, code: str, body: TogetherIn, response: Response,
+    wait: Annotated[bool, Query(description="false: answer 202 at once, with the job's address")] = True,
+) -> Any:  # fmt: skip
+    """One model of several recordings, joined: isometric ones and those in which the joint was held or moved."""
+    await asyncio.to_thread(participants.find, context, code)
+    if not wait:
+        return later(begin_fit(context, code, body, who.name))
+    model: Model = await together.fit(context.analyses, code, body.recordings, body.effects, who.name)
+    response.headers["Location"] = f"/v1/models/{model.id}"
+    return await asyncio.to_thread(context.versions.document, model)

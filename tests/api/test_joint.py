@@ -1,0 +1,305 @@
+"""A joint that moves, by REST: the sensor's poses, the participant's range, three guided tests, one model of all."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from websockets.sync.client import connect
+
+from tests.api.conftest import STUB, TOKEN, Service, run_service, run_test, wait_done
+from tests.api.fake_arm import back_and_forth, still
+
+RANGE = [math.radians(20), math.radians(110)]
+
+
+@pytest.fixture
+def service(tmp_path: Path, short_dir: Path) -> Iterator[Service]:
+    yield from run_service(tmp_path, short_dir, STUB, speed=10.0)
+
+
+@pytest.fixture
+def ready(service: Service, client: httpx.Client, participant: str) -> str:
+    """A participant with a range, at a rig with a sensor; the joint is still at 65°."""
+    service.rig.arm.way = still(math.radians(65))
+    seen_soon(client)
+    answer = client.put(f"/v1/participants/{participant}/profile", json={"angle_range_rad": RANGE})
+    assert answer.status_code == 200, answer.text
+    return participant
+
+
+def seen_soon(client: httpx.Client) -> None:
+    """Until the service has asked the rig again."""
+    end = time.monotonic() + 20
+    while not client.get("/v1/rig").json()["angle"]["present"]:
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def begin(client: httpx.Client, code: str, kind: str, **more: Any) -> httpx.Response:
+    return client.post("/v1/tests", json={"participant": code, "kind": kind, **more})
+
+
+# ---- the sensor -----------------------------------------------------------------------------------------------
+
+
+def test_a_rig_without_a_sensor_says_so_everywhere(client: httpx.Client, participant: str) -> None:
+    assert client.get("/v1/rig").json()["angle"]["present"] is False
+    client.put(f"/v1/participants/{participant}/profile", json={"angle_range_rad": RANGE})
+    asked = [
+        client.post("/v1/rig/angle/pose", json={"angle_rad": 0.2}), begin(client, participant, "passive"),
+    ]  # fmt: skip
+    assert [answer.status_code for answer in asked] == [409] * 2
+    assert {answer.json()["type"] for answer in asked} == {"/problems/no-angle-sensor"}
+    assert client.get("/v1/rig/angle").json()["present"] is False
+    overview = client.get(f"/v1/participants/{participant}/joint").json()
+    assert (overview["sensor"]["present"], overview["targets"], overview["doses"]) == (False, [], None)
+
+
+def test_two_poses_calibrate_and_are_written_down(service: Service, client: httpx.Client, ready: str) -> None:
+    service.rig.arm.way = still(0.0)
+    first = client.post("/v1/rig/angle/pose", json={"angle_rad": 0.0})
+    assert first.status_code == 200 and first.json()["pose"]["angle_rad"] == 0.0 and not first.json()["calibrated"]
+    near = client.post("/v1/rig/angle/pose", json={"angle_rad": 0.2})
+    assert near.status_code == 422 and "0.5 rad" in near.json()["detail"]
+    done = client.post("/v1/rig/angle/pose", json={"angle_rad": 1.5}).json()
+    assert done["calibrated"] and done["pose"] is None and done["calibration"]["by"] == "administrator"
+    assert client.get("/v1/rig/angle").json()["calibration"]["offset"] == 12.0
+    told = [entry for entry in client.get("/v1/audit").json()["entries"] if "angle sensor" in entry["action"]]
+    assert [entry["action"] for entry in told].count("pose of the angle sensor") == 2
+    (made,) = [entry for entry in told if entry["action"] == "calibrate the angle sensor"]
+    assert (made["subject"], made["detail"]["offset"], len(made["detail"]["poses"])) == ("rig", 12.0, 2)
+
+
+@pytest.mark.parametrize("angle", ["1.5", None, True, 4.0, [1.0]])
+def test_what_is_no_angle_is_no_pose(client: httpx.Client, ready: str, angle: Any) -> None:
+    assert client.post("/v1/rig/angle/pose", json={"angle_rad": angle}).status_code == 422
+
+
+# ---- the participant's range ----------------------------------------------------------------------------------
+
+
+def test_a_range_is_kept_changed_and_taken_away(client: httpx.Client, ready: str) -> None:
+    at = f"/v1/participants/{ready}/profile"
+    assert client.get(f"/v1/participants/{ready}").json()["profile"]["angle_range_rad"] == pytest.approx(RANGE)
+    client.put(at, json={"max_torque_nm": 20.0})
+    assert client.get(f"/v1/participants/{ready}").json()["profile"]["angle_range_rad"] == pytest.approx(RANGE)
+    assert client.put(at, json={"angle_range_rad": None}).status_code == 200
+    assert "angle_range_rad" not in client.get(f"/v1/participants/{ready}").json()["profile"]
+    assert begin(client, ready, "passive").json()["type"] == "/problems/no-angle-range"
+
+
+@pytest.mark.parametrize("wrong", [[1.0], [1.0, 0.5], [0.2, 0.21], [0.2, "2"], [0.2, 9.0], "x", [0.2, None], [0, 1, 2]])
+def test_what_is_no_range_is_refused(client: httpx.Client, ready: str, wrong: Any) -> None:
+    answer = client.put(f"/v1/participants/{ready}/profile", json={"angle_range_rad": wrong})
+    assert answer.status_code == 422
+    assert client.get(f"/v1/participants/{ready}").json()["profile"]["angle_range_rad"] == pytest.approx(RANGE)
+
+
+def test_a_range_beyond_the_rigs_is_refused(client: httpx.Client, ready: str) -> None:
+    answer = client.put(f"/v1/participants/{ready}/profile", json={"angle_range_rad": [0.2, 2.8]})
+    assert answer.status_code == 422 and "as this rig asks" in answer.text
+
+
+def test_a_test_may_narrow_the_range_and_not_widen_it(service: Service, client: httpx.Client, ready: str) -> None:
+    wide = begin(client, ready, "held", profile={"angle_range_rad": [0.1, 1.9]}, angle={"target_rad": 1.13})
+    assert wide.status_code == 422 and "beyond the participant's" in wide.json()["detail"]
+    narrow = begin(client, ready, "held", profile={"angle_range_rad": [0.6, 1.5]}, angle={"target_rad": 1.13})
+    assert narrow.status_code == 202, narrow.text
+    assert service.rig.last_plan.angle.range_rad == (0.6, 1.5)
+    wait_done(client, narrow.json()["id"])
+
+
+def test_a_range_voids_no_calibration(service: Service, client: httpx.Client, ready: str) -> None:
+    service.sql("UPDATE participants SET profile = json_set(profile, '$.motor_pulse_width_us', 100.0)")
+    assert client.put(f"/v1/participants/{ready}/profile", json={"angle_range_rad": [0.2, 2.0]}).status_code == 200
+
+
+# ---- the three tests ------------------------------------------------------------------------------------------
+
+
+def test_a_passive_test_ends_by_itself_once_enough_was_seen(service: Service, client: httpx.Client, ready: str) -> None:
+    service.rig.arm.way = back_and_forth(RANGE[0] + 0.01, RANGE[1] - 0.01)
+    begun = begin(client, ready, "passive")
+    assert begun.status_code == 202, begun.text
+    plan = service.rig.last_plan
+    assert plan.kind == "passive" and plan.angle.range_rad == pytest.approx(RANGE) and plan.angle.still_s == 8.0
+    assert not any(any(segment.settings["pulse_width_us"]) for segment in plan.segments), "no current at all"
+    done = wait_done(client, begun.json()["id"])
+    assert (done["state"], done["model_id"], done["fit"]) == ("completed", None, None)
+    told = done["joint"]
+    assert (told["ended"], told["coverage"]["enough"]) == ("covered", True)
+    assert done["duration_s"] < 60 < told["longest_s"] == 90.0
+    assert service.rig.starts == 1
+
+
+def test_while_it_runs_it_says_angle_and_what_is_missing(service: Service, client: httpx.Client, ready: str) -> None:
+    service.rig.arm.way = back_and_forth(RANGE[0] + 0.01, RANGE[1] - 0.01, (0.4,))  # never fast
+    service.rig.speed = 4.0
+    begun = begin(client, ready, "passive", max_duration_s=20)
+    address = f"{service.url.replace('http', 'ws')}/v1/tests/{begun.json()['id']}/live"
+    kinds, joint, lives = set(), {}, []
+    with connect(address, additional_headers={"Authorization": f"Bearer {TOKEN}"}) as socket:
+        for line in socket:
+            message = json.loads(line)
+            kinds.add(message["type"])
+            if message["type"] == "joint":
+                joint = message
+                seen = client.get(f"/v1/tests/{begun.json()['id']}").json()["joint"]
+                assert seen["state"] in ("watching", "ended")
+            if message["type"] == "live":
+                lives.append(message)
+    assert {"history", "live", "joint", "test"} <= kinds
+    assert 0.3 < joint["coverage"]["share"] < 0.9 and not joint["coverage"]["enough"]
+    assert any(words.startswith("Bend faster from") for words in joint["words"]), joint["words"]
+    assert {each["speed"] for each in joint["coverage"]["missing"]} == {"fast"}
+    assert RANGE[0] < lives[-1]["angle_rad"] < RANGE[1] and abs(lives[-1]["velocity_rad_s"]) == 0.4
+    done = wait_done(client, begun.json()["id"])
+    assert done["joint"]["ended"] == "time" and done["joint"]["coverage"]["share"] == joint["coverage"]["share"]
+
+
+def test_a_person_may_say_enough(service: Service, client: httpx.Client, ready: str) -> None:
+    service.rig.speed = 2.0
+    begun = begin(client, ready, "passive").json()["id"]
+    assert client.post(f"/v1/tests/{begun}/enough").status_code == 200
+    assert wait_done(client, begun)["joint"]["ended"] == "enough"
+
+
+def test_held_angles_come_one_after_the_other_and_are_remembered(
+    service: Service, client: httpx.Client, ready: str
+) -> None:
+    listed = client.get(f"/v1/participants/{ready}/joint").json()
+    angles = [row["angle_rad"] for row in listed["targets"]]
+    assert len(angles) == 5 and listed["next_rad"] == angles[0]
+    away = begin(client, ready, "held")
+    assert away.status_code == 422 and "the joint is at" in away.json()["detail"], "it is at the third one"
+    for number, angle in enumerate(angles):
+        service.rig.arm.way = still(angle + 0.03)
+        begun = begin(client, ready, "held")
+        assert begun.status_code == 202, begun.text
+        assert begun.json()["joint"]["target_rad"] == pytest.approx(angle)
+        done = wait_done(client, begun.json()["id"])
+        assert (done["state"], done["joint"]["ended"], done["joint"]["coverage"]) == ("completed", "completed", None)
+        listed = client.get(f"/v1/participants/{ready}/joint").json()
+        assert [row["done"] for row in listed["targets"]] == [k <= number for k in range(5)]
+    assert listed["next_rad"] is None
+    assert begin(client, ready, "held").json()["type"] == "/problems/all-held"
+    again = begin(client, ready, "held", angle={"target_rad": angles[-1]})
+    assert again.status_code == 202
+    wait_done(client, again.json()["id"])
+
+
+def test_a_stopped_held_test_leaves_its_angle_open(service: Service, client: httpx.Client, ready: str) -> None:
+    service.rig.speed = 1.0
+    service.rig.arm.way = still(client.get(f"/v1/participants/{ready}/joint").json()["next_rad"])
+    begun = begin(client, ready, "held").json()["id"]
+    assert client.post("/v1/stop").status_code == 200
+    assert wait_done(client, begun)["joint"]["ended"] == "stopped"
+    assert not any(row["done"] for row in client.get(f"/v1/participants/{ready}/joint").json()["targets"])
+
+
+def test_a_moving_test_counts_under_stimulation_only(service: Service, client: httpx.Client, ready: str) -> None:
+    service.rig.arm.way = back_and_forth(RANGE[0] + 0.01, RANGE[1] - 0.01, (0.6, 1.6))
+    begun = begin(client, ready, "moving")
+    assert begun.status_code == 202, begun.text
+    plan = service.rig.last_plan
+    widths = [width for segment in plan.segments for width in segment.settings["pulse_width_us"]]
+    assert 0 < max(widths) < 300 and plan.angle.still_s == 5.0
+    told = wait_done(client, begun.json()["id"])["joint"]
+    under_s = sum(width > 0 for width in widths) / plan.pulse_rate_hz
+    assert 0 < sum(map(sum, told["coverage"]["time_s"])) < under_s
+    assert told["ended"] in ("covered", "time")
+
+
+def test_the_three_cost_at_most_the_papers_test(client: httpx.Client, ready: str) -> None:
+    listed = client.get(f"/v1/participants/{ready}/joint").json()
+    doses = listed["doses"]
+    assert not listed["known"], "no model is approved: nothing but the share is told"
+    assert doses["total"] <= doses["paper"] and listed["share_of_paper"] == pytest.approx(
+        doses["total"] / doses["paper"]
+    )
+    assert doses["held"] == pytest.approx(5 * doses["held_each"])
+    model = run_test(client, ready)["model_id"]
+    client.post(f"/v1/models/{model}/approve", json={"reason": ""})
+    known = client.get(f"/v1/participants/{ready}/joint").json()
+    assert known["known"] and 0.5 < known["share_of_paper"] <= 1.0
+    preview = client.post("/v1/preview", json={"participant": ready, "kind": "moving"}).json()
+    assert preview["joint"]["doses"] == known["doses"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "more"),
+    [
+        ("passive", {"segments": [{"name": "rest", "sequence": "rest"}]}), ("held", {"protocol": "paper"}),
+        ("moving", {"target": {"curve_percent": 2}}), ("held", {"max_duration_s": 20}), ("passive", {"joins": "M1"}),
+        ("passive", {"angle": {"target_rad": 1.0}}), ("pre-session", {"angle": {}}), ("held", {"angle": {"x": 1}}),
+        ("passive", {"max_torque_time_nm_s": 3}), ("held", {"angle": {"target_rad": 2.5}}),
+        ("held", {"angle": {"tolerance_rad": 1.0}}), ("moving", {"angle": {"still_s": 0}}),
+    ],
+)  # fmt: skip
+def test_what_does_not_go_together_is_refused(
+    client: httpx.Client, ready: str, kind: str, more: dict[str, Any]
+) -> None:
+    answer = begin(client, ready, kind, **more)
+    assert answer.status_code == 422, answer.text
+
+
+# ---- one model of all -----------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def recordings(service: Service, client: httpx.Client, ready: str) -> list[str]:
+    service.rig.speed = 40.0
+    found = [run_test(client, ready)["recording_id"]]
+    service.rig.arm.way = still(client.get(f"/v1/participants/{ready}/joint").json()["next_rad"])
+    found.append(wait_done(client, begin(client, ready, "held").json()["id"])["recording_id"])
+    return found
+
+
+def test_one_model_of_several_recordings(client: httpx.Client, ready: str, recordings: list[str]) -> None:
+    made = client.post(f"/v1/participants/{ready}/models", json={"recordings": recordings})
+    assert made.status_code == 201, made.text
+    version = made.json()
+    assert version["effects"] == ["passive_torque", "torque_angle", "torque_velocity"]
+    assert version["recording_id"].startswith("joined-") and made.headers["Location"] == f"/v1/models/{version['id']}"
+    entries = client.get("/v1/audit").json()["entries"]
+    (told,) = [entry for entry in entries if entry["action"] == "fit recordings together"]
+    assert told["detail"]["recordings"] == recordings
+    one = client.post(f"/v1/participants/{ready}/models", json={"recordings": recordings[:1], "effects": []}).json()
+    assert (one["recording_id"], one["effects"]) == (recordings[0], [])
+
+
+def test_long_work_may_be_left_alone(client: httpx.Client, ready: str, recordings: list[str]) -> None:
+    begun = client.post(f"/v1/participants/{ready}/models?wait=false", json={"recordings": recordings})
+    assert begun.status_code == 202
+    end = time.monotonic() + 30
+    while not (job := client.get(begun.headers["Location"]).json())["done"]:
+        assert time.monotonic() < end
+        time.sleep(0.05)
+    assert (job["kind"], job["participant"], job["model_id"]) == ("fit-recordings", ready, None)
+    assert job["result_url"].startswith("/v1/models/")
+
+
+def test_a_recording_without_an_angle_is_named(
+    service: Service, client: httpx.Client, ready: str, recordings: list[str]
+) -> None:
+    (service.data / "recordings" / "no-angle").touch()
+    answer = client.post(f"/v1/participants/{ready}/models", json={"recordings": recordings})
+    assert answer.status_code == 422 and f"recording {recordings[1]}: it has no angle_rad" in answer.json()["detail"]
+
+
+def test_recordings_of_others_and_twice_are_refused(client: httpx.Client, ready: str, recordings: list[str]) -> None:
+    client.post("/v1/participants", json={"code": "P2"})
+    other = client.post("/v1/participants/P2/models", json={"recordings": recordings})
+    assert other.status_code == 422 and other.json()["type"] == "/problems/other-participant"
+    at = f"/v1/participants/{ready}/models"
+    assert client.post(at, json={"recordings": ["nothing"]}).status_code == 404
+    for wrong in ([], [recordings[0]] * 2, ["x"] * 21):
+        assert client.post(at, json={"recordings": wrong}).status_code == 422
+    assert client.post(at, json={"recordings": recordings, "effects": ["none_such"]}).status_code == 422
