@@ -194,6 +194,7 @@ class TestFree:
         assert np.all(np.diff(lost) <= 1e-9)
         assert lost[-1] < lost[0] - 1.0
 
+    @pytest.mark.slow
     def test_it_loads_no_cell_and_the_flexor_flexes_it(self) -> None:
         limb = Limb(Constant(1.0), Arm("free", {}, replace(Tissue(), mechanics=Mechanics(weight_nm=2.8))))
         found = rows(limb, 8.0)
@@ -223,6 +224,7 @@ class TestFree:
 
 
 class TestMovers:
+    @pytest.mark.slow
     def test_angle_velocity_and_acceleration_belong_together_whatever_is_asked_of_it(self) -> None:
         """Also where one mover takes over from another in full movement: no jump of angle or velocity."""
         limb, rng = Limb(Constant(1.0), Arm(), seed=4), np.random.default_rng(3)
@@ -280,10 +282,11 @@ class TestMovers:
             turn = 2.0 * math.pi * time_s
             assert 100.0 - math.degrees(angle) == pytest.approx((1.0 + turn) * math.exp(-turn), abs=0.01)
 
+    @pytest.mark.slow
     def test_a_hand_is_not_steady_and_no_two_sweeps_are_alike(self) -> None:
         def sweeps(seed: int, **settings: float) -> np.ndarray:
             arm = Arm("hand", {"from_deg": 40, "to_deg": 110, "deg_s": 40, **settings}, heavy())
-            return rows(Limb(Constant(), arm, seed), 30.0)
+            return rows(Limb(Constant(), arm, seed), 20.0)
 
         uneven, again, steady = sweeps(1), sweeps(1), sweeps(1, unsteady=0)
         assert np.array_equal(uneven, again)
@@ -294,6 +297,7 @@ class TestMovers:
         speeds = np.degrees(np.abs(uneven[:, 2]))
         assert 35.0 < np.percentile(speeds, 80) < 60.0
 
+    @pytest.mark.slow
     def test_a_hand_that_holds_still_wanders_and_trembles_by_some_millinewtonmetres(self) -> None:
         found = rows(Limb(Constant(), Arm("hand", {}, heavy()), 3), 40.0)[3200:]
         assert 0.1 < np.degrees(np.std(found[:, 1])) < 1.2
