@@ -131,6 +131,14 @@ class TestLaws:
             law("passive", "none", {"mass": 1.0})
         with pytest.raises(ArmError, match="must be a finite number"):
             law("passive", "linear_friction", {"dry_nm": math.nan})
+        for place, name, key, value in (
+            ("torque_velocity", "hill", "largest_rad_s", 0.0),
+            ("torque_velocity", "hill", "plateau", 1.0),
+            ("torque_angle", "force_length", "gamma", -0.1),
+            ("passive", "standard_linear_solid", "relaxation_s", 0),
+        ):
+            with pytest.raises(ArmError, match=f"'{key}' of law {name} of {place} must be above"):
+                law(place, name, {key: value})
 
 
 class TestWhatTheCellMeasures:
@@ -380,6 +388,7 @@ class TestFile:
             ("movement = 3", "'movement' must be a table"),
             ("mode = ", "not valid TOML"),
             ('[passive]\nlaw = "jelly"', "arm.toml: unknown law of passive 'jelly'"),
+            ("[mechanics]\ninertia_kg_m2 = 0", "'inertia_kg_m2' of mechanics must be above 0"),
             ("[mechanics]\nmass_kg = 1", "arm.toml: mechanics has no parameter 'mass_kg'"),
         ],
     )
