@@ -23,7 +23,7 @@ Method = Literal["cell", "stamps", "order", "regression"]
 ONE_CLOCK_S = 5e-4
 """Stamps that give other times than the order of the frames do are not of one clock: a device stamps itself."""
 LONGEST_PERIOD_S = 0.002
-"""The order of frames tells enough only where torques follow one another at least so soon."""
+"""The order of frames tells enough only where the cell's follow one another at least so soon."""
 LEAST_ORDERED = 20
 
 
@@ -129,12 +129,15 @@ def _by_order(samples: NDArray[Any], sensor_s: Array, torque: Reference) -> tupl
 
     A sensor may keep step with the cell, so the place between the two does not average out.
     """
-    if len(torque.samples) < 2:
+    arrived_s = torque.samples["host_time_s"]
+    last = np.flatnonzero(np.diff(arrived_s, append=np.inf) > 0)  # of each frame: it was sent with its last torque
+    if len(last) < 2:
         return None
-    period_s = float(np.median(np.diff(torque.time_s)))
-    after = np.searchsorted(torque.samples["host_time_s"], samples["host_time_s"])
-    between = np.flatnonzero((after > 0) & (after < len(torque.time_s)))
-    before_s, after_s = torque.time_s[after[between] - 1], torque.time_s[after[between]]
+    arrived_s, sent_s = arrived_s[last], torque.time_s[last]
+    period_s = float(np.median(np.diff(sent_s)))
+    after = np.searchsorted(arrived_s, samples["host_time_s"])
+    between = np.flatnonzero((after > 0) & (after < len(sent_s)))
+    before_s, after_s = sent_s[after[between] - 1], sent_s[after[between]]
     near = after_s - before_s < 1.5 * period_s
     if np.sum(near) < LEAST_ORDERED or not (period_s <= LONGEST_PERIOD_S):
         return None
