@@ -34,6 +34,13 @@ TEST_KINDS: dict[str, Any] = {
     "held": lazy("held angle"),
     "moving": lazy("movement under stimulation"),
 }
+TITLES: dict[str, Any] = {
+    "pre-session": lazy("Pre-session test"),
+    "adaptive": lazy("Test that stops itself"),
+    "passive": lazy("Passive movement"),
+    "held": lazy("Held angle"),
+    "moving": lazy("Movement under stimulation"),
+}
 ADAPTIVE_ENDS: dict[str, Any] = {
     "known-enough": lazy("Enough is known"),
     "enough": lazy("A person said that it is enough"),
@@ -82,6 +89,11 @@ def verdict_words(verdict: str) -> str:
 def test_kind_words(kind: str) -> str:
     """What a person calls a kind of test."""
     return str(TEST_KINDS.get(kind, kind))
+
+
+def test_title(kind: str) -> str:
+    """The title of a test's page."""
+    return str(TITLES.get(kind, TITLES["pre-session"]))
 
 
 def test_state_words(state: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from typing import Any
 
 from api.language import clock, lazy
@@ -63,13 +64,16 @@ def now(context: Context, principal: Principal | None) -> dict[str, Any]:
     }
     if principal is None:
         return shown
-    current = context.runner.current
+    current, status = context.runner.current, context.rig.status
+    angle_rad = context.runner.hub.angle()
     return {
         **shown,
         "torque_nm": torque_nm,
         "torque_age_s": age_s,
         "test": {"id": current.test_id, "participant": current.participant} if current else None,
         "notice": notice_key(context, state),
+        "sensor": status is not None and status.angle.present,
+        "angle_deg": None if angle_rad is None else round(math.degrees(angle_rad), 1),
     }
 
 
