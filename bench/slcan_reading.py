@@ -30,8 +30,8 @@ def measure(frames: int, ahead: bool) -> tuple[float, float]:
     cell = CanLoadCell(Settings(device="can_load_cell", bus=bus), MonotonicClock())
     cell.open()
     os.read(ours, 1000)
-    if not ahead and isinstance(cell._bus.serialPortOrig, ReadAhead):  # pyright: ignore
-        cell._bus.serialPortOrig = cell._bus.serialPortOrig._port  # pyright: ignore
+    if not ahead and isinstance(cell._bus.can.serialPortOrig, ReadAhead):  # pyright: ignore
+        cell._bus.can.serialPortOrig = cell._bus.can.serialPortOrig._port  # pyright: ignore
     lines = b"".join(
         b"t1818" + struct.pack("<fHBB", 1.0, i & 0xFFFF, 0, 0).hex().encode() + b"\r" for i in range(frames)
     )

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from hardware_sim import options as command_line
+from hardware_sim.arm import description as arms
 from hardware_sim.emulator import Emulator
 from hardware_sim.errors import FaultError, HardwareSimError, PatientError
 from hardware_sim.patients import registry
@@ -34,7 +35,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(json.dumps(_hidden().reveal(options.reveal)))
             return 0
         muscle, name = _patient(options)
-        emulator = Emulator(muscle, command_line.settings(options, name))
+        arm = arms.read(options.arm) if options.arm else None
+        emulator = Emulator(muscle, command_line.settings(options, name), arm)
     except HardwareSimError as error:
         print(f"{PROG}: {error}", file=sys.stderr)
         return 2

@@ -1,7 +1,8 @@
 """The control line for tests: a Unix socket with one JSON object per line each way. It is no part of the rig.
 
 Commands: `{"cmd": "state"}`, `{"cmd": "pulses", "since": 0}`, `{"cmd": "faults"}` (lists them),
-`{"cmd": "fault", "name": …, "on": true, "for_s": …, <settings>}`. Answers carry `"ok"`; if it is false, `"error"`.
+`{"cmd": "fault", "name": …, "on": true, "for_s": …, <settings>}`, and where there is an arm
+`{"cmd": "arm", "mode": …, <settings of the mode>}`. Answers carry `"ok"`; if it is false, `"error"`.
 """
 
 from __future__ import annotations
@@ -12,8 +13,9 @@ import socket
 from pathlib import Path
 from typing import Any, Protocol
 
+from hardware_sim.arm.limb import Limb
 from hardware_sim.electrodes import Electrodes
-from hardware_sim.errors import FaultError, HardwareSimError
+from hardware_sim.errors import ArmError, FaultError, HardwareSimError
 from hardware_sim.faults.registry import Faults
 from hardware_sim.reactor import Reactor
 from hardware_sim.timeline import Timeline, WallClock
@@ -27,6 +29,7 @@ class Controlled(Protocol):
 
     electrodes: Electrodes
     faults: Faults
+    limb: Limb | None
     timeline: Timeline
     clock: WallClock
 
@@ -56,6 +59,7 @@ class Control:
             "pulses": self._pulses,
             "faults": self._faults,
             "fault": self._fault,
+            "arm": self._arm,
         }
 
     def close(self) -> None:
@@ -109,6 +113,13 @@ class Control:
             "active": self._emulator.faults.active(),
             "pulses_received": len(self._emulator.electrodes.log),
         }
+
+    def _arm(self, request: dict[str, Any]) -> dict[str, Any]:
+        limb, time_s = self._emulator.limb, self._emulator.timeline.now_s
+        if limb is None:
+            raise ArmError("this rig has no arm; start it with --arm")
+        limb.move(str(request.pop("mode", "")), request, time_s)
+        return {"time_s": time_s, "monotonic_s": self._emulator.clock.monotonic_s(time_s), **limb.state()}
 
     def _accept(self) -> None:
         try:

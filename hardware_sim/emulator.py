@@ -1,4 +1,4 @@
-"""The emulator: stimulator, muscle and load cell together, and the loop that advances time."""
+"""The emulator: stimulator, muscle, load cell and angle sensor together, and the loop that advances time."""
 
 from __future__ import annotations
 
@@ -12,16 +12,23 @@ from pathlib import Path
 from typing import Any
 
 from hardware_sim import stimulators
+from hardware_sim.angle_sensors import sensor as angle_frames
+from hardware_sim.angle_sensors.encoder import Encoder, Mounting
+from hardware_sim.angle_sensors.sensor import AngleSensor
+from hardware_sim.arm.description import Arm
+from hardware_sim.arm.limb import Limb
 from hardware_sim.control import Control
 from hardware_sim.electrodes import Electrodes
 from hardware_sim.errors import SettingsError
 from hardware_sim.faults.registry import Faults
 from hardware_sim.load_cells import cells, transports
+from hardware_sim.load_cells.cells import with_angle
 from hardware_sim.load_cells.frames import CellProtocol
-from hardware_sim.load_cells.sampler import LoadCell, Noise, deliver
+from hardware_sim.load_cells.sampler import LoadCell, deliver
 from hardware_sim.patients.muscle import Muscle
 from hardware_sim.pseudo_terminal import PseudoTerminal
 from hardware_sim.reactor import Reactor
+from hardware_sim.sampling import Noise, take_in_order
 from hardware_sim.scan import pick
 from hardware_sim.settings import Settings
 from hardware_sim.stimulators.board import Board, FirmwareProtocol
@@ -37,28 +44,38 @@ class Emulator:
 
     Time advances in `run`: each turn simulates muscle, cell and firmware up to the present, delivers the frames, and
     waits for the host or the next tick. Before a command from the host is obeyed, time advances to its arrival.
+
+    Without an arm the joint is held still and nobody measures its angle.
     """
 
-    def __init__(self, muscle: Muscle, settings: Settings) -> None:
+    def __init__(self, muscle: Muscle, settings: Settings, arm: Arm | None = None) -> None:
         self.settings = settings
         self.random = random.Random(settings.noise_seed)
         self.timeline = Timeline()
         self._reactor = Reactor()
         self._folder = Path(tempfile.mkdtemp(prefix="stimrig-emulator-"))
         cell = self._cell = _cell(settings)
-        noise = Noise(settings.noise_nm, settings.noise_seed)
+        epoch_us = time.time_ns() // 1000
+        self.limb = Limb(muscle, arm, settings.noise_seed) if arm else None
+        muscle = self.limb or muscle
+        self.encoder = _encoder(self.limb, settings) if self.limb else None
         self.load_cell = LoadCell(
             muscle,
             cell,
-            noise,
+            Noise(settings.noise_nm, settings.noise_seed),
             settings.rate_hz,
             offset_nm=settings.torque_offset_nm,
             clock_ppm=settings.clock_ppm,
             jitter_s=settings.clock_jitter_us * 1e-6,
             has_sync=settings.sync,
-            epoch_us=time.time_ns() // 1000,
+            epoch_us=epoch_us,
+            read_angle=self.encoder.read if self.encoder and settings.angle == "in-cell" else None,
         )
-        self.timeline.followers.append(self.load_cell.produce)
+        self.angle_sensor: AngleSensor | None = None
+        if self.encoder and settings.angle == "own":
+            self.angle_sensor = _angle_sensor(self.encoder, self.load_cell, settings, epoch_us)
+        samplers = [self.load_cell, self.angle_sensor] if self.angle_sensor else [self.load_cell]
+        self.timeline.followers.append(lambda until_s: take_in_order(samplers, until_s))
         self.electrodes = Electrodes(muscle, self.load_cell.raise_sync)
         self.board = Board(self.timeline, self.electrodes, self._write, lambda: self.port.unread_bytes())
         self.firmware: FirmwareProtocol = pick(stimulators, "Firmware", settings.stimulator, "stimulator")(self.board)
@@ -89,7 +106,23 @@ class Emulator:
             "noise_nm": self.settings.noise_nm,
             "noise_seed": self.settings.noise_seed,
             "sync": self.settings.sync and self._cell.has_sync,
+            **self._ready_arm(),
         }
+
+    def _ready_arm(self) -> dict[str, Any]:
+        if not (self.limb and self.encoder):
+            return {}
+        settings, mounting = self.settings, self.encoder.mounting
+        in_cell = settings.angle == "in-cell"
+        sensor = {
+            "kind": "in_cell" if in_cell else "own",
+            "frame_id": with_angle.CAN_ID if in_cell else angle_frames.CAN_ID,
+            "rate_hz": settings.rate_hz if in_cell else settings.angle_rate_hz,
+            "offset_deg": mounting.offset_deg,
+            "direction": mounting.direction,
+            "scale": mounting.scale,
+        }
+        return {"arm": self.limb.mode, "angle_sensor": sensor}
 
     def run(self, stopping: Callable[[], bool]) -> None:
         """Advance time until `stopping`."""
@@ -153,7 +186,8 @@ class Emulator:
             "last_pulse_time_s": last_s,
             "last_pulse_monotonic_s": None if last_s is None else self.clock.monotonic_s(last_s),
             "torque_nm": self.load_cell.torque_nm,
-            "samples": self.load_cell.samples,
+            "samples": self.load_cell.clock.samples,
+            **(self.limb.state() if self.limb else {}),
             "frames_overrun": self.transport.overruns,
             "faults": self.faults.active(),
             "stimulator": self.port.path if self.port.is_open else None,
@@ -183,6 +217,29 @@ class Emulator:
 
     def _write(self, frame: bytes) -> None:
         self.port.write(frame)
+
+
+def _encoder(limb: Limb, settings: Settings) -> Encoder:
+    mounting = Mounting(
+        settings.angle_offset_deg,
+        settings.angle_direction,
+        settings.angle_scale,
+        settings.angle_bits,
+        settings.angle_noise_deg,
+    )
+    return Encoder(limb.angle_deg, mounting, settings.noise_seed)
+
+
+def _angle_sensor(encoder: Encoder, load_cell: LoadCell, settings: Settings, epoch_us: int) -> AngleSensor:
+    """The sensor's frames go onto the cell's bus, between the cell's own."""
+    return AngleSensor(
+        encoder,
+        load_cell.add_frame,
+        settings.angle_rate_hz,
+        settings.angle_clock_ppm,
+        settings.angle_jitter_us * 1e-6,
+        epoch_us,
+    )
 
 
 def _cell(settings: Settings) -> CellProtocol:

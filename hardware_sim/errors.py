@@ -17,3 +17,7 @@ class SettingsError(HardwareSimError):
 
 class FaultError(HardwareSimError):
     """A fault of that name does not exist, or its settings make no sense."""
+
+
+class ArmError(HardwareSimError):
+    """The arm cannot be moved so, or its description makes no sense."""

@@ -9,12 +9,15 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 from hardware_sim import stimulators
+from hardware_sim.arm import registry as arms
+from hardware_sim.errors import SettingsError
 from hardware_sim.load_cells import cells, transports
 from hardware_sim.patients import registry
 from hardware_sim.scan import modules_with
-from hardware_sim.settings import Settings
+from hardware_sim.settings import ANGLES, Settings
 
 DEFAULTS = Settings()
+WITH_ANGLE = "with_angle"
 
 
 class OneLineParser(argparse.ArgumentParser):
@@ -37,6 +40,7 @@ def parse(arguments: Sequence[str] | None = None, prog: str = "stimrig emulate")
     devices = parser.add_argument_group("the devices")
     _devices(devices)
     _samples(devices)
+    _arm(parser.add_argument_group("the arm and the sensor of its angle (only with --arm)"))
     _process(parser.add_argument_group("the process"))
     return parser.parse_args(arguments)
 
@@ -53,7 +57,7 @@ def settings(options: argparse.Namespace, patient: str) -> Settings:
     return Settings(
         patient=patient,
         stimulator=options.stimulator,
-        cell=options.cell,
+        cell=_cell_kind(options),
         transport=options.load_cell,
         noise_nm=options.noise_nm,
         noise_seed=seed,
@@ -64,7 +68,25 @@ def settings(options: argparse.Namespace, patient: str) -> Settings:
         clock_jitter_us=options.clock_jitter_us,
         samples_per_frame=options.samples_per_frame,
         sync=not options.no_sync,
+        angle=options.angle,
+        angle_rate_hz=options.angle_rate_hz,
+        angle_bits=options.angle_bits,
+        angle_noise_deg=options.angle_noise_deg,
+        angle_offset_deg=options.angle_offset_deg,
+        angle_direction=options.angle_direction,
+        angle_scale=options.angle_scale,
+        angle_clock_ppm=options.angle_clock_ppm,
+        angle_jitter_us=options.angle_jitter_us,
     )
+
+
+def _cell_kind(options: argparse.Namespace) -> str:
+    """The cell as asked for; the one with an angle is there where, and only where, the angle is in its frame."""
+    in_cell = options.arm is not None and options.angle == "in-cell"
+    kind = options.cell or (WITH_ANGLE if in_cell else DEFAULTS.cell)
+    if in_cell != (kind == WITH_ANGLE):
+        raise SettingsError(f"--cell {WITH_ANGLE} goes with --arm and --angle in-cell, and no other cell does")
+    return kind
 
 
 def _who(group: argparse._ArgumentGroup) -> None:
@@ -91,9 +113,8 @@ def _devices(group: argparse._ArgumentGroup) -> None:
     )
     group.add_argument(
         "--cell",
-        default=DEFAULTS.cell,
         choices=modules_with(cells, "Cell"),
-        help="the cell's frames (default: %(default)s: id 0x181, float32 N·m, counter, status)",
+        help=f"the cell's frames (default: {DEFAULTS.cell}: id 0x181, float32 N·m, counter, status)",
     )
     group.add_argument("--no-sync", action="store_true", help="no sync line from the stimulator to the cell")
     group.add_argument(
@@ -141,6 +162,42 @@ def _samples(group: argparse._ArgumentGroup) -> None:
         default=0.0,
         metavar="SD",
         help="standard deviation of each sample's own time, never more than 0.45 of a period (default: 0)",
+    )
+
+
+def _arm(group: argparse._ArgumentGroup) -> None:
+    group.add_argument(
+        "--arm",
+        metavar="MODE[,SETTING=NUMBER…]|FILE",
+        help=f"what holds or moves the elbow: {', '.join(arms.modes())}, or a TOML or JSON file "
+        "(default: no arm, the joint is still and has no sensor)",
+    )
+    group.add_argument(
+        "--angle",
+        choices=ANGLES,
+        default=DEFAULTS.angle,
+        help="the angle in frames of its own (id 0x182) or in the load cell's frame (default: %(default)s)",
+    )
+    numbers = {
+        "rate-hz": ("HZ", "frames per second of its own"),
+        "bits": ("BITS", "resolution of the encoder, bits per turn"),
+        "noise-deg": ("SD", "standard deviation of its white noise, degrees"),
+        "offset-deg": ("DEG", "its reading at the straight arm"),
+        "scale": ("FACTOR", "true angle = direction × FACTOR × (reading − offset)"),
+        "clock-ppm": ("PPM", "drift of its clock"),
+        "jitter-us": ("SD", "standard deviation of each of its samples' own time"),
+    }
+    for name, (metavar, what) in numbers.items():
+        default = getattr(DEFAULTS, "angle_" + name.replace("-", "_"))
+        group.add_argument(
+            f"--angle-{name}",
+            type=type(default),
+            default=default,
+            metavar=metavar,
+            help=f"{what} (default: %(default)g)",
+        )
+    group.add_argument(
+        "--angle-direction", type=int, choices=(1, -1), default=1, help="-1: its readings fall in flexion (default: 1)"
     )
 
 

@@ -75,11 +75,11 @@ def _configure(options: argparse.Namespace) -> configuration.RigConfig:
 
 
 def _check(config: configuration.RigConfig) -> None:
-    """Create both devices without opening them; this reads the DBC, too."""
-    clock = MonotonicClock(config.clock_speed)
-    devices.find("stimulator", config.stimulator.device).create(config.stimulator, clock)
-    devices.find("load_cell", config.load_cell.device).create(config.load_cell, clock)
-    print(json.dumps({"ok": True, "stimulator": config.stimulator.device, "load_cell": config.load_cell.device}))
+    """Create the devices without opening them; this reads the DBC, too."""
+    clock, chosen = MonotonicClock(config.clock_speed), config.devices()
+    for kind, settings in chosen.items():
+        devices.find(kind, settings.device).create(settings, clock)
+    print(json.dumps({"ok": True, **{kind: settings.device for kind, settings in chosen.items()}}))
 
 
 async def _serve(config: configuration.RigConfig, parent: int | None) -> None:

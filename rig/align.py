@@ -95,8 +95,8 @@ def align(
     if pairs is not None and len(pairs[0]) >= MIN_EDGES:
         *pairs, sure = pairs
         line, method = robust_line(*pairs), "sync"
-        misfit_s = _misfit(line, *pairs)
-        coarse_s = 0.0 if sure else _misfit(envelope, *earliest(cell_s, host_s))
+        misfit_s = misfit(line, *pairs)
+        coarse_s = 0.0 if sure else misfit(envelope, *earliest(cell_s, host_s))
         if coarse_s > COARSE_MISFIT_S:  # then edges may have been matched to the wrong pulses
             misfit_s = max(misfit_s, coarse_s)
         # Pulses are often synchronous with the samples, so a pulse's position in its sample does not average out.
@@ -104,7 +104,7 @@ def align(
         error_s = float(np.hypot(error_s, misfit_s))
     else:
         line, method = envelope, "regression"
-        error_s = float(np.hypot(envelope.error_s, _misfit(envelope, *earliest(cell_s, host_s))))
+        error_s = float(np.hypot(envelope.error_s, misfit(envelope, *earliest(cell_s, host_s))))
     time_s = line.at(cell_s)
     delay_ms = float(np.median(host_s - time_s)) * 1e3
     return time_s, Alignment(method, error_s * 1e3, delay_ms, (line.rate - 1) * 1e6)
@@ -136,7 +136,7 @@ def _median_slope(x: Array, y: Array) -> float:
     return float(np.median((y[j] - y[i])[apart] / (x[j] - x[i])[apart]))
 
 
-def _misfit(line: Line, cell_s: Array, host_s: Array) -> float:
+def misfit(line: Line, cell_s: Array, host_s: Array) -> float:
     """Largest slow deviation from the line (a clock with a drifting rate), s: the worst of the windows' medians.
 
     The scatter that medians of so few points have by chance is subtracted.

@@ -10,6 +10,7 @@ import hashlib
 import json
 import os
 import tempfile
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -49,6 +50,22 @@ COLUMNS: tuple[tuple[str, str, str], ...] = (
 )
 """Path, unit and description of each numeric dataset, in the order of `content_sha256`."""
 
+ANGLE_COLUMNS: tuple[tuple[str, str, str], ...] = (
+    ("angle/time_s", "s", "time of each sample on the test's clock, aligned with the pulses"),
+    ("angle/angle_rad", "rad", "joint angle; elbow: 0 is a straight arm, flexion is positive"),
+    ("angle/velocity_rad_s", "rad/s", "its derivative, by the method that the group's attributes state"),
+    ("angle/raw", "1", "what the sensor gave, in its own unit"),
+    ("angle/counter", "1", "the sensor's sample counter, unwrapped; -1 where it has none"),
+    ("angle/host_time_s", "s", "when the host received the sample, test's clock"),
+    ("angle/gaps", "1", "rows: index of the first sample after a loss, how many are missing there"),
+)
+"""The same, after the others, of a rig with an angle sensor: all of them, or none."""
+
+
+def layout(columns: Collection[str]) -> tuple[tuple[str, str, str], ...]:
+    """The datasets of a recording that has these paths."""
+    return COLUMNS + ANGLE_COLUMNS if any(path.startswith("angle/") for path in columns) else COLUMNS
+
 
 @dataclass(frozen=True, slots=True)
 class Sealed:
@@ -61,9 +78,9 @@ class Sealed:
 
 
 def content_sha256(columns: dict[str, NDArray[Any]]) -> str:
-    """SHA-256 over the raw little-endian bytes of the datasets, in the order of `COLUMNS`."""
+    """SHA-256 over the raw little-endian bytes of the datasets, in the order of `layout`."""
     digest = hashlib.sha256()
-    for path, _, _ in COLUMNS:
+    for path, _, _ in layout(columns):
         column = columns[path]
         digest.update(np.ascontiguousarray(column, dtype=column.dtype.newbyteorder("<")).tobytes())
     return digest.hexdigest()
@@ -75,7 +92,7 @@ def to_bytes(recording: Recording) -> bytes:
         for name, value in recording.attributes.items():
             file.attrs[name] = _text(value) if isinstance(value, str) else value
         file.attrs["content_sha256"] = content_sha256(recording.columns)
-        for path, unit, description in COLUMNS:
+        for path, unit, description in layout(recording.columns):
             column = recording.columns[path]
             kwargs = {"compression": "gzip", "compression_opts": 1, "shuffle": True} if column.size > 1000 else {}
             dataset = file.create_dataset(path, data=column, **kwargs)
@@ -87,6 +104,8 @@ def to_bytes(recording: Recording) -> bytes:
         group = file.create_group("alignment")
         for name in ("method", "error_ms", "delay_ms", "rate_ppm"):
             group.attrs[name] = getattr(recording.alignment, name)
+        for name, value in recording.angle.items():
+            file["angle"].attrs[name] = _text(value) if isinstance(value, str) else value
         file.attrs["events"] = json.dumps(recording.events)
         file.flush()
         return bytes(file.id.get_file_image())
@@ -158,7 +177,8 @@ def verify(path: Path) -> str:
     """
     try:
         with h5py.File(path, "r") as file:
-            columns = {p: np.asarray(file[p]) for p, _, _ in COLUMNS}
+            found = layout(["angle/"] if "angle" in file else [])
+            columns = {p: np.asarray(file[p]) for p, _, _ in found}
             stated = str(file.attrs["content_sha256"])
     except (OSError, KeyError) as error:
         raise RecordingError(f"{path}: not a readable recording ({error})") from None

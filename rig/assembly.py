@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rig import align, intended, journal
+from rig import align, angle_columns, intended, journal
+from rig.align_angle import Reference
 from rig.clock import utc_text
 from rig.errors import RecordingError
 from rig.journal import JournalContents, Kind
@@ -24,7 +25,7 @@ from rig.signals import SAMPLE, PulseStatus
 
 FORMAT = "stimrig-recording"
 FORMAT_VERSION = 1
-EVIDENCE = (Kind.START, Kind.INTENT, Kind.WRITTEN, Kind.SKIPPED, Kind.ACKED, Kind.TORQUE)
+EVIDENCE = (Kind.START, Kind.INTENT, Kind.WRITTEN, Kind.SKIPPED, Kind.ACKED, Kind.TORQUE, Kind.ANGLE)
 """Blocks that show that the test had begun."""
 LIKELY_RATE_HZ = 40.0
 """Assumed if neither header nor intents give the pulse rate."""
@@ -32,13 +33,17 @@ LIKELY_RATE_HZ = 40.0
 
 @dataclass(slots=True)
 class Recording:
-    """A test as arrays: `columns` by the paths of `archive.COLUMNS`, `names` of segments, attributes of the file."""
+    """A test as arrays: `columns` by the paths of `archive.COLUMNS`, `names` of segments, attributes of the file.
+
+    `angle` are the attributes of the group of that name; empty where the rig had no angle sensor.
+    """
 
     columns: dict[str, NDArray[Any]]
     names: list[str]
     attributes: dict[str, Any]
     alignment: align.Alignment
     events: list[dict[str, Any]] = field(default_factory=list)
+    angle: dict[str, Any] = field(default_factory=dict)
 
 
 def assemble(contents: JournalContents, outcome: str = "fault", reason: str = "") -> Recording:
@@ -77,8 +82,10 @@ def _assembled(contents: JournalContents, outcome: str, reason: str) -> Recordin
     columns = pulses.columns(rate_hz, played_s, contents.blocks_missing > 0, notes)
     written_s = columns["pulses/written_time_s"]
     pulse_times = np.sort(written_s[np.isfinite(written_s)])
-    torque, alignment, measured_hz = _torque(contents, t0_s, end_s, pulse_times, float(header["sample_rate_hz"]))
-    columns.update(torque)
+    reference, alignment, measured_hz = _aligned(contents, t0_s, pulse_times, float(header["sample_rate_hz"]))
+    columns.update(_torque(reference, end_s))
+    of_angle, angle = angle_columns.of_journal(contents, header, reference, end_s)
+    columns.update(of_angle)
     segments = [s for s in segments if s.start / rate_hz < played_s]
     columns["segments/start_s"] = np.array([s.start / rate_hz for s in segments])
     columns["segments/end_s"] = np.minimum([s.end / rate_hz for s in segments], max(played_s, 0.0))
@@ -104,7 +111,7 @@ def _assembled(contents: JournalContents, outcome: str, reason: str) -> Recordin
         "journal_note": "; ".join(notes),
     }
     events = [json.loads(payload) for kind, payload in contents.blocks if kind == Kind.EVENT]
-    return Recording(columns, [s.name for s in segments], attributes, alignment, events)
+    return Recording(columns, [s.name for s in segments], attributes, alignment, events, angle)
 
 
 def _ending(contents: JournalContents, header: dict[str, Any], end: dict[str, Any]) -> dict[str, Any]:
@@ -299,27 +306,32 @@ class _Pulses:
         self._current[known] = self._current_ma
 
 
-def _torque(
-    contents: JournalContents, t0_s: float, end_s: float, written_s: NDArray[np.float64], sample_rate_hz: float
-) -> tuple[dict[str, NDArray[Any]], align.Alignment, float]:
+def _aligned(
+    contents: JournalContents, t0_s: float, written_s: NDArray[np.float64], sample_rate_hz: float
+) -> tuple[Reference, align.Alignment, float]:
+    """All torque samples with their times on the test's clock, how these were obtained, samples per second."""
     blocks = [np.frombuffer(p, SAMPLE) for k, p in contents.blocks if k == Kind.TORQUE]
     samples = np.concatenate(blocks) if blocks else np.empty(0, SAMPLE)
-    counter = samples["counter"].astype(np.int64)
+    cell_s = align.cell_time(samples["counter"].astype(np.int64), samples["stamp_s"], sample_rate_hz)
     host_s = samples["host_time_s"] - t0_s
-    cell_s = align.cell_time(counter, samples["stamp_s"], sample_rate_hz)
     time_s, alignment = align.align(cell_s, host_s, samples["sync"], written_s, sample_rate_hz)
-    inside = np.flatnonzero((time_s >= 0) & (time_s < end_s))
+    measured_hz = sample_rate_hz / (1 + alignment.rate_ppm * 1e-6)
+    return Reference(samples, time_s, t0_s, alignment.error_ms), alignment, measured_hz
+
+
+def _torque(of: Reference, end_s: float) -> dict[str, NDArray[Any]]:
+    """The datasets of `/torque`, of the test alone."""
+    counter = of.samples["counter"].astype(np.int64)
+    inside = np.flatnonzero((of.time_s >= 0) & (of.time_s < end_s))
     steps = np.diff(counter)
     after = np.flatnonzero((steps > 1) & (counter[:-1] >= 0)) + 1
     after = after[np.isin(after, inside) & np.isin(after - 1, inside)]
     gaps = np.column_stack([np.searchsorted(inside, after), steps[after - 1] - 1])
-    measured_hz = sample_rate_hz / (1 + alignment.rate_ppm * 1e-6)
-    columns: dict[str, NDArray[Any]] = {
-        "torque/time_s": time_s[inside],
-        "torque/torque_nm": samples["torque_nm"][inside],
+    return {
+        "torque/time_s": of.time_s[inside],
+        "torque/torque_nm": of.samples["torque_nm"][inside],
         "torque/counter": counter[inside],
-        "torque/host_time_s": host_s[inside],
-        "torque/sync": samples["sync"][inside],
+        "torque/host_time_s": (of.samples["host_time_s"] - of.t0_s)[inside],
+        "torque/sync": of.samples["sync"][inside],
         "torque/gaps": gaps.astype(np.int64).reshape(-1, 2),
     }
-    return columns, alignment, measured_hz

@@ -6,6 +6,7 @@ An error is one line: file, key, what is wrong, how to correct it.
 from __future__ import annotations
 
 import json
+import math
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
@@ -18,6 +19,7 @@ from rig.acquire.health import Watch
 from rig.devices import DeviceSettings, Kind
 from rig.errors import ConfigError, RefusedError
 from rig.limits import Limit
+from rig.messages import Range
 
 
 class _Table(BaseModel):
@@ -40,6 +42,8 @@ class LimitSettings(_Numbers):
     pulse_rate_hz: float | None = Field(None, ge=1)
     torque_nm: float | None = Field(None, gt=0)
     torque_jump_nm: float | None = Field(None, gt=0)
+    angle_rad: Range | None = None
+    angle_jump_rad: float | None = Field(None, gt=0)
     duration_s: float | None = Field(None, gt=0)
     charge_per_test_uc: float | None = Field(None, ge=0)
     width_rise_us: float | None = Field(None, gt=0)
@@ -53,8 +57,8 @@ class LimitSettings(_Numbers):
             if name.startswith("rest_"):
                 table = limits.at_least(table, name, value, "rig file")
                 continue
-            lo = -value if name == "torque_nm" else None
-            table = limits.tightened(table, name, value, "rig file", lo)
+            lo, hi = value if name == "angle_rad" else (-value if name == "torque_nm" else None, value)
+            table = limits.tightened(table, name, hi, "rig file", lo)
         return table
 
 
@@ -67,6 +71,7 @@ class WatchSettings(_Numbers):
     stuck_torque_s: float = Field(0.5, gt=0.05, le=10)
     clipped_torque_s: float = Field(3.0, gt=0.05, le=10)
     stale_disk_s: float = Field(3.0, gt=0.5, le=10)
+    stale_angle_s: float = Field(0.1, gt=0, le=0.5)
 
     def watch(self) -> Watch:
         """As `rig.acquire` takes it."""
@@ -74,7 +79,7 @@ class WatchSettings(_Numbers):
 
 
 class RigConfig(_Table):
-    """A complete rig file, checked. `stimulator` and `load_cell` are the settings of the chosen devices.
+    """A complete rig file, checked. `stimulator`, `load_cell` and `angle_sensor` are the chosen devices' settings.
 
     `clock_speed` is not a key of the rig file: all limits with a time are in rig seconds, so a faster clock would widen
     them. Only the emulator's JSON line sets it (see `for_emulator`).
@@ -86,15 +91,21 @@ class RigConfig(_Table):
     require_calibration: StrictBool = True
     stimulator: DeviceSettings
     load_cell: DeviceSettings
+    angle_sensor: DeviceSettings | None = None
     limits: LimitSettings = LimitSettings.model_validate({})
     watch: WatchSettings = WatchSettings.model_validate({})
 
     def public(self) -> dict[str, Any]:
         """The configuration as stored in every recording."""
         content = self.model_dump(mode="json")
-        content["stimulator"] = self.stimulator.model_dump(mode="json")
-        content["load_cell"] = self.load_cell.model_dump(mode="json")
+        for kind, settings in self.devices().items():
+            content[kind] = settings.model_dump(mode="json")
         return content
+
+    def devices(self) -> dict[Kind, DeviceSettings]:
+        """The settings of each device that this rig has, in the order in which they are opened."""
+        found: dict[Kind, DeviceSettings] = {"stimulator": self.stimulator, "load_cell": self.load_cell}
+        return found if self.angle_sensor is None else {**found, "angle_sensor": self.angle_sensor}
 
 
 EMULATOR_ONLY = "clock_speed"
@@ -127,9 +138,9 @@ def load(path: Path, **overrides: Any) -> RigConfig:
         raise ConfigError(
             f"{place}: only an emulator's clock may run faster than real time, and its own JSON line sets it; remove it"
         )
-    cell = content.get("load_cell")
-    if isinstance(cell, dict) and str(cell.get("dbc", "")).endswith(".dbc"):
-        cell["dbc"] = str(path.parent / cell["dbc"])
+    for device in (content.get("load_cell"), content.get("angle_sensor")):
+        if isinstance(device, dict) and str(device.get("dbc", "")).endswith(".dbc"):
+            device["dbc"] = str(path.parent / device["dbc"])
     return check(content, str(path), **overrides)
 
 
@@ -141,9 +152,10 @@ EMULATED_CELLS: dict[str, Callable[[int], dict[str, Any]]] = {
     "plain": lambda samples: _packed("torque_packed3", samples, "Counter") if samples > 1 else {},
     "counts": lambda samples: _packed("counts_be16", samples, ""),
     "canopen": lambda _: {"start_frames": ["000#0101"], "stop_frames": ["000#0201"]},
+    "with_angle": lambda _: {"dbc": "torque_with_angle"},
 }
 """Rig-file settings for each of the emulator's cells, by name and samples per frame."""
-EMULATOR_WATCH = {"stale_torque_s": 0.5, "missing_ack_s": 0.5, "clipped_torque_s": 10.0}
+EMULATOR_WATCH = {"stale_torque_s": 0.5, "missing_ack_s": 0.5, "clipped_torque_s": 10.0, "stale_angle_s": 0.5}
 """No person is connected to an emulator, and it shares its processors with other programs. A pause of 0.1 s would stop
 a real rig, but must not end a demo. A hidden saturated amplifier is there to be diagnosed, and stays saturated for up
 to 6 s of the default ramp."""
@@ -166,6 +178,7 @@ def for_emulator(ready: str, **overrides: Any) -> RigConfig:
         # the link stays valid after replugging, like udev's names by id
         stimulator, can = line.get("stimulator_link", line["stimulator"]), line["can"]
         cell = EMULATED_CELLS[line.get("cell", "plain")](int(line.get("samples_per_frame", 1)))
+        sensor = _emulated_sensor(line["angle_sensor"]) if line.get("angle_sensor") else None
         # the link is missing while the emulated stimulator is unplugged: then use the port itself
         linked = Path(str(stimulator)).is_symlink() or Path(str(stimulator)).exists()
         place = Path(str(stimulator if linked else line["stimulator"])).resolve()
@@ -190,8 +203,22 @@ def for_emulator(ready: str, **overrides: Any) -> RigConfig:
             "sync": "Sync" if line.get("sync", True) else "",
             **cell,
         },
+        "angle_sensor": sensor,
     }
     return check(content, "--emulator-json", **overrides)
+
+
+def _emulated_sensor(line: dict[str, Any]) -> dict[str, Any]:
+    """The rig-file settings of an emulator's angle sensor, as a calibration by two poses would find them."""
+    of_the_cell = line["kind"] == "in_cell"
+    return {
+        "device": "can_angle_sensor",
+        "of_the_cell": of_the_cell,
+        "offset": float(line.get("offset_deg", 0.0)),
+        "direction": int(line.get("direction", 1)),
+        "radians_per_unit": math.radians(float(line.get("scale", 1.0))),
+        **({} if of_the_cell else {"sample_rate_hz": float(line["rate_hz"])}),
+    }
 
 
 def check(content: dict[str, Any], place: str, **overrides: Any) -> RigConfig:
@@ -199,6 +226,8 @@ def check(content: dict[str, Any], place: str, **overrides: Any) -> RigConfig:
     content = {**content, **{key: value for key, value in overrides.items() if value is not None}}
     for kind in ("stimulator", "load_cell"):
         content[kind] = _device(kind, content.get(kind), place)
+    if content.get("angle_sensor") is not None:
+        content["angle_sensor"] = _device("angle_sensor", content["angle_sensor"], place).beside(content["load_cell"])
     try:
         config = RigConfig.model_validate(content)
         config.limits.table()

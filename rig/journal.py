@@ -62,6 +62,7 @@ class Kind(IntEnum):
     END = 10
     SPACER = 11
     LAID = 12
+    ANGLE = 13
 
 
 LaidBy = Literal["plan", "extension", "end"]

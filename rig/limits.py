@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass, replace
 
 from rig.errors import RefusedError
-from rig.messages import Bound, Profile, TestPlan
+from rig.messages import PASSIVE, Bound, Profile, TestPlan
 from rig.signals import Pulse
 
 STEP_PULSE_WIDTH_US = 1.0
@@ -72,6 +72,16 @@ HARD_LIMITS: dict[str, Limit] = {
             "torque_jump_nm", 0.0, 5.0, "N·m",
             "an elbow's torque cannot change so much within a sample: a knock, a loose cable, a reversed sign",
             "own rule: 1000 N·m/s, twice a strong arm's rate of rise, is 0.6 N·m a sample at 1600/s",
+        ),
+        Limit(
+            "angle_rad", -0.35, 2.79, "rad",
+            "no elbow reaches farther (20° beyond straight, 160° of flexion): the sensor or the joint is in trouble",
+            "AAOS: 0 to 150°, lax joints 15° beyond straight; own margin of 5° and 10°",
+        ),
+        Limit(
+            "angle_jump_rad", 0.0, 0.12, "rad",
+            "an elbow cannot turn so far between two samples: a loose cable, a reversed sign, a slipped sensor",
+            "own rule: the fastest voluntary flexion, about 20 rad/s, is 0.1 rad a sample at 200/s",
         ),
         Limit(
             "duration_s", 0.0, 300.0, "s",
@@ -220,6 +230,8 @@ def tightened(table: dict[str, Limit], name: str, hi: float, owner: str, lo: flo
         The bound is not a number, or no value would be left.
     """
     row = table[name]
+    if lo is not None and not (lo <= row.hi):
+        raise RefusedError(f"{owner}: {name} {lo:g} {row.unit} must be at most {row.hi:g} {row.unit}")
     lo = row.lo if lo is None else max(row.lo, lo)
     if not (lo <= hi):
         raise RefusedError(f"{owner}: {name} {hi:g} {row.unit} must be at least {lo:g} {row.unit}")
@@ -250,6 +262,9 @@ def for_profile(table: dict[str, Limit], profile: Profile, owner: str = "partici
     table = tightened(table, "current_ma", profile.current_ma, owner)
     if not (profile.max_torque_nm > 0):
         raise RefusedError(f"{owner}: max_torque_nm {profile.max_torque_nm:g} N·m must be above 0")
+    if profile.angle_range_rad is not None:
+        lo_rad, hi_rad = profile.angle_range_rad
+        table = tightened(table, "angle_rad", hi_rad, owner, lo_rad)
     if profile.rest_between_tests_s is not None:
         table = at_least(table, "rest_between_tests_s", profile.rest_between_tests_s, owner)
     return tightened(table, "torque_nm", profile.max_torque_nm, owner, lo=-profile.max_torque_nm)
@@ -271,6 +286,11 @@ def for_plan(table: dict[str, Limit], request: TestPlan) -> dict[str, Limit]:
         if not (request.max_torque_nm > 0):
             raise RefusedError(f"{owner}: max_torque_nm {request.max_torque_nm:g} N·m must be above 0")
         table = tightened(table, "torque_nm", request.max_torque_nm, owner, lo=-request.max_torque_nm)
+    if request.angle is not None:
+        lo_rad, hi_rad = request.angle.range_rad
+        table = tightened(table, "angle_rad", hi_rad, owner, lo_rad)
+    if request.kind == PASSIVE:
+        table = tightened(table, "pulse_width_us", 0.0, "passive test")
     if request.adaptive is not None:
         table = tightened(table, "duration_s", request.adaptive.max_duration_s, owner)
     return table

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rig import pieces, protocols, sequences
 from rig.errors import PlanError
 from rig.limits import Limit, Steps, check
-from rig.messages import Preview, ProtocolInfo, RecruitmentTable, Sequences, TestPlan
+from rig.messages import HELD, MOVING, PASSIVE, Preview, ProtocolInfo, RecruitmentTable, Sequences, TestPlan
 from rig.pieces import MAX_SEGMENTS, MAX_WIDTH_SETTING, Piece
 
 USUAL_RATE_HZ = 40.0
@@ -79,6 +79,8 @@ class PlannedTest:
     @property
     def first_pulse(self) -> int | None:
         """Index of the earliest pulse that may stimulate; None: there is none."""
+        if self.plan.kind == PASSIVE:
+            return None  # nor can a client add one
         first = np.flatnonzero(self.pulse_width_us)
         if self.plan.adaptive is None:
             return int(first[0]) if len(first) else None
@@ -104,6 +106,7 @@ def build(plan: TestPlan, table: dict[str, Limit]) -> PlannedTest:
         The plan would break a limit: names the limit, the pulse and the excess.
     """
     pieces.refuse(check(table["pulse_rate_hz"], plan.pulse_rate_hz), "plan")
+    _check_angle(plan, table)
     chosen = plan.segments
     if chosen is None:
         chosen = protocols.segments(plan.protocol, min(table["pulse_width_us"].hi, plan.largest_us))
@@ -119,6 +122,19 @@ def build(plan: TestPlan, table: dict[str, Limit]) -> PlannedTest:
         _check_end(widths_us, plan, table)
         longest_s = table["duration_s"].hi
     return PlannedTest(plan, widths_us, laid_out(built), built, longest_s)
+
+
+def _check_angle(plan: TestPlan, table: dict[str, Limit]) -> None:
+    """What a kind of test needs of the angle, and whether its angles fit each other."""
+    if plan.angle is None:
+        if plan.kind in (PASSIVE, HELD, MOVING):
+            raise PlanError(f"plan.angle: a {plan.kind} test needs it; give at least its range_rad")
+        return
+    target_rad = plan.angle.target_rad
+    if plan.kind == HELD and target_rad is None:
+        raise PlanError("plan.angle.target_rad: a held test needs the angle at which the joint is held")
+    if target_rad is not None:
+        pieces.refuse(check(table["angle_rad"], target_rad), "plan.angle.target_rad")
 
 
 def _check_end(widths_us: NDArray[np.float64], plan: TestPlan, table: dict[str, Limit]) -> None:

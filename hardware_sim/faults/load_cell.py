@@ -113,7 +113,7 @@ def torque_step(target: Target, step_nm: float = 40.0) -> Undo:
 @fault
 def bus_off(target: Target) -> Undo:
     """The adapter reports bus-off once, then nothing comes."""
-    time_us = target.load_cell.time_us(target.timeline.now_s)
+    time_us = target.load_cell.clock.time_us(target.timeline.now_s)
     target.load_cell.add_frame(Frame(BUS_OFF_CLASS, bytes(8), time_us, error=True))
     return hooked(target.load_cell.frame_hooks, lambda _frame: ())
 
@@ -136,17 +136,17 @@ def counter_jump(target: Target, step: int = 1000) -> Undo:
 @fault
 def rate_off(target: Target, percent: float = 5.0) -> Undo:
     """The cell samples faster than nominal, or slower if `percent` is negative."""
-    target.load_cell.set_rate_factor(1.0 + percent / 100.0)
-    return lambda: target.load_cell.set_rate_factor(1.0)
+    target.load_cell.clock.set_rate_factor(1.0 + percent / 100.0)
+    return lambda: target.load_cell.clock.set_rate_factor(1.0)
 
 
 @fault
 def clock_jitter(target: Target, sd_us: float = 100.0) -> Undo:
     """Each sample is taken off its time at random, never by more than 0.45 of a period."""
     _check_not_negative("clock_jitter", "sd_us", sd_us)
-    before_s = target.load_cell.jitter_s
-    target.load_cell.set_jitter(sd_us * 1e-6)
-    return lambda: target.load_cell.set_jitter(before_s)
+    before_s = target.load_cell.clock.jitter_s
+    target.load_cell.clock.set_jitter(sd_us * 1e-6)
+    return lambda: target.load_cell.clock.set_jitter(before_s)
 
 
 @fault

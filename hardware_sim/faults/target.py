@@ -5,19 +5,26 @@ from __future__ import annotations
 import random
 from typing import Protocol
 
+from hardware_sim.angle_sensors.encoder import Encoder
+from hardware_sim.angle_sensors.sensor import AngleSensor
 from hardware_sim.load_cells.sampler import LoadCell
 from hardware_sim.stimulators.board import Board, FirmwareProtocol
 from hardware_sim.timeline import Timeline
 
 
 class Target(Protocol):
-    """The emulated devices and their cables; `random` gives every random number that a fault needs."""
+    """The emulated devices and their cables; `random` gives every random number that a fault needs.
+
+    The encoder is there where the rig has an arm, the angle sensor where the angle comes in frames of its own.
+    """
 
     random: random.Random
     timeline: Timeline
     board: Board
     firmware: FirmwareProtocol
     load_cell: LoadCell
+    encoder: Encoder | None
+    angle_sensor: AngleSensor | None
 
     def plug_stimulator(self) -> None:
         """Connect the stimulator, on a new port."""

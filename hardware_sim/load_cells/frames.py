@@ -8,13 +8,24 @@ from typing import Any, NamedTuple, Protocol
 LARGEST_STANDARD_ID = 0x7FF
 
 
+class AngleReading(NamedTuple):
+    """What a sensor of the joint's angle says: degrees from its own zero in its own direction, and its fault bit."""
+
+    angle_deg: float
+    fault: bool
+
+
 class Sample(NamedTuple):
-    """One reading; `time_us` is on the cell's own clock; `counter` never wraps here, only in a cell's frames."""
+    """One reading; `time_us` is on the cell's own clock; `counter` never wraps here, only in a cell's frames.
+
+    `angle` is there where the cell's electronics read a joint angle too.
+    """
 
     torque_nm: float
     counter: int
     sync: bool
     time_us: int
+    angle: AngleReading | None = None
 
 
 class Frame(NamedTuple):

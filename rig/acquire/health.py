@@ -34,6 +34,7 @@ class Watch:
     stale_disk_s: float = 3.0
     stuck_torque_s: float = 0.5
     clipped_torque_s: float = 3.0
+    stale_angle_s: float = 0.1
 
 
 DEFAULT_WATCH = Watch()
@@ -77,8 +78,17 @@ class Disk:
 class Health:
     """All checks together."""
 
-    def __init__(self, gate: Gate, receiver: Receiver, disk: Disk, clock: Clock, watch: Watch) -> None:
+    def __init__(
+        self,
+        gate: Gate,
+        receiver: Receiver,
+        disk: Disk,
+        clock: Clock,
+        watch: Watch,
+        angle: Callable[[], str | None] = lambda: None,
+    ) -> None:
         self._gate, self._receiver, self._disk, self._clock, self._watch = gate, receiver, disk, clock, watch
+        self._angle = angle
 
     def fault(self, due_s: float) -> str | None:
         """What is wrong, in words; None: all checks pass.
@@ -95,6 +105,8 @@ class Health:
         age_s = self._receiver.age_s(now_s) / speed
         if not (age_s <= watch.stale_torque_s):
             return f"load cell: torque is stale, the newest sample is {age_s * 1e3:.0f} ms old"
+        if (wrong := self._angle()) is not None:
+            return wrong
         pulse = self._gate.on_its_way
         if pulse is not None and not ((now_s - pulse.written_s) / speed <= watch.missing_ack_s):
             return f"stimulator: a pulse was not acknowledged within {watch.missing_ack_s * 1e3:.0f} ms"

@@ -17,6 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
+from rig.acquire.angle_guard import AngleGuard
+from rig.acquire.angle_receiver import AngleReceiver
 from rig.acquire.evidence import AROUND_S, evidence, stop_device, watch_decay
 from rig.acquire.halt import Cause, Halt
 from rig.acquire.health import DEFAULT_WATCH, Disk, Health, Watch
@@ -63,6 +65,7 @@ class RunResult:
     torque_time_nms: float = 0.0
     ended_by: str = ""
     last_sample_unix_s: float | None = None
+    angle_counts: Recorded | None = None
 
 
 class TestRun:
@@ -76,6 +79,8 @@ class TestRun:
         Already contains header and plan.
     halt
         Ends the test early from any thread.
+    angle
+        The angle sensor's receiver; None: the rig has none.
     """
 
     __test__ = False
@@ -90,6 +95,7 @@ class TestRun:
         clock: Clock,
         halt: Halt,
         watch: Watch = DEFAULT_WATCH,
+        angle: AngleReceiver | None = None,
     ) -> None:
         self.plan = test.plan
         self.score = Score(test, table, journal, clock)
@@ -103,6 +109,8 @@ class TestRun:
         self._receiver = receiver
         self._clock = clock
         self._watch = watch
+        self._angle = AngleGuard(angle, test.plan, table, clock, watch)
+        self._angle_counts: Recorded | None = None
         self._asked_s: float | None = None
         self._rest_nm: float | None = None
         self._outcome: TestOutcome = "fault"
@@ -125,8 +133,9 @@ class TestRun:
             self._receiver.changes_lately(),
         )
         self._receiver.record(self._journal, (torque.lo, torque.hi), self._fault, self._plausibility)
+        self._angle.record(self._journal, self._fault)
         disk = Disk(self._journal)
-        self._health = Health(self._gate, self._receiver, disk, self._clock, self._watch)
+        self._health = Health(self._gate, self._receiver, disk, self._clock, self._watch, self._angle.fault)
         try:
             if self._arm():
                 with _undisturbed():
@@ -203,16 +212,20 @@ class TestRun:
         began_s = self._clock.now_s()
         while True:
             fresh = self._receiver.age_s(self._clock.now_s()) <= self._watch.stale_torque_s * speed
-            if fresh and self._receiver.settled():
+            settled, seen = fresh and self._receiver.settled(), self._angle.fresh()
+            if settled and seen:
                 break
             waited_s = (self._clock.now_s() - began_s) / speed
             if not fresh and waited_s >= FRESH_S:
                 self._fault("load cell: no torque arrived before the test; check its cable and power supply")
+            if not seen and waited_s >= FRESH_S:
+                self._fault(self._angle.fault() or "angle sensor: no angle arrived before the test; check its cable")
             if waited_s >= SETTLE_S:
                 self._fault("load cell: samples arrive much faster than sample_rate_hz; check rig file and bus")
             if self._clock.wait(self._clock.now_s() + 0.005 * speed, self.halt.event):
                 return False
         self._plausibility.begin()
+        self._angle.begin()
         self._rest_nm = self._receiver.torque_around(0.1 * speed)
         self._gate.open(self._journal, self._table)
         if self.halt.event.is_set():
@@ -226,6 +239,7 @@ class TestRun:
         t0_s = clock.now_s() + LEAD_S * clock.speed
         self._journal.append_json(Kind.START, {"t0_s": t0_s, "unix_s": clock.unix_s() + LEAD_S})
         self.t0_s = t0_s
+        self._angle.started()
         self.started.set()
         late_s = self._watch.late_pulse_periods * period_s
         index, resting = 0, True
@@ -261,7 +275,7 @@ class TestRun:
         self.stimulation_ended.set()
         if cause is None and not device[0]:  # without the device's confirmation the end is a fault
             self._fault(f"the end of stimulation is not confirmed: {device[2] or device[1]}")
-        elif cause is None and (wrong := self._plausibility.fault_at_end()):
+        elif cause is None and (wrong := self._plausibility.fault_at_end() or self._angle.fault_at_end()):
             self._fault(wrong)
         cause = self.halt.cause
         if cause is None:
@@ -289,7 +303,7 @@ class TestRun:
             "ended_by": self.ended_by,
         }
         self._gate.release()
-        self._counts = self._receiver.release()
+        self._counts, self._angle_counts = self._receiver.release(), self._angle.release()
         # If the end cannot be written, the journal is recovered later as one without an end.
         with contextlib.suppress(JournalError):
             if cause is not None:
@@ -316,6 +330,7 @@ class TestRun:
             torque_time_nms=self.torque_time_nms,
             ended_by=self.ended_by,
             last_sample_unix_s=self._receiver.last_unix_s,
+            angle_counts=self._angle_counts,
         )
 
     def _rise_nm(self) -> float | None:

@@ -3,24 +3,26 @@
 from __future__ import annotations
 
 import logging
-import math
 import threading
 import time
 from collections.abc import Callable
+from typing import Any
 
 from rig import limits
+from rig.acquire.angle_receiver import AngleReceiver
 from rig.acquire.halt import Cause, Halt
 from rig.acquire.run import TestRun
 from rig.clock import Clock
 from rig.config import RigConfig
+from rig.control.angle_calibration import AngleCalibrating
 from rig.control.calibration import Calibration
 from rig.control.latch import Latch, Remembered, lock_folder
-from rig.control.live import live_event
+from rig.control.live import finite, live_event
 from rig.control.pair import Pair
 from rig.control.rest import Rest
 from rig.control.sealing import RecordingStore
-from rig.errors import ConfigError, RigError
-from rig.messages import Event, FinishedEvent, LiveEvent, StateEvent, Status, StopEvidence
+from rig.errors import ConfigError, DeviceError, RigError
+from rig.messages import AngleStatus, Event, FinishedEvent, LiveEvent, StateEvent, Status, StopEvidence
 from rig.trial import Trial
 
 log = logging.getLogger("rig")
@@ -55,6 +57,9 @@ class Core:
         self._lock = threading.RLock()
         self._trial = Trial()
         self._pair = Pair(config, clock, self._fault, self._lost)
+        self._poses = AngleCalibrating(config.data_dir, config.angle_sensor, clock)
+        self._pair.rescale(self._poses.scale)
+        self._has_angle = config.angle_sensor is not None
         self._halt: Halt | None = None
         self._run: TestRun | None = None
         self._thread: threading.Thread | None = None
@@ -103,12 +108,49 @@ class Core:
             stimulator=self._pair.identity["stimulator"],
             load_cell=cell,
             torque_age_s=receiver.age_s(self._clock.now_s()) if receiver and seen else None,
-            torque_nm=torque_nm if torque_nm is not None and math.isfinite(torque_nm) else None,
+            torque_nm=finite(torque_nm),
+            angle=self._angle_status(),
             calibration=calibration,
             limits=limits.bounds(self._table),
             require_calibration=self._require_calibration,
             finished=self.finished,
         )
+
+    def _angle_status(self) -> AngleStatus:
+        if not self._has_angle:
+            return AngleStatus()
+        angle, bound = self._pair.angle, self._table["angle_rad"]
+        age_s = None if angle is None else finite(angle.age_s(self._clock.now_s()))
+        return AngleStatus(
+            present=True,
+            angle_rad=None if angle is None else finite(angle.angle_rad),
+            velocity_rad_s=None if angle is None else finite(angle.velocity_rad_s),
+            age_s=age_s,
+            calibrated=self._poses.calibration is not None,
+            range_rad=(bound.lo, bound.hi),
+            problem="" if angle is None else angle.problem,
+            pose=self._poses.first,
+            calibration=self._poses.calibration,
+        )
+
+    def _angle_receiver(self) -> AngleReceiver:
+        """The sensor's receiver. Raises DeviceError while the rig is disconnected."""
+        if self._pair.angle is None:
+            raise DeviceError("angle sensor: the rig is disconnected; re-arm it first")
+        return self._pair.angle
+
+    def _of_angle(self) -> dict[str, Any] | None:
+        """What a journal's header says of the angle sensor; None: there is none."""
+        angle = self._pair.angle
+        if angle is None:
+            return None
+        sensor = angle.sensor
+        return {
+            "sample_rate_hz": sensor.sample_rate_hz,
+            "of_the_cell": sensor.of_the_cell,
+            "one_bus": sensor.on_the_cells_bus,
+            "calibration": self._poses.described(sensor.scale),
+        }
 
     def trouble(self) -> str | None:
         """Which thread or request of this process hangs or has died; None: none. For the process's watchdog."""
@@ -136,7 +178,7 @@ class Core:
             if receiver is None:
                 return None
             origin_s = run.t0_s if run and run.t0_s is not None else self._born_s
-            event = live_event(receiver, run, origin_s, now_s, self._next_live_pulse, samples)
+            event = live_event(receiver, run, origin_s, now_s, self._next_live_pulse, samples, self._pair.angle)
             if event is not None:
                 self._next_live_pulse += len(event.pulse_time_s)
             return event

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rig.acquire.angle_receiver import AngleReceiver
 from rig.acquire.receiver import Receiver
 from rig.acquire.run import TestRun
 from rig.messages import LatePulse, LiveEvent, TorqueSamples
@@ -16,7 +17,13 @@ BIN_S = 0.01
 
 
 def live_event(
-    receiver: Receiver, run: TestRun | None, origin_s: float, now_s: float, first_pulse: int, samples: bool = False
+    receiver: Receiver,
+    run: TestRun | None,
+    origin_s: float,
+    now_s: float,
+    first_pulse: int,
+    samples: bool = False,
+    angle: AngleReceiver | None = None,
 ) -> LiveEvent | None:
     """The newest torque as minimum and maximum of bins of 10 ms, or None if there is none.
 
@@ -30,6 +37,8 @@ def live_event(
         Index of the first pulse that earlier events did not contain.
     samples
         Whether every sample is wanted, too.
+    angle
+        The angle sensor's receiver; None: the rig has none.
     """
     blocks = []
     while receiver.live:
@@ -47,6 +56,7 @@ def live_event(
         torque_age_s=max(0.0, receiver.age_s(now_s)),
         lost_samples=receiver.counts.lost_samples,
         samples=_samples(found, origin_s) if samples else None,
+        **({} if angle is None else _of_angle(angle, origin_s, samples)),
         **(_idle() if run is None else _of_run(run, now_s, first_pulse, samples)),
     )
 
@@ -94,6 +104,23 @@ def _samples(found: NDArray[Any], origin_s: float) -> TorqueSamples:
         counter=found["counter"].tolist(),
         torque_nm=[value if math.isfinite(value) else None for value in torque_nm],
     )
+
+
+def _of_angle(angle: AngleReceiver, origin_s: float, samples: bool) -> dict[str, Any]:
+    """The newest angle, and all since the last event if they are wanted."""
+    rows: list[list[float | None]] = []
+    while angle.live:
+        block = angle.live.popleft()
+        if samples:
+            block = (block - [origin_s, 0.0, 0.0]).round(6).tolist()
+            rows += [[row[0], finite(row[1]), finite(row[2])] for row in block]
+    newest = {"angle_rad": finite(angle.angle_rad), "velocity_rad_s": finite(angle.velocity_rad_s)}
+    return {**newest, "angle": rows if samples else None}
+
+
+def finite(value: float | None) -> float | None:
+    """JSON has no NaN and no infinity: None."""
+    return value if value is not None and math.isfinite(value) else None
 
 
 def _finite(values: np.ndarray) -> list[float]:

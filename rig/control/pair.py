@@ -1,4 +1,4 @@
-"""The two devices of a rig, which are connected, checked and disconnected together."""
+"""The devices of a rig, which are connected, checked and disconnected together."""
 
 from __future__ import annotations
 
@@ -7,18 +7,23 @@ from collections.abc import Callable
 from typing import Any
 
 from rig import devices, limits
+from rig.acquire.angle_receiver import AngleReceiver
 from rig.acquire.receiver import Receiver
 from rig.acquire.run import FRESH_S, SETTLE_S
 from rig.clock import Clock
 from rig.config import RigConfig
 from rig.errors import DeviceError
 from rig.gate import Gate
+from rig.signals import AngleScale
 
 log = logging.getLogger("rig.pair")
 
 
 class Pair:
-    """A stimulator behind its gate and a load cell behind its receiver; both None while not connected.
+    """A stimulator behind its gate and a load cell behind its receiver, both None while not connected, and the angle
+    sensor of a rig that has one.
+
+    The angle sensor may be missing: it opens itself, and a test that needs it finds out.
 
     Parameters
     ----------
@@ -34,11 +39,18 @@ class Pair:
         self._on_fault, self._on_lost = on_fault, on_lost
         self.gate: Gate | None = None
         self.receiver: Receiver | None = None
+        self.angle: AngleReceiver | None = None
         self.found_state = ""
         """State that the stimulator reported when it was connected."""
         self.steps = limits.FINEST
         """The stimulator's resolution."""
-        self.identity: dict[str, dict[str, Any]] = {"stimulator": {}, "load_cell": {}}
+        self._identity: dict[str, dict[str, Any]] = {"stimulator": {}, "load_cell": {}}
+        self._scale: AngleScale | None = None
+
+    @property
+    def identity(self) -> dict[str, dict[str, Any]]:
+        """What each device says that it is."""
+        return self._identity if self.angle is None else {**self._identity, "angle_sensor": self.angle.identity}
 
     def connect(self) -> None:
         """Open both. A stimulator that is found able to stimulate is stopped at once, since no test runs.
@@ -49,16 +61,33 @@ class Pair:
         stimulator = devices.find("stimulator", settings[0].device).create(settings[0], self._clock)
         cell = devices.find("load_cell", settings[1].device).create(settings[1], self._clock)
         gate = Gate(stimulator, self._clock, self._on_fault, self._on_lost)
-        self.identity["stimulator"] = gate.identify()
+        self._identity["stimulator"] = gate.identify()
         try:
             self._stop_what_was_left(gate)
-            self.identity["load_cell"] = cell.open()
+            self._identity["load_cell"] = cell.open()
         except DeviceError:
             gate.disconnect()
             raise
         receiver = Receiver(cell, self._clock, self._on_lost)
         receiver.start()
         self.gate, self.receiver, self.steps = gate, receiver, stimulator.steps
+        self._watch_angle()
+
+    def _watch_angle(self) -> None:
+        """After the load cell: the angle sensor may share its bus."""
+        settings = self._config.angle_sensor
+        if settings is None:
+            return
+        sensor = devices.find("angle_sensor", settings.device).create(settings, self._clock)
+        self.angle = AngleReceiver(sensor, self._clock)
+        self.rescale(self._scale)
+        self.angle.start()
+
+    def rescale(self, scale: AngleScale | None) -> None:
+        """The angle by this calibration from now on; None: as the rig file says."""
+        self._scale = scale
+        if self.angle is not None:
+            self.angle.rescale(scale or self.angle.sensor.scale)
 
     def _stop_what_was_left(self, gate: Gate) -> None:
         safe, state = gate.state()
@@ -68,12 +97,14 @@ class Pair:
             gate.stop()
 
     def disconnect(self) -> None:
-        """Stop stimulation and close both; never raises."""
+        """Stop stimulation and close all; never raises."""
         if self.gate is not None:
             self.gate.disconnect()
+        if self.angle is not None:
+            self.angle.close()
         if self.receiver is not None:
             self.receiver.close()
-        self.gate = self.receiver = None
+        self.gate = self.receiver = self.angle = None
 
     def reconnect(self) -> None:
         """Close both, open them again and check that torque arrives. Raises DeviceError."""

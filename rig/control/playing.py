@@ -34,12 +34,12 @@ class Playing(Core):
         self._thread.start()
 
     def _begin(self, test: plan.PlannedTest, table: dict[str, limits.Limit]) -> None:
-        gate, receiver = self._pair.gate, self._pair.receiver
+        gate, receiver, angle = self._pair.gate, self._pair.receiver, self._pair.angle
         assert gate is not None
         assert receiver is not None
-        journal = self._store.begin(test, self._pair.identity)
+        journal = self._store.begin(test, self._pair.identity, self._of_angle())
         halt = Halt(self._clock)
-        run = TestRun(test, table, journal, gate, receiver, self._clock, halt, self._watch)
+        run = TestRun(test, table, journal, gate, receiver, self._clock, halt, self._watch, angle)
         halt.on_set(lambda: self._halted(halt.reason))
         self._halt, self._run, self._evidence = halt, run, None
         self._evidence_ready.clear()

@@ -7,10 +7,11 @@ from dataclasses import replace
 
 from rig import limits, plan
 from rig.control.calibration import check_profile
-from rig.control.extending import Extending, check_key
+from rig.control.extending import check_key
 from rig.control.playing import check_names
+from rig.control.posing import Posing
 from rig.errors import DeviceError
-from rig.messages import Status, StopEvidence, TestPlan
+from rig.messages import PASSIVE, Status, StopEvidence, TestPlan
 from rig.trial import Trial
 
 log = logging.getLogger("rig")
@@ -19,7 +20,7 @@ STOP_TIMEOUT_S = 6.0
 """Real seconds to wait for the evidence of a stop, including the fall of the torque."""
 
 
-class Rig(Extending):
+class Rig(Posing):
     """Owns the devices. All methods may be called from any thread.
 
     Parameters
@@ -86,9 +87,11 @@ class Rig(Extending):
             table = limits.for_plan(self._table, request)
             test = plan.build(request, table)
             now_s, longest_s = self._clock.unix_s(), test.longest_s / self._clock.speed
-            check_profile(request.profile, now_s, self._require_calibration, longest_s)
+            needs_widths = self._require_calibration and request.kind != PASSIVE  # no pulse, so no width to find
+            check_profile(request.profile, now_s, needs_widths, longest_s)
             plan.check_steps(test, self._pair.steps)
             self._rest.check(test, table["rest_between_tests_s"])
+            self._check_angle(request, table)
             self._store.check_room(request.test_id)
             self._key = key
             self._launch(test, table, self._trial.start(request.test_id, request.participant))

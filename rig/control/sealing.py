@@ -6,6 +6,7 @@ import logging
 import shutil
 import uuid
 from collections.abc import Iterator
+from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -68,10 +69,10 @@ class RecordingStore:
     def _free_bytes(self) -> int:
         return shutil.disk_usage(self._config.data_dir).free
 
-    def begin(self, test: PlannedTest, identity: dict[str, Any]) -> Journal:
+    def begin(self, test: PlannedTest, identity: dict[str, Any], angle: dict[str, Any] | None = None) -> Journal:
         """Create a journal with its header and plan, synced to the disk. Raises JournalError.
 
-        Of an adaptive test only the first segment is certain.
+        Of an adaptive test only the first segment is certain. `angle` describes the angle sensor, if there is one.
         """
         certain = test.segments if test.plan.adaptive is None else test.segments[:1]
         book = Journal(self.journals / f"{test.plan.test_id}.journal")
@@ -85,6 +86,7 @@ class RecordingStore:
             "configuration": {**self._config.public(), "devices": identity},
             "time_s": self._clock.now_s(),
             "unix_s": self._clock.unix_s(),
+            **({} if angle is None else {"angle": angle}),
         }
         book.begin(header, test.pulse_width_us[: certain[-1].end].astype("<f8").tobytes())
         return book
@@ -110,6 +112,9 @@ class RecordingStore:
             "cpu_percent": round(result.cpu_percent, 2),
             "stop": result.evidence.model_dump(),
         }
+        if result.angle_counts is not None:
+            counts = asdict(result.angle_counts)
+            summary["angle"] = {name: counts[name] for name in ("samples", "lost_samples", "duplicate_samples")}
         return self._seal(path, test_id, result.outcome, result.reason, summary, result.last_sample_unix_s)
 
     def recover(self, reason: str) -> Iterator[FinishedEvent]:
@@ -155,14 +160,15 @@ class RecordingStore:
             "recording_path": str(sealed.path),
             "recording_id": attributes["recording_id"],
             "file_sha256": sealed.file_sha256,
-            "summary": summary | _of_recording(sealed.recording),
+            "summary": summary | _of_recording(sealed.recording, summary.get("angle", {})),
         }
         return FinishedEvent.model_validate(event)
 
 
-def _of_recording(recording: assembly.Recording) -> dict[str, Any]:
+def _of_recording(recording: assembly.Recording, of_angle: dict[str, Any]) -> dict[str, Any]:
     alignment = recording.alignment
     return {
+        **({"angle": of_angle | _of_angle(recording)} if recording.angle else {}),
         "samples": len(recording.columns["torque/time_s"]),
         "sample_rate_hz": recording.attributes["sample_rate_measured_hz"],
         "alignment": {
@@ -175,10 +181,20 @@ def _of_recording(recording: assembly.Recording) -> dict[str, Any]:
     }
 
 
+def _of_angle(recording: assembly.Recording) -> dict[str, Any]:
+    angle_rad, error_ms = recording.columns["angle/angle_rad"], recording.angle["error_ms"]
+    return {
+        "samples": len(angle_rad),
+        "range_rad": [float(angle_rad.min()), float(angle_rad.max())] if len(angle_rad) else None,
+        "method": recording.angle["method"],
+        "error_ms": None if error_ms != error_ms else error_ms,
+    }
+
+
 def warnings(recording: assembly.Recording) -> list[str]:
     """Warnings before a model is fitted to it, one sentence each; empty if there are none."""
     alignment, attributes = recording.alignment, recording.attributes
-    found = _disturbed_line(recording)
+    found = [*_disturbed_line(recording), *_of_sensor(recording)]
     if attributes["journal_note"]:
         found.append(f"journal: {attributes['journal_note']}")
     nominal_hz, measured_hz = attributes["sample_rate_hz"], attributes["sample_rate_measured_hz"]
@@ -200,6 +216,22 @@ def warnings(recording: assembly.Recording) -> list[str]:
             f"load cell: {measured_hz:.0f} samples/s arrived, the rig file says {nominal_hz:g}: times in this "
             "recording may be wrong"
         )
+    return found
+
+
+def _of_sensor(recording: assembly.Recording) -> list[str]:
+    """Warnings about an angle sensor that failed in a test that did not need it, or whose times are uncertain."""
+    found = [
+        f"{event['reason']}; the angle in this recording may be wrong or missing"
+        for event in recording.events
+        if event.get("event") == "angle_trouble"
+    ]
+    if not recording.angle or not len(recording.columns["angle/time_s"]):
+        return found
+    error_ms = recording.angle["error_ms"]
+    if not (error_ms <= DOUBTFUL_ALIGNMENT_MS):
+        error = "unknown" if error_ms != error_ms else f"{error_ms:.1f} ms"
+        found.append(f"angle and torque: the error of their alignment is {error}; a model of a movement may be wrong")
     return found
 
 

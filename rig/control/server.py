@@ -110,7 +110,7 @@ class Server:
             return
         full = to_line(event)
         with_samples = isinstance(event, LiveEvent) and event.samples is not None
-        plain = to_line(event.model_copy(update={"samples": None, "late": []})) if with_samples else full
+        plain = to_line(event.model_copy(update={"samples": None, "angle": None, "late": []})) if with_samples else full
         for writer, samples in tuple(self._subscribers.items()):
             if writer.transport.is_closing():  # it left while its subscription was still being answered
                 self._subscribers.pop(writer, None)
@@ -217,6 +217,8 @@ class Server:
                 return self.rig.calibrate_mark(request.threshold)
             case "calibrate-finish":
                 return self.rig.calibrate_finish(request.by, request.discard)
+            case "angle_pose":
+                return self.rig.angle_pose(request)
             case _:
                 return self.rig.status()
 

@@ -1,7 +1,7 @@
-"""Devices behind two small Protocols; each device is one file here, found by its id (the file's name).
+"""Devices behind three small Protocols; each device is one file here, found by its id (the file's name).
 
-A device module has `KIND` ("stimulator" or "load_cell"), `Settings` (a pydantic model, the device's part of the
-rig file) and `create(settings, clock)`. To add a device, add a file.
+A device module has `KIND` ("stimulator", "load_cell" or "angle_sensor"), `Settings` (a pydantic model, the device's
+part of the rig file) and `create(settings, clock)`. To add a device, add a file.
 """
 
 from __future__ import annotations
@@ -11,15 +11,15 @@ import pkgutil
 from collections.abc import Callable
 from functools import cache
 from types import ModuleType
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, Self
 
 from pydantic import BaseModel, ConfigDict
 
 from rig.errors import ConfigError
 from rig.limits import Admitted, Steps
-from rig.signals import Ack, TorqueBlock
+from rig.signals import Ack, AngleBlock, AngleScale, TorqueBlock
 
-Kind = Literal["stimulator", "load_cell"]
+Kind = Literal["stimulator", "load_cell", "angle_sensor"]
 
 
 class DeviceSettings(BaseModel):
@@ -28,6 +28,10 @@ class DeviceSettings(BaseModel):
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
     device: str
+
+    def beside(self, _cell: DeviceSettings) -> Self:
+        """These settings, completed by those of the rig's load cell: the two may share an adapter."""
+        return self
 
 
 class Stimulator(Protocol):
@@ -103,6 +107,32 @@ class LoadCell(Protocol):
 
     def close(self) -> None:
         """Stop the cell and close the bus; never raises."""
+        ...
+
+
+class AngleSensor(Protocol):
+    """Gives the joint's angle as it arrives. Opened after the load cell, closed before it."""
+
+    sample_rate_hz: float
+    counter_modulus: int
+    """As of a load cell."""
+    scale: AngleScale
+    """From its own value to the joint's angle, by the rig file. A calibration by two poses replaces it."""
+    of_the_cell: bool
+    """Whether its samples come in the load cell's own frames, counted by the cell's counter."""
+    on_the_cells_bus: bool
+    """Whether its frames come over the load cell's adapter: then one clock stamps both."""
+
+    def open(self) -> dict[str, Any]:
+        """Open the bus, or share the load cell's; returns the identity to display. Raises DeviceError."""
+        ...
+
+    def read(self, timeout_s: float) -> AngleBlock:
+        """As `LoadCell.read`."""
+        ...
+
+    def close(self) -> None:
+        """Close the bus, or leave it to the load cell; never raises."""
         ...
 
 

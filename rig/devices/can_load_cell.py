@@ -6,25 +6,20 @@ The bus may be any that python-can supports: socketcan on hardware, socketcand o
 from __future__ import annotations
 
 import contextlib
-import logging
-import math
 import re
-import socket
 import time
-from typing import Any, cast
+from typing import Any
 
 import can
 import numpy as np
-import serial
-from can.interfaces.slcan import slcanBus
 from pydantic import Field, field_validator
 
 from rig.clock import Clock
 from rig.devices import DeviceSettings
+from rig.devices._can_bus import CanBus, Frame
 from rig.errors import ConfigError, DeviceError, WireError
 from rig.signals import SAMPLE, TorqueBlock
 from rig.wire import dbc
-from rig.wire.read_ahead import ReadAhead
 
 KIND = "load_cell"
 
@@ -80,42 +75,21 @@ class CanLoadCell:
         self._clock = clock
         names = [settings.signal] if isinstance(settings.signal, str) else settings.signal
         try:
-            self._frame = dbc.TorqueFrame(
+            self._frame = dbc.SampleFrame(
                 settings.dbc, settings.message, names, settings.counter or None, settings.sync or None
             )
         except ConfigError as error:
             raise ConfigError(f"load_cell.{error}") from None
         self.sample_rate_hz = settings.sample_rate_hz
         self.counter_modulus = self._frame.counter_modulus * self._frame.samples_per_frame
-        self._bus: can.BusABC | None = None
-        self._stamped = False
-        # python-can warns about every frame that is split between two packets, which is normal
-        logging.getLogger("can").setLevel(logging.CRITICAL)
+        self._bus: CanBus | None = None
 
     def open(self) -> dict[str, Any]:
-        bus = self._bus_arguments()
-        self._probe(bus)
-        last: Exception | None = None
-        for _ in range(5):
-            try:
-                self._bus = can.Bus(**bus)
-                break
-            except can.CanError as error:
-                # the server's greeting and the first frame may share a packet, which aborts the handshake
-                last = error
-                time.sleep(0.05)
-            except Exception as error:
-                raise DeviceError(f"load_cell.bus: {self._place()} cannot be opened: {_line(error)}") from None
-        if self._bus is None:
-            raise DeviceError(f"load_cell.bus: {self._place()} cannot be opened: {_line(last)}")
-        if isinstance(self._bus, slcanBus) and isinstance(self._bus.serialPortOrig, serial.Serial):
-            self._bus.serialPortOrig = cast("Any", ReadAhead(self._bus.serialPortOrig))
-        # Timestamps of these interfaces are the sender's or the kernel's, of the others the host's at reading.
-        self._stamped = bus.get("interface") in ("socketcand", "socketcan", "pcan", "kvaser", "ixxat", "vector")
-        self._send(self._settings.start_frames)
+        self._bus = CanBus(self._settings.bus, "load cell", self._clock)
+        self._bus.send(map(message_of, self._settings.start_frames))
         return {
             "device": "can_load_cell",
-            "bus": self._place(),
+            "bus": self._bus.place,
             "frame_id": f"0x{self._frame.frame_id:X}",
             "message": self._frame.message.name,
             "sample_rate_hz": self.sample_rate_hz,
@@ -129,23 +103,15 @@ class CanLoadCell:
         end_s = time.monotonic() + timeout_s
         while (remaining_s := end_s - time.monotonic()) > 0:
             try:
-                message = self._bus.recv(remaining_s)
-            except ValueError:
-                malformed += 1  # slcan: a damaged line
-                continue
-            except (can.CanError, OSError) as error:
-                raise DeviceError(f"load cell on {self._place()}: the bus was lost: {_line(error)}") from None
-            except Exception as error:
-                raise DeviceError(f"load cell on {self._place()}: reading failed: {_line(error)}") from None
-            if message is None:
-                continue
-            if message.is_error_frame:
-                error_frames += 1
-                continue
-            if message.arbitration_id != self._frame.frame_id or message.is_remote_frame:
-                continue
-            try:
-                self._append(rows, message)
+                frame = self._bus.receive(remaining_s)
+                if frame is None:
+                    continue
+                if frame.message.is_error_frame:
+                    error_frames += 1
+                    continue
+                if frame.message.arbitration_id != self._frame.frame_id or frame.message.is_remote_frame:
+                    continue
+                self._append(rows, frame)
             except WireError:
                 malformed += 1
                 continue
@@ -157,57 +123,17 @@ class CanLoadCell:
         if self._bus is None:
             return
         with contextlib.suppress(Exception):  # an unplugged adapter raises, and there is nothing left to stop
-            self._send(self._settings.stop_frames)
-        with contextlib.suppress(Exception):
-            self._bus.shutdown()
+            self._bus.send(map(message_of, self._settings.stop_frames))
+        self._bus.close()
         self._bus = None
 
-    def _append(self, rows: list[tuple[float, float, float, int, int]], message: can.Message) -> None:
-        host_time_s = self._clock.now_s()
-        last_s = message.timestamp if self._stamped else math.nan
-        frame = self._frame.decode(bytes(message.data))
-        n = len(frame.values)
-        for i, value in enumerate(frame.values):
-            counter = frame.counter * n + i if frame.counter >= 0 else -1
-            stamp_s = last_s - (n - 1 - i) / self.sample_rate_hz  # a frame is sent with its last sample
-            rows.append((host_time_s, stamp_s, value * self._settings.scale_nm, counter, frame.sync))
-
-    def _bus_arguments(self) -> dict[str, Any]:
-        bus = dict(self._settings.bus)
-        if bus.get("interface") == "slcan":
-            bus.setdefault("sleep_after_open", 0)
-        return bus
-
-    def _probe(self, bus: dict[str, Any]) -> None:
-        """Fail early if no server answers: python-can itself would retry for ten seconds."""
-        if bus.get("interface") != "socketcand":
-            return
-        host, port = bus.get("host"), bus.get("port")
-        try:
-            socket.create_connection((str(host), int(str(port))), timeout=2.0).close()
-        except (OSError, ValueError) as error:
-            raise DeviceError(
-                f"load_cell.bus: no socketcand answers at {host}:{port} ({_line(error)}); check that it is running"
-            ) from None
-
-    def _send(self, frames: list[str]) -> None:
-        assert self._bus is not None
-        for frame in frames:
-            try:
-                self._bus.send(message_of(frame), timeout=0.5)
-            except (can.CanError, OSError) as error:
-                raise DeviceError(f"load cell on {self._place()}: frame {frame} not sent: {_line(error)}") from None
-
-    def _place(self) -> str:
-        bus = self._settings.bus
-        where = bus.get("channel", "")
-        if "host" in bus:
-            where = f"{where}@{bus['host']}:{bus.get('port')}"
-        return f"{bus.get('interface', 'default interface')} {where}".strip()
-
-
-def _line(error: Exception | None) -> str:
-    return " ".join(str(error).split())
+    def _append(self, rows: list[tuple[float, float, float, int, int]], frame: Frame) -> None:
+        found = self._frame.decode(bytes(frame.message.data))
+        n = len(found.values)
+        for i, value in enumerate(found.values):
+            counter = found.counter * n + i if found.counter >= 0 else -1
+            stamp_s = frame.stamp_s - (n - 1 - i) / self.sample_rate_hz  # a frame is sent with its last sample
+            rows.append((frame.host_time_s, stamp_s, value * self._settings.scale_nm, counter, found.flag))
 
 
 def create(settings: Settings, clock: Clock) -> CanLoadCell:

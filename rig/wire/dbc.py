@@ -1,4 +1,4 @@
-"""Decodes torque samples from CAN frames by a DBC file, so that a new cell needs a description, not a driver."""
+"""Decodes samples from CAN frames by a DBC file, so that a new sensor needs a description, not a driver."""
 
 from __future__ import annotations
 
@@ -53,15 +53,15 @@ def _choose(kind: str, name: str, known: Sequence[str], place: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class FrameSamples:
-    """Content of one frame: torque values in the signal's unit, counter (−1: none), sync (255: none)."""
+    """Content of one frame: values in the signal's unit, counter (−1: none), flag (255: none)."""
 
     values: tuple[float, ...]
     counter: int
-    sync: int
+    flag: int
 
 
-class TorqueFrame:
-    """Decoder of the message that contains the torque.
+class SampleFrame:
+    """Decoder of the message that contains the torque or the angle.
 
     Parameters
     ----------
@@ -70,9 +70,11 @@ class TorqueFrame:
     message
         Name of the message; None: the first one with the signal.
     signals
-        Names of the torque signals, in order of time (several if a frame contains several samples).
-    counter, sync
-        Names of the signals of counter and sync line; None if there is none.
+        Names of the signals, in order of time (several if a frame contains several samples).
+    counter, flag
+        Names of the signals of the counter and of a bit (a cell's sync line, a sensor's fault); None if there is none.
+    flag_key
+        How the rig file calls that bit.
 
     Raises
     ------
@@ -81,7 +83,13 @@ class TorqueFrame:
     """
 
     def __init__(
-        self, dbc: str, message: str | None, signals: Sequence[str], counter: str | None, sync: str | None
+        self,
+        dbc: str,
+        message: str | None,
+        signals: Sequence[str],
+        counter: str | None,
+        flag: str | None,
+        flag_key: str = "sync",
     ) -> None:
         database = load(dbc)
         if message is None:
@@ -97,7 +105,7 @@ class TorqueFrame:
         place = f"message {found.name} of {dbc}"
         self._signals = tuple(_choose("signal", s, names, place) for s in signals)
         self._counter = _choose("counter", counter, names, place) if counter else None
-        self._sync = _choose("sync", sync, names, place) if sync else None
+        self._flag = _choose(flag_key, flag, names, place) if flag else None
         self.counter_modulus = 0
         if self._counter:
             self.counter_modulus = 1 << found.get_signal_by_name(self._counter).length
@@ -109,7 +117,7 @@ class TorqueFrame:
 
     @property
     def samples_per_frame(self) -> int:
-        """Number of torque samples per frame."""
+        """Number of samples per frame."""
         return len(self._signals)
 
     def decode(self, data: bytes) -> FrameSamples:
@@ -129,7 +137,7 @@ class TorqueFrame:
             return FrameSamples(
                 tuple(float(values[s]) for s in self._signals),
                 int(values[self._counter]) if self._counter else -1,
-                int(values[self._sync]) if self._sync else 255,
+                int(values[self._flag]) if self._flag else 255,
             )
         except Exception as error:
             raise WireError(f"frame {data.hex(' ')} does not fit {self.message.name}: {error}") from None

@@ -15,7 +15,8 @@ import pytest
 from hardware_sim.errors import SettingsError
 from hardware_sim.load_cells.cells import canopen, counts, plain
 from hardware_sim.load_cells.frames import Sample
-from hardware_sim.load_cells.sampler import LoadCell, Noise
+from hardware_sim.load_cells.sampler import LoadCell
+from hardware_sim.sampling import Noise
 from hardware_sim.settings import Settings
 from tests.hardware_sim.emulated import Emulated, emulated
 from tests.hardware_sim.test_load_cells import Ramp
@@ -60,10 +61,10 @@ def test_jitter_moves_each_sample_and_none_overtakes() -> None:
 def test_jitter_can_be_switched_and_leaves_the_grid_where_it_was() -> None:
     made = cell()
     recorded(made, 1.0)
-    made.set_jitter(100e-6)
-    made.set_rate_factor(1.0)  # a new anchor takes no jitter over
+    made.clock.set_jitter(100e-6)
+    made.clock.set_rate_factor(1.0)  # a new anchor takes no jitter over
     recorded(made, 2.0)
-    made.set_jitter(0.0)
+    made.clock.set_jitter(0.0)
     recorded(made, 2.01)
     times_s, _ = recorded(made, 3.0)
     off_s = (times_s + PERIOD_S / 2) % PERIOD_S - PERIOD_S / 2

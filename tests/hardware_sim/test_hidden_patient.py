@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from hardware_sim.load_cells.cells.plain import Cell
-from hardware_sim.load_cells.sampler import LoadCell, Noise
+from hardware_sim.load_cells.sampler import LoadCell
 from hardware_sim.patients import hidden
 from hardware_sim.patients.hidden.draw import Scenario, draw_scenario
 from hardware_sim.patients.hidden.live import HiddenMuscle
 from hardware_sim.patients.hidden.scenario import simulate
+from hardware_sim.sampling import Noise
 
 pytestmark = pytest.mark.slow
 

@@ -21,10 +21,11 @@ import serial
 
 from hardware_sim.load_cells.cells import canopen, counts, plain
 from hardware_sim.load_cells.frames import Frame, Sample
-from hardware_sim.load_cells.sampler import LoadCell, Noise
+from hardware_sim.load_cells.sampler import LoadCell
 from hardware_sim.load_cells.transports import slcan, socketcand
 from hardware_sim.pseudo_terminal import PseudoTerminal
 from hardware_sim.reactor import Reactor
+from hardware_sim.sampling import Noise
 from tests.hardware_sim.emulated import emulated
 
 LAYOUT = struct.Struct("<fHBB")
@@ -99,9 +100,9 @@ class TestSampler:
     def test_rate_factor_changes_from_the_next_sample_on(self) -> None:
         made = cell()
         made.produce(1.0)
-        made.set_rate_factor(1.05)
+        made.clock.set_rate_factor(1.05)
         made.produce(2.0)
-        assert made.samples == pytest.approx(1600 + 1680, abs=1)
+        assert made.clock.samples == pytest.approx(1600 + 1680, abs=1)
 
 
 class TestCells:

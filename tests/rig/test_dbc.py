@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from rig.errors import ConfigError, WireError
-from rig.wire.dbc import PACKAGED, TorqueFrame
+from rig.wire.dbc import PACKAGED, SampleFrame
 
 COUNTS = """VERSION ""
 BS_:
@@ -23,55 +23,55 @@ BO_ 610 Value: 8 Cell
 
 
 def test_the_default_frame():
-    frame = TorqueFrame(PACKAGED, None, ["Torque_Nm"], "Counter", "Sync")
+    frame = SampleFrame(PACKAGED, None, ["Torque_Nm"], "Counter", "Sync")
     assert (frame.frame_id, frame.counter_modulus, frame.samples_per_frame) == (0x181, 65536, 1)
     got = frame.decode(struct.pack("<fHBB", -3.25, 65535, 1, 0))
-    assert (got.values, got.counter, got.sync) == ((-3.25,), 65535, 1)
-    assert frame.decode(struct.pack("<fHBB", 0, 0, 2, 0)).sync == 0
+    assert (got.values, got.counter, got.flag) == ((-3.25,), 65535, 1)
+    assert frame.decode(struct.pack("<fHBB", 0, 0, 2, 0)).flag == 0
     assert math.isnan(frame.decode(struct.pack("<fHBB", math.nan, 0, 0, 0)).values[0])
 
 
 def test_several_samples_of_big_endian_counts(tmp_path: Path):
     path = tmp_path / "counts.dbc"
     path.write_text(COUNTS)
-    frame = TorqueFrame(str(path), "Value", ["First", "Second", "Third"], "Index", None)
+    frame = SampleFrame(str(path), "Value", ["First", "Second", "Third"], "Index", None)
     assert (frame.frame_id, frame.counter_modulus, frame.samples_per_frame) == (610, 256, 3)
     got = frame.decode(struct.pack(">hhhBB", 100, -200, 300, 9, 0))
     assert got.values == pytest.approx((1.0, -2.0, 3.0))
-    assert (got.counter, got.sync) == (9, 255)
-    without = TorqueFrame(str(path), None, ["Second"], None, None)
+    assert (got.counter, got.flag) == (9, 255)
+    without = SampleFrame(str(path), None, ["Second"], None, None)
     assert without.decode(bytes(8)).counter == -1
     assert without.counter_modulus == 0
 
 
 def test_a_short_frame_is_told():
     with pytest.raises(WireError, match="does not fit Torque"):
-        TorqueFrame(PACKAGED, None, ["Torque_Nm"], None, None).decode(b"\0\0")
+        SampleFrame(PACKAGED, None, ["Torque_Nm"], None, None).decode(b"\0\0")
 
 
 def test_a_file_that_is_no_dbc(tmp_path: Path):
     path = tmp_path / "x.dbc"
     path.write_text("BO_ hello")
     with pytest.raises(ConfigError, match="not a DBC file"):
-        TorqueFrame(str(path), None, ["a"], None, None)
+        SampleFrame(str(path), None, ["a"], None, None)
     with pytest.raises(ConfigError, match="no file"):
-        TorqueFrame("nothing", None, ["a"], None, None)
+        SampleFrame("nothing", None, ["a"], None, None)
 
 
 def test_counts_like_those_of_a_gsv_4():
     for n in (1, 2, 4):
-        frame = TorqueFrame("counts_be16", None, [f"Torque{i + 1}_Nm" for i in range(n)], None, None)
+        frame = SampleFrame("counts_be16", None, [f"Torque{i + 1}_Nm" for i in range(n)], None, None)
         assert (frame.frame_id, frame.samples_per_frame, frame.counter_modulus) == (610, n, 0)
         data = b"".join(counts.to_bytes(2, "big") for counts in (32768, 65535, 1, 32768 + 655)[:n])
         found = frame.decode(data)
         assert found.values == pytest.approx((0.0, 50.0, -50.0, 655 * 50 / 32767)[:n], abs=1e-6)
-        assert (found.counter, found.sync) == (-1, 255)
+        assert (found.counter, found.flag) == (-1, 255)
         with pytest.raises(WireError):
             frame.decode(data[:-1])
 
 
 def test_three_samples_a_frame_with_a_counter_of_frames():
-    frame = TorqueFrame("torque_packed3", None, ["Torque1_Nm", "Torque2_Nm", "Torque3_Nm"], "Counter", None)
+    frame = SampleFrame("torque_packed3", None, ["Torque1_Nm", "Torque2_Nm", "Torque3_Nm"], "Counter", None)
     found = frame.decode(struct.pack("<hhhH", 500, -250, 1, 40_000))
     assert found.values == pytest.approx((1.0, -0.5, 0.002))
     assert (found.counter, frame.counter_modulus) == (40_000, 65536)

@@ -104,6 +104,8 @@ def test_the_hard_limits_are_those_that_were_agreed_on():
             ("pulse_interval_s", 0.008, inf, "s"),
             ("torque_nm", -60, 60, "N·m"),
             ("torque_jump_nm", 0, 5, "N·m"),
+            ("angle_rad", -0.35, 2.79, "rad"),
+            ("angle_jump_rad", 0, 0.12, "rad"),
             ("duration_s", 0, 300, "s"),
             ("charge_per_test_uc", 0, 50_000, "µC"),
             ("width_rise_us", -inf, 50, "µs/pulse"),

@@ -98,7 +98,7 @@ def test_a_port_that_is_no_serial_line_is_left_as_it_is():
     bus = {"interface": "slcan", "channel": "loop://"}
     cell = CanLoadCell(Settings(device="can_load_cell", bus=bus), MonotonicClock())
     cell.open()
-    assert not isinstance(cell._bus.serialPortOrig, ReadAhead)  # pyright: ignore
+    assert not isinstance(cell._bus.can.serialPortOrig, ReadAhead)  # pyright: ignore
     cell.close()
 
 

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rig.acquire.receiver import LONGEST_READ_S, READ_TIMEOUT_S, SILENCE_S, CounterUnwrapper, Receiver
+from rig.acquire.receiver import Receiver
+from rig.acquire.stream import LONGEST_READ_S, READ_TIMEOUT_S, SILENCE_S, CounterUnwrapper
 from rig.clock import VirtualClock
 from rig.journal import Journal
 from rig.signals import SAMPLE, TorqueBlock

@@ -81,7 +81,7 @@ def _ramp(top: float, up_s: float) -> Floats:
     return np.concatenate([up, 1.0 - up]) * top
 
 
-def _levels(rng: Generator, top: float, duration_s: float) -> Floats:
+def levels(rng: Generator, top: float, duration_s: float) -> Floats:
     """Random levels, each held 0.2 to 1 s; one in seven is a rest."""
     n = round(duration_s * PULSES_PER_S)
     out: list[Floats] = []
@@ -91,7 +91,7 @@ def _levels(rng: Generator, top: float, duration_s: float) -> Floats:
     return np.concatenate(out)[:n]
 
 
-def _staircase(top: float, steps: int, held_s: float) -> Floats:
+def staircase(top: float, steps: int, held_s: float) -> Floats:
     up = np.arange(1, steps + 1) / steps
     return np.repeat(np.concatenate([up, up[-2::-1], [0.0]]) * top, round(held_s * PULSES_PER_S))
 
@@ -129,12 +129,12 @@ def make_design(
                 rest(2),
                 ("ramp", _ramp(top_us, 5.0)),
                 rest(2),
-                ("staircase", _staircase(top_us, 5, 1.2)),
+                ("staircase", staircase(top_us, 5, 1.2)),
                 rest(1),
             ]
             parts += [("ramp", _ramp(top_us, 1.5)), rest(2)]
         if with_validate:
-            parts += [("validate", _levels(rng, top_us, validate_s)), rest(2)]
+            parts += [("validate", levels(rng, top_us, validate_s)), rest(2)]
     width = np.asarray(np.round(np.concatenate([w for _, w in parts])), dtype=np.float64)  # stimulators set whole µs
     segment = np.concatenate([np.full(len(w), s, dtype="U12") for s, w in parts])
     movement = None

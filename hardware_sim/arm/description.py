@@ -1,0 +1,108 @@
+"""An arm as the command line or a file describes it.
+
+`--arm MODE[,SETTING=NUMBER…]`, or a TOML or JSON file::
+
+    mode = "robot"
+    [movement]            # the mode's settings
+    from_deg = 30
+    to_deg = 120
+    deg_s = 20
+    [mechanics]           # what `hardware_sim.arm.mechanics` says of the forearm
+    weight_nm = 2.8
+    [passive]             # the law of each place, and its parameters
+    law = "linear_friction"
+    dry_nm = 0.3
+    [torque_angle]
+    law = "moment_arm"
+    [torque_velocity]
+    law = "none"
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from hardware_sim.arm import registry
+from hardware_sim.arm.mechanics import Mechanics
+from hardware_sim.arm.motion import LARGEST_DEG, SMALLEST_DEG, within
+from hardware_sim.arm.tissue import DEFAULT_LAWS, PLACES, Tissue, built, law
+from hardware_sim.errors import ArmError
+
+KEYS = ("mode", "movement", "mechanics", *PLACES)
+
+
+@dataclass(frozen=True)
+class Arm:
+    """What moves it at first and how, and its tissue."""
+
+    mode: str = "held"
+    movement: Mapping[str, Any] = field(default_factory=dict)
+    tissue: Tissue = field(default_factory=Tissue)
+
+    @property
+    def start_deg(self) -> float:
+        """Where it is when the emulator starts: where its movement begins, or at 90 degrees."""
+        first = self.movement.get("angle_deg", self.movement.get("from_deg", 90.0))
+        with contextlib.suppress(TypeError, IndexError, KeyError):  # the mover says what is wrong with its points
+            first = self.movement["points"][0][1]
+        return within("start", first, SMALLEST_DEG, LARGEST_DEG)
+
+
+def read(text: str) -> Arm:
+    """The arm that `--arm` names.
+
+    Raises
+    ------
+    ArmError
+        It is neither a mode with settings nor a readable file that describes an arm.
+    """
+    mode, *pairs = text.split(",")
+    if mode in registry.modes():
+        return Arm(mode, dict(map(_setting, pairs)))
+    path = Path(text)
+    if path.suffix.lower() in {".toml", ".json"} or path.exists():
+        return _from_file(path)
+    raise ArmError(f"--arm {text}: neither a file nor one of {', '.join(registry.modes())}")
+
+
+def _setting(pair: str) -> tuple[str, float]:
+    key, _, value = pair.partition("=")
+    try:
+        return key, float(value)
+    except ValueError:
+        raise ArmError(f"--arm: '{pair}' must be SETTING=NUMBER") from None
+
+
+def _from_file(path: Path) -> Arm:
+    try:
+        text = path.read_text(encoding="utf-8")
+        described = json.loads(text) if path.suffix.lower() == ".json" else tomllib.loads(text)
+    except (OSError, UnicodeDecodeError) as error:
+        raise ArmError(f"{path}: cannot be read ({error}); give a readable TOML or JSON file") from None
+    except ValueError as error:  # both decoders' errors name line and column
+        raise ArmError(f"{path}: not valid {'JSON' if path.suffix == '.json' else 'TOML'}: {error}") from None
+    if not isinstance(described, dict) or set(described) - set(KEYS):
+        raise ArmError(f"{path}: an arm's file is a table of {', '.join(KEYS)}")
+    tables = {key: described.get(key, {}) for key in KEYS[1:]}
+    for key, table in tables.items():
+        if not isinstance(table, dict):
+            raise ArmError(f"{path}: '{key}' must be a table")
+    try:
+        return Arm(str(described.get("mode", "held")), tables.pop("movement"), _tissue(tables))
+    except ArmError as error:
+        raise ArmError(f"{path}: {error}") from None
+
+
+def _tissue(tables: dict[str, dict[str, Any]]) -> Tissue:
+    mechanics = built(Mechanics, "mechanics", tables.pop("mechanics"))
+    laws = {}
+    for place, table in tables.items():
+        parameters = {key: value for key, value in table.items() if key != "law"}
+        laws[place] = law(place, str(table.get("law", DEFAULT_LAWS[place])), parameters)
+    return Tissue(**laws, mechanics=mechanics)

@@ -1,0 +1,157 @@
+"""Offline records of an arm whose truth is known, for developing and judging what identifies g(x, ẋ) and h(x, ẋ).
+
+Simulated at 1600 Hz, sampled at 400 Hz. The joint is moved by the emulator's hand or robot; a fixture that holds it
+yields by up to 3 mrad/N·m, as fixtures do. Angle and velocity are what a rig records: an encoder of 13 bits with noise
+of 0.02 degrees at 200 Hz, the velocity by a local quadratic over 60 ms, centred, both interpolated to the torque's
+times. The torque has white noise of U(0.05, 0.1) N·m.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.random import Generator
+from scipy.signal import savgol_filter
+
+from hardware_sim.arm.law import Floats
+from hardware_sim.arm_designs import KINDS, SIMULATION_HZ, ArmDesign, Asked
+from hardware_sim.arm_patient import ArmPatient, arm_patient
+from hardware_sim.patients.hidden.design import PULSES_PER_S
+from hardware_sim.patients.hidden.draw import rng_of
+
+__all__ = ["KINDS", "arm_patient", "changed", "held_angles_rad", "record"]
+
+RATE_HZ, ANGLE_HZ = 400, 200
+VELOCITY_WINDOW_S, ENCODER_STEP_DEG, ENCODER_NOISE_DEG = 0.060, 360.0 / 2**13, 0.02
+
+
+def record(
+    patient: ArmPatient,
+    kind: str,
+    seed: int,
+    *,
+    angle_rad: float | None = None,
+    mover: str | None = None,
+    protocol: str = "prbs",
+    duration_s: float | None = None,
+    noise_sd_nm: float | None = None,
+) -> dict[str, Any]:
+    """One record of an arm.
+
+    Parameters
+    ----------
+    kind
+        `isometric`: at `angle_rad` (90 degrees if None) by `protocol`, `prbs` (the paper's PRBS, then a ramp) or
+        `staircase`. `held`: a short staircase at `angle_rad`, or anywhere in the range. `passive`: no current; sweeps
+        at about 8, 20, 45 and 80 degrees/s. `moving`: steady levels, 3 to 7 s each, while the joint is swept. `unseen`:
+        random levels and another movement, for validation.
+    seed
+        Decides, together with patient and kind, every random number.
+    mover
+        `hand` or `robot`; drawn if None. `unseen` moves by waves of 0.05 to 0.6 Hz.
+    duration_s
+        Length of `passive`, `moving` or `unseen`; 66, 60 and 30 if None. Others have their protocol's.
+    noise_sd_nm
+        Of the torque; drawn if None.
+
+    Returns
+    -------
+    dict
+        `time_s`, `pulse_width_us`, `torque_nm`, `angle_rad`, `velocity_rad_s`, `segment`, shape (n,), and `truth`: the
+        same rows without noise (`torque_nm`, `isometric_nm`, `passive_nm`, `angle_rad`, `velocity_rad_s`,
+        `acceleration_rad_s2`), `noise_sd_nm`, `mover` and `patient`.
+
+    Raises
+    ------
+    ValueError
+        No such kind, protocol or mover.
+    """
+    if kind not in KINDS:
+        raise ValueError(f"kind {kind!r}: one of {', '.join(KINDS)}")
+    if mover not in (None, "hand", "robot"):
+        raise ValueError(f"mover {mover!r}: hand or robot")
+    rng = rng_of(seed, "arm record", str(patient.seed), kind)
+    drawn = str(rng.choice(["hand", "robot"]))
+    chosen = mover or drawn
+    sd_nm = float(rng.uniform(0.05, 0.1))
+    sd_nm = sd_nm if noise_sd_nm is None else noise_sd_nm
+    design = KINDS[kind](Asked(patient, rng, chosen, angle_rad, protocol, duration_s))
+    clean = _simulated(patient, design)
+    every = SIMULATION_HZ // RATE_HZ
+    rows = {name: column[::every] for name, column in clean.items()}
+    time_s = np.arange(rows["torque_nm"].size) / RATE_HZ
+    angle, velocity = _measured(rng, clean["angle_rad"], time_s)
+    held = (time_s * PULSES_PER_S + 1e-9).astype(int)
+    return {
+        "time_s": time_s,
+        "pulse_width_us": design.width_us[held],
+        "torque_nm": rows["torque_nm"] + rng.normal(0.0, sd_nm, time_s.size),
+        "angle_rad": angle,
+        "velocity_rad_s": velocity,
+        "segment": design.segment[held],
+        "truth": {**rows, "noise_sd_nm": sd_nm, "mover": chosen, "kind": kind, "patient": patient.truth},
+    }
+
+
+def held_angles_rad(patient: ArmPatient, count: int = 4) -> Floats:
+    """Angles for held records: the reference angle and others evenly over the range, a little inside its ends."""
+    low, high = patient.range_rad
+    others = np.linspace(low + 0.05, high - 0.05, count)
+    others[np.argmin(np.abs(others - patient.reference_rad))] = patient.reference_rad
+    return others
+
+
+def changed(
+    made: dict[str, Any],
+    *,
+    scale: float = 1.0,
+    offset_nm: float = 0.0,
+    start_s: float = 0.0,
+    time_shift_s: float = 0.0,
+    angle_error_rad: float = 0.0,
+) -> dict[str, Any]:
+    """The record as another recorder gives it; `truth` stays with the arm.
+
+    Torque × `scale` (negative: the cell turned round) + `offset_nm`; without its first `start_s`; its clock shifted;
+    the angle off by a calibration's error.
+    """
+    first = round(start_s * RATE_HZ)
+    columns = {name: column[first:].copy() for name, column in made.items() if isinstance(column, np.ndarray)}
+    columns["time_s"] += time_shift_s - start_s
+    columns["torque_nm"] = columns["torque_nm"] * scale + offset_nm
+    columns["angle_rad"] += angle_error_rad
+    truth = {
+        name: value[first:].copy() if isinstance(value, np.ndarray) else value for name, value in made["truth"].items()
+    }
+    return {**columns, "truth": truth}
+
+
+def _simulated(patient: ArmPatient, design: ArmDesign) -> dict[str, Floats]:
+    step_s, angle_rad = 1.0 / SIMULATION_HZ, design.angle_rad
+    velocity = np.gradient(angle_rad, step_s)
+    acceleration = np.gradient(velocity, step_s)
+    isometric = patient.isometric_nm(design.fine_width_us, step_s)
+    passive = patient.h_nm(angle_rad, velocity) + patient.remembered_nm(angle_rad, step_s)
+    torque = patient.g(angle_rad, velocity) * isometric + passive - patient.inertia_kg_m2 * acceleration
+    return {
+        "torque_nm": torque,
+        "isometric_nm": isometric,
+        "passive_nm": passive,
+        "angle_rad": angle_rad,
+        "velocity_rad_s": velocity,
+        "acceleration_rad_s2": acceleration,
+    }
+
+
+def _measured(rng: Generator, angle_rad: Floats, time_s: Floats) -> tuple[Floats, Floats]:
+    """What encoder and rig make of the true angles, at the torque's times."""
+    every = SIMULATION_HZ // ANGLE_HZ
+    first = int(rng.integers(every))
+    true_deg = np.degrees(angle_rad[first::every])
+    read_deg = np.round((true_deg + rng.normal(0.0, ENCODER_NOISE_DEG, true_deg.size)) / ENCODER_STEP_DEG)
+    read_rad = np.radians(read_deg * ENCODER_STEP_DEG)
+    at_s = (first + every * np.arange(read_rad.size)) / SIMULATION_HZ
+    window = 2 * round(0.5 * VELOCITY_WINDOW_S * ANGLE_HZ) + 1
+    velocity = np.asarray(savgol_filter(read_rad, window, 2, deriv=1, delta=1.0 / ANGLE_HZ), float)
+    return np.interp(time_s, at_s, read_rad), np.interp(time_s, at_s, velocity)

@@ -1,0 +1,88 @@
+"""What sensors that sample by clocks of their own have in common: the clock, white noise, and whose turn it is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+
+NOISE_BLOCK = 4096
+LARGEST_JITTER_PERIODS = 0.45
+"""Below one half, so that samples stay in order."""
+
+
+class Noise:
+    """White noise, the same for the same seed, drawn in blocks to save time."""
+
+    def __init__(self, sd: float, seed: int) -> None:
+        self._sd = sd
+        self._random = np.random.default_rng(seed)
+        self._block: list[float] = []
+
+    def next(self) -> float:
+        """Noise of the next sample, in the unit of its standard deviation."""
+        if not self._block:
+            self._block = (self._sd * self._random.standard_normal(NOISE_BLOCK))[::-1].tolist()
+        return self._block.pop()
+
+
+class SampleClock:
+    """When a sensor takes its next sample, in emulated seconds, and what its own clock says then.
+
+    Samples come at exact multiples of the period, which is off by `ppm`. With `jitter_s` each is taken, and stamped,
+    off that time by this standard deviation.
+    """
+
+    def __init__(self, rate_hz: float, ppm: float, jitter_s: float, jitter_seed: int, epoch_us: int = 0) -> None:
+        self.samples = 0
+        self._nominal_hz, self._rate, self._epoch_us = rate_hz, 1.0 + ppm * 1e-6, epoch_us
+        self._jitter_seed = jitter_seed
+        self._anchor_s, self._anchor_sample, self._period_s = 0.0, 0, 1.0 / (rate_hz * self._rate)
+        self._off_s = 0.0
+        self.set_jitter(jitter_s)
+
+    def next_s(self) -> float:
+        """When the next sample is due."""
+        return self._anchor_s + (self.samples - self._anchor_sample) * self._period_s + self._off_s
+
+    def taken(self) -> None:
+        """The sample that was due is taken."""
+        self.samples += 1
+        largest_s = LARGEST_JITTER_PERIODS * self._period_s
+        self._off_s = min(max(self._jitter.next(), -largest_s), largest_s) if self._jitter else 0.0
+
+    def set_rate_factor(self, factor: float) -> None:
+        """Sample `factor` times as fast as nominal from the next sample on."""
+        self._anchor_s, self._anchor_sample = self.next_s() - self._off_s, self.samples
+        self._period_s = 1.0 / (self._nominal_hz * self._rate * factor)
+
+    def set_jitter(self, sd_s: float) -> None:
+        """Standard deviation of each sample's own time, from the next sample but one on."""
+        self.jitter_s = sd_s
+        self._jitter = Noise(sd_s, self._jitter_seed) if sd_s else None
+
+    def time_us(self, time_s: float) -> int:
+        """The sensor's clock at an emulated time."""
+        return self._epoch_us + round(time_s * self._rate * 1e6)
+
+
+class Sampler(Protocol):
+    """A sensor whose samples are taken one by one."""
+
+    def next_s(self) -> float:
+        """When its next sample is due, in emulated seconds."""
+        ...
+
+    def sample(self) -> None:
+        """Take that sample."""
+        ...
+
+
+def take_in_order(samplers: Sequence[Sampler], until_s: float) -> None:
+    """Take all samples due before `until_s`, of all sensors in the order of their time: a limb's time only advances."""
+    while True:
+        first = min(samplers, key=lambda sampler: sampler.next_s())
+        if first.next_s() >= until_s:
+            return
+        first.sample()

@@ -1,0 +1,169 @@
+"""The angle receiver: a stream that is always open, and records while a test runs.
+
+A sensor that is gone harms no test that does not ask for the angle. So it is opened again by itself, and whether a test
+must stop is decided by what the test asks (`rig.acquire.angle_guard`).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.acquire.angle_check import AngleCheck
+from rig.acquire.rate import RATE_TOLERANCE
+from rig.acquire.stream import Stream
+from rig.angle_velocity import LiveSlope
+from rig.clock import Clock
+from rig.devices import AngleSensor
+from rig.errors import DeviceError, JournalError
+from rig.journal import Journal, Kind
+from rig.signals import ANGLE_SAMPLE, AngleBlock, AngleScale, Recorded
+
+NAME = "angle sensor"
+REOPEN_S = 2.0
+"""Real seconds between two attempts to open a sensor that is gone."""
+LIVE_BLOCKS = 4000
+RECENT_S = 1.0
+"""Real seconds of angles that are kept for a pose, and for where the joint is."""
+
+
+class AngleReceiver(Stream[AngleBlock]):
+    """Owns the angle sensor's reading thread, which opens it, too.
+
+    Parameters
+    ----------
+    sensor
+        Not opened yet.
+    """
+
+    def __init__(self, sensor: AngleSensor, clock: Clock) -> None:
+        super().__init__(NAME, sensor, clock, self._gone)
+        self.sensor = sensor
+        self.scale = sensor.scale
+        self.identity: dict[str, Any] = {}
+        self.problem = ""
+        """Why it gives nothing; empty: it does, or has not been opened yet."""
+        self.live: deque[NDArray[Any]] = deque(maxlen=LIVE_BLOCKS)
+        """Columns: time of arrival (rig clock, s), angle (rad), velocity (rad/s)."""
+        self.angle_rad: float | None = None
+        self.velocity_rad_s: float | None = None
+        self.late_s = 0.0
+        """How much later the newest sample came than the promptest one, by its number, rig seconds."""
+        self._prompt: tuple[float, float] | None = None
+        self._slope = LiveSlope(sensor.sample_rate_hz)
+        self._recent: deque[NDArray[Any]] = deque()
+        self._journal: Journal | None = None
+        self._check: AngleCheck | None = None
+        self._on_broken: Callable[[str], None] = lambda _: None
+
+    def rescale(self, scale: AngleScale) -> None:
+        """From now on the joint's angle by this calibration."""
+        with self._lock:
+            self.scale = scale
+            self._slope.forget()
+            self._recent = deque(self._scaled(samples) for samples in self._recent)
+
+    def record(
+        self,
+        journal: Journal,
+        check: AngleCheck,
+        on_fault: Callable[[str], None],
+        on_broken: Callable[[str], None],
+    ) -> None:
+        """From now on write every sample and check it.
+
+        Parameters
+        ----------
+        on_fault
+            Called with what is wrong with the angle.
+        on_broken
+            Called if the journal cannot be written.
+        """
+        with self._lock:
+            self._journal, self._check = journal, check
+            self._on_fault, self._on_broken = on_fault, on_broken
+            self.counts = Recorded()
+
+    def release(self) -> Recorded:
+        """Stop recording; returns the counts since `record`."""
+        with self._lock:
+            self._journal = self._check = None
+            self._on_fault = self._on_broken = lambda _: None
+            return replace(self.counts)
+
+    def data_age_s(self, now_s: float) -> float:
+        """How old the newest angle is: since its arrival, and what it came late."""
+        return self.age_s(now_s) + self.late_s
+
+    def recent(self, duration_s: float) -> NDArray[Any]:
+        """The samples of the last seconds, at most `RECENT_S`; dtype `ANGLE_SAMPLE`."""
+        samples = np.concatenate([np.empty(0, ANGLE_SAMPLE), *tuple(self._recent)])
+        return samples[samples["host_time_s"] > self._clock.now_s() - duration_s]
+
+    def angle_around(self, duration_s: float) -> float | None:
+        """Median of the last seconds' angles, rad; None if there is none."""
+        values = self.recent(duration_s)["angle_rad"]
+        return float(np.median(values)) if len(values) else None
+
+    def _scaled(self, samples: NDArray[Any]) -> NDArray[Any]:
+        samples = samples.copy()
+        samples["angle_rad"] = self.scale.angle_rad(samples["raw"])
+        return samples
+
+    def _keep(self, samples: NDArray[Any]) -> None:
+        samples = self._scaled(samples)
+        if self._journal is not None:
+            self.counts.samples += len(samples)
+            try:
+                self._journal.append(Kind.ANGLE, samples.tobytes())
+            except JournalError as error:
+                self._on_broken(str(error))
+        self.problem = ""
+        self._remember(samples)
+        if self._check is not None and (fault := self._check.fault(samples)):
+            self._on_fault(fault)
+
+    def _remember(self, samples: NDArray[Any]) -> None:
+        now_s, _, delay_s = self._rate[-1]
+        best_s = delay_s if self._prompt is None else self._prompt[1] + RATE_TOLERANCE * (now_s - self._prompt[0])
+        self._prompt = now_s, min(delay_s, best_s)
+        self.late_s = delay_s - self._prompt[1]
+        numbers = samples["counter"]
+        if self._unwrapper is None:
+            numbers = self._total - np.arange(len(samples))[::-1]
+        velocity_rad_s = self._slope.add(numbers.astype(np.int64), samples["angle_rad"])
+        self.angle_rad, self.velocity_rad_s = float(samples["angle_rad"][-1]), float(velocity_rad_s[-1])
+        self.live.append(np.column_stack([samples["host_time_s"], samples["angle_rad"], velocity_rad_s]))
+        self._recent.append(samples)
+        while self._recent[0]["host_time_s"][-1] < now_s - RECENT_S * self._clock.speed:
+            self._recent.popleft()
+
+    def _run(self) -> None:
+        """Open it, read it until it is gone, and so on until closed."""
+        while not self._closing.is_set():
+            try:
+                self.identity = self.sensor.open()
+            except DeviceError as error:
+                self._gone(str(error))
+            else:
+                self._begin_anew()
+                super()._run()
+            if self._closing.wait(REOPEN_S):
+                return
+
+    def _begin_anew(self) -> None:
+        """A sensor that was without power counts from zero: its numbers go on from where the clock is."""
+        with self._lock:
+            self._prompt = None
+            if self._unwrapper is not None and self._previous is not None:
+                passed_s = max(0.0, self._clock.now_s() - self._previous[1])
+                self._unwrapper.resume(self._previous[0] + 1 + round(passed_s * self.nominal_rate_hz))
+
+    def _gone(self, reason: str) -> None:
+        self.problem = reason
+        self.angle_rad = self.velocity_rad_s = None

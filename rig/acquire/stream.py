@@ -1,0 +1,266 @@
+"""What the receivers of torque and angle share: one reading thread each, from connect to disconnect.
+
+A stream unwraps the device's counter, finds lost, repeated and disordered samples, measures the rate, and notices
+silence and samples that come late.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import deque
+from collections.abc import Callable
+from typing import Any, Generic, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.acquire.rate import RATE_TOLERANCE
+from rig.clock import Clock
+from rig.errors import DeviceError
+from rig.signals import Recorded
+
+log = logging.getLogger("rig.receiver")
+
+READ_TIMEOUT_S = 0.02
+SILENCE_S = 1.0
+"""Real seconds of reading without a sample after which a device counts as gone. Its bus is closed, since some drivers
+then use a whole processor."""
+LONGEST_READ_S = 0.25
+"""Real seconds for which one reading counts at most: a machine that stood still did not read."""
+SETTLING_S = 0.1
+BACKLOG_RATE = 1.6
+BEHIND_S = 0.1
+"""Real seconds by which the newest sample may be later than the promptest one of the last `PROMPT_S` real seconds. A
+reader that was kept from reading, or that is too slow, is behind: what it reads now was measured long ago."""
+PROMPT_S = 5.0
+JUMP_ALLOWANCE_S = 0.5
+"""A counter that is further ahead of the host's clock than this has jumped, so its samples have no reliable time."""
+
+BlockT = TypeVar("BlockT", bound="Block")
+BlockT_co = TypeVar("BlockT_co", covariant=True)
+
+
+class Block(Protocol):
+    """Samples as a device gives them; they have a `host_time_s` and a `counter`."""
+
+    @property
+    def samples(self) -> NDArray[Any]: ...
+
+    @property
+    def malformed(self) -> int: ...
+
+    @property
+    def error_frames(self) -> int: ...
+
+    def __len__(self) -> int: ...
+
+
+class Source(Protocol[BlockT_co]):
+    """What a stream reads."""
+
+    sample_rate_hz: float
+    counter_modulus: int
+
+    def read(self, timeout_s: float) -> BlockT_co: ...
+
+    def close(self) -> None: ...
+
+
+class CounterUnwrapper:
+    """Turns the device's wrapping counter into one that never wraps, across blocks.
+
+    A step of zero is a repeated frame, a step backwards is a late frame: both are left out of the recording.
+    """
+
+    def __init__(self, modulus: int) -> None:
+        self._modulus = modulus
+        self._last: int | None = None
+        self._shift = 0
+        self._next: int | None = None
+
+    def resume(self, at: int) -> None:
+        """The device may have started again: whatever it counts next is number `at`."""
+        self._last, self._next = None, at
+
+    def unwrap(self, raw: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_], int, int]:
+        """Unwrapped counters, which samples to keep, number of repeats, number of late samples."""
+        if self._next is not None:
+            self._shift, self._next = self._next - int(raw[0]), None
+        raw = raw + self._shift
+        if self._last is None:
+            self._last = int(raw[0]) - 1
+        ahead = (raw - self._last + self._modulus // 2) % self._modulus - self._modulus // 2
+        counter = self._last + ahead
+        newest = np.maximum.accumulate(np.concatenate([[self._last], counter]))
+        keep = counter > newest[:-1]
+        repeats = int(np.sum(counter == newest[:-1]))
+        self._last = int(newest[-1])
+        return counter, keep, repeats, int(len(raw) - np.sum(keep)) - repeats
+
+
+class Stream(Generic[BlockT]):
+    """Base of the receivers: owns one device's reading thread.
+
+    Parameters
+    ----------
+    name
+        Of the device, for messages.
+    source
+        An opened device.
+    on_lost
+        Called once, with the reason, when the device is gone; the thread then ends.
+    """
+
+    def __init__(self, name: str, source: Source[BlockT], clock: Clock, on_lost: Callable[[str], None]) -> None:
+        self._name, self._source, self._clock, self._on_lost = name, source, clock, on_lost
+        self._lock = threading.Lock()
+        self._closing = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._unwrapper = CounterUnwrapper(source.counter_modulus) if source.counter_modulus else None
+        self._on_fault: Callable[[str], None] = lambda _: None
+        self._previous: tuple[int, float] | None = None
+        self._rate: deque[tuple[float, int, float]] = deque(maxlen=2000)
+        self._total = 0
+        self.counts = Recorded()
+        self.last_s: float | None = None
+        self.last_unix_s: float | None = None
+
+    @property
+    def nominal_rate_hz(self) -> float:
+        """Samples per second according to the rig file."""
+        return self._source.sample_rate_hz
+
+    def start(self) -> None:
+        """Start reading."""
+        self._thread = threading.Thread(target=self._run, name=f"{self._name} receiver", daemon=True)
+        self._thread.start()
+
+    @property
+    def living(self) -> bool:
+        """Whether its thread still runs."""
+        return self._thread is not None and self._thread.is_alive()
+
+    def close(self) -> None:
+        """End the thread and close the device."""
+        self._closing.set()
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._thread.join(timeout=2.0)
+        self._source.close()
+
+    def age_s(self, now_s: float) -> float:
+        """Age of the newest sample, infinite before the first."""
+        last_s = self.last_s
+        return np.inf if last_s is None else now_s - last_s
+
+    def settled(self) -> bool:
+        """Whether what arrives is of now: at the device's own rate, not faster, and not behind.
+
+        If samples arrive faster, old ones from a buffer are being read: after a pause of host or adapter.
+        """
+        since_s = self._clock.now_s() - SETTLING_S * self._clock.speed
+        rate = [entry for entry in tuple(self._rate) if entry[0] >= since_s]
+        if len(rate) < 2 or rate[-1][0] - rate[0][0] < 0.5 * SETTLING_S * self._clock.speed:
+            return False
+        rate_hz = (rate[-1][1] - rate[0][1]) / (rate[-1][0] - rate[0][0])
+        return rate_hz <= BACKLOG_RATE * self.nominal_rate_hz and self.behind_s() <= BEHIND_S * self._clock.speed
+
+    def behind_s(self) -> float:
+        """How much later the newest sample came than the promptest one of the last seconds, rig seconds; at least 0.
+
+        Its number says when it was due. A device may be slower than its nominal rate by `RATE_TOLERANCE`.
+        """
+        rate = tuple(self._rate)
+        if not rate:
+            return 0.0
+        now_s, _, delay_s = rate[-1]
+        since_s = now_s - PROMPT_S * self._clock.speed
+        return max(
+            delay_s - then_delay_s - RATE_TOLERANCE * (now_s - then_s)
+            for then_s, _, then_delay_s in rate
+            if then_s >= since_s
+        )
+
+    def measured_rate_hz(self) -> float | None:
+        """Samples per second over the last seconds, by the host's clock."""
+        rate = tuple(self._rate)
+        if len(rate) < 2 or rate[-1][0] <= rate[0][0]:
+            return None
+        return (rate[-1][1] - rate[0][1]) / (rate[-1][0] - rate[0][0])
+
+    def take(self, block: BlockT) -> None:
+        """Process one block from the device: unwrap, record, check."""
+        with self._lock:
+            self.counts.malformed_frames += block.malformed
+            self.counts.error_frames += block.error_frames
+            if len(block) == 0:
+                return
+            samples = self._placed(block.samples)
+            if len(samples):
+                self._time(samples)
+                self._keep(samples)
+
+    def _keep(self, samples: NDArray[Any]) -> None:
+        """Record and check samples that have their place; holds the lock."""
+        raise NotImplementedError
+
+    def _placed(self, samples: NDArray[Any]) -> NDArray[Any]:
+        """The samples with unwrapped counters, without repeated and late ones; counts the lost ones."""
+        if self._unwrapper is None:
+            return samples
+        counter, keep, repeats, late = self._unwrapper.unwrap(samples["counter"])
+        self.counts.duplicate_samples += repeats
+        self.counts.disordered_samples += late
+        samples = samples[keep].copy()
+        samples["counter"] = counter[keep]
+        if len(samples) == 0:
+            return samples
+        before = self._previous or (int(samples["counter"][0]) - 1, float(samples["host_time_s"][0]))
+        steps = np.diff(samples["counter"], prepend=before[0])
+        missing = int(np.sum(steps - 1))
+        if missing:
+            self.counts.lost_samples += missing
+            self._check_jump(samples, before, missing)
+        self._previous = int(samples["counter"][-1]), float(samples["host_time_s"][-1])
+        return samples
+
+    def _check_jump(self, samples: NDArray[Any], before: tuple[int, float], missing: int) -> None:
+        elapsed_s = float(samples["host_time_s"][-1]) - before[1]
+        if missing / self.nominal_rate_hz > elapsed_s + JUMP_ALLOWANCE_S:
+            self._on_fault(f"{self._name}: its counter jumped by {missing} samples within {elapsed_s * 1e3:.0f} ms")
+
+    def _time(self, samples: NDArray[Any]) -> None:
+        self.last_s = float(samples["host_time_s"][-1])
+        self.last_unix_s = self._clock.unix_s()
+        self._total += len(samples)
+        number = self._total if self._unwrapper is None else int(samples["counter"][-1])
+        self._rate.append((self.last_s, self._total, self.last_s - number / self.nominal_rate_hz))
+
+    def _run(self) -> None:
+        try:
+            self._read_all()
+        except Exception as error:  # a bug in a driver or here: report it at once, not after a timeout
+            log.exception("the receiver of the %s failed", self._name)
+            self._lose(f"{self._name}: internal: {type(error).__name__}: {error}")
+
+    def _read_all(self) -> None:
+        silent_s = 0.0
+        while not self._closing.is_set():
+            began_s = self._clock.now_s()
+            try:
+                block = self._source.read(READ_TIMEOUT_S)
+            except DeviceError as error:
+                self._lose(str(error))
+                return
+            read_s = min(self._clock.now_s() - began_s, LONGEST_READ_S * self._clock.speed)
+            newest_s = self.last_s
+            self.take(block)
+            silent_s = silent_s + read_s if self.last_s == newest_s else 0.0  # frames that repeat are silence, too
+            if silent_s > SILENCE_S * self._clock.speed:
+                self._lose(f"{self._name}: silent for {SILENCE_S:g} s; check its cable and supply")
+                return
+
+    def _lose(self, reason: str) -> None:
+        if not self._closing.is_set():
+            self._source.close()
+            self._on_lost(reason)

@@ -1,0 +1,177 @@
+"""Calibration of the angle sensor by two poses: what a goniometer shows, and what the sensor gives there.
+
+It is kept in the data folder, for the sensor that it was made with. Another sensor in the rig file has none.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from rig import archive
+from rig.acquire.angle_check import degrees
+from rig.acquire.angle_receiver import AngleReceiver
+from rig.clock import Clock, utc_text
+from rig.devices import DeviceSettings
+from rig.errors import DeviceError, RecordingError, RefusedError, RigError
+from rig.limits import Limit, check
+from rig.messages import AngleCalibration, AnglePose
+from rig.signals import AngleScale
+
+log = logging.getLogger("rig")
+
+POSE_S = 0.5
+"""Real seconds for which the joint must have been still when a pose is told."""
+STILL_RAD = 0.01
+PART_S = 0.05
+"""Real seconds of which one mean counts for stillness: noise is no movement."""
+LEAST_SHARE = 0.7
+"""Of the samples due in that time that must have come."""
+APART_RAD = 0.5
+SCALES = 0.5, 2.0
+"""How far the scale of two poses may be from the rig file's: beyond it a number was mistyped or the sensor slips."""
+SENSOR = "device", "bus", "dbc", "message", "signal", "of_the_cell"
+"""Settings that tell one sensor from another."""
+
+
+class AngleCalibrating:
+    """The calibration of a rig's angle sensor, and the first pose of the next one.
+
+    Parameters
+    ----------
+    sensor
+        Its settings; None: the rig has none.
+    """
+
+    def __init__(self, folder: Path, sensor: DeviceSettings | None, clock: Clock) -> None:
+        self._path, self._clock = folder / "angle-calibration.json", clock
+        content = {} if sensor is None else sensor.model_dump(mode="json")
+        self._sensor = {name: content[name] for name in SENSOR if name in content}
+        self.first: AnglePose | None = None
+        self.calibration = self._read() if sensor is not None else None
+
+    @property
+    def scale(self) -> AngleScale | None:
+        """By the two poses; None: there is no calibration."""
+        found = self.calibration
+        return None if found is None else AngleScale(found.offset, found.direction, found.radians_per_unit)
+
+    def described(self, rig_file: AngleScale) -> dict[str, Any]:
+        """What holds now, for journals and recordings: the calibration, else what the rig file says."""
+        if self.calibration is not None:
+            return self.calibration.model_dump(mode="json")
+        return {
+            "poses": [],
+            "offset": rig_file.offset,
+            "direction": rig_file.direction,
+            "radians_per_unit": rig_file.radians_per_unit,
+            "by": "rig file",
+            "set_at_utc": "",
+        }
+
+    def pose(self, angle_rad: float, by: str, receiver: AngleReceiver, bound: Limit) -> bool:
+        """Take a pose; True if it completed a calibration.
+
+        Raises
+        ------
+        RefusedError
+            No angle of a joint, the joint moved, or the two poses do not fit each other.
+        DeviceError
+            The sensor gives no angle.
+        RigError
+            The calibration could not be stored: the old one holds.
+        """
+        refusal = check(bound, angle_rad)
+        if refusal is not None:
+            raise RefusedError(f"angle_pose: {refusal}")
+        pose = AnglePose(angle_rad=angle_rad, raw=still_raw(receiver, self._clock.speed))
+        if self.first is None:
+            self.first = pose
+            return False
+        found = self._of_two(self.first, pose, by, receiver.sensor.scale)
+        self._write(found)
+        self.first, self.calibration = None, found
+        log.info("angle sensor calibrated by %s: %s", by, found.model_dump_json())
+        return True
+
+    def _of_two(self, first: AnglePose, second: AnglePose, by: str, rig_file: AngleScale) -> AngleCalibration:
+        apart_rad = second.angle_rad - first.angle_rad
+        if not (abs(apart_rad) >= APART_RAD):
+            raise RefusedError(
+                f"angle_pose: it is {degrees(abs(apart_rad))} from the first pose, at {degrees(first.angle_rad)}; at "
+                f"least {degrees(APART_RAD)} are needed: move the joint farther"
+            )
+        slope = apart_rad / (second.raw - first.raw) if second.raw != first.raw else float("inf")
+        lo, hi = (factor * rig_file.radians_per_unit for factor in SCALES)
+        if not (lo <= abs(slope) <= hi):
+            self.first = None
+            raise RefusedError(
+                f"angle_pose: the two poses make {abs(slope):.4g} rad of a unit, the rig file says "
+                f"{rig_file.radians_per_unit:.4g}; check goniometer and mounting, then begin with the first pose"
+            )
+        return AngleCalibration(
+            poses=[first, second],
+            offset=first.raw - first.angle_rad / slope,
+            direction=1 if slope > 0 else -1,
+            radians_per_unit=abs(slope),
+            by=by,
+            set_at_utc=utc_text(self._clock.unix_s()),
+        )
+
+    def _read(self) -> AngleCalibration | None:
+        try:
+            content = json.loads(self._path.read_text("utf-8"))
+            if content["sensor"] != self._sensor:
+                log.warning("%s: made with another sensor; take two poses again", self._path)
+                return None
+            return AngleCalibration.model_validate(content["calibration"])
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError, KeyError, TypeError, ValidationError) as error:
+            log.error("%s: not readable (%s); take two poses again", self._path, " ".join(str(error).split()))
+            return None
+
+    def _write(self, found: AngleCalibration) -> None:
+        content = {"sensor": self._sensor, "calibration": found.model_dump(mode="json")}
+        try:
+            archive.write_atomically(self._path, json.dumps(content).encode())
+        except RecordingError as error:
+            raise RigError(f"angle_pose: {error}") from None
+
+
+def still_raw(receiver: AngleReceiver, speed: float) -> float:
+    """What the sensor gave during the last moment, in its unit.
+
+    Raises
+    ------
+    DeviceError
+        Too little came.
+    RefusedError
+        The joint moved, or the sensor reports a fault.
+    """
+    samples = receiver.recent(POSE_S * speed)
+    raw = samples["raw"]
+    if len(samples) < max(3.0, LEAST_SHARE * POSE_S * speed * receiver.nominal_rate_hz):
+        raise DeviceError(receiver.problem or "angle sensor: too few angles arrive; check its cable and supply")
+    if not np.all(np.isfinite(raw)) or np.any(samples["fault"] == 1):
+        raise RefusedError("angle_pose: the sensor reports a fault of its own, or no number; check sensor and cable")
+    moved_rad = _moved(samples, PART_S * speed) * receiver.sensor.scale.radians_per_unit
+    if not (moved_rad < STILL_RAD):
+        raise RefusedError(
+            f"angle_pose: the joint moved by {degrees(moved_rad)} during the last {POSE_S:g} s; hold it still, read "
+            "the goniometer again, then tell the pose"
+        )
+    return float(np.mean(raw))
+
+
+def _moved(samples: NDArray[Any], part_s: float) -> float:
+    """Largest difference of the means of short parts, in the sensor's unit."""
+    part = np.floor((samples["host_time_s"] - samples["host_time_s"][0]) / part_s).astype(int)
+    means = [float(np.mean(samples["raw"][part == each])) for each in np.unique(part)]
+    return max(means) - min(means)

@@ -1,0 +1,143 @@
+"""An angle sensor on a CAN bus: a frame of its own, or a signal in the load cell's frame. A DBC file describes it.
+
+It shares the load cell's adapter where that is the same one, so each adapter is opened once.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Any, Literal, Self
+
+import numpy as np
+from pydantic import Field
+
+from rig.clock import Clock
+from rig.devices import DeviceSettings
+from rig.devices._can_bus import CanBus, Frame, Tap, place_of
+from rig.errors import ConfigError, DeviceError, WireError
+from rig.signals import ANGLE_SAMPLE, AngleBlock, AngleScale
+from rig.wire import dbc
+
+KIND = "angle_sensor"
+
+NAME = "angle sensor"
+GATHER_S = 0.01
+"""Real seconds: a block is returned at most this long after its first sample arrived."""
+OF_THE_CELL = "dbc", "message", "counter", "sample_rate_hz"
+"""Settings that the load cell's replace where the angle stands in its frame, unless the rig file gives them."""
+
+
+class Settings(DeviceSettings):
+    bus: dict[str, Any] = Field(default_factory=dict, description="as the load cell's, and by default the same")
+    dbc: str = Field("angle_default", description="path of a DBC file, or angle_default")
+    message: str | None = Field(None, description="message with the angle; default: the first one that has the signal")
+    signal: str = Field("Angle_deg", description="angle signal")
+    counter: str | None = Field("Counter", description="signal of the counter of frames; '' if there is none")
+    fault: str | None = Field("Fault", description="signal of the bit by which it reports a fault; '' if there is none")
+    sample_rate_hz: float = Field(200.0, gt=0, le=20_000)
+    radians_per_unit: float = Field(math.pi / 180, gt=0, description="rad per unit of the signal")
+    direction: Literal[-1, 1] = Field(1, description="-1: the signal falls when the joint is flexed")
+    offset: float = Field(0.0, description="signal of a straight arm, in its unit")
+    of_the_cell: bool = Field(False, description="the signal stands in the load cell's own frame")
+
+    def beside(self, _cell: DeviceSettings) -> Self:
+        """The cell's bus, and of a signal in its frame the cell's description, unless the rig file gives others."""
+        given, cell = self.model_fields_set, _cell.model_dump()
+        taken = {} if self.bus else {"bus": cell.get("bus", {})}
+        if self.of_the_cell:
+            taken |= {name: cell[name] for name in OF_THE_CELL if name in cell and name not in given}
+            taken |= {} if "fault" in given else {"fault": None}
+            several = cell.get("signal")
+            if isinstance(several, list) and "sample_rate_hz" in taken:
+                taken["sample_rate_hz"] /= len(several)
+        return self.model_copy(update=taken)
+
+
+class CanAngleSensor:
+    """Driver of one sensor; see `rig.devices.AngleSensor` for what the methods promise."""
+
+    def __init__(self, settings: Settings, clock: Clock) -> None:
+        self._settings, self._clock = settings, clock
+        try:
+            self._frame = dbc.SampleFrame(
+                settings.dbc,
+                settings.message,
+                [settings.signal],
+                settings.counter or None,
+                settings.fault or None,
+                "fault",
+            )
+        except ConfigError as error:
+            raise ConfigError(f"{KIND}.{error}") from None
+        self.sample_rate_hz, self.counter_modulus = settings.sample_rate_hz, self._frame.counter_modulus
+        self.scale = AngleScale(settings.offset, settings.direction, settings.radians_per_unit)
+        self.of_the_cell = settings.of_the_cell
+        self._source: CanBus | Tap | None = None
+
+    @property
+    def on_the_cells_bus(self) -> bool:
+        return isinstance(self._source, Tap)
+
+    def open(self) -> dict[str, Any]:
+        bus, frame_id = self._settings.bus, self._frame.frame_id
+        self._source = CanBus.tap(bus, NAME, frame_id)
+        if self._source is None:
+            if self.of_the_cell:
+                raise DeviceError(f"{KIND}.of_the_cell: the load cell's bus {place_of(bus)} is not open")
+            self._source = CanBus(bus, NAME, self._clock)
+        return {
+            "device": "can_angle_sensor",
+            "bus": place_of(bus),
+            "frame_id": f"0x{frame_id:X}",
+            "message": self._frame.message.name,
+            "sample_rate_hz": self.sample_rate_hz,
+        }
+
+    def read(self, timeout_s: float) -> AngleBlock:
+        if self._source is None:
+            raise DeviceError("angle sensor is not open")
+        rows: list[tuple[float, float, float, float, int, int]] = []
+        malformed = error_frames = 0
+        end_s = time.monotonic() + timeout_s
+        while (remaining_s := end_s - time.monotonic()) > 0:
+            try:
+                frame = self._source.receive(remaining_s)
+                if frame is None:
+                    continue
+                if frame.message.is_error_frame:
+                    error_frames += 1
+                    continue
+                if frame.message.arbitration_id != self._frame.frame_id or frame.message.is_remote_frame:
+                    continue
+                rows.append(self._row(frame))
+            except WireError:
+                malformed += 1
+                continue
+            if len(rows) == 1:
+                end_s = min(end_s, time.monotonic() + GATHER_S)
+        samples = np.array(rows, dtype=ANGLE_SAMPLE)
+        samples["angle_rad"] = self.scale.angle_rad(samples["raw"])
+        return AngleBlock(samples, malformed, error_frames)
+
+    def close(self) -> None:
+        if isinstance(self._source, Tap):
+            CanBus.untap(self._source)
+        elif self._source is not None:
+            self._source.close()
+        self._source = None
+
+    def _row(self, frame: Frame) -> tuple[float, float, float, float, int, int]:
+        found = self._frame.decode(bytes(frame.message.data))
+        return frame.host_time_s, frame.stamp_s, found.values[0], math.nan, found.counter, found.flag
+
+
+def create(settings: Settings, clock: Clock) -> CanAngleSensor:
+    """The device, not yet opened.
+
+    Raises
+    ------
+    ConfigError
+        The DBC lacks the message or signal.
+    """
+    return CanAngleSensor(settings, clock)
