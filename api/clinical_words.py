@@ -31,7 +31,7 @@ TEST_KINDS: dict[str, Any] = {
     "sequence": lazy("trial of a controller"),
     "adaptive": lazy("test that stops itself"),
     "passive": lazy("passive movement"),
-    "held": lazy("held angle"),
+    "held": lazy("held-angle test"),
     "moving": lazy("movement under stimulation"),
 }
 TITLES: dict[str, Any] = {

@@ -52,5 +52,7 @@ async def take_pose(request: Request, context: Ctx, who: Tester) -> Response:
     try:
         await joint.take_pose(context, body, who.name)
     except ApiError as error:
+        words = error.detail.removeprefix("angle_pose: ")
+        error.detail = words[:1].upper() + words[1:]
         return await shown(request, context, text, problem=error, again=first)
     return RedirectResponse("/rig/angle", 303)

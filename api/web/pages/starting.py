@@ -82,7 +82,7 @@ async def ask(context: Context, who: Principal, body: TestIn, back: str = "") ->
         button=_("Start now: %(strength)s", strength=strength) if stimulates else _("Start now: no stimulation"),
         action=action,
         rows=rows(row, preview, standing, other_than(who.name, body.ran_by) or who.name, rig_words(context)),
-        warnings=[*warnings(row, standing), *out_of_reach(preview)],
+        warnings=[*(warnings(row, standing) if stimulates else []), *out_of_reach(preview)],
         stimulates=stimulates,
         back=back,
         at_deg=joint_words.allowed_deg(joint) if joint else None,
@@ -121,6 +121,10 @@ def rows(row: Participant, preview: dict[str, Any], standing: Calibrated, ran_by
         more = [Row(_("Stops once known within"), number(preview["target"]["curve_percent"], 1, "%"))]
         more += [Row(_("Expected"), translated(reach["words"]))] if reach["reachable"] else []
     profile = row.profile
+    if not widest_us(preview):
+        return [Row(_("Who"), row.code), *more, Row(_("How long"), long), Row(_("Dose"), dose),
+                Row(_("Stops at"), number(profile["max_torque_nm"], 1, "N·m")), Row(_("Run by"), ran_by),
+                Row(_("Rig"), rig)]  # fmt: skip
     widest, most = number(widest_us(preview), 0, "µs"), number(profile["max_pulse_width_us"], 0, "µs")
     return [
         Row(_("Who"), row.code),

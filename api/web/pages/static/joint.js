@@ -53,10 +53,10 @@ function angleLines() {
 }
 
 function trace(name, values, title, unit, lines) {
-  let low = Math.min(0, ...lines), high = Math.max(unit === "°" ? 10 : 20, ...lines);
+  let low = lines.length ? Math.min(...lines) : 0, high = Math.max(unit === "°" ? 10 : 60, ...lines);
   for (const value of values) { if (value < low) low = value; if (value > high) high = value; }
   if (unit !== "°") { high = Math.max(high, -low); low = -high; }
-  const room = 0.06 * (high - low), drawn = frame(byId(name), low - room, high + room, title, unit), { pen, x, y, area } = drawn;
+  const room = 0.06 * (high - low), drawn = frame(byId(name), low - room, high + room, title, unit, false), { pen, x, y, area } = drawn;
   if (low < 0) { pen.strokeStyle = colours.zero; pen.lineWidth = 1; pen.beginPath(); pen.moveTo(area.left, y(0)); pen.lineTo(area.right, y(0)); pen.stroke(); }
   pen.strokeStyle = colours.limit; pen.lineWidth = 1.5; pen.setLineDash([7, 5]);
   for (const line of lines) { pen.beginPath(); pen.moveTo(area.left, y(line)); pen.lineTo(area.right, y(line)); pen.stroke(); }
@@ -77,7 +77,7 @@ function drawCoverage() {
   pen.font = "12px " + FONT;
   const rows = told.time_s.length, edges = told.angle_edges_rad.map((v) => v * DEG), columns = edges.length - 1;
   const names = words.rows, widest = Math.max(...names.map((name) => pen.measureText(name).width));
-  const area = { left: widest + 14, right: size.width - 8, top: 26, bottom: size.height - 36 };
+  const area = { left: widest + 14, right: size.width - 20, top: 26, bottom: size.height - 36 };
   const high = (area.bottom - area.top) / rows;
   const x = (deg) => area.left + ((deg - edges[0]) / (edges[columns] - edges[0])) * (area.right - area.left);
   pen.textBaseline = "middle"; pen.textAlign = "right"; pen.fillStyle = colours.dim;

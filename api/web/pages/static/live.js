@@ -121,14 +121,14 @@ function nice(span, count) {
   return [1, 2, 5, 10].map((m) => m * power).find((step) => step >= rough);
 }
 
-function frame(canvas, low, high, title, unit) {
+function frame(canvas, low, high, title, unit, timed = true) {
   const ratio = window.devicePixelRatio || 1, box = canvas.getBoundingClientRect();
   const w = Math.round(box.width * ratio), h = Math.round(box.height * ratio);
   if (canvas.width !== w || canvas.height !== h) { canvas.width = w; canvas.height = h; }
   const pen = canvas.getContext("2d");
   pen.reset(); pen.setTransform(ratio, 0, 0, ratio, 0, 0);
   pen.clearRect(0, 0, box.width, box.height);
-  const area = { left: 62, right: box.width - 10, top: 26, bottom: box.height - 34 };
+  const area = { left: 62, right: box.width - 10, top: 26, bottom: box.height - (timed ? 34 : 10) };
   const span = Math.max(state.duration, 1);
   const x = (t) => area.left + (t / span) * (area.right - area.left);
   const y = (v) => area.bottom - ((v - low) / (high - low)) * (area.bottom - area.top);
@@ -140,8 +140,8 @@ function frame(canvas, low, high, title, unit) {
     pen.fillText(shown(+v.toFixed(6)), area.left - 8, y(v));
   }
   pen.textAlign = "center"; pen.textBaseline = "top";
-  for (let t = 0; t <= span + 1e-9; t += xstep) pen.fillText(shown(+t.toFixed(6)), x(t), area.bottom + 5);
-  pen.textAlign = "right"; pen.fillText(words.time, area.right, area.bottom + 20);
+  for (let t = 0; timed && t <= span + 1e-9; t += xstep) pen.fillText(shown(+t.toFixed(6)), x(t), area.bottom + 5);
+  pen.textAlign = "right"; if (timed) pen.fillText(words.time, area.right, area.bottom + 20);
   pen.textAlign = "left"; pen.fillStyle = colours.ink; pen.font = "600 13px " + FONT; pen.fillText(title + " (" + unit + ")", 4, 3);
   segments(pen, area, x);
   pen.beginPath(); pen.rect(area.left, 0, area.right - area.left + 2, area.bottom + 1); pen.clip();
