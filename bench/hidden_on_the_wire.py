@@ -1,6 +1,10 @@
 """Hidden patients on the wire, through REST alone: test, compare, diagnose, next experiment, add, and what was hidden.
 
     python -m bench.hidden_on_the_wire --seeds 1000:1008
+    python -m bench.hidden_on_the_wire --moving --seeds 2520:2540
+
+`--moving`: patients whose joint moves, with an angle sensor; one test, sealed, read and diagnosed, and beside it the
+same patient's record as a CSV file (`tests/harness/moving_on_the_wire.py`).
 
 Every seed counts. `--speed` lets emulator and rig run faster than real time (a busy machine makes the result noisy).
 `tests/harness/hidden_on_the_wire.py` plays one seed.
@@ -12,10 +16,12 @@ import argparse
 import json
 import tempfile
 from pathlib import Path
+from typing import Any
 
 from api.cli.errors import CommandError
 from api.client.errors import ServiceError
 from tests.harness.hidden_on_the_wire import run
+from tests.harness.moving_on_the_wire import run as run_moving
 
 
 def main() -> None:
@@ -24,13 +30,21 @@ def main() -> None:
     parser.add_argument("--seeds", default="1000:1008", help="first:last, last not included")
     parser.add_argument("--speed", type=float, default=2.0)
     parser.add_argument("--json", type=Path, help="write all that was found here")
+    parser.add_argument("--moving", action="store_true", help="patients whose joint moves")
     options = parser.parse_args()
     first, _, last = options.seeds.partition(":")
+    seeds = range(int(first), int(last or int(first) + 1))
+    rows = _moving(seeds, options.speed) if options.moving else _still(seeds, options.speed)
+    if options.json:
+        options.json.write_text(json.dumps(rows, indent=1))
+
+
+def _still(seeds: range, speed: float) -> list[dict[str, Any]]:
     rows = []
-    for seed in range(int(first), int(last or int(first) + 1)):
+    for seed in seeds:
         try:
             with tempfile.TemporaryDirectory(prefix="hidden-") as folder:
-                row = run(seed, options.speed, Path(folder))
+                row = run(seed, speed, Path(folder))
         except (CommandError, ServiceError) as error:
             rows.append({"seed": seed, "agrees": False, "error": str(error)})
             print(f"{seed}  FAILED: {error}", flush=True)
@@ -46,8 +60,31 @@ def main() -> None:
             flush=True,
         )
     print(f"{sum(row['agrees'] for row in rows)} of {len(rows)} agree")
-    if options.json:
-        options.json.write_text(json.dumps(rows, indent=1))
+    return rows
+
+
+def _moving(seeds: range, speed: float) -> list[dict[str, Any]]:
+    """Rows, printed as they come, and the totals of each effect on the wire and as a file."""
+    rows = []
+    for seed in seeds:
+        with tempfile.TemporaryDirectory(prefix="moving-") as folder:
+            row = run_moving(seed, speed, Path(folder))
+        rows.append(row)
+        told = {where: f"{row[where]['verdict']}: {', '.join(row[where]['named']) or '-'}" for where in ("wire", "csv")}
+        print(
+            f"{seed}  hidden {'+'.join(row['hidden']) or 'nothing'} ({row['strength']})  wire {told['wire']}  "
+            f"csv {told['csv']}  pulses late {row['lateness_ms']} ms, {row['dropped_pulses']} dropped",
+            flush=True,
+        )
+    for effect in sorted({"+".join(row["hidden"]) for row in rows}):
+        of_it = [row for row in rows if "+".join(row["hidden"]) == effect]
+        right = {where: sum(row[where]["agrees"] for row in of_it) for where in ("wire", "csv")}
+        first = {where: sum(row[where]["named_first"] for row in of_it) for where in ("wire", "csv")}
+        print(
+            f"{effect or 'nothing'}: right {right['wire']} of {len(of_it)} on the wire, {right['csv']} as a file; "
+            f"named first {first['wire']} and {first['csv']}"
+        )
+    return rows
 
 
 if __name__ == "__main__":

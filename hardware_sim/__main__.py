@@ -10,17 +10,21 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from hardware_sim import options as command_line
 from hardware_sim.arm import description as arms
+from hardware_sim.arm.description import Arm
+from hardware_sim.arm.tissue import bare
 from hardware_sim.emulator import Emulator
-from hardware_sim.errors import FaultError, HardwareSimError, PatientError
+from hardware_sim.errors import ArmError, FaultError, HardwareSimError, PatientError
 from hardware_sim.patients import registry
 from hardware_sim.patients.muscle import Muscle
 
 PROG = "stimrig emulate"
+DESIGN = "design"
 FASTEST_AT_PRIORITY = 5.0
 
 
@@ -32,11 +36,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return done.code if isinstance(done.code, int) else 2
     try:
         if options.reveal is not None:
-            print(json.dumps(_hidden().reveal(options.reveal)))
+            print(json.dumps(_hidden().reveal(options.reveal, moving=options.arm is not None)))
             return 0
         muscle, name = _patient(options)
-        arm = arms.read(options.arm) if options.arm else None
-        emulator = Emulator(muscle, command_line.settings(options, name), arm)
+        emulator = Emulator(muscle, command_line.settings(options, name), _arm(options))
     except HardwareSimError as error:
         print(f"{PROG}: {error}", file=sys.stderr)
         return 2
@@ -85,13 +88,26 @@ def _orphan_watch() -> Callable[[], bool]:
 
 def _patient(options: argparse.Namespace) -> tuple[Muscle, str]:
     if options.hidden is not None:
-        return _hidden().make(options.hidden), f"hidden:{options.hidden}"
+        return _hidden().make(options.hidden, moving=options.arm is not None), f"hidden:{options.hidden}"
     name = options.patient
     if name in registry.names():
         return registry.make(name), name
     if Path(name).suffix.lower() in {".toml", ".json"} or Path(name).exists():
         return registry.from_file(Path(name)), name
     return registry.make(name), name
+
+
+def _arm(options: argparse.Namespace) -> Arm | None:
+    """The arm asked for; a hidden patient brings all that its joint does, and how it moves if asked for by `design`."""
+    if options.arm is None:
+        return None
+    if options.hidden is None:
+        return arms.with_laws(arms.read(options.arm), options.arm_law)
+    if options.arm_law:
+        raise ArmError("--arm-law: what the arm of a hidden patient does is hidden, too")
+    if options.arm == DESIGN:
+        return Arm("waves", _hidden().movement(options.hidden), bare())
+    return replace(arms.read(options.arm), tissue=bare())
 
 
 def _hidden() -> Any:

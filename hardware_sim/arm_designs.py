@@ -34,6 +34,7 @@ class Asked:
     angle_rad: float | None = None
     protocol: str = "prbs"
     duration_s: float | None = None
+    parts: Parts | None = None
 
     @property
     def top_us(self) -> float:
@@ -98,7 +99,7 @@ def _somewhere(asked: Asked) -> ArmDesign:
 
 def _staircase_at(asked: Asked, angle_rad: float) -> ArmDesign:
     steps = np.round(staircase(asked.top_us, 5, 1.0))
-    return _held(asked, angle_rad, [_rest(1.0), ("staircase", steps), _rest(1.5)])
+    return _held(asked, angle_rad, asked.parts or [_rest(1.0), ("staircase", steps), _rest(1.5)])
 
 
 def _passive(asked: Asked) -> ArmDesign:
@@ -112,18 +113,23 @@ def _passive(asked: Asked) -> ArmDesign:
 
 
 def _moving(asked: Asked) -> ArmDesign:
-    seconds, rng = asked.duration_s or 60.0, asked.rng
+    parts = asked.parts or _steady(asked.rng, asked.top_us, asked.duration_s or 60.0)
+    seconds = sum(widths.size for _, widths in parts) / PULSES_PER_S
+    speeds = asked.rng.permutation([15.0, 35.0, 60.0])
+    moves = [(third * seconds / 3.0, *_sweeps(asked, float(deg_s))) for third, deg_s in enumerate(speeds)]
+    return ArmDesign(parts, _moved(asked, moves, parts))
+
+
+def _steady(rng: Generator, top_us: float, seconds: float) -> Parts:
+    """Levels of 3 to 7 s between two rests."""
     left_s = seconds - 4.0
     shares: list[Floats] = []
     while left_s > 0.0:
         lasts_s = min(float(rng.uniform(3.0, 7.0)), left_s)
         share = 0.0 if rng.random() < 0.1 else float(rng.uniform(0.25, 1.0))
-        shares.append(np.full(round(lasts_s * PULSES_PER_S), np.round(share * asked.top_us)))
+        shares.append(np.full(round(lasts_s * PULSES_PER_S), np.round(share * top_us)))
         left_s -= lasts_s
-    speeds = rng.permutation([15.0, 35.0, 60.0])
-    moves = [(third * seconds / 3.0, *_sweeps(asked, float(deg_s))) for third, deg_s in enumerate(speeds)]
-    parts = [_rest(2.0), ("levels", np.concatenate(shares)), _rest(2.0)]
-    return ArmDesign(parts, _moved(asked, moves, parts))
+    return [_rest(2.0), ("levels", np.concatenate(shares)), _rest(2.0)]
 
 
 def _unseen(asked: Asked) -> ArmDesign:

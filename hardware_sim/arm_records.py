@@ -15,7 +15,7 @@ from numpy.random import Generator
 from scipy.signal import savgol_filter
 
 from hardware_sim.arm.law import Floats
-from hardware_sim.arm_designs import KINDS, SIMULATION_HZ, ArmDesign, Asked
+from hardware_sim.arm_designs import KINDS, SIMULATION_HZ, ArmDesign, Asked, Parts
 from hardware_sim.arm_patient import ArmPatient, arm_patient
 from hardware_sim.patients.hidden.design import PULSES_PER_S
 from hardware_sim.patients.hidden.draw import rng_of
@@ -35,6 +35,7 @@ def record(
     mover: str | None = None,
     protocol: str = "prbs",
     duration_s: float | None = None,
+    parts: Parts | None = None,
     noise_sd_nm: float | None = None,
 ) -> dict[str, Any]:
     """One record of an arm.
@@ -52,6 +53,9 @@ def record(
         `hand` or `robot`; drawn if None. `unseen` moves by waves of 0.05 to 0.6 Hz.
     duration_s
         Length of `passive`, `moving` or `unseen`; 66, 60 and 30 if None. Others have their protocol's.
+    parts
+        Of `held` or `moving`: segments in order, each a name and its pulse widths at 40 pulses/s, µs, instead of the
+        kind's own.
     noise_sd_nm
         Of the torque; drawn if None.
 
@@ -76,7 +80,7 @@ def record(
     chosen = mover or drawn
     sd_nm = float(rng.uniform(0.05, 0.1))
     sd_nm = sd_nm if noise_sd_nm is None else noise_sd_nm
-    design = KINDS[kind](Asked(patient, rng, chosen, angle_rad, protocol, duration_s))
+    design = KINDS[kind](Asked(patient, rng, chosen, angle_rad, protocol, duration_s, parts))
     clean = _simulated(patient, design)
     every = SIMULATION_HZ // RATE_HZ
     rows = {name: column[::every] for name, column in clean.items()}

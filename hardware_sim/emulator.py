@@ -12,9 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from hardware_sim import stimulators
-from hardware_sim.angle_sensors import sensor as angle_frames
-from hardware_sim.angle_sensors.encoder import Encoder, Mounting
-from hardware_sim.angle_sensors.sensor import AngleSensor
+from hardware_sim.angle_sensors import mounted
 from hardware_sim.arm.description import Arm
 from hardware_sim.arm.limb import Limb
 from hardware_sim.control import Control
@@ -22,7 +20,6 @@ from hardware_sim.electrodes import Electrodes
 from hardware_sim.errors import SettingsError
 from hardware_sim.faults.registry import Faults
 from hardware_sim.load_cells import cells, transports
-from hardware_sim.load_cells.cells import with_angle
 from hardware_sim.load_cells.frames import CellProtocol
 from hardware_sim.load_cells.sampler import LoadCell, deliver
 from hardware_sim.patients.muscle import Muscle
@@ -58,7 +55,7 @@ class Emulator:
         epoch_us = time.time_ns() // 1000
         self.limb = Limb(muscle, arm, settings.noise_seed) if arm else None
         muscle = self.limb or muscle
-        self.encoder = _encoder(self.limb, settings) if self.limb else None
+        self.encoder = mounted.encoder(self.limb.angle_deg, settings) if self.limb else None
         self.load_cell = LoadCell(
             muscle,
             cell,
@@ -71,9 +68,7 @@ class Emulator:
             epoch_us=epoch_us,
             read_angle=self.encoder.read if self.encoder and settings.angle == "in-cell" else None,
         )
-        self.angle_sensor: AngleSensor | None = None
-        if self.encoder and settings.angle == "own":
-            self.angle_sensor = _angle_sensor(self.encoder, self.load_cell, settings, epoch_us)
+        self.angle_sensor = mounted.own_sensor(self.encoder, self.load_cell.add_frame, settings, epoch_us)
         samplers = [self.load_cell, self.angle_sensor] if self.angle_sensor else [self.load_cell]
         self.timeline.followers.append(lambda until_s: take_in_order(samplers, until_s))
         self.electrodes = Electrodes(muscle, self.load_cell.raise_sync)
@@ -106,23 +101,8 @@ class Emulator:
             "noise_nm": self.settings.noise_nm,
             "noise_seed": self.settings.noise_seed,
             "sync": self.settings.sync and self._cell.has_sync,
-            **self._ready_arm(),
+            **({"arm": self.limb.mode, "angle_sensor": mounted.described(self.settings)} if self.limb else {}),
         }
-
-    def _ready_arm(self) -> dict[str, Any]:
-        if not (self.limb and self.encoder):
-            return {}
-        settings, mounting = self.settings, self.encoder.mounting
-        in_cell = settings.angle == "in-cell"
-        sensor = {
-            "kind": "in_cell" if in_cell else "own",
-            "frame_id": with_angle.CAN_ID if in_cell else angle_frames.CAN_ID,
-            "rate_hz": settings.rate_hz if in_cell else settings.angle_rate_hz,
-            "offset_deg": mounting.offset_deg,
-            "direction": mounting.direction,
-            "scale": mounting.scale,
-        }
-        return {"arm": self.limb.mode, "angle_sensor": sensor}
 
     def run(self, stopping: Callable[[], bool]) -> None:
         """Advance time until `stopping`."""
@@ -217,29 +197,6 @@ class Emulator:
 
     def _write(self, frame: bytes) -> None:
         self.port.write(frame)
-
-
-def _encoder(limb: Limb, settings: Settings) -> Encoder:
-    mounting = Mounting(
-        settings.angle_offset_deg,
-        settings.angle_direction,
-        settings.angle_scale,
-        settings.angle_bits,
-        settings.angle_noise_deg,
-    )
-    return Encoder(limb.angle_deg, mounting, settings.noise_seed)
-
-
-def _angle_sensor(encoder: Encoder, load_cell: LoadCell, settings: Settings, epoch_us: int) -> AngleSensor:
-    """The sensor's frames go onto the cell's bus, between the cell's own."""
-    return AngleSensor(
-        encoder,
-        load_cell.add_frame,
-        settings.angle_rate_hz,
-        settings.angle_clock_ppm,
-        settings.angle_jitter_us * 1e-6,
-        epoch_us,
-    )
 
 
 def _cell(settings: Settings) -> CellProtocol:

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from hardware_sim.patients import hidden
 from hardware_sim.patients.hidden.design import UNRECORDED, Design, make_design
 from hardware_sim.patients.hidden.draw import Scenario, draw_pair, draw_scenario, effect_ids, outside_ids, rng_of
 from hardware_sim.patients.hidden.kernels import Floats
@@ -123,6 +124,17 @@ def generate(
         conditions |= {"slow_sd_nm": slow_sd_nm, "slow_correlation_s": SLOW_CORRELATION_S}
     about = {"seed": seed, "noise": conditions, "steep": steep, "design": design, "rate_hz": rate_hz}
     return record | {"truth": scenario.truth(noise_sd_nm) | about}
+
+
+def of_patient(seed: int, moving: bool = False, rate_hz: float = 400.0) -> dict[str, Any]:
+    """A record of the patient that `--hidden SEED` plays (with an arm if `moving`), by the design that sized it.
+
+    White noise of 0.04 N·m, against which its strength was chosen.
+    """
+    scenario = hidden.drawn(seed, moving)
+    rng = rng_of(seed, "noise of a patient", "moving" if moving else "still")
+    noise_nm = lambda count: rng.normal(0.0, hidden.NOISE_SD_NM, count)  # noqa: E731
+    return sampled(scenario, scenario.design, rate_hz, 0.0, noise_nm) | {"truth": hidden.reveal(seed, moving)}
 
 
 def sampled(

@@ -10,6 +10,7 @@ from typing import NoReturn
 
 from hardware_sim import stimulators
 from hardware_sim.arm import registry as arms
+from hardware_sim.arm.tissue import DEFAULT_LAWS, PLACES
 from hardware_sim.errors import SettingsError
 from hardware_sim.load_cells import cells, transports
 from hardware_sim.patients import registry
@@ -98,7 +99,12 @@ def _who(group: argparse._ArgumentGroup) -> None:
         help=f"{', '.join(registry.names())}, or a TOML or JSON file with 'patient' and a table 'parameters' "
         "(default: %(default)s)",
     )
-    who.add_argument("--hidden", type=int, metavar="SEED", help="a patient with a hidden effect, drawn by SEED")
+    who.add_argument(
+        "--hidden",
+        type=int,
+        metavar="SEED",
+        help="a patient with a hidden effect, drawn by SEED; with --arm another one, whose joint matters",
+    )
     who.add_argument("--reveal", type=int, metavar="SEED", help="print what --hidden SEED hides, and exit")
 
 
@@ -169,8 +175,16 @@ def _arm(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
         "--arm",
         metavar="MODE[,SETTING=NUMBER…]|FILE",
-        help=f"what holds or moves the elbow: {', '.join(arms.modes())}, or a TOML or JSON file "
-        "(default: no arm, the joint is still and has no sensor)",
+        help=f"what holds or moves the elbow: {', '.join(arms.modes())}, or a TOML or JSON file; with --hidden also "
+        "'design', the movement that its effect was sized on (default: no arm, the joint is still and has no sensor)",
+    )
+    group.add_argument(
+        "--arm-law",
+        action="append",
+        default=[],
+        metavar="PLACE=NAME[,PARAMETER=NUMBER…]",
+        help=f"another law of its tissue, at {', '.join(PLACES)}; may be repeated (default: "
+        f"{', '.join(f'{place}={name}' for place, name in DEFAULT_LAWS.items())}; each place has 'none')",
     )
     group.add_argument(
         "--angle",

@@ -22,6 +22,9 @@ from identify.model import Model
 from identify.records.record import Record
 
 AUTO = "auto"
+MOVING_JOINT = ("passive_torque:surface", "torque_angle:smooth", "torque_velocity:surface")
+"""Effects with which `fit` estimates all of the paper's Fig. 2 together, from joined records: h(x, ẋ), then g(x, ẋ) as
+a curve over the angle times a hyperbola over the velocity, both of free shape."""
 NO_EFFECTS_WITH = {"monotone", "order"}
 """Options that cannot be combined with effects."""
 

@@ -99,6 +99,8 @@ class Model(Shown):
     fit, residual_tests, valid_for, quality, bands, data : dict
         See `docs/` and MODEL.json; `fit` holds fit_percent, held_out_fit_percent, rms_nm, held_out_rms_nm,
         ceiling_percent and noise_sd_nm.
+    joint : dict
+        g(x, ẋ) and h(x, ẋ) as tables with bands (`identify.simulation.joint_surface`); empty where the joint was held.
     reasons : tuple of str
         Reasons for the structure, the number of knots and the noise model.
     """
@@ -119,6 +121,7 @@ class Model(Shown):
     quality: dict[str, Any] = field(default_factory=dict)
     bands: dict[str, Any] = field(default_factory=dict)
     data: dict[str, Any] = field(default_factory=dict)
+    joint: dict[str, Any] = field(default_factory=dict)
     reasons: tuple[str, ...] = ()
     extra: dict[str, Any] = field(default_factory=dict)
     model_id: str = ""
@@ -186,6 +189,7 @@ class Model(Shown):
                     "figures": self.figures(),
                 },
                 "effects": self.effects,
+                **({"joint": self.joint} if self.joint else {}),
                 "fit": self.fit,
                 "residual_tests": self.residual_tests,
                 "quality": self.quality,
@@ -277,6 +281,7 @@ def _from_dict(data: dict[str, Any]) -> Model:
         quality=data.get("quality", {}),
         bands=uncertainty.get("bands", {}),
         data=data.get("data", {}),
+        joint=data.get("joint", {}),
         reasons=tuple(data.get("reasons", ())),
         extra=data.get("extra", {}),
         model_id=str(data.get("model_id", "")),

@@ -186,10 +186,15 @@ SETTINGS = {
     "sign": sign,
     "reference_s": number(-PLAUSIBLE, PLAUSIBLE),
 }
+JOINT_SETTINGS = {
+    "reference_rad": number(-1e3, 1e3),
+    "angle_range_rad": several(number(-1e3, 1e3), 2, 2, rising=True),
+}
+"""Of a record with an angle."""
 EFFECT_STATE = number(0.0, 1.0, "Give a number from 0 (rested) to 1, or leave it out: rested.")
 EFFECT = fields(
     {"id": text, "parameters": each(lambda value, place: ANY(parameter_value(value), place))},
-    {"form": text, "settings": fields({}, SETTINGS), "state": EFFECT_STATE},
+    {"form": text, "settings": fields({}, SETTINGS | JOINT_SETTINGS), "state": EFFECT_STATE},
 )
 WHOLE = number(0, LONGEST)
 _NARX = fields(
@@ -217,6 +222,29 @@ COVARIANCE = fields(
         "matrix": several(several(maybe(ANY), most=1000), most=1000),
     }
 )
+ANGLES = several(number(-1e3, 1e3), 1, 1000, rising=True)
+TABLE = several(several(ANY, 1, 1000), 1, 1000)
+_JOINT = fields(
+    {
+        "reference_angle_rad": number(-1e3, 1e3), "angle_rad": ANGLES, "velocity_rad_s": ANGLES, "g": TABLE,
+        "h_nm": TABLE, "inertia_nm_s2_per_rad": ANY,
+    },
+    dict.fromkeys(("g_lower", "g_upper", "h_lower_nm", "h_upper_nm", "seen_g", "seen_h"), TABLE),
+)  # fmt: skip
+
+
+def joint(value: Any, place: str) -> None:
+    """Tables with one row for each angle and one column for each velocity."""
+    if value == {}:
+        return
+    _JOINT(value, place)
+    rows, columns = len(value["angle_rad"]), len(value["velocity_rad_s"])
+    for name in ("g", "h_nm", "g_lower", "g_upper", "h_lower_nm", "h_upper_nm", "seen_g", "seen_h"):
+        table = value.get(name)
+        if table is not None and (len(table) != rows or any(len(row) != columns for row in table)):
+            raise BadModel(f"not {rows} rows of {columns}", place=f"{place}.{name}", fix=FIX)
+
+
 MODEL = fields(
     {
         "method": text,
@@ -231,6 +259,7 @@ MODEL = fields(
         "initial": several(ANY, 2, 2),
         "noise": each(maybe(ANY)),
         "effects": several(EFFECT, most=50),
+        "joint": joint,
         "uncertainty": maybe(fields({}, {"covariance": maybe(COVARIANCE), "bands": each(anything)})),
         "fit": fields({}, dict.fromkeys(STATISTICS, STATISTIC)),
         "residual_tests": each(each(anything)),

@@ -2,7 +2,9 @@
 
 The torque's times are aligned with the pulses already (`rig.align`). Where the angle stands in the load cell's frames,
 its times are those of these frames. Where one interface stamps the frames of both, its stamps are one clock for both.
-Elsewhere each sample came late by some delay, and the least delays of both are taken for equal.
+Over one adapter without such stamps, frames come in the order in which they were sent: an angle was sent between the
+torques before and after it, however late all of them were read. Of two adapters only the times of arrival are known: a
+sample can come late, never early.
 """
 
 from __future__ import annotations
@@ -16,7 +18,13 @@ from numpy.typing import NDArray
 from rig import align
 from rig.align import Array, Line
 
-Method = Literal["cell", "stamps", "regression"]
+Method = Literal["cell", "stamps", "order", "regression"]
+
+ONE_CLOCK_S = 5e-4
+"""Stamps that give other times than the order of the frames do are not of one clock: a device stamps itself."""
+LONGEST_PERIOD_S = 0.002
+"""The order of frames tells enough only where the cell's follow one another at least so soon."""
+LEAST_ORDERED = 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,13 +86,12 @@ def beside(
         time_s = line.at(sensor_s) + off_s
         time_s[which] = known_s
         return time_s, _told("cell", torque.error_ms, host_s, time_s, line.rate)
-    stamped = one_bus and all(
-        len(found) > 1 and bool(np.all(np.isfinite(found["stamp_s"]))) for found in (samples, torque.samples)
-    )
-    if stamped:
-        found, error_s, method = _by_stamps(samples["stamp_s"], sensor_s, torque)
-    else:
-        found, error_s, method = _by_arrival(host_s, sensor_s, torque, one_bus)
+    found, error_s, method = (one_bus and _by_order(samples, sensor_s, torque)) or _by_arrival(host_s, sensor_s)
+    if one_bus and _stamped(samples) and _stamped(torque.samples):
+        line, stamps_error_s = _by_stamps(samples["stamp_s"], sensor_s, torque)
+        ends_s = sensor_s[[0, -1]]
+        if np.max(np.abs(line.at(ends_s) - found.at(ends_s))) <= max(ONE_CLOCK_S, error_s):
+            found, error_s, method = line, stamps_error_s, "stamps"
     time_s = found.at(sensor_s)
     error_ms = float(np.hypot(torque.error_ms, error_s * 1e3))
     return time_s, _told(method, error_ms, host_s, time_s, found.rate)
@@ -105,26 +112,58 @@ def _of_same_frames(samples: NDArray[Any], torque: Reference) -> tuple[NDArray[n
     return (same, torque.time_s[at[same]]) if np.sum(same) > 1 else None
 
 
-def _by_stamps(stamp_s: Array, sensor_s: Array, torque: Reference) -> tuple[Line, float, Method]:
+def _stamped(samples: NDArray[Any]) -> bool:
+    stamp_s = samples["stamp_s"]
+    return len(samples) > 1 and bool(np.all(np.isfinite(stamp_s))) and bool(np.all(np.diff(stamp_s) >= 0))
+
+
+def _by_stamps(stamp_s: Array, sensor_s: Array, torque: Reference) -> tuple[Line, float]:
     """Through the interface's stamps of both: a line from the sensor's clock to the stamps, one on to the test's."""
     on = align.robust_line(torque.samples["stamp_s"], torque.time_s)
     of = align.robust_line(sensor_s, stamp_s)
-    return _chained(of, on), float(np.hypot(on.error_s, of.error_s)), "stamps"
+    return _chained(of, on), float(np.hypot(on.error_s, of.error_s))
 
 
-def _by_arrival(host_s: Array, sensor_s: Array, torque: Reference, one_bus: bool) -> tuple[Line, float, Method]:
-    """Below the times of arrival of both; of two adapters the delays are not known to be equal."""
-    of = align.lower_envelope(sensor_s, host_s)
-    error_s = float(np.hypot(of.error_s, align.misfit(of, *align.earliest(sensor_s, host_s))))
-    if not one_bus or len(torque.samples) < 2:
-        return of, error_s, "regression"
-    on = align.lower_envelope(torque.time_s, torque.samples["host_time_s"] - torque.t0_s)
-    return _chained(of, _inverse(on)), float(np.hypot(error_s, on.error_s)), "regression"
+def _by_order(samples: NDArray[Any], sensor_s: Array, torque: Reference) -> tuple[Line, float, Method] | None:
+    """Through the torques that came right before and after each angle; None: too few did, or too far apart.
+
+    A sensor may keep step with the cell, so the place between the two does not average out.
+    """
+    arrived_s = torque.samples["host_time_s"]
+    last = np.flatnonzero(np.diff(arrived_s, append=np.inf) > 0)  # of each frame: it was sent with its last torque
+    if len(last) < 2:
+        return None
+    arrived_s, sent_s = arrived_s[last], torque.time_s[last]
+    period_s = float(np.median(np.diff(sent_s)))
+    after = np.searchsorted(arrived_s, samples["host_time_s"])
+    between = np.flatnonzero((after > 0) & (after < len(sent_s)))
+    before_s, after_s = sent_s[after[between] - 1], sent_s[after[between]]
+    near = after_s - before_s < 1.5 * period_s
+    if np.sum(near) < LEAST_ORDERED or not (period_s <= LONGEST_PERIOD_S):
+        return None
+    line = _fitted(sensor_s[between[near]], 0.5 * (before_s + after_s)[near], period_s)
+    return line, float(np.hypot(line.error_s, period_s / np.sqrt(12))), "order"
 
 
-def _inverse(line: Line) -> Line:
-    """The line that leads back."""
-    return Line(-line.offset_s, 1 / line.rate, line.offset_s + line.centre_s, line.error_s)
+def _fitted(sensor_s: Array, time_s: Array, period_s: float) -> Line:
+    """Least squares through points that stand on a grid of times, on which a median of slopes would see no drift."""
+    line = align.robust_line(sensor_s, time_s)
+    for _ in range(2):  # the first line may be off by a drift of some periods over a test
+        residual_s = time_s - line.at(sensor_s)
+        kept = np.abs(residual_s) <= max(3 * period_s, 4 * float(np.median(np.abs(residual_s))))
+        x_s, y_s = sensor_s[kept] - line.centre_s, (time_s - sensor_s)[kept]
+        slope, offset_s = np.polynomial.polynomial.polyfit(x_s, y_s, 1)[::-1]
+        line = Line(
+            float(offset_s), 1 + float(slope), line.centre_s, float(np.std(residual_s[kept]) / np.sqrt(kept.sum()))
+        )
+    return line
+
+
+def _by_arrival(host_s: Array, sensor_s: Array) -> tuple[Line, float, Method]:
+    """Below the times of arrival, as `rig.align` does without a sync line."""
+    line = align.lower_envelope(sensor_s, host_s)
+    error_s = align.misfit(line, *align.earliest(sensor_s, host_s))
+    return line, float(np.hypot(line.error_s, error_s)), "regression"
 
 
 def _chained(first: Line, then: Line) -> Line:

@@ -92,9 +92,20 @@ class Models(Connection):
         """Go back to the version this one was made from; returns that one."""
         return self.post(f"/v1/models/{model_id}/undo", json={"reason": reason})
 
-    def predict(self, model_id: str, pulse_width_us: Sequence[float], pulse_rate_hz: float = 40.0) -> list[float]:
-        """Mean torque in the period of each pulse, N·m, with all effects of the model. Nothing is played."""
-        body = {"pulse_width_us": list(pulse_width_us), "pulse_rate_hz": pulse_rate_hz}
+    def predict(
+        self,
+        model_id: str,
+        pulse_width_us: Sequence[float],
+        pulse_rate_hz: float = 40.0,
+        angle_rad: Sequence[float] | None = None,
+    ) -> list[float]:
+        """Mean torque in the period of each pulse, N·m, with all effects of the model. Nothing is played.
+
+        `angle_rad`: of the joint in each period, rad; a model that depends on it needs it.
+        """
+        body: dict[str, Any] = {"pulse_width_us": list(pulse_width_us), "pulse_rate_hz": pulse_rate_hz}
+        if angle_rad is not None:
+            body["angle_rad"] = list(angle_rad)
         return self.post(f"/v1/models/{model_id}/prediction", json=body)["torque_nm"]
 
     def widths(

@@ -24,6 +24,14 @@ SURE, LIKELY = 0.9, 0.6
 LEAST_SHARE = 0.005
 """Octaves above the last one with a larger share are not shown."""
 
+PARTS = {
+    "f": lazy("f(u), the recruitment curve"),
+    "G": lazy("G, the linear dynamics"),
+    "g": lazy("g(x, ẋ), the active torque over angle and velocity"),
+    "h": lazy("h(x, ẋ), the passive torque over angle and velocity"),
+}
+"""Where an effect stands in the paper's Fig. 2."""
+
 
 def view(
     diagnosis: dict[str, Any], comparison: dict[str, Any] | None, effects: Sequence[str], leaves_structure: bool = False
@@ -171,6 +179,7 @@ def card(entry: dict[str, Any], library: dict[str, Any]) -> dict[str, Any]:
         "signature": known.get("signature") or "",
         "equation": entry.get("equation") or known.get("equation") or "",
         "source": known.get("source") or "",
+        "part": PARTS.get(known.get("part") or ""),
         "next_experiment": worded(entry.get("next_experiment") or ""),
         "rivals": [_in_a_sentence(rival, library) for rival in entry.get("confused_with") or []],
         "errors": [error for error in errors if error[1] is not None],

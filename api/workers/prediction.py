@@ -11,17 +11,26 @@ Progress = Callable[[float, str], None]
 
 
 def forecast(
-    progress: Progress, model_json: str, pulse_width_us: list[float], pulse_rate_hz: float = 40.0
+    progress: Progress,
+    model_json: str,
+    pulse_width_us: list[float],
+    pulse_rate_hz: float = 40.0,
+    angle_rad: list[float] | None = None,
 ) -> dict[str, Any]:
-    """Mean torque that the pulses give in each pulse's period, N·m, effects included, after one second of rest."""
+    """Mean torque that the pulses give in each pulse's period, N·m, effects included, after one second of rest.
+
+    `angle_rad`: of the joint in each pulse's period, where it moves.
+    """
     import numpy as np
 
     import identify
-    from identify.simulation.pulses import above_rest
+    from identify.simulation.pulses import Motion, above_rest
 
     progress(0.1, "predicting")
     model = identify.Model.from_json(model_json)
-    return {"torque_nm": above_rest(model, np.asarray(pulse_width_us, float), pulse_rate_hz).round(6).tolist()}
+    motion = None if angle_rad is None else Motion.of(np.asarray(angle_rad, float), pulse_rate_hz)
+    torque = above_rest(model, np.asarray(pulse_width_us, float), pulse_rate_hz, motion)
+    return {"torque_nm": torque.round(6).tolist()}
 
 
 def invert(
@@ -29,6 +38,7 @@ def invert(
     model_json: str,
     reference_torque_nm: list[float] | None = None,
     time_s: list[float] | None = None,
+    angle_rad: list[float] | None = None,
     table: str | None = None,
     pulse_rate_hz: float | None = None,
     largest_us: float | None = None,
@@ -50,6 +60,6 @@ def invert(
     if table is not None:
         reference = read_reference(table.encode(), "the upload", rate_hz)
     else:
-        reference = Reference.of(reference_torque_nm, time_s, pulse_rate_hz=rate_hz)
+        reference = Reference.of(reference_torque_nm, time_s, angle_rad=angle_rad, pulse_rate_hz=rate_hz)
     found = widths_for(model, reference, largest_us=largest_us, rise_us=rise_us, whole=whole)
     return clean(found.to_dict())

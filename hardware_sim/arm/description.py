@@ -23,8 +23,8 @@ from __future__ import annotations
 import contextlib
 import json
 import tomllib
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -64,19 +64,39 @@ def read(text: str) -> Arm:
     """
     mode, *pairs = text.split(",")
     if mode in registry.modes():
-        return Arm(mode, dict(map(_setting, pairs)))
+        return Arm(mode, dict(_number(_halves(pair)) for pair in pairs))
     path = Path(text)
     if path.suffix.lower() in {".toml", ".json"} or path.exists():
         return _from_file(path)
     raise ArmError(f"--arm {text}: neither a file nor one of {', '.join(registry.modes())}")
 
 
-def _setting(pair: str) -> tuple[str, float]:
+def with_laws(arm: Arm, texts: Sequence[str]) -> Arm:
+    """The arm with other laws, each as `PLACE=NAME[,PARAMETER=NUMBER…]`.
+
+    Raises
+    ------
+    ArmError
+        There is no such place, law or parameter.
+    """
+    laws = {}
+    for text in texts:
+        (place, name), *parameters = (_halves(pair) for pair in text.split(","))
+        laws[place] = law(place, name, dict(map(_number, parameters)))
+    return replace(arm, tissue=replace(arm.tissue, **laws))
+
+
+def _halves(pair: str) -> tuple[str, str]:
     key, _, value = pair.partition("=")
+    return key, value
+
+
+def _number(halves: tuple[str, str]) -> tuple[str, float]:
+    key, value = halves
     try:
         return key, float(value)
     except ValueError:
-        raise ArmError(f"--arm: '{pair}' must be SETTING=NUMBER") from None
+        raise ArmError(f"--arm: '{key}={value}' must be SETTING=NUMBER") from None
 
 
 def _from_file(path: Path) -> Arm:

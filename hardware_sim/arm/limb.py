@@ -18,6 +18,7 @@ from typing import Any
 from hardware_sim.arm import registry
 from hardware_sim.arm.description import Arm
 from hardware_sim.arm.motion import Begin, Motion
+from hardware_sim.errors import ArmError
 from hardware_sim.patients.muscle import Muscle
 
 LONGEST_STEP_S = 1.0 / 1600.0
@@ -51,7 +52,10 @@ class Limb:
             There is no such mode, or a setting makes no sense; then it goes on as before.
         """
         self._advance(time_s)
-        self._mover = registry.make(mode, Begin(self._time_s, self.motion, self._seed), settings)
+        mover = registry.make(mode, Begin(self._time_s, self.motion, self._seed), settings)
+        if not (mover.holds or self._inertia_kg_m2 > 0.0):
+            raise ArmError(f"mode '{mode}': a forearm without inertia (a hidden patient's) cannot be let go")
+        self._mover = mover
         self.mode = mode
 
     def pulse(self, time_s: float, width_us: float, current_ma: float) -> None:

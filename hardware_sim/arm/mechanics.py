@@ -30,7 +30,7 @@ class Mechanics:
     upper_arm_deg: float = 0.0
     least_deg: float = -5.0
     most_deg: float = 145.0
-    stop_nm_per_rad: float = 60.0
+    stop_nm_per_rad: float = 200.0
     stop_loss_s_per_rad: float = 0.5
 
     def gravity_nm(self, angle_rad: Number) -> Number:

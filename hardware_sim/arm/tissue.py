@@ -75,3 +75,9 @@ class Tissue:
         """Torque of the relaxed arm, N·m: tissue that has been there for long, stops and gravity."""
         still = self.passive.torque_nm(angle_rad, velocity_rad_s)
         return still + self.mechanics.stops_nm(angle_rad, velocity_rad_s) + self.mechanics.gravity_nm(angle_rad)
+
+
+def bare() -> Tissue:
+    """No tissue, no mass and no stops: the joint's torque is the muscle's own, whatever that makes of the movement."""
+    laws = {place: law(place, "none") for place in PLACES}
+    return Tissue(**laws, mechanics=Mechanics(inertia_kg_m2=0.0, stop_nm_per_rad=0.0))

@@ -115,7 +115,7 @@ def bus_off(target: Target) -> Undo:
     """The adapter reports bus-off once, then nothing comes."""
     time_us = target.load_cell.clock.time_us(target.timeline.now_s)
     target.load_cell.add_frame(Frame(BUS_OFF_CLASS, bytes(8), time_us, error=True))
-    return hooked(target.load_cell.frame_hooks, lambda _frame: ())
+    return _hooked_on_bus(target, lambda _frame: ())
 
 
 @fault
@@ -167,7 +167,7 @@ def delivery_jitter(target: Target, largest_s: float = 0.02) -> Undo:
         target.timeline.at(last_s, release)
         return ()
 
-    unhook = hooked(target.load_cell.frame_hooks, delay)
+    unhook = _hooked_on_bus(target, delay)
 
     def undo() -> None:
         unhook()
@@ -175,6 +175,19 @@ def delivery_jitter(target: Target, largest_s: float = 0.02) -> Undo:
             release()
 
     return undo
+
+
+def _hooked_on_bus(target: Target, change: Callable[[Frame], Iterable[Frame]]) -> Undo:
+    """Act on all frames of the bus: the cell's and those of an angle sensor."""
+    undo = [hooked(target.load_cell.frame_hooks, change)]
+    if target.angle_sensor is not None:
+        undo.append(hooked(target.angle_sensor.frame_hooks, change))
+
+    def unhook() -> None:
+        for take_out in undo:
+            take_out()
+
+    return unhook
 
 
 def _frame_fault(target: Target, probability: float, change: Callable[[Frame], Iterable[Frame]]) -> Undo:

@@ -84,6 +84,7 @@ def _missing(search: EffectSearch, verdict: Verdict, effect: str, row: list[Step
     return {
         "effect": effect,
         "name": described.name,
+        "part": described.part,
         "probability": verdict.found[effect],
         "rms_before_nm": before["rms_nm"],
         "rms_after_nm": after["rms_nm"],
@@ -120,6 +121,14 @@ def _experiment(search: EffectSearch, effect: str, confused: list[str]) -> dict[
         return None
     best = plan(search.record, rivals)
     return {key: best[key] for key in ("segments", "duration_s", "dose", "expected_log_evidence", "decides", "text")}
+
+
+PARTS = {
+    "f": "f(u), the recruitment curve",
+    "G": "G, the linear dynamics",
+    "g": "g(x, ẋ), the active torque over angle and velocity",
+    "h": "h(x, ẋ), the passive torque over angle and velocity",
+}
 
 
 def _few(parameters: dict[str, Any]) -> dict[str, Any]:
@@ -165,6 +174,8 @@ def _plain(
     for entry in missing:
         chance = entry["probability"]
         text = f"{entry['name']} is {sure(chance)} missing ({probability(chance)}). {entry['plain']}"
+        if entry["part"]:
+            text += f" In the paper's Fig. 2 it stands in {PARTS[entry['part']]}."
         if entry["confused_with"]:
             others = ", ".join(get(name).name.lower() for name in entry["confused_with"])
             text += f" This record cannot clearly separate it from: {others}. To decide: {entry['next_experiment']}"

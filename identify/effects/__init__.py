@@ -98,6 +98,7 @@ def _describe(effect: Effect) -> dict[str, Any]:
         "id": effect.id,
         "name": effect.name,
         "stage": effect.stage,
+        "part": effect.part,
         "equation": first.equation,
         "parameters": [_parameter(p) for p in first.parameters],
         "forms": [

@@ -4,14 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.polynomial.chebyshev import chebvander
 
 from identify.dynamics.variable_speed import SpeedLaw
 
 STAGES = ("pulse_width", "gain", "speed", "branch", "delay", "filter", "output", "additive", "sensor")
 """The stages at which a form can act, in the order in which the signal passes them: see `Form`."""
+
+JOINT = ("angle_rad", "velocity_rad_s")
+"""Columns that tell where the joint is."""
+LEAST_RANGE_RAD = 0.1
+"""A smaller range of angles counts as this one: of a joint that is held, noise is no shape."""
 
 
 @dataclass(frozen=True)
@@ -83,6 +90,15 @@ class Scene:
         Largest pulse width, µs.
     angle_rad, velocity_rad_s : ndarray or None, shape (K,)
         Joint angle, rad, and velocity, rad/s, if the record has them.
+    acceleration_rad_s2 : ndarray or None, shape (K,)
+        Angular acceleration, rad/s², from the velocity.
+    reference_rad : float or None
+        The model's own angle: here the curve holds as it stands, and no passive torque is counted. None: the angle at
+        the record's start.
+    angle_range_rad : tuple of float or None
+        Smallest and largest angle that the model was fitted on, rad. None: those of the record.
+    begins : ndarray of bool or None, shape (K,)
+        Where a recording begins; None: at the first time alone.
     noise_sd_nm : float
         White noise of a sample, N·m.
     zero_nm : float
@@ -104,6 +120,10 @@ class Scene:
     largest_us: float
     angle_rad: np.ndarray | None = None
     velocity_rad_s: np.ndarray | None = None
+    acceleration_rad_s2: np.ndarray | None = None
+    reference_rad: float | None = None
+    angle_range_rad: tuple[float, float] | None = None
+    begins: np.ndarray | None = None
     noise_sd_nm: float = 0.0
     zero_nm: float = 0.0
     reference_s: float = 0.0
@@ -125,6 +145,34 @@ class Scene:
     def span_s(self) -> float:
         """Length of the record, s."""
         return float(self.time_s[-1] - self.time_s[0])
+
+    @cached_property
+    def away_rad(self) -> np.ndarray:
+        """Angle from the reference angle, rad, shape (K,)."""
+        assert self.angle_rad is not None
+        return self.angle_rad - (self.angle_rad[0] if self.reference_rad is None else self.reference_rad)
+
+    @cached_property
+    def place(self) -> np.ndarray:
+        """Place in the range of fitted angles, from -1 to 1 at its ends and held there beyond them, shape (K,)."""
+        assert self.angle_rad is not None
+        low, high = self.angle_range
+        return np.clip((2.0 * self.angle_rad - low - high) / max(high - low, LEAST_RANGE_RAD), -1.0, 1.0)
+
+    @property
+    def angle_range(self) -> tuple[float, float]:
+        """Smallest and largest angle that the model holds for, rad."""
+        assert self.angle_rad is not None
+        return self.angle_range_rad or (float(self.angle_rad.min()), float(self.angle_rad.max()))
+
+    def bends(self, degrees: int) -> np.ndarray:
+        """Chebyshev polynomials of `place`, of degrees 1 to `degrees`, all 0 at the reference angle, shape (n, K)."""
+        away = self.away_rad
+        assert self.angle_rad is not None
+        low, high = self.angle_range
+        own = float(self.angle_rad[0] - away[0])
+        home = np.clip((2.0 * own - low - high) / max(high - low, LEAST_RANGE_RAD), -1.0, 1.0)
+        return (chebvander(self.place, degrees) - chebvander(np.array([home]), degrees)).T[1:]
 
 
 Apply = Callable[[Any, dict[str, Any], Scene], Any]
@@ -279,6 +327,18 @@ class Effect:
     def stage(self) -> str:
         """The stage of its first form."""
         return self.forms[0].stage
+
+    @property
+    def moves_with_joint(self) -> bool:
+        """Whether it depends on the angle or the velocity of the joint."""
+        return any(need in JOINT for need in self.needs)
+
+    @property
+    def part(self) -> str:
+        """Where it stands in the paper's Fig. 2: "f", "G", "g" or "h"; "" where that has no place for it."""
+        if self.moves_with_joint:
+            return "h" if self.stage == "additive" else "g"
+        return {"pulse_width": "f", "gain": "f", "additive": "", "sensor": "", "output": ""}.get(self.stage, "G")
 
     def form(self, name: str) -> Form:
         """A form by its name; the first form if the name is empty."""

@@ -9,18 +9,13 @@ import numpy as np
 from identify.effects.base import Effect, Form, Parameter, Scene
 
 
-def _away(scene: Scene) -> np.ndarray:
-    assert scene.angle_rad is not None
-    return scene.angle_rad - scene.angle_rad[0]
-
-
 def _parabola(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
-    away = _away(scene)
+    away = scene.away_rad
     return y * np.maximum(1.0 + p["slope_per_rad"] * away + p["bend_per_rad2"] * away * away, 0.0)
 
 
 def _cubic(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
-    away = _away(scene)
+    away = scene.away_rad
     bent = p["slope_per_rad"] * away + p["bend_per_rad2"] * away**2 + p["twist_per_rad3"] * away**3
     return y * np.maximum(1.0 + bent, 0.0)
 
@@ -28,17 +23,24 @@ def _cubic(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
 def _bell(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
     sharp = p["sharpness_per_rad2"]
     best = p["best_rad"]
-    return y * np.exp(sharp * (best * best - (_away(scene) - best) ** 2))
+    return y * np.exp(sharp * (best * best - (scene.away_rad - best) ** 2))
+
+
+SMOOTH = "smooth"
+SIZES = (1.5, 1.5, 1.0, 1.0, 0.7, 0.5, 0.4, 0.3, 0.25, 0.2)
+
+
+def _smooth(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+    bends = scene.bends(len(SIZES))
+    return y * np.maximum(1.0 + sum(p[f"bend_{i}"] * bend for i, bend in enumerate(bends, start=1)), 0.0)
 
 
 KNOTS = 8
 
 
 def _curve(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
-    """Linear between knots over the recorded angles."""
-    assert scene.angle_rad is not None
-    low, high = float(scene.angle_rad.min()), float(scene.angle_rad.max())
-    place = (scene.angle_rad - low) / max(high - low, 1e-6) * (KNOTS - 1)
+    """Linear between knots over the fitted angles."""
+    place = 0.5 * (scene.place + 1.0) * (KNOTS - 1)
     values = np.concatenate([p[f"gain_{i}"] for i in range(KNOTS)], axis=1)
     first = np.minimum(place.astype(np.int64), KNOTS - 2)
     part = place - first
@@ -52,11 +54,9 @@ EFFECT = Effect(
         Form(
             "parabola",
             "output",
-            "y (1 + slope·Δ + bend·Δ²), Δ = angle - angle at the start",
+            "y (1 + slope·Δ + bend·Δ²), Δ = angle - reference angle",
             (
-                Parameter(
-                    "slope_per_rad", "1/rad", -4.0, 4.0, 0.0, (0.3, -0.3), about="slope at the angle of the start"
-                ),
+                Parameter("slope_per_rad", "1/rad", -4.0, 4.0, 0.0, (0.3, -0.3), about="slope at the reference angle"),
                 Parameter("bend_per_rad2", "1/rad²", -6.0, 6.0, 0.0, (0.0,), about="curvature"),
             ),
             _parabola,
@@ -68,9 +68,7 @@ EFFECT = Effect(
             "output",
             "y (1 + slope·Δ + bend·Δ² + twist·Δ³)",
             (
-                Parameter(
-                    "slope_per_rad", "1/rad", -4.0, 4.0, 0.0, (0.3, -0.3), about="slope at the angle of the start"
-                ),
+                Parameter("slope_per_rad", "1/rad", -4.0, 4.0, 0.0, (0.3, -0.3), about="slope at the reference angle"),
                 Parameter("bend_per_rad2", "1/rad²", -6.0, 6.0, 0.0, (0.0,), about="curvature"),
                 Parameter("twist_per_rad3", "1/rad³", -12.0, 12.0, 0.0, (0.0,), about="third-order part"),
             ),
@@ -85,7 +83,9 @@ EFFECT = Effect(
                 Parameter(
                     "sharpness_per_rad2", "1/rad²", 0.0, 8.0, 0.0, (0.5,), about="sharpness of the length-tension curve"
                 ),
-                Parameter("best_rad", "rad", -1.5, 1.5, 0.0, (0.5, -0.5), about="optimal angle, relative to the start"),
+                Parameter(
+                    "best_rad", "rad", -1.5, 1.5, 0.0, (0.5, -0.5), about="optimal angle, from the reference angle"
+                ),
             ),
             _bell,
             True,
@@ -104,13 +104,23 @@ EFFECT = Effect(
             source="Murray, Delp, Buchanan 1995: moment arms vary freely with the angle",
         ),
         Form(
+            SMOOTH,
+            "output",
+            "y (1 + Σ bend_k (T_k(x) - T_k(reference))), x: place in the fitted range, -1 to 1",
+            tuple(
+                Parameter(f"bend_{i}", "1", -size, size, 0.0, (0.0,), about=f"polynomial of degree {i}")
+                for i, size in enumerate(SIZES, start=1)
+            ),
+            _smooth,
+            True,
+            source="shape free; Murray, Delp, Buchanan 1995; Thelen 2003 for what it has to follow",
+        ),
+        Form(
             "drive",
             "gain",
             "w = f(u) (1 + slope·Δ + bend·Δ²): acts on the force, before the dynamics",
             (
-                Parameter(
-                    "slope_per_rad", "1/rad", -4.0, 4.0, 0.0, (0.3, -0.3), about="slope at the angle of the start"
-                ),
+                Parameter("slope_per_rad", "1/rad", -4.0, 4.0, 0.0, (0.3, -0.3), about="slope at the reference angle"),
                 Parameter("bend_per_rad2", "1/rad²", -6.0, 6.0, 0.0, (0.0,), about="curvature"),
             ),
             _parabola,

@@ -10,6 +10,10 @@ from identify.effects.base import Effect, Form, Parameter, Scene
 
 _SIDE = Parameter("slope_s_per_rad", "s/rad", -2.0, 2.0, 0.0, (0.1, -0.1), about="share of torque lost per rad/s")
 
+_SHAPE = Parameter("shape", "1", 0.1, 2.0, 0.25, (0.25,), "log", about="Hill's a/F0")
+_TOP = Parameter("top", "1", 1.05, 1.9, 1.4, (1.4,), about="largest torque when lengthening, divided by isometric")
+SURFACE = "surface"
+
 
 def _linear(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
     assert scene.velocity_rad_s is not None
@@ -19,7 +23,17 @@ def _linear(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
 def _hill(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
     """Hill's hyperbola for shortening, continued to a plateau for lengthening."""
     assert scene.velocity_rad_s is not None
-    v = p["slope_s_per_rad"] * scene.velocity_rad_s
+    return _hyperbola(y, p, p["slope_s_per_rad"] * scene.velocity_rad_s)
+
+
+def _bent(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+    """As `_hill`, its slope another one at each angle: moment arm and fibre length change with it."""
+    assert scene.velocity_rad_s is not None
+    slope = p["slope_s_per_rad"] + p["tilt_s_per_rad"] * scene.place + p["bow_s_per_rad"] * scene.place**2
+    return _hyperbola(y, p, slope * scene.velocity_rad_s)
+
+
+def _hyperbola(y: np.ndarray, p: dict[str, Any], v: np.ndarray) -> np.ndarray:
     shape = p["shape"]
     shortening = np.maximum(1.0 - v, 0.0) / (1.0 + np.maximum(v, 0.0) / shape)
     top = p["top"]
@@ -54,14 +68,27 @@ EFFECT = Effect(
             "y (1 - v)/(1 + v/shape) for shortening, up to `top`·y for lengthening; v = slope·velocity",
             (
                 _SIDE,
-                Parameter("shape", "1", 0.1, 2.0, 0.25, (0.25,), "log", about="Hill's a/F0"),
-                Parameter(
-                    "top", "1", 1.05, 1.9, 1.4, (1.4,), about="largest torque when lengthening, divided by isometric"
-                ),
+                _SHAPE,
+                _TOP,
             ),
             _hill,
             True,
             source="Hill 1938; Thelen 2003",
+        ),
+        Form(
+            SURFACE,
+            "output",
+            "as hill, v = (slope + tilt·x + bow·x²)·velocity, x: place in the fitted range, -1 to 1",
+            (
+                _SIDE,
+                Parameter("tilt_s_per_rad", "s/rad", -1.0, 1.0, 0.0, (0.0,), about="slope's slope over the range"),
+                Parameter("bow_s_per_rad", "s/rad", -1.0, 1.0, 0.0, (0.0,), about="slope's curvature over the range"),
+                _SHAPE,
+                _TOP,
+            ),
+            _bent,
+            True,
+            source="Hill 1938; Thelen 2003; Marion et al. 2010 for the dependence on the angle",
         ),
         Form(
             "marion",

@@ -8,6 +8,7 @@ import numpy as np
 
 from identify.estimation.gram import gram
 from identify.estimation.joint import Fitted
+from identify.estimation.movement import joint_of
 from identify.estimation.short_result import Short
 from identify.noise.level import profile, whitened
 from identify.simulation.problem import Problem
@@ -93,6 +94,7 @@ def _setup(short: Short) -> Setup:
         delay_bounds_s=grid.delay_bounds_s,
         zero_nm=zero,
         sign=short.sign,
+        **joint_of(grid, short.rows),
     )
 
 

@@ -14,6 +14,7 @@ from identify.dynamics.linear import Discrete, SecondOrder
 from identify.dynamics.narx import run
 from identify.dynamics.pulse_grid import Grid, runs
 from identify.estimation.band_effect import band_as_effect
+from identify.estimation.clustered import clustered_covariance
 from identify.estimation.evaluation import evaluate
 from identify.estimation.fit_statistics import fit_statistics, white_sd
 from identify.estimation.joint import Fitted
@@ -23,8 +24,10 @@ from identify.estimation.uncertainty import bands
 from identify.model import Covariance, Model, Noise
 from identify.noise.ar1 import ar1_or_white
 from identify.recruitment.curve import Curve
+from identify.simulation.joint_surface import Surfaces, joint_tables
 from identify.simulation.predict import fingerprint, predict_on
 
+AT_WORK = 0.05
 EASED = 0.98
 """Share of the penalty that is removed to see how far it holds the curve back."""
 
@@ -76,7 +79,23 @@ def finish(
     model = model.with_(
         bands=bands(model, _unpenalised_change(fitted)), valid_for=valid_for(model, setup.grid, setup.fitted)
     )
+    model = model.with_(joint=_joint(model, written, known))
     return model.with_(quality=quality(model, setup.grid, setup.fitted, fitted.converged))
+
+
+def _joint(model: Model, fitted: Fitted, known: int) -> dict[str, Any]:
+    """g and h over the angles and velocities of the fitted rows; empty without an angle, or where nothing asks for one.
+
+    Rows with less than `AT_WORK` of the largest torque show the passive part alone.
+    """
+    grid, rows = fitted.problem.setup.grid, fitted.problem.setup.fitted
+    if grid.angle_rad is None or grid.velocity_rad_s is None or Surfaces.of(model) is None:
+        return {}
+    assert model.covariance is not None
+    wide = replace(model.covariance, matrix=clustered_covariance(fitted)[:known, :known])
+    level = np.abs(model.recruitment(grid.pulse_width_us[rows]))
+    at_work = level > AT_WORK * float(level.max())
+    return joint_tables(model, wide, grid.angle_rad[rows], grid.velocity_rad_s[rows], at_work)
 
 
 def _parts(fitted: Fitted) -> dict[str, Any]:
@@ -135,6 +154,7 @@ def _covariance(fitted: Fitted, known: int) -> Covariance:
 def _effect(fitted: Fitted, index: int) -> dict[str, Any]:
     chosen = fitted.problem.chosen[index]
     setup = fitted.problem.setup
+    joint = {"reference_rad": setup.reference_rad, "angle_range_rad": setup.angle_range_rad}
     return {
         "id": chosen.effect,
         "form": chosen.form.name,
@@ -147,7 +167,8 @@ def _effect(fitted: Fitted, index: int) -> dict[str, Any]:
             "zero_nm": setup.zero_nm,
             "sign": setup.sign,
             "reference_s": setup.reference_s,
-        },
+        }
+        | {name: value for name, value in joint.items() if value is not None},
     }
 
 

@@ -10,6 +10,7 @@ from identify.dynamics.make_grid import make_grid
 from identify.dynamics.pulse_grid import Grid
 from identify.errors import NotIdentifiable
 from identify.estimation.joint import Fitted, solve
+from identify.estimation.movement import joint_of, still_rows
 from identify.estimation.pilot import estimate
 from identify.estimation.projection import Solution
 from identify.estimation.samples import Raw, inspect, white_noise
@@ -70,12 +71,16 @@ def fit_plain(grid: Grid, rows: np.ndarray) -> Fitted:
 
     Knots and smoothness of the recruitment curve are chosen here, and not changed afterwards.
     """
-    return to_fitted(estimate(grid, rows)[0])
+    return to_fitted(estimate(grid, still_rows(grid, rows))[0], rows)
 
 
-def to_fitted(solution: Solution, most: int = 20) -> Fitted:
-    """The solution of the joint problem, with white and slow noise, started from a projected solution."""
-    setup = setup_of(solution)
+def to_fitted(solution: Solution, rows: np.ndarray, most: int = 20) -> Fitted:
+    """The solution of the joint problem on some rows, with white and slow noise, started from a projected solution.
+
+    The projected solution may be of fewer rows, where the joint moves in the others: see `still_rows`.
+    """
+    solution = _with_zeros(solution, rows)
+    setup = setup_of(solution, rows)
     problem = Problem(setup, [])
     size, linear = solution.projection.basis.size, solution.linear
     values = np.zeros(problem.size)
@@ -96,8 +101,20 @@ def to_fitted(solution: Solution, most: int = 20) -> Fitted:
     return max(fitted, solve(problem, theta, noise, most=most), key=lambda found: found.log_evidence)
 
 
-def setup_of(solution: Solution) -> Setup:
-    """The set-up that all candidates share, from the projected solution."""
+def _with_zeros(solution: Solution, rows: np.ndarray) -> Solution:
+    """The solution with a zero for parts of which it has no row: the middle of their torque without pulses."""
+    projection, grid = solution.projection, solution.projection.grid
+    found = solution.coefficients.copy()
+    for part in range(grid.begins.size):
+        own = rows & (grid.part == part)
+        if own.any() and not np.any(projection.rows & own):
+            rest = own & (grid.pulse_width_us == 0)
+            found[projection.basis.size + part] = np.median(grid.torque_nm[rest if rest.any() else own])
+    return replace(solution, coefficients=found)
+
+
+def setup_of(solution: Solution, rows: np.ndarray) -> Setup:
+    """The set-up that all candidates share, from the projected solution and the rows that are fitted."""
     projection, grid = solution.projection, solution.projection.grid
     size = projection.basis.size
     curve = projection.basis.design(np.linspace(0.0, projection.basis.largest_us, 101)) @ solution.coefficients[:size]
@@ -106,12 +123,12 @@ def setup_of(solution: Solution) -> Setup:
     target = sign * (grid.torque_nm - zero)
     parts = grid.begins.size
     own_zero = sign * (solution.coefficients[size : size + parts][grid.part] - zero)
-    smooth = np.convolve(np.where(projection.rows, target - own_zero, 0.0), np.ones(3) / 3, "same")
-    scale = float(np.percentile(np.abs(smooth[projection.rows]), 99.5))
+    smooth = np.convolve(np.where(rows, target - own_zero, 0.0), np.ones(3) / 3, "same")
+    scale = float(np.percentile(np.abs(smooth[rows]), 99.5))
     return Setup(
         grid=grid,
         target_nm=target,
-        fitted=projection.rows,
+        fitted=rows,
         basis=projection.basis,
         roughness=solution.weight / max(solution.variance, 1e-300) * projection.roughness,
         scale_nm=max(scale, 1e-9),
@@ -120,7 +137,8 @@ def setup_of(solution: Solution) -> Setup:
         zero_nm=zero,
         sign=sign,
         spread=_spread(grid),
-        reference_s=_reference(grid, projection.rows),
+        reference_s=_reference(grid, rows),
+        **joint_of(grid, rows),
     )
 
 

@@ -21,6 +21,8 @@ too much."""
 WITHIN_NOISE = 1.3
 """If the error is at most this many times the noise, it passes as noise, even if the torque hardly changes."""
 OWN = "the fitted rows"
+ANGLE_SLACK_RAD, VELOCITY_SLACK_RAD_S = 0.09, 0.1
+"""Five degrees, and what a hand that holds still may move."""
 NEGLIGIBLE = 5e-4
 """Share of the torque's range below which the kind of an error does not matter."""
 
@@ -37,6 +39,17 @@ def valid_for(model: Model, grid: Grid, rows: np.ndarray) -> dict[str, Any]:
         "pulse_rate_hz": [model.pulse_rate_hz * 0.95, model.pulse_rate_hz * 1.05],
         "sample_rate_hz": [39.0, 2100.0],
         "memory_s": model.linear.memory_s,
+        **_joint(grid, rows),
+    }
+
+
+def _joint(grid: Grid, rows: np.ndarray) -> dict[str, Any]:
+    """Angles, rad, and velocities, rad/s, of the fitted rows, where the record has them."""
+    columns = {"angle_rad": grid.angle_rad, "velocity_rad_s": grid.velocity_rad_s}
+    return {
+        name: [float(np.min(column[rows])), float(np.max(column[rows]))]
+        for name, column in columns.items()
+        if column is not None
     }
 
 
@@ -63,7 +76,26 @@ def range_warnings(model: Model, record: Record) -> list[str]:
             f"{100 * float(np.mean(beyond)):.0f} % of the pulse widths are above the largest fitted width, "
             f"{largest:g} µs: the recruitment curve is constant there"
         )
-    return warnings
+    return warnings + _joint_warnings(model, record)
+
+
+def _joint_warnings(model: Model, record: Record) -> list[str]:
+    """Warnings if the joint was where, or moved as, it did not in the fitted rows."""
+    found = []
+    for column, slack, name, unit in (
+        (record.angle_rad, ANGLE_SLACK_RAD, "angle", "rad"),
+        (record.velocity_rad_s, VELOCITY_SLACK_RAD_S, "velocity", "rad/s"),
+    ):
+        span = model.valid_for.get(f"{name}_{unit.replace('/', '_')}")
+        if column is None or span is None:
+            continue
+        outside = float(np.mean(~((column >= span[0] - slack) & (column <= span[1] + slack))))
+        if outside > 0.0:
+            found.append(
+                f"in {max(100 * outside, 1):.0f} % of the samples the joint's {name} is outside {span[0]:.2f} to "
+                f"{span[1]:.2f} {unit}: the model was fitted there only"
+            )
+    return found
 
 
 def quality(model: Model, grid: Grid, rows: np.ndarray, converged: bool = True) -> dict[str, Any]:

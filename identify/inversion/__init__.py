@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from identify.inversion.demand import Bounds, best_demand
+from identify.inversion.moving_joint import Joint
 from identify.inversion.plant import Plant
 from identify.inversion.reached import Inversion, judged
 from identify.inversion.reference import Reference
@@ -35,7 +36,8 @@ def invert(
 
     The demand before f is found by regularised least squares through G (norm-optimal control, Amann, Owens and Rogers
     1996), with 0 and the largest demand as bounds; f is inverted; then the demand is corrected on what the model
-    predicts, effects included, as between trials.
+    predicts, effects included, as between trials. Where the joint moves, the passive torque h is taken off what is
+    wanted, and the rest divided by g (Fig. 2 of the paper, read backwards).
 
     Parameters
     ----------
@@ -53,18 +55,22 @@ def invert(
     Raises
     ------
     BadModel
-        The model has other dynamics, gives no torque, or holds for another pulse rate.
+        The model has other dynamics, gives no torque, or holds for another pulse rate; it depends on the joint, and
+        the reference has no angle.
     BadRequest
         A limit is not a positive number.
     """
     plant = Plant.of(model, reference, largest_us, rise_us, whole)
+    rate_hz, motion = reference.pulse_rate_hz, reference.motion
+    joint = Joint.of(model, motion, plant.sign, rate_hz)
     wanted = plant.sign * reference.torque_nm
+    needed = joint.active(wanted)
     demand, best, least = np.zeros(wanted.size), None, np.inf
-    target, idle = wanted, 0
+    target, idle = needed, 0
     for _ in range(TURNS):
         demand = best_demand(plant.a, plant.b, target, Bounds(plant.largest_nm, plant.rises(demand)))
         widths = plant.widths(demand)
-        got = plant.sign * above_rest(model, widths, reference.pulse_rate_hz)
+        got = plant.sign * above_rest(model, widths, rate_hz, motion)
         error = wanted - got
         left = float(np.sqrt(np.mean(error**2)))
         idle = idle + 1 if left > GAIN * least else 0
@@ -72,6 +78,6 @@ def invert(
             best, least = (demand, widths, got), left
         if idle > 1 or left < ENOUGH * plant.largest_nm or (not model.effects and rise_us is None):
             break
-        target = plant.linear(demand) + STEP * error
+        target = plant.linear(demand) + STEP * error / joint.gain
     assert best is not None
-    return judged(plant, reference, *best)
+    return judged(plant, reference, needed, *best)

@@ -13,8 +13,9 @@ from identify.errors import BadModel, BadRequest
 from identify.inversion.reference import Reference
 from identify.model import Model
 from identify.recruitment.landmarks import THRESHOLD_SHARE
+from identify.simulation.joint_surface import Surfaces
 from identify.simulation.predict import LARGEST_RATE_CHANGE
-from identify.simulation.pulses import SAMPLES_A_PULSE, above_rest
+from identify.simulation.pulses import SAMPLES_A_PULSE, Motion, above_rest
 
 OWED = 0.05
 """Most that one pulse leaves to those after it, as a share of the largest torque."""
@@ -177,8 +178,10 @@ def _later(model: Model, rate_hz: float, widest_us: float) -> float:
     size = round(PROBE_S * rate_hz)
     plain = model.with_(effects=())
     half_s = []
+    surfaces = Surfaces.of(model)
+    held = None if surfaces is None else Motion.held(surfaces.reference_rad, size)
     for one in (model, plain):
-        step = np.abs(above_rest(one, np.full(size, widest_us), rate_hz))
+        step = np.abs(above_rest(one, np.full(size, widest_us), rate_hz, held))
         peak = int(np.argmax(step))
         half_s.append(
             float(np.interp(step[peak] / 2, np.maximum.accumulate(step[: peak + 1]), np.arange(peak + 1))) / rate_hz

@@ -86,6 +86,7 @@ class Inversion:
                 "pulse_rate_hz": reference.pulse_rate_hz,
                 "duration_s": reference.torque_nm.size / reference.pulse_rate_hz,
                 "reference_torque_nm": reference.torque_nm.round(6),
+                **({} if reference.angle_rad is None else {"angle_rad": reference.angle_rad.round(6)}),
                 "pulse_width_us": self.pulse_width_us,
                 "predicted_torque_nm": self.predicted_nm.round(6),
                 "unreachable": [
@@ -105,13 +106,21 @@ class Inversion:
 
 
 def judged(
-    plant: Plant, reference: Reference, demand_nm: np.ndarray, widths_us: np.ndarray, got_nm: np.ndarray
+    plant: Plant,
+    reference: Reference,
+    needed_nm: np.ndarray,
+    demand_nm: np.ndarray,
+    widths_us: np.ndarray,
+    got_nm: np.ndarray,
 ) -> Inversion:
-    """The result, with torque `got_nm` positive in the direction of pull."""
+    """The result, with torque `got_nm` positive in the direction of pull.
+
+    `needed_nm` is what the muscle itself has to give: the reference, but for what the joint adds and takes.
+    """
     wanted = plant.sign * reference.torque_nm
     tolerance_nm = TOLERANCE * plant.largest_nm
     missed = np.abs(wanted - got_nm) > tolerance_nm
-    reasons = _reasons(plant, wanted, demand_nm, missed, wanted > got_nm, tolerance_nm)
+    reasons = _reasons(plant, needed_nm, demand_nm, missed, wanted > got_nm, tolerance_nm)
     step_s = 1.0 / reference.pulse_rate_hz
     stretches = [
         Stretch(

@@ -7,11 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from identify.errors import BadRequest
+from identify.simulation.pulses import Motion
 
 LONGEST_S = 300.0
 MOST_SAMPLES = 60_000
 """Of a reference: the longest one at 200 a second."""
 LARGEST_NM = 1000.0
+LARGEST_RAD = 7.0
+"""A little more than a whole turn."""
 LEAST_GAP_S, LONGEST_GAP_S = 1e-9, 1.0
 """Between neighbouring samples: across a shorter one the slope is no number, across a longer one a straight line is no
 wish of anybody's."""
@@ -28,10 +31,19 @@ class Reference:
         N·m, with the sign that the record of the model has.
     pulse_rate_hz : float
         Pulses per second.
+    angle_rad : ndarray or None, shape (K,)
+        Angle of the joint, rad, mean over each pulse interval, where it moves. The torque is then the whole torque that
+        the cell measures, passive torque included, above that of a joint at rest at the first angle.
     """
 
     torque_nm: np.ndarray
     pulse_rate_hz: float = 40.0
+    angle_rad: np.ndarray | None = None
+
+    @property
+    def motion(self) -> Motion | None:
+        """How the joint moves; None where nothing says so."""
+        return None if self.angle_rad is None else Motion.of(self.angle_rad, self.pulse_rate_hz)
 
     @property
     def time_s(self) -> np.ndarray:
@@ -40,7 +52,13 @@ class Reference:
 
     @classmethod
     def of(
-        cls, torque_nm: object, time_s: object = None, *, pulse_rate_hz: float = 40.0, name: str = "reference_torque_nm"
+        cls,
+        torque_nm: object,
+        time_s: object = None,
+        *,
+        angle_rad: object = None,
+        pulse_rate_hz: float = 40.0,
+        name: str = "reference_torque_nm",
     ) -> Reference:
         """A reference as somebody gives it.
 
@@ -50,6 +68,8 @@ class Reference:
             N·m above rest.
         time_s : array_like, shape (N,), optional
             Times, s, rising, in any steps; the first is that of the first pulse. None: one torque for each pulse.
+        angle_rad : array_like, shape (N,), optional
+            Angle of the joint at each torque, rad. A model that depends on the joint needs it.
         pulse_rate_hz : float
             Pulses per second.
         name : str
@@ -74,13 +94,16 @@ class Reference:
                 place=f"{name}[{large[0]}]",
                 fix=f"At most {LARGEST_NM:g} N·m; is it in mN·m?",
             )
+        angle = None if angle_rad is None else _angles(angle_rad, torque.size, name)
         if time_s is not None:
-            torque = _on_pulses(_times(time_s, torque.size, name), torque, pulse_rate_hz)
+            times_s = _times(time_s, torque.size, name)
+            torque = _on_pulses(times_s, torque, pulse_rate_hz)
+            angle = None if angle is None else _on_pulses(times_s, angle, pulse_rate_hz)
         if torque.size > LONGEST_S * pulse_rate_hz:
             raise BadRequest(
                 f"{torque.size / pulse_rate_hz:.5g} s long", place=name, fix=f"Give at most {LONGEST_S:g} s, one trial."
             )
-        return cls(torque, float(pulse_rate_hz))
+        return cls(torque, float(pulse_rate_hz), angle)
 
 
 def _column(values: object, name: str) -> np.ndarray:
@@ -102,6 +125,22 @@ def _column(values: object, name: str) -> np.ndarray:
             fix="Give a finite number at every place.",
         )
     return column
+
+
+def _angles(values: object, size: int, name: str) -> np.ndarray:
+    angle = _column(values, "angle_rad")
+    if angle.size != size:
+        raise BadRequest(
+            f"{angle.size} angles for {size} of {name}", place="angle_rad", fix="Give one angle for each torque."
+        )
+    large = np.flatnonzero(~(np.abs(angle) <= LARGEST_RAD))
+    if large.size:
+        raise BadRequest(
+            f"{angle[large[0]]:g} rad",
+            place=f"angle_rad[{large[0]}]",
+            fix=f"At most {LARGEST_RAD:g}; is it in degrees?",
+        )
+    return angle
 
 
 def _times(values: object, size: int, name: str) -> np.ndarray:

@@ -1,4 +1,7 @@
-"""A reference torque as a table of text: `time_s,torque_nm`, or `torque_nm` alone with one row for each pulse."""
+"""A reference torque as a table of text: `time_s,torque_nm`, or `torque_nm` alone with one row for each pulse.
+
+Of a joint that moves `angle_rad` beside it.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,12 @@ from identify.inversion.reference import MOST_SAMPLES, Reference
 from identify.records import text
 
 FIX = "Give a header time_s,torque_nm (or torque_nm alone) and one row of numbers a line."
-NAMES = {"time_s": "time_s", "torque_nm": "torque_nm", "reference_torque_nm": "torque_nm"}
+NAMES = {
+    "time_s": "time_s",
+    "torque_nm": "torque_nm",
+    "reference_torque_nm": "torque_nm",
+    "angle_rad": "angle_rad",
+}
 
 
 def read_reference(content: bytes, name: str, pulse_rate_hz: float = 40.0) -> Reference:
@@ -40,7 +48,7 @@ def read_reference(content: bytes, name: str, pulse_rate_hz: float = 40.0) -> Re
     separator = next((sign for sign in ";\t," if sign in head), ",")
     header = [cell.strip().strip('"').lower() for cell in head.split(separator)]
     known = [NAMES[cell] for cell in header if cell in NAMES]
-    if sorted(known) not in (["time_s", "torque_nm"], ["torque_nm"]):
+    if sorted(set(known) - {"time_s", "angle_rad"}) != ["torque_nm"] or len(set(known)) != len(known):
         raise BadRecord("no header with torque_nm", place=f"{name}, line {number}", fix=FIX)
     columns: dict[str, list[float]] = {column: [] for column in known}
     for count, (number, line) in enumerate(rows, 1):
@@ -54,7 +62,11 @@ def read_reference(content: bytes, name: str, pulse_rate_hz: float = 40.0) -> Re
                 place = f"{name}, line {number}, column {cell}"
                 columns[NAMES[cell]].append(_number(cells[at] if at < len(cells) else "", separator, place))
     return Reference.of(
-        np.array(columns["torque_nm"]), columns.get("time_s"), pulse_rate_hz=pulse_rate_hz, name=f"{name}, torque_nm"
+        np.array(columns["torque_nm"]),
+        columns.get("time_s"),
+        angle_rad=columns.get("angle_rad"),
+        pulse_rate_hz=pulse_rate_hz,
+        name=f"{name}, torque_nm",
     )
 
 

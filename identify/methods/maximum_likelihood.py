@@ -16,6 +16,7 @@ from identify.dynamics.pulse_grid import Grid
 from identify.errors import BadRequest
 from identify.estimation.finish import finish
 from identify.estimation.joint import Fitted
+from identify.estimation.movement import still_rows
 from identify.estimation.pilot import estimate
 from identify.estimation.prepare import to_fitted
 from identify.estimation.rows import fitted_rows
@@ -58,7 +59,8 @@ class MaximumLikelihood:
         if options.get("recruitment") == "near-sigmoid" or "earlier" in options:
             return near_sigmoid(grid, rows, options)
         delay_s = float(options["delay_s"]) if "delay_s" in options else None
-        solution, _ = estimate(grid, rows, int(options["knots"]) if "knots" in options else None, delay_s)
+        knots = int(options["knots"]) if "knots" in options else None
+        solution, _ = estimate(grid, still_rows(grid, rows), knots, delay_s)
         kind = str(options.get("recruitment", "spline"))
         if kind == "power-series":
             solution, reason = power_series(solution, int(options["power"]) if "power" in options else None)
@@ -74,8 +76,8 @@ class MaximumLikelihood:
                 fix="Give spline, power-series, sigmoid or near-sigmoid.",
             )
         if flag(options.get("monotone", False), "monotone"):
-            return to_fitted(monotone(solution), most=0), [reason, "recruitment constrained to be monotone"]
-        return to_fitted(solution, most=20 if kind == "spline" else 0), [reason]
+            return to_fitted(monotone(solution), rows, most=0), [reason, "recruitment constrained to be monotone"]
+        return to_fitted(solution, rows, most=20 if kind == "spline" else 0), [reason]
 
 
 METHOD = MaximumLikelihood()

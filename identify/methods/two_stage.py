@@ -72,7 +72,7 @@ class TwoStage:
         order = order_option(options.get("order", "second-order"))
         if order == "second-order" and not literal and not inverse:
             solution, reasons = physical(grid, prbs, ramp, iterations, knots)
-            return finish(self.id, to_fitted(solution, most=0), reasons)
+            return finish(self.id, to_fitted(solution, solution.projection.rows, most=0), reasons)
         return general(self.id, grid, prbs, ramp, iterations, knots, order, literal, inverse)
 
 

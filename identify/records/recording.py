@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from identify.records import bounds
 from identify.records.felt import read_pulses
 from identify.records.hdf5 import FIX, StrictFile
 from identify.records.record import Pulses, Record, Source
+from identify.records.recorded_angle import read_angle
 
 FORMAT = "stimrig-recording"
 
@@ -34,6 +36,7 @@ def read_recording(content: bytes, path: Path, pulse_rate_hz: float | None = Non
 
     The width in force at a sample is that of the last pulse due before it, and how late that was felt stands beside
     it; a pulse that was dropped or refused counts as none. Samples outside every segment are left out.
+    An angle sensor's angles are brought to the times of the torque; rows in its long gaps are doubted.
 
     Raises
     ------
@@ -56,11 +59,17 @@ def read_recording(content: bytes, path: Path, pulse_rate_hz: float | None = Non
         raise BadRecord(f"torque {what}", place=f"{name}, /torque/torque_nm, sample {bad[0]}", fix=FIX)
     pulses, doubts = read_pulses(file, name, time_s, rate)
     width, late = _in_force(pulses, time_s, rate)
+    angle, note = read_angle(file, name, time_s, inside)
+    if angle is not None:
+        doubts = doubts | angle.unknown
     bounds.check_span(time_s[inside], f"{name}, /torque/time_s")
     source = Source(path.name, file.text("recording_id", ""), file.text("content_sha256", ""))
+    source = replace(source, notes=(note,)) if note else source
     return Record.from_arrays(
         time_s[inside], width[inside], torque[inside], code[inside], segment_names=names, pulse_rate_hz=rate,
         source=source, pulses=pulses,
+        angle_rad=None if angle is None else angle.angle_rad[inside],
+        velocity_rad_s=None if angle is None else angle.velocity_rad_s[inside],
         late_s=late[inside] if pulses.late_s.any() else None,
         doubted=doubts[inside] if doubts.any() else None,
     )  # fmt: skip

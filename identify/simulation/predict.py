@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -117,6 +117,7 @@ def problem_of(
         zero_nm=float(settings.get("zero_nm", 0.0)),
         sign=float(settings.get("sign", 1.0)),
         reference_s=float(settings.get("reference_s", 0.0)),
+        **_own_angles(model, grid.record, settings),
         states={} if same_data(model, grid.record) else states_of(model),
     )
     effects = [(form.name, form) for form, _ in further if form.stage == "gain"]
@@ -151,6 +152,25 @@ def problem_of(
     values[problem.coefficients] = setup.sign * model.recruitment.coefficients_nm
     values[problem.coefficients.stop :] = parameters
     return problem, problem.from_physical(values)
+
+
+def _own_angles(model: Muscle, record: Record, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The reference angle and the range of fitted angles; a model of an older version knows them of its own record.
+
+    Raises
+    ------
+    BadModel
+        The model depends on the joint and does not say at which angle its curve holds.
+    """
+    if "reference_rad" in settings:
+        return {"reference_rad": settings["reference_rad"], "angle_range_rad": tuple(settings["angle_range_rad"])}
+    if any(get(entry["id"]).moves_with_joint for entry in model.effects) and not same_data(model, record):
+        raise BadModel(
+            "the model does not say at which angle its curve holds",
+            place="effects.0.settings.reference_rad",
+            fix="Fit its record again with this version.",
+        )
+    return {}
 
 
 def states_of(model: Muscle) -> dict[str, float]:

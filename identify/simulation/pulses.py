@@ -2,20 +2,65 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
 
+from identify.errors import BadModel
 from identify.records.record import Record
+from identify.simulation.joint_surface import Surfaces
 from identify.simulation.predict import Muscle, predict
 
 REST_S = 1.0
 SAMPLES_A_PULSE = 8
 
 
-def above_rest(model: Muscle, pulse_width_us: np.ndarray, pulse_rate_hz: float) -> np.ndarray:
+@dataclass(frozen=True)
+class Motion:
+    """How the joint moves during a trial.
+
+    Parameters
+    ----------
+    angle_rad, velocity_rad_s : ndarray, shape (K,)
+        Mean in each pulse's period, rad and rad/s.
+    """
+
+    angle_rad: np.ndarray
+    velocity_rad_s: np.ndarray
+
+    @classmethod
+    def of(cls, angle_rad: np.ndarray, pulse_rate_hz: float) -> Motion:
+        """From the angles alone: the velocity is their slope, over two periods in the middle."""
+        angle = np.asarray(angle_rad, float)
+        slope = np.gradient(angle, 1.0 / pulse_rate_hz) if angle.size > 1 else np.zeros(angle.size)
+        return cls(angle, slope)
+
+    @classmethod
+    def held(cls, angle_rad: float, size: int) -> Motion:
+        """A joint that is held."""
+        return cls(np.full(size, angle_rad), np.zeros(size))
+
+    def columns(self, rest: int) -> dict[str, np.ndarray]:
+        """Angle and velocity at the samples of a record that begins with `rest` periods at the first angle, at rest."""
+        middle = np.arange(self.angle_rad.size) + 0.5
+        at = (np.arange(self.angle_rad.size * SAMPLES_A_PULSE) + 0.5) / SAMPLES_A_PULSE
+        still = np.zeros(rest * SAMPLES_A_PULSE)
+        angle = np.interp(at, middle, self.angle_rad)
+        return {
+            "angle_rad": np.r_[still + angle[0], angle],
+            "velocity_rad_s": np.r_[still, np.interp(at, middle, self.velocity_rad_s)],
+        }
+
+
+def above_rest(
+    model: Muscle, pulse_width_us: np.ndarray, pulse_rate_hz: float, motion: Motion | None = None
+) -> np.ndarray:
     """Mean torque in each pulse's period, N·m, after one second of rest, effects included; shape (K,).
 
     What the same model gives without any pulse is taken off: voluntary effort, tremor, hum and drift of the day of the
-    test are no answer to a stimulus, and won't be there again.
+    test are no answer to a stimulus, and won't be there again. Of a joint that moves its passive torque stays: only
+    what there is at rest at the movement's first angle is taken off, as by the rest before a trial.
 
     Parameters
     ----------
@@ -25,19 +70,27 @@ def above_rest(model: Muscle, pulse_width_us: np.ndarray, pulse_rate_hz: float) 
         One for each pulse, µs.
     pulse_rate_hz : float
         Pulses per second.
+    motion : Motion, optional
+        How the joint moves. A model that depends on the joint needs it.
 
     Raises
     ------
     BadModel
-        As `predict`.
+        As `predict`; the model depends on the joint, and nothing says where that is.
     """
     rest = round(REST_S * pulse_rate_hz)
+    widths = np.asarray(pulse_width_us, float)
+    if motion is None and Surfaces.of(model) is not None:
+        raise BadModel(
+            "the model depends on the angle of the joint", place="angle_rad", fix="Give the angle at each pulse."
+        )
 
-    def torque_of(widths_us: np.ndarray) -> np.ndarray:
+    def torque_of(widths_us: np.ndarray, moved: Motion | None) -> np.ndarray:
         held = np.repeat(np.r_[np.zeros(rest), widths_us], SAMPLES_A_PULSE)
         time_s = np.arange(held.size) / (SAMPLES_A_PULSE * pulse_rate_hz)
-        record = Record.from_arrays(time_s, held, np.zeros(held.size), pulse_rate_hz=pulse_rate_hz)
+        columns: dict[str, Any] = {} if moved is None else moved.columns(rest)
+        record = Record.from_arrays(time_s, held, np.zeros(held.size), pulse_rate_hz=pulse_rate_hz, **columns)
         return predict(model, record).reshape(-1, SAMPLES_A_PULSE).mean(axis=1)[rest:]
 
-    widths = np.asarray(pulse_width_us, float)
-    return torque_of(widths) - torque_of(np.zeros(widths.size))
+    at_rest = None if motion is None else Motion.held(float(motion.angle_rad[0]), widths.size)
+    return torque_of(widths, motion) - torque_of(np.zeros(widths.size), at_rest)

@@ -5,12 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
 from identify.dynamics.pulse_grid import Grid
 from identify.effects.base import Scene
 from identify.recruitment.curve import Basis
+
+ACCELERATION_S = 0.05
+"""Time over which the slope of the velocity is taken: two pulse intervals."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +50,10 @@ class Setup:
         Time at which the recruitment curve holds, if an effect makes it drift, s.
     curve_nm : ndarray, shape (n,), or float
         Prior mean of the curve's coefficients, N·m.
+    reference_rad : float or None
+        Angle at which the curve holds as it stands, rad (`Scene.reference_rad`).
+    angle_range_rad : tuple of float or None
+        Smallest and largest angle that was fitted, rad.
     states : mapping of str to float
         By effect id, where its slow state begins; 0 (rested) where there is none.
     """
@@ -63,6 +71,8 @@ class Setup:
     spread: np.ndarray | float = 1.0
     reference_s: float = 0.0
     curve_nm: np.ndarray | float = 0.0
+    reference_rad: float | None = None
+    angle_range_rad: tuple[float, float] | None = None
     states: Mapping[str, float] = field(default_factory=dict)
 
     @cached_property
@@ -93,7 +103,7 @@ class Setup:
         grid = self.grid
         mean = np.bincount(grid.interval, grid.fraction, minlength=grid.size) / np.maximum(grid.count, 1)
         mean = np.where(grid.count > 0, mean, 0.5)
-        scene = self._scene((np.arange(grid.size) + mean) * grid.step_s, grid.pulse_width_us)
+        scene = self._scene((np.arange(grid.size) + mean) * grid.step_s, grid.pulse_width_us, grid.begins)
         pauses = np.zeros(grid.size)
         pauses[grid.begins] = [part.pause_s - part.folded_s for part in grid.record.parts]
         return replace(scene, fitted=self.fitted, pauses_s=pauses, states=self.states)
@@ -102,21 +112,24 @@ class Setup:
     def scene_at_ends(self) -> Scene:
         """At the ends of the intervals, shape (K + 1,)."""
         grid = self.grid
-        return self._scene(np.arange(grid.size + 1) * grid.step_s, np.r_[grid.pulse_width_us, grid.pulse_width_us[-1]])
+        widths_us = np.r_[grid.pulse_width_us, grid.pulse_width_us[-1]]
+        return self._scene(np.arange(grid.size + 1) * grid.step_s, widths_us, grid.begins)
 
     @cached_property
     def scene_at_samples(self) -> Scene:
         """At the record's samples, shape (N,)."""
         grid = self.grid
         time_s = (grid.interval + grid.fraction) * grid.step_s
-        return self._scene(time_s, grid.pulse_width_us[grid.interval])
+        first = np.array([part.first for part in grid.record.parts])
+        return self._scene(time_s, grid.pulse_width_us[grid.interval], first)
 
-    def _scene(self, time_s: np.ndarray, width_us: np.ndarray) -> Scene:
+    def _scene(self, time_s: np.ndarray, width_us: np.ndarray, first: np.ndarray) -> Scene:
         grid, record = self.grid, self.grid.record
         angle, velocity = record.angle_rad, record.velocity_rad_s
         own = record.time_s - grid.start_s
         if velocity is None and angle is not None:
             velocity = np.gradient(angle, record.time_s)
+        acceleration = None if velocity is None else self._acceleration(velocity)
         return Scene(
             time_s=time_s,
             pulse_width_us=width_us,
@@ -125,10 +138,27 @@ class Setup:
             largest_us=self.basis.largest_us,
             angle_rad=None if angle is None else np.interp(time_s, own, angle),
             velocity_rad_s=None if velocity is None else np.interp(time_s, own, velocity),
+            acceleration_rad_s2=None if acceleration is None else np.interp(time_s, own, acceleration),
+            reference_rad=self.reference_rad,
+            angle_range_rad=self.angle_range_rad,
+            begins=np.isin(np.arange(time_s.size), first),
             noise_sd_nm=self.noise_sd_nm,
             zero_nm=self.zero_nm,
             reference_s=self.reference_s,
         )
+
+    def _acceleration(self, velocity_rad_s: np.ndarray) -> np.ndarray:
+        """Slope of the velocity over `ACCELERATION_S`, rad/s², each part of the record by itself, shape (N,)."""
+        record = self.grid.record
+        edges = [*(part.first for part in record.parts), record.time_s.size]
+        reach = max(1, round(ACCELERATION_S * record.sample_rate_hz / 2))
+        slopes = []
+        for begin, end in pairwise(edges):
+            at = np.arange(end - begin)
+            low, high = np.maximum(at - reach, 0), np.minimum(at + reach, at.size - 1)
+            own, time_s = velocity_rad_s[begin:end], record.time_s[begin:end]
+            slopes.append((own[high] - own[low]) / np.maximum(time_s[high] - time_s[low], 1e-9))
+        return np.concatenate(slopes)
 
     @cached_property
     def design(self) -> np.ndarray:

@@ -90,8 +90,9 @@ class CounterUnwrapper:
         raw = raw + self._shift
         if self._last is None:
             self._last = int(raw[0]) - 1
-        ahead = (raw - self._last + self._modulus // 2) % self._modulus - self._modulus // 2
-        counter = self._last + ahead
+        # from one to the next: a block that comes after a standstill may be longer than a small counter's half
+        steps = (np.diff(raw, prepend=self._last) + self._modulus // 2) % self._modulus - self._modulus // 2
+        counter = self._last + np.cumsum(steps)
         newest = np.maximum.accumulate(np.concatenate([[self._last], counter]))
         keep = counter > newest[:-1]
         repeats = int(np.sum(counter == newest[:-1]))

@@ -147,6 +147,9 @@ def test_an_arm_costs_one_line_where_it_is_described_badly(capsys: pytest.Captur
         ("--arm", "held", "--angle-noise-deg", "nan"): "--angle-noise-deg must be between",
         ("--arm", "held", "--angle", "in-cell", "--cell", "plain"): "--cell with_angle goes with",
         ("--cell", "with_angle"): "--cell with_angle goes with",
+        ("--arm", "held", "--arm-law", "passive=jelly"): "unknown law of passive 'jelly'",
+        ("--arm", "held", "--arm-law", "passive=linear_friction,dry_nm=much"): "must be SETTING=NUMBER",
+        ("--hidden", "1", "--arm", "held", "--arm-law", "passive=none"): "is hidden, too",
     }.items():
         assert main(list(arguments)) == 2
         output, errors = capsys.readouterr()

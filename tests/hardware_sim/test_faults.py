@@ -306,7 +306,7 @@ def test_the_library_is_listed_and_every_fault_can_be_switched(host: Host) -> No
     listed = host.rig.ask(cmd="faults")["faults"]
     assert set(listed) == set(library()) >= {"no_ack", "cell_silent"}
     assert "" not in {entry["what"] for entry in listed.values()}
-    for name in set(listed) - {"stimulator_unplugged", "cell_unplugged"}:
+    for name in {name for name in listed if not name.startswith("angle_")} - {"stimulator_unplugged", "cell_unplugged"}:
         with broken(host, name) as answer:
             assert answer["active"] == [name]
 

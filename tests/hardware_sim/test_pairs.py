@@ -75,7 +75,7 @@ CELLS: dict[str, tuple[list[str], int, int, Decode]] = {
     "plain of 3": (["--cell", "plain", "--samples-per-frame", "3"], 0x181, 3, packed),
     "counts": (["--cell", "counts"], 610, 1, counts),
     "canopen": (["--cell", "canopen"], 0x181, 1, plain),
-    "with_angle": (["--cell", "with_angle", "--arm", "held", "--angle", "in-cell"], 0x181, 1, with_angle),
+    "with_angle": (["--arm", "held", "--arm-law", "passive=none", "--angle", "in-cell"], 0x181, 1, with_angle),
 }
 
 

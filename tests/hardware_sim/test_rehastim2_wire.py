@@ -194,6 +194,7 @@ def test_unplugged_it_pulses_on_until_the_watchdog(host: Host) -> None:
 
 
 def test_every_fault_can_be_switched(host: Host) -> None:
-    for name in set(host.rig.ask(cmd="faults")["faults"]) - {"stimulator_unplugged", "cell_unplugged"}:
+    listed = {name for name in host.rig.ask(cmd="faults")["faults"] if not name.startswith("angle_")}
+    for name in listed - {"stimulator_unplugged", "cell_unplugged"}:
         assert host.rig.ask(cmd="fault", name=name)["active"] == [name]
         assert host.rig.ask(cmd="fault", name=name, on=False)["active"] == []

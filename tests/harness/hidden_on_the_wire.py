@@ -17,10 +17,13 @@ PARTICIPANT = "HIDDEN"
 NOISE_LIKE = 1.3
 
 
-def reveal(seed: int) -> dict[str, Any]:
-    """What the emulator hides, asked after the verdict."""
+def reveal(seed: int, *more: str) -> dict[str, Any]:
+    """What the emulator hides, asked after the verdict; `more` are the emulator's options that change it."""
     done = subprocess.run(
-        [sys.executable, "-m", "hardware_sim", "--reveal", str(seed)], capture_output=True, text=True, check=True
+        [sys.executable, "-m", "hardware_sim", "--reveal", str(seed), *more],
+        capture_output=True,
+        text=True,
+        check=True,
     )
     return json.loads(done.stdout)
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from rig import limits, plan
+from rig.acquire.angle_receiver import AngleReceiver
 from rig.acquire.halt import Halt
 from rig.acquire.health import DEFAULT_WATCH, Watch
 from rig.acquire.receiver import Receiver
@@ -20,12 +21,16 @@ from rig.errors import DeviceError
 from rig.gate import Gate
 from rig.journal import Journal, Kind
 from rig.limits import Admitted, Steps
-from rig.messages import AdaptivePlan, Profile, SegmentPlan, TestPlan
+from rig.messages import AdaptivePlan, AnglePlan, Profile, SegmentPlan, TestPlan
 from rig.signals import SAMPLE, Ack, LateError, TorqueBlock
+from tests.rig.angle import FakeSensor
 
 RATE_HZ = 1600.0
 ON_A_BUSY_DISK = replace(DEFAULT_WATCH, stale_disk_s=60.0)
 """The disk alone is real here: where others write to it, it may stand still for seconds of the world's time."""
+
+
+OF_ANGLE = {"angle": {"sample_rate_hz": 200.0, "of_the_cell": False, "one_bus": True, "calibration": {"by": "nurse"}}}
 
 
 class FakeStimulator:
@@ -181,9 +186,14 @@ class VirtualRig:
         watch: Watch = ON_A_BUSY_DISK,
         adaptive: AdaptivePlan | None = None,
         base: dict[str, limits.Limit] = limits.HARD_LIMITS,
-        **profile: float,
+        kind: str = "pre-session",
+        angle: AnglePlan | None = None,
+        has_sensor: bool = False,
+        **profile: Any,
     ) -> None:
         self.clock = VirtualClock()
+        self.sensor = FakeSensor(self.clock)
+        self.angle = AngleReceiver(self.sensor, self.clock) if has_sensor else None
         self.stimulator = FakeStimulator(self.clock)
         self.cell = FakeCell(self.clock, self.stimulator)
         self.halt = Halt(self.clock)
@@ -199,14 +209,17 @@ class VirtualRig:
             SegmentPlan(name="rest", sequence="rest", settings={"duration_s": 0.5}),
         ]
         self.plan = TestPlan(
-            test_id="t", participant="P", profile=Profile(**profile), segments=segments, adaptive=adaptive
-        )
+            test_id="t", participant="P", kind=kind, profile=Profile(**profile), segments=segments, adaptive=adaptive,
+            angle=angle,
+        )  # fmt: skip
         self.table = limits.for_plan(base, self.plan)
         self.test = plan.build(self.plan, self.table)
         self.path = folder / "t.journal"
         self.journal = Journal(self.path)
-        self.run = TestRun(self.test, self.table, self.journal, self.gate, self.receiver, self.clock, self.halt, watch)
-        self.journal.append_json(Kind.HEADER, header(self.run, self.clock))
+        self.run = TestRun(
+            self.test, self.table, self.journal, self.gate, self.receiver, self.clock, self.halt, watch, self.angle
+        )
+        self.journal.append_json(Kind.HEADER, header(self.run, self.clock) | ({} if self.angle is None else OF_ANGLE))
         self.journal.append(Kind.PLAN, self.run.score.laid.pulse_width_us.astype("<f8").tobytes())
 
     def at(self, time_s: float, action: Callable[[], object]) -> None:
@@ -215,6 +228,8 @@ class VirtualRig:
 
     def execute(self) -> RunResult:
         """Play the test."""
+        if self.angle is not None:
+            self.sensor.feed(self.angle, self.clock.now_s() + self.test.longest_s + 8)
         self.cell.feed(self.receiver, self.clock.now_s() + self.test.longest_s + 8)
         return self.run.execute()
 

@@ -261,6 +261,7 @@ class InversionOut(Document):
     pulse_rate_hz: float
     duration_s: float
     reference_torque_nm: list[float] = Field(description="mean in each pulse's period, N·m")
+    angle_rad: list[float] | None = Field(None, description="mean in each pulse's period, where one was given, rad")
     pulse_width_us: list[float] = Field(description="one for each pulse, µs")
     predicted_torque_nm: list[float] = Field(description="mean in each pulse's period, N·m above rest")
     unreachable: list[Unreachable]

@@ -14,6 +14,7 @@ from api.store.tables import Participant
 from api.web.dependencies import PROBLEM, Context, Ctx, ModelReader
 from api.web.responses.base import answers
 from api.web.responses.models import InversionOut
+from api.web.routes.prediction import Angles
 
 router = APIRouter(prefix="/v1", tags=["models"], responses=PROBLEM)
 REST_S = 1.0
@@ -27,6 +28,7 @@ class ReferenceIn(Body):
 
     reference_torque_nm: Annotated[Column, Field(description="above rest, N·m; one for each pulse, without `time_s`")]
     time_s: Annotated[Column, Field(description="times of the torques, s, rising; of any rate")] | None = None
+    angle_rad: Angles | None = None
     pulse_rate_hz: FiniteFloat | None = Field(None, ge=10, le=100, description="None: the model's")
     max_pulse_width_us: FiniteFloat | None = Field(None, gt=0, le=500, description="never above the participant's, µs")
     max_rise_us: FiniteFloat | None = Field(None, gt=0, le=500, description="from pulse to pulse, µs; None: the rig's")
@@ -39,7 +41,7 @@ async def widths(context: Ctx, _who: ModelReader, model_id: str, body: Reference
 
     Of a version, or of one that was tracked from it (its `model_id`).
     """
-    given = body.model_dump(include={"reference_torque_nm", "time_s", "pulse_rate_hz"})
+    given = body.model_dump(include={"reference_torque_nm", "time_s", "angle_rad", "pulse_rate_hz"})
     return await inverted(context, model_id, given, body.max_pulse_width_us, body.max_rise_us, body.whole_us)
 
 

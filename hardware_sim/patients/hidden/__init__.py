@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
@@ -12,40 +13,50 @@ if TYPE_CHECKING:
     from hardware_sim.patients.hidden.draw import Scenario
     from hardware_sim.patients.hidden.live import HiddenMuscle
 
-__all__ = ["make", "reveal"]
+__all__ = ["drawn", "make", "movement", "reveal"]
 
 NOISE_SD_NM = 0.04
 
 
+MOVING_KINDS = {"moving": 0.7, "nothing": 0.15, "still": 0.15}
+"""What the seed of a patient whose joint moves hides: an effect of the movement, nothing, an effect of the library that
+shows at any joint; its probability."""
+
+
 @lru_cache(maxsize=8)
-def _scenario(seed: int) -> Scenario:
+def _scenario(seed: int, moving: bool) -> Scenario:
     from hardware_sim.patients.hidden import draw
 
-    rng = draw.rng_of(seed, "hidden patient")
-    kind = str(rng.choice(["one", "nothing", "two", "outside"], p=[0.64, 0.12, 0.1, 0.14]))
+    rng = draw.rng_of(seed, "hidden patient, moving" if moving else "hidden patient")
+    kinds = MOVING_KINDS if moving else {"one": 0.64, "nothing": 0.12, "two": 0.1, "outside": 0.14}
+    kind = str(rng.choice(list(kinds), p=list(kinds.values())))
     strength = str(rng.choice(["weak", "middle", "strong"], p=[0.2, 0.45, 0.35]))
     for attempt in range(20):
         names: tuple[str, ...] = ()
-        if kind == "one":
+        if kind in ("one", "still"):
             names = (str(rng.choice(draw.still_effect_ids())),)
+        elif kind == "moving":
+            names = (str(rng.choice(sorted(draw.MOVING))),)
         elif kind == "two":
             names = draw.draw_pair(rng)
         elif kind == "outside":
             names = (str(rng.choice(draw.outside_ids())),)
         try:
-            return draw.draw_scenario(names, strength, seed + attempt, noise_sd_nm=NOISE_SD_NM)
+            return draw.draw_scenario(names, strength, seed + attempt, noise_sd_nm=NOISE_SD_NM, moving=moving)
         except ValueError:  # no muscle shows this effect so strongly: draw another
             continue
     raise ValueError(f"seed {seed}: no patient found; take another seed")
 
 
-def make(seed: int) -> HiddenMuscle:
-    """The patient that `seed` hides, at rest; the joint is held still.
+def make(seed: int, moving: bool = False) -> HiddenMuscle:
+    """The patient that `seed` hides, at rest.
 
     Parameters
     ----------
     seed
         Any whole number from 0.
+    moving
+        Its joint will move: another patient, whose effect may show only then (`MOVING_KINDS`).
 
     Raises
     ------
@@ -54,9 +65,21 @@ def make(seed: int) -> HiddenMuscle:
     """
     from hardware_sim.patients.hidden.live import HiddenMuscle
 
-    return HiddenMuscle(_scenario(seed))
+    return HiddenMuscle(_scenario(seed, moving))
 
 
-def reveal(seed: int) -> dict[str, Any]:
+def movement(seed: int) -> dict[str, Any]:
+    """How the joint of the moving patient moves in the test that its effect was sized on: settings of `waves`."""
+    hz, amplitude_rad, phase_rad = _scenario(seed, True).design.movement or ((), (), ())
+    deg = [math.degrees(size) for size in amplitude_rad]
+    return {"hz": list(map(float, hz)), "deg": deg, "phase_rad": list(map(float, phase_rad))}
+
+
+def reveal(seed: int, moving: bool = False) -> dict[str, Any]:
     """What `make(seed)` hides: `effects`, `formulation`, `strength`, `parameters`, `outside_library` and more."""
-    return _scenario(seed).truth(NOISE_SD_NM) | {"seed": seed}
+    return _scenario(seed, moving).truth(NOISE_SD_NM) | {"seed": seed}
+
+
+def drawn(seed: int, moving: bool = False) -> Scenario:
+    """The patient with its design, for records off line."""
+    return _scenario(seed, moving)

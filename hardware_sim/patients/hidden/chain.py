@@ -90,10 +90,12 @@ class Chain:
         self._steps += x.size
         return out
 
-    def step(self, x: float, pulse: float, at_step: float | None = None) -> float:
-        """One step with the joint held still; `at_step` sets the time, in steps."""
+    def step(
+        self, x: float, pulse: float, at_step: float | None = None, joint: tuple[float, float] = (0.0, 0.0)
+    ) -> float:
+        """One step with the joint at this angle, rad, and velocity, rad/s; `at_step` sets the time, in steps."""
         one = self._one
-        one[0, 0], one[1, 0] = x, pulse
+        one[0, 0], one[1, 0], one[2, 0], one[3, 0] = x, pulse, *joint
         if at_step is not None:
             self._steps = at_step
         _run(self._addresses, self._p, self._s, self._c, one[0], one[1], one[2], one[3], self._steps, one[4])

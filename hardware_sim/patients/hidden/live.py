@@ -13,12 +13,14 @@ STEPS_PER_S = 1600.0
 PULSE_PERIOD_S = 0.025
 LATE_S = 0.005
 NOMINAL_CURRENT_MA = 20.0
+REMEMBERED_STEPS = 64
+"""More than the latest pulse can go back: 5 ms and a delivery."""
 
 _Saved = tuple[Floats, Floats, float]
 
 
 class HiddenMuscle:
-    """A muscle with hidden effects and its joint held still; it implements the `Muscle` protocol.
+    """A muscle with hidden effects; it implements the `Muscle` protocol. Its joint is still unless a limb tells it.
 
     A pulse's width is held for 25 ms. Jitter leaves gaps between two holds; a gap of up to 5 ms is closed by going back
     to its beginning. Another current than 20 mA scales the width by charge.
@@ -41,6 +43,13 @@ class HiddenMuscle:
         self._arrivals: list[float] = []
         self._hold_end = -math.inf
         self._at_hold_end: tuple[_Saved, int, tuple[float, float], float] | None = None
+        self._joint = (0.0, 0.0)
+        self._joints = [self._joint] * REMEMBERED_STEPS  # by step, for going back; known up to and with `_joints_known`
+        self._joints_known = 0
+
+    def joint(self, angle_rad: float, velocity_rad_s: float) -> None:
+        """The joint's angle and velocity in the steps that were not simulated yet."""
+        self._joint = (angle_rad, velocity_rad_s)
 
     def pulse(self, time_s: float, width_us: float, current_ma: float) -> None:
         """A pulse of `width_us` a phase and `current_ma` reaches the electrodes at `time_s`."""
@@ -84,8 +93,16 @@ class HiddenMuscle:
     def _run_to(self, step: int) -> None:
         while self._done < step:
             width, pulse = self._input()
-            self._values = (self._values[1], self._muscle.step(width, pulse, self._done + 1.0))
             self._done += 1
+            torque_nm = self._muscle.step(width, pulse, float(self._done), self._joint_at(self._done))
+            self._values = (self._values[1], torque_nm)
+
+    def _joint_at(self, step: int) -> tuple[float, float]:
+        """The joint at a step; a step that is simulated again finds what it had."""
+        if step > self._joints_known:
+            self._joints_known = step
+            self._joints[step % REMEMBERED_STEPS] = self._joint
+        return self._joints[step % REMEMBERED_STEPS]
 
     def _input(self) -> tuple[float, float]:
         """Mean width over the next step, and whether a pulse arrives in it."""

@@ -1,0 +1,189 @@
+"""f, G, g and h of simulated arms from joined records, beside the truth; see docs/moving-joint.md.
+
+    python -m bench.moving_joint --arms 1000:1050 [--json FILE]
+
+The arms come from `hardware_sim.arm_patient`, whose laws and distributions were written apart from the library. Arms
+0 to 99 were developed on; report on arms from 1000. Of each arm: the paper's isometric test, and the three guided tests
+(passive; held at four angles; moving), with torque-times of each; then an unseen trial with another movement.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from api.sessions import joint_plan
+from bench.stamp import written_by
+from hardware_sim.arm_patient import ArmPatient, arm_patient
+from hardware_sim.arm_records import record
+from identify.fitting import MOVING_JOINT, fit
+from identify.model import Model
+from identify.records.join import join
+from identify.records.record import Record
+from identify.simulation.predict import predict
+
+PASSIVE_S, UNSEEN_S, RATE_HZ = 66.0, 30.0, 40.0
+COLUMNS = ("time_s", "pulse_width_us", "torque_nm")
+
+
+def as_record(made: dict[str, Any]) -> Record:
+    """A made record, as identify takes it."""
+    return Record.from_arrays(
+        *(made[name] for name in COLUMNS),
+        list(made["segment"]),
+        angle_rad=made["angle_rad"],
+        velocity_rad_s=made["velocity_rad_s"],
+    )
+
+
+def torque_time_nms(arm: ArmPatient, made: dict[str, Any]) -> float:
+    """Of the active torque, N·m·s."""
+    truth = made["truth"]
+    active = arm.g(truth["angle_rad"], truth["velocity_rad_s"]) * truth["isometric_nm"]
+    return float(np.sum(np.abs(active)) * (made["time_s"][1] - made["time_s"][0]))
+
+
+def one(seed: int) -> dict[str, Any]:
+    """One arm: what was found of it, beside the truth."""
+    arm = arm_patient(seed)
+    isometric = record(arm, "isometric", seed)
+    alone = fit(as_record(isometric))
+    guided = guided_tests(arm, alone, isometric, seed)
+    unseen = record(arm, "unseen", seed, duration_s=UNSEEN_S)
+    dose = {"paper": torque_time_nms(arm, isometric), "guided": sum(torque_time_nms(arm, each) for each in guided)}
+    told = {"seed": seed, "laws": laws(arm), "dose": dose}
+    told["isometric"] = active_errors(arm, alone, arm.reference_rad)
+    for name, made in (("guided", guided), ("all", [isometric, *guided])):
+        began = time.process_time()
+        model = fit(joined(made), effects=MOVING_JOINT)
+        told[name] = {"cpu_s": time.process_time() - began, **judged(arm, Model.from_json(model.to_json()), unseen)}
+    return told
+
+
+def guided_tests(arm: ArmPatient, model: Model, isometric: dict[str, Any], seed: int) -> list[dict[str, Any]]:
+    """The three tests as the service plans them with the model of the isometric test: passive, held, moving."""
+    width_us, torque_nm = model.recruitment.table()
+    top_us = float(arm.largest_width_us)
+    curve = joint_plan.curve_of({"pulse_width_us": list(width_us), "torque_nm": list(torque_nm)}, top_us, None)
+    every = round(isometric["time_s"].size / (isometric["time_s"][-1] * RATE_HZ))
+    layout = joint_plan.layout(arm.range_rad, curve, top_us, isometric["pulse_width_us"][::every], RATE_HZ)
+    made = [record(arm, "passive", seed, duration_s=PASSIVE_S)]
+    for place, x in enumerate(layout.targets_rad):
+        made.append(record(arm, "held", 10 * seed + place, angle_rad=x, parts=parts_of(layout.held)))
+    return [*made, record(arm, "moving", seed, parts=parts_of(layout.moving))]
+
+
+def parts_of(segments: list[dict[str, Any]]) -> list[tuple[str, np.ndarray]]:
+    """Segments of a plan, as records are made of them."""
+    return [(each["name"], np.array(each["settings"]["pulse_width_us"])) for each in segments]
+
+
+def joined(made: list[dict[str, Any]]) -> Record:
+    """The records as the parts of one, two minutes apart."""
+    return join([as_record(each) for each in made], [120.0 * place for place in range(len(made))])
+
+
+def laws(arm: ArmPatient) -> dict[str, Any]:
+    """Which laws the arm has."""
+    return {place: arm.truth[place]["law"] for place in ("passive", "torque_angle", "torque_velocity")}
+
+
+def judged(arm: ArmPatient, model: Model, unseen: dict[str, Any]) -> dict[str, Any]:
+    """Errors of g and h where they were seen, what their bands hold, and an unseen trial's error over its noise."""
+    known = {name: np.asarray(value) for name, value in model.joint.items() if name != "formula"}
+    reference = float(known["reference_angle_rad"])
+    x, v = np.meshgrid(known["angle_rad"], known["velocity_rad_s"], indexing="ij")
+    truth = {"h": arm.h_nm(x, v) - arm.h_nm(reference, 0.0), "g": arm.g(x, v) / arm.g(reference, 0.0)}
+    found: dict[str, Any] = {"reference_rad": reference}
+    for name, unit in (("h", "_nm"), ("g", "")):
+        seen = known[f"seen_{name}"] > 0
+        error = (known[f"{name}{unit}"] - truth[name])[seen]
+        scale = float(np.ptp(truth[name][seen])) if name == "h" else 1.0
+        inside = (truth[name] >= known[f"{name}_lower{unit}"]) & (truth[name] <= known[f"{name}_upper{unit}"])
+        found[name] = {
+            "rms": float(np.sqrt(np.mean(error**2))) / scale,
+            "p95": float(np.percentile(np.abs(error), 95)) / scale,
+            "largest": float(np.max(np.abs(error))) / scale,
+            "covered": float(np.mean(inside[seen])),
+            "half_width": float(np.median((known[f"{name}_upper{unit}"] - known[f"{name}{unit}"])[seen])) / scale,
+        }
+    error_nm = unseen["torque_nm"] - predict(model, as_record(unseen))
+    # The sensor's zero of another day is not the model's.
+    error_nm = error_nm - np.median(error_nm)
+    found["unseen_over_noise"] = float(np.sqrt(np.mean(error_nm**2))) / unseen["truth"]["noise_sd_nm"]
+    return found | active_errors(arm, model, reference)
+
+
+def active_errors(arm: ArmPatient, model: Model, reference_rad: float) -> dict[str, float]:
+    """Errors of f, as a share of its largest value, and of G's step response, root mean square."""
+    width_us = np.linspace(0.0, float(model.valid_for["pulse_width_us"][1]), 201)
+    f_nm = arm.recruitment_nm(width_us) * float(arm.g(reference_rad, 0.0))
+    time_s = np.linspace(0.0, 2.0, 401)
+    fine = np.full(401, float(arm.largest_width_us))
+    step = arm.isometric_nm(fine, time_s[1]) / float(arm.recruitment_nm(float(arm.largest_width_us)))
+    return {
+        "f": float(np.sqrt(np.mean((model.recruitment(width_us) - f_nm) ** 2)) / np.ptp(f_nm)),
+        "G": float(np.sqrt(np.mean((model.linear.step_response(time_s) - step) ** 2))),
+        "fit_percent": model.fit["fit_percent"],
+        "ceiling_percent": model.fit["ceiling_percent"],
+    }
+
+
+def tell(rows: list[dict[str, Any]]) -> None:
+    """The goals, each beside what was measured."""
+    for name in ("guided", "all"):
+        print(f"{'three guided tests' if name == 'guided' else 'and the isometric test'}, {len(rows)} arms")
+        for part, goal in (("h", 0.05), ("g", 0.07)):
+            errors = np.array([row[name][part]["rms"] for row in rows])
+            p95 = np.array([row[name][part]["p95"] for row in rows])
+            covered = np.mean([row[name][part]["covered"] for row in rows])
+            print(
+                f"  {part}: rms within {100 * goal:g} %: {np.sum(errors <= goal)} of {errors.size}, median "
+                f"{100 * np.median(errors):.2f} %, worst {100 * errors.max():.2f} %; 95 % of the cells within it: "
+                f"{np.sum(p95 <= goal)}; bands hold {100 * covered:.1f} %"
+            )
+        for part in ("f", "G"):
+            ours, alone = (np.array([row[key][part] for row in rows]) for key in (name, "isometric"))
+            print(
+                f"  {part}: median error {100 * np.median(ours):.2f} %, isometric alone {100 * np.median(alone):.2f} %;"
+                f" no worse in {np.sum(ours <= 1.05 * alone)} of {ours.size}"
+            )
+        unseen = np.array([row[name]["unseen_over_noise"] for row in rows])
+        print(
+            f"  unseen movement: error {np.median(unseen):.2f} x noise (median), within 1.3: "
+            f"{np.sum(unseen <= 1.3)} of {unseen.size}, worst {unseen.max():.2f}; fit "
+            f"{np.median([row[name]['cpu_s'] for row in rows]):.1f} s of a processor"
+        )
+    share = np.array([row["dose"]["guided"] / row["dose"]["paper"] for row in rows])
+    print(f"torque-time of the three over the paper's test: median {np.median(share):.2f}, largest {share.max():.2f}")
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--arms", default="1000:1050", help="first:last, last not included")
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--workers", type=int, default=2)
+    options = parser.parse_args(arguments)
+    first, last = (int(part) for part in options.arms.split(":"))
+    rows = []
+    with ProcessPoolExecutor(options.workers) as pool:
+        for row in pool.map(one, range(first, last)):
+            rows.append(row)
+            print(f"arm {row['seed']}: {row['laws']} {row['all']['h']['rms']:.3f} {row['all']['g']['rms']:.3f} "
+                  f"{row['all']['unseen_over_noise']:.2f}", file=sys.stderr, flush=True)  # fmt: skip
+    print(written_by(f"python -m bench.moving_joint --arms {options.arms}"))
+    tell(rows)
+    if options.json:
+        options.json.write_text(json.dumps(rows, indent=1))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,258 @@
+"""g(x, ẋ) and h(x, ẋ) of a model, the rest of Fig. 2 of the paper, as tables with bands.
+
+T = baseline + g(x, ẋ)·y + h(x, ẋ) + inertia·ẍ, y = G f(u) at the reference angle. g is the product of what the model's
+effects multiply the torque by, h the sum of what they add to it; whatever form each of them has.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Protocol
+
+import numpy as np
+
+from identify.effects import get
+from identify.effects.base import Effect, Form, Scene
+from identify.errors import BadModel
+
+ANGLES = 61
+SPEEDS = (0.0, 0.01, 0.03, 0.06, 0.12, 0.25, 0.5, 0.75, 1.0)
+"""Velocities of the table, as shares of the largest one: closer together near 0, where dry friction turns."""
+POINTWISE = 1.959964
+INERTIA = "inertia_nm_s2_per_rad"
+STEP = 1e-4
+FORMULA = "T = baseline + g(x, v) y + h(x, v) + inertia a; y = G f(u); x: angle, v: velocity, a: acceleration"
+
+
+class Muscle(Protocol):
+    """The attribute of a model that its surfaces need."""
+
+    @property
+    def effects(self) -> tuple[dict[str, Any], ...]: ...
+
+
+class Covariance(Protocol):
+    """What bands need of a covariance: the parameters' names, and the matrix."""
+
+    @property
+    def names(self) -> tuple[str, ...]: ...
+
+    @property
+    def matrix(self) -> np.ndarray: ...
+
+
+@dataclass(frozen=True)
+class _Acting:
+    """One effect of the joint, with its values."""
+
+    effect: Effect
+    form: Form
+    values: dict[str, float]
+
+    @property
+    def adds(self) -> bool:
+        return self.form.stage == "additive"
+
+
+@dataclass(frozen=True)
+class Surfaces:
+    """g and h of a model, to be asked at any angles and velocities.
+
+    Parameters
+    ----------
+    acting : tuple
+        The model's effects that depend on the joint.
+    settings : mapping
+        Those that the effects were fitted with.
+    """
+
+    acting: tuple[_Acting, ...]
+    settings: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, model: Muscle) -> Surfaces | None:
+        """Those of a model; None if nothing of it depends on the joint.
+
+        Raises
+        ------
+        BadModel
+            An effect or its form is unknown here, or an older version fitted it, without its own angle.
+        """
+        acting = []
+        for entry in model.effects:
+            try:
+                effect = get(entry["id"])
+                form = effect.form(entry.get("form", ""))
+                values = {p.name: float(_value(entry["parameters"][p.name])) for p in form.parameters}
+            except Exception as error:
+                raise BadModel(
+                    f"{error}", place=f"effects.{entry.get('id')}", fix="Install the effect's file."
+                ) from error
+            if effect.moves_with_joint:
+                acting.append(_Acting(effect, form, values))
+        if not acting:
+            return None
+        settings = model.effects[0].get("settings", {})
+        if "reference_rad" not in settings:
+            raise BadModel("the model does not say at which angle its curve holds", fix="Fit its record again.")
+        return cls(tuple(acting), settings)
+
+    @property
+    def reference_rad(self) -> float:
+        """The angle at which f holds as it stands, rad."""
+        return float(self.settings["reference_rad"])
+
+    @property
+    def inertia_nm_s2_per_rad(self) -> float:
+        """What the cell feels of an acceleration, N·m per rad/s², with the record's sign."""
+        return self._sign * sum(one.values.get(INERTIA, 0.0) for one in self.acting)
+
+    @cached_property
+    def _sign(self) -> float:
+        return float(self.settings.get("sign", 1.0))
+
+    def g(self, angle_rad: np.ndarray, velocity_rad_s: np.ndarray) -> np.ndarray:
+        """Share of the torque at the reference angle that is there, at rest 1 at that angle; of the inputs' shape."""
+        scene = self._scene(angle_rad, velocity_rad_s)
+        large = np.full((1, scene.time_s.size), float(self.settings.get("scale_nm", 1.0)))
+        torque = large
+        for one in self.acting:
+            if not one.adds:
+                torque = np.asarray(one.form.call(torque, _rows(one.values), scene))
+        return (torque / large).reshape(np.shape(angle_rad))
+
+    def h_nm(self, angle_rad: np.ndarray, velocity_rad_s: np.ndarray) -> np.ndarray:
+        """Passive torque, 0 at rest at the reference angle, with the record's sign, N·m; of the inputs' shape.
+
+        Of tissue that has been there for long: what of it relaxes is not in it.
+        """
+        scene = self._scene(angle_rad, velocity_rad_s)
+        total = np.zeros((1, scene.time_s.size))
+        for one in self.acting:
+            if one.adds:
+                total = total + np.asarray(one.form.call(None, _rows(one.values), scene))
+        return self._sign * total.reshape(np.shape(angle_rad))
+
+    def _scene(self, angle_rad: np.ndarray, velocity_rad_s: np.ndarray) -> Scene:
+        angle, velocity = (np.ravel(np.asarray(values, float)) for values in (angle_rad, velocity_rad_s))
+        known = self.settings.get("angle_range_rad")
+        return Scene(
+            time_s=np.zeros(angle.size),
+            pulse_width_us=np.zeros(angle.size),
+            step_s=1.0,
+            scale_nm=float(self.settings.get("scale_nm", 1.0)),
+            largest_us=1.0,
+            angle_rad=angle,
+            velocity_rad_s=velocity,
+            reference_rad=self.reference_rad,
+            angle_range_rad=None if known is None else (float(known[0]), float(known[1])),
+            begins=np.ones(angle.size, bool),
+        )
+
+    def _with(self, name: str, value: float) -> Surfaces:
+        """With one parameter, by its name in the covariance, changed."""
+        effect, _, parameter = name.partition(".")
+        acting = [
+            _Acting(one.effect, one.form, one.values | {parameter: value}) if one.effect.id == effect else one
+            for one in self.acting
+        ]
+        return Surfaces(tuple(acting), self.settings)
+
+    def slopes(
+        self, names: Sequence[str], angle_rad: np.ndarray, velocity_rad_s: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Derivatives of g and of h by named parameters of the model, each of shape (len(names), *inputs' shape)."""
+        own = {f"{one.effect.id}.{name}": value for one in self.acting for name, value in one.values.items()}
+        found = np.zeros((2, len(names), *np.shape(angle_rad)))
+        for place, name in enumerate(names):
+            if name not in own:
+                continue
+            step = STEP * max(abs(own[name]), 0.01)
+            up, down = self._with(name, own[name] + step), self._with(name, own[name] - step)
+            found[0, place] = (up.g(angle_rad, velocity_rad_s) - down.g(angle_rad, velocity_rad_s)) / (2 * step)
+            found[1, place] = (up.h_nm(angle_rad, velocity_rad_s) - down.h_nm(angle_rad, velocity_rad_s)) / (2 * step)
+        return found[0], found[1]
+
+
+def joint_tables(
+    model: Muscle,
+    covariance: Covariance | None,
+    angle_rad: np.ndarray,
+    velocity_rad_s: np.ndarray,
+    at_work: np.ndarray,
+) -> dict[str, Any]:
+    """What MODEL.json has under `joint`: g and h on a grid, with 95 % bands, and how long each cell was seen.
+
+    Parameters
+    ----------
+    model : Muscle
+        The model.
+    covariance : Covariance or None
+        Of its parameters; without it there are no bands.
+    angle_rad, velocity_rad_s : ndarray, shape (K,)
+        Angle and velocity of each fitted pulse interval.
+    at_work : ndarray of bool, shape (K,)
+        Those in which the muscle was stimulated: only they show g.
+
+    Returns
+    -------
+    dict
+        Empty if nothing of the model depends on the joint. Tables have one row for each angle and one column for each
+        velocity; `seen_g` and `seen_h` count the pulse intervals nearest to each.
+    """
+    surfaces = Surfaces.of(model)
+    if surfaces is None:
+        return {}
+    low, high = surfaces.settings.get("angle_range_rad", (float(angle_rad.min()), float(angle_rad.max())))
+    angles = np.unique(np.r_[np.linspace(low, high, ANGLES), np.clip(surfaces.reference_rad, low, high)])
+    fastest = max(float(np.max(np.abs(velocity_rad_s))), 1e-3)
+    shares = np.array(SPEEDS)
+    velocities = fastest * np.r_[-shares[:0:-1], shares]
+    x, v = np.meshgrid(angles, velocities, indexing="ij")
+    found = {
+        "reference_angle_rad": surfaces.reference_rad,
+        "angle_rad": angles,
+        "velocity_rad_s": velocities,
+        "g": surfaces.g(x, v).round(6),
+        "h_nm": surfaces.h_nm(x, v).round(6),
+        "inertia_nm_s2_per_rad": surfaces.inertia_nm_s2_per_rad,
+        "formula": {
+            "torque": FORMULA,
+            "g": [one.form.equation for one in surfaces.acting if not one.adds],
+            "h": [one.form.equation for one in surfaces.acting if one.adds],
+        },
+        "seen_g": _seen(angles, velocities, angle_rad[at_work], velocity_rad_s[at_work]),
+        "seen_h": _seen(angles, velocities, angle_rad, velocity_rad_s),
+    }
+    if covariance is not None:
+        found |= _bands(surfaces, covariance, x, v, found["g"], found["h_nm"])
+    return found
+
+
+def _bands(
+    surfaces: Surfaces, covariance: Covariance, x: np.ndarray, v: np.ndarray, g: np.ndarray, h_nm: np.ndarray
+) -> dict[str, Any]:
+    rows = [place for place, name in enumerate(covariance.names) if "." in name]
+    matrix = covariance.matrix[np.ix_(rows, rows)]
+    slopes = surfaces.slopes([covariance.names[row] for row in rows], x, v)
+    found: dict[str, Any] = {"level_percent": 95}
+    for name, unit, value, slope in (("g", "", g, slopes[0]), ("h", "_nm", h_nm, slopes[1])):
+        half = POINTWISE * np.sqrt(np.maximum(np.einsum("iab,ij,jab->ab", slope, matrix, slope, optimize=True), 0.0))
+        found |= {f"{name}_lower{unit}": (value - half).round(6), f"{name}_upper{unit}": (value + half).round(6)}
+    return found
+
+
+def _seen(angles: np.ndarray, velocities: np.ndarray, angle_rad: np.ndarray, velocity_rad_s: np.ndarray) -> np.ndarray:
+    """Number of the given points nearest to each cell of the table, shape (len(angles), len(velocities))."""
+    edges = [np.r_[-np.inf, 0.5 * (axis[1:] + axis[:-1]), np.inf] for axis in (angles, velocities)]
+    return np.histogram2d(angle_rad, velocity_rad_s, bins=edges)[0].astype(int)
+
+
+def _rows(values: Mapping[str, float]) -> dict[str, np.ndarray]:
+    return {name: np.array([[value]]) for name, value in values.items()}
+
+
+def _value(entry: Any) -> float:
+    return entry["value"] if isinstance(entry, dict) else entry

@@ -1,0 +1,210 @@
+"""Each fault of the angle sensor, as its frames show it; on a clock that the test moves."""
+
+from __future__ import annotations
+
+import math
+import random
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hardware_sim.angle_sensors.encoder import Encoder, Mounting
+from hardware_sim.angle_sensors.sensor import AngleSensor
+from hardware_sim.errors import FaultError
+from hardware_sim.faults.registry import Faults, library
+from hardware_sim.load_cells.cells import plain, with_angle
+from hardware_sim.load_cells.frames import Frame
+from hardware_sim.load_cells.sampler import LoadCell
+from hardware_sim.sampling import Noise, take_in_order
+from hardware_sim.timeline import Timeline
+from tests.hardware_sim.test_load_cells import Ramp
+
+OWN = struct.Struct("<fHBB")
+ANGLE_FAULTS = sorted(name for name in library() if name.startswith("angle_"))
+
+
+@dataclass
+class Bench:
+    """An angle sensor beside a cell, and nothing else; it implements what these faults need of `Target`."""
+
+    angle_deg: Callable[[float], float] = lambda time_s: 60.0 + 5.0 * time_s
+    in_cell: bool = False
+    random: random.Random = field(default_factory=lambda: random.Random(1))
+    timeline: Timeline = field(default_factory=Timeline)
+    angle_sensor: AngleSensor | None = None
+
+    def __post_init__(self) -> None:
+        self.encoder: Encoder | None = Encoder(self.angle_deg, Mounting(offset_deg=10.0, noise_deg=0.0, bits=20), 0)
+        cell = with_angle.Cell() if self.in_cell else plain.Cell()
+        read = self.encoder.read if self.in_cell else None
+        self.load_cell = LoadCell(Ramp(), cell, Noise(0.0, 0), 1600.0, read_angle=read)
+        samplers: list[Any] = [self.load_cell]
+        if not self.in_cell:
+            self.angle_sensor = AngleSensor(self.encoder, self.load_cell.add_frame)
+            samplers.append(self.angle_sensor)
+        self.timeline.followers.append(lambda until_s: take_in_order(samplers, until_s))
+        self.faults = Faults(self)  # pyright: ignore[reportArgumentType]
+
+    def frames(self, seconds: float = 1.0) -> list[Frame]:
+        """Frames of the next while."""
+        self.load_cell.take_frames()
+        self.timeline.run_until(self.timeline.now_s + seconds)
+        return self.load_cell.take_frames()
+
+    def rows(self, seconds: float = 1.0) -> list[tuple[float, int, int, int]]:
+        """The angle sensor's next frames."""
+        return [OWN.unpack(frame.data) for frame in self.frames(seconds) if frame.can_id == 0x182]
+
+    def broken(self, name: str, seconds: float = 1.0, **settings: Any) -> list[tuple[float, int, int, int]]:
+        """The next frames with this fault; it is off afterwards."""
+        self.faults.on(name, settings)
+        rows = self.rows(seconds)
+        self.faults.off(name)
+        return rows
+
+
+@pytest.fixture
+def bench() -> Bench:
+    made = Bench()
+    made.rows(0.1)
+    return made
+
+
+def angles(rows: list[tuple[float, int, int, int]]) -> np.ndarray:
+    return np.array([row[0] for row in rows])
+
+
+def steps(rows: list[tuple[float, int, int, int]]) -> set[int]:
+    return {(after[1] - before[1]) & 0xFFFF for before, after in pairwise(rows)}
+
+
+def test_the_contracts_list_is_there() -> None:
+    assert set(ANGLE_FAULTS) == {
+        "angle_stuck", "angle_silent", "angle_jump", "angle_nan", "angle_offset_step", "angle_reversed",
+        "angle_noise_burst", "angle_frames_lost", "angle_frames_repeated", "angle_counter_jump", "angle_unplugged",
+        "angle_rate_off", "angle_fault_bit", "angle_delayed",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ANGLE_FAULTS)
+def test_each_ends_without_a_trace_in_the_readings(bench: Bench, name: str) -> None:
+    bench.broken(name, 0.5)
+    rows = bench.rows(0.5)
+    assert len(rows) == pytest.approx(100, abs=1)
+    assert steps(rows) == {1}
+    assert {row[2] for row in rows} == {0}
+    assert angles(rows) == pytest.approx(70.0 + 5.0 * (0.6 + 0.005 * np.arange(len(rows))), abs=0.05)
+
+
+def test_stuck(bench: Bench) -> None:
+    rows = bench.broken("angle_stuck")
+    assert len(set(angles(rows))) == 1
+    assert steps(rows) == {1}
+
+
+def test_silent_and_unplugged_differ_in_the_counter(bench: Bench) -> None:
+    before = bench.rows(0.1)[-1][1]
+    assert bench.broken("angle_silent") == []
+    assert bench.rows(0.01)[0][1] == before + 201
+    frames = []
+    bench.faults.on("angle_unplugged", {})
+    frames = bench.frames()
+    bench.faults.off("angle_unplugged")
+    assert {frame.can_id for frame in frames} == {0x181}
+    assert bench.rows(0.01)[0][1] == 0
+
+
+def test_jump_is_of_single_readings(bench: Bench) -> None:
+    off = np.diff(angles(bench.broken("angle_jump", 5.0, step_deg=15.0, probability=0.05)))
+    assert set(np.round(off / 15.0)) >= {-1.0, 0.0, 1.0}
+    assert 0.05 < np.mean(np.abs(off) > 7.0) < 0.15
+
+
+def test_nan(bench: Bench) -> None:
+    assert np.all(np.isnan(angles(bench.broken("angle_nan"))))
+    some = np.isnan(angles(bench.broken("angle_nan", probability=0.3)))
+    assert 0.2 < some.mean() < 0.4
+
+
+def test_offset_step(bench: Bench) -> None:
+    last = bench.rows(0.1)[-1][0]
+    assert bench.broken("angle_offset_step", step_deg=7.0)[0][0] == pytest.approx(last + 7.0, abs=0.05)
+
+
+def test_reversed_from_where_it_is_or_about_its_zero(bench: Bench) -> None:
+    last = bench.rows(0.1)[-1][0]
+    turned = angles(bench.broken("angle_reversed"))
+    assert turned[0] == pytest.approx(last, abs=0.1), "no jump gives it away"
+    assert np.polyfit(0.005 * np.arange(turned.size), turned, 1)[0] == pytest.approx(-5.0, rel=0.01)
+    true_deg = angles(bench.broken("angle_reversed", 0.1, about_present=False)) - 10.0
+    assert np.all(true_deg < -60.0)
+
+
+def test_noise_burst(bench: Bench) -> None:
+    noisy = angles(bench.broken("angle_noise_burst", 5.0, sd_deg=3.0))
+    assert np.diff(noisy).std() == pytest.approx(3.0 * math.sqrt(2.0), rel=0.1)
+
+
+def test_delayed_by_what_was_asked_and_stamped_as_if_not(bench: Bench) -> None:
+    now = bench.timeline.now_s
+    rows = bench.broken("angle_delayed", 1.0, delay_s=0.2)
+    late_deg = 70.0 + 5.0 * (now + 0.005 * np.arange(len(rows))) - angles(rows)
+    assert late_deg[-1] == pytest.approx(1.0, abs=0.03)
+    assert steps(rows) == {1}
+
+
+def test_fault_bit(bench: Bench) -> None:
+    rows = bench.broken("angle_fault_bit")
+    assert {row[2] for row in rows} == {1}
+    assert angles(rows)[-1] > angles(rows)[0]
+
+
+def test_lost_repeated_and_counter(bench: Bench) -> None:
+    lost = bench.broken("angle_frames_lost", 10.0)
+    assert steps(lost) >= {1, 2}
+    assert len(lost) == pytest.approx(1800, abs=50)
+    assert steps(bench.broken("angle_frames_repeated", 5.0)) == {0, 1}
+    before = bench.rows(0.1)[-1][1]
+    assert bench.broken("angle_counter_jump", step=500)[0][1] == before + 501
+
+
+def test_rate_off(bench: Bench) -> None:
+    assert len(bench.broken("angle_rate_off", 10.0, percent=-8.0)) == pytest.approx(1840, abs=2)
+
+
+def test_a_fault_of_the_bus_takes_both(bench: Bench) -> None:
+    bench.faults.on("bus_off", {})
+    assert [frame.error for frame in bench.frames()] == []  # the error frame itself was among those let go of
+    bench.faults.off("bus_off")
+    bench.faults.on("delivery_jitter", {"largest_s": 0.05})
+    frames = [frame for _ in range(400) for frame in bench.frames(0.0025)]
+    bench.faults.off("delivery_jitter")
+    for can_id, fewest in ((0x181, 1400), (0x182, 170)):
+        counters = [OWN.unpack(frame.data)[1] for frame in frames if frame.can_id == can_id]
+        assert len(counters) > fewest
+        assert {(after - before) & 0xFFFF for before, after in pairwise(counters)} == {1}
+
+
+def test_in_the_cells_frame_readings_fail_and_frames_are_the_cells() -> None:
+    bench = Bench(in_cell=True)
+    bench.faults.on("angle_nan", {})
+    bench.faults.on("angle_fault_bit", {})
+    rows = [struct.unpack("<fhBB", frame.data) for frame in bench.frames(0.1)]
+    assert {(row[1], row[3]) for row in rows} == {(-32768, 2)}
+    with pytest.raises(FaultError, match="use the load cell's fault"):
+        bench.faults.on("angle_silent", {})
+
+
+def test_nonsense_is_told(bench: Bench) -> None:
+    for name, settings in {"angle_delayed": {"delay_s": math.nan}, "angle_rate_off": {"percent": -100.0}}.items():
+        with pytest.raises(FaultError, match=name):
+            bench.faults.on(name, settings)
+    bench.encoder = None
+    for name in ANGLE_FAULTS:
+        with pytest.raises(FaultError, match="start it with --arm"):
+            bench.faults.on(name, {})

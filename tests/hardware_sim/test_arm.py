@@ -1,0 +1,390 @@
+"""The arm's physics: laws, signs, energy, stops, a pendulum's period, and whatever moves it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hardware_sim.arm import description, registry
+from hardware_sim.arm.description import Arm
+from hardware_sim.arm.limb import Limb
+from hardware_sim.arm.mechanics import Mechanics
+from hardware_sim.arm.motion import Begin, Motion
+from hardware_sim.arm.passive.standard_linear_solid import Law as Solid
+from hardware_sim.arm.tissue import PLACES, REFERENCE_RAD, Tissue, bare, law
+from hardware_sim.errors import ArmError
+from hardware_sim.patients import registry as patients
+from hardware_sim.scan import modules_with
+
+STEP_S = 1.0 / 1600.0
+RANGE = np.radians(np.linspace(0.0, 140.0, 71))
+
+
+class Constant:
+    """A muscle with the same torque for ever."""
+
+    def __init__(self, torque_nm: float = 0.0) -> None:
+        self.level_nm = torque_nm
+
+    def pulse(self, time_s: float, width_us: float, current_ma: float) -> None:
+        raise AssertionError((time_s, width_us, current_ma))
+
+    def torque_nm(self, time_s: float) -> float:
+        return self.level_nm + 0.0 * time_s
+
+
+def rows(limb: Limb, seconds: float, begin_s: float = 0.0) -> np.ndarray:
+    """Torque at the cell, angle, velocity, acceleration at 1600 Hz."""
+    times_s = begin_s + STEP_S * np.arange(1, round(seconds / STEP_S))
+    return np.array([[limb.torque_nm(float(time_s)), *limb.motion] for time_s in times_s])
+
+
+def heavy(**mechanics: Any) -> Tissue:
+    """A pendulum without any loss."""
+    return replace(bare(), mechanics=Mechanics(**{"inertia_kg_m2": 0.07, **mechanics}))
+
+
+def names(place: str) -> list[str]:
+    return list(modules_with(PLACES[place], "Law"))
+
+
+class TestLaws:
+    def test_there_are_several_of_each(self) -> None:
+        assert set(names("passive")) >= {
+            "double_exponential", "fibre_exponential", "linear_friction", "standard_linear_solid",
+        }  # fmt: skip
+        assert set(names("torque_angle")) >= {"parabola", "force_length", "moment_arm", "arm_and_length"}
+        assert set(names("torque_velocity")) >= {"hill", "logarithmic", "bell"}
+
+    @pytest.mark.parametrize("name", names("passive"))
+    def test_tissue_pushes_back_from_both_ends_and_never_gives_energy(self, name: str) -> None:
+        passive = law("passive", name)
+        still = passive.torque_nm(RANGE, 0.0)
+        assert still.shape == RANGE.shape
+        assert np.all(np.diff(still) <= 1e-12)
+        if name != "none":
+            assert still[0] > 0.5 > -0.5 > still[-1]
+        turn = np.linspace(0.0, 2.0 * math.pi, 4001)
+        angle, velocity = 1.2 + 0.8 * np.sin(turn), 0.8 * np.cos(turn)
+        work_j = np.trapezoid(passive.torque_nm(angle, velocity) * velocity, turn)
+        assert work_j <= 1e-9
+        assert work_j < -0.01 or name == "none"
+
+    @pytest.mark.parametrize("name", names("torque_angle"))
+    def test_a_share_is_positive_and_has_one_best_angle(self, name: str) -> None:
+        share = law("torque_angle", name).share(RANGE)
+        assert np.all((share > 0.0) & (share <= 1.1))
+        rising = np.diff(share)[np.abs(np.diff(share)) > 1e-12] > 0
+        assert np.count_nonzero(rising[1:] != rising[:-1]) <= 1
+        assert Tissue(torque_angle=law("torque_angle", name)).g(REFERENCE_RAD, 0.0) == pytest.approx(1.0)
+
+    @pytest.mark.parametrize("name", names("torque_velocity"))
+    def test_a_muscle_that_shortens_gives_less_and_one_that_is_stretched_more(self, name: str) -> None:
+        velocity = np.linspace(-8.0, 20.0, 400)
+        share = law("torque_velocity", name).share(np.full(400, REFERENCE_RAD), velocity)
+        assert law("torque_velocity", name).share(REFERENCE_RAD, 0.0) == pytest.approx(1.0)
+        assert np.all(np.diff(share) <= 1e-12)
+        assert np.all((share >= 0.0) & (share < 2.0))
+        assert (share[0] > 1.1 and share[-1] < 0.3) or name == "none"
+
+    @pytest.mark.parametrize("name", ["hill", "logarithmic"])
+    def test_the_slope_at_rest_is_the_same_on_both_sides(self, name: str) -> None:
+        share = law("torque_velocity", name).share
+        below, at, above = (float(share(REFERENCE_RAD, v)) for v in (-1e-4, 0.0, 1e-4))
+        assert at - below == pytest.approx(above - at, rel=1e-3)
+
+    def test_numbers_of_the_papers(self) -> None:
+        hill = law("torque_velocity", "hill", {"largest_rad_s": 10.0, "curvature": 0.25, "plateau": 1.5})
+        assert hill.share(1.0, 5.0) == pytest.approx(0.5 / 3.0)
+        assert hill.share(1.0, 10.0) == 0.0
+        assert hill.share(1.0, -1e9) == pytest.approx(1.5)
+        fibre = law(
+            "passive", "fibre_exponential", {"extensor_nm": 0.0, "flexor_slack_rad": 1.3, "viscosity_nm_s": 0.0}
+        )
+        assert fibre.torque_nm(1.3 - 0.6 / 0.5, 0.0) == pytest.approx(6.0), "one at a stretch of 0.6 lengths"
+        parabola = law("torque_angle", "parabola", {"linear_per_deg": 0.0344, "quadratic_per_deg2": 4.49e-4})
+        assert parabola.share(math.radians(70.0)) == pytest.approx(1.0 + 0.0344 * 20 - 4.49e-4 * 400)
+        thelen = law("torque_angle", "force_length", {"best_rad": 1.0, "lengths_per_rad": 0.5, "gamma": 0.45})
+        assert thelen.share(2.0) == pytest.approx(math.exp(-0.25 / 0.45))
+
+    def test_a_solid_relaxes_with_its_time_constant(self) -> None:
+        solid = Solid(stiffness_nm_per_rad=2.0, lasting_share=0.5, relaxation_s=1.0, viscosity_nm_s=0.0)
+        memory = solid.begin(1.0)
+        for _ in range(1600):
+            memory = solid.step(memory, 1.5, STEP_S)
+        assert solid.remembered_nm(memory, 1.5) == pytest.approx(-0.5 * math.exp(-1.0), rel=1e-9)
+
+    def test_a_law_that_is_not_there_is_told(self) -> None:
+        for asked, told in {
+            ("colour", "red"): "no laws of 'colour'",
+            ("passive", "jelly"): "unknown law of passive 'jelly'",
+        }.items():
+            with pytest.raises(ArmError, match=told):
+                law(*asked)
+        with pytest.raises(ArmError, match="has no parameter 'mass'"):
+            law("passive", "none", {"mass": 1.0})
+        with pytest.raises(ArmError, match="must be a finite number"):
+            law("passive", "linear_friction", {"dry_nm": math.nan})
+
+
+class TestWhatTheCellMeasures:
+    def test_at_the_reference_angle_it_is_the_muscles_torque_and_passive_torque(self) -> None:
+        limb = Limb(Constant(5.0), Arm())
+        assert limb.torque_nm(1.0) == pytest.approx(5.0 + Tissue().h_nm(REFERENCE_RAD, 0.0))
+
+    def test_gravity_pulls_the_horizontal_forearm_into_extension(self) -> None:
+        for upper_arm_deg, angle_deg, wanted in (
+            (0, 90, -2.8),
+            (0, 0, 0.0),
+            (90, 0, -2.8),
+            (90, 90, 0.0),
+            (0, 30, -1.4),
+        ):
+            arm = Arm("held", {"angle_deg": angle_deg}, heavy(weight_nm=2.8, upper_arm_deg=upper_arm_deg))
+            assert Limb(Constant(), arm).torque_nm(1.0) == pytest.approx(wanted, abs=1e-9)
+
+    def test_a_forearm_that_is_speeded_up_pulls_the_other_way(self) -> None:
+        limb = Limb(Constant(), Arm("script", {"points": [[0, 90], [1, 120]]}, heavy()))
+        found = rows(limb, 1.5)
+        assert np.abs(found[:, 3]).max() > 1.0
+        assert found[:, 0] == pytest.approx(-0.07 * found[:, 3], abs=1e-12)
+
+    def test_active_torque_follows_g_and_not_the_isometric_torque(self) -> None:
+        tissue = replace(Tissue(passive=law("passive", "none")), mechanics=Mechanics(inertia_kg_m2=0.0))
+        limb = Limb(Constant(6.0), Arm("robot", {"from_deg": 40, "to_deg": 120, "deg_s": 80}, tissue))
+        found = rows(limb, 4.0)
+        assert found[:, 0] == pytest.approx(6.0 * tissue.g(found[:, 1], found[:, 2]))
+        slow = np.abs(found[:, 1] - 1.4) < 0.05
+        assert np.ptp(found[slow, 0]) > 0.5, "at one angle, less while it flexes than while it extends"
+
+    def test_the_real_muscle_behind_it_gets_the_pulses(self) -> None:
+        alone, limb = patients.make("paper"), Limb(patients.make("paper"), Arm(tissue=bare()))
+        for k in range(40):
+            for muscle in (alone, limb):
+                muscle.pulse(0.025 * k, 200.0, 20.0)
+        assert limb.torque_nm(1.0) == pytest.approx(alone.torque_nm(1.0), rel=1e-9)
+
+
+class TestFree:
+    def test_a_pendulums_period(self) -> None:
+        tissue = heavy(weight_nm=2.8, least_deg=-90.0)
+        limb = Limb(Constant(), Arm("held", {"angle_deg": 6.0}, tissue))
+        limb.move("free", {})
+        angle = rows(limb, 6.0)[:, 1]
+        crossings = STEP_S * np.flatnonzero((angle[:-1] > 0) & (angle[1:] <= 0))
+        period_s = 2.0 * math.pi * math.sqrt(0.07 / 2.8) * (1.0 + math.radians(6.0) ** 2 / 16.0)
+        assert np.diff(crossings).mean() == pytest.approx(period_s, rel=1e-3)
+
+    def test_energy_is_kept_without_loss_and_lost_with_tissue(self) -> None:
+        def energy_j(found: np.ndarray) -> np.ndarray:
+            return 0.5 * 0.07 * found[:, 2] ** 2 - 2.8 * np.cos(found[:, 1])
+
+        mechanics = {"weight_nm": 2.8, "least_deg": -170.0, "most_deg": 170.0}
+        ideal = Limb(Constant(), Arm("free", {}, heavy(**mechanics)))
+        kept = energy_j(rows(ideal, 5.0))
+        assert np.ptp(kept) < 1e-6
+        real = replace(heavy(**mechanics), passive=law("passive", "linear_friction", {"stiffness_nm_per_rad": 0.0}))
+        lost = energy_j(rows(Limb(Constant(), Arm("free", {}, real)), 5.0))
+        assert np.all(np.diff(lost) <= 1e-9)
+        assert lost[-1] < lost[0] - 1.0
+
+    def test_it_loads_no_cell_and_the_flexor_flexes_it(self) -> None:
+        limb = Limb(Constant(1.0), Arm("free", {}, replace(Tissue(), mechanics=Mechanics(weight_nm=2.8))))
+        found = rows(limb, 8.0)
+        assert not found[:, 0].any()
+        assert abs(found[-1, 2]) < 0.02, "it has come to rest"
+        tissue = replace(Tissue(), mechanics=Mechanics(weight_nm=2.8))
+        balance_nm = tissue.g(found[-1, 1], 0.0) + tissue.h_nm(found[-1, 1], 0.0)
+        assert balance_nm == pytest.approx(0.0, abs=0.03)
+        stronger = rows(Limb(Constant(3.0), Arm("free", {}, tissue)), 8.0)
+        assert stronger[-1, 1] > found[-1, 1]
+
+    def test_stops_end_the_range_and_never_pull(self) -> None:
+        for torque_nm, ends_deg in ((15.0, 145.0), (-15.0, -5.0)):
+            found = rows(Limb(Constant(torque_nm), Arm("free", {}, heavy())), 6.0)
+            assert np.degrees(found[-1, 1]) == pytest.approx(ends_deg, abs=math.degrees(15.5 / 200.0))
+            assert np.degrees(np.abs(found[:, 1] - math.radians(70.0))).max() < 75.0 + 18.0
+        mechanics = Mechanics()
+        away = mechanics.stops_nm(math.radians(150.0), np.linspace(-50.0, 50.0, 101))
+        assert np.all(away <= 0.0)
+        assert mechanics.stops_nm(1.5, 5.0) == 0.0
+
+    def test_a_forearm_without_inertia_is_not_let_go(self) -> None:
+        limb = Limb(Constant(), Arm(tissue=bare()))
+        with pytest.raises(ArmError, match="without inertia"):
+            limb.move("free", {})
+        assert limb.state()["arm"] == "held"
+
+
+class TestMovers:
+    def test_angle_velocity_and_acceleration_belong_together_whatever_is_asked_of_it(self) -> None:
+        """Also where one mover takes over from another in full movement: no jump of angle or velocity."""
+        limb, rng = Limb(Constant(1.0), Arm(), seed=4), np.random.default_rng(3)
+        asked: list[tuple[str, dict[str, Any]]] = [
+            ("robot", {"from_deg": 20, "to_deg": 130, "deg_s": 120}),
+            ("hand", {"from_deg": 110, "to_deg": 40, "deg_s": 60}),
+            ("held", {}),
+            ("script", {"points": [[0, 100], [0.5, 90], [1.5, 30]]}),
+            ("free", {}),
+            ("waves", {"hz": [0.2, 0.3], "deg": [20, 10], "phase_rad": [0.3, 2.0]}),
+            ("held", {"angle_deg": 70}),
+            ("hand", {}),
+        ]
+        found = []
+        for mode, settings in asked * 2:
+            limb.move(mode, settings, limb._time_s)
+            found.append(rows(limb, float(rng.uniform(0.7, 2.5)), limb._time_s))
+        angle, velocity = np.concatenate(found)[:, 1:3].T
+        between = np.diff(angle) / STEP_S
+        assert np.abs(between - 0.5 * (velocity[1:] + velocity[:-1])).max() < 0.01
+        assert np.abs(np.diff(velocity)).max() < 0.35, "the fastest servo's acceleration in one step"
+        assert np.all(np.degrees(angle) > -10.0) and np.all(np.degrees(angle) < 160.0)
+
+    @pytest.mark.parametrize("mode", registry.modes())
+    def test_the_movement_does_not_depend_on_when_it_is_looked_at(self, mode: str) -> None:
+        if mode == "free":
+            return
+        settings = {"script": {"points": [[0, 40], [1, 60], [2, 50]]}, "held": {"angle_deg": 40}}.get(mode, {})
+        begin = Begin(0.0, Motion(1.2), seed=5)
+        often, seldom = registry.make(mode, begin, settings), registry.make(mode, begin, settings)
+        for k in range(1, 3001):
+            seen = often.advance(0.001 * k, lambda _x, _v: 0.0)
+            if k % 377 == 0:
+                assert seldom.advance(0.001 * k, lambda _x, _v: 0.0) == pytest.approx(seen)
+
+    def test_a_robot_keeps_its_limit_and_comes_to_rest_between(self) -> None:
+        robot = {"from_deg": 30, "to_deg": 120, "deg_s": 200, "limit_deg_s": 50, "pause_s": 2.5}
+        found = rows(Limb(Constant(), Arm("robot", robot)), 12.0)
+        assert np.degrees(np.abs(found[:, 2]).max()) == pytest.approx(50.0, rel=1e-6)
+        assert np.degrees(found[:, 1].min()) == pytest.approx(30.0, abs=1.0)
+        assert np.degrees(found[:, 1].max()) == pytest.approx(120.0, abs=1.0)
+
+    def test_the_servo_is_of_second_order(self) -> None:
+        settings = {
+            "from_deg": 100.0,
+            "to_deg": 100.0,
+            "deg_s": 1000.0,
+            "bandwidth_hz": 1.0,
+            "damping": 1.0,
+            "pause_s": 9,
+        }
+        robot = registry.make("robot", Begin(0.0, Motion(math.radians(99.0))), {**settings, "limit_deg_s": 1000.0})
+        for time_s in np.linspace(0.05, 1.0, 20):
+            angle = robot.advance(float(time_s), lambda _x, _v: 0.0).angle_rad
+            turn = 2.0 * math.pi * time_s
+            assert 100.0 - math.degrees(angle) == pytest.approx((1.0 + turn) * math.exp(-turn), abs=0.01)
+
+    def test_a_hand_is_not_steady_and_no_two_sweeps_are_alike(self) -> None:
+        def sweeps(seed: int, **settings: float) -> np.ndarray:
+            arm = Arm("hand", {"from_deg": 40, "to_deg": 110, "deg_s": 40, **settings}, heavy())
+            return rows(Limb(Constant(), arm, seed), 30.0)
+
+        uneven, again, steady = sweeps(1), sweeps(1), sweeps(1, unsteady=0)
+        assert np.array_equal(uneven, again)
+        assert not np.allclose(uneven, sweeps(2))
+        peaks = {name: turning_points(each) for name, each in (("uneven", uneven), ("steady", steady))}
+        assert np.std(peaks["uneven"]) > math.radians(1.0)
+        assert np.std(peaks["steady"]) < math.radians(0.1)
+        speeds = np.degrees(np.abs(uneven[:, 2]))
+        assert 35.0 < np.percentile(speeds, 80) < 60.0
+
+    def test_a_hand_that_holds_still_wanders_and_trembles_by_some_millinewtonmetres(self) -> None:
+        found = rows(Limb(Constant(), Arm("hand", {}, heavy()), 3), 40.0)[3200:]
+        assert 0.1 < np.degrees(np.std(found[:, 1])) < 1.2
+        spectrum = np.abs(np.fft.rfft(found[:, 0] * np.hanning(found.shape[0])))
+        hz = np.fft.rfftfreq(found.shape[0], STEP_S)
+        tremor = spectrum[(hz > 7.0) & (hz < 13.0)].max()
+        assert tremor > 20.0 * np.median(spectrum[(hz > 3.0) & (hz < 7.0)])
+        assert 0.002 < np.std(found[:, 0]) < 0.05
+
+    def test_a_script_goes_through_its_points(self) -> None:
+        points = [[0.0, 90], [1.0, 60], [2.5, 100], [3.0, 100], [4.0, 80]]
+        limb = Limb(Constant(), Arm("script", {"points": points}))
+        found = rows(limb, 6.0)
+        angle, lead_s = np.degrees(found[:, 1]), 0.2
+        for time_s, deg in points:
+            assert np.interp(time_s + lead_s, STEP_S * np.arange(1, angle.size + 1), angle) == pytest.approx(
+                deg, abs=0.1
+            )
+        assert angle.min() > 59.9 and angle.max() < 100.1
+        assert abs(found[-1, 2]) < 1e-9
+
+    def test_it_starts_where_its_movement_begins(self) -> None:
+        for arm, deg in (
+            (Arm("held", {"angle_deg": 45}), 45.0),
+            (Arm("robot", {"from_deg": 33}), 33.0),
+            (Arm("script", {"points": [[0, 70], [1, 80]]}), 70.0),
+            (Arm("free"), 90.0),
+        ):
+            assert math.degrees(Limb(Constant(), arm).motion.angle_rad) == pytest.approx(deg)
+
+    @pytest.mark.parametrize(
+        ("mode", "settings", "told"),
+        [
+            ("fly", {}, "unknown mode of the arm 'fly'; there are free, hand, held, robot, script, waves"),
+            ("held", {"angle": 3}, "no setting 'angle'; it has angle_deg, deg_s"),
+            ("held", {"angle_deg": 161}, "'angle_deg' must be between -10 and 160"),
+            ("held", {"angle_deg": "up"}, "'angle_deg' must be between"),
+            ("held", {"angle_deg": math.inf}, "must be a finite number"),
+            ("robot", {"deg_s": 0}, "'deg_s' must be between"),
+            ("robot", {"damping": True}, "'damping' must be between"),
+            ("script", {"points": [[1, 2], [0, 3]]}, "must rise"),
+            ("script", {"points": "abc"}, "two or more"),
+            ("waves", {"hz": [1.0], "deg": [1.0, 2.0]}, "equally long"),
+            ("waves", {"hz": 3}, "lists of numbers"),
+        ],
+    )
+    def test_nonsense_is_told_and_it_goes_on_as_before(self, mode: str, settings: dict[str, Any], told: str) -> None:
+        limb = Limb(Constant(), Arm("robot"))
+        with pytest.raises(ArmError, match=told):
+            limb.move(mode, settings)
+        assert limb.mode == "robot"
+
+
+def turning_points(found: np.ndarray) -> np.ndarray:
+    """Angles at which sweeps turn back into extension, rad."""
+    highest = found[:, 1] > 0.5 * (found[:, 1].min() + found[:, 1].max())
+    borders = np.flatnonzero(highest[1:] != highest[:-1])
+    return np.array([found[a:b, 1].max() for a, b in pairwise(borders) if highest[a + 1]])
+
+
+class TestFile:
+    def test_everything_that_it_may_say(self, tmp_path: Path) -> None:
+        path = tmp_path / "arm.toml"
+        path.write_text(
+            'mode = "robot"\n[movement]\nfrom_deg = 50\n[mechanics]\nweight_nm = 2.5\n'
+            '[passive]\nlaw = "linear_friction"\ndry_nm = 0.3\n[torque_velocity]\nlaw = "none"\n'
+        )
+        arm = description.read(str(path))
+        assert (arm.mode, arm.movement, arm.start_deg) == ("robot", {"from_deg": 50}, 50.0)
+        assert arm.tissue.mechanics.weight_nm == 2.5
+        assert arm.tissue.passive == law("passive", "linear_friction", {"dry_nm": 0.3})
+        assert arm.tissue.torque_angle == Tissue().torque_angle
+        path.with_suffix(".json").write_text('{"mode": "held", "movement": {"angle_deg": 30}}')
+        assert description.read(str(path.with_suffix(".json"))).start_deg == 30.0
+
+    @pytest.mark.parametrize(
+        ("text", "told"),
+        [
+            ('colour = "red"', "a table of mode, movement, mechanics"),
+            ("movement = 3", "'movement' must be a table"),
+            ("mode = ", "not valid TOML"),
+            ('[passive]\nlaw = "jelly"', "arm.toml: unknown law of passive 'jelly'"),
+            ("[mechanics]\nmass_kg = 1", "arm.toml: mechanics has no parameter 'mass_kg'"),
+        ],
+    )
+    def test_mistakes_name_the_file(self, text: str, told: str, tmp_path: Path) -> None:
+        path = tmp_path / "arm.toml"
+        path.write_text(text)
+        with pytest.raises(ArmError, match=told):
+            description.read(str(path))
+
+    def test_a_file_that_is_not_there(self, tmp_path: Path) -> None:
+        with pytest.raises(ArmError, match="cannot be read"):
+            description.read(str(tmp_path / "none.toml"))

@@ -1,0 +1,90 @@
+"""An angle sensor that lives on a virtual clock, in one thread: for tests of receiver, run and recording."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from rig.acquire.angle_receiver import AngleReceiver
+from rig.clock import VirtualClock
+from rig.errors import DeviceError
+from rig.signals import ANGLE_SAMPLE, AngleBlock, AngleScale
+
+RATE_HZ = 200.0
+PER_BLOCK = 2
+
+
+def still(_: float) -> float:
+    """A joint that is held at 60 degrees."""
+    return math.radians(60)
+
+
+class FakeSensor:
+    """Blocks of two samples with a 16-bit counter, degrees with an offset and reversed; faults are attributes."""
+
+    sample_rate_hz = RATE_HZ
+    counter_modulus = 65536
+    scale = AngleScale(offset=30.0, direction=-1, radians_per_unit=math.pi / 180)
+    of_the_cell = False
+    on_the_cells_bus = True
+
+    def __init__(self, clock: VirtualClock, angle_rad: Callable[[float], float] = still) -> None:
+        self.clock, self.angle_rad = clock, angle_rad
+        self.silent = self.fault = self.nan = self.repeating = False
+        self.add_deg = 0.0
+        self.rate = 1.0
+        self.skip = 0
+        self.late_s = 0.0
+        self.noise_deg = 0.02
+        self.counter = 65400
+        self._rng = np.random.default_rng(3)
+
+    def open(self) -> dict[str, Any]:
+        if self.silent:
+            raise DeviceError("angle_sensor.bus: it is not there")
+        return {"device": "fake"}
+
+    def read(self, timeout_s: float) -> AngleBlock:
+        raise NotImplementedError
+
+    def close(self) -> None: ...
+
+    def block(self, n: int = PER_BLOCK, at_s: float | None = None) -> AngleBlock:
+        """The next samples; the last one is taken now."""
+        now_s = self.clock.now_s() if at_s is None else at_s
+        if not self.repeating:
+            self.counter += n + self.skip
+        self.skip = 0
+        times_s = now_s - np.arange(n)[::-1] / RATE_HZ
+        samples = np.zeros(n, ANGLE_SAMPLE)
+        samples["host_time_s"], samples["stamp_s"] = now_s, np.nan
+        degrees = np.degrees([self.angle_rad(t) for t in times_s]) + self.noise_deg * self._rng.standard_normal(n)
+        samples["raw"] = np.nan if self.nan else 30.0 - degrees + self.add_deg
+        samples["angle_rad"] = self.scale.angle_rad(samples["raw"])
+        samples["counter"] = (self.counter - np.arange(n)[::-1]) % 65536
+        samples["fault"] = self.fault
+        return AngleBlock(samples)
+
+    def feed(self, receiver: AngleReceiver, until_s: float) -> None:
+        """Schedule blocks for the receiver until a time."""
+        period_s = PER_BLOCK / RATE_HZ / self.rate
+        first_s = self.clock.now_s() + 0.0003  # between two blocks of the cell
+        for i in range(1, math.ceil((until_s - first_s) / period_s)):
+            self.clock.call_at(first_s + i * period_s, lambda: self._send(receiver))
+
+    def _send(self, receiver: AngleReceiver) -> None:
+        if self.silent:
+            self.counter += PER_BLOCK
+            return
+        block = self.block()
+        if self.late_s:
+            self.clock.call_at(self.clock.now_s() + self.late_s, lambda: self._arrive(receiver, block))
+        else:
+            receiver.take(block)
+
+    def _arrive(self, receiver: AngleReceiver, block: AngleBlock) -> None:
+        block.samples["host_time_s"] = self.clock.now_s()
+        receiver.take(block)

@@ -1,0 +1,223 @@
+"""Angles in a recording: aligned with the torque, with their velocity, covered by the hash, saved from damage."""
+
+from __future__ import annotations
+
+import math
+import struct
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+from rig import align_angle, angle_velocity, archive, assembly, journal
+from rig.align_angle import Reference
+from rig.errors import RecordingError
+from rig.journal import Kind
+from rig.signals import ANGLE_SAMPLE, SAMPLE
+from tests.rig.fakes import VirtualRig
+from tests.rig.test_angle_run import swinging
+
+CELL_HZ, SENSOR_HZ = 1600.0, 200.0
+PPM = 150.0
+"""By which the sensor's clock is fast."""
+
+
+def on_one_bus(
+    duration_s: float, rng: np.random.Generator, stamps: str = "", delay_ms: float = 2.0, sensor_hz: float = SENSOR_HZ
+) -> tuple[np.ndarray, Reference, np.ndarray]:
+    """Angle samples, torque samples and when the angles were taken; both are read late, in batches, in their order.
+
+    Without `stamps` there are none; of the "bus" one clock stamps both, of the "sensor" each stamps itself.
+    """
+    torque, angle = np.zeros(int(duration_s * CELL_HZ), SAMPLE), np.zeros(int(duration_s * sensor_hz), ANGLE_SAMPLE)
+    cell_s = np.arange(len(torque)) / CELL_HZ
+    taken_s = 0.0021 + np.arange(len(angle)) / sensor_hz / (1 + PPM * 1e-6)
+    both_s = np.concatenate([cell_s, taken_s])
+    order = np.argsort(both_s, kind="stable")
+    batch_s = np.ceil(both_s[order] / 0.004) * 0.004 + 1e-3 * rng.exponential(delay_ms, len(order))
+    read_s = np.empty(len(order))
+    read_s[order] = np.maximum.accumulate(batch_s) + 1e-6 * np.arange(len(order))
+    for samples, part, own_s in (
+        (torque, slice(None, len(torque)), cell_s),
+        (angle, slice(len(torque), None), taken_s),
+    ):
+        samples["host_time_s"] = 500.0 + read_s[part]
+        samples["counter"] = 1000 + np.arange(len(samples))
+        fast = 1 + (PPM * 1e-6 if samples is angle and stamps == "sensor" else 0.0)
+        samples["stamp_s"] = 1.7e9 + (own_s + 60.0) * fast if stamps else np.nan
+    return angle, Reference(torque, cell_s, 500.0, 0.2), taken_s
+
+
+@pytest.mark.parametrize(
+    ("stamps", "method", "within_ms"), [("bus", "stamps", 0.01), ("sensor", "order", 0.1), ("", "order", 0.1)]
+)
+def test_angles_on_the_cells_bus_are_aligned_with_the_torque(stamps: str, method: str, within_ms: float):
+    for seed in range(3):
+        angle, torque, taken_s = on_one_bus(20.0, np.random.default_rng(seed), stamps)
+        time_s, told = align_angle.beside(angle, SENSOR_HZ, torque, of_the_cell=False, one_bus=True)
+        assert told.method == method
+        assert np.max(np.abs(time_s - taken_s)) * 1e3 < within_ms
+        assert told.rate_ppm == pytest.approx(-PPM, abs=10.0)
+        assert told.error_ms < 1.0
+
+
+def test_a_standstill_of_the_host_shifts_no_angle():
+    angle, torque, taken_s = on_one_bus(20.0, np.random.default_rng(0))
+    for samples in (angle, torque.samples):
+        late = (samples["host_time_s"] > 508.0) & (samples["host_time_s"] < 508.4)
+        samples["host_time_s"][late] = 508.4 + 1e-3 * (samples["host_time_s"][late] - 508.0)
+    time_s, told = align_angle.beside(angle, SENSOR_HZ, torque, of_the_cell=False, one_bus=True)
+    assert told.method == "order"
+    assert np.max(np.abs(time_s - taken_s)) < 2e-4
+
+
+def test_a_sensor_in_step_with_the_cell_is_off_by_less_than_half_a_sample():
+    angle, torque, _ = on_one_bus(20.0, np.random.default_rng(0))
+    taken_s = 10 / CELL_HZ + np.arange(len(angle)) / SENSOR_HZ  # every eighth torque, to the microsecond
+    at = np.searchsorted(torque.time_s, taken_s - 1e-9)
+    angle["host_time_s"] = torque.samples["host_time_s"][np.minimum(at, len(torque.samples) - 1)] + 1e-7
+    time_s, told = align_angle.beside(angle[:3900], SENSOR_HZ, torque, of_the_cell=False, one_bus=True)
+    error_ms = np.abs(time_s - taken_s[:3900]) * 1e3
+    assert np.max(error_ms) <= 0.5e3 / CELL_HZ + 0.01 and told.error_ms >= 1e3 / CELL_HZ / math.sqrt(12)
+
+
+def test_over_another_adapter_the_least_delay_counts():
+    angle, torque, taken_s = on_one_bus(20.0, np.random.default_rng(0), delay_ms=0.5)
+    angle["host_time_s"] = 500.0 + taken_s + np.random.default_rng(1).exponential(5e-4, len(angle))
+    time_s, told = align_angle.beside(angle, SENSOR_HZ, torque, of_the_cell=False, one_bus=False)
+    assert told.method == "regression"
+    assert np.max(np.abs(time_s - taken_s)) < 1e-3
+
+
+@pytest.mark.parametrize("per_frame", [1, 3])
+def test_an_angle_in_the_cells_frame_has_exactly_its_time(per_frame: int):
+    _, torque, _ = on_one_bus(5.0, np.random.default_rng(0))
+    frames = len(torque.samples) // per_frame
+    torque.samples["host_time_s"] = torque.samples["host_time_s"][
+        np.arange(len(torque.samples)) // per_frame * per_frame
+    ]
+    angle = np.zeros(frames, ANGLE_SAMPLE)
+    angle["host_time_s"] = torque.samples["host_time_s"][::per_frame][:frames]
+    angle["counter"] = 70 + np.arange(frames)
+    lost = Reference(np.delete(torque.samples, np.s_[600:660]), np.delete(torque.time_s, np.s_[600:660]), 500.0, 0.2)
+    for reference in (torque, lost):
+        time_s, told = align_angle.beside(angle, CELL_HZ / per_frame, reference, of_the_cell=True, one_bus=True)
+        assert told.method == "cell"
+        assert np.allclose(time_s, torque.time_s[per_frame - 1 :: per_frame][:frames], atol=1e-9)
+
+
+def test_velocities_of_a_swing():
+    time_s = np.arange(800) / SENSOR_HZ
+    angle_rad = np.array([swinging(t) for t in time_s])
+    true_rad_s = math.radians(30) * math.pi / 2 * np.cos(math.pi / 2 * time_s)
+    noisy = angle_rad + math.radians(0.02) * np.random.default_rng(0).standard_normal(800)
+    found = angle_velocity.centred(noisy, np.arange(800), SENSOR_HZ)
+    assert np.max(np.abs(found - true_rad_s)[6:-6]) < 0.03
+    assert np.max(np.abs(angle_velocity.centred(angle_rad, np.arange(800), SENSOR_HZ) - true_rad_s)) < 1e-3
+    live = angle_velocity.LiveSlope(SENSOR_HZ)
+    numbers = np.arange(800)
+    late = np.concatenate([live.add(numbers[i : i + 7], angle_rad[i : i + 7]) for i in range(0, 800, 7)])
+    before_s = time_s - angle_velocity.LIVE_WINDOW_S / 2
+    assert np.max(np.abs(late - math.radians(30) * math.pi / 2 * np.cos(math.pi / 2 * before_s))[20:]) < 1e-3
+    assert np.isnan(late[:2]).all()
+
+
+def test_a_long_gap_breaks_the_velocity_and_a_short_one_does_not():
+    number = np.delete(np.arange(400), [*range(100, 106), *range(200, 220)])
+    angle_rad = np.where(number < 210, 0.01 * number, 5.0 - 0.01 * number)  # 2 rad/s, after the long gap -2 rad/s
+    found = angle_velocity.centred(angle_rad, number, SENSOR_HZ)
+    assert np.allclose(found, np.where(number < 210, 2.0, -2.0))
+    assert np.isfinite(angle_velocity.centred(np.array([1.0]), np.array([5]), SENSOR_HZ)).all()
+
+
+def played(folder: Path) -> VirtualRig:
+    rig = VirtualRig(folder, has_sensor=True)
+    rig.sensor.angle_rad = swinging
+    rig.execute()
+    return rig
+
+
+def test_the_sealed_file_holds_the_angle(tmp_path: Path):
+    rig = played(tmp_path)
+    sealed = archive.seal(assembly.assemble(journal.read(rig.path)), tmp_path)
+    with h5py.File(sealed.path) as file:
+        group = file["angle"]
+        assert {f"angle/{name}" for name in group} == {path for path, _, _ in archive.ANGLE_COLUMNS}
+        assert all(group[name].attrs["unit"] and group[name].attrs["description"] for name in group)
+        time_s = group["time_s"][:]
+        assert 0 <= time_s[0] < 0.01 and np.diff(time_s) == pytest.approx(1 / 200)
+        true_rad = np.array([swinging(t + rig.run.t0_s) for t in time_s])
+        assert np.max(np.abs(group["angle_rad"][:] - true_rad)) < math.radians(0.1) + 0.001 * math.radians(48)
+        assert np.allclose(group["raw"][:], 30.0 - np.degrees(group["angle_rad"][:]))
+        assert group.attrs["method"] == "regression" and group.attrs["velocity_delay_s"] == 0.0
+        assert group.attrs["velocity_method"] == "local quadratic over 60 ms, centred"
+        assert group.attrs["velocity_window_s"] == 0.06 and "nurse" in group.attrs["calibration"]
+        assert group.attrs["sample_rate_measured_hz"] == pytest.approx(200.0, rel=1e-3)
+    assert archive.verify(sealed.path) == sealed.content_sha256
+
+
+@pytest.mark.parametrize("change", ["value", "left out", "added"])
+def test_a_changed_angle_is_found(tmp_path: Path, change: str):
+    rig = VirtualRig(tmp_path, has_sensor=change != "added")
+    rig.execute()
+    sealed = archive.seal(assembly.assemble(journal.read(rig.path)), tmp_path)
+    with h5py.File(sealed.path, "a") as file:
+        if change == "value":
+            file["angle/angle_rad"][5] += 1e-6
+        elif change == "left out":
+            del file["angle"]
+        else:
+            for path, _, _ in archive.ANGLE_COLUMNS:
+                file[path] = np.zeros(3)
+    with pytest.raises(RecordingError, match="does not match"):
+        archive.verify(sealed.path)
+
+
+def test_without_a_sensor_the_file_is_what_it_was(tmp_path: Path):
+    rig = VirtualRig(tmp_path)
+    rig.execute()
+    recording = assembly.assemble(journal.read(rig.path))
+    assert recording.angle == {} and not any(path.startswith("angle/") for path in recording.columns)
+    sealed = archive.seal(recording, tmp_path)
+    with h5py.File(sealed.path) as file:
+        assert "angle" not in file
+    assert archive.verify(sealed.path) == sealed.content_sha256
+
+
+def damaged(path: Path, spoil: Any) -> journal.JournalContents:
+    """The journal with some blocks' payloads overwritten."""
+    data = bytearray(path.read_bytes())
+    at = data.find(journal.MARK)
+    while at >= 0:
+        kind, length = data[at + 4], struct.unpack_from("<I", data, at + 8)[0]
+        if spoil(Kind(kind)):
+            data[at + 20 : at + 20 + min(length, 8)] = b"\xff" * min(length, 8)
+        at = data.find(journal.MARK, at + 16 + length)
+    path.write_bytes(bytes(data))
+    return journal.read(path)
+
+
+def test_angles_are_saved_where_both_headers_are_lost(tmp_path: Path):
+    rig = played(tmp_path)
+    whole = assembly.assemble(journal.read(rig.path))
+    found = assembly.assemble(damaged(rig.path, lambda kind: kind in (Kind.HEADER, Kind.PLAN)))
+    assert "header are lost" in found.attributes["journal_note"]
+    off_s = found.columns["angle/time_s"][0] - whole.columns["angle/time_s"][0]
+    assert abs(off_s) < 0.02  # by times of arrival alone: the header said that both are on one bus
+    n = min(len(found.columns["angle/angle_rad"]), len(whole.columns["angle/angle_rad"])) - 5
+    assert n > 500 and np.array_equal(found.columns["angle/raw"][:n], whole.columns["angle/raw"][:n])
+    assert found.angle["sample_rate_hz"] == pytest.approx(200.0, rel=0.02)
+
+
+def test_lost_blocks_of_angles_are_gaps(tmp_path: Path):
+    rig = played(tmp_path)
+    count = iter(range(10_000))
+    spoiled = damaged(rig.path, lambda kind: kind == Kind.ANGLE and 100 <= next(count) < 110)
+    found = assembly.assemble(spoiled)
+    gaps = found.columns["angle/gaps"]
+    assert gaps.shape == (1, 2) and gaps[0, 1] == 20
+    first = gaps[0, 0]
+    assert np.diff(found.columns["angle/time_s"])[first - 1] == pytest.approx(21 / 200)
+    assert archive.verify(archive.seal(found, tmp_path).path)
