@@ -11,8 +11,8 @@ from api.store import audit
 from api.store.tables import Model, Recording
 
 JOINT_EFFECTS = ("passive_torque:surface|relaxing", "torque_angle:smooth", "torque_velocity:surface")
-"""What the torque does with angle and velocity, `identify.fitting.MOVING_JOINT` (the web process loads no numpy): fitted
-where nothing else is asked for."""
+"""What the torque does with angle and velocity, as `identify.fitting.MOVING_JOINT` (the web process loads no numpy):
+fitted where nothing else is asked for."""
 MOST = 20
 ANGLE = "angle_rad"
 

@@ -242,7 +242,8 @@ def _bands(
     slopes = surfaces.slopes([covariance.names[row] for row in rows], x, v)
     found: dict[str, Any] = {"level_percent": 95}
     for name, unit, value, slope in (("g", "", g, slopes[0]), ("h", "_nm", h_nm, slopes[1])):
-        half = WIDER[name] * POINTWISE * np.sqrt(np.maximum(np.einsum("iab,ij,jab->ab", slope, matrix, slope, optimize=True), 0.0))
+        variance = np.einsum("iab,ij,jab->ab", slope, matrix, slope, optimize=True)
+        half = WIDER[name] * POINTWISE * np.sqrt(np.maximum(variance, 0.0))
         found |= {f"{name}_lower{unit}": (value - half).round(6), f"{name}_upper{unit}": (value + half).round(6)}
     return found
 

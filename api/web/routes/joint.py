@@ -45,7 +45,7 @@ def _once(recordings: list[str]) -> list[str]:
 
 
 RecordingId = Annotated[str, StringConstraints(min_length=1, max_length=80)]
-EffectId = Annotated[str, StringConstraints(pattern=r"^[a-z0-9_]{1,64}$")]
+EffectId = Annotated[str, StringConstraints(pattern=r"^[a-z0-9_]{1,64}(:[a-z0-9_|]{1,100})?$")]
 
 
 class TogetherIn(Body):
