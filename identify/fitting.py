@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,7 @@ from identify.model import Model
 from identify.records.record import Record
 
 AUTO = "auto"
-MOVING_JOINT = ("passive_torque:surface", "torque_angle:smooth", "torque_velocity:surface")
+MOVING_JOINT = ("passive_torque:surface|relaxing", "torque_angle:smooth", "torque_velocity:surface")
 """Effects with which `fit` estimates all of the paper's Fig. 2 together, from joined records: h(x, ẋ), then g(x, ẋ) as
 a curve over the angle times a hyperbola over the velocity, both of free shape."""
 NO_EFFECTS_WITH = {"monotone", "order"}
@@ -122,9 +123,12 @@ def _with_effects(
     for name in wanted:
         get(name.partition(":")[0])  # an unknown one is refused before anything is fitted
     base, reasons = MAXIMUM_LIKELIHOOD.start(grid, rows, options)
-    for number, name in enumerate(wanted, start=1):
-        progress(number / (len(wanted) + 2), f"fitting {name.partition(':')[0].replace('_', ' ')}")
-        base = with_effects(base, [name], raw)
+    steps = count(1)
+
+    def tell(effect: str) -> None:
+        progress(min(next(steps), len(wanted)) / (len(wanted) + 2), f"fitting {effect.replace('_', ' ')}")
+
+    base = with_effects(base, wanted, raw, tell)
     progress((len(wanted) + 1) / (len(wanted) + 2), "bands and tests of the residual")
     model = finish(MAXIMUM_LIKELIHOOD.id, base, reasons)
     progress(1.0, "done")

@@ -22,6 +22,8 @@ from hardware_sim.errors import ArmError
 from hardware_sim.patients.muscle import Muscle
 
 LONGEST_STEP_S = 1.0 / 1600.0
+SEEDS_APART = 1 << 32
+"""No two movements of one limb are alike, nor those of two limbs with neighbouring seeds."""
 
 
 class Limb:
@@ -32,7 +34,7 @@ class Limb:
     """
 
     def __init__(self, muscle: Muscle, arm: Arm, seed: int = 0) -> None:
-        self._seed = seed
+        self._seed, self._moves = seed, 0
         self.motion = Motion(math.radians(arm.start_deg))
         self.converted_nm = getattr(muscle, "converted_nm", None)
         self._muscle, self._tissue = muscle, arm.tissue
@@ -52,10 +54,11 @@ class Limb:
             There is no such mode, or a setting makes no sense; then it goes on as before.
         """
         self._advance(time_s)
-        mover = registry.make(mode, Begin(self._time_s, self.motion, self._seed), settings)
+        begin = Begin(self._time_s, self.motion, self._seed + SEEDS_APART * self._moves)
+        mover = registry.make(mode, begin, settings)
         if not (mover.holds or self._inertia_kg_m2 > 0.0):
             raise ArmError(f"mode '{mode}': a forearm without inertia (a hidden patient's) cannot be let go")
-        self._mover = mover
+        self._mover, self._moves = mover, self._moves + 1
         self.mode = mode
 
     def pulse(self, time_s: float, width_us: float, current_ma: float) -> None:

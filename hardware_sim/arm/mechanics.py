@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -24,6 +25,8 @@ class Mechanics:
     horizontal plane. Beyond `least_deg` and `most_deg` a stop pushes back, stiffer while it is being compressed, and
     never pulls (Hunt and Crossley 1975).
     """
+
+    ABOVE: ClassVar[dict[str, float]] = {"inertia_kg_m2": 0.0, "stop_nm_per_rad": 0.0}
 
     inertia_kg_m2: float = 0.07
     weight_nm: float = 0.0

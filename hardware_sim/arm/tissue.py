@@ -28,7 +28,7 @@ def law(place: str, name: str, parameters: Mapping[str, Any] | None = None) -> A
     Raises
     ------
     ArmError
-        There is no such place, law or parameter, or a value is not a finite number.
+        There is no such place, law or parameter, or a value is not a finite number or out of range.
     """
     if place not in PLACES:
         raise ArmError(f"the arm has no laws of {place!r}; it has {', '.join(PLACES)}")
@@ -39,12 +39,12 @@ def law(place: str, name: str, parameters: Mapping[str, Any] | None = None) -> A
 
 
 def built(kind: Any, what: str, parameters: Mapping[str, Any]) -> Any:
-    """The dataclass of numbers `kind` with these parameters.
+    """The dataclass of numbers `kind` with these parameters; its `ABOVE` says what some must be above.
 
     Raises
     ------
     ArmError
-        It has no such parameter, or a value is not a finite number.
+        It has no such parameter, or a value is not a finite number or out of range.
     """
     known = [each.name for each in dataclasses.fields(kind)]
     for key, value in parameters.items():
@@ -52,6 +52,9 @@ def built(kind: Any, what: str, parameters: Mapping[str, Any]) -> Any:
             raise ArmError(f"{what} has no parameter '{key}'; it has {', '.join(known) or 'none'}")
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
             raise ArmError(f"parameter '{key}' of {what} must be a finite number, not {value!r}")
+        lowest = getattr(kind, "ABOVE", {}).get(key, -math.inf)
+        if not value > lowest:
+            raise ArmError(f"parameter '{key}' of {what} must be above {lowest:g}, not {value!r}")
     return kind(**parameters)
 
 

@@ -225,6 +225,9 @@ class Form:
     fixed : bool
         Whether its parameters are found in the samples before the fit, and are not fitted. The fitted torque is
         corrected for it beforehand.
+    fine : bool
+        For "additive" only: whether it changes so fast that it is averaged over each pulse interval in the fit, instead
+        of taken in its middle.
     source : str
         Publication.
     state : callable or None
@@ -245,6 +248,7 @@ class Form:
     accept: Callable[[dict[str, float], Scene], bool] | None = None
     restarts: tuple[dict[str, float], ...] = ()
     fixed: bool = False
+    fine: bool = False
     source: str = ""
     state: Callable[[np.ndarray, dict[str, Any], Scene], np.ndarray] | None = None
 

@@ -50,21 +50,19 @@ SIZES = (3.0, 3.0, 2.0, 2.0, 1.5, 1.0, 1.0, 1.0, 0.7, 0.5, 0.4, 0.3)
 def _surface(_: None, p: dict[str, Any], scene: Scene) -> np.ndarray:
     velocity, place = _speed(scene), scene.place
     elastic = sum(p[f"elastic_{i}_nm"] * bend for i, bend in enumerate(scene.bends(SHAPES), start=1))
-    viscous = (
-        p["viscosity_nm_s_per_rad"] + p["tilt_nm_s_per_rad"] * place + p["bow_nm_s_per_rad"] * place**2
-    ) * velocity
+    viscous = p["viscosity_nm_s_per_rad"] + p["tilt_nm_s_per_rad"] * place + p["bow_nm_s_per_rad"] * place**2
     acceleration = 0.0 if scene.acceleration_rad_s2 is None else scene.acceleration_rad_s2
     dry = p["dry_nm"] * np.tanh(velocity / p["dry_below_rad_s"])
-    return elastic + viscous + dry + _relaxing(p, scene) + p["inertia_nm_s2_per_rad"] * acceleration
+    return elastic + viscous * velocity + dry + p["inertia_nm_s2_per_rad"] * acceleration
 
 
-def _relaxing(p: dict[str, Any], scene: Scene) -> np.ndarray:
-    """A spring behind a dashpot: tissue that gives way (standard linear solid)."""
+def _relaxing(_: None, p: dict[str, Any], scene: Scene) -> np.ndarray:
+    """As `_surface`, and a spring behind a dashpot."""
     away = scene.away_rad
     begins = np.zeros(away.size, bool) if scene.begins is None else scene.begins
     time_constants, row = np.unique(p["relaxation_s"], return_inverse=True)
     followed = relaxed(away, scene.time_s, begins, time_constants)
-    return p["relaxing_nm_per_rad"] * (away - followed[row.ravel()])
+    return _surface(None, p, scene) + p["relaxing_nm_per_rad"] * (away - followed[row.ravel()])
 
 
 _STIFF = Parameter(
@@ -77,6 +75,29 @@ _STIFF = Parameter(
     "linear",
     "torque",
     "elastic part, at the reference angle",
+)
+
+_FREE = Form(
+    SURFACE,
+    "additive",
+    "y + Σ elastic_k (T_k(x) - T_k(reference)) + (viscosity + tilt·x + bow·x²)·velocity + dry·tanh(velocity/below) + "
+    "inertia·acceleration, x: place in the fitted range, -1 to 1",
+    (
+        *(
+            Parameter(f"elastic_{i}_nm", "N·m", -size, size, 0.0, (0.0,), "linear", "torque", f"polynomial {i}")
+            for i, size in enumerate(SIZES, start=1)
+        ),
+        _VISCOUS,
+        replace(_VISCOUS, name="tilt_nm_s_per_rad", about="viscosity's slope over the range"),
+        replace(_VISCOUS, name="bow_nm_s_per_rad", about="viscosity's curvature over the range"),
+        Parameter("dry_nm", "N·m", -0.5, 0.5, 0.0, (0.0,), "linear", "torque", "dry friction"),
+        Parameter("dry_below_rad_s", "rad/s", 0.01, 0.5, 0.07, (0.07,), "log", about="where it is less than that"),
+        Parameter("inertia_nm_s2_per_rad", "N·m·s²/rad", -0.5, 0.5, 0.0, (0.0,), about="of what the cell moves"),
+    ),
+    _surface,
+    True,
+    fine=True,
+    source="shape free: Riener and Edrich 1999 for what it has to follow; Coulomb friction; Newton",
 )
 
 EFFECT = Effect(
@@ -123,43 +144,18 @@ EFFECT = Effect(
             _two_sided,
             True,
         ),
-        Form(
-            SURFACE,
-            "additive",
-            "y + Σ elastic_k (T_k(x) - T_k(reference)) + (viscosity + tilt·x + bow·x²)·velocity + "
-            "dry·tanh(velocity/below) + relaxing·(Δ - z) + inertia·acceleration, z' = (Δ - z)/relaxation, "
-            "x: place in the fitted range, -1 to 1",
-            (
-                *(
-                    Parameter(
-                        f"elastic_{i}_nm",
-                        "N·m",
-                        -size,
-                        size,
-                        0.0,
-                        (0.0,),
-                        "linear",
-                        "torque",
-                        f"polynomial of degree {i}",
-                    )
-                    for i, size in enumerate(SIZES, start=1)
-                ),
-                _VISCOUS,
-                replace(_VISCOUS, name="tilt_nm_s_per_rad", about="viscosity's slope over the range"),
-                replace(_VISCOUS, name="bow_nm_s_per_rad", about="viscosity's curvature over the range"),
-                Parameter("dry_nm", "N·m", -0.5, 0.5, 0.0, (0.0,), "linear", "torque", "dry friction"),
-                Parameter(
-                    "dry_below_rad_s", "rad/s", 0.01, 0.5, 0.07, (0.07,), "log", about="where it is less than that"
-                ),
+        _FREE,
+        replace(
+            _FREE,
+            name="relaxing",
+            equation=f"{SURFACE} + relaxing·(Δ - z), z' = (Δ - z)/relaxation",
+            parameters=(
+                *_FREE.parameters,
                 replace(_STIFF, name="relaxing_nm_per_rad", start=(0.0,), about="stiffness that gives way"),
                 Parameter("relaxation_s", "s", 0.3, 10.0, 1.0, (1.0,), "log", about="time in which it does"),
-                Parameter(
-                    "inertia_nm_s2_per_rad", "N·m·s²/rad", -0.5, 0.5, 0.0, (0.0,), about="of what the cell moves"
-                ),
             ),
-            _surface,
-            True,
-            source="shape free: Riener and Edrich 1999 for what it has to follow; Coulomb friction; Newton",
+            apply=_relaxing,
+            source="standard linear solid, Fung 1981",
         ),
     ),
     signature="Torque that follows the movement, also without stimulation.",

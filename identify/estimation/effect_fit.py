@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -187,18 +187,45 @@ def detected_effects(raw: Raw) -> list[tuple[str, Form, dict[str, float]]]:
     return found
 
 
-def with_effects(base: Fitted, wanted: Sequence[str], raw: Raw) -> Fitted:
+def with_effects(base: Fitted, wanted: Sequence[str], raw: Raw, tell: Callable[[str], None] | None = None) -> Fitted:
     """The model with the named effects, each in its most likely form or in the one given after a colon.
+
+    Of several forms, `id:one|another`, the first is fitted; when all effects are there, the likeliest of them is taken.
+    `tell` is called with the id of each effect before it is fitted.
 
     Raises
     ------
     BadRequest, NotIdentifiable
         As `add_effect`; or no effect has that name.
     """
-    for name in wanted:
-        identifier, _, form = name.partition(":")
-        base = add_effect(base, get(identifier), form, raw)
+    chosen = [(identifier, forms.split("|")) for identifier, _, forms in (name.partition(":") for name in wanted)]
+    for identifier, forms in chosen:
+        if tell is not None:
+            tell(identifier)
+        base = add_effect(base, get(identifier), forms[0], raw)
+    for identifier, forms in chosen:
+        for form in forms[1:]:
+            if tell is not None:
+                tell(identifier)
+            other = in_form(base, identifier, form)
+            base = max(base, other, key=lambda fitted: fitted.log_evidence)
     return base
+
+
+def in_form(base: Fitted, effect: str, form: str) -> Fitted:
+    """The model with one of its effects in another form, fitted from what both forms share.
+
+    Raises
+    ------
+    BadRequest
+        The effect has no such form.
+    """
+    try:
+        other = get(effect).form(form)
+    except KeyError as error:
+        raise BadRequest(f"{effect} has no form {form!r}", place="effects") from error
+    problem = Problem(base.problem.setup, [(name, other if name == effect else own) for name, own in base.effects])
+    return solve(problem, start_from(problem, base, {}), base.noise, tolerance=TOLERANCE)
 
 
 def fitted_with(record: Record, wanted: Sequence[str]) -> Fitted:

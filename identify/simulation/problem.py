@@ -18,7 +18,7 @@ from identify.dynamics.second_order import Core
 from identify.dynamics.variable_speed import SpeedLaw, run_core
 from identify.effects.base import Form, Parameter
 from identify.recruitment.curve import Basis
-from identify.simulation.setup import Setup
+from identify.simulation.setup import WITHIN, Setup
 
 _NONE = np.zeros((0, 1))
 
@@ -387,7 +387,11 @@ class _StagePass:
                 continue
             # An added torque does not depend on the signal: rows with the same parameters share one evaluation.
             own = np.r_[0, np.arange(present, rows.size)]
-            added = np.asarray(chosen.form.call(None, self.named(chosen, values[own]), scene))
+            fine = chosen.form.fine and scene is self.setup.scene
+            at = self.setup.scene_within if fine else scene
+            added = np.asarray(chosen.form.call(None, self.named(chosen, values[own]), at))
+            if fine:
+                added = added.reshape(len(own), -1, WITHIN).mean(axis=2)
             value[:present] += added[:1]
             value[present:] += added[1:]
         return value

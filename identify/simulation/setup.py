@@ -13,6 +13,8 @@ from identify.dynamics.pulse_grid import Grid
 from identify.effects.base import Scene
 from identify.recruitment.curve import Basis
 
+WITHIN = 5
+"""A joint that turns round within a pulse interval has dry friction on both sides: the middle knows one of them."""
 ACCELERATION_S = 0.05
 """Time over which the slope of the velocity is taken: two pulse intervals."""
 
@@ -101,12 +103,26 @@ class Setup:
     def scene(self) -> Scene:
         """At the middle of the samples of each interval."""
         grid = self.grid
-        mean = np.bincount(grid.interval, grid.fraction, minlength=grid.size) / np.maximum(grid.count, 1)
-        mean = np.where(grid.count > 0, mean, 0.5)
-        scene = self._scene((np.arange(grid.size) + mean) * grid.step_s, grid.pulse_width_us, grid.begins)
+        scene = self._scene((np.arange(grid.size) + self._middle) * grid.step_s, grid.pulse_width_us, grid.begins)
         pauses = np.zeros(grid.size)
         pauses[grid.begins] = [part.pause_s - part.folded_s for part in grid.record.parts]
         return replace(scene, fitted=self.fitted, pauses_s=pauses, states=self.states)
+
+    @cached_property
+    def _middle(self) -> np.ndarray:
+        """Mean place of the samples within each interval, 0 to 1, shape (K,)."""
+        grid = self.grid
+        mean = np.bincount(grid.interval, grid.fraction, minlength=grid.size) / np.maximum(grid.count, 1)
+        return np.where(grid.count > 0, mean, 0.5)
+
+    @cached_property
+    def scene_within(self) -> Scene:
+        """At `WITHIN` places of each interval, evenly about the middle of its samples, shape (WITHIN K,)."""
+        grid = self.grid
+        about = (np.arange(WITHIN) + 0.5) / WITHIN - 0.5
+        time_s = (np.arange(grid.size) + self._middle)[:, None] + about
+        widths_us = np.repeat(grid.pulse_width_us, WITHIN)
+        return self._scene(time_s.ravel() * grid.step_s, widths_us, WITHIN * grid.begins)
 
     @cached_property
     def scene_at_ends(self) -> Scene:

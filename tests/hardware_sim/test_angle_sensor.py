@@ -10,6 +10,7 @@ from typing import Any
 import can
 import numpy as np
 import pytest
+import serial
 
 from hardware_sim.__main__ import main
 from hardware_sim.angle_sensors.encoder import Encoder, Mounting
@@ -18,8 +19,9 @@ from hardware_sim.load_cells.cells import plain, with_angle
 from hardware_sim.load_cells.frames import AngleReading, Frame, Sample
 from hardware_sim.load_cells.sampler import LoadCell
 from hardware_sim.sampling import Noise, take_in_order
-from tests.hardware_sim.emulated import Emulated, emulated
+from tests.hardware_sim.emulated import Emulated, emulated, wait_for
 from tests.hardware_sim.test_load_cells import Ramp, listen
+from tests.hardware_sim.test_pairs import p24
 
 OWN, IN_CELL = struct.Struct("<fHBB"), struct.Struct("<fhBB")
 
@@ -192,6 +194,15 @@ class TestOverTheWire:
             assert "angle_sensor" not in rig.ready
             assert rows_of(rig, 0x182, OWN, 500) == []
             assert rig.ask(cmd="arm", mode="held")["error"] == "this rig has no arm; start it with --arm"
+
+    def test_a_stimulated_arm_that_nobody_holds_flexes(self) -> None:
+        with emulated("--arm", "held,angle_deg=70") as rig:
+            assert rig.ask(cmd="arm", mode="free")["ok"]
+            before = rig.ask(cmd="state")["angle_deg"]
+            with serial.Serial(rig.ready["stimulator"], 3_000_000, timeout=20) as line:
+                p24(line)
+            wait_for(lambda: rig.ask(cmd="state")["angle_deg"] > before + 5.0)
+            assert rig.ask(cmd="state")["torque_nm"] == 0.0
 
     def test_the_control_line_moves_it(self) -> None:
         with emulated("--arm", "held", "--speed", "5") as rig:

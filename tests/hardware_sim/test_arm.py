@@ -131,6 +131,14 @@ class TestLaws:
             law("passive", "none", {"mass": 1.0})
         with pytest.raises(ArmError, match="must be a finite number"):
             law("passive", "linear_friction", {"dry_nm": math.nan})
+        for place, name, key, value in (
+            ("torque_velocity", "hill", "largest_rad_s", 0.0),
+            ("torque_velocity", "hill", "plateau", 1.0),
+            ("torque_angle", "force_length", "gamma", -0.1),
+            ("passive", "standard_linear_solid", "relaxation_s", 0),
+        ):
+            with pytest.raises(ArmError, match=f"'{key}' of law {name} of {place} must be above"):
+                law(place, name, {key: value})
 
 
 class TestWhatTheCellMeasures:
@@ -194,6 +202,7 @@ class TestFree:
         assert np.all(np.diff(lost) <= 1e-9)
         assert lost[-1] < lost[0] - 1.0
 
+    @pytest.mark.slow
     def test_it_loads_no_cell_and_the_flexor_flexes_it(self) -> None:
         limb = Limb(Constant(1.0), Arm("free", {}, replace(Tissue(), mechanics=Mechanics(weight_nm=2.8))))
         found = rows(limb, 8.0)
@@ -223,6 +232,7 @@ class TestFree:
 
 
 class TestMovers:
+    @pytest.mark.slow
     def test_angle_velocity_and_acceleration_belong_together_whatever_is_asked_of_it(self) -> None:
         """Also where one mover takes over from another in full movement: no jump of angle or velocity."""
         limb, rng = Limb(Constant(1.0), Arm(), seed=4), np.random.default_rng(3)
@@ -280,10 +290,11 @@ class TestMovers:
             turn = 2.0 * math.pi * time_s
             assert 100.0 - math.degrees(angle) == pytest.approx((1.0 + turn) * math.exp(-turn), abs=0.01)
 
+    @pytest.mark.slow
     def test_a_hand_is_not_steady_and_no_two_sweeps_are_alike(self) -> None:
         def sweeps(seed: int, **settings: float) -> np.ndarray:
             arm = Arm("hand", {"from_deg": 40, "to_deg": 110, "deg_s": 40, **settings}, heavy())
-            return rows(Limb(Constant(), arm, seed), 30.0)
+            return rows(Limb(Constant(), arm, seed), 20.0)
 
         uneven, again, steady = sweeps(1), sweeps(1), sweeps(1, unsteady=0)
         assert np.array_equal(uneven, again)
@@ -294,6 +305,7 @@ class TestMovers:
         speeds = np.degrees(np.abs(uneven[:, 2]))
         assert 35.0 < np.percentile(speeds, 80) < 60.0
 
+    @pytest.mark.slow
     def test_a_hand_that_holds_still_wanders_and_trembles_by_some_millinewtonmetres(self) -> None:
         found = rows(Limb(Constant(), Arm("hand", {}, heavy()), 3), 40.0)[3200:]
         assert 0.1 < np.degrees(np.std(found[:, 1])) < 1.2
@@ -376,6 +388,7 @@ class TestFile:
             ("movement = 3", "'movement' must be a table"),
             ("mode = ", "not valid TOML"),
             ('[passive]\nlaw = "jelly"', "arm.toml: unknown law of passive 'jelly'"),
+            ("[mechanics]\ninertia_kg_m2 = 0", "'inertia_kg_m2' of mechanics must be above 0"),
             ("[mechanics]\nmass_kg = 1", "arm.toml: mechanics has no parameter 'mass_kg'"),
         ],
     )

@@ -9,6 +9,7 @@ relaxed elbow) with Coulomb's friction, smooth at rest. The numbers are of their
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -18,6 +19,8 @@ from hardware_sim.arm.law import Number, PassiveLaw
 @dataclass(frozen=True)
 class Law(PassiveLaw):
     """A linear joint; within `smooth_rad_s` of rest, friction is smaller than `dry_nm`."""
+
+    ABOVE: ClassVar[dict[str, float]] = {"smooth_rad_s": 0.0}
 
     stiffness_nm_per_rad: float = 1.5
     rest_rad: float = 1.4

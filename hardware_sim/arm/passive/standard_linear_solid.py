@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 from hardware_sim.arm.law import Number, PassiveLaw
 
@@ -17,6 +18,8 @@ from hardware_sim.arm.law import Number, PassiveLaw
 @dataclass(frozen=True)
 class Law(PassiveLaw):
     """The memory is the dashpot's angle z."""
+
+    ABOVE: ClassVar[dict[str, float]] = {"relaxation_s": 0.0}
 
     stiffness_nm_per_rad: float = 2.0
     lasting_share: float = 0.6

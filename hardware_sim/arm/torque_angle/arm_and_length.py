@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -18,6 +19,8 @@ from hardware_sim.arm.law import Number
 @dataclass(frozen=True)
 class Law:
     """Angles where the arm and where the force is largest, rad; the other numbers are those of the two laws."""
+
+    ABOVE: ClassVar[dict[str, float]] = {"gamma": 0.0}
 
     arm_best_rad: float = 1.7
     arm_least: float = 0.45

@@ -6,6 +6,7 @@ A flexor's fibres shorten as the elbow flexes.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -15,6 +16,8 @@ from hardware_sim.arm.law import Number
 @dataclass(frozen=True)
 class Law:
     """Best angle, rad, lengths per rad, and γ."""
+
+    ABOVE: ClassVar[dict[str, float]] = {"gamma": 0.0}
 
     best_rad: float = 1.4
     lengths_per_rad: float = 0.5

@@ -7,6 +7,7 @@ degrees, so the default takes a flatter one of the same form, most at 80 degrees
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -16,6 +17,8 @@ from hardware_sim.arm.law import Number
 @dataclass(frozen=True)
 class Law:
     """Never below `least`."""
+
+    ABOVE: ClassVar[dict[str, float]] = {"least": 0.0}
 
     linear_per_deg: float = 0.002
     quadratic_per_deg2: float = 1.0e-4

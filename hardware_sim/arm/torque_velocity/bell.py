@@ -6,6 +6,7 @@ Their force loses V1 θ exp(-V2 θ) θ', θ in degrees, V2 = 0.0229. Here the be
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -15,6 +16,8 @@ from hardware_sim.arm.law import Number
 @dataclass(frozen=True)
 class Law:
     """Share lost per rad/s where it is most; V2 per degree; a stretched muscle gains no more than `plateau`."""
+
+    ABOVE: ClassVar[dict[str, float]] = {"plateau": 1.0}
 
     lost_per_rad_s: float = 0.15
     v2_per_deg: float = 0.0229

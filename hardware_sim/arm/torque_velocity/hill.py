@@ -6,6 +6,7 @@ shortening: (1 - v) / (1 + v / a),   stretched: 1 + (p - 1) s |v| / (p - 1 + s |
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -15,6 +16,8 @@ from hardware_sim.arm.law import Number
 @dataclass(frozen=True)
 class Law:
     """Largest velocity of the joint, rad/s; curvature a; plateau p."""
+
+    ABOVE: ClassVar[dict[str, float]] = {"largest_rad_s": 0.0, "curvature": 0.0, "plateau": 1.0}
 
     largest_rad_s: float = 15.0
     curvature: float = 0.3

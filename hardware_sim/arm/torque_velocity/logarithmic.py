@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -21,6 +22,8 @@ AT_REST = D1 * math.asinh(D3) + D4
 @dataclass(frozen=True)
 class Law:
     """Largest velocity of the joint, rad/s."""
+
+    ABOVE: ClassVar[dict[str, float]] = {"largest_rad_s": 0.0}
 
     largest_rad_s: float = 15.0
 
