@@ -33,9 +33,11 @@ EFFECTS: dict[str, Any] = {
     "voluntary_effort": lazy("Voluntary effort or spasm"),
 }
 PARAMETERS: dict[str, Any] = {
+    "bend_1": lazy("slope over the angle"),
     "ceiling": lazy("ceiling"),
     "delay": lazy("delay"),
     "depth": lazy("depth"),
+    "elastic_1": lazy("elastic torque over the angle"),
     "fall": lazy("time constant of relaxation"),
     "floor": lazy("floor"),
     "frequency": lazy("frequency"),
