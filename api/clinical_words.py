@@ -31,8 +31,15 @@ TEST_KINDS: dict[str, Any] = {
     "sequence": lazy("trial of a controller"),
     "adaptive": lazy("test that stops itself"),
     "passive": lazy("passive movement"),
-    "held": lazy("held angle"),
+    "held": lazy("held-angle test"),
     "moving": lazy("movement under stimulation"),
+}
+TITLES: dict[str, Any] = {
+    "pre-session": lazy("Pre-session test"),
+    "adaptive": lazy("Test that stops itself"),
+    "passive": lazy("Passive movement"),
+    "held": lazy("Held angle"),
+    "moving": lazy("Movement under stimulation"),
 }
 ADAPTIVE_ENDS: dict[str, Any] = {
     "known-enough": lazy("Enough is known"),
@@ -82,6 +89,11 @@ def verdict_words(verdict: str) -> str:
 def test_kind_words(kind: str) -> str:
     """What a person calls a kind of test."""
     return str(TEST_KINDS.get(kind, kind))
+
+
+def test_title(kind: str) -> str:
+    """The title of a test's page."""
+    return str(TITLES.get(kind, TITLES["pre-session"]))
 
 
 def test_state_words(state: str) -> str:

@@ -287,6 +287,7 @@ class AnglePoseRequest(Message):
     id: int = 0
     angle_rad: float = Field(description="elbow: 0 is straight, flexion positive, rad")
     by: str
+    first: bool = Field(False, description="begin anew: a first pose that waits for its second is forgotten")
 
 
 Request = Annotated[

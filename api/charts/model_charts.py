@@ -225,11 +225,16 @@ def recorded(found: dict[str, Any], plan_us: list[float], rate_hz: float, how: s
                 "text": said(_("%(how)s at %(time)s s", how=how, time=localised(f"{end_s:.1f}"))),
             }
         )
+    moves = bool(found.get("angle_deg"))
+    if moves:
+        data.append(line(found["angle_time_s"], found["angle_deg"], _("angle of the joint"), INK, 1.6, yaxis="y3"))
+    panels = ([0.6, 1.0], [0.0, 0.2], [0.3, 0.5]) if moves else ([0.48, 1.0], [0.0, 0.36], None)
+    more = {"yaxis3": axis(_("Angle (°)"), domain=panels[2])} if moves else {}
     return {
         "data": data,
         "layout": layout(
             shapes=shapes, annotations=labels,
-            xaxis=axis(_("Time (s)"), range=[0.0, last_s]), yaxis=axis(_("Torque (N·m)"), domain=[0.48, 1.0]),
-            yaxis2=axis(_("Pulse width (µs)"), domain=[0.0, 0.36], rangemode="tozero"),
+            xaxis=axis(_("Time (s)"), range=[0.0, last_s]), yaxis=axis(_("Torque (N·m)"), domain=panels[0]),
+            yaxis2=axis(_("Pulse width (µs)"), domain=panels[1], rangemode="tozero"), **more,
         ),
     }  # fmt: skip

@@ -6,7 +6,7 @@ import contextlib
 import json
 import math
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -22,6 +22,14 @@ DATA_HELP = (
 )
 Json = Annotated[bool, typer.Option("--json", help="one JSON object on standard output, nothing else there")]
 Data = Annotated[Path, typer.Argument(help=DATA_HELP, metavar="DATA", show_default=False)]
+SeveralData = Annotated[
+    list[Path],
+    typer.Argument(
+        help=f"{DATA_HELP}. Several are joined: recordings of one muscle, each a part of one record",
+        metavar="DATA…",
+        show_default=False,
+    ),
+]
 ColumnMap = Annotated[
     list[str] | None,
     typer.Option(
@@ -89,8 +97,50 @@ def load_record(data: Path, columns: list[str] | None = None) -> Any:
     return record
 
 
-def load_held(path: Path | None, data: Path, columns: list[str] | None = None) -> tuple[Any, Any, list[str]]:
-    """A record, the model whose structure is meant on it (none: the plain one), and the effects that this holds.
+def load_joined(data: Sequence[Path], columns: list[str] | None = None, effects: Sequence[str] = ()) -> Any:
+    """A record from its file, or from several as one; what was assumed goes to standard error.
+
+    Raises
+    ------
+    InputError
+        A file is named twice.
+    IdentifyError
+        One cannot be read, they do not go together, or one lacks what one of the `effects` needs.
+    """
+    from api.workers import several
+
+    twice = [path for number, path in enumerate(data) if path in data[:number]]
+    if twice:
+        raise InputError(f"{twice[0]}: named twice. Name each recording once.")
+    needs = _needed(effects) if len(data) > 1 else []
+    return several.read(data, columns, needs, note=lambda words: print(words, file=sys.stderr))
+
+
+def _needed(effects: Sequence[str]) -> list[str]:
+    """The columns that effects need; of an unknown one the fit says so."""
+    import identify
+    from identify import effects as library
+
+    found: list[str] = []
+    for effect in effects:
+        with contextlib.suppress(identify.IdentifyError):
+            found += library.get(effect.partition(":")[0]).needs
+    return list(dict.fromkeys(found))
+
+
+def short(data: Sequence[Path]) -> str:
+    """Files at the head of a report."""
+    return ", ".join(path.name for path in data)
+
+
+def called(data: Sequence[Path]) -> str:
+    """Files in a sentence."""
+    return " and ".join(str(path) for path in data) if len(data) < 3 else f"{len(data)} recordings, {data[0]} first"
+
+
+def load_held(path: Path | None, data: Sequence[Path], columns: list[str] | None = None) -> tuple[Any, Any, list[str]]:
+    """A record, of one file or of several; the model whose structure is meant on it (none: the plain one); the effects
+    that this holds.
 
     Raises
     ------
@@ -101,7 +151,7 @@ def load_held(path: Path | None, data: Path, columns: list[str] | None = None) -
     from api.structure import held_by
 
     model = None if path is None else load_model(path)
-    record = load_record(data, columns)
+    record = load_joined(data, columns)
     try:
         return record, model, held_by(model, record)
     except identify.IdentifyError as error:

@@ -123,6 +123,7 @@ class SessionTest(TypedDict):
     planned: dict[str, Any]
     recording_id: Any
     recording_url: Any
+    joint: dict[str, Any] | None
     joins: str | None
     model_id: Any
     model_url: Any
@@ -136,7 +137,8 @@ class Job(TypedDict):
 
     id: str
     kind: str
-    model_id: str
+    model_id: str | None
+    participant: str | None
     state: Literal["running", "completed", "failed", "cancelled"]
     done: bool
     progress: float

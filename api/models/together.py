@@ -10,8 +10,9 @@ from api.models.analyses import Analyses, OnCall
 from api.store import audit
 from api.store.tables import Model, Recording
 
-JOINT_EFFECTS = ("passive_torque", "torque_angle", "torque_velocity")
-"""What the torque does with angle and velocity: fitted where nothing else is asked for."""
+JOINT_EFFECTS = ("passive_torque:surface|relaxing", "torque_angle:smooth", "torque_velocity:surface")
+"""What the torque does with angle and velocity, as `identify.fitting.MOVING_JOINT` (the web process loads no numpy):
+fitted where nothing else is asked for."""
 MOST = 20
 ANGLE = "angle_rad"
 
@@ -36,8 +37,9 @@ async def fit(
         needs it, or the data do not allow the fit.
     """
     rows = await asyncio.to_thread(_found, analyses, participant, recordings)
-    await analyses.check_known(list(effects))
-    needs = [ANGLE] if set(effects) & set(JOINT_EFFECTS) else []
+    await analyses.check_known([name.partition(":")[0] for name in effects])
+    ids = {name.partition(":")[0] for name in effects}
+    needs = [ANGLE] if ids & {name.partition(":")[0] for name in JOINT_EFFECTS} else []
     whole = rows[0] if len(rows) == 1 else await _joined(analyses, rows, participant, needs)
     call = analyses.pool.submit("fit", data=whole.path, effects=list(effects))
     if on_call is not None:

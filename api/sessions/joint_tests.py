@@ -63,7 +63,10 @@ class JointTests:
         asked, longest_s = body.angle or AngleIn(), body.max_duration_s
         shared = await self._layout(plan, range_rad, longest_s, preview_s)
         angle = AnglePlan(range_rad=range_rad, tolerance_rad=asked.tolerance_rad)
-        told = {"kind": plan.kind, "doses": shared.doses, "known": shared.known, "longest_s": None, "target_rad": None}
+        told = {
+            "kind": plan.kind, "doses": shared.doses, "known": shared.known, "longest_s": None, "target_rad": None,
+            "tolerance_rad": asked.tolerance_rad,
+        }  # fmt: skip
         if plan.kind == HELD:
             target = await asyncio.to_thread(self._target, plan, asked, shared)
             angle.target_rad = told["target_rad"] = target
@@ -172,6 +175,8 @@ class JointTests:
         ended = told["ended"] if rigs == "enough" and told["ended"] else ENDS.get(rigs, rigs)
         if row.kind == HELD:
             ended = event.outcome
+        elif row.kind == MOVING and rigs == "plan":
+            ended = "torque-time"  # its levels were played: they are as many as its share allows
         measured = event.summary.get("torque_time_nms", told["torque_time_nm_s"])
         told |= {"state": "ended", "ended": ended, "torque_time_nm_s": measured}
         return {"joint": {**told, "angle_rad": None, "velocity_rad_s": None}}

@@ -52,6 +52,8 @@ class Question:
         Whether current flows on yes.
     back : str
         Where no leads to; the participant where nothing is said.
+    at_deg : tuple of float, optional
+        The joint must be between these angles when yes is said.
     """
 
     participant: str
@@ -62,6 +64,7 @@ class Question:
     warnings: list[str] = field(default_factory=list)
     stimulates: bool = False
     back: str = ""
+    at_deg: tuple[float, float] | None = None
     asker: tuple[str, str | None] = ("", None)
     asked_s: float = 0.0
     asked_unix_s: float = 0.0

@@ -16,6 +16,8 @@ class Current:
     test_id: str
     participant: str
     by: str
+    kind: str = ""
+    """Of the test."""
     started: bool = False
     """The rig has said that it plays."""
     ending: bool = False

@@ -177,7 +177,7 @@ class Runner:
         plan = planned.plan
         if body.joins is not None:
             await asyncio.to_thread(self._check_joins, body)
-        current = self.current = Current(plan.test_id, plan.participant, by)
+        current = self.current = Current(plan.test_id, plan.participant, by, plan.kind)
         current_test.set(plan.test_id)
         self.pool.cancel_background()
         try:
@@ -457,7 +457,7 @@ class Runner:
                 and status.test_id == row.id
                 and status.state not in ("ready", "latched", "uncertain")
             ):
-                self.current = Current(row.id, row.participant, row.requested_by, started=True)
+                self.current = Current(row.id, row.participant, row.requested_by, row.kind, started=True)
                 self.hub.begin(row.id)
             else:
                 self._follow(row.id, self._recover(row.id, "the service was restarted during the test"))

@@ -26,7 +26,13 @@ def diagnosis(
     """
     import identify
 
-    record = identify.read(Path(data), map=columns)
+    return diagnosed(identify.read(Path(data), map=columns), progress, model_json)
+
+
+def diagnosed(record: Any, progress: Progress, model_json: str | None = None) -> dict[str, Any]:
+    """The same of a record that was read."""
+    import identify
+
     model = None if model_json is None else identify.Model.from_json(model_json)
     structure = held_by(model, record)
     found = identify.diagnose(record, model, lambda share, text="": progress(0.8 * share, text)).to_dict()
@@ -113,40 +119,11 @@ def joined(parts: Sequence[str], out: str, progress: Progress, needs: Sequence[s
     """
     import hashlib
 
-    import identify
+    from api.workers import several
     from identify.records import parts_csv
-    from identify.records.join import join
 
     progress(0.1, "joining the recordings")
-    records = [identify.read(Path(part)) for part in parts]
-    check_columns(records, needs)
-    parts_csv.write(join(records, [begun(Path(part)) for part in parts]), Path(out))
+    whole = several.read([Path(part) for part in parts], needs=needs, name=lambda number: f"recording {number + 1}")
+    parts_csv.write(whole, Path(out))
     with Path(out).open("rb") as file:
         return {"file_sha256": hashlib.file_digest(file, "sha256").hexdigest()}
-
-
-def check_columns(records: Sequence[Any], needs: Sequence[str]) -> None:
-    """Refuse a record that lacks a column which the model needs. Raises BadRecord, which names the record's number."""
-    import identify
-
-    for number, record in enumerate(records, start=1):
-        lacking = [name for name in needs if getattr(record, name) is None]
-        if lacking:
-            raise identify.BadRecord(
-                f"it has no {', '.join(lacking)}, which an effect of the model needs",
-                place=f"recording {number}",
-                fix="Leave it out, or record it anew on a rig with an angle sensor.",
-            )
-
-
-def begun(path: Path) -> float | None:
-    """When a sealed recording's clock was 0, as Unix time; None for CSV: a joined one says it of its parts."""
-    from datetime import datetime
-
-    import identify
-    from identify.records.recording import attributes
-
-    try:
-        return datetime.fromisoformat(attributes(path, ["created_utc"])["created_utc"]).timestamp()
-    except (identify.IdentifyError, ValueError, OverflowError):
-        return None

@@ -8,8 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from api.workers.diagnosis_verbs import begun
 from api.workers.json_values import clean
+from api.workers.several import begun
 
 Progress = Callable[[float, str], None]
 MOST_MISSED = 50

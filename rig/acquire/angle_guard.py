@@ -19,6 +19,8 @@ from rig.signals import Recorded
 
 AROUND_S = 0.1
 """Real seconds over which the median tells where the joint is before a test."""
+PATIENCE_S = 2.0
+"""Real seconds to wait for a sensor that was just plugged in, or a rig that was just started."""
 
 
 class AngleGuard:
@@ -119,9 +121,11 @@ def check_start(receiver: AngleReceiver | None, plan: TestPlan, table: dict[str,
     if plan.angle is None:
         return
     assert receiver is not None
-    now_rad = receiver.angle_around(AROUND_S * clock.speed)
-    if now_rad is None:
-        raise DeviceError(_worded(receiver))
+    end_s = clock.now_s() + PATIENCE_S * clock.speed
+    while (now_rad := receiver.angle_around(AROUND_S * clock.speed)) is None:
+        if clock.now_s() > end_s:
+            raise DeviceError(_worded(receiver))
+        clock.wait(clock.now_s() + 0.02 * clock.speed)
     bound, target_rad, tolerance_rad = table["angle_rad"], plan.angle.target_rad, plan.angle.tolerance_rad
     if check(bound, now_rad) is not None:
         raise RefusedError(f"plan.angle: {outside(now_rad, bound)}; move the joint into it")

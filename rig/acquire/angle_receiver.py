@@ -25,8 +25,10 @@ from rig.journal import Journal, Kind
 from rig.signals import ANGLE_SAMPLE, AngleBlock, AngleScale, Recorded
 
 NAME = "angle sensor"
-REOPEN_S = 2.0
+REOPEN_S = 0.5
 """Real seconds between two attempts to open a sensor that is gone."""
+RESTARTED = 10
+"""Samples in a row whose numbers are behind: the sensor was without power for a moment and counts from zero."""
 LIVE_BLOCKS = 4000
 RECENT_S = 1.0
 """Real seconds of angles that are kept for a pose, and for where the joint is."""
@@ -55,6 +57,7 @@ class AngleReceiver(Stream[AngleBlock]):
         self.late_s = 0.0
         """How much later the newest sample came than the promptest one, by its number, rig seconds."""
         self._prompt: tuple[float, float] | None = None
+        self._behind = 0
         self._slope = LiveSlope(sensor.sample_rate_hz)
         self._recent: deque[NDArray[Any]] = deque()
         self._journal: Journal | None = None
@@ -106,14 +109,22 @@ class AngleReceiver(Stream[AngleBlock]):
         return samples[samples["host_time_s"] > self._clock.now_s() - duration_s]
 
     def angle_around(self, duration_s: float) -> float | None:
-        """Median of the last seconds' angles, rad; None if there is none."""
+        """Median of the last seconds' angles, rad; None if there is none, or one that is no number."""
         values = self.recent(duration_s)["angle_rad"]
-        return float(np.median(values)) if len(values) else None
+        return float(np.median(values)) if len(values) and np.all(np.isfinite(values)) else None
 
     def _scaled(self, samples: NDArray[Any]) -> NDArray[Any]:
         samples = samples.copy()
         samples["angle_rad"] = self.scale.angle_rad(samples["raw"])
         return samples
+
+    def _placed(self, samples: NDArray[Any]) -> NDArray[Any]:
+        before = self.counts.disordered_samples
+        placed = super()._placed(samples)
+        self._behind = 0 if len(placed) else self._behind + self.counts.disordered_samples - before
+        if self._behind >= RESTARTED:
+            self._count_on()
+        return placed
 
     def _keep(self, samples: NDArray[Any]) -> None:
         samples = self._scaled(samples)
@@ -159,10 +170,13 @@ class AngleReceiver(Stream[AngleBlock]):
     def _begin_anew(self) -> None:
         """A sensor that was without power counts from zero: its numbers go on from where the clock is."""
         with self._lock:
-            self._prompt = None
-            if self._unwrapper is not None and self._previous is not None:
-                passed_s = max(0.0, self._clock.now_s() - self._previous[1])
-                self._unwrapper.resume(self._previous[0] + 1 + round(passed_s * self.nominal_rate_hz))
+            self._count_on()
+
+    def _count_on(self) -> None:
+        self._prompt, self._behind = None, 0
+        if self._unwrapper is not None and self._previous is not None:
+            passed_s = max(0.0, self._clock.now_s() - self._previous[1])
+            self._unwrapper.resume(self._previous[0] + 1 + round(passed_s * self.nominal_rate_hz))
 
     def _gone(self, reason: str) -> None:
         self.problem = reason

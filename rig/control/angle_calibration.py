@@ -75,8 +75,8 @@ class AngleCalibrating:
             "set_at_utc": "",
         }
 
-    def pose(self, angle_rad: float, by: str, receiver: AngleReceiver, bound: Limit) -> bool:
-        """Take a pose; True if it completed a calibration.
+    def pose(self, angle_rad: float, by: str, receiver: AngleReceiver, bound: Limit, first: bool = False) -> bool:
+        """Take a pose; True if it completed a calibration. `first`: it begins anew, whichever one waits.
 
         Raises
         ------
@@ -91,7 +91,7 @@ class AngleCalibrating:
         if refusal is not None:
             raise RefusedError(f"angle_pose: {refusal}")
         pose = AnglePose(angle_rad=angle_rad, raw=still_raw(receiver, self._clock.speed))
-        if self.first is None:
+        if self.first is None or first:
             self.first = pose
             return False
         found = self._of_two(self.first, pose, by, receiver.sensor.scale)

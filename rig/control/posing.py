@@ -33,7 +33,9 @@ class Posing(Extending):
                 raise PlanError(NO_SENSOR.format("angle_pose"))
             if self._trial.busy:
                 raise BusyError(f"test {self._trial.test_id} is {self._trial.state}; take the pose afterwards")
-            self._poses.pose(request.angle_rad, request.by, self._angle_receiver(), self._table["angle_rad"])
+            self._poses.pose(
+                request.angle_rad, request.by, self._angle_receiver(), self._table["angle_rad"], request.first
+            )
             self._pair.rescale(self._poses.scale)
             self._publish(StateEvent(status=self.status()))
         return self.status()

@@ -76,12 +76,12 @@ class FakeArm:
             return f"the joint is at {angle_rad:.2f} rad, not within {plan.angle.tolerance_rad:g} rad of {target:.2f}"
         return ""
 
-    def pose(self, angle_rad: float, by: str, time_s: float) -> str:
+    def pose(self, angle_rad: float, by: str, time_s: float, first: bool = False) -> str:
         """Take a pose; why it is refused, or nothing."""
         if self.way is None:
             return "this rig has no angle sensor"
         found = m.AnglePose(angle_rad=angle_rad, raw=57.3 * self.way(time_s)[0] + 12.0)
-        if self.first is None:
+        if self.first is None or first:
             self.first = found
             return ""
         if abs(angle_rad - self.first.angle_rad) < 0.5:

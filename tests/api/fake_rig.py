@@ -309,7 +309,7 @@ class FakeRig:
     async def _on_angle_pose(self, request: Any, writer: Any) -> dict[str, Any]:
         if self.state != "ready":
             raise m_refusal("busy", "Not now", f"the rig is {self.state}")
-        if why := self.arm.pose(request.angle_rad, request.by, time.monotonic()):
+        if why := self.arm.pose(request.angle_rad, request.by, time.monotonic(), request.first):
             raise m_refusal("bad-plan", "Not taken", why)
         return self.status().model_dump()
 

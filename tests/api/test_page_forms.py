@@ -20,6 +20,7 @@ NAMES = (
     "archived", "at", "colours", "kind", "language", "muscle", "now", "q", "ran_by", "secret", "side",
     "plan", "reference", "max_duration_s", "trials", "target", "test_id", "text", "username",
     "gain_percent", "threshold_percent", "time_scale_percent",
+    "angle_deg", "angle_from_deg", "angle_to_deg", "first", "target_rad", "recording",
 )  # fmt: skip
 """Every field of every form; `test_no_field_is_forgotten` looks."""
 ODD = [

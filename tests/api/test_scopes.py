@@ -43,6 +43,15 @@ POST   /v1/sessions/lock                                   anyone         409
 POST   /v1/sessions/unlock                                 anyone         422
 GET    /v1/sequences                                       anyone         200
 GET    /v1/rig                                             read-live      200
+GET    /v1/rig/angle                                       read-live      200
+POST   /v1/rig/angle/pose                                  run-test       422
+GET    /rig/angle                                          run-test       409
+POST   /rig/angle/pose                                     run-test       4xx
+GET    /v1/participants/x/joint                            run-test       404
+POST   /v1/participants/x/models                           run-test       422
+GET    /participants/x/joint                               run-test       404
+POST   /participants/x/joint/tests                         run-test       4xx
+POST   /participants/x/joint/model                         run-test       404
 GET    /v1/tests                                           read-live      200
 GET    /v1/tests/x                                         read-live      404
 GET    /tests/x                                            read-live      404

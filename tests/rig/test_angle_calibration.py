@@ -97,6 +97,17 @@ def test_a_new_first_pose_begins_again_and_the_old_calibration_holds_until_the_s
     assert np.degrees(posed.poses.scale.angle_rad(np.array([30.0 - 40.0]))) == pytest.approx(45.0, abs=0.1)
 
 
+def test_a_wrong_first_pose_is_taken_once_more(posed: Posed):
+    posed.hold(20.0)
+    posed.pose(25.0)
+    posed.hold(90.0)
+    assert posed.poses.pose(math.radians(90.0), "nurse", posed.receiver, BOUND, first=True) is False
+    assert posed.poses.first is not None and posed.poses.first.angle_rad == pytest.approx(math.radians(90.0))
+    posed.hold(20.0)
+    assert posed.pose(20.0) is True
+    assert posed.poses.calibration is not None and posed.poses.calibration.offset == pytest.approx(30.0, abs=0.05)
+
+
 def test_a_pose_of_a_joint_that_moved_is_refused(posed: Posed):
     posed.moving_deg_s = 3.0
     posed.hold(20.0)

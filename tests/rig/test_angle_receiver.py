@@ -77,6 +77,25 @@ def test_a_sensor_that_starts_again_counts_on_by_the_clock():
     assert receiver.counts.disordered_samples == 0
 
 
+def test_a_sensor_that_was_without_power_for_a_moment_counts_on_soon():
+    clock, sensor, receiver = made()
+    run(clock, sensor, receiver, 1.0)
+    sensor.counter = 0
+    began_s = clock.now_s()
+    run(clock, sensor, receiver, 0.3)
+    assert receiver.data_age_s(clock.now_s()) < 0.03
+    assert receiver.counts.disordered_samples <= 12  # 50 ms until it is believed
+    assert receiver._previous is not None and receiver._previous[1] > began_s + 0.25
+
+
+def test_one_sample_that_is_no_number_leaves_no_angle():
+    clock, sensor, receiver = made()
+    run(clock, sensor, receiver, 0.5)
+    sensor.nan = True
+    receiver.take(sensor.block(1))
+    assert receiver.angle_around(0.1) is None
+
+
 def test_blocks_longer_than_half_of_a_small_counter_are_unwrapped():
     """148 frames at once after a standstill, of a cell that counts to 256."""
     unwrapper = CounterUnwrapper(256)

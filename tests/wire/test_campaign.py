@@ -18,6 +18,10 @@ FAULTS = (
     "corrupt_commands",
     "line_stalled",
     "line_stalled_70_ms",
+    "angle_silent",
+    "angle_offset_step",
+    "angle_stuck",
+    "angle_frames_lost",
 )
 """Those that the other tests of this folder do not make, and one of the load cell, played amid pulses (PRBS).
 
@@ -27,7 +31,7 @@ That one holds the 0.1 s of a rig file: a campaign's rigs have its watch.
 
 def test_a_short_campaign_finds_nothing_wrong():
     jobs = [(fault, PHASES[1:4][number % 3], 77) for number, fault in enumerate(FAULTS)]
-    found = campaign(jobs, workers=1, speed=4.0, minutes=2.5)
+    found = campaign(jobs, workers=1, speed=4.0, minutes=3.5)
     assert len(found) == len(FAULTS)
     for verdict in found:
         assert not verdict.failed, verdict

@@ -9,14 +9,16 @@ import typer
 
 from api.cli.terminal import (
     ColumnMap,
-    Data,
     Json,
     ModelFile,
+    SeveralData,
+    called,
+    load_joined,
     load_model,
-    load_record,
     model_report,
     say,
     say_json,
+    short,
     write,
 )
 
@@ -28,7 +30,7 @@ def register(app: typer.Typer) -> None:
 
 def compare(
     model_json: ModelFile,
-    data: Data,
+    data: SeveralData,
     html: Annotated[Path | None, typer.Option(help="write a report with charts here")] = None,
     columns: ColumnMap = None,
     as_json: Json = False,
@@ -42,16 +44,16 @@ def compare(
     from api.workers.verbs import clean, curves, thinned
 
     model = load_model(model_json)
-    record = load_record(data, columns)
+    record = load_joined(data, columns)
     found = identify.compare(model, record).to_dict()
     if html is not None:
         drawn = clean(curves(model, record))
-        write(html, comparison_html(model.to_dict(), drawn, data.name, comparison=thinned(found)))
+        write(html, comparison_html(model.to_dict(), drawn, short(data), comparison=thinned(found)))
     if as_json:
         say_json(found)
         return
     about = f"{model_json}, its figures on what it was fitted to"
-    say(about, *model_report(model.to_dict()), "", f"{data} against it, all rows", *comparison_lines(found))
+    say(about, *model_report(model.to_dict()), "", f"{called(data)} against it, all rows", *comparison_lines(found))
     if html is not None:
         say("", f"report         {html}")
 

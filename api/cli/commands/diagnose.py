@@ -6,7 +6,7 @@ from typing import Any
 
 import typer
 
-from api.cli.terminal import ColumnMap, Data, HeldModel, Json, load_held, number, percent, say, say_json
+from api.cli.terminal import ColumnMap, HeldModel, Json, SeveralData, load_held, number, percent, say, say_json
 from api.progress_bar import progress_bar
 from api.structure import in_words, worded
 
@@ -23,7 +23,7 @@ def register(app: typer.Typer) -> None:
 
 
 def diagnose(
-    data: Data,
+    data: SeveralData,
     model_json: HeldModel = None,
     columns: ColumnMap = None,
     as_json: Json = False,

@@ -10,11 +10,11 @@ import typer
 from api.cli.errors import InputError
 from api.cli.terminal import (
     ColumnMap,
-    Data,
     Json,
+    SeveralData,
     carried_lines,
+    load_joined,
     load_model,
-    load_record,
     model_report,
     names,
     say,
@@ -32,7 +32,7 @@ def register(app: typer.Typer) -> None:
 
 
 def fit(
-    data: Data,
+    data: SeveralData,
     method: Annotated[
         str,
         typer.Option(help="maximum-likelihood, two-stage, ramp-deconvolution, separable-least-squares or narx"),
@@ -69,7 +69,7 @@ def fit(
     if carry is not None and (method != METHOD or effects or fit_on):
         raise InputError("--carry takes the structure of its MODEL.json. Leave out --method, --effects and --fit-on.")
     earlier = None if carry is None else load_model(carry)
-    record = load_record(data, columns)
+    record = load_joined(data, columns, names(effects))
     found: dict[str, Any] | None = None
     with progress_bar() as progress:
         if earlier is None:

@@ -11,13 +11,14 @@ import typer
 from api.cli.commands.diagnose import VERDICTS
 from api.cli.terminal import (
     ColumnMap,
-    Data,
     HeldModel,
     Json,
+    SeveralData,
     load_held,
     number,
     say,
     say_json,
+    short,
     table,
     write,
     write_model,
@@ -35,7 +36,7 @@ def register(app: typer.Typer) -> None:
 
 
 def improve(
-    data: Data,
+    data: SeveralData,
     model_json: HeldModel = None,
     html: Annotated[Path | None, typer.Option(help="write a report with charts here")] = None,
     output: Annotated[
@@ -58,7 +59,7 @@ def improve(
     if output is not None:
         write_model(output, models[-1])
     if html is not None:
-        write(html, report(record, found, models, data, model, columns))
+        write(html, report(record, found, models, short(data), model))
     if as_json:
         say_json(found)
         return
@@ -70,24 +71,23 @@ def report(
     record: Any,
     found: dict[str, Any],
     models: Sequence[Any],
-    data: Path,
+    name: str,
     held: Any | None = None,
-    columns: list[str] | None = None,
 ) -> str:
     """The report: what was found, what each effect is, what is left before and after."""
     import numpy as np
 
     import identify
     from api.web.pages.report_file import improvement_html
-    from api.workers.diagnosis_verbs import diagnosis
+    from api.workers.diagnosis_verbs import diagnosed
     from api.workers.verbs import runs, thinned
 
     before, after = (thinned(identify.compare(model, record).to_dict()) for model in (models[0], models[-1]))
     labels = [str(record.segment_names[index]) for index in record.segment]
     segments = runs(labels, np.asarray(record.time_s))
     with progress_bar() as progress:
-        missing = diagnosis(str(data), progress, None if held is None else held.to_json(), columns)
-    return improvement_html(found, data.name, missing, before, after, segments)
+        missing = diagnosed(record, progress, None if held is None else held.to_json())
+    return improvement_html(found, name, missing, before, after, segments)
 
 
 def improvement_lines(found: dict[str, Any]) -> list[str]:

@@ -75,7 +75,8 @@ environment.filters.update({name: in_its_language(words_of) for name, words_of i
     "verdict_words": clinical_words.verdict_words,
     "effect_words": effect_words.effect_words, "effects_words": effect_words.effects_words,
     "decision_words": clinical_words.decision_words, "test_kind_words": clinical_words.test_kind_words,
-    "test_state_words": clinical_words.test_state_words,
+    "test_state_words": clinical_words.test_state_words, "joint_end_words": clinical_words.joint_end_words,
+    "degrees": clinical_words.degrees, "test_title": clinical_words.test_title,
 }.items()})  # fmt: skip
 environment.globals["chart_config"] = PAGE_CONFIG
 environment.policies["json.dumps_kwargs"] = {"sort_keys": True, "default": in_words}

@@ -8,9 +8,9 @@ from typing import Any
 
 from starlette.datastructures import FormData
 
-from api.sessions import profiles
+from api.sessions import angles, profiles
 from api.sessions.questions import Row
-from api.web.pages import typed
+from api.web.pages import angle_form, typed
 from rig.messages import Bound, Status
 
 LONGEST_SHOWN = 60
@@ -41,7 +41,7 @@ class LimitsForm:
     version: str
     texts: dict[str, str]
     seen: dict[str, str]
-    asked: dict[str, float] = field(default_factory=dict)
+    asked: dict[str, Any] = field(default_factory=dict)
     errors: dict[str, str] = field(default_factory=dict)
     notice: str = ""
     theirs: list[Row] = field(default_factory=list)
@@ -49,11 +49,11 @@ class LimitsForm:
 
 def fresh(profile: Mapping[str, Any]) -> LimitsForm:
     """The form with what is saved."""
-    texts = {name: typed.shown(profile[name]) for name in profiles.LIMITS}
+    texts = {name: typed.shown(profile[name]) for name in profiles.LIMITS} | angle_form.texts(profile)
     return LimitsForm(profiles.version(profile), texts, dict(texts))
 
 
-def read(sent: FormData, profile: Mapping[str, Any], limits: Mapping[str, Bound]) -> LimitsForm:
+def read(sent: FormData, profile: Mapping[str, Any], status: Status | None) -> LimitsForm:
     """The form as a person sent it, held against what is saved.
 
     A field that still holds what it was made with asks for nothing, so a limit that somebody else has set meanwhile is
@@ -64,11 +64,27 @@ def read(sent: FormData, profile: Mapping[str, Any], limits: Mapping[str, Bound]
         return _stale(form, sent)
     for name in profiles.LIMITS:
         _take(form, name, sent, profile[name])
+    limits: Mapping[str, Bound] = status.limits if status else {}
     for name, words in profiles.outside(form.asked, profile, limits).items():
         form.errors[name] = f"{form.texts[name]!r}: {words}"
+    _take_angles(form, sent, profile, status)
     if form.errors:
         form.notice = "Nothing was changed, nothing was started: see beside the field."
     return form
+
+
+def _take_angles(form: LimitsForm, sent: FormData, profile: Mapping[str, Any], status: Status | None) -> None:
+    """The range of angles, where the form has its fields."""
+    given = {name: text[:LONGEST_SHOWN] for name in angle_form.NAMES if (text := _one(sent, name)) is not None}
+    if len(given) < len(angle_form.NAMES):
+        return
+    asked, errors = angle_form.asked(given, profile)
+    rigs = status.angle.range_rad if status else None
+    if beyond := angles.outside(asked, rigs):
+        errors[angle_form.NAMES[1]] = beyond[angles.RANGE]
+    form.texts |= given
+    form.errors |= errors
+    form.asked |= {} if errors else asked
 
 
 def _take(form: LimitsForm, name: str, sent: FormData, saved: float) -> None:
@@ -96,6 +112,11 @@ def _stale(form: LimitsForm, sent: FormData) -> LimitsForm:
             continue
         form.texts[name] = text[:LONGEST_SHOWN]
         form.theirs.append(Row(f"{limit.words.capitalize()} ({limit.unit})", form.texts[name], form.seen[name]))
+    for name in angle_form.NAMES:
+        text = _one(sent, name)
+        if text is not None and text != _one(sent, f"seen_{name}"):
+            form.texts[name] = text[:LONGEST_SHOWN]
+            form.theirs.append(Row(angle_form.LABELS[name], form.texts[name], form.seen[name]))
     return form
 
 
@@ -110,7 +131,7 @@ def fields(status: Status | None) -> list[dict[str, str]]:
     for name in profiles.LIMITS:
         words = profiles.takes(name, status.limits if status else {})
         found.append({"name": name, "label": LABELS[name], "help": words})
-    return found
+    return found + angle_form.fields(status)
 
 
 LABELS = {

@@ -12,12 +12,12 @@ from markupsafe import Markup
 from api.language import when
 from api.people import controller_keys
 from api.people.auth import Principal
-from api.sessions import profiles
+from api.sessions import angles, profiles
 from api.sessions.questions import Question, Row
 from api.store import audit
 from api.store.tables import Participant, Test
 from api.web.dependencies import Context, Ctx, Tester
-from api.web.pages import kind_form, limits_form, next_view, starting, trials_view
+from api.web.pages import angle_form, kind_form, limits_form, next_view, starting, trials_view
 from api.web.pages.limits_form import LimitsForm
 from api.web.pages.render import page
 from api.web.routes import participants
@@ -57,6 +57,7 @@ async def shown(
             "keys": controller_keys.of(context.auth, code),
             "made": made,
             "trials": trials_of(context, who, code),
+            "sensor": angle_form.present(context.rig.status),
         }
 
     return page(request, "participant.html", status, **await asyncio.to_thread(gather))
@@ -85,7 +86,7 @@ async def taken(request: Request, context: Context, who: Principal, code: str, s
     row = await asyncio.to_thread(participants.find, context, code)
     status = context.rig.status
     sent = await request.form()
-    form = limits_form.read(sent, row.profile, status.limits if status else {})
+    form = limits_form.read(sent, row.profile, status)
     if form.notice and not form.errors:
         form.notice += await asyncio.to_thread(_by_whom, context, code)
         return await shown(request, context, who, code, form, 409)
@@ -119,6 +120,10 @@ def _question(row: Participant, new: dict[str, Any], doubts: list[str], save: An
         value, before = f"{new[name]:g} {limit.unit}", f"{row.profile[name]:g} {limit.unit}"
         lines.append(Row(limit.words.capitalize(), value, before if before != value else ""))
         values.append(value)
+    if (range_rad := angles.of(new)) is not None:
+        now, was = angles.words(range_rad), angles.of(row.profile)
+        before = angles.words(was) if was else "–"
+        lines.append(Row("Joint angles", now, before if before != now else ""))
     return Question(
         participant=row.code,
         title=f"Set these limits for {row.code}?",

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from typing import Any
 
 from api.language import clock, lazy
 from api.people.auth import Principal
+from api.sessions.joint_plan import PASSIVE
 from api.web.dependencies import Context
 
 SILENT_S = 1.6
@@ -19,6 +21,7 @@ WORDS: dict[str, tuple[Any, Any]] = {
     "calibrating": (lazy("No stimulation"), lazy("a calibration is open")),
     "arming": (lazy("Stimulating"), lazy("begins")),
     "running": (lazy("Stimulating"), ""),
+    PASSIVE: (lazy("No stimulation"), lazy("passive movement")),
     "stopping": (lazy("Stopping"), lazy("not confirmed yet")),
     "sealing": (lazy("No stimulation"), lazy("saving the recording")),
     "latched": (lazy("Stopped"), lazy("needs re-arm")),
@@ -40,6 +43,12 @@ def state_of(context: Context) -> str:
     return rig.status.state
 
 
+def plays_passive(context: Context) -> bool:
+    """Whether what the rig plays is a passive test, in which it refuses every pulse."""
+    status, current = context.rig.status, context.runner.current
+    return current is not None and current.kind == PASSIVE and status is not None and status.test_id == current.test_id
+
+
 def torque_now(context: Context) -> tuple[float | None, float | None]:
     """The newest torque (N·m) and its age (s); no torque where it is old or no number, no age where none ever came."""
     torque_nm, age_s = context.runner.hub.torque()
@@ -51,6 +60,8 @@ def torque_now(context: Context) -> tuple[float | None, float | None]:
 def now(context: Context, principal: Principal | None) -> dict[str, Any]:
     """What the rig does now. Without a sign-in: the state only, nothing about a participant."""
     state = state_of(context)
+    if state in ("arming", "running") and plays_passive(context):
+        state = PASSIVE
     flow, more = WORDS[state]
     torque_nm, age_s = torque_now(context)
     shown: dict[str, Any] = {
@@ -63,13 +74,16 @@ def now(context: Context, principal: Principal | None) -> dict[str, Any]:
     }
     if principal is None:
         return shown
-    current = context.runner.current
+    current, status = context.runner.current, context.rig.status
+    angle_rad = context.runner.hub.angle()
     return {
         **shown,
         "torque_nm": torque_nm,
         "torque_age_s": age_s,
         "test": {"id": current.test_id, "participant": current.participant} if current else None,
         "notice": notice_key(context, state),
+        "sensor": status is not None and status.angle.present,
+        "angle_deg": None if angle_rad is None else round(math.degrees(angle_rad), 1),
     }
 
 

@@ -18,6 +18,7 @@ from api.sessions.runner import Seen
 from api.store import audit
 from api.store.tables import Participant
 from api.web.dependencies import Context
+from api.web.pages import joint_words
 from api.web.pages.environment import environment, number
 from api.web.routes import participants
 
@@ -73,15 +74,18 @@ async def ask(context: Context, who: Principal, body: TestIn, back: str = "") ->
         return f"/tests/{test.id}"
 
     strength = f"{current_words(row)}, {number(widest_us(preview), 0, 'µs')}"
+    stimulates = widest_us(preview) > 0.0
+    joint = preview.get("joint")
     question = Question(
         participant=row.code,
         title=_("Start the %(kind)s of %(code)s?", kind=test_kind_words(body.kind), code=row.code),
-        button=_("Start now: %(strength)s", strength=strength),
+        button=_("Start now: %(strength)s", strength=strength) if stimulates else _("Start now: no stimulation"),
         action=action,
         rows=rows(row, preview, standing, other_than(who.name, body.ran_by) or who.name, rig_words(context)),
-        warnings=[*warnings(row, standing), *out_of_reach(preview)],
-        stimulates=True,
+        warnings=[*(warnings(row, standing) if stimulates else []), *out_of_reach(preview)],
+        stimulates=stimulates,
         back=back,
+        at_deg=joint_words.allowed_deg(joint) if joint else None,
     )
     return context.questions.ask(question, who)
 
@@ -108,13 +112,19 @@ def rows(row: Participant, preview: dict[str, Any], standing: Calibrated, ran_by
         dose += _(", about %(effort)s of torque", effort=number(torque_time, 0, "N·m·s"))
     long = number(preview["duration_s"], 0, "s")
     more = []
-    if bounds := preview.get("bounds"):
+    if joint := preview.get("joint"):
+        long, dose, more = joint_words.of_question(joint, row.profile, long, dose)
+    elif bounds := preview.get("bounds"):
         reach, most = preview["reach"], number(bounds["max_torque_time_nms"], 0, "N·m·s")
         long = _("at most %(most)s", most=number(bounds["max_duration_s"], 0, "s"))
         dose = _("at most %(most)s of torque", most=most)
         more = [Row(_("Stops once known within"), number(preview["target"]["curve_percent"], 1, "%"))]
         more += [Row(_("Expected"), translated(reach["words"]))] if reach["reachable"] else []
     profile = row.profile
+    if not widest_us(preview):
+        return [Row(_("Who"), row.code), *more, Row(_("How long"), long), Row(_("Dose"), dose),
+                Row(_("Stops at"), number(profile["max_torque_nm"], 1, "N·m")), Row(_("Run by"), ran_by),
+                Row(_("Rig"), rig)]  # fmt: skip
     widest, most = number(widest_us(preview), 0, "µs"), number(profile["max_pulse_width_us"], 0, "µs")
     return [
         Row(_("Who"), row.code),

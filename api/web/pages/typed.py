@@ -29,6 +29,12 @@ def number(text: str) -> float:
     return float(f"{whole}.{part or 0}")
 
 
+def signed(text: str) -> float:
+    """The same, where a minus may stand in front. Raises as `number`."""
+    plain = text.strip()
+    return -number(plain[1:]) if plain[:1] in ("-", "−") else number(plain)
+
+
 def whole(text: str) -> int | None:
     """A whole number as it was typed; None where it is none, which whoever takes it refuses."""
     return int(text) if re.fullmatch(r"[1-9][0-9]{0,4}", text.strip()) else None

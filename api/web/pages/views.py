@@ -11,6 +11,7 @@ from markupsafe import Markup
 
 from api.charts import model_charts
 from api.charts.svg import svg
+from api.clinical_words import missing_words
 from api.errors import ApiError
 from api.language import _, plain, translated
 from api.models import stored
@@ -29,16 +30,20 @@ async def test(request: Request, context: Ctx, _who: LiveReader, test_id: str) -
     """A test: live while it runs, its outcome after."""
     row = await asyncio.to_thread(tests.find, context, test_id)
     document = await asyncio.to_thread(context.runner.document, row)
-    fixed = [] if document["adaptive"] else (row.plan.get("preview") or {}).get("pulse_width_us") or []
-    bounds = limits_of(row, context.rig.status)
+    joint, status = document["joint"], context.rig.status
+    grows = document["adaptive"] or (joint and joint["coverage"])
+    fixed = [] if grows else (row.plan.get("preview") or {}).get("pulse_width_us") or []
+    bounds = limits_of(row, status)
     if told := document["adaptive"]:
         document = {**document, "adaptive": {**told, **{name: plain(told[name]) for name in ("words", "problem")}}}
     data = {
         "test": document, "planned_us": fixed, "pulse_rate_hz": row.plan.get("pulse_rate_hz", 40.0), "limits": bounds,
+        "sensor": joint is not None or (status is not None and status.angle.present),
     }  # fmt: skip
     shown: dict[str, Any] = await drawn(context, row) if document["done"] else {"drawn": None, "drawn_problem": None}
     notes = await asyncio.to_thread(context.notes.of_test, test_id)
-    return page(request, "test.html", test=document, data=data, limits=bounds, notes=notes, **shown)
+    missing = missing_words(((joint or {}).get("coverage") or {}).get("missing"))
+    return page(request, "test.html", test=document, data=data, limits=bounds, notes=notes, missing=missing, **shown)
 
 
 @router.post("/tests/{test_id}/keep-plain")

@@ -6,7 +6,7 @@ import asyncio
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Response
-from pydantic import AfterValidator, Field, StringConstraints
+from pydantic import AfterValidator, Field, StrictBool, StringConstraints
 
 from api.errors import ApiError
 from api.models import together
@@ -35,6 +35,7 @@ class PoseIn(Body):
     """What a goniometer shows while the joint is held still."""
 
     angle_rad: AngleRad = Field(description="elbow: 0 is straight, flexion is positive, rad")
+    first: StrictBool = Field(False, description="begin anew with this one: a first pose that waits is forgotten")
 
 
 def _once(recordings: list[str]) -> list[str]:
@@ -44,7 +45,7 @@ def _once(recordings: list[str]) -> list[str]:
 
 
 RecordingId = Annotated[str, StringConstraints(min_length=1, max_length=80)]
-EffectId = Annotated[str, StringConstraints(pattern=r"^[a-z0-9_]{1,64}$")]
+EffectId = Annotated[str, StringConstraints(pattern=r"^[a-z0-9_]{1,64}(:[a-z0-9_|]{1,100})?$")]
 
 
 class TogetherIn(Body):
@@ -56,7 +57,7 @@ class TogetherIn(Body):
     )
 
 
-async def take_pose(context: Context, angle_rad: float, by: str) -> AngleStatus:
+async def take_pose(context: Context, body: PoseIn, by: str) -> AngleStatus:
     """Tell the rig a pose; the second one completes a calibration.
 
     Raises
@@ -66,14 +67,14 @@ async def take_pose(context: Context, angle_rad: float, by: str) -> AngleStatus:
     """
     sensor(context)
     before = context.rig.status.angle.calibration if context.rig.status else None
-    status = await context.rig.ask_for(Status, AnglePoseRequest(angle_rad=angle_rad, by=by))
+    status = await context.rig.ask_for(Status, AnglePoseRequest(angle_rad=body.angle_rad, by=by, first=body.first))
     context.rig.status = status
     done = status.angle.calibration if status.angle.calibration != before else None
 
     def note() -> None:
         with context.store.write() as session:
             now = context.clock.utc()
-            audit.write(session, now, by, "pose of the angle sensor", "rig", angle_rad=round(angle_rad, 4))
+            audit.write(session, now, by, "pose of the angle sensor", "rig", angle_rad=round(body.angle_rad, 4))
             if done is not None:
                 audit.write(session, now, by, "calibrate the angle sensor", "rig", **done.model_dump(exclude={"by"}))
 
@@ -118,7 +119,7 @@ async def angle(context: Ctx, _who: LiveReader) -> dict[str, Any]:
 @router.post("/rig/angle/pose", **answers(AngleOut))
 async def pose(context: Ctx, who: Tester, body: PoseIn) -> dict[str, Any]:
     """Tell the angle that a goniometer shows, at two poses at least 0.5 rad apart; a third one begins anew."""
-    return (await take_pose(context, body.angle_rad, who.name)).model_dump()
+    return (await take_pose(context, body, who.name)).model_dump()
 
 
 @router.get("/participants/{code}/joint", **answers(JointOverviewOut))

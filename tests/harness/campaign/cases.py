@@ -9,7 +9,9 @@ from typing import Any, Literal
 Must = Literal["stop", "go on", "either"]
 
 WATCH_S = 0.1
-"""The rig's watch for torque and acks (defaults)."""
+"""The rig's watch for torque, angle and acks (defaults)."""
+STILL_S = 0.5
+"""Real seconds for which the angle of a moving test may stand still."""
 SYNC_WATCH_S = 3.5
 """The rig's watch for the disk, and the time from one attempt to the next."""
 PAGE_S = 0.08
@@ -50,6 +52,11 @@ class Case:
     fault: str = ""
     may_follow: int = 0
 
+    @property
+    def of_the_angle(self) -> bool:
+        """Whether it breaks the angle sensor: then a robot moves the arm, and the test asks for the angle."""
+        return self.name.startswith("angle_")
+
     def command(self, speed: float) -> dict[str, Any]:
         """For the emulator's control line; delays in emulated seconds: a rig that runs faster waits for real ones."""
         settings = {key: value * speed if key.endswith("_s") else value for key, value in self.settings.items()}
@@ -87,6 +94,20 @@ CASES: dict[str, Case] = {
         Case("error_frames", "go on"),
         Case("clock_jitter", "go on"),
         Case("delivery_jitter", "go on"),
+        Case("angle_silent", "stop", WATCH_S),
+        Case("angle_unplugged", "stop", WATCH_S),
+        Case("angle_nan", "stop"),
+        Case("angle_fault_bit", "stop"),
+        Case("angle_jump", "stop", settings={"probability": 1.0}),
+        Case("angle_offset_step", "stop"),
+        Case("angle_counter_jump", "stop"),
+        Case("angle_stuck", "stop", STILL_S),
+        Case("angle_rate_off", "either", 4.0),
+        Case("angle_noise_burst", "either", 1.0),
+        Case("angle_reversed", "either", 1.0),
+        Case("angle_delayed", "go on"),
+        Case("angle_frames_lost", "go on"),
+        Case("angle_frames_repeated", "go on"),
         Case("disk_full", "stop", PAGE_S, of="host"),
         Case("disk_slow", "stop", SYNC_WATCH_S, of="host"),
         Case("host_killed", "stop", of="host"),
@@ -122,3 +143,17 @@ def plan_of(phase: str, hidden_s: float, speed: float) -> list[dict[str, Any]]:
         "ramp": [rest, ramp],
         "sealing": [rest, first],
     }[phase]
+
+
+def angle_of(case: Case, speed: float) -> dict[str, Any]:
+    """What the plan of a test asks of the angle, for the faults of its sensor."""
+    if not case.of_the_angle:
+        return {}
+    return {"kind": "moving", "angle": {"range_rad": [0.3, 2.3], "still_s": STILL_S * speed}}
+
+
+def movement_of(case: Case) -> dict[str, Any]:
+    """Who moves the arm in a test, for the emulator's control line: a robot, or nobody."""
+    if not case.of_the_angle:
+        return {"cmd": "arm", "mode": "held", "angle_deg": 60.0}
+    return {"cmd": "arm", "mode": "robot", "from_deg": 40.0, "to_deg": 90.0, "deg_s": 30.0}

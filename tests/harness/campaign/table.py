@@ -16,9 +16,10 @@ HEAD = (
 )
 KNOWN = (
     '"Known" is when something that the host receives differs, or when nothing came for as long as it waits: 100 ms '
-    "for torque and acks, 0.5 s for a value that stands still, 3 s for the disk, 80 ms until a full disk's last page "
-    'is full. Times are real ms, median / worst; a time below zero means that no pulse came after the fault. "Ended" '
-    "counts tests that did not go on to their end. Where a fault cannot be seen in a phase (an electrode in a rest), "
+    "for torque, angle and acks, 0.5 s for a value that stands still, 3 s for the disk, 80 ms until a full disk's last "
+    "page is full. Times are real ms, median / worst; a time below zero means that no pulse came after the fault. "
+    '"Ended" counts tests that did not go on to their end. Where a fault cannot be seen in a phase (an electrode in a '
+    "rest), "
     "going on is right. A stop is not called confirmed where the stimulator does not answer, where no torque comes, or "
     "where the fault itself holds the torque up: that is what it is to say then."
 )

@@ -15,7 +15,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from tests.harness.campaign.cases import CASES, WINDOW_S, Case, plan_of
+from tests.harness.campaign.cases import CASES, WINDOW_S, Case, angle_of, movement_of, plan_of
 from tests.harness.campaign.judge import Verdict, judge_file, judge_intervals, judge_outcome, judge_times
 from tests.harness.processes import CLINIC_WATCH, Bench, RigClient, busy_process, control, default_plan, kill_hard
 
@@ -73,7 +73,11 @@ class Worker:
         client = self._ready()
         self._count += 1
         test_id = f"{case.name}.{verdict.phase}.{verdict.seed}.{self._count}"
-        plan = default_plan(test_id, segments=plan_of(verdict.phase, case.hidden_s, self.speed))
+        segments = plan_of(verdict.phase, case.hidden_s, self.speed)
+        plan = default_plan(test_id, segments=segments, **angle_of(case, self.speed))
+        assert self.bench is not None
+        moved = self.bench.fault(**movement_of(case))
+        assert moved["ok"], moved
         before = self._felt_count()
         while not client.events.empty():
             client.events.get_nowait()
@@ -310,7 +314,8 @@ class Worker:
         self._condemned = False
         if self.client is None:
             self._made += 1
-            self.bench = Bench(self.disk / f"bench{self._made}", "--noise-seed", str(self._made), speed=self.speed)
+            options = "--noise-seed", str(self._made), "--arm", "held"
+            self.bench = Bench(self.disk / f"bench{self._made}", *options, speed=self.speed)
             self.client = self._rig_on()
         for old in (self.disk).glob("bench*/data/recordings/*.h5"):
             old.unlink()

@@ -20,6 +20,7 @@ function take(message) {
   if (message.type === "history") {
     Object.assign(state, { time: message.time_s, low: message.torque_min_nm, high: message.torque_max_nm, pulseTime: message.pulse_time_s, width: message.pulse_width_us });
     if (message.duration_s) state.duration = message.duration_s;
+    if (data.sensor) takeAngles(message);
   } else if (message.type === "live") {
     state.heard = performance.now();
     state.torqueAge = message.torque_age_s;
@@ -27,9 +28,12 @@ function take(message) {
     showNumbers(message);
   } else if (message.type === "adaptive") {
     showAdaptive(message);
+  } else if (message.type === "joint") {
+    showJoint(message);
   } else if (message.type === "test") {
     showTest(message.test, message.words);
     if (state.test.adaptive && message.test.state !== "running") showEnough(false);
+    if (state.test.joint && message.test.state !== "running" && byId("enough")) byId("enough").hidden = true;
   } else if (message.type === "link" || message.type === "idle") {
     state.connected = message.type === "link" ? message.connected : message.rig_connected;
   }
@@ -41,8 +45,10 @@ function addFrame(message) {
   if (message.duration_s) state.duration = message.duration_s;
   state.time.push(...message.time_s); state.low.push(...message.torque_min_nm); state.high.push(...message.torque_max_nm);
   state.pulseTime.push(...message.pulse_time_s); state.width.push(...message.pulse_width_us);
-  if (!state.test.adaptive) return;
-  showDose(message.torque_time_nms);
+  if (data.sensor) takeAngles(message);
+  if (state.test.joint) showTorqueTime(message.torque_time_nms);
+  if (!state.test.adaptive && !(state.test.joint && state.test.joint.coverage)) return;
+  if (state.test.adaptive) showDose(message.torque_time_nms);
   if (laidEnd(message.laid_segments) !== laidEnd(state.laid || [])) { state.laid = message.laid_segments; drawTrack(); }
 }
 
@@ -92,7 +98,8 @@ function showTest(test, told) {
   const carrying = byId("keep-plain");
   if (carrying) carrying.hidden = !(test.state === "identifying" && job && job.verb === "carry");
   if (test.reason) { say("reason", told.reason); byId("reason").hidden = false; }
-  if (test.done && wasOpen && !leaving) location.replace(test.model_id ? "/models/" + test.model_id : location.pathname);
+  const next = test.model_id ? "/models/" + test.model_id : test.joint && test.state === "completed" ? "/participants/" + test.participant + "/joint" : location.pathname;
+  if (test.done && wasOpen && !leaving) location.replace(next);
 }
 
 function age() {
@@ -114,14 +121,14 @@ function nice(span, count) {
   return [1, 2, 5, 10].map((m) => m * power).find((step) => step >= rough);
 }
 
-function frame(canvas, low, high, title, unit) {
+function frame(canvas, low, high, title, unit, timed = true) {
   const ratio = window.devicePixelRatio || 1, box = canvas.getBoundingClientRect();
   const w = Math.round(box.width * ratio), h = Math.round(box.height * ratio);
   if (canvas.width !== w || canvas.height !== h) { canvas.width = w; canvas.height = h; }
   const pen = canvas.getContext("2d");
   pen.reset(); pen.setTransform(ratio, 0, 0, ratio, 0, 0);
   pen.clearRect(0, 0, box.width, box.height);
-  const area = { left: 62, right: box.width - 10, top: 26, bottom: box.height - 34 };
+  const area = { left: 62, right: box.width - 10, top: 26, bottom: box.height - (timed ? 34 : 10) };
   const span = Math.max(state.duration, 1);
   const x = (t) => area.left + (t / span) * (area.right - area.left);
   const y = (v) => area.bottom - ((v - low) / (high - low)) * (area.bottom - area.top);
@@ -133,8 +140,8 @@ function frame(canvas, low, high, title, unit) {
     pen.fillText(shown(+v.toFixed(6)), area.left - 8, y(v));
   }
   pen.textAlign = "center"; pen.textBaseline = "top";
-  for (let t = 0; t <= span + 1e-9; t += xstep) pen.fillText(shown(+t.toFixed(6)), x(t), area.bottom + 5);
-  pen.textAlign = "right"; pen.fillText(words.time, area.right, area.bottom + 20);
+  for (let t = 0; timed && t <= span + 1e-9; t += xstep) pen.fillText(shown(+t.toFixed(6)), x(t), area.bottom + 5);
+  pen.textAlign = "right"; if (timed) pen.fillText(words.time, area.right, area.bottom + 20);
   pen.textAlign = "left"; pen.fillStyle = colours.ink; pen.font = "600 13px " + FONT; pen.fillText(title + " (" + unit + ")", 4, 3);
   segments(pen, area, x);
   pen.beginPath(); pen.rect(area.left, 0, area.right - area.left + 2, area.bottom + 1); pen.clip();
@@ -225,7 +232,7 @@ function drawTrack() {
 }
 
 function draw() {
-  if (state.dirty) { state.dirty = false; drawTorque(); drawWidth(); if (state.test.adaptive) drawKnown(); }
+  if (state.dirty) { state.dirty = false; drawTorque(); drawWidth(); if (state.test.adaptive) drawKnown(); if (data.sensor) drawAngles(); }
   requestAnimationFrame(draw);
 }
 
@@ -248,7 +255,7 @@ function connect() {
 
 function readColours() {
   const style = getComputedStyle(document.documentElement);
-  for (const name of ["ink", "dim", "grid", "torque", "torque-band", "width", "plan", "limit", "cursor", "held-out"]) colours[name] = style.getPropertyValue("--" + name).trim();
+  for (const name of ["ink", "dim", "grid", "torque", "torque-band", "width", "plan", "limit", "cursor", "held-out", "zero", "mark", "chart"]) colours[name] = style.getPropertyValue("--" + name).trim();
   state.dirty = true;
 }
 
@@ -264,6 +271,7 @@ new ResizeObserver(fit).observe(document.getElementById("main"));
 readColours();
 fit();
 if (state.test.adaptive) { state.laid = []; showAdaptive(state.test.adaptive); }
+if (state.test.joint) { if (state.test.joint.coverage) state.laid = []; showJoint(state.test.joint); }
 drawTrack();
 connect();
 setInterval(age, 100);

@@ -46,7 +46,17 @@
     const name = "pill state-" + state;
     if (pill.className !== name) pill.className = name;
     say("flow", flow); say("more", more); say("at", ""); say("torque", torque());
-    for (const box of document.querySelectorAll("[data-needs-ready]")) box.disabled = !ready;
+    say("angle", angle());
+    for (const box of document.querySelectorAll("[data-needs-ready]")) box.disabled = !ready || !there(box);
+    for (const box of document.querySelectorAll("[data-at-angle]")) box.classList.toggle("is-there", there(box));
+  }
+
+  function angle() { return old() || !known || typeof known.angle_deg !== "number" ? "–" : figure(known.angle_deg, 0) + "°"; }
+
+  function there(box) { // whether the joint is where a held test begins; where none is asked for, it is
+    if (box.dataset.angleFrom === undefined) return true;
+    if (old() || !known || typeof known.angle_deg !== "number") return false;
+    return known.angle_deg >= Number(box.dataset.angleFrom) && known.angle_deg <= Number(box.dataset.angleTo);
   }
 
   function torque() {

@@ -1,0 +1,71 @@
+"""The range of joint angles in the form of a participant's limits: typed in degrees, kept in radians."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from api.sessions import angles
+from api.web.pages import typed
+from rig.messages import Status
+
+NAMES = ("angle_from_deg", "angle_to_deg")
+LABELS = {"angle_from_deg": "Joint angle from (°)", "angle_to_deg": "Joint angle to (°)"}
+HALF_A_STEP_DEG = 0.006
+"""What is shown has two digits behind the point: nearer than half of them is the same angle."""
+
+
+def texts(profile: Mapping[str, Any]) -> dict[str, str]:
+    """What stands in the two fields; empty where there is no range."""
+    range_rad = angles.of(profile)
+    if range_rad is None:
+        return dict.fromkeys(NAMES, "")
+    return {name: shown(angle) for name, angle in zip(NAMES, range_rad, strict=True)}
+
+
+def shown(angle_rad: float) -> str:
+    """An angle as a person would type it."""
+    return typed.shown(round(math.degrees(angle_rad), 2) + 0.0)
+
+
+def present(status: Status | None) -> bool:
+    """Whether the rig has an angle sensor: without one there are no such fields."""
+    return status is not None and status.angle.present
+
+
+def fields(status: Status | None) -> list[dict[str, str]]:
+    """What the fields are called, and what this rig takes in them."""
+    if status is None or not status.angle.present:
+        return []
+    within = "" if status.angle.range_rad is None else f"within {angles.words(status.angle.range_rad)} (rig)"
+    help_of = {NAMES[0]: "0° is a straight arm", NAMES[1]: within}
+    return [{"name": name, "label": LABELS[name], "help": help_of[name]} for name in NAMES]
+
+
+def asked(given: Mapping[str, str], profile: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
+    """The range that is asked for as part of a profile, and what is wrong with it, by field.
+
+    Nothing is asked where the fields say what is saved. Both empty: the participant has no range any more.
+    """
+    if dict(given) == texts(profile):
+        return {}, {}
+    if not any(text.strip() for text in given.values()):
+        return ({} if angles.of(profile) is None else {angles.RANGE: None}), {}
+    values, errors = {}, {}
+    for name, text in given.items():
+        try:
+            values[name] = math.radians(typed.signed(text))
+        except ValueError as error:
+            errors[name] = str(error)
+    if errors:
+        return {}, errors
+    low, high = (values[name] for name in NAMES)
+    if not (low >= angles.LEAST_RAD and high <= angles.MOST_RAD and high - low >= angles.NARROWEST_RAD - 1e-9):
+        least = math.degrees(angles.NARROWEST_RAD)
+        return {}, {NAMES[1]: f"the second angle must be at least {least:.0f}° above the first"}
+    saved = angles.of(profile)
+    near = math.radians(HALF_A_STEP_DEG)
+    if saved is not None and abs(saved[0] - low) < near and abs(saved[1] - high) < near:
+        return {}, {}
+    return {angles.RANGE: [low, high]}, {}

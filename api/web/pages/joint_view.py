@@ -1,0 +1,113 @@
+"""The guided tests of a joint that moves, on a page of their own: what was done, what is next, one model of all."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+from fastapi import APIRouter, Request
+from fastapi.responses import RedirectResponse, Response
+
+from api.errors import ApiError
+from api.models import together
+from api.sessions import angles
+from api.sessions.joint_plan import HELD, KINDS, MOVING, PASSIVE
+from api.sessions.joint_tests import target_of
+from api.sessions.requests import AngleIn, TestIn
+from api.sessions.trials import SEQUENCE
+from api.store.tables import Participant, Test
+from api.web.dependencies import Context, Ctx, Tester
+from api.web.pages import joint_words, next_view, starting
+from api.web.pages.checked import checked
+from api.web.pages.model_view import to_job
+from api.web.pages.render import page
+from api.web.routes import joint, participants
+from api.web.routes.joint import TogetherIn
+
+router = APIRouter(include_in_schema=False, prefix="/participants/{code}/joint")
+ISOMETRIC = ("pre-session", "adaptive", "next-experiment")
+"""Kinds of tests in which the joint stands still at the angle of the fixture."""
+
+
+@router.get("")
+async def show(request: Request, context: Ctx, _who: Tester, code: str) -> Response:
+    """Sensor, range, the three kinds of tests with what is open, and the recordings of today."""
+    row = await asyncio.to_thread(participants.find, context, code)
+    problem = None
+    try:
+        found = await joint.overview_of(context, row)
+    except ApiError as error:
+        problem, found = error, {"sensor": joint.sensor(context).model_dump(), "range_rad": None, **joint.NOTHING_OPEN}
+    gathered = await asyncio.to_thread(_gather, context, row, found)
+    return page(request, "joint.html", participant=row, found=found, problem=problem, **gathered)
+
+
+def _gather(context: Context, row: Participant, found: dict[str, Any]) -> dict[str, Any]:
+    rows = _recorded_today(context, row.code)
+    picked = _picked(rows)
+    return {
+        "range_rad": angles.of(row.profile),
+        "may_start": starting.calibrated(context, row).may_start,
+        "archived": next_view.step(context, row).kind == "archived",
+        "held": [{**each, "deg": _deg(each["angle_rad"])} for each in found["targets"]],
+        "allowed": None if found["next_rad"] is None else joint_words.allowed_deg({"target_rad": found["next_rad"]}),
+        "recordings": [{"test": test, "picked": test.id in picked, "target_rad": target_of(test)} for test in rows],
+        "kinds_lacking": [kind for kind in (PASSIVE, HELD, MOVING) if not any(test.kind == kind for test in rows)],
+    }
+
+
+def _deg(angle_rad: float) -> tuple[float, float] | None:
+    return joint_words.allowed_deg({"target_rad": angle_rad})
+
+
+def _recorded_today(context: Context, code: str) -> list[Test]:
+    """Tests of today that ended well and have a recording, oldest first; no trials of a controller."""
+    conditions = (
+        Test.participant == code, Test.state == "completed", Test.recording_id.is_not(None), Test.kind != SEQUENCE,
+        Test.requested_utc >= context.clock.start_of_day_utc(),
+    )  # fmt: skip
+    return context.store.all(Test, *conditions, order=Test.requested_utc)
+
+
+def _picked(rows: list[Test]) -> set[str]:
+    """The newest isometric, passive and moving one, and the newest at each angle that was held."""
+    newest: dict[str, str] = {}
+    for test in rows:
+        angle = f"{target_of(test):.1f}" if test.kind == HELD else ""
+        newest[("isometric" if test.kind in ISOMETRIC else test.kind) + angle] = test.id
+    return set(newest.values())
+
+
+@router.post("/tests")
+async def start_test(request: Request, context: Ctx, who: Tester, code: str) -> Response:
+    """To the question before a guided test."""
+    sent = await request.form()
+    kind = str(sent.get("kind") or "")
+    if kind not in KINDS:
+        raise ApiError(422, "invalid-input", "This value cannot be used", "kind: choose one of the three tests.")
+    more: dict[str, Any] = {}
+    if kind == HELD and (text := str(sent.get("target_rad") or "")):
+        more["angle"] = checked(AngleIn, target_rad=_number(text))
+    body = checked(TestIn, participant=code, kind=kind, **more)
+    return RedirectResponse(await starting.ask(context, who, body, back=f"/participants/{code}/joint"), 303)
+
+
+def _number(text: str) -> float:
+    """An angle as this page itself wrote it, rad."""
+    try:
+        return float(text[:20])
+    except ValueError:
+        detail = f"target_rad: {text[:20]!r} is no angle. Go back and press the button of an angle."
+        raise ApiError(422, "invalid-input", "This value cannot be used", detail) from None
+
+
+@router.post("/model")
+async def fit_together(request: Request, context: Ctx, who: Tester, code: str) -> Response:
+    """One model of the recordings that are ticked."""
+    await asyncio.to_thread(participants.find, context, code)
+    sent = await request.form()
+    chosen = [str(each)[:80] for each in sent.getlist("recording")]
+    if not chosen:
+        raise ApiError(422, "invalid-input", "No recording is ticked", "Go back and tick those that belong together.")
+    body = checked(TogetherIn, recordings=chosen, effects=list(together.JOINT_EFFECTS))
+    return await to_job(joint.begin_fit(context, code, body, who.name))

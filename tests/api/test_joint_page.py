@@ -1,0 +1,187 @@
+"""The pages of a moving joint in a real browser: poses, range, the guided tests, and nothing of it without a sensor."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.api.browser import PHONE, painted_soon, participant
+from tests.api.conftest import STUB, Service, run_service
+from tests.api.fake_arm import back_and_forth, still
+
+pytestmark = pytest.mark.browser
+LOW, HIGH = math.radians(20), math.radians(110)
+
+
+@pytest.fixture
+def service(tmp_path: Path, short_dir: Path) -> Iterator[Service]:
+    yield from run_service(tmp_path, short_dir, STUB, speed=4.0)
+
+
+@pytest.fixture
+def sensor(service: Service) -> Service:
+    service.rig.arm.way = still(math.radians(65))
+    with service.client() as http:
+        end = time.monotonic() + 30
+        while not http.get("/v1/rig").json()["angle"]["present"]:
+            assert time.monotonic() < end
+            time.sleep(0.05)
+    return service
+
+
+def with_range(tab: Any, service: Service, code: str = "X1") -> None:
+    participant(tab, service, code)
+    tab.locator("#angle_from_deg").fill("20")
+    tab.locator("#angle_to_deg").fill("110")
+    tab.get_by_role("button", name="Set the limits").click()
+    tab.wait_for_load_state()
+
+
+def at(tab: Any, service: Service, angle_deg: float) -> None:
+    """Move the joint there, and wait until the page knows."""
+    service.rig.arm.way = still(math.radians(angle_deg))
+    tab.locator('[data-now="angle"]', has_text=f"{angle_deg:.0f}°").first.wait_for()
+
+
+def test_without_a_sensor_there_is_nothing_of_it(tab: Any, service: Service) -> None:
+    participant(tab, service, "X1")
+    assert tab.locator(".joint-link").count() == 0 == tab.locator("#angle_from_deg").count()
+    tab.goto(f"{service.url}/participants/X1/joint")
+    tab.get_by_text("This rig has no angle sensor.").wait_for()
+    assert tab.locator("main button").count() == 0, "no dead controls"
+    assert tab.goto(f"{service.url}/rig/angle").status == 409
+    tab.goto(f"{service.url}/participants/X1")
+    tab.get_by_role("button", name="Start the pre-session test").click()
+    tab.get_by_role("button", name="Start now").click()
+    tab.wait_for_url("**/tests/T*")
+    tab.locator("#torque").get_by_text("N·m").wait_for()
+    assert tab.locator("#angle-chart, #velocity-chart, #angle, #coverage-chart").count() == 0
+    assert tab.errors == [] or all("409" in error for error in tab.errors), tab.errors
+
+
+def test_two_poses_on_the_page_and_the_first_once_more(tab: Any, sensor: Service) -> None:
+    sensor.rig.arm.way = still(math.radians(15))
+    tab.goto(f"{sensor.url}/rig/angle")
+    tab.get_by_text("Not calibrated.").wait_for()
+    tab.locator('[data-now="angle"]', has_text="15°").wait_for()
+    tab.get_by_label("The goniometer shows (°)").fill("zwei")
+    tab.get_by_role("button", name="Take the first pose").click()
+    tab.get_by_text("is not a plain number").wait_for()
+    assert tab.get_by_label("The goniometer shows (°)").input_value() == "zwei"
+    tab.get_by_label("The goniometer shows (°)").fill("51")  # a slip
+    tab.get_by_role("button", name="Take the first pose").click()
+    tab.get_by_role("heading", name="Second pose").wait_for()
+    tab.get_by_role("link", name="Start again").click()
+    tab.get_by_label("The goniometer shows (°)").fill("15")
+    tab.get_by_role("button", name="Take the first pose").click()
+    tab.get_by_text("The first pose is taken: 15°").wait_for()
+    tab.get_by_label("The goniometer shows (°)").fill("20")
+    tab.get_by_role("button", name="Take the second pose").click()
+    tab.get_by_role("alert").get_by_text("less than 0.5 rad apart").wait_for()
+    tab.get_by_label("The goniometer shows (°)").fill("100,4")
+    tab.get_by_role("button", name="Take the second pose").click()
+    tab.get_by_text("by Ada, at 15° and 100°").wait_for()
+    assert [round(math.degrees(pose.angle_rad), 1) for pose in sensor.rig.arm.calibration.poses] == [15.0, 100.4]
+    assert sensor.rig.arm.calibration.by == "Ada"
+
+
+def test_a_range_is_typed_in_degrees(tab: Any, sensor: Service) -> None:
+    with_range(tab, sensor)
+    with sensor.client() as http:
+        found = http.get("/v1/participants/X1").json()["profile"]["angle_range_rad"]
+    assert [round(math.degrees(value), 6) for value in found] == [20, 110]
+    for low, high, words in (("110", "20", "must be at least 10° above"), ("x", "110", "not a plain number"),
+                             ("20", "170", "as this rig asks")):  # fmt: skip
+        tab.locator("#angle_from_deg").fill(low)
+        tab.locator("#angle_to_deg").fill(high)
+        tab.get_by_role("button", name="Set the limits").click()
+        tab.locator(".wrong", has_text=words).wait_for()
+    tab.locator("#angle_from_deg").fill("−5")
+    tab.locator("#angle_to_deg").fill("90")
+    tab.get_by_role("button", name="Set the limits").click()
+    tab.wait_for_load_state()
+    assert tab.locator("#angle_from_deg").input_value() == "-5"
+    tab.locator("#angle_from_deg").fill("")
+    tab.locator("#angle_to_deg").fill("")
+    tab.get_by_role("button", name="Set the limits").click()
+    tab.wait_for_load_state()
+    tab.goto(f"{sensor.url}/participants/X1/joint")
+    tab.get_by_text("Set the range first.").wait_for()
+
+
+def test_a_passive_test_shows_its_map_and_ends_by_itself(tab: Any, sensor: Service) -> None:
+    with_range(tab, sensor)
+    tab.get_by_role("link", name="To the tests of the joint").click()
+    tab.get_by_role("button", name="Start the passive movement…").click()
+    tab.get_by_text("none: no current flows").wait_for()
+    sensor.rig.arm.way = back_and_forth(LOW + 0.01, HIGH - 0.01)
+    tab.get_by_role("button", name="Start now: no stimulation").click()
+    tab.wait_for_url("**/tests/T*")
+    tab.locator("#missing li", has_text="Bend faster from").wait_for()
+    assert "Stimulating" not in tab.locator("#rig-state").inner_text(), "no current flows, so the bar says so"
+    assert (
+        painted_soon(tab, "coverage-chart") and painted_soon(tab, "angle-chart") and painted_soon(tab, "velocity-chart")
+    )
+    assert tab.locator("#angle").inner_text().endswith("°") and tab.locator("#stop").is_visible()
+    tab.wait_for_url("**/participants/X1/joint", timeout=60_000)
+    tab.locator(".step", has_text="Passive movement").get_by_text("done today").wait_for()
+    assert tab.errors == []
+
+
+def test_held_angles_start_only_there_and_survive_a_reload(tab: Any, sensor: Service) -> None:
+    with_range(tab, sensor)
+    tab.goto(f"{sensor.url}/participants/X1/joint")
+    start = tab.get_by_role("button", name="Start at 35°…")
+    at(tab, sensor, 65)
+    assert start.is_disabled()
+    at(tab, sensor, 37)
+    tab.locator(".held-now.is-there").wait_for()
+    start.click()
+    tab.get_by_text("Hold at").wait_for()
+    at(tab, sensor, 50)
+    assert tab.get_by_role("button", name="Start now").is_disabled(), "it left the angle before yes was said"
+    at(tab, sensor, 36)
+    tab.get_by_role("button", name="Start now").click()
+    tab.wait_for_url("**/tests/T*")
+    tab.locator("#held", has_text="Hold the joint at").wait_for()
+    tab.wait_for_url("**/participants/X1/joint", timeout=60_000)
+    tab.get_by_role("button", name="Start at 50°…").wait_for()
+    tab.reload()
+    assert tab.locator(".angles .is-done").count() == 1 and tab.locator(".angles li").count() == 5
+    again = tab.locator(".angles .is-done").get_by_role("button", name="again…")
+    at(tab, sensor, 50)
+    assert again.is_disabled()
+    at(tab, sensor, 35)
+    again.click()
+    tab.get_by_role("heading", name="Start the held-angle test of X1?").wait_for()
+
+
+def test_movement_under_stimulation_and_one_model_of_all(tab: Any, sensor: Service) -> None:
+    sensor.rig.speed = 10.0
+    with_range(tab, sensor)
+    tab.goto(f"{sensor.url}/participants/X1/joint")
+    tab.get_by_role("button", name="Start the movement under stimulation…").click()
+    tab.get_by_text("of the pre-session test's").wait_for()
+    sensor.rig.arm.way = back_and_forth(LOW + 0.01, HIGH - 0.01, (0.6, 1.6))
+    tab.get_by_role("button", name="Start now").click()
+    tab.wait_for_url("**/tests/T*")
+    tab.locator("#dose-used", has_text="N·m·s").wait_for()
+    tab.wait_for_url("**/participants/X1/joint", timeout=90_000)
+    assert tab.locator("input[name=recording]:checked").count() == 1
+    tab.get_by_text("Not recorded today: passive movement, held-angle test.").wait_for()
+    tab.get_by_role("button", name="Fit one model to the ticked ones").click()
+    tab.wait_for_url("**/models/M-*", timeout=60_000)
+    assert tab.errors == []
+
+
+def test_on_a_phone_nothing_is_wider_than_the_screen(tab: Any, sensor: Service) -> None:
+    with_range(tab, sensor)
+    tab.set_viewport_size({"width": PHONE[0], "height": PHONE[1]})
+    for place in ("/participants/X1", "/participants/X1/joint", "/rig/angle"):
+        tab.goto(sensor.url + place)
+        assert tab.evaluate("document.documentElement.scrollWidth <= innerWidth"), place

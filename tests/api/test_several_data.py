@@ -1,0 +1,66 @@
+"""The verbs of the command line take several recordings as the parts of one; what does not go together is named."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from api.cli import main
+from tests.api.test_worker import made_up_csv
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def parts(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """One record, and the same with an angle."""
+    folder = tmp_path_factory.mktemp("several")
+    plain = made_up_csv(folder / "plain.csv")
+    rows = plain.read_text().splitlines()
+    moved = folder / "moved.csv"
+    more = [f"{row},{0.8 + 0.001 * k:.4f},0.04" for k, row in enumerate(rows[1:])]
+    moved.write_text("\n".join([rows[0] + ",angle_rad,velocity_rad_s", *more]))
+    return [plain, moved]
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
+    capsys.readouterr()
+    code = main.run([str(each) for each in arguments])
+    out = capsys.readouterr()
+    return code, out.out, out.err
+
+
+def test_a_fit_of_two_is_of_both(parts: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    model = tmp_path / "MODEL.json"
+    code, out, err = run(capsys, "fit", *parts, "-o", model, "--json")
+    assert code == 0, err
+    assert "plain.csv: no angle_rad, so it is left out of the joined record" in err
+    assert json.loads(out)["data"]["recording_id"] == "plain.csv + moved.csv"
+    code, out, err = run(capsys, "compare", model, *parts, "--html", tmp_path / "report.html")
+    assert code == 0 and "plain.csv and " in out, err
+    assert "plain.csv, moved.csv" in (tmp_path / "report.html").read_text("utf-8")
+    code, out, err = run(capsys, "diagnose", *parts, "--model", model, "--json")
+    assert code == 0 and json.loads(out)["verdict"], err
+
+
+def test_the_one_without_an_angle_is_named(parts: list[Path], capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, err = run(capsys, "fit", *parts, "--effects", "torque_angle")
+    assert (code, out) == (2, "")
+    assert "plain.csv: it has no angle_rad" in err and len(err.strip().splitlines()) == 1
+
+
+def test_a_file_twice_or_none_is_refused(parts: list[Path], capsys: pytest.CaptureFixture[str]) -> None:
+    code, _, err = run(capsys, "fit", parts[0], parts[0])
+    assert code == 2 and "named twice" in err
+    assert run(capsys, "fit")[0] == 2
+
+
+def test_what_cannot_be_joined_names_its_file(
+    parts: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    short = tmp_path / "short.csv"
+    short.write_text("\n".join(parts[0].read_text().splitlines()[:6]))
+    code, _, err = run(capsys, "fit", parts[0], short)
+    assert code == 2 and "short.csv" in err and len(err.strip().splitlines()) == 1, err

@@ -1,0 +1,277 @@
+"""f, G, g and h from joined records of a joint that moves; the arms' physics is the emulator's, not the library's."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+import identify
+from hardware_sim.arm_patient import arm_patient
+from hardware_sim.arm_records import changed, record
+from identify.effects import get
+from identify.effects.kernels import relaxed
+from identify.errors import BadModel, BadRequest
+from identify.estimation.quality import range_warnings
+from identify.fitting import MOVING_JOINT
+from identify.inversion import Reference, invert
+from identify.inversion.table import read_reference
+from identify.model import Model
+from identify.records.join import join
+from identify.records.record import Record
+from identify.simulation.joint_surface import Surfaces
+from identify.simulation.pulses import Motion, above_rest
+
+ARM = 12
+"""Tissue that relaxes, a Hill muscle, moment arm and fibre length: one of the development arms."""
+COLUMNS = ("time_s", "pulse_width_us", "torque_nm")
+
+
+def as_record(made: dict[str, Any]) -> Record:
+    columns = {name: made[name] for name in ("angle_rad", "velocity_rad_s")}
+    return Record.from_arrays(*(made[name] for name in COLUMNS), list(made["segment"]), **columns)
+
+
+@cache
+def recorded_tests() -> tuple[dict[str, Any], ...]:
+    arm = arm_patient(ARM)
+    held = [record(arm, "held", place, angle_rad=x) for place, x in enumerate(np.linspace(*arm.range_rad, 5)[1:-1])]
+    return (record(arm, "isometric", 1), record(arm, "passive", 1), *held, record(arm, "moving", 1, duration_s=30.0))
+
+
+def joined(made: Any, order: Any = None) -> Record:
+    begins = [120.0 * place for place in range(len(made))]
+    places = list(order or range(len(made)))
+    return join([as_record(made[place]) for place in places], [begins[place] for place in places])
+
+
+@cache
+def model() -> Model:
+    return identify.fit(joined(recorded_tests()), effects=MOVING_JOINT)
+
+
+def surfaces(of: Model) -> Surfaces:
+    found = Surfaces.of(of)
+    assert found is not None
+    return found
+
+
+def seen(of: Model, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Angles and velocities of the cells that were seen."""
+    x, v = np.meshgrid(of.joint["angle_rad"], of.joint["velocity_rad_s"], indexing="ij")
+    rows = np.asarray(of.joint[f"seen_{name}"]) > 0
+    return x[rows], v[rows]
+
+
+def test_g_and_h_are_found_beside_f_and_dynamics():
+    arm, found = arm_patient(ARM), surfaces(model())
+    home = found.reference_rad
+    x, v = seen(model(), "h")
+    true_h = arm.h_nm(x, v) - arm.h_nm(home, 0.0)
+    assert np.sqrt(np.mean((found.h_nm(x, v) - true_h) ** 2)) < 0.05 * np.ptp(true_h)
+    x, v = seen(model(), "g")
+    assert np.sqrt(np.mean((found.g(x, v) - arm.g(x, v) / arm.g(home, 0.0)) ** 2)) < 0.07
+    width_us = np.linspace(0.0, arm.largest_width_us, 81)
+    true_f = arm.recruitment_nm(width_us) * arm.g(home, 0.0)
+    assert np.sqrt(np.mean((model().recruitment(width_us) - true_f) ** 2)) < 0.03 * true_f.max()
+    assert -found.inertia_nm_s2_per_rad == pytest.approx(arm.inertia_kg_m2, rel=0.1)
+
+
+def test_an_unseen_movement_is_predicted_to_the_noise():
+    unseen = record(arm_patient(ARM), "unseen", 7, duration_s=20.0)
+    error_nm = unseen["torque_nm"] - model().predict(as_record(unseen))
+    error_nm -= np.median(error_nm)
+    assert np.sqrt(np.mean(error_nm**2)) < 1.3 * unseen["truth"]["noise_sd_nm"]
+
+
+def test_at_its_own_angle_at_rest_g_is_one_and_h_is_zero():
+    home = np.array([surfaces(model()).reference_rad])
+    assert surfaces(model()).g(home, 0 * home) == pytest.approx(1.0)
+    assert surfaces(model()).h_nm(home, 0 * home) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_the_reference_is_where_most_was_stimulated_at_rest():
+    """Not where the record begins: the passive test, put first, begins elsewhere."""
+    assert surfaces(model()).reference_rad == pytest.approx(arm_patient(ARM).reference_rad, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"offset_nm": 4.0}, {"scale": -1.0}, {"start_s": 1.3}, {"scale": 2.0, "offset_nm": -7.0}],
+    ids=["offset", "the cell turned round", "a later start", "another scale"],
+)
+def test_what_changes_nothing_changes_nothing(change: dict[str, float]):
+    scale = change.get("scale", 1.0)
+    other = surfaces(identify.fit(joined([changed(made, **change) for made in recorded_tests()]), effects=MOVING_JOINT))
+    x, v = seen(model(), "h")
+    h = surfaces(model()).h_nm(x, v)
+    assert np.max(np.abs(other.h_nm(x, v) / scale - h)) < 0.03 * np.ptp(h)
+    x, v = seen(model(), "g")
+    assert np.max(np.abs(other.g(x, v) - surfaces(model()).g(x, v))) < 0.03
+    assert other.inertia_nm_s2_per_rad / scale == pytest.approx(surfaces(model()).inertia_nm_s2_per_rad, rel=0.05)
+
+
+def test_the_order_of_the_recordings_changes_nothing():
+    turned = identify.fit(joined(recorded_tests(), order=[5, 2, 0, 4, 1, 3]), effects=MOVING_JOINT)
+    assert turned.fit["rms_nm"] == pytest.approx(model().fit["rms_nm"], rel=1e-6)
+
+
+def test_a_sensor_with_another_zero_moves_the_angles_and_nothing_else():
+    moved = identify.fit(
+        joined([changed(made, angle_error_rad=0.5) for made in recorded_tests()]), effects=MOVING_JOINT
+    )
+    assert surfaces(moved).reference_rad == pytest.approx(surfaces(model()).reference_rad + 0.5, abs=1e-6)
+    x, v = seen(model(), "h")
+    assert surfaces(moved).h_nm(x + 0.5, v) == pytest.approx(surfaces(model()).h_nm(x, v), abs=1e-3)
+
+
+def test_the_prediction_does_not_ask_where_a_record_begins():
+    whole = as_record(record(arm_patient(ARM), "unseen", 3, duration_s=20.0))
+    rows = whole.time_s >= 8.0
+    part = Record.from_arrays(
+        whole.time_s[rows],
+        0 * whole.pulse_width_us[rows],
+        whole.torque_nm[rows],
+        angle_rad=whole.angle_rad[rows],
+        velocity_rad_s=whole.velocity_rad_s[rows],
+    )
+    still = replace(whole, pulse_width_us=0 * whole.pulse_width_us)
+    later, own = model().predict(still)[rows], model().predict(part)
+    assert np.max(np.abs((later - own)[2400:])) < 0.03 * np.ptp(own)  # tissue has forgotten by then
+
+
+def test_a_model_of_the_joint_refuses_to_predict_without_an_angle():
+    made = as_record(recorded_tests()[0])
+    with pytest.raises(BadModel, match="angle_rad"):
+        model().predict(replace(made, angle_rad=None, velocity_rad_s=None))
+    with pytest.raises(BadModel, match="depends on the angle"):
+        above_rest(model(), np.full(40, 200.0), 40.0)
+
+
+def test_a_model_that_does_not_know_its_own_angle_is_refused_on_other_records():
+    document = json.loads(model().to_json())
+    for entry in document["effects"]:
+        entry["settings"] = {k: v for k, v in entry["settings"].items() if "rad" not in k}
+    old = Model.from_dict(document)
+    with pytest.raises(BadModel, match="at which angle"):
+        old.predict(as_record(recorded_tests()[0]))
+    assert np.isfinite(old.predict(joined(recorded_tests()))).all()
+
+
+def test_model_json_holds_both_surfaces():
+    again = Model.from_json(model().to_json())
+    assert again.joint["g"] == model().to_dict()["joint"]["g"]
+    rows, columns = len(again.joint["angle_rad"]), len(again.joint["velocity_rad_s"])
+    for name in ("g", "h_nm", "g_lower", "g_upper", "h_lower_nm", "h_upper_nm", "seen_g", "seen_h"):
+        assert np.shape(again.joint[name]) == (rows, columns)
+    x, v = np.meshgrid(again.joint["angle_rad"], again.joint["velocity_rad_s"], indexing="ij")
+    assert np.allclose(again.joint["g"], surfaces(again).g(x, v), atol=1e-5)
+    assert np.all(np.asarray(again.joint["h_lower_nm"]) <= np.asarray(again.joint["h_upper_nm"]))
+    assert len(model().to_json(None)) < 1_000_000
+
+
+def test_the_table_is_dense_enough_for_straight_lines_between():
+    found, known = surfaces(model()), model().joint
+    angle, speed = np.asarray(known["angle_rad"]), np.asarray(known["velocity_rad_s"])
+    middle = 0.5 * (angle[1:] + angle[:-1])
+    v = np.zeros(middle.size) + speed[12]
+    h = np.asarray(known["h_nm"])
+    between = 0.5 * (h[1:, 12] + h[:-1, 12])
+    assert np.max(np.abs(found.h_nm(middle, v) - between)) < 0.005 * np.ptp(h)
+
+
+@pytest.mark.parametrize(
+    ("change", "place"),
+    [
+        ({"angle_rad": [0.0, 0.0]}, "joint.angle_rad"),
+        ({"g": [[1.0]]}, "joint.g"),
+        ({"h_nm": "none"}, "joint.h_nm"),
+        ({"reference_angle_rad": float("nan")}, "joint.reference_angle_rad"),
+        ({"h_lower_nm": [[]]}, "joint.h_lower_nm"),
+    ],
+)
+def test_a_spoiled_table_is_refused_with_its_place(change: dict[str, Any], place: str):
+    document = model().to_dict()
+    document["joint"] = {**document["joint"], **change}
+    with pytest.raises(BadModel) as caught:
+        Model.from_dict(document)
+    assert caught.value.place.startswith(place)
+
+
+def test_a_record_where_the_joint_was_not_is_told():
+    made = as_record(recorded_tests()[0])
+    assert made.angle_rad is not None and made.velocity_rad_s is not None
+    assert range_warnings(model(), made) == []
+    far = replace(made, angle_rad=made.angle_rad + 2.0, velocity_rad_s=made.velocity_rad_s + 9.0)
+    told = " ".join(range_warnings(model(), far))
+    assert "angle" in told and "velocity" in told
+    isometric = identify.fit(made)
+    assert "angle" in " ".join(range_warnings(isometric, far))
+
+
+def test_widths_follow_a_torque_while_the_joint_moves():
+    at_s = np.arange(400) / 40.0
+    arm = arm_patient(ARM)
+    low, high = arm.range_rad
+    angle = 0.5 * (low + high) + 0.3 * (high - low) * np.sin(0.8 * at_s)
+    motion = Motion.of(angle, 40.0)
+    passive = above_rest(model(), np.zeros(400), 40.0, motion)
+    bell = np.sin(np.pi * np.clip(at_s - 0.5, 0.0, 9.0) / 9.0) ** 2
+    wanted = passive + 0.4 * surfaces(model()).g(motion.angle_rad, motion.velocity_rad_s) * 8.0 * bell
+    found = invert(model(), Reference.of(wanted, angle_rad=angle))
+    assert found.fit_percent is not None and found.fit_percent > 97.0
+    still = Motion.held(float(angle[0]), 400)
+    as_if_still = above_rest(model(), found.pulse_width_us, 40.0, still)
+    moving = above_rest(model(), found.pulse_width_us, 40.0, motion)
+    assert np.sqrt(np.mean((as_if_still - wanted) ** 2)) > 5 * np.sqrt(np.mean((moving - wanted) ** 2))
+
+
+def test_what_only_the_joint_gives_is_no_reason_to_stimulate():
+    """The muscle pulls one way: where the passive torque alone is above what is wanted, no pulse is sent."""
+    angle = np.linspace(*arm_patient(ARM).range_rad, 200)
+    passive = above_rest(model(), np.zeros(200), 40.0, Motion.of(angle, 40.0))
+    found = invert(model(), Reference.of(passive - 0.5, angle_rad=angle))
+    assert np.max(found.pulse_width_us) == 0.0
+    assert {one.reason for one in found.unreachable} == {"below-zero"}
+
+
+def test_a_reference_without_its_angle_is_refused():
+    with pytest.raises(BadModel, match="angle"):
+        invert(model(), Reference.of(np.ones(80)))
+    with pytest.raises(BadRequest, match="3 angles for 80"):
+        Reference.of(np.ones(80), angle_rad=[1.0, 1.0, 1.0])
+    with pytest.raises(BadRequest, match="degrees"):
+        Reference.of(np.ones(80), angle_rad=np.full(80, 90.0))
+
+
+def test_the_angle_stands_beside_the_torque_in_a_table():
+    rows = "\n".join(f"{k / 40},{1.0},{1.2 + k / 400}" for k in range(80))
+    found = read_reference(f"time_s,torque_nm,angle_rad\n{rows}\n".encode(), "a.csv")
+    assert found.angle_rad is not None and found.angle_rad[0] == pytest.approx(1.2, abs=0.01)
+
+
+def test_the_diagnosis_names_the_part_of_fig_2():
+    parts = {"passive_torque": "h", "torque_angle": "g", "torque_velocity": "g", "fatigue": "f", "tremor": ""}
+    assert {name: get(name).part for name in parts} == parts
+    assert get("electromechanical_delay").part == get("asymmetric_relaxation").part == "G"
+
+
+def test_several_forms_of_an_effect_and_the_likelier_is_taken():
+    forms = {entry["id"]: entry["form"] for entry in model().effects}
+    assert forms["passive_torque"] == "relaxing"  # this arm's tissue gives way
+    with pytest.raises(BadRequest, match="no form 'nothing'"):
+        identify.fit(as_record(recorded_tests()[1 + 1]), effects=["passive_torque:surface|nothing"])
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.7])
+def test_a_lag_follows_a_straight_line_exactly(slope: float):
+    time_s = np.sort(np.r_[0.0, np.random.default_rng(0).uniform(0.0, 3.0, 20)])
+    value = 1.0 + slope * time_s
+    found = relaxed(value, time_s, np.zeros(21, bool), np.array([0.8]))[0]
+    assert found == pytest.approx(value - 0.8 * slope * (1 - np.exp(-time_s / 0.8)))
+    anew = relaxed(value, time_s, np.arange(21) == 9, np.array([0.8]))[0]
+    assert anew[9] == value[9]

@@ -1,0 +1,208 @@
+"""The joint's angle over the wire: aligned, calibrated, recorded; faults end a test, and a passive one has no pulse."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+import identify
+from rig import archive
+from tests.harness.processes import Bench, RigClient, control, default_plan
+
+pytestmark = [pytest.mark.wire, pytest.mark.slow]
+
+PPM = 150.0
+MOUNTED = ("--angle-offset-deg", "31.5", "--angle-direction", "-1")
+MOVING = {"cmd": "arm", "mode": "robot", "from_deg": 30.0, "to_deg": 100.0, "deg_s": 40.0}
+PLAN = {"kind": "moving", "angle": {"range_rad": [0.2, 2.2], "still_s": 2.0}}
+STEPS = [
+    {"name": "rest", "sequence": "rest", "settings": {"duration_s": 0.5}},
+    {"name": "steps", "sequence": "steps", "settings": {"on_s": 2.5, "off_s": 1.0, "repeats": 1}},
+]
+REST = [{"name": "passive", "sequence": "rest", "settings": {"duration_s": 3.0}}]
+
+
+def pulses(bench: Bench) -> int:
+    return control(bench.emulator.ready["control"], {"cmd": "state"})["pulses_received"]
+
+
+def played(bench: Bench, client: RigClient, test_id: str, **fields: Any) -> dict[str, Any]:
+    """A whole test; its finished event."""
+    client.ask("subscribe")
+    reply = client.start(default_plan(test_id, **{"segments": STEPS, **fields}))
+    assert reply["ok"], reply
+    return client.wait_finished(test_id, timeout_s=40)
+
+
+@pytest.mark.parametrize(
+    ("options", "methods"),
+    [
+        (("--angle-clock-ppm", f"{PPM:g}", "--angle-jitter-us", "200"), {"order", "stamps"}),
+        (("--load-cell", "slcan", "--angle-clock-ppm", f"{PPM:g}"), {"order"}),
+        (("--angle", "in-cell"), {"cell"}),
+    ],
+    ids=["socketcand", "slcan", "in the cell"],
+)
+def test_angles_are_recorded_and_stand_within_a_millisecond_of_the_torque(
+    make_bench: Callable[..., Bench], options: tuple[str, ...], methods: set[str]
+):
+    bench = make_bench("--arm", "held", "--noise-seed", "7", *MOUNTED, *options)
+    client = bench.start_rig()
+    client.ask("subscribe", samples=True)
+    assert bench.fault(**MOVING)["ok"]
+    event = played(bench, client, "t", **PLAN)
+    assert event["outcome"] == "completed", event
+    live = [e for e in list(client.events.queue) if e["event"] == "live" and e["angle"]]
+    path = Path(event["recording_path"])
+    assert archive.verify(path)
+    with h5py.File(path) as file:
+        group, torque = file["angle"], file["torque"]
+        assert group.attrs["method"] in methods
+        time_s, number = group["time_s"][:], group["counter"][:]
+        assert np.degrees(group["angle_rad"][:].min()) == pytest.approx(30.0, abs=2.0)
+        assert np.degrees(group["angle_rad"][:].max()) == pytest.approx(100.0, abs=2.0)
+        assert np.percentile(np.abs(np.degrees(group["velocity_rad_s"][:])), 90) == pytest.approx(40.0, abs=2.0)
+        assert np.allclose(np.degrees(group["angle_rad"][:]), -(group["raw"][:] - 31.5), atol=1e-9)
+        if "cell" in methods:
+            assert np.isin(time_s, torque["time_s"][:]).mean() > 0.99
+        else:  # both counters began when the emulator did, and neither has wrapped
+            sampled = number * 8.0 / (1 + PPM * 1e-6)
+            true_s = np.interp(sampled, torque["counter"][:], torque["time_s"][:])
+            assert np.max(np.abs(time_s - true_s)[20:-20]) < 1e-3
+    record = identify.read(path)
+    assert record.angle_rad is not None and record.velocity_rad_s is not None
+    assert live == [] or all(len(row) == 3 for row in live[0]["angle"])
+
+
+@pytest.fixture(scope="module")
+def angled(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Bench, RigClient]]:
+    """An arm with its sensor, and a rig, for the rest of this file."""
+    bench = Bench(tmp_path_factory.mktemp("angled"), "--arm", "held", "--noise-seed", "7", *MOUNTED, speed=2.0)
+    yield bench, bench.start_rig()
+    bench.close()
+
+
+@pytest.fixture
+def ready(angled: tuple[Bench, RigClient]) -> tuple[Bench, RigClient]:
+    """The file's pair, ready and at 60 degrees."""
+    bench, client = angled
+    for name in bench.fault(cmd="faults")["active"]:
+        bench.fault(cmd="fault", name=name, on=False)
+    if client.status()["state"] != "ready":
+        client.wait_state("latched", "disconnected")
+        assert client.ask("rearm", by="test")["ok"]
+    at(bench, client, 60.0)
+    return bench, client
+
+
+def at(bench: Bench, client: RigClient, degrees: float) -> None:
+    """Hold the arm there until the rig sees it."""
+    assert bench.fault(cmd="arm", mode="held", angle_deg=degrees)["ok"]
+    end = time.monotonic() + 15
+    while True:
+        raw = client.status()["angle"]
+        still = raw["velocity_rad_s"] is not None and abs(raw["velocity_rad_s"]) < 0.1
+        if still and abs(math.degrees(raw["angle_rad"]) - degrees) < 2.0:
+            return
+        assert time.monotonic() < end, raw
+        time.sleep(0.05)
+
+
+FAULTS = {
+    "angle_silent": "stale",
+    "angle_nan": "not a number",
+    "angle_fault_bit": "a fault of its own",
+    "angle_offset_step": "jumped",
+    "angle_counter_jump": "counter jumped",
+    "angle_stuck": "no movement",
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_of_the_sensor_ends_the_test(ready: tuple[Bench, RigClient], fault: str):
+    bench, client = ready
+    assert bench.fault(**MOVING)["ok"]
+    client.ask("subscribe")
+    before = pulses(bench)
+    lasting = [STEPS[0], {"name": "steps", "sequence": "steps", "settings": {"on_s": 20.0, "off_s": 0.0}}]
+    assert client.start(default_plan(fault, segments=lasting, **PLAN))["ok"]
+    end = time.monotonic() + 10
+    while pulses(bench) < before + 20:
+        assert time.monotonic() < end
+        time.sleep(0.02)
+    assert bench.fault(cmd="fault", name=fault, on=True)["ok"]
+    event = client.wait_finished(fault, timeout_s=20)
+    assert event["outcome"] == "fault"
+    assert event["reason"].startswith("angle sensor: ") and FAULTS[fault] in event["reason"]
+    assert client.wait_state("latched")["reason"]
+    felt = pulses(bench)
+    time.sleep(0.3)
+    assert pulses(bench) == felt
+    assert archive.verify(Path(event["recording_path"]))
+
+
+def test_no_pulse_is_felt_in_a_passive_test(ready: tuple[Bench, RigClient]):
+    bench, client = ready
+    assert bench.fault(**MOVING)["ok"]
+    before = pulses(bench)
+    refused = client.ask("start", plan=default_plan("wide", **{**PLAN, "kind": "passive", "segments": STEPS}))
+    assert "passive test" in refused["problem"]["detail"]
+    event = played(bench, client, "passive", **{**PLAN, "kind": "passive", "segments": REST})
+    assert event["outcome"] == "completed", event
+    assert pulses(bench) == before
+
+
+def test_a_held_test_starts_at_its_angle_only(ready: tuple[Bench, RigClient]):
+    bench, client = ready
+    held = {"kind": "held", "angle": {"range_rad": [0.2, 2.2], "target_rad": math.radians(60)}}
+    at(bench, client, 80.0)
+    refused = client.start(default_plan("held", segments=STEPS, **held))["problem"]
+    assert refused["code"] == "refused" and "this test needs 60.0°" in refused["detail"]
+    at(bench, client, 62.0)
+    assert played(bench, client, "held", **held)["outcome"] == "completed"
+
+
+def test_a_sensor_that_fails_does_not_end_a_test_without_an_angle(ready: tuple[Bench, RigClient]):
+    bench, client = ready
+    assert bench.fault(cmd="fault", name="angle_silent", on=True)["ok"]
+    event = played(bench, client, "plain")
+    assert event["outcome"] == "completed", event
+    assert any(line.startswith("angle sensor: ") for line in event["summary"]["warnings"])
+
+
+def test_a_sensor_that_is_plugged_in_again_is_found_by_itself(ready: tuple[Bench, RigClient]):
+    bench, client = ready
+    assert bench.fault(cmd="fault", name="angle_unplugged", on=True)["ok"]
+    end = time.monotonic() + 15
+    while not client.status()["angle"]["problem"]:
+        assert time.monotonic() < end
+        time.sleep(0.05)
+    assert bench.fault(cmd="fault", name="angle_unplugged", on=False)["ok"]
+    at(bench, client, 60.0)
+    assert client.status()["angle"]["problem"] == ""
+
+
+def test_two_poses_calibrate_and_are_kept(make_bench: Callable[..., Bench]):
+    bench = make_bench("--arm", "held", "--noise-seed", "7", *MOUNTED, "--angle-scale", "1.1")
+    client = bench.start_rig()
+    off_deg = 4.0  # the goniometer's zero is another than the emulator's
+    for degrees in (20.0, 90.0):
+        at(bench, client, degrees)
+        end = time.monotonic() + 15
+        while not (reply := client.ask("angle_pose", angle_rad=math.radians(degrees + off_deg), by="nurse"))["ok"]:
+            assert "moved" in reply["problem"]["detail"] and time.monotonic() < end, reply
+            time.sleep(0.1)
+    found = reply["body"]["angle"]
+    assert found["calibrated"] and found["calibration"]["direction"] == -1
+    assert found["calibration"]["radians_per_unit"] == pytest.approx(math.radians(1.1), rel=0.01)
+    assert bench.rig is not None
+    bench.rig.stop()
+    again = bench.start_rig().status()["angle"]
+    assert again["calibrated"] and again["calibration"] == found["calibration"]
