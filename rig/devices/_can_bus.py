@@ -13,7 +13,7 @@ import queue
 import socket
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple, cast
 
 import can
@@ -190,6 +190,47 @@ class CanBus:
                 f"{_table(self._name)}.bus: no socketcand answers at {host}:{port} ({_line(error)}); check that it is "
                 "running"
             ) from None
+
+
+def gather(
+    source: CanBus | Tap, frame_id: int, timeout_s: float, gather_s: float, take: Callable[[Frame], None]
+) -> tuple[int, int]:
+    """Hand the frames of an identifier to `take` as they arrive; how many were damaged, and how many told of an error.
+
+    Parameters
+    ----------
+    timeout_s
+        Real seconds to wait for the first one.
+    gather_s
+        Real seconds to go on after it.
+    take
+        Raises WireError for a frame that it cannot read.
+
+    Raises
+    ------
+    DeviceError
+        The bus is gone.
+    """
+    damaged = errors = taken = 0
+    end_s = time.monotonic() + timeout_s
+    while (remaining_s := end_s - time.monotonic()) > 0:
+        try:
+            frame = source.receive(remaining_s)
+            if frame is None:
+                continue
+            if frame.message.is_error_frame:
+                errors += 1
+                continue
+            if frame.message.arbitration_id != frame_id or frame.message.is_remote_frame:
+                continue
+            take(frame)
+        except WireError:
+            damaged += 1
+            continue
+        taken += 1
+        if taken == 1:
+            end_s = min(end_s, time.monotonic() + gather_s)
+    return damaged, errors
 
 
 def place_of(arguments: dict[str, Any]) -> str:

@@ -6,7 +6,6 @@ It shares the load cell's adapter where that is the same one, so each adapter is
 from __future__ import annotations
 
 import math
-import time
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -14,8 +13,8 @@ from pydantic import Field
 
 from rig.clock import Clock
 from rig.devices import DeviceSettings
-from rig.devices._can_bus import CanBus, Frame, Tap, place_of
-from rig.errors import ConfigError, DeviceError, WireError
+from rig.devices._can_bus import CanBus, Frame, Tap, gather, place_of
+from rig.errors import ConfigError, DeviceError
 from rig.signals import ANGLE_SAMPLE, AngleBlock, AngleScale
 from rig.wire import dbc
 
@@ -98,27 +97,12 @@ class CanAngleSensor:
         if self._source is None:
             raise DeviceError("angle sensor is not open")
         rows: list[tuple[float, float, float, float, int, int]] = []
-        malformed = error_frames = 0
-        end_s = time.monotonic() + timeout_s
-        while (remaining_s := end_s - time.monotonic()) > 0:
-            try:
-                frame = self._source.receive(remaining_s)
-                if frame is None:
-                    continue
-                if frame.message.is_error_frame:
-                    error_frames += 1
-                    continue
-                if frame.message.arbitration_id != self._frame.frame_id or frame.message.is_remote_frame:
-                    continue
-                rows.append(self._row(frame))
-            except WireError:
-                malformed += 1
-                continue
-            if len(rows) == 1:
-                end_s = min(end_s, time.monotonic() + GATHER_S)
+        counts = gather(
+            self._source, self._frame.frame_id, timeout_s, GATHER_S, lambda frame: rows.append(self._row(frame))
+        )
         samples = np.array(rows, dtype=ANGLE_SAMPLE)
         samples["angle_rad"] = self.scale.angle_rad(samples["raw"])
-        return AngleBlock(samples, malformed, error_frames)
+        return AngleBlock(samples, *counts)
 
     def close(self) -> None:
         if isinstance(self._source, Tap):

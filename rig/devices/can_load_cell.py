@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import re
-import time
+from functools import partial
 from typing import Any
 
 import can
@@ -16,8 +16,8 @@ from pydantic import Field, field_validator
 
 from rig.clock import Clock
 from rig.devices import DeviceSettings
-from rig.devices._can_bus import CanBus, Frame
-from rig.errors import ConfigError, DeviceError, WireError
+from rig.devices._can_bus import CanBus, Frame, gather
+from rig.errors import ConfigError, DeviceError
 from rig.signals import SAMPLE, TorqueBlock
 from rig.wire import dbc
 
@@ -99,25 +99,8 @@ class CanLoadCell:
         if self._bus is None:
             raise DeviceError("load cell is not open")
         rows: list[tuple[float, float, float, int, int]] = []
-        malformed = error_frames = 0
-        end_s = time.monotonic() + timeout_s
-        while (remaining_s := end_s - time.monotonic()) > 0:
-            try:
-                frame = self._bus.receive(remaining_s)
-                if frame is None:
-                    continue
-                if frame.message.is_error_frame:
-                    error_frames += 1
-                    continue
-                if frame.message.arbitration_id != self._frame.frame_id or frame.message.is_remote_frame:
-                    continue
-                self._append(rows, frame)
-            except WireError:
-                malformed += 1
-                continue
-            if len(rows) == self._frame.samples_per_frame:
-                end_s = min(end_s, time.monotonic() + GATHER_S)
-        return TorqueBlock(np.array(rows, dtype=SAMPLE), malformed, error_frames)
+        counts = gather(self._bus, self._frame.frame_id, timeout_s, GATHER_S, partial(self._append, rows))
+        return TorqueBlock(np.array(rows, dtype=SAMPLE), *counts)
 
     def close(self) -> None:
         if self._bus is None:
