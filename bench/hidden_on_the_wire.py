@@ -4,7 +4,8 @@
     python -m bench.hidden_on_the_wire --moving --seeds 2520:2540
 
 `--moving`: patients whose joint moves, with an angle sensor; one test, sealed, read and diagnosed, and beside it the
-same patient's record as a CSV file (`tests/harness/moving_on_the_wire.py`).
+same patient's record as a CSV file (`tests/harness/moving_on_the_wire.py`). `--hiding`: only the seeds among them that
+hide this effect, asked before they are played.
 
 Every seed counts. `--speed` lets emulator and rig run faster than real time (a busy machine makes the result noisy).
 `tests/harness/hidden_on_the_wire.py` plays one seed.
@@ -20,7 +21,8 @@ from typing import Any
 
 from api.cli.errors import CommandError
 from api.client.errors import ServiceError
-from tests.harness.hidden_on_the_wire import run
+from tests.harness.hidden_on_the_wire import reveal, run
+from tests.harness.moving_on_the_wire import DESIGN
 from tests.harness.moving_on_the_wire import run as run_moving
 
 
@@ -31,15 +33,18 @@ def main() -> None:
     parser.add_argument("--speed", type=float, default=2.0)
     parser.add_argument("--json", type=Path, help="write all that was found here")
     parser.add_argument("--moving", action="store_true", help="patients whose joint moves")
+    parser.add_argument("--hiding", help="with --moving: only seeds that hide this effect")
     options = parser.parse_args()
     first, _, last = options.seeds.partition(":")
-    seeds = range(int(first), int(last or int(first) + 1))
+    seeds = list(range(int(first), int(last or int(first) + 1)))
+    if options.hiding:
+        seeds = [seed for seed in seeds if options.hiding in reveal(seed, *DESIGN)["effects"]]
     rows = _moving(seeds, options.speed) if options.moving else _still(seeds, options.speed)
     if options.json:
         options.json.write_text(json.dumps(rows, indent=1))
 
 
-def _still(seeds: range, speed: float) -> list[dict[str, Any]]:
+def _still(seeds: list[int], speed: float) -> list[dict[str, Any]]:
     rows = []
     for seed in seeds:
         try:
@@ -63,7 +68,7 @@ def _still(seeds: range, speed: float) -> list[dict[str, Any]]:
     return rows
 
 
-def _moving(seeds: range, speed: float) -> list[dict[str, Any]]:
+def _moving(seeds: list[int], speed: float) -> list[dict[str, Any]]:
     """Rows, printed as they come, and the totals of each effect on the wire and as a file."""
     rows = []
     for seed in seeds:

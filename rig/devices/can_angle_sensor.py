@@ -46,7 +46,6 @@ class Settings(DeviceSettings):
         taken = {} if self.bus else {"bus": cell.get("bus", {})}
         if self.of_the_cell:
             taken |= {name: cell[name] for name in OF_THE_CELL if name in cell and name not in given}
-            taken |= {} if "fault" in given else {"fault": None}
             several = cell.get("signal")
             if isinstance(several, list) and "sample_rate_hz" in taken:
                 taken["sample_rate_hz"] /= len(several)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
@@ -12,6 +13,7 @@ from typing import cast
 import cantools
 from cantools.database import Database
 from cantools.database.can import Message
+from cantools.database.namedsignalvalue import NamedSignalValue
 
 from rig.errors import ConfigError, WireError
 
@@ -49,6 +51,16 @@ def _choose(kind: str, name: str, known: Sequence[str], place: str) -> str:
     near = difflib.get_close_matches(name, known, 1)
     hint = f"; did you mean {near[0]!r}?" if near else ""
     raise ConfigError(f"{kind}: {place} has no {kind} {name!r}{hint} (it has: {', '.join(known) or 'none'})")
+
+
+def _measured(value: float | NamedSignalValue) -> float:
+    """Of a signal; a word is no number."""
+    return math.nan if isinstance(value, NamedSignalValue) else float(value)
+
+
+def _whole(value: float | NamedSignalValue) -> int:
+    """Of a counter or a bit, also where the description has a word for it."""
+    return int(value.value if isinstance(value, NamedSignalValue) else value)
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +133,7 @@ class SampleFrame:
         return len(self._signals)
 
     def decode(self, data: bytes) -> FrameSamples:
-        """Values of one frame.
+        """Values of one frame; NaN where the description has a word for a value (`VAL_`, as "no reading").
 
         Raises
         ------
@@ -130,14 +142,14 @@ class SampleFrame:
         """
         try:
             values = cast(
-                "dict[str, float]",
+                "dict[str, float | NamedSignalValue]",
                 # a frame may be shorter than described, but the signals needed here must be in it
-                self.message.decode(data, decode_choices=False, scaling=True, allow_truncated=True),
+                self.message.decode(data, decode_choices=True, scaling=True, allow_truncated=True),
             )
             return FrameSamples(
-                tuple(float(values[s]) for s in self._signals),
-                int(values[self._counter]) if self._counter else -1,
-                int(values[self._flag]) if self._flag else 255,
+                tuple(_measured(values[s]) for s in self._signals),
+                _whole(values[self._counter]) if self._counter else -1,
+                _whole(values[self._flag]) if self._flag else 255,
             )
         except Exception as error:
             raise WireError(f"frame {data.hex(' ')} does not fit {self.message.name}: {error}") from None

@@ -149,20 +149,15 @@ def test_a_signal_in_the_cells_own_frame():
         cell.open()
         sensor.open()
         for i in range(5):
-            data = struct.pack("<fhBB", 0.25 * i, -1234 + i, i, i % 2)
+            data = struct.pack("<fhBB", 0.25 * i, -1234 + i if i < 4 else -32768, i, i % 2 + 2 * (i > 2))
             peer.send(can.Message(arbitration_id=0x181, is_extended_id=False, data=data))
         torques, angles = cell.read(0.1).samples, sensor.read(0.1).samples
-        assert torques["torque_nm"].tolist() == [0, 0.25, 0.5, 0.75, 1.0] and torques["sync"].tolist() == [
-            0,
-            1,
-            0,
-            1,
-            0,
-        ]
-        assert angles["raw"] == pytest.approx([-12.34, -12.33, -12.32, -12.31, -12.30])
+        assert torques["torque_nm"].tolist() == [0, 0.25, 0.5, 0.75, 1.0]
+        assert torques["sync"].tolist() == [0, 1, 0, 1, 0]
+        assert angles["raw"] == pytest.approx([-12.34, -12.33, -12.32, -12.31, math.nan], nan_ok=True)
         assert angles["counter"].tolist() == torques["counter"].tolist()
         assert angles["host_time_s"].tolist() == torques["host_time_s"].tolist()
-        assert angles["fault"].tolist() == [255] * 5
+        assert angles["fault"].tolist() == [0, 0, 0, 1, 1]
         sensor.close()
         cell.close()
 

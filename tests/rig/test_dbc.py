@@ -44,6 +44,15 @@ def test_several_samples_of_big_endian_counts(tmp_path: Path):
     assert without.counter_modulus == 0
 
 
+def test_a_value_that_has_a_word_is_no_reading(tmp_path: Path):
+    path = tmp_path / "words.dbc"
+    path.write_text(COUNTS + 'VAL_ 610 First -32768 "no reading" 32767 "overload" ;\nVAL_ 610 Index 9 "nine" ;\n')
+    frame = SampleFrame(str(path), "Value", ["First", "Second"], "Index", None)
+    for raw in (-32768, 32767):
+        got = frame.decode(struct.pack(">hhhBB", raw, -32768, 0, 9, 0))
+        assert math.isnan(got.values[0]) and got.values[1] == pytest.approx(-327.68) and got.counter == 9
+
+
 def test_a_short_frame_is_told():
     with pytest.raises(WireError, match="does not fit Torque"):
         SampleFrame(PACKAGED, None, ["Torque_Nm"], None, None).decode(b"\0\0")
