@@ -45,14 +45,14 @@ def test_the_three_tests_cost_at_most_what_the_papers_costs(
     found = layout((0.2, 0.2 + math.radians(width)), curve, 300.0, PAPER_US, RATE_HZ)
     held = torque_time(widths_of(found.held), RATE_HZ, curve) * len(found.targets_rad)
     whole = held + torque_time(widths_of(found.moving), RATE_HZ, curve)
-    assert whole <= torque_time(PAPER_US, RATE_HZ, curve) + 1e-6
+    assert whole <= 0.85 * torque_time(PAPER_US, RATE_HZ, curve) + 1e-6, "the rest is for a muscle stronger elsewhere"
     assert found.doses["total"] == pytest.approx(whole)
     assert max(widths_of(found.held + found.moving)) <= 300.0
 
 
 def test_a_usual_muscle_gets_steps_and_levels_that_are_long_enough() -> None:
     found = layout((0.2, 1.9), curve_of(sigmoid(150, 25, 8.0), 300.0, None), 300.0, PAPER_US, RATE_HZ)
-    assert found.known and 0.8 < found.share <= 1.0
+    assert found.known and 0.7 < found.share <= 0.85
     steps = [s for s in found.held if s["name"].startswith("hold")]
     assert len(steps) == 3 and all(len(s["settings"]["pulse_width_us"]) >= 0.6 * RATE_HZ for s in steps)
     under = sum(width > 0 for width in widths_of(found.moving)) / RATE_HZ
