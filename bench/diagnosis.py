@@ -24,7 +24,7 @@ import numpy as np
 
 from identify.diagnosis import candidates as workers
 from identify.diagnosis import diagnose
-from identify.diagnosis.verdict import STRUCTURE
+from identify.diagnosis.thresholds import STRUCTURE
 from identify.effects import registry
 from identify.records.join import join
 from identify.records.record import Record

@@ -9,7 +9,7 @@ from typing import Any
 from identify.diagnosis.held_out_error import held_out_rise
 from identify.diagnosis.residual_structure import quiet_rows, residual_structure
 from identify.diagnosis.search import without_effect
-from identify.diagnosis.thresholds import FIRST_MARGIN, STRUCTURE
+from identify.diagnosis.thresholds import FIRST_MARGIN
 from identify.effects import get
 from identify.effects.base import Effect
 from identify.errors import NotIdentifiable
@@ -58,7 +58,7 @@ def still_needed(
     judged: dict[str, Judged] = {}
     full = _with_all(plain, model, raw, judged, lambda share, text: say(0.6 * share, text))
     last = _reduced(full, raw, judged, lambda share, text: say(0.6 + 0.4 * share, text))
-    if residual_structure(last, quiet_rows(last), raw.noise_sd_nm).ratio > STRUCTURE:
+    if residual_structure(last, quiet_rows(last), raw.noise_sd_nm).left:
         judged = {name: _undecided(verdict) for name, verdict in judged.items()}
     return last, judged
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from identify.diagnosis.thresholds import COUNTS, QUIET
+from identify.diagnosis.thresholds import COUNTS, QUIET, STRUCTURE, STRUCTURE_SHARE
 from identify.dynamics.pulse_grid import runs
 from identify.estimation.joint import Fitted
 from identify.noise.level import band_part
@@ -32,6 +32,8 @@ class ResidualStructure:
         Standard deviation of the slow part of the residual, N·m.
     ar1 : float
         Correlation of neighbours of the residual as a whole.
+    scale_nm : float
+        The record's largest torque, N·m.
     """
 
     white_nm: float
@@ -40,6 +42,13 @@ class ResidualStructure:
     ideal: float
     slow_nm: float
     ar1: float
+    scale_nm: float
+
+    @property
+    def left(self) -> bool:
+        """Whether work and rest differ, and by as much as matters: enough samples make every trifle significant."""
+        excess_nm = max(self.busy_nm**2 - self.white_nm**2, 0.0) ** 0.5
+        return self.ratio > STRUCTURE and excess_nm > STRUCTURE_SHARE * self.scale_nm
 
 
 def residual_structure(fitted: Fitted, quiet: np.ndarray, noise_sd_nm: float) -> ResidualStructure:
@@ -70,6 +79,7 @@ def residual_structure(fitted: Fitted, quiet: np.ndarray, noise_sd_nm: float) ->
         ideal=_ideal(setup.fitted, resting, white, sum(r.stop - r.start for r in rests)),
         slow_nm=fitted.noise.sd_nm * float(np.sqrt(min(fitted.noise.share, 1.0))),
         ar1=lag,
+        scale_nm=setup.scale_nm,
     )
 
 

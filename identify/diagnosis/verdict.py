@@ -28,7 +28,6 @@ from identify.diagnosis.thresholds import (
     RELATIVE,
     REPEATED_SHARE,
     SEEN_AT_REST,
-    STRUCTURE,
     STRUCTURE_BESIDE_BAND,
     TEMPERATURE,
     UNKNOWN_FORM,
@@ -92,9 +91,9 @@ def _nothing(candidates: list[Candidate]) -> float:
     return 1.0 / (1.0 + sum(float(np.exp(min(c.gain - FIRST_MARGIN, 60.0))) for c in candidates))
 
 
-def _no_effort(search: EffectSearch, explained: float, structure: float) -> bool:
+def _no_effort(search: EffectSearch, explained: float, structure: bool) -> bool:
     """Whether what looks like efforts is more likely caused by the stimulation."""
-    if explained < LEAST_EXPLAINED_BY_EFFORTS and structure > STRUCTURE:
+    if explained < LEAST_EXPLAINED_BY_EFFORTS and structure:
         return True
     effort = search.added[0]
     holder = search.chain[1]
@@ -165,15 +164,15 @@ def judge(search: EffectSearch) -> Verdict:
     if strange:
         notes.append(f"{100 * held:.0f} % of the readings equal the one before: the converter repeats values.")
     if effects:
-        strange = strange or (explained < LEAST_EXPLAINED and structure > STRUCTURE)
+        strange = strange or (explained < LEAST_EXPLAINED and left.left)
         lawless = search.free_gain[0] > search.rounds[0][0].gain + FREE_GAIN_MARGIN
         strange = strange or (lawless and explained < EXPLAINED_BY_LAWS)
         if get(effects[0]).band:
             strange = strange or (explained < LEAST_EXPLAINED_BY_BAND and structure > STRUCTURE_BESIDE_BAND)
         elif search.added and not get(search.added[0]).predictable:
-            strange = strange or _everywhere(search) or _no_effort(search, explained, structure)
+            strange = strange or _everywhere(search) or _no_effort(search, explained, left.left)
     else:
-        strange = strange or structure > STRUCTURE
+        strange = strange or left.left
     # Naming an effect claims more than naming none, so less error is allowed.
     form = FORM_ERROR_WITH_EFFECTS if effects else FORM_ERROR
     before, after = (held_out_error(fitted, form, last) for fitted in (first, last))

@@ -10,6 +10,7 @@ import pytest
 
 from identify.diagnosis import verdict
 from identify.diagnosis.held_out_error import HeldOutError
+from identify.diagnosis.residual_structure import ResidualStructure
 from identify.diagnosis.search import EffectSearch
 from identify.diagnosis.verdict import Verdict, judge, shares
 from identify.effects import get
@@ -59,8 +60,15 @@ class Made:
         monkeypatch.setattr(verdict, "held_out_rise", self._rise)
         monkeypatch.setattr(verdict, "held_out_error", self._unseen)
 
-    def left(self, ratio: float = 0.0, ideal: float = 80.0, busy_nm: float = 1.0, white_nm: float = 0.0) -> Any:
-        return SimpleNamespace(ratio=ratio, ideal=ideal, busy_nm=busy_nm, white_nm=white_nm)
+    def left(
+        self,
+        ratio: float = 0.0,
+        ideal: float = 80.0,
+        busy_nm: float = 1.0,
+        white_nm: float = 0.0,
+        scale_nm: float = 9.0,
+    ) -> ResidualStructure:
+        return ResidualStructure(white_nm, busy_nm, ratio, ideal, slow_nm=0.0, ar1=0.0, scale_nm=scale_nm)
 
     def add(self, effect: str, gain: float, log_likelihood: float, rival: float = 0.0, **parameters: float) -> Made:
         """One effect more, that took the log-likelihood so far."""
@@ -179,6 +187,15 @@ def test_structure_that_no_effect_explains(made: Made, ratio: float, strange: bo
     if strange:
         assert found.probability == 0.9
     assert found.structure == ratio
+
+
+@pytest.mark.parametrize(("scale_nm", "strange"), [(266.0, True), (267.0, False)])
+def test_an_error_too_small_to_matter_is_no_structure(made: Made, scale_nm: float, strange: bool):
+    """0.4 N·m are 0.15 % of 266.7. A record of many samples shows every trifle, as a pulse a millisecond late."""
+    made.work.residuals = [made.left(ratio=100.0, busy_nm=0.5, white_nm=0.3, scale_nm=scale_nm)]
+    assert (made.judged().kind == "unexplained_structure") is strange
+    made.work.residuals = [made.left(ratio=100.0, busy_nm=0.3, white_nm=0.5, scale_nm=1.0)]
+    assert made.judged().kind == "nothing_missing", "less than noise"
 
 
 @pytest.mark.parametrize(
