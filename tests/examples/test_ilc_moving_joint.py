@@ -10,13 +10,14 @@ import importlib
 import io
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import h5py
 import numpy as np
 import pytest
 
+from stimrig import Client
 from tests.examples.test_ilc_controller import MODEL, UNLIKE_THE_MODEL, felt, model_of, patient_of
 
 PATH = Path(__file__).parents[2] / "examples" / "ilc_moving_joint.py"
@@ -117,6 +118,12 @@ class Answers:
     def __init__(self, content: bytes, recording_id: str | None = "R1") -> None:
         self.content, self.recording_id, self.asked = content, recording_id, []
 
+    def approved_model(self, _participant: str, _known: Any) -> Any:
+        return SimpleNamespace(document=model_of(*MODEL), changed=True)
+
+    def model_file(self, model_id: str) -> dict[str, Any]:
+        return model_of(*MODEL) | {"model_id": model_id, "joint": {"g": []}}
+
     def start_test(self, participant: str, **more: Any) -> dict[str, Any]:
         assert (participant, more["kind"]) == ("P", "sequence")
         assert [part["sequence"] for part in more["segments"]] == ["rest", "widths", "rest"]
@@ -147,6 +154,11 @@ def service(ilc: ModuleType, client: Answers, begun: Callable[[], None] = lambda
     return ilc.MovingService(client, "P", begun)
 
 
+def test_the_client_that_is_made_up_has_no_method_that_the_real_one_lacks() -> None:
+    made_up = {name for name in vars(Answers) if not name.startswith("_")}
+    assert [name for name in made_up if not hasattr(Client, name)] == []
+
+
 def test_the_movement_is_started_once_when_the_first_pulse_is_due(ilc: ModuleType) -> None:
     client, begun = Answers(recording()), []
     torque_nm, sent_us, angle_rad = service(ilc, client, lambda: begun.append(list(client.asked))).play_moving(
@@ -155,6 +167,21 @@ def test_the_movement_is_started_once_when_the_first_pulse_is_due(ilc: ModuleTyp
     assert begun == [[None, 0.6]], "not in the rest before it, and not again"
     assert sent_us.tolist() == [90.0] * SIZE and np.abs(torque_nm).max() < 1e-9
     np.testing.assert_allclose(angle_rad, 1.1 + 0.1 * (np.arange(SIZE) + 0.5) / RATE_HZ, atol=1e-6)
+
+
+def test_another_version_is_asked_for_by_its_id(
+    ilc: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    client = Answers(recording())
+    movement = tmp_path / "angles.csv"
+    np.savetxt(movement, np.full(SIZE, 1.0))
+    monkeypatch.setattr(ilc, "Client", lambda *_: client)
+    monkeypatch.setenv("STIMRIG_TOKEN", "a token")
+    given = ["ilc", "--participant", "P", "--movement", str(movement), "--trials", "1"]
+    for more, says in (([], "model M of a joint at rest"), (["--model", "other"], "model other with g and h")):
+        monkeypatch.setattr("sys.argv", [*given, *more])
+        ilc.main()
+        assert capsys.readouterr().out.startswith(says)
 
 
 @pytest.mark.parametrize(

@@ -28,7 +28,9 @@ ROOT = Path(__file__).parents[2]
 TOKEN = "administrator-token-of-a-moving-joint"
 SPEED, PULSES = 2.0, 160
 LOW_DEG, HIGH_DEG = 70.0, 110.0
-OUT_AND_BACK = {"cmd": "arm", "mode": "script", "points": [[0, LOW_DEG], [1.6, HIGH_DEG], [3.2, LOW_DEG]]}
+WAY = [[0, LOW_DEG], [0.1, LOW_DEG], [1.6, HIGH_DEG], [3.1, LOW_DEG], [3.2, LOW_DEG]]
+OUT_AND_BACK = {"cmd": "arm", "mode": "script", "points": WAY}
+"""Level at both ends: it comes to rest where the next one begins."""
 SWEEPS = {"cmd": "arm", "mode": "robot", "from_deg": 50.0, "to_deg": 130.0, "deg_s": 50.0}
 HELD = {"cmd": "arm", "mode": "held", "angle_deg": LOW_DEG}
 WIDTHS = [0.0] * 40 + [50.0, 100.0] + [140.0] * 160 + [180.0] + [220.0] * 160 + [0.0] * 40
@@ -80,7 +82,7 @@ def test_the_joint_is_moved_in_each_trial_and_its_angle_is_learnt_from(tmp_path:
         assert services.emulator is not None
         socket = services.emulator.ready["control"]
         model = identified(client, socket)
-        document = client.model(model)
+        document = client.model_file(model)
         assert document["joint"]["velocity_rad_s"][-1] > 0.5, "g and h, seen in motion"
         done = learnt(services.url, tmp_path, socket)
         assert done.returncode == 0, done.stderr
