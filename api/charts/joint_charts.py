@@ -21,7 +21,7 @@ STILL_RAD_S, FAST_RAD_S = 0.15, 0.7
 NEAR_RAD = math.radians(3) + 1e-9
 """An angle counts as seen if the joint was this near to it: the table is finer than any movement."""
 BAND = role("series-band")
-HEIGHT_PX = 400
+HEIGHT_PX = 430
 
 
 @dataclass(frozen=True)
