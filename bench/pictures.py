@@ -1,14 +1,17 @@
-"""The README's pictures of the page: `python -m bench.pictures` writes docs/img/page.png and docs/img/why.png.
+"""The pictures of the page: `python -m bench.pictures [model] [joint]` writes them to docs/img, all or those asked for.
 
-A service on the emulated rig, a clinician, a recording of a muscle with a hidden hysteresis, and Debian's chromium.
+`model`: page.png and why.png, of a recording of a muscle with a hidden hysteresis. `joint`: joint.png, of an emulated
+arm's isometric test and its guided tests, joined. A service on the emulated rig, a clinician, and Debian's chromium.
 """
 
 from __future__ import annotations
 
+import argparse
 import io
 import os
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import httpx
 from PIL import Image
@@ -16,26 +19,56 @@ from playwright.sync_api import Page, sync_playwright
 
 from api.cli.launcher import Services
 from api.settings import Settings
+from bench.moving_joint import as_record, guided_tests, joined
 from hardware_sim import hidden_records
+from hardware_sim.arm_patient import arm_patient
+from hardware_sim.arm_records import record
+from identify.fitting import fit
+from identify.records import parts_csv
 
 IMAGES = Path(__file__).parents[1] / "docs" / "img"
 TOKEN = "bench-of-the-pictures-of-the-page"
 NAME, PASSWORD = "Ada", "correct horse battery"
 WIDTH, HEIGHT, MARGIN, COLOURS = 1366, 768, 14, 128
+ARM = 3
+"""Whose joint is shown: one of those that were developed on."""
 
 
 def prepared(url: str, folder: Path) -> str:
-    """A clinician, a participant with a recording, and its diagnosis; the id of the model."""
-    record = folder / "record.csv"
-    hidden_records.write_csv(hidden_records.generate("recruitment_hysteresis", "strong", seed=4, rate_hz=400), record)
-    with httpx.Client(base_url=url, headers={"Authorization": f"Bearer {TOKEN}"}, timeout=180) as http:
-        http.post("/v1/users", json={"name": NAME, "password": PASSWORD}).raise_for_status()
-        http.post("/v1/participants", json={"code": "P017"}).raise_for_status()
-        headers = {"Content-Type": "text/csv"}
-        sent = http.post("/v1/participants/P017/recordings", content=record.read_bytes(), headers=headers)
-        model = str(sent.raise_for_status().json()["model"]["id"])
+    """A participant with a recording, and its diagnosis; the id of the model."""
+    path = folder / "record.csv"
+    hidden_records.write_csv(hidden_records.generate("recruitment_hysteresis", "strong", seed=4, rate_hz=400), path)
+    with client(url) as http:
+        model = str(taken(http, "P017", path)["model"]["id"])
         http.get(f"/v1/models/{model}/diagnosis").raise_for_status()
     return model
+
+
+def prepared_joint(url: str, folder: Path) -> str:
+    """A participant with the tests of a joint, joined; the id of the model of all of them."""
+    arm = arm_patient(ARM)
+    isometric = record(arm, "isometric", ARM)
+    guided = guided_tests(arm, fit(as_record(isometric)), isometric, ARM)
+    path = folder / "joint.csv"
+    parts_csv.write(joined([isometric, *guided]), path)
+    with client(url) as http:
+        recording = taken(http, "P018", path)["recording_id"]
+        return str(
+            http.post("/v1/participants/P018/models", json={"recordings": [recording]}).raise_for_status().json()["id"]
+        )
+
+
+def client(url: str) -> httpx.Client:
+    """The administrator's."""
+    return httpx.Client(base_url=url, headers={"Authorization": f"Bearer {TOKEN}"}, timeout=180)
+
+
+def taken(http: httpx.Client, code: str, path: Path) -> dict[str, Any]:
+    """What the service says of a new participant's recording."""
+    http.post("/v1/participants", json={"code": code}).raise_for_status()
+    headers = {"Content-Type": "text/csv"}
+    sent = http.post(f"/v1/participants/{code}/recordings", content=path.read_bytes(), headers=headers)
+    return sent.raise_for_status().json()
 
 
 def keep(name: str, content: bytes) -> None:
@@ -46,13 +79,29 @@ def keep(name: str, content: bytes) -> None:
     print(f"{path}: {path.stat().st_size // 1000} kB")
 
 
-def photograph(page: Page, url: str, model: str) -> None:
-    """Sign in, open the model, keep its first screen, then the missing effect and where the error sits."""
+def signed_in(page: Page, url: str) -> None:
+    """As the clinician."""
+    with client(url) as http:
+        http.post("/v1/users", json={"name": NAME, "password": PASSWORD}).raise_for_status()
     page.goto(f"{url}/sign-in")
     page.fill("input[name=name]", NAME)
     page.fill("input[name=password]", PASSWORD)
     page.press("input[name=password]", "Enter")
     page.wait_for_url(f"{url}/")
+
+
+def cut(page: Page, above: str, below: str) -> bytes:
+    """The page from the top of one part to the end of another, as PNG."""
+    whole = Image.open(io.BytesIO(page.screenshot(full_page=True)))
+    place = "document.querySelector('{}').getBoundingClientRect().{} + scrollY"
+    upper, lower = (page.evaluate(place.format(*asked)) for asked in ((above, "top"), (below, "bottom")))
+    part = io.BytesIO()
+    whole.crop((0, int(upper - MARGIN), whole.width, int(lower + MARGIN))).save(part, "PNG")
+    return part.getvalue()
+
+
+def photograph(page: Page, url: str, model: str) -> None:
+    """The model's first screen, then the missing effect and where the error sits."""
     page.goto(f"{url}/models/{model}")
     page.wait_for_selector(".why-head")
     page.wait_for_selector("#torque .js-plotly-plot .main-svg")
@@ -61,25 +110,39 @@ def photograph(page: Page, url: str, model: str) -> None:
     page.evaluate("for (const name of ['.effect', '#error']) document.querySelector(name).open = true")
     page.wait_for_selector("#error .js-plotly-plot .main-svg")
     page.wait_for_timeout(1500)
-    whole = Image.open(io.BytesIO(page.screenshot(full_page=True)))
-    place = "document.querySelector('{}').getBoundingClientRect().{} + scrollY"
-    upper, lower = (page.evaluate(place.format(*asked)) for asked in ((".effect", "top"), ("#error", "bottom")))
-    part = io.BytesIO()
-    whole.crop((0, int(upper - MARGIN), whole.width, int(lower + MARGIN))).save(part, "PNG")
-    keep("why", part.getvalue())
+    keep("why", cut(page, ".effect", "#error"))
+
+
+def photograph_joint(page: Page, url: str, model: str) -> None:
+    """How the torque depends on the angle and the velocity of the joint."""
+    page.goto(f"{url}/models/{model}")
+    page.evaluate("document.querySelector('#joint').open = true")
+    for name in ("joint_g", "joint_h"):
+        page.wait_for_selector(f"[data-figure={name}] .main-svg")
+    page.wait_for_timeout(1500)
+    keep("joint", cut(page, "#joint", "#joint"))
+
+
+PICTURES = {"model": (prepared, photograph), "joint": (prepared_joint, photograph_joint)}
 
 
 def main() -> None:
-    """Both pictures."""
+    """Those that are asked for."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("names", nargs="*", metavar="model|joint", help="default: both")
+    names = parser.parse_args().names or list(PICTURES)
+    if unknown := set(names) - set(PICTURES):
+        parser.error(f"no picture {sorted(unknown)[0]}; take one of {', '.join(PICTURES)}")
     with tempfile.TemporaryDirectory(prefix="stimrig-pictures-") as folder:
         settings = Settings(data_dir=Path(folder) / "data")
         settings.port = 0
         with Services(settings, [], TOKEN) as services, sync_playwright() as playwright:
-            model = prepared(services.url, Path(folder))
             chromium = os.environ.get("CHROMIUM", "/usr/bin/chromium")
             browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox", "--disable-gpu"])
             page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT}, locale="en-GB")
-            photograph(page, services.url, model)
+            signed_in(page, services.url)
+            for prepare, take in (PICTURES[name] for name in names):
+                take(page, services.url, prepare(services.url, Path(folder)))
             browser.close()
 
 

@@ -143,7 +143,7 @@ def main() -> None:
     parser.add_argument("--participant", required=True)
     parser.add_argument("--movement", required=True, help="file with the angle at each pulse, rad, one a line")
     parser.add_argument("--start", default="", help="command that starts the movement")
-    parser.add_argument("--model", help="another version than the approved one")
+    parser.add_argument("--model", help="another version than the approved one; a controller's key opens none")
     parser.add_argument("--trials", type=int, default=8)
     parser.add_argument("--peak-nm", type=float, help="default: 40 %% of the largest torque the model is valid for")
     options = parser.parse_args()
@@ -155,7 +155,7 @@ def main() -> None:
             subprocess.Popen(command)
 
     service = MovingService(Client(options.url, token), options.participant, start_movement)
-    model = service.client.model(options.model) if options.model else service.fetch()
+    model = service.client.model_file(options.model) if options.model else service.fetch()
     movement_rad = np.loadtxt(options.movement)
     peak_nm = options.peak_nm or 0.4 * float(model["recruitment"]["inverse"]["torque_nm"][-1])
     reference = Reference(np.resize(Reference.reach(peak_nm).torque_nm, movement_rad.size))

@@ -8,9 +8,11 @@ from typing import Any
 from api.language import localised
 
 TORQUE, RESIDUAL, WIDTH, SHARE = "%{y:.2f} N·m", "%{y:+.3f} N·m", "%{y:.0f} µs", "%{y:.3f}"
+FACTOR = "%{y:.2f}"
 BESIDE = " · %{customdata}"
 AT_TIME = {"unifiedhovertitle": {"text": "%{x:.2f} s"}}
 AT_WIDTH = {"unifiedhovertitle": {"text": "%{x:.0f} µs"}}
+AT_ANGLE = {"unifiedhovertitle": {"text": "%{x:.0f}°"}}
 QUIET = {"hoverinfo": "skip"}
 
 
@@ -25,7 +27,14 @@ def with_band(words: str, value: str, x: Sequence[float], band: dict[str, Any], 
     if not band:
         return says(words, value)
     halves = [(high - low) / 2 for low, high in zip(band["whole_lower"], band["whole_upper"], strict=True)]
-    return says(words, f"{value} ± %{{customdata}}", [localised(f"{on(at, band[along], halves):.2f}") for at in x])
+    return with_halves(words, value, [on(at, band[along], halves) for at in x])
+
+
+def with_halves(words: str, value: str, halves: Sequence[float]) -> dict[str, Any]:
+    """A curve's hover text with the half width of its band at each of its points; without it if there are none."""
+    if not halves:
+        return says(words, value)
+    return says(words, f"{value} ± %{{customdata}}", [localised(f"{half:.2f}") for half in halves])
 
 
 def on(at: float, x: Sequence[float], y: Sequence[float]) -> float:

@@ -9,6 +9,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+from tests.api.made_up_joint import joint
+
 
 def model(effects: list[str]) -> dict[str, Any]:
     widths = list(range(0, 301, 5))
@@ -25,6 +27,7 @@ def model(effects: list[str]) -> dict[str, Any]:
         "quality": {"verdict": "usable", "words": "Little is left to explain.", "reasons": [],
                     "gates": {"stable": {"passed": True, "severity": "refuse", "says": ""}}},
         "effects": [{"id": effect} for effect in effects], "uncertainty": {}, "data": {}, "software": {},
+        **({"joint": joint()} if set(effects) & set(JOINT) else {}),
     }  # fmt: skip
 
 

@@ -7,10 +7,12 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import httpx
 import jsonschema_rs
+import numpy as np
 import pytest
 
 from api import schemas
@@ -18,8 +20,10 @@ from api.cli import main
 from api.cli.commands.test import through
 from api.store import Store
 from api.workers.pool import WORKER
-from identify.model import SCHEMA_VERSION
+from identify.json_values import json_value
+from identify.model import SCHEMA_VERSION, Covariance
 from identify.paper import table1
+from identify.simulation.joint_surface import joint_tables
 from tests.api.conftest import TOKEN, run_service
 from tests.api.test_worker import made_up_csv
 
@@ -66,6 +70,20 @@ def test_audits_json_holds_to_its_schema(tmp_path: Path, capsys: pytest.CaptureF
     Store(f"sqlite:///{tmp_path}/stimrig.db").close()
     assert main.run(["audit", "verify", "--data", str(tmp_path), "--json"]) == 0
     assert unmet("audit", json.loads(capsys.readouterr().out)) == []
+
+
+def test_g_and_h_hold_to_the_models_schema(model: Path) -> None:
+    settings = {"reference_rad": 1.5, "angle_range_rad": [1.0, 2.0], "scale_nm": 5.0, "sign": 1.0}
+    values = {"slope_per_rad": 0.1, "bend_per_rad2": -0.4}
+    bent = {"id": "torque_angle", "form": "parabola", "parameters": values, "settings": settings}
+    covariance = Covariance(tuple(f"torque_angle.{name}" for name in values), np.array([0.1, -0.4]), np.eye(2) * 1e-4)
+    angle_rad, work = np.linspace(1.0, 2.0, 50), np.ones(50, bool)
+    tables = joint_tables(SimpleNamespace(effects=(bent,)), covariance, angle_rad, np.full(50, 0.2), work)
+    document = json.loads(model.read_text())
+    whole = document | {"joint": json_value(tables)}
+    assert set(whole["joint"]) == set(ALL["model"]["properties"]["joint"]["properties"])
+    assert unmet("model", whole) == []
+    assert unmet("model", document | {"joint": {**whole["joint"], "seen_g": [[0.5]]}}) != []
 
 
 def test_table1_holds_to_its_schema() -> None:

@@ -9,7 +9,7 @@ from fastapi import APIRouter, Form, Request
 from fastapi.responses import RedirectResponse, Response
 
 from api import language
-from api.charts import diagnosis_charts, model_charts
+from api.charts import diagnosis_charts, joint_charts, model_charts
 from api.charts.overview import LARGE, overview
 from api.errors import ApiError
 from api.models import advice, carried_shown, explanation, headline, next_step, stored, summary
@@ -70,7 +70,8 @@ async def model(request: Request, context: Ctx, who: ModelReader, model_id: str,
 def drawn(document: dict[str, Any], measured: dict[str, Any]) -> dict[str, Any]:
     """The model's own figures; the first one low enough for the first screen."""
     figures = model_charts.of_model(document, measured["curves"], measured["comparison"])
-    return figures | ({"overview": overview(figures[LARGE])} if LARGE in figures else {})
+    first = {"overview": overview(figures[LARGE])} if LARGE in figures else {}
+    return figures | first | joint_charts.of_joint(document)
 
 
 async def next_step_of(context: Context, row: Model, version: dict[str, Any], may_test: bool) -> next_step.Step | None:

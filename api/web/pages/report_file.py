@@ -8,7 +8,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from api.charts import diagnosis_charts, model_charts
+from api.charts import diagnosis_charts, joint_charts, model_charts
 from api.models import explanation, summary
 from api.web.pages.environment import HERE, environment
 from api.web.pages.static import packaged
@@ -47,6 +47,7 @@ def comparison_html(
         test=test,
         figures={
             **model_charts.of_model(document, curves, comparison),
+            **joint_charts.of_joint(document),
             **diagnosis_charts.of_why(comparison, curves["segments"], None, {}, []),
         },
         plain=(comparison or {}).get("plain") or [],

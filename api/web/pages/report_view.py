@@ -8,7 +8,7 @@ from typing import Any
 from fastapi import APIRouter, Request
 from fastapi.responses import Response
 
-from api.charts import model_charts
+from api.charts import joint_charts, model_charts
 from api.charts.svg import svg
 from api.language import _
 from api.models import advice, explanation, stored, summary
@@ -35,6 +35,7 @@ async def report(request: Request, context: Ctx, _who: ModelReader, model_id: st
     found = await asyncio.to_thread(context.analyses.known_diagnosis, row)
     recording: Recording = await asyncio.to_thread(context.store.get, Recording, row.recording_id)
     figures = model_charts.of_model(document, measured["curves"], measured["comparison"])
+    figures |= joint_charts.of_joint(document)
     lineage = await asyncio.to_thread(context.versions.lineage, row)
     drawn = {
         name: svg(figures[name], width, height, words, on_paper=True)
@@ -47,6 +48,8 @@ async def report(request: Request, context: Ctx, _who: ModelReader, model_id: st
             ),
             ("recruitment", 375.0, LOW, _("Steady torque over pulse width")),
             ("step", 375.0, LOW, _("Step response over time")),
+            ("joint_g", 760.0, LOW, _("Share of the muscle's torque over the angle of the joint")),
+            ("joint_h", 760.0, LOW, _("Passive torque over the angle of the joint")),
         )
         if name in figures
     }
