@@ -251,7 +251,7 @@ class Service:
                 return measured(self.client.recording(test["recording_id"]), widths_us.size)
         raise HaltedError(f"the trial ended as {test['state']}: {test['reason']}")
 
-    def start(self, segments: list[dict[str, Any]]) -> str:
+    def start(self, segments: list[dict[str, Any]], **asked: Any) -> str:
         """Start a trial as soon as the rig has rested; the id of its test. The service shows its error."""
         patience = time.monotonic() + 90
         rests = round(BEFORE_S * PULSE_RATE_HZ), round(AFTER_S * PULSE_RATE_HZ)
@@ -259,7 +259,7 @@ class Service:
         while True:
             try:
                 return self.client.start_test(
-                    self.participant, kind="sequence", segments=segments, reference_torque_nm=wanted_nm
+                    self.participant, kind="sequence", segments=segments, reference_torque_nm=wanted_nm, **asked
                 )["id"]
             except (Conflict, Invalid) as error:
                 if "rest" not in error.detail or time.monotonic() > patience:

@@ -78,7 +78,7 @@ class MovingService(Service):
         ]
         started = False
         test: dict[str, Any] = {}
-        for test in self.client.follow(self.start(segments)):
+        for test in self.client.follow(self.start(segments, angle={})):  # it stops where the joint leaves its range
             if not started and test["state"] == "running" and (test.get("elapsed_s") or 0.0) >= BEFORE_S:
                 started = True
                 self.start_movement()

@@ -55,11 +55,7 @@ class JointTests:
             409: the rig has no angle sensor, or no angle is left to hold; 422: the participant has no range of angles,
             or one that is too small, or the target is not in it; what the rig refuses.
         """
-        range_rad = plan.profile.angle_range_rad
-        self._refuse_without_sensor()
-        if range_rad is None:
-            detail = f"Set the angles that are comfortable for {plan.participant}: angle_range_rad of its profile."
-            raise ApiError(422, "no-angle-range", "The participant has no range of angles", detail)
+        range_rad = self._range(plan)
         asked, longest_s = body.angle or AngleIn(), body.max_duration_s
         shared = await self._layout(plan, range_rad, longest_s, preview_s)
         angle = AnglePlan(range_rad=range_rad, tolerance_rad=asked.tolerance_rad)
@@ -80,6 +76,19 @@ class JointTests:
         chosen = [SegmentPlan(**segment) for segment in segments]
         plan = plan.model_copy(update={"segments": chosen, "angle": angle, "adaptive": bounds})
         return Planned(plan, joint=told)
+
+    def watched(self, plan: TestPlan, asked: AngleIn) -> TestPlan:
+        """A plan of another kind that the angle may stop, too. Raises ApiError as `planned`."""
+        return plan.model_copy(update={"angle": AnglePlan(range_rad=self._range(plan), still_s=asked.still_s)})
+
+    def _range(self, plan: TestPlan) -> tuple[float, float]:
+        """The participant's range of angles, where the rig can watch it."""
+        self._refuse_without_sensor()
+        range_rad = plan.profile.angle_range_rad
+        if range_rad is None:
+            detail = f"Set the angles that are comfortable for {plan.participant}: angle_range_rad of its profile."
+            raise ApiError(422, "no-angle-range", "The participant has no range of angles", detail)
+        return range_rad
 
     def _refuse_without_sensor(self) -> None:
         status = self.rig.status

@@ -154,14 +154,14 @@ class AngleIn(Body):
         angles.TOLERANCE_RAD
     )
     still_s: FiniteFloat | None = Field(
-        default=None, ge=1, le=60, description="kinds `passive` and `moving`: the test stops after so long without a "
-        "movement, s; null: 8 and 5"
+        default=None, ge=1, le=60, description="kinds `passive`, `moving` and `sequence`: the test stops after so long "
+        "without a movement, s; null: 8, 5 and never"
     )  # fmt: skip
 
 
 OWN_FIELDS: dict[str, set[str]] = {
     "adaptive": {"target", "max_duration_s", "max_torque_time_nm_s", "anyway"},
-    "sequence": {"reference_torque_nm"},
+    "sequence": {"reference_torque_nm", "angle"},
     PASSIVE: {"angle", "max_duration_s"},
     HELD: {"angle"},
     MOVING: {"angle", "max_duration_s", "max_torque_time_nm_s"},
@@ -219,7 +219,11 @@ class TestIn(Body):
         default=False, description="kind `adaptive`: play it although the target is out of reach"
     )
 
-    angle: AngleIn | None = Field(default=None, description="kinds `passive`, `held` and `moving`")
+    angle: AngleIn | None = Field(
+        default=None,
+        description="kinds `passive`, `held` and `moving`, which have it anyway; kind `sequence`: with it, as {}, the "
+        "test stops where the joint leaves the participant's range or the sensor fails",
+    )
     reference_torque_nm: Annotated[list[ReferenceNm], Field(min_length=1, max_length=12_000)] | None = Field(
         default=None,
         description="kind `sequence`: the torque that the controller wants, one value for each pulse of the whole "

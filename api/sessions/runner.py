@@ -254,6 +254,8 @@ class Runner:
         )
         if body.kind in KINDS:
             return await self.joint.planned(body, plan, PREVIEW_S)
+        if body.angle is not None:
+            plan = self.joint.watched(plan, body.angle)
         return await self.adaptive.planned(body, plan, PREVIEW_S)
 
     async def joint_overview(self, participant: Participant) -> dict[str, Any]:

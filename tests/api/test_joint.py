@@ -250,6 +250,24 @@ def test_what_does_not_go_together_is_refused(
     assert answer.status_code == 422, answer.text
 
 
+def test_a_controllers_trial_can_be_watched(service: Service, client: httpx.Client, ready: str) -> None:
+    """With `angle` it stops as a guided test does; without, as ever, it takes no notice of the angle."""
+    segments = [{"name": "s", "sequence": "widths", "settings": {"pulse_width_us": [50.0, 100.0, 50.0, 0.0]}}]
+    for more, watched in (({"angle": {}}, True), ({"angle": {"still_s": 2}}, True), ({}, False)):
+        begun = begin(client, ready, "sequence", segments=segments, **more)
+        assert begun.status_code == 202, begun.text
+        angle = service.rig.last_plan.angle
+        assert (angle is not None) == watched
+        if watched:
+            assert angle.range_rad == pytest.approx(RANGE) and angle.target_rad is None
+            assert angle.still_s == more["angle"].get("still_s")
+        assert wait_done(client, begun.json()["id"])["joint"] is None, "it is no guided test"
+    client.put(f"/v1/participants/{ready}/profile", json={"angle_range_rad": None}).raise_for_status()
+    refused = begin(client, ready, "sequence", segments=segments, angle={})
+    assert (refused.status_code, refused.json()["type"]) == (422, "/problems/no-angle-range")
+    assert begin(client, ready, "sequence", segments=segments, angle={"target_rad": 1.0}).status_code == 422
+
+
 # ---- one model of all -----------------------------------------------------------------------------------------
 
 

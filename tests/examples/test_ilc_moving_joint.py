@@ -125,7 +125,7 @@ class Answers:
         return model_of(*MODEL) | {"model_id": model_id, "joint": {"g": []}}
 
     def start_test(self, participant: str, **more: Any) -> dict[str, Any]:
-        assert (participant, more["kind"]) == ("P", "sequence")
+        assert (participant, more["kind"], more["angle"]) == ("P", "sequence", {}), "it stops with the angle"
         assert [part["sequence"] for part in more["segments"]] == ["rest", "widths", "rest"]
         return {"id": "T1"}
 

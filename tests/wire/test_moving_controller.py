@@ -36,6 +36,9 @@ HELD = {"cmd": "arm", "mode": "held", "angle_deg": LOW_DEG}
 WIDTHS = [0.0] * 40 + [50.0, 100.0] + [140.0] * 160 + [180.0] + [220.0] * 160 + [0.0] * 40
 
 
+PROFILE = {"current_ma": 20.0, "max_pulse_width_us": 300.0, "max_torque_nm": 30.0, "angle_range_rad": [0.7, 2.5]}
+
+
 def trial(client: Client, widths_us: list[float]) -> dict[str, Any]:
     """A list of widths, played to its end."""
     segments = [{"name": "steps", "sequence": "widths", "settings": {"pulse_width_us": widths_us}}]
@@ -46,7 +49,7 @@ def trial(client: Client, widths_us: list[float]) -> dict[str, Any]:
 
 def identified(client: Client, socket: str) -> str:
     """The model of a pre-session test at rest and of steps while a robot sweeps the joint; approved."""
-    client.make_participant("P", {"current_ma": 20.0, "max_pulse_width_us": 300.0, "max_torque_nm": 30.0})
+    client.make_participant("P", PROFILE)
     still = client.run_test("P")["recording_id"]
     assert control(socket, SWEEPS)["ok"]
     swept = trial(client, WIDTHS)["recording_id"]
