@@ -124,6 +124,7 @@ class AngleReceiver(Stream[AngleBlock]):
         self._behind = 0 if len(placed) else self._behind + self.counts.disordered_samples - before
         if self._behind >= RESTARTED:
             self._count_on()
+            self._on_fault(f"{NAME}: its counter went back; it was without power, or what it sent comes once more")
         return placed
 
     def _keep(self, samples: NDArray[Any]) -> None:

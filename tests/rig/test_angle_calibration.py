@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import time
 from collections.abc import Callable, Iterator
@@ -82,6 +83,46 @@ def test_it_is_kept_for_this_sensor_alone(posed: Posed):
     assert AngleCalibrating(posed.folder, None, posed.clock).calibration is None
     (posed.folder / "angle-calibration.json").write_text('{"sensor": 1')
     assert AngleCalibrating(posed.folder, SETTINGS, posed.clock).calibration is None
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"offset": math.nan},
+        {"offset": 31.0},
+        {"offset": math.inf},
+        {"radians_per_unit": math.nan},
+        {"radians_per_unit": 0.0},
+        {"radians_per_unit": -math.pi / 180},
+        {"radians_per_unit": 1.1 * math.pi / 180},
+        {"radians_per_unit": 1e300},
+        {"direction": 1},
+        {"direction": True},
+        {"poses": []},
+        {"poses": [{"angle_rad": 0.4, "raw": 10.0}] * 2},
+        {"poses": [{"angle_rad": 0.4, "raw": math.nan}, {"angle_rad": 1.6, "raw": 80.0}]},
+        {"by": 5},
+    ],
+)
+def test_a_file_that_says_something_else_than_its_poses_is_no_calibration(posed: Posed, change: dict[str, Any]):
+    for degrees in (20.0, 90.0):
+        posed.hold(degrees)
+        posed.pose(degrees)
+    path = posed.folder / "angle-calibration.json"
+    content = json.loads(path.read_text())
+    path.write_text(json.dumps(content))
+    assert AngleCalibrating(posed.folder, SETTINGS, posed.clock).calibration == posed.poses.calibration
+    content["calibration"] |= change
+    path.write_text(json.dumps(content))
+    assert AngleCalibrating(posed.folder, SETTINGS, posed.clock).calibration is None
+
+
+@pytest.mark.parametrize(
+    "content", ["[" * 100_000, '{"sensor":' * 100_000, "[]", '"x"', "", "\udcff", '{"sensor":' + 5_000 * "9" + "}"]
+)
+def test_a_rig_comes_up_whatever_stands_in_the_file(tmp_path: Path, content: str):
+    (tmp_path / "angle-calibration.json").write_bytes(content.encode("utf-8", "surrogateescape"))
+    assert AngleCalibrating(tmp_path, SETTINGS, VirtualClock()).calibration is None
 
 
 def test_a_new_first_pose_begins_again_and_the_old_calibration_holds_until_the_second(posed: Posed):
