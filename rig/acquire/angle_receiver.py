@@ -156,7 +156,7 @@ class AngleReceiver(Stream[AngleBlock]):
             self._recent.popleft()
 
     def _run(self) -> None:
-        """Open it, read it until it is gone, and so on until closed."""
+        """Open it, read it until it is gone, and so on until closed; who closes may not wait for an adapter to open."""
         while not self._closing.is_set():
             try:
                 self.identity = self.sensor.open()
@@ -165,8 +165,8 @@ class AngleReceiver(Stream[AngleBlock]):
             else:
                 self._begin_anew()
                 super()._run()
-            if self._closing.wait(REOPEN_S):
-                return
+            self._closing.wait(REOPEN_S)
+        self.sensor.close()
 
     def _begin_anew(self) -> None:
         """A sensor that was without power counts from zero: its numbers go on from where the clock is."""
