@@ -34,6 +34,8 @@ PART_S = 0.05
 LEAST_SHARE = 0.7
 """Of the samples due in that time that must have come."""
 APART_RAD = 0.5
+FIRST_LASTS_S = 600.0
+"""Real seconds for which a first pose waits for its second: later the sensor may sit elsewhere."""
 SCALES = 0.5, 2.0
 """How far the scale of two poses may be from the rig file's: beyond it a number was mistyped or the sensor slips."""
 SENSOR = "device", "bus", "dbc", "message", "signal", "of_the_cell"
@@ -55,8 +57,16 @@ class AngleCalibrating:
         self._path, self._clock = folder / "angle-calibration.json", clock
         content = {} if sensor is None else sensor.model_dump(mode="json")
         self._sensor = {name: content[name] for name in SENSOR if name in content}
-        self.first: AnglePose | None = None
+        self._first: tuple[AnglePose, float] | None = None
         self.calibration = self._read() if sensor is not None else None
+
+    @property
+    def first(self) -> AnglePose | None:
+        """The first pose of the next calibration, while it waits for its second."""
+        if self._first is None:
+            return None
+        pose, told_s = self._first
+        return pose if self._clock.now_s() - told_s <= FIRST_LASTS_S * self._clock.speed else None
 
     @property
     def scale(self) -> AngleScale | None:
@@ -93,12 +103,13 @@ class AngleCalibrating:
         if refusal is not None:
             raise RefusedError(f"angle_pose: {refusal}")
         pose = AnglePose(angle_rad=angle_rad, raw=still_raw(receiver, self._clock.speed))
-        if self.first is None or first:
-            self.first = pose
+        before = None if first else self.first
+        if before is None:
+            self._first = pose, self._clock.now_s()
             return False
-        found = self._of_two(self.first, pose, by, receiver.sensor.scale)
+        found = self._of_two(before, pose, by, receiver.sensor.scale)
         self._write(found)
-        self.first, self.calibration = None, found
+        self._first, self.calibration = None, found
         log.info("angle sensor calibrated by %s: %s", by, found.model_dump_json())
         return True
 
@@ -112,7 +123,7 @@ class AngleCalibrating:
         slope = _slope(first, second)
         lo, hi = (factor * rig_file.radians_per_unit for factor in SCALES)
         if not (lo <= abs(slope) <= hi):
-            self.first = None
+            self._first = None
             raise RefusedError(
                 f"angle_pose: the two poses make {abs(slope):.4g} rad of a unit, the rig file says "
                 f"{rig_file.radians_per_unit:.4g}; check goniometer and mounting, then begin with the first pose"
