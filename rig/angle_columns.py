@@ -15,6 +15,8 @@ from rig.journal import JournalContents, Kind
 from rig.signals import ANGLE_SAMPLE
 
 LIKELY_RATE_HZ = 200.0
+LARGEST_RAD = 2 * np.pi
+"""No joint turns farther, however its sensor is mounted."""
 
 
 def of_journal(
@@ -41,8 +43,9 @@ def of_journal(
         samples, rate_hz, torque, bool(told.get("of_the_cell")), bool(told.get("one_bus"))
     )
     number = _numbers(samples, time_s, rate_hz)
-    inside = (time_s >= 0) & (time_s < end_s) & np.isfinite(samples["angle_rad"])
-    inside &= np.diff(time_s, prepend=-np.inf) > 0  # a sensor that started again may overlap itself
+    inside = (time_s >= 0) & (time_s < end_s) & _believable(samples)
+    # a sensor that started again may overlap itself
+    inside &= time_s > np.maximum.accumulate(np.concatenate([[-np.inf], time_s]))[:-1]
     chosen, number = samples[inside], number[inside]
     steps = np.diff(number)
     after = np.flatnonzero(steps > 1) + 1
@@ -65,6 +68,11 @@ def of_journal(
         "velocity_window_s": angle_velocity.WINDOW_S,
         "calibration": json.dumps(told.get("calibration")),
     }
+
+
+def _believable(samples: NDArray[Any]) -> NDArray[np.bool_]:
+    """Which samples are the angle of a joint: others would spoil a test that did not need the sensor."""
+    return (np.abs(samples["angle_rad"]) <= LARGEST_RAD) & (samples["fault"] != 1)
 
 
 def _rate_hz(samples: NDArray[Any]) -> float:

@@ -34,6 +34,8 @@ Range = Annotated[tuple[float, float], Field(strict=False)]
 PASSIVE, HELD, MOVING = "passive", "held", "moving"
 """Kinds of tests with a joint's angle: without any pulse, at a held angle, with a movement."""
 
+LONGEST_NAME = 200
+"""Characters of who calibrated the angle sensor."""
 LONGEST_LINE = 1_900_000
 """Bytes of a request. The rig refuses longer ones."""
 SAFE_END_S = 1.0
@@ -286,7 +288,7 @@ class AnglePoseRequest(Message):
     kind: Literal["angle_pose"] = "angle_pose"
     id: int = 0
     angle_rad: float = Field(description="elbow: 0 is straight, flexion positive, rad")
-    by: str
+    by: str = Field(max_length=LONGEST_NAME, description="it stands in every status and recording from then on")
     first: bool = Field(False, description="begin anew: a first pose that waits for its second is forgotten")
 
 
@@ -391,8 +393,8 @@ class AngleCalibration(Message):
     offset: float = Field(description="raw value of a straight arm, in the sensor's unit")
     direction: Literal[-1, 1]
     radians_per_unit: float
-    by: str
-    set_at_utc: str
+    by: str = Field(max_length=LONGEST_NAME)
+    set_at_utc: str = Field(max_length=LONGEST_NAME)
 
 
 class AngleStatus(Message):

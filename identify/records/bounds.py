@@ -19,12 +19,14 @@ LARGEST = {
     "time_s": 1e7,
     "pulse_width_us": 1e4,
     "torque_nm": 1e6,
-    "angle_rad": 1e3,
+    "angle_rad": 7.0,
     "velocity_rad_s": 1e5,
     "late_s": 1.0,
     "doubted": 1.0,
     "part": 1e3,
 }
+UNITS = {"angle_rad": "No joint turns so far: angles are in rad. If these are degrees, say so in the column's head."}
+"""What is likely wrong where all numbers of a column are finite, and one is too large."""
 LARGEST_CALENDAR_S = 1e11
 """Times as they are read may be counted from 1970, or from 1904."""
 LONGEST_NAME = 100

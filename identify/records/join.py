@@ -6,6 +6,7 @@ the pause between two parts: it has no rows, and `Part` says how long it truly w
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -77,12 +78,14 @@ def join(records: Sequence[Record], begun_s: Sequence[float | None]) -> Record:
     Raises
     ------
     BadRecord
-        Pulse rates differ, too little in one or too much together, or fewer than two samples a pulse in a slow part.
+        Pulse rates differ, too little in one or too much together, fewer than two samples a pulse in a slow part.
+        The same measurement twice: its noise would count as that of two.
     """
     if len(records) != len(begun_s) or not records:
         raise BadRecord(f"{len(records)} records with {len(begun_s)} begins", fix="Give one for each.")
     rate_hz = records[0].pulse_rate_hz
     pieces: list[_Piece] = []
+    known: set[bytes] = set()
     for number, (record, begun) in enumerate(zip(records, begun_s, strict=True), start=1):
         if abs(record.pulse_rate_hz - rate_hz) > 1e-6:
             message = f"{record.pulse_rate_hz:g} pulses/s, the first has {rate_hz:g}"
@@ -90,12 +93,25 @@ def join(records: Sequence[Record], begun_s: Sequence[float | None]) -> Record:
         if record.time_s.size < LEAST_SAMPLES:
             message = f"only {record.time_s.size} samples"
             raise BadRecord(message, place=f"recording {number}", fix="Give a few seconds of data.")
-        pieces += _pieces(record, begun)
+        own = _pieces(record, begun)
+        _refuse_twice(own, known, f"recording {number}")
+        pieces += own
     if len(pieces) > bounds.MOST_PARTS:
         raise BadRecord(f"{len(pieces)} parts", fix=f"Join at most {bounds.MOST_PARTS}.")
     if all(piece.begun_s is not None for piece in pieces):
         pieces = [replace(piece, follows=False) for piece in sorted(pieces, key=_order)]
     return _joined(_at_one_rate(pieces, rate_hz), rate_hz)
+
+
+def _refuse_twice(pieces: Sequence[_Piece], known: set[bytes], place: str) -> None:
+    """Refuse a measurement that is there already, under whatever name: a copy, or a part of a joined record."""
+    for piece in pieces:
+        torque_nm = piece.record.torque_nm
+        content = hashlib.sha256(torque_nm.tobytes() + piece.record.pulse_width_us.tobytes()).digest()
+        if content in known and np.ptp(torque_nm) > 0:
+            message = "what it holds was measured in another of these recordings, too"
+            raise BadRecord(message, place=place, fix="Name each recording once, and none beside a joined one with it.")
+        known.add(content)
 
 
 def _order(piece: _Piece) -> tuple[float, str, str, bytes]:

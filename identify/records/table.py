@@ -115,10 +115,11 @@ class Table:
         bad = np.flatnonzero(~(np.abs(values) <= bounds.largest(column)) & ~np.asarray(missing))
         if bad.size:
             shown = _shown(cells[bad[0]].strip())
+            fix = "Remove the row's cause, or cut the record before it; values must be finite."
+            if np.isfinite(values[bad]).all():
+                fix = bounds.UNITS.get(column, fix)
             raise BadRecord(
-                f"{shown} is no measurement" if shown else "empty",
-                place=self.at(lines[bad[0]], column),
-                fix="Remove the row's cause, or cut the record before it; values must be finite.",
+                f"{shown} is no measurement" if shown else "empty", place=self.at(lines[bad[0]], column), fix=fix
             )
         return values
 

@@ -163,7 +163,11 @@ def _own_angles(model: Muscle, record: Record, settings: Mapping[str, Any]) -> d
         The model depends on the joint and does not say at which angle its curve holds.
     """
     if "reference_rad" in settings:
-        return {"reference_rad": settings["reference_rad"], "angle_range_rad": tuple(settings["angle_range_rad"])}
+        known = settings.get("angle_range_rad")
+        return {
+            "reference_rad": settings["reference_rad"],
+            "angle_range_rad": None if known is None else (float(known[0]), float(known[1])),
+        }
     if any(get(entry["id"]).moves_with_joint for entry in model.effects) and not same_data(model, record):
         raise BadModel(
             "the model does not say at which angle its curve holds",

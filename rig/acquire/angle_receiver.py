@@ -124,6 +124,7 @@ class AngleReceiver(Stream[AngleBlock]):
         self._behind = 0 if len(placed) else self._behind + self.counts.disordered_samples - before
         if self._behind >= RESTARTED:
             self._count_on()
+            self._on_fault(f"{NAME}: its counter went back; it was without power, or what it sent comes once more")
         return placed
 
     def _keep(self, samples: NDArray[Any]) -> None:
@@ -155,7 +156,7 @@ class AngleReceiver(Stream[AngleBlock]):
             self._recent.popleft()
 
     def _run(self) -> None:
-        """Open it, read it until it is gone, and so on until closed."""
+        """Open it, read it until it is gone, and so on until closed; who closes may not wait for an adapter to open."""
         while not self._closing.is_set():
             try:
                 self.identity = self.sensor.open()
@@ -164,8 +165,8 @@ class AngleReceiver(Stream[AngleBlock]):
             else:
                 self._begin_anew()
                 super()._run()
-            if self._closing.wait(REOPEN_S):
-                return
+            self._closing.wait(REOPEN_S)
+        self.sensor.close()
 
     def _begin_anew(self) -> None:
         """A sensor that was without power counts from zero: its numbers go on from where the clock is."""

@@ -34,10 +34,14 @@ PART_S = 0.05
 LEAST_SHARE = 0.7
 """Of the samples due in that time that must have come."""
 APART_RAD = 0.5
+FIRST_LASTS_S = 600.0
+"""Real seconds for which a first pose waits for its second: later the sensor may sit elsewhere."""
 SCALES = 0.5, 2.0
 """How far the scale of two poses may be from the rig file's: beyond it a number was mistyped or the sensor slips."""
 SENSOR = "device", "bus", "dbc", "message", "signal", "of_the_cell"
 """Settings that tell one sensor from another."""
+ROUNDED = 1e-9
+"""Share by which what a file says may differ from what its two poses make."""
 
 
 class AngleCalibrating:
@@ -53,8 +57,16 @@ class AngleCalibrating:
         self._path, self._clock = folder / "angle-calibration.json", clock
         content = {} if sensor is None else sensor.model_dump(mode="json")
         self._sensor = {name: content[name] for name in SENSOR if name in content}
-        self.first: AnglePose | None = None
+        self._first: tuple[AnglePose, float] | None = None
         self.calibration = self._read() if sensor is not None else None
+
+    @property
+    def first(self) -> AnglePose | None:
+        """The first pose of the next calibration, while it waits for its second."""
+        if self._first is None:
+            return None
+        pose, told_s = self._first
+        return pose if self._clock.now_s() - told_s <= FIRST_LASTS_S * self._clock.speed else None
 
     @property
     def scale(self) -> AngleScale | None:
@@ -91,12 +103,13 @@ class AngleCalibrating:
         if refusal is not None:
             raise RefusedError(f"angle_pose: {refusal}")
         pose = AnglePose(angle_rad=angle_rad, raw=still_raw(receiver, self._clock.speed))
-        if self.first is None or first:
-            self.first = pose
+        before = None if first else self.first
+        if before is None:
+            self._first = pose, self._clock.now_s()
             return False
-        found = self._of_two(self.first, pose, by, receiver.sensor.scale)
+        found = self._of_two(before, pose, by, receiver.sensor.scale)
         self._write(found)
-        self.first, self.calibration = None, found
+        self._first, self.calibration = None, found
         log.info("angle sensor calibrated by %s: %s", by, found.model_dump_json())
         return True
 
@@ -107,10 +120,10 @@ class AngleCalibrating:
                 f"angle_pose: it is {degrees(abs(apart_rad))} from the first pose, at {degrees(first.angle_rad)}; at "
                 f"least {degrees(APART_RAD)} are needed: move the joint farther"
             )
-        slope = apart_rad / (second.raw - first.raw) if second.raw != first.raw else float("inf")
+        slope = _slope(first, second)
         lo, hi = (factor * rig_file.radians_per_unit for factor in SCALES)
         if not (lo <= abs(slope) <= hi):
-            self.first = None
+            self._first = None
             raise RefusedError(
                 f"angle_pose: the two poses make {abs(slope):.4g} rad of a unit, the rig file says "
                 f"{rig_file.radians_per_unit:.4g}; check goniometer and mounting, then begin with the first pose"
@@ -130,10 +143,10 @@ class AngleCalibrating:
             if content["sensor"] != self._sensor:
                 log.warning("%s: made with another sensor; take two poses again", self._path)
                 return None
-            return AngleCalibration.model_validate(content["calibration"])
+            return _of_its_poses(AngleCalibration.model_validate(content["calibration"]))
         except FileNotFoundError:
             return None
-        except (OSError, ValueError, KeyError, TypeError, ValidationError) as error:
+        except (OSError, ValueError, KeyError, TypeError, RecursionError, ValidationError) as error:
             log.error("%s: not readable (%s); take two poses again", self._path, " ".join(str(error).split()))
             return None
 
@@ -143,6 +156,33 @@ class AngleCalibrating:
             archive.write_atomically(self._path, json.dumps(content).encode())
         except RecordingError as error:
             raise RigError(f"angle_pose: {error}") from None
+
+
+def _slope(first: AnglePose, second: AnglePose) -> float:
+    """Rad of a unit, negative where the signal falls when the joint is flexed; infinite where it did not change."""
+    apart = second.raw - first.raw
+    return (second.angle_rad - first.angle_rad) / apart if apart else float("inf")
+
+
+def _of_its_poses(kept: AngleCalibration) -> AngleCalibration:
+    """A calibration out of its file, if it is what its two poses make: a digit that changed is noticed, too.
+
+    Raises
+    ------
+    ValueError
+        It is not.
+    """
+    if len(kept.poses) != 2:
+        raise ValueError(f"it has {len(kept.poses)} poses")
+    first, second = kept.poses
+    slope = _slope(first, second)
+    apart_rad, told = abs(second.angle_rad - first.angle_rad), kept.direction * kept.radians_per_unit
+    off_rad = abs(slope * (first.raw - kept.offset) - first.angle_rad)
+    if not (apart_rad >= APART_RAD and kept.radians_per_unit > 0 and abs(told - slope) <= ROUNDED * abs(slope)):
+        raise ValueError("direction and radians_per_unit are not those of its poses")
+    if not (off_rad <= ROUNDED * max(1.0, abs(slope * first.raw))):
+        raise ValueError("its offset is not that of its poses")
+    return kept
 
 
 def still_raw(receiver: AngleReceiver, speed: float) -> float:

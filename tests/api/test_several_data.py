@@ -15,13 +15,13 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def parts(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """One record, and the same with an angle."""
+    """One record, and another one with an angle."""
     folder = tmp_path_factory.mktemp("several")
     plain = made_up_csv(folder / "plain.csv")
-    rows = plain.read_text().splitlines()
+    head, *rows = (row.split(",") for row in plain.read_text().splitlines())
     moved = folder / "moved.csv"
-    more = [f"{row},{0.8 + 0.001 * k:.4f},0.04" for k, row in enumerate(rows[1:])]
-    moved.write_text("\n".join([rows[0] + ",angle_rad,velocity_rad_s", *more]))
+    more = [f"{t},{w},{0.97 * float(nm):.6f},{s},{0.8 + 0.001 * k:.4f},0.04" for k, (t, w, nm, s) in enumerate(rows)]
+    moved.write_text("\n".join([",".join([*head, "angle_rad", "velocity_rad_s"]), *more]))
     return [plain, moved]
 
 
@@ -55,6 +55,17 @@ def test_a_file_twice_or_none_is_refused(parts: list[Path], capsys: pytest.Captu
     code, _, err = run(capsys, "fit", parts[0], parts[0])
     assert code == 2 and "named twice" in err
     assert run(capsys, "fit")[0] == 2
+
+
+def test_a_copy_or_a_link_is_no_second_recording(
+    parts: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy, link = tmp_path / "copy.csv", tmp_path / "link.csv"
+    copy.write_bytes(parts[0].read_bytes())
+    link.symlink_to(parts[0])
+    for again in (copy, link, parts[0].parent / ".." / parts[0].parent.name / parts[0].name):
+        code, _, err = run(capsys, "fit", parts[0], again)
+        assert code == 2 and "measured in another" in err and again.name in err, err
 
 
 def test_what_cannot_be_joined_names_its_file(

@@ -12,6 +12,7 @@ import identify
 from identify import Record
 from identify.dynamics.make_grid import make_grid
 from identify.dynamics.pulse_grid import Grid, runs
+from identify.errors import BadRecord
 from identify.estimation.prepare import fit_plain, prepare
 from identify.records import parts_csv
 from identify.records.join import PAUSE_S, join
@@ -46,6 +47,17 @@ def through_file(joined: Record, folder: Path) -> Record:
     path = folder / "joined.csv"
     parts_csv.write(joined, path)
     return identify.read(path)
+
+
+def test_the_same_measurement_twice_is_refused_under_any_name(tmp_path):
+    a, b = record(400), record(400, name="b", seed=2)
+    copy = replace(a, source=Source("copy.h5", "20260101T000000Z_copy", "c" * 64))
+    with pytest.raises(BadRecord, match=r"recording 2: what it holds was measured in another"):
+        join([a, copy], [0.0, 100.0])
+    whole = join([a, b], [0.0, 100.0])
+    for again in (whole, through_file(whole, tmp_path)):
+        with pytest.raises(BadRecord, match=r"recording 3: "):
+            join([record(400, name="d", seed=4), b, again], [500.0, 100.0, None])
 
 
 @pytest.mark.parametrize("rates", [(400, 400), (400, 1600), (1000, 400)])
@@ -205,13 +217,13 @@ def test_lateness_and_doubt_of_one_part_stay_its_own(tmp_path):
 
 @pytest.mark.parametrize("known", [True, False])
 def test_gap_is_told_by_the_pulses_or_doubted_to_the_end_of_its_part(known):
-    def with_gap(name: str) -> Record:
-        whole = record(400, name=name)
+    def with_gap(name: str, seed: int) -> Record:
+        whole = record(400, name=name, seed=seed)
         slots = slice(None, None, 10)
         pulses = Pulses(whole.time_s[slots], whole.pulse_width_us[slots], np.zeros(240), np.zeros(240, bool))
         return replace(whole, pulses=pulses if known else None).take((whole.time_s < 4.9) | (whole.time_s >= 5.3))
 
-    a, b = with_gap("a"), with_gap("b")
+    a, b = with_gap("a", 1), with_gap("b", 2)
     joined = join([a, b], [0.0, 9.0])
     grid = make_grid(joined)
     own = make_grid(a)

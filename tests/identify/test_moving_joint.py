@@ -152,6 +152,15 @@ def test_a_model_of_the_joint_refuses_to_predict_without_an_angle():
         above_rest(model(), np.full(40, 200.0), 40.0)
 
 
+def test_a_model_that_does_not_know_its_range_of_angles_predicts_all_the_same():
+    content = json.loads(model().to_json(None))
+    for entry in content["effects"]:
+        del entry["settings"]["angle_range_rad"]
+    motion = Motion.held(1.0, 40)
+    torque = above_rest(Model.from_json(json.dumps(content)), np.full(40, 150.0), 40.0, motion)
+    assert np.isfinite(torque).all()
+
+
 def test_a_model_that_does_not_know_its_own_angle_is_refused_on_other_records():
     document = json.loads(model().to_json())
     for entry in document["effects"]:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import identify
+from identify.errors import BadRecord
 from identify.records.record import Record
 from tests.harness.muscle import FINE_HZ
 from tests.harness.patients import Patient, make_record, protocol
@@ -304,13 +305,20 @@ def test_angles_in_degrees_and_columns_without_a_unit_passed_over(tmp_path: Path
     assert record.angle_rad[0] == pytest.approx(np.pi / 2) and record.velocity_rad_s[0] == pytest.approx(np.pi)
 
 
+def test_degrees_that_are_not_named_so_are_no_radians(tmp_path: Path) -> None:
+    path = tmp_path / "data.csv"
+    path.write_text(table((*OURS[:3], "angle_rad"), [[*row[:3], "90"] for row in rows(measured())]))
+    with pytest.raises(BadRecord, match=r"column angle_rad: 90 is no measurement.*If these are degrees"):
+        identify.read(path)
+
+
 def test_joined_records_keep_what_was_said_of_their_parts(tmp_path: Path) -> None:
     from identify.records.join import join
 
     path = tmp_path / "data.csv"
     path.write_bytes(german(measured()))
     record = identify.read(path)
-    joined = join([record, record], [0.0, 100.0])
+    joined = join([record, replace(record, torque_nm=record.torque_nm[::-1].copy())], [0.0, 100.0])
     assert joined.notes == ("data.csv: semicolons between cells, decimal commas",)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import time
 from collections.abc import Callable, Iterator
@@ -84,6 +85,47 @@ def test_it_is_kept_for_this_sensor_alone(posed: Posed):
     assert AngleCalibrating(posed.folder, SETTINGS, posed.clock).calibration is None
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"offset": math.nan},
+        {"offset": 31.0},
+        {"offset": math.inf},
+        {"radians_per_unit": math.nan},
+        {"radians_per_unit": 0.0},
+        {"radians_per_unit": -math.pi / 180},
+        {"radians_per_unit": 1.1 * math.pi / 180},
+        {"radians_per_unit": 1e300},
+        {"direction": 1},
+        {"direction": True},
+        {"poses": []},
+        {"poses": [{"angle_rad": 0.4, "raw": 10.0}] * 2},
+        {"poses": [{"angle_rad": 0.4, "raw": math.nan}, {"angle_rad": 1.6, "raw": 80.0}]},
+        {"by": 5},
+        {"by": "x" * 1_000_000},
+    ],
+)
+def test_a_file_that_says_something_else_than_its_poses_is_no_calibration(posed: Posed, change: dict[str, Any]):
+    for degrees in (20.0, 90.0):
+        posed.hold(degrees)
+        posed.pose(degrees)
+    path = posed.folder / "angle-calibration.json"
+    content = json.loads(path.read_text())
+    path.write_text(json.dumps(content))
+    assert AngleCalibrating(posed.folder, SETTINGS, posed.clock).calibration == posed.poses.calibration
+    content["calibration"] |= change
+    path.write_text(json.dumps(content))
+    assert AngleCalibrating(posed.folder, SETTINGS, posed.clock).calibration is None
+
+
+@pytest.mark.parametrize(
+    "content", ["[" * 100_000, '{"sensor":' * 100_000, "[]", '"x"', "", "\udcff", '{"sensor":' + 5_000 * "9" + "}"]
+)
+def test_a_rig_comes_up_whatever_stands_in_the_file(tmp_path: Path, content: str):
+    (tmp_path / "angle-calibration.json").write_bytes(content.encode("utf-8", "surrogateescape"))
+    assert AngleCalibrating(tmp_path, SETTINGS, VirtualClock()).calibration is None
+
+
 def test_a_new_first_pose_begins_again_and_the_old_calibration_holds_until_the_second(posed: Posed):
     for degrees in (20.0, 90.0):
         posed.hold(degrees)
@@ -95,6 +137,25 @@ def test_a_new_first_pose_begins_again_and_the_old_calibration_holds_until_the_s
     assert posed.pose(105.0) is True and posed.poses.calibration is not old
     assert posed.poses.scale is not None
     assert np.degrees(posed.poses.scale.angle_rad(np.array([30.0 - 40.0]))) == pytest.approx(45.0, abs=0.1)
+
+
+def test_a_first_pose_of_long_ago_is_none(posed: Posed):
+    posed.hold(20.0)
+    posed.pose(20.0)
+    posed.clock.wait(posed.clock.now_s() + angle_calibration.FIRST_LASTS_S + 1.0)
+    assert posed.poses.first is None
+    posed.hold(75.0)  # the sensor sits elsewhere meanwhile
+    assert posed.pose(90.0) is False and posed.poses.calibration is None
+    posed.hold(5.0)
+    assert posed.pose(20.0) is True
+    assert posed.poses.calibration is not None
+    assert [pose.angle_rad for pose in posed.poses.calibration.poses] == [math.radians(90.0), math.radians(20.0)]
+
+
+def test_who_poses_has_a_name_and_no_book():
+    assert AnglePoseRequest(angle_rad=1.0, by="n" * 200).by
+    with pytest.raises(ValueError, match="at most 200"):
+        AnglePoseRequest(angle_rad=1.0, by="n" * 201)
 
 
 def test_a_wrong_first_pose_is_taken_once_more(posed: Posed):

@@ -195,7 +195,22 @@ def test_silence_is_told_and_ends_when_an_angle_comes(how: str):
     receiver._closing = Waits(comes)
     receiver._run()
     assert problems == ["angle sensor: silent for 1 s; check its cable and supply", ""]
-    assert device.closed == 2
+    assert device.closed == 3  # when silent, when gone, and at the end of its thread
+
+
+def test_an_adapter_that_opens_while_the_rig_disconnects_is_closed(monkeypatch: pytest.MonkeyPatch):
+    _, sensor, receiver = made()
+    done: list[str] = []
+
+    def slowly() -> dict[str, Any]:
+        receiver._closing.set()  # who closed waits no longer
+        done.append("opened")
+        return {}
+
+    monkeypatch.setattr(sensor, "open", slowly)
+    monkeypatch.setattr(sensor, "close", lambda: done.append("closed"))
+    receiver._run()
+    assert done == ["opened", "closed"]
 
 
 def test_a_mistake_in_a_driver_is_told_too():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import h5py
 import numpy as np
 import pytest
 
+import identify
 from rig import align_angle, angle_velocity, archive, assembly, journal
 from rig.align_angle import Reference
 from rig.errors import RecordingError
@@ -221,3 +223,19 @@ def test_lost_blocks_of_angles_are_gaps(tmp_path: Path):
     first = gaps[0, 0]
     assert np.diff(found.columns["angle/time_s"])[first - 1] == pytest.approx(21 / 200)
     assert archive.verify(archive.seal(found, tmp_path).path)
+
+
+@pytest.mark.parametrize("back", [100, 20])
+def test_angles_that_overlap_are_taken_once(tmp_path: Path, back: int):
+    rig = VirtualRig(tmp_path, has_sensor=True)
+    assert rig.execute().outcome == "completed"
+    contents = journal.read(rig.path)
+    angles = [np.frombuffer(payload, ANGLE_SAMPLE) for kind, payload in contents.blocks if kind == Kind.ANGLE]
+    whole = np.concatenate(angles)
+    again = np.concatenate([whole[:300], whole[300 - back :]])
+    others = [block for block in contents.blocks if block[0] != Kind.ANGLE]
+    doubled = replace(contents, blocks=[*others[:-1], (Kind.ANGLE, again.tobytes()), others[-1]])
+    sealed = archive.seal(assembly.assemble(doubled), tmp_path)
+    columns = sealed.recording.columns
+    assert np.all(np.diff(columns["angle/time_s"]) > 0) and np.all(np.diff(columns["angle/counter"]) > 0)
+    assert identify.read(sealed.path).angle_rad is not None

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import identify
 from rig import archive, assembly, journal, limits
 from rig.acquire.angle_guard import check_start
 from rig.acquire.health import DEFAULT_WATCH
@@ -51,8 +52,10 @@ FAULTS: dict[str, tuple[Callable[[VirtualRig], None], str, float]] = {
     "fault bit": (set_to("fault", True), "a fault of its own", 0.05),
     "jump": (set_to("add_deg", -15.0), "jumped by 1", 0.05),
     "counter": (set_to("skip", 5000), "counter jumped", 0.05),
-    "repeated": (set_to("repeating", True), "stale", 0.16),
+    "repeated": (set_to("repeating", True), "counter went back", 0.16),
     "delayed": (set_to("late_s", 0.3), "stale", 0.16),
+    "power": (lambda rig: (set_to("counter", 0)(rig), set_to("add_deg", -15.0)(rig)), "counter went back", 0.1),
+    "nonsense": (set_to("add_deg", 1e300), "jumped by 1", 0.05),
 }
 """What happens to the sensor, what is told, and within how many seconds no pulse follows any more."""
 
@@ -83,6 +86,20 @@ def test_a_test_without_an_angle_goes_on_records_and_warns(tmp_path: Path, fault
     assert all(np.isfinite(recording.columns[path]).all() for path, _, _ in archive.ANGLE_COLUMNS)
     told = [line for line in warnings(recording) if line.startswith("angle sensor: ")]
     assert len(told) == 1 and FAULTS[fault][1] in told[0]
+
+
+@pytest.mark.parametrize("fault", ["nonsense", "fault bit", "jump"])
+def test_what_is_no_angle_spoils_no_recording_that_needs_none(tmp_path: Path, fault: str):
+    rig = VirtualRig(tmp_path, has_sensor=True)
+    rig.at(1.3, lambda: (FAULTS[fault][0](rig), set_to("add_deg", rig.sensor.add_deg or 40.0)(rig)))
+    assert rig.execute().outcome == "completed"
+    sealed = archive.seal(assembly.assemble(journal.read(rig.path)), tmp_path)
+    record = identify.read(sealed.path)
+    assert record.time_s[-1] > 2.4
+    known_rad = sealed.recording.columns["angle/angle_rad"]
+    assert len(known_rad) > 200
+    if fault != "jump":
+        assert np.all(np.abs(known_rad - math.radians(60)) < 0.01)
 
 
 def test_a_sensor_that_works_needs_no_warning(tmp_path: Path):
