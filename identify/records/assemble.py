@@ -15,6 +15,8 @@ from identify.records.record import OPTIONAL, Record, Source
 
 LEAST_LARGEST_US = 1.0
 """A record whose largest pulse width is less has it in another unit."""
+WIDEST_RAD = 2 * np.pi
+"""No joint turns farther: a record whose angle does has it in another unit."""
 MOST_HOLES = 0.1
 """Share of rows without a number up to which the others are a record."""
 PULSE_RATE_HZ = 40.0
@@ -72,6 +74,7 @@ def record_of(found: Found) -> Record:
     check_numbers(found.columns, found.at)
     found = _from_zero(without_holes(found))
     check_widths(found.columns, found.at)
+    check_angle(found.columns, found.at)
     time_s = found.columns["time_s"]
     bounds.check_span(time_s, found.at(time_s.size - 1, "time_s"))
     rows = found.columns if found.segment is None else {**found.columns, "segment": found.segment}
@@ -154,6 +157,21 @@ def _from_zero(found: Found) -> Found:
         f"time is counted from the first sample, at {time_s[0]:.3f} s",
         columns={**found.columns, "time_s": time_s - time_s[0]},
     )
+
+
+def check_angle(columns: Columns, at: Callable[[int, str], str]) -> None:
+    """Refuse an angle that no joint has. Raises BadRecord where it is in another unit."""
+    angle_rad = columns.get("angle_rad", np.zeros(0))
+    known = np.flatnonzero(np.isfinite(angle_rad))
+    if not known.size:
+        return
+    low, high = (int(known[pick(angle_rad[known])]) for pick in (np.argmin, np.argmax))
+    if not (angle_rad[high] - angle_rad[low] <= WIDEST_RAD):
+        raise BadRecord(
+            f"the angle runs from {angle_rad[low]:.4g} to {angle_rad[high]:.4g} rad, and no joint turns so far",
+            place=at(high, "angle_rad"),
+            fix="Is it in degrees? Then say so: --map angle_rad=angle_rad:deg, and the same for a velocity.",
+        )
 
 
 def check_widths(columns: Columns, at: Callable[[int, str], str]) -> None:

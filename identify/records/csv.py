@@ -14,7 +14,7 @@ import numpy as np
 
 from identify.errors import BadRecord
 from identify.records import bounds, columns, parts_csv, text
-from identify.records.assemble import PULSE_RATE_HZ, Found, check_widths, optional, record_of
+from identify.records.assemble import PULSE_RATE_HZ, Found, check_angle, check_widths, optional, record_of
 from identify.records.columns import Column, Given
 from identify.records.record import Record, Source, joined_source
 from identify.records.table import Table
@@ -85,6 +85,7 @@ def _joined(found: Found, table: Table, pulse_rate_hz: float | None) -> Record:
             place = found.at(int(bad[0]), column)
             raise BadRecord(f"{values[bad[0]]:g} is no measurement", place=place, fix=parts_csv.FIX)
     check_widths(found.columns, found.at)
+    check_angle(found.columns, found.at)
     time_s = found.columns["time_s"]
     joined = parts_csv.parsed(found.columns, table.parts, table.lines, table.name)
     bounds.check_span(time_s, found.at(time_s.size - 1, "time_s"))

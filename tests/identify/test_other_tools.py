@@ -304,6 +304,19 @@ def test_angles_in_degrees_and_columns_without_a_unit_passed_over(tmp_path: Path
     assert record.angle_rad[0] == pytest.approx(np.pi / 2) and record.velocity_rad_s[0] == pytest.approx(np.pi)
 
 
+@pytest.mark.parametrize("header", [("angle_rad",), ("angle_rad", "segment")], ids=["other tool's", "our own columns"])
+def test_degrees_under_the_name_of_radians_are_refused(tmp_path: Path, header: tuple[str, ...]) -> None:
+    path = tmp_path / "data.csv"
+    all_rows = rows(measured())
+    swept = [f"{60 + 40 * np.sin(0.01 * number):.3f}" for number in range(len(all_rows))]
+    cells = [[*row[:3], angle, *row[3:][: len(header) - 1]] for row, angle in zip(all_rows, swept, strict=True)]
+    path.write_text(table((*OURS[:3], *header), cells))
+    with pytest.raises(identify.BadRecord, match=r"from 20 to 100 rad, and no joint turns so far.*angle_rad:deg"):
+        identify.read(path)
+    record = identify.read(path, map={"angle_rad": "angle_rad:deg"})
+    assert record.angle_rad is not None and np.degrees(np.ptp(record.angle_rad)) == pytest.approx(80, abs=0.1)
+
+
 def test_joined_records_keep_what_was_said_of_their_parts(tmp_path: Path) -> None:
     from identify.records.join import join
 
