@@ -91,6 +91,7 @@ def test_two_poses_on_the_page_and_the_first_once_more(tab: Any, sensor: Service
     tab.get_by_label("The goniometer shows (°)").fill("100,4")
     tab.get_by_role("button", name="Take the second pose").click()
     tab.get_by_text("by Ada, at 15° and 100°").wait_for()
+    tab.get_by_text("Check it: bring the joint to a third angle").wait_for()
     assert [round(math.degrees(pose.angle_rad), 1) for pose in sensor.rig.arm.calibration.poses] == [15.0, 100.4]
     assert sensor.rig.arm.calibration.by == "Ada"
 
