@@ -219,6 +219,11 @@ class Services:
         return str(self.api.ready["url"])
 
     @property
+    def control_line(self) -> str | None:
+        """The socket by which faults are made and the arm is moved; None: no emulator was started here."""
+        return None if self.emulator is None else self.emulator.ready.get("control")
+
+    @property
     def drawn_token(self) -> str | None:
         """The first administrator's token, if it was drawn at this start."""
         return self.api.ready.get("drawn_token")

@@ -25,7 +25,10 @@ LARGEST = {
     "doubted": 1.0,
     "part": 1e3,
 }
-UNITS = {"angle_rad": "No joint turns so far: angles are in rad. If these are degrees, say so in the column's head."}
+UNITS = {
+    "angle_rad": "No joint turns so far. If these are degrees, say so: --map angle_rad=angle_rad:deg, and the same "
+    "for a velocity."
+}
 """What is likely wrong where all numbers of a column are finite, and one is too large."""
 LARGEST_CALENDAR_S = 1e11
 """Times as they are read may be counted from 1970, or from 1904."""

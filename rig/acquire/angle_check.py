@@ -158,10 +158,12 @@ def _unreliable(samples: NDArray[Any]) -> str | None:
 
 
 def outside(angle_rad: float, bound: Limit) -> str:
-    """An angle outside a range, in words."""
-    return f"{degrees(angle_rad)} is outside {degrees(bound.lo)} … {degrees(bound.hi)} ({bound.owner})"
+    """An angle outside a range, in words; one that is beyond it by a hair is not told as the end itself."""
+    beyond_rad = max(bound.lo - angle_rad, angle_rad - bound.hi)
+    digits = 1 if beyond_rad >= math.radians(0.1) else 3
+    return f"{degrees(angle_rad, digits)} is outside {degrees(bound.lo)} … {degrees(bound.hi)} ({bound.owner})"
 
 
-def degrees(angle_rad: float) -> str:
+def degrees(angle_rad: float, digits: int = 1) -> str:
     """An angle for people."""
-    return f"{math.degrees(angle_rad):.1f}°"
+    return f"{math.degrees(angle_rad):.{digits}f}°"

@@ -36,7 +36,7 @@ LEAST_SHARE = 0.7
 APART_RAD = 0.5
 FIRST_LASTS_S = 600.0
 """Real seconds for which a first pose waits for its second: later the sensor may sit elsewhere."""
-SCALES = 0.5, 2.0
+SCALES = 0.7, 1.4
 """How far the scale of two poses may be from the rig file's: beyond it a number was mistyped or the sensor slips."""
 SENSOR = "device", "bus", "dbc", "message", "signal", "of_the_cell"
 """Settings that tell one sensor from another."""
@@ -121,12 +121,13 @@ class AngleCalibrating:
                 f"least {degrees(APART_RAD)} are needed: move the joint farther"
             )
         slope = _slope(first, second)
+        turned_rad = abs(second.raw - first.raw) * rig_file.radians_per_unit
         lo, hi = (factor * rig_file.radians_per_unit for factor in SCALES)
         if not (lo <= abs(slope) <= hi):
             self._first = None
             raise RefusedError(
-                f"angle_pose: the two poses make {abs(slope):.4g} rad of a unit, the rig file says "
-                f"{rig_file.radians_per_unit:.4g}; check goniometer and mounting, then begin with the first pose"
+                f"angle_pose: between the two poses the goniometer turned by {degrees(abs(apart_rad))}, the sensor by "
+                f"{degrees(turned_rad)}; check goniometer and mounting, then begin with the first pose"
             )
         return AngleCalibration(
             poses=[first, second],

@@ -73,6 +73,11 @@ def test_two_poses_on_the_page_and_the_first_once_more(tab: Any, sensor: Service
     tab.get_by_role("button", name="Take the first pose").click()
     tab.get_by_text("is not a plain number").wait_for()
     assert tab.get_by_label("The goniometer shows (°)").input_value() == "zwei"
+    for slip in ("200", "-90"):
+        tab.get_by_label("The goniometer shows (°)").fill(slip)
+        tab.get_by_role("button", name="Take the first pose").click()
+        tab.locator(".wrong", has_text=f"{slip}° is not within −6° … 138°, as this rig asks").wait_for()
+        assert tab.get_by_label("The goniometer shows (°)").input_value() == slip
     tab.get_by_label("The goniometer shows (°)").fill("51")  # a slip
     tab.get_by_role("button", name="Take the first pose").click()
     tab.get_by_role("heading", name="Second pose").wait_for()
@@ -86,6 +91,7 @@ def test_two_poses_on_the_page_and_the_first_once_more(tab: Any, sensor: Service
     tab.get_by_label("The goniometer shows (°)").fill("100,4")
     tab.get_by_role("button", name="Take the second pose").click()
     tab.get_by_text("by Ada, at 15° and 100°").wait_for()
+    tab.get_by_text("Check it: bring the joint to a third angle").wait_for()
     assert [round(math.degrees(pose.angle_rad), 1) for pose in sensor.rig.arm.calibration.poses] == [15.0, 100.4]
     assert sensor.rig.arm.calibration.by == "Ada"
 
@@ -96,7 +102,7 @@ def test_a_range_is_typed_in_degrees(tab: Any, sensor: Service) -> None:
         found = http.get("/v1/participants/X1").json()["profile"]["angle_range_rad"]
     assert [round(math.degrees(value), 6) for value in found] == [20, 110]
     for low, high, words in (("110", "20", "must be at least 10° above"), ("x", "110", "not a plain number"),
-                             ("20", "170", "as this rig asks")):  # fmt: skip
+                             ("20", "170", "as this rig asks"), ("20", "200", "as this rig asks")):  # fmt: skip
         tab.locator("#angle_from_deg").fill(low)
         tab.locator("#angle_to_deg").fill(high)
         tab.get_by_role("button", name="Set the limits").click()
@@ -128,6 +134,7 @@ def test_a_passive_test_shows_its_map_and_ends_by_itself(tab: Any, sensor: Servi
         painted_soon(tab, "coverage-chart") and painted_soon(tab, "angle-chart") and painted_soon(tab, "velocity-chart")
     )
     assert tab.locator("#angle").inner_text().endswith("°") and tab.locator("#stop").is_visible()
+    assert tab.locator("#current").count() == 0, "no current flows, so none is shown"
     tab.wait_for_url("**/participants/X1/joint", timeout=60_000)
     tab.locator(".step", has_text="Passive movement").get_by_text("done today").wait_for()
     assert tab.errors == []

@@ -105,6 +105,9 @@ def test_everything_dies_with_the_launcher(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "api.cli", "serve", "--port", "0", "--data", str(tmp_path)]
     launcher = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
     assert launcher.stdout is not None and "stimrig serves http://127.0.0.1:" in launcher.stdout.readline()
+    launcher.stdout.readline()
+    control = launcher.stdout.readline().partition("the emulator's control line: ")[2].strip()
+    assert Path(control).is_socket()
     children = subprocess.run(
         ["ps", "-o", "pid=", "--ppid", str(launcher.pid)], capture_output=True, text=True
     ).stdout.split()

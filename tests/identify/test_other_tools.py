@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 import identify
-from identify.errors import BadRecord
 from identify.records.record import Record
 from tests.harness.muscle import FINE_HZ
 from tests.harness.patients import Patient, make_record, protocol
@@ -305,11 +304,17 @@ def test_angles_in_degrees_and_columns_without_a_unit_passed_over(tmp_path: Path
     assert record.angle_rad[0] == pytest.approx(np.pi / 2) and record.velocity_rad_s[0] == pytest.approx(np.pi)
 
 
-def test_degrees_that_are_not_named_so_are_no_radians(tmp_path: Path) -> None:
+@pytest.mark.parametrize("header", [("angle_rad",), ("angle_rad", "segment")], ids=["other tool's", "our own columns"])
+def test_degrees_under_the_name_of_radians_are_refused(tmp_path: Path, header: tuple[str, ...]) -> None:
     path = tmp_path / "data.csv"
-    path.write_text(table((*OURS[:3], "angle_rad"), [[*row[:3], "90"] for row in rows(measured())]))
-    with pytest.raises(BadRecord, match=r"column angle_rad: 90 is no measurement.*If these are degrees"):
+    all_rows = rows(measured())
+    swept = [f"{60 + 40 * np.sin(0.01 * number):.3f}" for number in range(len(all_rows))]
+    cells = [[*row[:3], angle, *row[3:][: len(header) - 1]] for row, angle in zip(all_rows, swept, strict=True)]
+    path.write_text(table((*OURS[:3], *header), cells))
+    with pytest.raises(identify.BadRecord, match=r"column angle_rad: .* is no measurement.*angle_rad=angle_rad:deg"):
         identify.read(path)
+    record = identify.read(path, map={"angle_rad": "angle_rad:deg"})
+    assert record.angle_rad is not None and np.degrees(np.ptp(record.angle_rad)) == pytest.approx(80, abs=0.1)
 
 
 def test_joined_records_keep_what_was_said_of_their_parts(tmp_path: Path) -> None:

@@ -195,9 +195,19 @@ def test_poses_that_give_another_scale_begin_again(posed: Posed, second_deg: flo
     posed.hold(20.0)
     posed.pose(20.0)
     posed.hold(second_deg if second_deg < 100 else 60.0)
-    with pytest.raises(RefusedError, match="rad of a unit, the rig file says"):
+    with pytest.raises(RefusedError, match=r"the goniometer turned by (70|139)\.0°, the sensor by (0\.5|40\.0)°"):
         posed.pose(90.0 if second_deg < 100 else second_deg)
     assert posed.poses.first is None and posed.poses.calibration is None
+
+
+def test_a_slip_that_would_halve_every_angle_is_refused(posed: Posed):
+    """60 typed for 100."""
+    posed.hold(20.0)
+    posed.pose(20.0)
+    posed.hold(99.0)
+    with pytest.raises(RefusedError, match=r"the goniometer turned by 40\.0°, the sensor by 79\.0°"):
+        posed.pose(60.0)
+    assert posed.poses.calibration is None
 
 
 @pytest.mark.parametrize("told_rad", [math.nan, math.inf, -1.0, 3.0])

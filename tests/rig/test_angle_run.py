@@ -12,6 +12,7 @@ import pytest
 
 import identify
 from rig import archive, assembly, journal, limits
+from rig.acquire.angle_check import outside
 from rig.acquire.angle_guard import check_start
 from rig.acquire.health import DEFAULT_WATCH
 from rig.control.sealing import warnings
@@ -252,3 +253,9 @@ def test_a_start_away_from_the_target_is_refused(tmp_path: Path):
 
 def test_the_watch_on_the_angle_is_as_tight_as_on_the_torque():
     assert DEFAULT_WATCH.stale_angle_s == DEFAULT_WATCH.stale_torque_s == 0.1
+
+
+@pytest.mark.parametrize(("angle_deg", "said"), [(120.02, "120.020°"), (121.0, "121.0°"), (19.96, "19.960°")])
+def test_an_angle_a_hair_beyond_its_range_is_not_told_as_the_end_itself(angle_deg: float, said: str):
+    bound = limits.Limit("angle_rad", math.radians(20), math.radians(120), "rad", "", "", "participant's profile")
+    assert outside(math.radians(angle_deg), bound) == f"{said} is outside 20.0° … 120.0° (participant's profile)"

@@ -107,4 +107,6 @@ def welcome(services: Services, settings: Settings) -> list[str]:
         lines.append("the administrator's token is the one in STIMRIG_ADMIN_TOKEN")
     else:
         lines.append("sign in with a token issued before (set STIMRIG_ADMIN_TOKEN to replace a lost one)")
+    if services.control_line:
+        lines.append(f"the emulator's control line: {services.control_line}")
     return lines

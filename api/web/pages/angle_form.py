@@ -43,6 +43,21 @@ def fields(status: Status | None) -> list[dict[str, str]]:
     return [{"name": name, "label": LABELS[name], "help": help_of[name]} for name in NAMES]
 
 
+def of_pose(text: str, status: Status | None) -> float:
+    """The angle that a goniometer shows, rad, from its text in degrees.
+
+    Raises
+    ------
+    ValueError
+        No plain number, or no angle that this rig takes; one line for people.
+    """
+    angle_rad = math.radians(typed.signed(text))
+    rigs = status.angle.range_rad if status else None
+    if rigs is not None and not (rigs[0] <= angle_rad <= rigs[1]):
+        raise ValueError(f"{shown(angle_rad) + '°'} is not within {angles.words(rigs)}, as this rig asks")
+    return angle_rad
+
+
 def asked(given: Mapping[str, str], profile: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
     """The range that is asked for as part of a profile, and what is wrong with it, by field.
 
@@ -61,7 +76,7 @@ def asked(given: Mapping[str, str], profile: Mapping[str, Any]) -> tuple[dict[st
     if errors:
         return {}, errors
     low, high = (values[name] for name in NAMES)
-    if not (low >= angles.LEAST_RAD and high <= angles.MOST_RAD and high - low >= angles.NARROWEST_RAD - 1e-9):
+    if not (high - low >= angles.NARROWEST_RAD - 1e-9):
         least = math.degrees(angles.NARROWEST_RAD)
         return {}, {NAMES[1]: f"the second angle must be at least {least:.0f}° above the first"}
     saved = angles.of(profile)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 from fastapi import APIRouter, Request
@@ -10,7 +9,7 @@ from fastapi.responses import RedirectResponse, Response
 
 from api.errors import ApiError
 from api.web.dependencies import Context, Ctx, Tester
-from api.web.pages import typed
+from api.web.pages import angle_form
 from api.web.pages.checked import checked
 from api.web.pages.render import page
 from api.web.routes import joint
@@ -45,7 +44,7 @@ async def take_pose(request: Request, context: Ctx, who: Tester) -> Response:
     sent = await request.form()
     text, first = str(sent.get("angle_deg") or "")[:60], bool(sent.get("first"))
     try:
-        angle_rad = math.radians(typed.signed(text))
+        angle_rad = angle_form.of_pose(text, context.rig.status)
     except ValueError as error:
         return await shown(request, context, text, str(error), again=first)
     body = checked(PoseIn, angle_rad=angle_rad, first=first)

@@ -79,7 +79,7 @@ def _take_angles(form: LimitsForm, sent: FormData, profile: Mapping[str, Any], s
     if len(given) < len(angle_form.NAMES):
         return
     asked, errors = angle_form.asked(given, profile)
-    rigs = status.angle.range_rad if status else None
+    rigs = (status.angle.range_rad if status else None) or (angles.LEAST_RAD, angles.MOST_RAD)
     if beyond := angles.outside(asked, rigs):
         errors[angle_form.NAMES[1]] = beyond[angles.RANGE]
     form.texts |= given
