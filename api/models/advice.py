@@ -114,6 +114,12 @@ GATES: dict[str, Gate] = {
         lazy("Not usable: test again with the arm held still and relaxed."),
         lazy("The error follows a pattern, and the controller repeats it in each trial."),
     ),
+    "joint": Gate(
+        lazy("The joint moved during the test, and the model does not know of it."),
+        lazy("Usable with care: at the angles of this test only."),
+        lazy("Not usable: test again with the arm held still and relaxed."),
+        lazy("At another angle the muscle is stronger or weaker: the controller's pulses would not fit."),
+    ),
     "sensor": Gate(
         lazy("The load cell shows the same torque again and again: it clips, or it is not connected."),
         lazy("Usable with care: look at the highest torques in the chart first; the load cell clips."),

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 
 from identify.dynamics.linear import Discrete
 from identify.dynamics.pulse_grid import Grid
+from identify.effects import get
 from identify.model import Model
 from identify.records.record import Record
 from identify.simulation.predict import refuse_rate
@@ -23,6 +25,8 @@ WITHIN_NOISE = 1.3
 OWN = "the fitted rows"
 ANGLE_SLACK_RAD, VELOCITY_SLACK_RAD_S = 0.09, 0.1
 """Five degrees, and what a hand that holds still may move."""
+LARGEST_MOVE_RAD = 0.17
+"""Ten degrees: less is the give of a fixture."""
 NEGLIGIBLE = 5e-4
 """Share of the torque's range below which the kind of an error does not matter."""
 
@@ -119,6 +123,7 @@ def quality(model: Model, grid: Grid, rows: np.ndarray, converged: bool = True) 
         "held_out": _held_out(model),
         "gap": _gap(model),
         "residual": _residual(model, float(np.ptp(grid.torque_nm[rows]))),
+        "joint": _joint_at_rest(model, grid, rows),
         "sensor": _sensor(grid, model.baseline_nm),
     }
     failed = [gate for gate in gates.values() if not gate["passed"]]
@@ -251,6 +256,16 @@ def _residual(model: Model, span_nm: float) -> dict[str, Any]:
         return _gate(True, "care", "")
     failed = [name for name, test in model.residual_tests.items() if not test.get("passed", True)]
     return _gate(not failed, "care", f"the residual is not pure noise ({', '.join(failed)} test): see the diagnosis")
+
+
+def _joint_at_rest(model: Model, grid: Grid, rows: np.ndarray) -> dict[str, Any]:
+    """Whether the joint moved in a test that a model of a joint at rest does not follow."""
+    if grid.angle_rad is None or any(get(entry["id"]).moves_with_joint for entry in model.effects):
+        return _gate(True, "care", "")
+    moved_rad = float(np.ptp(grid.angle_rad[rows]))
+    far = moved_rad > LARGEST_MOVE_RAD and not _reach(model)[3] <= WITHIN_NOISE * model.noise.white_sd_nm
+    says = f"the joint moved by {math.degrees(moved_rad):.0f}°, and the model is one of a joint at rest"
+    return _gate(not far, "care", f"{says}: hold it still, or add what depends on the joint")
 
 
 def _sensor(grid: Grid, baseline_nm: float) -> dict[str, Any]:

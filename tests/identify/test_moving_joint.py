@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -65,6 +66,17 @@ def seen(of: Model, name: str) -> tuple[np.ndarray, np.ndarray]:
     x, v = np.meshgrid(of.joint["angle_rad"], of.joint["velocity_rad_s"], indexing="ij")
     rows = np.asarray(of.joint[f"seen_{name}"]) > 0
     return x[rows], v[rows]
+
+
+def test_a_joint_that_moved_in_a_test_at_rest_is_told():
+    isometric, swept = recorded_tests()[0], recorded_tests()[-1]
+    held = identify.fit(as_record(isometric)).quality["gates"]["joint"]
+    assert held["passed"], "it has an angle, and that does not move"
+    blind = identify.fit(as_record(swept)).quality["gates"]["joint"]
+    moved = math.degrees(np.ptp(swept["angle_rad"]))
+    assert not blind["passed"] and blind["severity"] == "care"
+    assert f"moved by {moved:.0f}°" in blind["says"] and "add what depends on the joint" in blind["says"]
+    assert model().quality["gates"]["joint"]["passed"], "with g and h it may move"
 
 
 def test_g_and_h_are_found_beside_f_and_dynamics():
