@@ -136,6 +136,17 @@ def learn_moving(
     return done
 
 
+def movement_of(path: str) -> np.ndarray:
+    """The angle at each pulse, rad, shape (N,), from a text file with one a line."""
+    try:
+        table = np.loadtxt(path, ndmin=2)
+    except (OSError, ValueError) as error:
+        sys.exit(f"--movement {path}: {error}")
+    if table.shape[1] != 1 or not np.all(np.abs(table) <= 2 * np.pi):
+        sys.exit(f"--movement {path}: one angle a line, in rad")
+    return table[:, 0]
+
+
 def main() -> None:
     """Learn, and show how the error falls."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -156,7 +167,7 @@ def main() -> None:
 
     service = MovingService(Client(options.url, token), options.participant, start_movement)
     model = service.client.model_file(options.model) if options.model else service.fetch()
-    movement_rad = np.loadtxt(options.movement)
+    movement_rad = movement_of(options.movement)
     peak_nm = options.peak_nm or 0.4 * float(model["recruitment"]["inverse"]["torque_nm"][-1])
     reference = Reference(np.resize(Reference.reach(peak_nm).torque_nm, movement_rad.size))
     done = learn_moving(service, model, reference, movement_rad, options.trials)

@@ -21,8 +21,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -33,6 +31,7 @@ from hardware_sim.arm.mechanics import Mechanics
 from hardware_sim.arm.motion import LARGEST_DEG, SMALLEST_DEG, within
 from hardware_sim.arm.tissue import DEFAULT_LAWS, PLACES, Tissue, built, law
 from hardware_sim.errors import ArmError
+from hardware_sim.tables import read_table
 
 KEYS = ("mode", "movement", "mechanics", *PLACES)
 
@@ -100,14 +99,8 @@ def _number(halves: tuple[str, str]) -> tuple[str, float]:
 
 
 def _from_file(path: Path) -> Arm:
-    try:
-        text = path.read_text(encoding="utf-8")
-        described = json.loads(text) if path.suffix.lower() == ".json" else tomllib.loads(text)
-    except (OSError, UnicodeDecodeError) as error:
-        raise ArmError(f"{path}: cannot be read ({error}); give a readable TOML or JSON file") from None
-    except ValueError as error:  # both decoders' errors name line and column
-        raise ArmError(f"{path}: not valid {'JSON' if path.suffix == '.json' else 'TOML'}: {error}") from None
-    if not isinstance(described, dict) or set(described) - set(KEYS):
+    described = read_table(path, ArmError, f"a table of {', '.join(KEYS)}")
+    if set(described) - set(KEYS):
         raise ArmError(f"{path}: an arm's file is a table of {', '.join(KEYS)}")
     tables = {key: described.get(key, {}) for key in KEYS[1:]}
     for key, table in tables.items():

@@ -11,9 +11,7 @@ A file in TOML or JSON names one of them and overrides its parameters::
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -22,6 +20,7 @@ from hardware_sim import patients
 from hardware_sim.errors import PatientError
 from hardware_sim.patients.muscle import Muscle
 from hardware_sim.scan import modules_with
+from hardware_sim.tables import read_table
 
 
 def names() -> list[str]:
@@ -60,7 +59,7 @@ def from_file(path: Path) -> Muscle:
     PatientError
         The file cannot be read, is malformed, or describes no patient; names the file.
     """
-    described = _read(path)
+    described = read_table(path, PatientError, "a table with 'patient' and 'parameters'")
     unknown = sorted(set(described) - {"patient", "parameters"})
     if unknown:
         raise PatientError(f"{path}: unknown key '{unknown[0]}'; a patient's file has 'patient' and 'parameters'")
@@ -71,16 +70,3 @@ def from_file(path: Path) -> Muscle:
         return make(str(described.get("patient", "paper")), parameters)
     except PatientError as error:
         raise PatientError(f"{path}: {error}") from None
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        text = path.read_text(encoding="utf-8")
-        described = json.loads(text) if path.suffix.lower() == ".json" else tomllib.loads(text)
-    except (OSError, UnicodeDecodeError) as error:
-        raise PatientError(f"{path}: cannot be read ({error}); give a readable TOML or JSON file") from None
-    except ValueError as error:  # both decoders' errors name line and column
-        raise PatientError(f"{path}: not valid {'JSON' if path.suffix == '.json' else 'TOML'}: {error}") from None
-    if not isinstance(described, dict):
-        raise PatientError(f"{path}: must hold a table with 'patient' and 'parameters'")
-    return described

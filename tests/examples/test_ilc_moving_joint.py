@@ -199,6 +199,23 @@ def test_a_trial_that_did_not_end_well_or_has_no_angle_halts_the_controller(
         service(ilc, client).play_moving(np.full(SIZE, 90.0))
 
 
+@pytest.mark.parametrize(("text", "says"), [(None, "not found"), ("x\n", "could not convert"), ("1 2\n", "one angle"),
+                                            ("90\n", "in rad"), ("nan\n", "in rad")])  # fmt: skip
+def test_a_file_that_is_no_movement_is_told_in_a_line(
+    ilc: ModuleType, tmp_path: Path, text: str | None, says: str
+) -> None:
+    path = tmp_path / "angles.csv"
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(SystemExit, match=rf"--movement {path}: .*{says}"):
+        ilc.movement_of(str(path))
+
+
+def test_a_movement_is_one_angle_a_line(ilc: ModuleType, tmp_path: Path) -> None:
+    (tmp_path / "angles.csv").write_text("1\n1.5\n2\n")
+    assert ilc.movement_of(str(tmp_path / "angles.csv")).tolist() == [1.0, 1.5, 2.0]
+
+
 def test_only_a_model_with_g_and_h_is_told_the_angles(ilc: ModuleType) -> None:
     client = Answers(b"")
     for model in ({"model_id": "M", "joint": {"g": []}}, {"model_id": "M", "joint": {}}, {"model_id": "M"}):

@@ -247,3 +247,16 @@ def kill_hard(process: Process) -> None:
     """SIGKILL, as the kernel's out-of-memory killer would."""
     os.kill(process.popen.pid, signal.SIGKILL)
     process.popen.wait()
+
+
+def made_ready(bench: Bench, client: RigClient) -> tuple[Bench, RigClient]:
+    """A pair without faults, re-armed, whose events are read."""
+    for name in bench.fault(cmd="faults")["active"]:
+        bench.fault(cmd="fault", name=name, on=False)
+    if client.status()["state"] != "ready":
+        client.ask("stop", reason="the test before left it so", by="test")
+        client.wait_state("latched", "disconnected")
+        assert client.ask("rearm", by="test")["ok"]
+    while not client.events.empty():
+        client.events.get_nowait()
+    return bench, client

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.harness.processes import Bench, RigClient
+from tests.harness.processes import Bench, RigClient, made_ready
 
 SPEED = 2.0
 
@@ -38,16 +38,7 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Bench, RigC
 @pytest.fixture
 def shared(pair: tuple[Bench, RigClient]) -> tuple[Bench, RigClient]:
     """The file's pair, ready: what one test left behind is no other test's failure."""
-    bench, client = pair
-    for name in bench.fault(cmd="faults")["active"]:
-        bench.fault(cmd="fault", name=name, on=False)
-    if client.status()["state"] != "ready":
-        client.ask("stop", reason="the test before left it so", by="test")
-        client.wait_state("latched", "disconnected")
-        assert client.ask("rearm", by="test")["ok"]
-    while not client.events.empty():
-        client.events.get_nowait()
-    return pair
+    return made_ready(*pair)
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ import pytest
 
 import identify
 from rig import archive
-from tests.harness.processes import Bench, RigClient, control, default_plan
+from tests.harness.processes import Bench, RigClient, control, default_plan, made_ready
 
 pytestmark = [pytest.mark.wire, pytest.mark.slow]
 
@@ -92,12 +92,7 @@ def angled(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Bench, Ri
 @pytest.fixture
 def ready(angled: tuple[Bench, RigClient]) -> tuple[Bench, RigClient]:
     """The file's pair, ready and at 60 degrees."""
-    bench, client = angled
-    for name in bench.fault(cmd="faults")["active"]:
-        bench.fault(cmd="fault", name=name, on=False)
-    if client.status()["state"] != "ready":
-        client.wait_state("latched", "disconnected")
-        assert client.ask("rearm", by="test")["ok"]
+    bench, client = made_ready(*angled)
     at(bench, client, 60.0)
     return bench, client
 
