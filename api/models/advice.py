@@ -120,6 +120,12 @@ GATES: dict[str, Gate] = {
         lazy("Not usable: test again with the arm held still and relaxed."),
         lazy("At another angle the muscle is stronger or weaker: the controller's pulses would not fit."),
     ),
+    "joint_seen": Gate(
+        lazy("The joint hardly moved in these tests: how the torque depends on it is a guess."),
+        lazy("Usable with care: at the angle of these tests only."),
+        lazy("Not usable: record again while the joint moves."),
+        lazy("At another angle the torque that the controller expects is a guess."),
+    ),
     "sensor": Gate(
         lazy("The load cell shows the same torque again and again: it clips, or it is not connected."),
         lazy("Usable with care: look at the highest torques in the chart first; the load cell clips."),

@@ -124,6 +124,7 @@ def quality(model: Model, grid: Grid, rows: np.ndarray, converged: bool = True) 
         "gap": _gap(model),
         "residual": _residual(model, float(np.ptp(grid.torque_nm[rows]))),
         "joint": _joint_at_rest(model, grid, rows),
+        "joint_seen": _joint_seen(model, grid, rows),
         "sensor": _sensor(grid, model.baseline_nm),
     }
     failed = [gate for gate in gates.values() if not gate["passed"]]
@@ -260,12 +261,26 @@ def _residual(model: Model, span_nm: float) -> dict[str, Any]:
 
 def _joint_at_rest(model: Model, grid: Grid, rows: np.ndarray) -> dict[str, Any]:
     """Whether the joint moved in a test that a model of a joint at rest does not follow."""
-    if grid.angle_rad is None or any(get(entry["id"]).moves_with_joint for entry in model.effects):
+    if grid.angle_rad is None or _moves(model):
         return _gate(True, "care", "")
     moved_rad = float(np.ptp(grid.angle_rad[rows]))
     far = moved_rad > LARGEST_MOVE_RAD and not _reach(model)[3] <= WITHIN_NOISE * model.noise.white_sd_nm
     says = f"the joint moved by {math.degrees(moved_rad):.0f}°, and the model is one of a joint at rest"
     return _gate(not far, "care", f"{says}: hold it still, or add what depends on the joint")
+
+
+def _joint_seen(model: Model, grid: Grid, rows: np.ndarray) -> dict[str, Any]:
+    """Whether the joint moved in the tests of a model of a joint that moves."""
+    if grid.angle_rad is None or not _moves(model):
+        return _gate(True, "care", "")
+    moved_rad = float(np.ptp(grid.angle_rad[rows]))
+    says = f"the joint moved by {math.degrees(moved_rad):.0f}° only: what depends on it is a guess; move it in a test"
+    return _gate(moved_rad > LARGEST_MOVE_RAD, "care", says)
+
+
+def _moves(model: Model) -> bool:
+    """Whether it is one of a joint that moves."""
+    return any(get(entry["id"]).moves_with_joint for entry in model.effects)
 
 
 def _sensor(grid: Grid, baseline_nm: float) -> dict[str, Any]:

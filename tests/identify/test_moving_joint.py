@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -77,6 +78,14 @@ def test_a_joint_that_moved_in_a_test_at_rest_is_told():
     assert not blind["passed"] and blind["severity"] == "care"
     assert f"moved by {moved:.0f}°" in blind["says"] and "add what depends on the joint" in blind["says"]
     assert model().quality["gates"]["joint"]["passed"], "with g and h it may move"
+
+
+def test_a_joint_that_did_not_move_says_nothing_of_g_and_h():
+    resting = as_record(recorded_tests()[0])
+    gate = identify.fit(resting, effects=("torque_angle",)).quality["gates"]["joint_seen"]
+    assert not gate["passed"] and gate["severity"] == "care" and re.match(r"the joint moved by \d° only", gate["says"])
+    assert identify.fit(resting).quality["gates"]["joint_seen"]["passed"], "without such an effect it need not"
+    assert model().quality["gates"]["joint_seen"]["passed"]
 
 
 def test_g_and_h_are_found_beside_f_and_dynamics():
