@@ -141,6 +141,7 @@ def test_a_passive_test_shows_its_map_and_ends_by_itself(tab: Any, sensor: Servi
 
 
 def test_held_angles_start_only_there_and_survive_a_reload(tab: Any, sensor: Service) -> None:
+    sensor.rig.speed = 0.5  # it is still playing when a busy machine has loaded its page
     with_range(tab, sensor)
     tab.goto(f"{sensor.url}/participants/X1/joint")
     start = tab.get_by_role("button", name="Start at 35°…")
@@ -169,7 +170,7 @@ def test_held_angles_start_only_there_and_survive_a_reload(tab: Any, sensor: Ser
 
 
 def test_movement_under_stimulation_and_one_model_of_all(tab: Any, sensor: Service) -> None:
-    sensor.rig.speed = 10.0
+    sensor.rig.speed = 1.0  # it is still playing when a busy machine has loaded its page
     with_range(tab, sensor)
     tab.goto(f"{sensor.url}/participants/X1/joint")
     tab.get_by_role("button", name="Start the movement under stimulation…").click()
@@ -178,6 +179,7 @@ def test_movement_under_stimulation_and_one_model_of_all(tab: Any, sensor: Servi
     tab.get_by_role("button", name="Start now").click()
     tab.wait_for_url("**/tests/T*")
     tab.locator("#dose-used", has_text="N·m·s").wait_for()
+    tab.get_by_role("button", name="Enough").click()
     tab.wait_for_url("**/participants/X1/joint", timeout=90_000)
     assert tab.locator("input[name=recording]:checked").count() == 1
     tab.get_by_text("Not recorded today: passive movement, held-angle test.").wait_for()
