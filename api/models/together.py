@@ -37,15 +37,20 @@ async def fit(
         needs it, or the data do not allow the fit.
     """
     rows = await asyncio.to_thread(_found, analyses, participant, recordings)
-    await analyses.check_known([name.partition(":")[0] for name in effects])
-    ids = {name.partition(":")[0] for name in effects}
-    needs = [ANGLE] if ids & {name.partition(":")[0] for name in JOINT_EFFECTS} else []
+    ids = _ids(effects)
+    await analyses.check_known(ids)
+    needs = [ANGLE] if {*ids} & {*_ids(JOINT_EFFECTS)} else []
     whole = rows[0] if len(rows) == 1 else await _joined(analyses, rows, participant, needs)
     call = analyses.pool.submit("fit", data=whole.path, effects=list(effects))
     if on_call is not None:
         on_call(call)
     found = await asyncio.shield(call.result)
     return await asyncio.to_thread(_store, analyses, found["json"], participant, whole, by, recordings)
+
+
+def _ids(effects: Sequence[str]) -> list[str]:
+    """Of effects that may say their forms, too."""
+    return [name.partition(":")[0] for name in effects]
 
 
 def _found(analyses: Analyses, participant: str, recordings: Sequence[str]) -> list[Recording]:

@@ -156,10 +156,7 @@ def add_effect(base: Fitted, effect: Effect, form: str, raw: Raw) -> Fitted:
     for need in effect.needs:
         if getattr(base.problem.setup.grid.record, need) is None:
             raise NotIdentifiable(f"{effect.id} needs the column {need}", place=need, fix="Record this column.")
-    try:
-        forms = [effect.form(form)] if form else list(effect.forms)
-    except KeyError as error:
-        raise BadRequest(f"{effect.id} has no form {form!r}", place="effects") from error
+    forms = [_form(effect, form)] if form else list(effect.forms)
     for identifier, seen, values in detected_effects(raw):
         if identifier == effect.id:
             return fit_from(base, identifier, seen, values)
@@ -220,12 +217,17 @@ def in_form(base: Fitted, effect: str, form: str) -> Fitted:
     BadRequest
         The effect has no such form.
     """
-    try:
-        other = get(effect).form(form)
-    except KeyError as error:
-        raise BadRequest(f"{effect} has no form {form!r}", place="effects") from error
+    other = _form(get(effect), form)
     problem = Problem(base.problem.setup, [(name, other if name == effect else own) for name, own in base.effects])
     return solve(problem, start_from(problem, base, {}), base.noise, tolerance=TOLERANCE)
+
+
+def _form(effect: Effect, form: str) -> Form:
+    """A form by its name. Raises BadRequest where the effect has none of that name."""
+    try:
+        return effect.form(form)
+    except KeyError as error:
+        raise BadRequest(f"{effect.id} has no form {form!r}", place="effects") from error
 
 
 def fitted_with(record: Record, wanted: Sequence[str]) -> Fitted:

@@ -9,10 +9,9 @@ import numpy as np
 
 from identify.dynamics.linear import Discrete
 from identify.dynamics.pulse_grid import Grid
-from identify.effects import get
 from identify.model import Model
 from identify.records.record import Record
-from identify.simulation.predict import refuse_rate
+from identify.simulation.predict import moves_with_joint, refuse_rate
 
 UNDER_CEILING_POINTS = 1.0
 LARGEST_DIP = 0.05
@@ -261,7 +260,7 @@ def _residual(model: Model, span_nm: float) -> dict[str, Any]:
 
 def _joint_at_rest(model: Model, grid: Grid, rows: np.ndarray) -> dict[str, Any]:
     """Whether the joint moved in a test that a model of a joint at rest does not follow."""
-    if grid.angle_rad is None or _moves(model):
+    if grid.angle_rad is None or moves_with_joint(model):
         return _gate(True, "care", "")
     moved_rad = float(np.ptp(grid.angle_rad[rows]))
     far = moved_rad > LARGEST_MOVE_RAD and not _reach(model)[3] <= WITHIN_NOISE * model.noise.white_sd_nm
@@ -271,16 +270,11 @@ def _joint_at_rest(model: Model, grid: Grid, rows: np.ndarray) -> dict[str, Any]
 
 def _joint_seen(model: Model, grid: Grid, rows: np.ndarray) -> dict[str, Any]:
     """Whether the joint moved in the tests of a model of a joint that moves."""
-    if grid.angle_rad is None or not _moves(model):
+    if grid.angle_rad is None or not moves_with_joint(model):
         return _gate(True, "care", "")
     moved_rad = float(np.ptp(grid.angle_rad[rows]))
     says = f"the joint moved by {math.degrees(moved_rad):.0f}° only: what depends on it is a guess; move it in a test"
     return _gate(moved_rad > LARGEST_MOVE_RAD, "care", says)
-
-
-def _moves(model: Model) -> bool:
-    """Whether it is one of a joint that moves."""
-    return any(get(entry["id"]).moves_with_joint for entry in model.effects)
 
 
 def _sensor(grid: Grid, baseline_nm: float) -> dict[str, Any]:

@@ -112,8 +112,7 @@ def check_numbers(columns: Columns, at: Callable[[int, str], str]) -> None:
         missing = np.isnan(column) if name in MAY_LACK else False
         if (bad := np.flatnonzero(~(np.abs(column) <= bounds.largest(name)) & ~np.asarray(missing))).size:
             fix = "Cut the record before it; values must be finite."
-            if np.isfinite(column[bad]).all():
-                fix = bounds.UNITS.get(name, fix)
+            fix = bounds.fix_of(name, column[bad], fix)
             raise BadRecord(f"{column[bad[0]]:g} is no measurement", place=at(int(bad[0]), name), fix=fix)
 
 

@@ -72,6 +72,11 @@ def largest(column: str) -> float:
     return LARGEST_CALENDAR_S if column == "time_s" else LARGEST[column]
 
 
+def fix_of(column: str, wrong: np.ndarray, otherwise: str) -> str:
+    """What to do about numbers of a column that are too large, or none."""
+    return UNITS.get(column, otherwise) if np.isfinite(wrong).all() else otherwise
+
+
 def check_rate(pulse_rate_hz: float, place: str) -> None:
     """Refuse a pulse rate that no stimulator has.
 

@@ -116,8 +116,7 @@ class Table:
         if bad.size:
             shown = _shown(cells[bad[0]].strip())
             fix = "Remove the row's cause, or cut the record before it; values must be finite."
-            if np.isfinite(values[bad]).all():
-                fix = bounds.UNITS.get(column, fix)
+            fix = bounds.fix_of(column, values[bad], fix)
             raise BadRecord(
                 f"{shown} is no measurement" if shown else "empty", place=self.at(lines[bad[0]], column), fix=fix
             )

@@ -154,6 +154,11 @@ def problem_of(
     return problem, problem.from_physical(values)
 
 
+def moves_with_joint(model: Muscle) -> bool:
+    """Whether an effect of the model depends on the angle or the velocity of the joint."""
+    return any(get(entry["id"]).moves_with_joint for entry in model.effects)
+
+
 def _own_angles(model: Muscle, record: Record, settings: Mapping[str, Any]) -> dict[str, Any]:
     """The reference angle and the range of fitted angles; a model of an older version knows them of its own record.
 
@@ -168,7 +173,7 @@ def _own_angles(model: Muscle, record: Record, settings: Mapping[str, Any]) -> d
             "reference_rad": settings["reference_rad"],
             "angle_range_rad": None if known is None else (float(known[0]), float(known[1])),
         }
-    if any(get(entry["id"]).moves_with_joint for entry in model.effects) and not same_data(model, record):
+    if moves_with_joint(model) and not same_data(model, record):
         raise BadModel(
             "the model does not say at which angle its curve holds",
             place="effects.0.settings.reference_rad",
