@@ -3,8 +3,9 @@
     STIMRIG_TOKEN=… python examples/ilc_moving_joint.py --participant P017 --movement angles.csv --start "robot --go"
 
 `angles.csv` has the angle at each pulse of a trial, in rad, one a line: the movement as it is meant to be. `--start` is
-a command that starts it; it is run when the trial's first pulse is due. The rig itself moves nothing. The reference is
-the whole torque at the cell above the rest before the trial, passive torque included.
+a command that starts it; it is run as soon as the trial's first pulse is seen to be due. The rig itself moves nothing.
+The reference is the whole torque at the cell above the rest before the trial: a reach, and the passive torque that the
+model foretells along the movement.
 
 Trial k plays the widths for which the model, along the movement, gives reference - d, and learns
 
@@ -22,6 +23,7 @@ import argparse
 import io
 import os
 import shlex
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -160,6 +162,8 @@ def main() -> None:
     options = parser.parse_args()
     token = os.environ.get("STIMRIG_TOKEN") or sys.exit("set STIMRIG_TOKEN to a controller's key")
     command = shlex.split(options.start)
+    if command and shutil.which(command[0]) is None:
+        sys.exit(f"--start: there is no command {command[0]}")
 
     def start_movement() -> None:
         if command:
@@ -169,7 +173,8 @@ def main() -> None:
     model = service.client.model_file(options.model) if options.model else service.fetch()
     movement_rad = movement_of(options.movement)
     peak_nm = options.peak_nm or 0.4 * float(model["recruitment"]["inverse"]["torque_nm"][-1])
-    reference = Reference(np.resize(Reference.reach(peak_nm).torque_nm, movement_rad.size))
+    passive_nm = service.foretell(model, np.zeros(movement_rad.size), movement_rad)  # the stimulation need not undo it
+    reference = Reference(np.resize(Reference.reach(peak_nm).torque_nm, movement_rad.size) + passive_nm)
     done = learn_moving(service, model, reference, movement_rad, options.trials)
     kind = "with g and h" if model.get("joint") else "of a joint at rest"
     print(f"model {model['model_id']} {kind}, reference {reference.rms_nm:.2f} N·m rms; error in % of it")

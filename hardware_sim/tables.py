@@ -26,7 +26,7 @@ def read_table(path: Path, error: type[HardwareSimError], holds: str) -> dict[st
         described = json.loads(text) if is_json else tomllib.loads(text)
     except (OSError, UnicodeDecodeError) as reason:
         raise error(f"{path}: cannot be read ({reason}); give a readable TOML or JSON file") from None
-    except (ValueError, RecursionError) as reason:  # both decoders' errors name line and column
+    except (ValueError, RecursionError) as reason:  # a ValueError of either decoder names line and column
         raise error(f"{path}: not valid {'JSON' if is_json else 'TOML'}: {reason}") from None
     if not isinstance(described, dict):
         raise error(f"{path}: must hold {holds}")

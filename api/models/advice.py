@@ -116,7 +116,7 @@ GATES: dict[str, Gate] = {
     ),
     "joint": Gate(
         lazy("The joint moved during the test, and the model does not know of it."),
-        lazy("Usable with care: at the angles of this test only."),
+        lazy("Usable with care: hold the joint still and test again, or add what depends on the joint."),
         lazy("Not usable: test again with the arm held still and relaxed."),
         lazy("At another angle the muscle is stronger or weaker: the controller's pulses would not fit."),
     ),

@@ -54,7 +54,7 @@ STRUCTURE_BESIDE_BAND = 60.0
 STRUCTURE = 12.0
 """Log-likelihood by which work and rest must differ for structure to be left."""
 STRUCTURE_SHARE = 0.0015
-"""The same as a share of the largest torque: pulses that come a millisecond early or late leave an error of 0.1 %."""
+"""Error at work above that of white noise, as a share of the largest torque, below which it does not matter."""
 UNKNOWN_FORM = 0.04
 """Probability that is kept for what no form in the library describes."""
 FREE_GAIN_MARGIN = 8.0

@@ -24,8 +24,8 @@ WITHIN_NOISE = 1.3
 OWN = "the fitted rows"
 ANGLE_SLACK_RAD, VELOCITY_SLACK_RAD_S = 0.09, 0.1
 """Five degrees, and what a hand that holds still may move."""
-LARGEST_MOVE_RAD = 0.17
-"""Ten degrees: less is the give of a fixture."""
+LARGEST_MOVE_RAD = math.radians(10)
+"""Less is the give of a fixture."""
 NEGLIGIBLE = 5e-4
 """Share of the torque's range below which the kind of an error does not matter."""
 
@@ -116,13 +116,13 @@ def quality(model: Model, grid: Grid, rows: np.ndarray, converged: bool = True) 
         "stable": _stable(model),
         "converged": _gate(converged, "care", "the search for the dynamics did not converge"),
         "torque": _torque(model, grid, rows),
+        "joint": _joint_at_rest(model, grid, rows),
         "monotone": _monotone(model),
         "range": _range(grid, rows),
         "ceiling": _ceiling(model),
         "held_out": _held_out(model),
         "gap": _gap(model),
         "residual": _residual(model, float(np.ptp(grid.torque_nm[rows]))),
-        "joint": _joint_at_rest(model, grid, rows),
         "joint_seen": _joint_seen(model, grid, rows),
         "sensor": _sensor(grid, model.baseline_nm),
     }

@@ -15,10 +15,11 @@ import pytest
 import identify
 from hardware_sim.arm_patient import arm_patient
 from hardware_sim.arm_records import changed, record
+from identify.dynamics.make_grid import make_grid
 from identify.effects import get
 from identify.effects.kernels import relaxed
 from identify.errors import BadModel, BadRequest
-from identify.estimation.quality import range_warnings
+from identify.estimation.quality import quality, range_warnings
 from identify.fitting import MOVING_JOINT
 from identify.inversion import Reference, invert
 from identify.inversion.table import read_reference
@@ -78,6 +79,11 @@ def test_a_joint_that_moved_in_a_test_at_rest_is_told():
     assert not blind["passed"] and blind["severity"] == "care"
     assert f"moved by {moved:.0f}°" in blind["says"] and "add what depends on the joint" in blind["says"]
     assert model().quality["gates"]["joint"]["passed"], "with g and h it may move"
+    found, grid = identify.fit(as_record(swept)), make_grid(as_record(swept))
+    for times, passed in ((1.29, True), (1.31, False)):
+        error = {"rms_nm": times * found.noise.white_sd_nm, "held_out_fit_percent": None}
+        again = quality(found.with_(fit=found.fit | error), grid, grid.fitted)
+        assert again["gates"]["joint"]["passed"] == passed, "an error within the noise leaves nothing to tell"
 
 
 def test_a_joint_that_did_not_move_says_nothing_of_g_and_h():
