@@ -262,7 +262,7 @@ class Service:
                     self.participant, kind="sequence", segments=segments, reference_torque_nm=wanted_nm, **asked
                 )["id"]
             except (Conflict, Invalid) as error:
-                if "rest" not in error.detail or time.monotonic() > patience:
+                if error.code != "rest-needed" or time.monotonic() > patience:
                     raise
             time.sleep(0.3)  # the gate asks for a rest between tests
 

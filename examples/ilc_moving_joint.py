@@ -83,11 +83,20 @@ class MovingService(Service):
         for test in self.client.follow(self.start(segments, angle={})):  # it stops where the joint leaves its range
             if not started and test["state"] == "running" and (test.get("elapsed_s") or 0.0) >= BEFORE_S:
                 started = True
-                self.start_movement()
+                self._start_movement()
             if test["recording_id"]:
+                if not started:
+                    raise HaltedError("the trial was over before its movement was started")
                 content = self.client.recording(test["recording_id"])
                 return *measured(content, widths_us.size), angles(content, widths_us.size)
         raise HaltedError(f"the trial ended as {test['state']}: {test['reason']}")
+
+    def _start_movement(self) -> None:
+        try:
+            self.start_movement()
+        except OSError as error:
+            self.client.stop()
+            raise HaltedError(f"the movement did not start: {error}") from None
 
     def foretell(self, model: dict[str, Any], widths_us: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
         """What a model gives along these angles, N·m above rest, shape (N,); without g and h they do not matter."""
@@ -165,9 +174,11 @@ def main() -> None:
     if command and shutil.which(command[0]) is None:
         sys.exit(f"--start: there is no command {command[0]}")
 
+    moves: list[subprocess.Popen[bytes]] = []
+
     def start_movement() -> None:
         if command:
-            subprocess.Popen(command)
+            moves.append(subprocess.Popen(command))
 
     service = MovingService(Client(options.url, token), options.participant, start_movement)
     model = service.client.model_file(options.model) if options.model else service.fetch()
@@ -175,7 +186,11 @@ def main() -> None:
     peak_nm = options.peak_nm or 0.4 * float(model["recruitment"]["inverse"]["torque_nm"][-1])
     passive_nm = service.foretell(model, np.zeros(movement_rad.size), movement_rad)  # the stimulation need not undo it
     reference = Reference(np.resize(Reference.reach(peak_nm).torque_nm, movement_rad.size) + passive_nm)
-    done = learn_moving(service, model, reference, movement_rad, options.trials)
+    try:
+        done = learn_moving(service, model, reference, movement_rad, options.trials)
+    finally:  # nothing moves the arm on where the controller has halted
+        for move in moves:
+            move.terminate()
     kind = "with g and h" if model.get("joint") else "of a joint at rest"
     print(f"model {model['model_id']} {kind}, reference {reference.rms_nm:.2f} N·m rms; error in % of it")
     for number, trial in enumerate(done, start=1):

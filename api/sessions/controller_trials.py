@@ -97,6 +97,8 @@ async def _within_plan(runner: Runner, store: Store, who: Principal, body: TestI
         limits[name] = min(value for value in (asked, plan[name], participant.profile.get(name)) if value is not None)
     if body.profile and body.profile.max_torque_nm:
         limits["max_torque_nm"] = body.profile.max_torque_nm
+    if body.profile and body.profile.angle_range_rad:
+        limits["angle_range_rad"] = body.profile.angle_range_rad
     narrowed = body.model_copy(update={"profile": ProfileIn(**limits)})
     preview = await runner.preview(narrowed)
     if not preview["duration_s"] <= plan["max_duration_s"] + 1e-9:

@@ -40,7 +40,9 @@ def limits_of(body: TestIn, own: dict[str, Any] | None) -> dict[str, Any]:
     profile = Profile(**own)
     wider = [words for name in LIMITS if name in asked if (words := _wider(name, asked[name], getattr(profile, name)))]
     range_rad = angles.of(asked)
-    if range_rad is not None and not angles.within(range_rad, profile.angle_range_rad):
+    if range_rad is not None and profile.angle_range_rad is None:
+        wider.append(f"{angles.RANGE} {angles.words(range_rad)} narrows nothing: {body.participant} has no range")
+    elif range_rad is not None and not angles.within(range_rad, profile.angle_range_rad):
         own_words = angles.words(profile.angle_range_rad or ())
         wider.append(f"{angles.RANGE} {angles.words(range_rad)} is beyond the participant's {own_words}")
     if wider:

@@ -108,6 +108,13 @@ def _worded(receiver: AngleReceiver) -> str:
     return found if found.startswith("angle sensor") else f"angle sensor: {found}"
 
 
+def await_angle(receiver: AngleReceiver, clock: Clock) -> None:
+    """Wait a moment for the first angle: right after connecting there is none."""
+    end_s = clock.now_s() + PATIENCE_S * clock.speed
+    while receiver.angle_around(AROUND_S * clock.speed) is None and clock.now_s() <= end_s:
+        clock.wait(clock.now_s() + 0.02 * clock.speed)
+
+
 def check_start(receiver: AngleReceiver | None, plan: TestPlan, table: dict[str, Limit], clock: Clock) -> None:
     """Check where the joint is before a test that asks for its angle.
 
@@ -121,11 +128,9 @@ def check_start(receiver: AngleReceiver | None, plan: TestPlan, table: dict[str,
     if plan.angle is None:
         return
     assert receiver is not None
-    end_s = clock.now_s() + PATIENCE_S * clock.speed
-    while (now_rad := receiver.angle_around(AROUND_S * clock.speed)) is None:
-        if clock.now_s() > end_s:
-            raise DeviceError(_worded(receiver))
-        clock.wait(clock.now_s() + 0.02 * clock.speed)
+    now_rad = receiver.angle_around(AROUND_S * clock.speed)
+    if now_rad is None:
+        raise DeviceError(_worded(receiver))
     bound, target_rad, tolerance_rad = table["angle_rad"], plan.angle.target_rad, plan.angle.tolerance_rad
     if check(bound, now_rad) is not None:
         raise RefusedError(f"plan.angle: {outside(now_rad, bound)}; move the joint into it")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rig.acquire.angle_check import degrees
-from rig.acquire.angle_guard import check_start
+from rig.acquire.angle_guard import await_angle, check_start
 from rig.control.angle_calibration import APART_RAD
 from rig.control.extending import Extending
 from rig.errors import BusyError, PlanError, RefusedError
@@ -39,6 +39,12 @@ class Posing(Extending):
             self._pair.rescale(self._poses.scale)
             self._publish(StateEvent(status=self.status()))
         return self.status()
+
+    def _await_angle(self, plan: TestPlan) -> None:
+        """Wait for a first angle, where a test asks for one; without the lock, so that no stop waits behind it."""
+        receiver = self._angle_receiver() if plan.angle is not None and self._has_angle else None
+        if receiver is not None:
+            await_angle(receiver, self._clock)
 
     def _check_angle(self, plan: TestPlan, table: dict[str, Limit]) -> None:
         """Refuse a test that asks for an angle that this rig cannot give, or where the joint is elsewhere."""

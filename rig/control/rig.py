@@ -80,6 +80,7 @@ class Rig(Posing):
             The journal or the latch file cannot be written.
         """
         self._trial.may_start()  # before the lock: a start that was asked for while stopped must not run later
+        self._await_angle(request)
         with self._lock:
             self._trial.may_start()
             check_names("plan", test_id=request.test_id, participant=request.participant)
