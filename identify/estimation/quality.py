@@ -263,9 +263,9 @@ def _joint_at_rest(model: Model, grid: Grid, rows: np.ndarray) -> dict[str, Any]
     if grid.angle_rad is None or moves_with_joint(model):
         return _gate(True, "care", "")
     moved_rad = float(np.ptp(grid.angle_rad[rows]))
-    far = moved_rad > LARGEST_MOVE_RAD and not _reach(model)[3] <= WITHIN_NOISE * model.noise.white_sd_nm
+    little = moved_rad <= LARGEST_MOVE_RAD or _reach(model)[3] <= WITHIN_NOISE * model.noise.white_sd_nm
     says = f"the joint moved by {math.degrees(moved_rad):.0f}°, and the model is one of a joint at rest"
-    return _gate(not far, "care", f"{says}: hold it still, or add what depends on the joint")
+    return _gate(little, "care", f"{says}: hold it still, or add what depends on the joint")
 
 
 def _joint_seen(model: Model, grid: Grid, rows: np.ndarray) -> dict[str, Any]:

@@ -116,6 +116,10 @@ class SampleFrame:
         names = [s.name for s in found.signals]
         place = f"message {found.name} of {dbc}"
         self._signals = tuple(_choose("signal", s, names, place) for s in signals)
+        for name in self._signals:
+            signal = found.get_signal_by_name(name)
+            if signal.is_float and signal.choices:  # a word is looked up by a whole number: 5.1 would be a 5
+                raise ConfigError(f"signal: {place}, {name}: a floating-point signal has no words; remove its VAL_")
         self._counter = _choose("counter", counter, names, place) if counter else None
         self._flag = _choose(flag_key, flag, names, place) if flag else None
         self.counter_modulus = 0

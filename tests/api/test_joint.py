@@ -15,6 +15,7 @@ from websockets.sync.client import connect
 
 from tests.api.conftest import STUB, TOKEN, Service, run_service, run_test, wait_done
 from tests.api.fake_arm import back_and_forth, still
+from tests.api.test_controller_keys import made
 
 RANGE = [math.radians(20), math.radians(110)]
 
@@ -266,6 +267,26 @@ def test_a_controllers_trial_can_be_watched(service: Service, client: httpx.Clie
     refused = begin(client, ready, "sequence", segments=segments, angle={})
     assert (refused.status_code, refused.json()["type"]) == (422, "/problems/no-angle-range")
     assert begin(client, ready, "sequence", segments=segments, angle={"target_rad": 1.0}).status_code == 422
+
+
+def test_a_range_for_one_trial_only_narrows_also_by_a_controllers_key(
+    service: Service, client: httpx.Client, ready: str
+) -> None:
+    model = run_test(client, ready)["model_id"]
+    client.post(f"/v1/models/{model}/approve", json={"reason": ""}).raise_for_status()
+    segments = [{"name": "s", "sequence": "widths", "settings": {"pulse_width_us": [50.0, 100.0, 50.0, 0.0]}}]
+    with service.client(made(client, ready)) as key:
+        for who in (client, key):
+            asked = {"segments": segments, "angle": {}, "profile": {"angle_range_rad": [0.9, 1.3]}}
+            begun = begin(who, ready, "sequence", **asked)
+            assert begun.status_code == 202, begun.text
+            assert service.rig.last_plan.angle.range_rad == pytest.approx((0.9, 1.3))
+            wait_done(client, begun.json()["id"])
+            asked["profile"] = {"angle_range_rad": [-0.3, 2.5]}
+            assert begin(who, ready, "sequence", **asked).json()["type"] == "/problems/wider-profile"
+    client.put(f"/v1/participants/{ready}/profile", json={"angle_range_rad": None}).raise_for_status()
+    invented = begin(client, ready, "sequence", **asked | {"profile": {"angle_range_rad": [0.9, 1.3]}})
+    assert invented.status_code == 422 and "has no range" in invented.json()["detail"]
 
 
 # ---- one model of all -----------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -16,11 +17,11 @@ import pytest
 from rig import journal
 from rig.acquire.angle_receiver import AngleReceiver
 from rig.clock import MonotonicClock, VirtualClock
-from rig.control import angle_calibration, pair
+from rig.control import angle_calibration, pair, posing
 from rig.control.angle_calibration import AngleCalibrating
 from rig.control.rig import Rig
 from rig.devices import can_angle_sensor
-from rig.errors import BusyError, DeviceError, PlanError, RefusedError, RigError
+from rig.errors import BusyError, DeviceError, LatchedError, PlanError, RefusedError, RigError
 from rig.journal import Kind
 from rig.limits import HARD_LIMITS
 from rig.messages import AnglePlan, AnglePoseRequest
@@ -363,6 +364,23 @@ def test_poses_are_told_kept_and_stand_in_the_journal(angled: Callable[..., Angl
     finished = live.rig.finished
     assert finished is not None and finished.outcome == "completed"
     assert any(line.startswith("angle sensor") for line in finished.summary["warnings"])
+
+
+def test_a_stop_does_not_wait_behind_a_start_that_waits_for_an_angle(
+    angled: Callable[..., AngledRig], monkeypatch: pytest.MonkeyPatch
+):
+    live, stopped = angled(), []
+
+    def stop_meanwhile(*_: Any) -> None:
+        presses = threading.Thread(target=lambda: stopped.append(live.rig.stop("pressed", "nurse")), daemon=True)
+        presses.start()
+        presses.join(10)
+        assert stopped, "the stop waits for the start"
+
+    monkeypatch.setattr(posing, "await_angle", stop_meanwhile)
+    with pytest.raises(LatchedError):
+        live.rig.start(live.plan("t", **HELD))
+    assert live.rig.status().state == "latched"
 
 
 def _started(live: AngledRig, plan: Any) -> bool:

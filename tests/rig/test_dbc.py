@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
+from importlib import resources
 from pathlib import Path
 
 import pytest
@@ -51,6 +52,14 @@ def test_a_value_that_has_a_word_is_no_reading(tmp_path: Path):
     for raw in (-32768, 32767):
         got = frame.decode(struct.pack(">hhhBB", raw, -32768, 0, 9, 0))
         assert math.isnan(got.values[0]) and got.values[1] == pytest.approx(-327.68) and got.counter == 9
+
+
+def test_a_float_has_no_words(tmp_path: Path):
+    packaged = resources.files("rig.wire").joinpath(f"{PACKAGED}.dbc").read_text("utf-8")
+    path = tmp_path / "float.dbc"
+    path.write_text(packaged + 'VAL_ 385 Torque_Nm 0 "rest" ;\n')
+    with pytest.raises(ConfigError, match="Torque_Nm: a floating-point signal has no words"):
+        SampleFrame(str(path), None, ["Torque_Nm"], None, None)
 
 
 def test_a_short_frame_is_told():
