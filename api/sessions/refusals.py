@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import asyncio
+from dataclasses import dataclass, field
 
 from api.errors import ApiError
 from api.people import names
@@ -24,6 +25,8 @@ class Current:
     """Its end has been heard."""
     missed: int = 0
     """How often in a row the rig, asked for its state, did not name it."""
+    let_go: asyncio.Event = field(default_factory=asyncio.Event)
+    """The rig is free of it."""
 
 
 def other_than(asker: str, ran_by: str | None) -> str | None:

@@ -8,6 +8,7 @@ import math
 import secrets
 from collections.abc import Coroutine
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -62,6 +63,8 @@ ANSWER_S = 15.0
 """So long the rig may take to answer a start."""
 PREVIEW_S = 35.0
 """More than the rig takes for one before it says that the computer is too busy."""
+ENDING_S = 2.0
+"""So long a start waits for a test whose end has been heard."""
 MISSED_POLLS = 3
 """After so many states that don't name the test, its end was lost: it comes within milliseconds of the state."""
 NOTE_S = 0.3
@@ -138,6 +141,7 @@ class Runner:
             404 no such participant; 409 another test runs, the holder named; 409 it would not be what was seen, or a
             stop came since it was asked for; 503 that was too long ago; what the rig refuses.
         """
+        await self._let_end()
         self.refuse_second()
         if body.kind == ADAPTIVE:  # what it can reach is computed now, and not while others wait, and then remembered
             await self._planned(body, await self._participant(body))
@@ -150,6 +154,12 @@ class Runner:
         """Whether the rig plays this test now."""
         current = self.current
         return current is not None and current.test_id == test_id and current.started and not current.ending
+
+    async def _let_end(self) -> None:
+        """A test is seen to be done a moment before the rig is let go: who starts the next one then is not refused."""
+        if self.current is not None and self.current.ending:
+            with suppress(TimeoutError):
+                await asyncio.wait_for(self.current.let_go.wait(), ENDING_S)
 
     def refuse_second(self) -> None:
         """409 while a test runs, its holder named."""
@@ -436,6 +446,7 @@ class Runner:
     def _release(self, test_id: str) -> None:
         """The rig is free again; the identification goes on beside it."""
         if self.current is not None and self.current.test_id == test_id:
+            self.current.let_go.set()
             self.current = None
             self._leave()
 

@@ -234,6 +234,16 @@ def wait_done(client: httpx.Client, test_id: str, limit_s: float = 120.0) -> dic
     raise AssertionError(f"not done: {document}")
 
 
+def let_go(client: httpx.Client, limit_s: float = 20.0) -> bool:
+    """Whether the rig is soon free: a test is seen to be done a moment before that."""
+    end = time.monotonic() + limit_s
+    while client.get("/v1/rig").json()["holder"] is not None:
+        if time.monotonic() > end:
+            return False
+        time.sleep(0.02)
+    return True
+
+
 def run_test(client: httpx.Client, participant: str, limit_s: float = 120.0) -> dict[str, Any]:
     """Start a test and follow it to its end."""
     started = client.post("/v1/tests", json={"participant": participant})

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import threading
+import time
 from typing import Any
 
 import httpx
 import pytest
 
+from api.sessions import runner
 from rig.messages import StartRequest
-from tests.api.conftest import Service, run_test, wait_done
+from tests.api.conftest import Service, let_go, run_test, wait_done
 
 
 def fails(*_args: Any, **_more: Any) -> Any:
@@ -48,15 +51,43 @@ def test_a_test_taken_up_after_a_restart_ends_whatever_fails(
         now = wait_done(client, ended["id"], 20)
     assert now["state"] == "failed" and now["reason"] == "something unexpected"
     assert [record.test_id for record in caplog.records if record.exc_info] == [ended["id"]]  # pyright: ignore[reportAttributeAccessIssue]
-    told = [message["test"]["state"] for message in iter_now(queue) if message["type"] == "test"]
-    assert told[-1:] == ["failed"], "open pages hear of it"
+    assert told_of(queue, "failed"), "open pages hear of it"
     monkeypatch.undo()
-    assert client.get("/v1/rig").json()["holder"] is None
+    assert let_go(client)
     assert run_test(client, participant)["state"] == "completed"
 
 
-def iter_now(queue: asyncio.Queue[dict[str, Any]]) -> list[dict[str, Any]]:
-    return [queue.get_nowait() for _ in range(queue.qsize())]
+def told_of(queue: asyncio.Queue[dict[str, Any]], state: str, limit_s: float = 20.0) -> bool:
+    """Whether open pages soon hear that a test is in this state: they are told after it is written down."""
+    end = time.monotonic() + limit_s
+    while time.monotonic() < end:
+        while not queue.empty():
+            message = queue.get_nowait()
+            if message["type"] == "test" and message["test"]["state"] == state:
+                return True
+        time.sleep(0.02)
+    return False
+
+
+def test_a_start_between_a_tests_end_and_the_rig_let_go_waits(
+    client: httpx.Client, service: Service, participant: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The database says that a test is done a moment before the rig is let go: on a busy machine clients met a 409."""
+    lifecycle, written_down = service.app.state.context.runner.lifecycle, threading.Event()
+    fail = lifecycle.fail
+
+    def fails_slowly(test_id: str, error: Exception) -> None:
+        fail(test_id, error)
+        assert written_down.wait(60)
+
+    monkeypatch.setattr(lifecycle, "take_recording", fails)
+    monkeypatch.setattr(lifecycle, "fail", fails_slowly)
+    monkeypatch.setattr(runner, "ENDING_S", 60.0)
+    first = run_test(client, participant)
+    assert first["state"] == "failed" and client.get("/v1/rig").json()["holder"]["test_id"] == first["id"]
+    threading.Timer(0.3, written_down.set).start()
+    assert client.post("/v1/tests", json={"participant": participant}).status_code == 202
+    assert written_down.is_set()
 
 
 def test_what_has_ended_is_not_called_failed_by_what_goes_wrong_later(
