@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
+from functools import cache
 
-from fastapi import FastAPI
+from fastapi import APIRouter, FastAPI
+from starlette.routing import BaseRoute
 from starlette.types import ASGIApp
 
 from api.clock import Clock
@@ -62,15 +64,23 @@ def create_app(
         docs_url=None,
         redoc_url=None,
         openapi_url="/openapi.json",
+        routes=list(_routes()),
     )
     app.state.context = context
     app.add_middleware(strict_body.StrictBody)
     app.add_middleware(BodyLimit, context=context)  # the last one added stands outside
     problems.install(app)
-    for router in [*routes.routers(), *pages.routers()]:
-        app.include_router(router)
     openapi.describe(app)
     return app
+
+
+@cache
+def _routes() -> Sequence[BaseRoute]:
+    """All routes, made once a process: FastAPI examines every endpoint anew for each application it is included in."""
+    whole = APIRouter()
+    for router in [*routes.routers(), *pages.routers()]:
+        whole.include_router(router)
+    return whole.routes
 
 
 def _lifespan(context: Context):

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import shutil
+import ssl
 import sys
 import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,8 @@ from tests.harness.postgres import Cluster
 TOKEN = "administrator-token-of-the-tests"
 PATIENCE_S = 60.0
 """For each answer: a busy machine is slow, and a test says so where an answer has to be quick."""
+NO_TLS = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+"""Services of tests speak plain HTTP: without it every client would read the machine's certificates, 20 ms each."""
 STUB = (sys.executable, str(Path(__file__).parent / "stub_worker.py"))
 
 
@@ -122,7 +125,7 @@ class Service:
     def client(self, token: str | None = TOKEN, **more: Any) -> httpx.Client:
         headers = {"Authorization": f"Bearer {token}"} if token else {}
         headers |= more.pop("headers", {})
-        return httpx.Client(base_url=self.url, headers=headers, **{"timeout": PATIENCE_S} | more)
+        return httpx.Client(base_url=self.url, headers=headers, **{"timeout": PATIENCE_S, "verify": NO_TLS} | more)
 
     def sql(self, statement: str) -> Any:
         """Done to the database behind the service's back; what it answers."""
@@ -179,9 +182,21 @@ def service(tmp_path: Path, short_dir: Path) -> Iterator[Service]:
     yield from run_service(tmp_path, short_dir, STUB)
 
 
+@cache
+def empty_database() -> bytes:
+    """SQLite's file with the tables of today, made once a process: each fresh service gets a copy."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "empty.sqlite"
+        Store(f"sqlite:///{path}").close()
+        return path.read_bytes()
+
+
 def run_service(tmp_path: Path, short_dir: Path, worker: Any, speed: float = 30.0, **more: Any) -> Iterator[Service]:
     socket = short_dir / f"rig-{time.time_ns()}.sock"
     settings = Settings(data_dir=tmp_path, admin_token=TOKEN, rig_socket=socket, port=0, **more)  # pyright: ignore[reportArgumentType]
+    if settings.database == f"sqlite:///{tmp_path / 'stimrig.db'}" and not (tmp_path / "stimrig.db").exists():
+        tmp_path.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "stimrig.db").write_bytes(empty_database())
     with RigThread(socket, settings.recordings_dir, speed=speed) as rig:
         app = create_app(settings, worker=worker)
         with Server(app) as url:
@@ -230,7 +245,7 @@ def wait_done(client: httpx.Client, test_id: str, limit_s: float = 120.0) -> dic
         document = client.get(f"/v1/tests/{test_id}").json()
         if document["done"]:
             return document
-        time.sleep(0.02)
+        time.sleep(0.05)
     raise AssertionError(f"not done: {document}")
 
 

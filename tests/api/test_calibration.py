@@ -33,8 +33,8 @@ def test_steps_and_marks_become_the_profile_of_the_day(
     assert [profile[f"{name}_pulse_width_us"] for name in ("sensory", "motor", "max")] == [10, 20, 30]
     assert client.get("/v1/participants/P017").json()["profile"] == profile
     test = client.post("/v1/tests", json={"participant": participant})
-    assert test.status_code == 202 and service.rig.plan is not None
-    assert service.rig.plan.profile.motor_pulse_width_us == 20
+    assert test.status_code == 202 and service.rig.last_plan is not None
+    assert service.rig.last_plan.profile.motor_pulse_width_us == 20
     wait_done(client, test.json()["id"])
     actions = [entry["action"] for entry in client.get("/v1/audit").json()["entries"]]
     assert {"begin calibration", "mark motor", "finish calibration"} <= set(actions)
@@ -70,7 +70,7 @@ def test_sequence_is_played_and_nothing_is_identified(client: httpx.Client, serv
     segments = [{"name": "trial", "sequence": "widths", "settings": {"pulse_width_us": [0, 100, 0]}}]
     body = {"participant": participant, "kind": "sequence", "segments": segments, "max_torque_nm": 5}
     started = client.post("/v1/tests", json=body)
-    assert started.status_code == 202 and service.rig.plan is not None and service.rig.plan.max_torque_nm == 5
+    assert started.status_code == 202 and service.rig.last_plan is not None and service.rig.last_plan.max_torque_nm == 5
     document = wait_done(client, started.json()["id"])
     assert document["state"] == "completed" and document["model_id"] is None
     assert client.get(document["recording_url"]).status_code == 200

@@ -55,7 +55,7 @@ def test_a_narrower_limit_reaches_the_rig(client: httpx.Client, service: Service
     service.rig.speed = 0.5  # still running where its plan is looked at
     body = {"participant": limited, "profile": {"current_ma": 10}, "max_pulse_width_us": 200, "max_torque_nm": 11}
     test_id = client.post("/v1/tests", json=body).json()["id"]
-    plan = service.rig.plan
+    plan = service.rig.last_plan
     assert plan is not None
     assert (plan.profile.current_ma, plan.profile.max_pulse_width_us, plan.profile.max_torque_nm) == (10, 220, 12)
     assert (plan.max_pulse_width_us, plan.max_torque_nm) == (200, 11)

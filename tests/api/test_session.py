@@ -175,7 +175,7 @@ def test_a_test_may_name_its_protocol(client: httpx.Client, service: Service, pa
         assert client.post("/v1/tests", json={"participant": participant, **wrong}).status_code == 422
     assert service.rig.starts == 0
     assert client.post("/v1/tests", json={"participant": participant, "protocol": "short"}).status_code == 202
-    assert (service.rig.plan.protocol, service.rig.plan.segments) == ("short", None)
+    assert (service.rig.last_plan.protocol, service.rig.last_plan.segments) == ("short", None)
 
 
 def test_preview_plays_nothing(client: httpx.Client, service: Service, participant: str) -> None:

@@ -22,6 +22,7 @@ from rig.errors import DeviceError
 from rig.limits import Admitted, Steps
 from rig.messages import Event, Profile, SegmentPlan, TestPlan
 from rig.signals import SAMPLE, Ack, LateError, TorqueBlock
+from tests.harness.paced_time import CLOCK
 
 RATE_HZ = 1600.0
 SPEED = 4.0
@@ -143,6 +144,7 @@ class LiveRig:
         armed: bool = False,
         speed: float = SPEED,
     ) -> None:
+        assert CLOCK.paced, "mark the test `wire`: this rig keeps time, and other tests compute beside it"
         self.clock = MonotonicClock(speed)
         self.stimulator = LiveStimulator(self.clock)
         self.cell = LiveCell(self.clock, self.stimulator)

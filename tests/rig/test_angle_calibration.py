@@ -327,6 +327,7 @@ HELD = {
 }
 
 
+@pytest.mark.wire
 @pytest.mark.slow
 def test_poses_are_told_kept_and_stand_in_the_journal(angled: Callable[..., AngledRig], tmp_path: Path):
     live = angled()
@@ -366,6 +367,7 @@ def test_poses_are_told_kept_and_stand_in_the_journal(angled: Callable[..., Angl
     assert any(line.startswith("angle sensor") for line in finished.summary["warnings"])
 
 
+@pytest.mark.wire
 def test_a_stop_does_not_wait_behind_a_start_that_waits_for_an_angle(
     angled: Callable[..., AngledRig], monkeypatch: pytest.MonkeyPatch
 ):
@@ -391,6 +393,7 @@ def _started(live: AngledRig, plan: Any) -> bool:
     return True
 
 
+@pytest.mark.wire
 @pytest.mark.slow
 def test_a_clinics_rig_needs_a_calibration_for_an_angle(angled: Callable[..., AngledRig]):
     live = angled(require=True)
@@ -412,6 +415,7 @@ def test_a_clinics_rig_needs_a_calibration_for_an_angle(angled: Callable[..., An
         live.rig.start(live.plan("h", **HELD))
 
 
+@pytest.mark.wire
 def test_without_a_sensor_poses_and_angles_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     live = LiveRig(tmp_path, monkeypatch)
     assert live.rig.status().angle.present is False

@@ -106,6 +106,7 @@ def test_in_a_real_terminal():
     assert b"stopped" in said
 
 
+@pytest.mark.wire
 def test_the_rig_stops_by_it_and_latches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     live = LiveRig(tmp_path, monkeypatch)
     live.rig.start(live.plan("one", hold_s=20.0))

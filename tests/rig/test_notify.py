@@ -74,6 +74,7 @@ def test_an_abstract_socket_is_found():
         assert heard(line) == ["READY=1"]
 
 
+@pytest.mark.wire
 @pytest.mark.parametrize("well", [True, False])
 def test_the_process_tells_what_it_finds(
     manager: socket.socket,

@@ -9,7 +9,6 @@ from __future__ import annotations
 from pathlib import Path
 
 from alembic import command
-from alembic.autogenerate import compare_metadata
 from alembic.config import Config
 from alembic.runtime.migration import MigrationContext
 from alembic.script import ScriptDirectory
@@ -82,12 +81,14 @@ def _newer(found: object) -> SchemaError:
 
 
 def _refuse_lacking(connection: Connection) -> None:
-    """Compare the database with the tables of `api.store.tables`."""
-    for difference in compare_metadata(MigrationContext.configure(connection), METADATA):
-        if difference[0] == "add_column":
-            lacking = f"table {difference[2]} lacks {difference[3].name}"
-        elif difference[0] == "add_table":
-            lacking = f"there is no table {difference[1].name}"
+    """Compare the database's columns with those of `api.store.tables`."""
+    found = inspect(connection).get_multi_columns()
+    kept = {table: {column["name"] for column in columns} for (_, table), columns in found.items()}
+    for table in METADATA.sorted_tables:
+        if table.name not in kept:
+            lacking = f"there is no table {table.name}"
+        elif missing := [column.name for column in table.columns if column.name not in kept[table.name]]:
+            lacking = f"table {table.name} lacks {missing[0]}"
         else:
             continue
         raise SchemaError(f"{lacking}, which cannot be made up; restore the database from a backup")

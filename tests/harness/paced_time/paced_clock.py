@@ -62,6 +62,11 @@ class PacedClock:
         with Path(path).open("r+b") as file:
             self._path, self.cells = path, memoryview(mmap.mmap(file.fileno(), BYTES)).cast("q")
 
+    @property
+    def paced(self) -> bool:
+        """Whether time waits for a process that is left without a processor."""
+        return self._path != ""
+
     def write(self, paced_ns: int, now_ns: int, ahead_ns: int) -> None:
         """Say what paced time is; readers see the whole slot or the one before."""
         number = self.cells[0] + 1
