@@ -20,7 +20,7 @@ debian() { # install Debian packages, as root, only those that are missing
     exit 1
   fi
   say "installing Debian packages: ${missing[*]}"
-  apt-get update -qq
+  apt-get update -qq -o Acquire::http::Timeout=30
   DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends "${missing[@]}" >/dev/null
 }
 
@@ -54,8 +54,13 @@ $venv/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --
 say "compiling, once (half a minute)"
 $venv/bin/python -m identify.diagnosis.warm_up
 
-if [ "$what" = test ] && ! command -v chromium >/dev/null 2>&1; then
-  debian chromium
+shell=chromium-headless-shell # opens no windows: with the whole browser each tab costs three times the processor
+if [ "$what" = test ] && ! command -v $shell >/dev/null 2>&1; then
+  if command -v chromium >/dev/null 2>&1; then
+    (debian $shell) || say "the pages are tested with the whole chromium: slower, nothing else"
+  else
+    debian $shell
+  fi
 fi
 if [ "$what" != run ] && [ "$what" != bench ] && ! compgen -G '/usr/lib/postgresql/*/bin/postgres' >/dev/null; then
   debian postgresql

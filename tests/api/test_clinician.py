@@ -176,7 +176,8 @@ def test_the_whole_way_by_keyboard_alone(blank: Any, service: Service) -> None:
     service.rig.speed = 1.5
     blank.goto(service.url)
     keys = blank.keyboard
-    keys.type(NAME)  # the field has the focus
+    blank.locator("#name:focus").wait_for()  # it has the focus by itself
+    keys.type(NAME)
     keys.press("Tab")
     keys.type(PASSWORD)
     keys.press("Enter")
