@@ -15,15 +15,15 @@ PROCESSORS = os.cpu_count() or 1
 SIDE_BY_SIDE = ("--dist", "worksteal", "-n")
 ON_POSTGRESQL = ("access", "archive", "controller_keys", "idle_lock", "names", "notes", "people", "session", "tracked")
 LANES = {
-    # one process more than processors: some tests wait for a page or a service
-    "pure": ("-m", "not wire", *SIDE_BY_SIDE, str(PROCESSORS + 1), "tests"),
+    # more processes than processors: tests of the service wait half of their time
+    "pure": ("-m", "not wire", *SIDE_BY_SIDE, str(PROCESSORS + 2), "tests"),
     # what several services share, and what the database decides; `make postgresql` runs all of it there
     "postgresql": (
         "--postgresql",
         "-m",
         "service and not browser and not wire and not slow",
         *SIDE_BY_SIDE,
-        str(PROCESSORS + 1),
+        str(PROCESSORS + 2),
         *(f"tests/api/test_{name}.py" for name in ON_POSTGRESQL),
     ),
     # two emulated rigs leave half of two processors idle
