@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any
 
 from api.charts import hover, ramp_directions
@@ -19,6 +20,8 @@ SHOWN_BEYOND = 1.5
 FONT = {"family": "system-ui, -apple-system, 'Segoe UI', 'DejaVu Sans', sans-serif", "size": 13, "color": role("ink")}
 TOOLBAR_PX = 42
 """On the right of a chart: the buttons stand there one below the other, and cover neither legend nor line."""
+PAUSE = 20.0
+"""A step in time that is so many times the usual one is a pause between two recordings: no line goes through it."""
 LETTER = 0.007
 """Width of a letter of a segment's name, as a share of a wide chart."""
 SYMBOLS = {"rising": "triangle-up", "falling": "triangle-down"}
@@ -102,9 +105,10 @@ def measurement(
 
 def measured_lines(curves: dict[str, Any], series: dict[str, Any] | None) -> list[dict[str, Any]]:
     """The traces of the measurement: torque on y, residual on y2, pulse width on y3, all over the same x."""
+    curves = broken_at_pauses(curves)
     time_s, torque_nm, predicted_nm = curves["time_s"], curves["torque_nm"], curves["predicted_torque_nm"]
     residual = [
-        None if predicted is None else round(measured - predicted, 5)
+        None if predicted is None or measured is None else round(measured - predicted, 5)
         for measured, predicted in zip(torque_nm, predicted_nm, strict=True)
     ]
     names = hover.segments_at(time_s, curves["segments"], segment_name)
@@ -120,6 +124,23 @@ def measured_lines(curves: dict[str, Any], series: dict[str, Any] | None) -> lis
     if series and series.get("lower_nm"):
         data[1:1] = filled(series["time_s"], series["lower_nm"], series["upper_nm"], _("95 %% band of the model"))
     return data
+
+
+def broken_at_pauses(curves: dict[str, Any]) -> dict[str, Any]:
+    """The curves with a point without a value in each pause between the recordings of a joined one."""
+    time_s = curves["time_s"]
+    steps_s = [after - before for before, after in pairwise(time_s)]
+    usual_s = sorted(steps_s)[len(steps_s) // 2] if steps_s else 0.0
+    pauses = [place + 1 for place, step_s in enumerate(steps_s) if step_s > PAUSE * usual_s]
+    if not pauses:
+        return curves
+    lines = ("torque_nm", "predicted_torque_nm", "pulse_width_us")
+    broken: dict[str, list[Any]] = {name: list(curves[name]) for name in ("time_s", *lines)}
+    for place in reversed(pauses):
+        broken["time_s"].insert(place, (time_s[place - 1] + time_s[place]) / 2)
+        for name in lines:
+            broken[name].insert(place, None)
+    return {**curves, **broken}
 
 
 def segment_name(name: str) -> str:

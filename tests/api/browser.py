@@ -100,6 +100,13 @@ def say_yes(page: Any) -> None:
     page.wait_for_url("**/tests/T*")
 
 
+def gone(locator: Any) -> None:
+    """Wait until there is no such element: the page before may have had it, with the words that were waited for."""
+    from playwright.sync_api import expect
+
+    expect(locator).to_have_count(0, timeout=30_000)
+
+
 def painted(page: Any, canvas: str) -> int:
     """How many pixels of a canvas are not empty."""
     script = """(id) => { const c = document.getElementById(id);

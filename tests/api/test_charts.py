@@ -52,6 +52,20 @@ def test_the_measurement_says_time_torque_residual_width_and_segment(figures: di
     assert len(names) == len(figure["data"][0]["x"])
 
 
+def test_no_line_goes_through_the_pause_between_two_recordings() -> None:
+    document, drawn = measured()
+    assert model_charts.broken_at_pauses(drawn) is drawn, "one recording has no pause"
+    half = len(drawn["time_s"]) // 2
+    paused = {**drawn, "time_s": [t + 600.0 * (place >= half) for place, t in enumerate(drawn["time_s"])]}
+    figure = model_charts.of_model(document, paused)["comparison"]
+    for trace in figure["data"]:
+        assert len(trace["x"]) == len(trace["y"]) == len(drawn["time_s"]) + 1
+        middle_s = sum(paused["time_s"][half - 1 : half + 1]) / 2
+        assert trace["y"][half] is None and trace["x"][half] == pytest.approx(middle_s)
+        assert len(trace.get("customdata", trace["x"])) == len(trace["x"])
+    assert "NaN" not in svg(figure)
+
+
 def test_torque_residual_and_width_share_one_time_axis(figures: dict[str, Any]) -> None:
     figure = figures["comparison"]
     assert {line.get("yaxis", "y") for line in figure["data"]} == {"y", "y2", "y3"}

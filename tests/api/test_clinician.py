@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from tests.api.browser import NAME, PASSWORD, open_tab, participant, sign_in, sign_in_with_token, start
+from tests.api.browser import NAME, PASSWORD, gone, open_tab, participant, sign_in, sign_in_with_token, start
 from tests.api.conftest import STUB, Service, run_service, run_test
 
 pytestmark = pytest.mark.browser
@@ -201,7 +201,7 @@ def test_the_whole_way_by_keyboard_alone(blank: Any, service: Service) -> None:
     tab_to(blank, "I have checked: re-arm")
     keys.press("Enter")
     blank.get_by_role("heading", name="Participants").wait_for()
-    assert blank.get_by_text("stays stopped").count() == 0
+    gone(blank.get_by_text("stays stopped"))
     service.rig.speed = 8.0
 
 

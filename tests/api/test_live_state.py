@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from tests.api.browser import bring_to_rest, open_tab, participant, start
+from tests.api.browser import bring_to_rest, gone, open_tab, participant, start
 from tests.api.conftest import STUB, Service, run_service, run_test
 
 pytestmark = pytest.mark.browser
@@ -68,7 +68,7 @@ def test_every_page_in_every_tab_follows_the_rig(tab: Any, service: Service, don
         test = http.post("/v1/tests", json={"participant": "E1"}).json()["id"]
     for page in pages:
         says(page, "Stimulating")
-    assert start_button.count() == 0, "hidden while a test runs"
+    gone(start_button)
     pages[0].reload()
     row.get_by_text("running", exact=True).wait_for()
     assert pages[1].get_by_role("link", name="test of E1").get_attribute("href") == f"/tests/{test}"
@@ -86,7 +86,7 @@ def test_back_to_a_page_that_was_loaded_before_the_start_shows_what_flows(tab: A
     start(tab)
     tab.go_back()
     says(tab, "Stimulating")
-    assert tab.get_by_role("button", name="Start the pre-session test").count() == 0
+    gone(tab.get_by_role("button", name="Start the pre-session test"))
     tab.go_forward()
     says(tab, "Stimulating")
 
@@ -152,7 +152,7 @@ def test_a_silent_load_cell_leaves_a_way_back_on_every_page(tab: Any, service: S
         tab.get_by_text("Check the cable and the power of the load cell. Then press Reconnect").wait_for()
         tab.get_by_role("button", name="Reconnect").click()
         says(tab, "No stimulation ready")
-        assert tab.get_by_role("button", name="Reconnect").count() == 0
+        gone(tab.get_by_role("button", name="Reconnect"))
         if "nothing-here" not in address:
             assert tab.url == address, "back where it was pressed"
 

@@ -88,7 +88,12 @@ def test_a_joint_that_moved_in_a_test_at_rest_is_told():
 
 def test_a_joint_that_did_not_move_says_nothing_of_g_and_h():
     resting = as_record(recorded_tests()[0])
-    gate = identify.fit(resting, effects=("torque_angle",)).quality["gates"]["joint_seen"]
+    found = identify.fit(resting, effects=("torque_angle",))
+    gate = found.quality["gates"]["joint_seen"]
+    spiked = np.array(resting.angle_rad)
+    spiked[spiked.size // 2] += 1.0
+    grid = make_grid(replace(resting, angle_rad=spiked))
+    assert not quality(found, grid, grid.fitted)["gates"]["joint_seen"]["passed"], "one spike is no movement"
     assert not gate["passed"] and gate["severity"] == "care" and re.match(r"the joint moved by \d° only", gate["says"])
     assert identify.fit(resting).quality["gates"]["joint_seen"]["passed"], "without such an effect it need not"
     assert model().quality["gates"]["joint_seen"]["passed"]

@@ -177,6 +177,27 @@ def test_a_changed_angle_is_found(tmp_path: Path, change: str):
         archive.verify(sealed.path)
 
 
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [("a group", "not a readable recording"), ("far too long", r"more than 1e\+08 values"), ("text", "does not match")],
+)
+def test_a_damaged_file_is_refused_in_one_line(tmp_path: Path, change: str, words: str):
+    rig = VirtualRig(tmp_path)
+    rig.execute()
+    sealed = archive.seal(assembly.assemble(journal.read(rig.path)), tmp_path)
+    with h5py.File(sealed.path, "a") as file:
+        del file["torque/torque_nm"]
+        if change == "a group":
+            file.create_group("torque/torque_nm")
+        elif change == "far too long":  # chunks that were never written take no room in the file
+            file.create_dataset("torque/torque_nm", shape=(10**12,), dtype="f8", chunks=(1000,))
+        else:
+            file["torque/torque_nm"] = "none"
+    with pytest.raises(RecordingError, match=words) as told:
+        archive.verify(sealed.path)
+    assert "\n" not in str(told.value)
+
+
 def test_without_a_sensor_the_file_is_what_it_was(tmp_path: Path):
     rig = VirtualRig(tmp_path)
     rig.execute()
