@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -105,6 +106,21 @@ def gone(locator: Any) -> None:
     from playwright.sync_api import expect
 
     expect(locator).to_have_count(0, timeout=30_000)
+
+
+def after_the_end(page: Any, where: str, link: str) -> None:
+    """From a test that ends to what comes of it: its page leads there, or offers a link where it was loaded late."""
+    from playwright.sync_api import Error
+
+    end = time.monotonic() + 90
+    while where not in page.url:
+        assert time.monotonic() < end, page.url
+        late = page.get_by_role("link", name=link, exact=True)
+        with suppress(Error):  # the page itself went on meanwhile
+            if late.count():
+                late.click(timeout=2000)
+        page.wait_for_timeout(100)
+    page.wait_for_load_state()
 
 
 def painted(page: Any, canvas: str) -> int:

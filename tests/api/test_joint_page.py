@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from tests.api.browser import PHONE, painted_soon, participant
+from tests.api.browser import PHONE, after_the_end, painted_soon, participant
 from tests.api.conftest import STUB, Service, run_service
 from tests.api.fake_arm import back_and_forth, still
 
@@ -135,7 +135,7 @@ def test_a_passive_test_shows_its_map_and_ends_by_itself(tab: Any, sensor: Servi
     )
     assert tab.locator("#angle").inner_text().endswith("°") and tab.locator("#stop").is_visible()
     assert tab.locator("#current").count() == 0, "no current flows, so none is shown"
-    tab.wait_for_url("**/participants/X1/joint", timeout=60_000)
+    after_the_end(tab, "/participants/X1/joint", "Back to the joint")
     tab.locator(".step", has_text="Passive movement").get_by_text("done today").wait_for()
     assert tab.errors == []
 
@@ -157,7 +157,7 @@ def test_held_angles_start_only_there_and_survive_a_reload(tab: Any, sensor: Ser
     tab.get_by_role("button", name="Start now").click()
     tab.wait_for_url("**/tests/T*")
     tab.locator("#held", has_text="Hold the joint at").wait_for()
-    tab.wait_for_url("**/participants/X1/joint", timeout=60_000)
+    after_the_end(tab, "/participants/X1/joint", "Back to the joint")
     tab.get_by_role("button", name="Start at 50°…").wait_for()
     tab.reload()
     assert tab.locator(".angles .is-done").count() == 1 and tab.locator(".angles li").count() == 5
@@ -180,8 +180,8 @@ def test_movement_under_stimulation_and_one_model_of_all(tab: Any, sensor: Servi
     tab.wait_for_url("**/tests/T*")
     tab.locator("#dose-used", has_text="N·m·s").wait_for()
     tab.get_by_role("button", name="Enough").click()
-    tab.wait_for_url("**/participants/X1/joint", timeout=90_000)
-    assert tab.locator("input[name=recording]:checked").count() == 1
+    after_the_end(tab, "/participants/X1/joint", "Back to the joint")
+    tab.locator("input[name=recording]:checked").wait_for()
     tab.get_by_text("Not recorded today: passive movement, held-angle test.").wait_for()
     tab.get_by_role("button", name="Fit one model to the ticked ones").click()
     tab.wait_for_url("**/models/M-*", timeout=60_000)
