@@ -20,8 +20,8 @@ SHOWN_BEYOND = 1.5
 FONT = {"family": "system-ui, -apple-system, 'Segoe UI', 'DejaVu Sans', sans-serif", "size": 13, "color": role("ink")}
 TOOLBAR_PX = 42
 """On the right of a chart: the buttons stand there one below the other, and cover neither legend nor line."""
-PAUSE = 20.0
-"""A step in time that is so many times the usual one is a pause between two recordings: no line goes through it."""
+PAUSE, PAUSE_S = 20.0, 2.0
+"""A step in time of so many usual ones, and of so many seconds at least, is a pause: no line goes through it."""
 LETTER = 0.007
 """Width of a letter of a segment's name, as a share of a wide chart."""
 SYMBOLS = {"rising": "triangle-up", "falling": "triangle-down"}
@@ -131,7 +131,7 @@ def broken_at_pauses(curves: dict[str, Any]) -> dict[str, Any]:
     time_s = curves["time_s"]
     steps_s = [after - before for before, after in pairwise(time_s)]
     usual_s = sorted(steps_s)[len(steps_s) // 2] if steps_s else 0.0
-    pauses = [place + 1 for place, step_s in enumerate(steps_s) if step_s > PAUSE * usual_s]
+    pauses = [place + 1 for place, step_s in enumerate(steps_s) if step_s > max(PAUSE * usual_s, PAUSE_S)]
     if not pauses:
         return curves
     lines = ("torque_nm", "predicted_torque_nm", "pulse_width_us")
