@@ -43,7 +43,7 @@ def test_approval_wants_the_password_a_rejection_a_reason_and_says_what_is_wrong
     tab.get_by_role("button", name="Approve").click()
     tab.get_by_role("heading", name="The password does not match").wait_for()
     tab.get_by_role("link", name="Back to the model").click()
-    assert tab.get_by_text("Not approved yet").is_visible()
+    tab.get_by_text("Not approved yet").wait_for()
     tab.get_by_label("Your password, once more").first.fill(PASSWORD)
     tab.get_by_role("button", name="Approve").click()
     tab.get_by_text(f"Approved by {NAME}").wait_for()

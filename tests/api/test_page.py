@@ -46,7 +46,7 @@ def test_a_clinicians_whole_way(tab: Any, service: Service) -> None:
     assert tab.get_by_text("Done. The controller has today's model until 23:59.").is_visible()
     assert tab.locator(".who").inner_text().split() == ["Signed", "in:", "Ada", "clinician"]
     tab.get_by_role("link", name="P100").click()
-    assert tab.get_by_text("in use", exact=True).is_visible()
+    tab.get_by_text("in use", exact=True).wait_for()
     with service.client() as http:
         assert http.get("/v1/participants/P100/model").status_code == 200
     assert {urlsplit(url).netloc for url in tab.requests if url.startswith("http")} == {urlsplit(service.url).netloc}
@@ -81,10 +81,10 @@ def test_stop_is_confirmed_and_the_rig_waits_for_a_person(tab: Any, service: Ser
     tab.get_by_role("button", name="Stop stimulation").click()
     tab.get_by_text("The rig confirms that stimulation is off.").wait_for()
     tab.get_by_role("link", name="To the participants").click()
-    assert tab.get_by_text("stays stopped").is_visible()
+    tab.get_by_text("stays stopped").wait_for()
     tab.get_by_role("button", name="I have checked: re-arm").click()
     tab.get_by_role("heading", name="Participants").wait_for()
-    assert not tab.get_by_text("stays stopped").is_visible()
+    gone(tab.get_by_text("stays stopped"))
 
 
 def test_stop_works_while_the_live_channel_is_cut(tab: Any, service: Service) -> None:
@@ -169,7 +169,7 @@ def test_a_name_is_refused_politely(tab: Any, service: Service) -> None:
     tab.evaluate("document.getElementById('code').removeAttribute('pattern')")
     tab.get_by_label("Code").fill("Anna Schmidt")
     tab.get_by_role("button", name="Create").click()
-    assert tab.get_by_text("Please no names").is_visible()
+    tab.get_by_text("Please no names").wait_for()
 
 
 def test_every_control_has_a_name_and_every_page_a_title(tab: Any, service: Service) -> None:
