@@ -25,6 +25,7 @@ from hardware_sim.arm_patient import arm_patient
 from hardware_sim.arm_records import record
 from identify.fitting import fit
 from identify.records import parts_csv
+from tests.api.browser import CHROMIUM
 
 IMAGES = Path(__file__).parents[1] / "docs" / "img"
 TOKEN = "bench-of-the-pictures-of-the-page"
@@ -137,7 +138,7 @@ def main() -> None:
         settings = Settings(data_dir=Path(folder) / "data")
         settings.port = 0
         with Services(settings, [], TOKEN) as services, sync_playwright() as playwright:
-            chromium = os.environ.get("CHROMIUM", "/usr/bin/chromium")
+            chromium = os.environ.get("CHROMIUM", str(CHROMIUM))
             browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox", "--disable-gpu"])
             page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT}, locale="en-GB")
             signed_in(page, services.url)

@@ -62,7 +62,7 @@ ANGLE_COLUMNS: tuple[tuple[str, str, str], ...] = (
 """The same, after the others, of a rig with an angle sensor: all of them, or none."""
 
 MOST_VALUES = 10**8
-"""Of a dataset, fourteen hours at 2000 Hz: a damaged file that declares more is refused before it is read."""
+"""Of one dataset; fourteen hours at 2000 Hz have as many. A damaged file that declares more is not read."""
 
 
 def layout(columns: Collection[str]) -> tuple[tuple[str, str, str], ...]:
@@ -173,6 +173,8 @@ def seal(recording: Recording, folder: Path) -> Sealed:
 def _values(found: object) -> NDArray[Any]:
     if not isinstance(found, h5py.Dataset):
         raise TypeError("a group stands in a dataset's place")
+    if found.dtype.kind not in "biuf":
+        raise TypeError(f"{found.name} holds no numbers")
     if (found.size or 0) > MOST_VALUES:
         raise ValueError(f"{found.name} has more than {MOST_VALUES:.0e} values; no test is so long")
     return np.asarray(found)

@@ -21,7 +21,7 @@ FONT = {"family": "system-ui, -apple-system, 'Segoe UI', 'DejaVu Sans', sans-ser
 TOOLBAR_PX = 42
 """On the right of a chart: the buttons stand there one below the other, and cover neither legend nor line."""
 PAUSE, PAUSE_S = 20.0, 2.0
-"""A step in time of so many usual ones, and of so many seconds at least, is a pause: no line goes through it."""
+"""A pause lasts more than so many of the usual steps in time, and more than so many seconds: no line crosses it."""
 LETTER = 0.007
 """Width of a letter of a segment's name, as a share of a wide chart."""
 SYMBOLS = {"rising": "triangle-up", "falling": "triangle-down"}

@@ -86,7 +86,6 @@ class FakeRig:
         self.plan: m.TestPlan | None = None
         self.last_plan: m.TestPlan | None = None
         """Kept when the test has ended."""
-        self.last_plan: m.TestPlan | None = None
         self.elapsed_s = self.duration_s = 0.0
         self.segment: str | None = None
         self.confirms_stop = True
@@ -232,7 +231,6 @@ class FakeRig:
         self.starts += 1
         self.last_plan = request.plan
         self.plan, self.state, self.reason, self.key = request.plan, "running", "", request.key
-        self.last_plan = request.plan
         self._stop.clear()
         self._play = asyncio.create_task(self._run(request.plan))
         return self.status().model_dump()

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from tests.api.browser import gone, open_tab
+from tests.api.browser import open_tab
 from tests.api.conftest import STUB, Service, run_service
 
 pytestmark = pytest.mark.browser
@@ -167,7 +167,7 @@ def test_a_service_that_does_not_answer_is_told_and_no_button_works(page: Any, s
     page.route("**/calibration**", lambda route: route.abort())
     page.keyboard.press("ArrowUp")
     page.get_by_text("It is not known whether the train was sent").wait_for()
-    gone(page.locator("#calibration button:not([disabled])"))
+    assert page.locator("#calibration button:not([disabled])").count() == 0
     page.unroute("**/calibration**")
     settled(page, 0)
     press(page, "ArrowUp", 1)

@@ -56,6 +56,9 @@ def test_no_line_goes_through_the_pause_between_two_recordings() -> None:
     document, drawn = measured()
     assert model_charts.broken_at_pauses(drawn) is drawn, "one recording has no pause"
     half = len(drawn["time_s"]) // 2
+    slow_s = [t if place < half else drawn["time_s"][half] + 1.0 * (place - half)
+              for place, t in enumerate(drawn["time_s"])]  # fmt: skip
+    assert model_charts.broken_at_pauses({**drawn, "time_s": slow_s})["time_s"] == slow_s
     paused = {**drawn, "time_s": [t + 600.0 * (place >= half) for place, t in enumerate(drawn["time_s"])]}
     figure = model_charts.of_model(document, paused)["comparison"]
     for trace in figure["data"]:

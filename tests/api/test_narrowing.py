@@ -52,7 +52,7 @@ def test_a_wider_limit_is_refused_and_nothing_starts(
 
 
 def test_a_narrower_limit_reaches_the_rig(client: httpx.Client, service: Service, limited: str) -> None:
-    service.rig.speed = 0.5  # still running where its plan is looked at
+    service.rig.speed = 0.5
     body = {"participant": limited, "profile": {"current_ma": 10}, "max_pulse_width_us": 200, "max_torque_nm": 11}
     test_id = client.post("/v1/tests", json=body).json()["id"]
     plan = service.rig.last_plan
