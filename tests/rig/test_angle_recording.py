@@ -181,7 +181,7 @@ def test_a_changed_angle_is_found(tmp_path: Path, change: str):
     ("change", "words"),
     [
         ("a group", "not a readable recording"),
-        ("far too long", r"more than 1e\+08 values"),
+        ("far too long", r"more than 1e\+09 bytes"),
         ("text", "not a readable recording.*holds no numbers"),
     ],
 )
