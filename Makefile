@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 export PYTHONUNBUFFERED = 1
 FAST := not wire and not browser and not service and not slow
 
-.PHONY: demo centre test check fast lint types serve bench postgresql faults soak campaigns mutation words lock clean help setup setup-test setup-centre
+.PHONY: demo centre test check fast lint types serve bench postgresql late faults soak campaigns mutation words lock clean help setup setup-test setup-centre
 
 help:
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -47,6 +47,9 @@ campaigns: setup-test ## the tests that are too long for `make test`: whole grid
 
 postgresql: setup-test ## every test of the service on PostgreSQL instead of SQLite
 	@$(BIN)/python -m pytest -n 2 --dist worksteal --postgresql -m "service and not browser and not wire" tests/api
+
+late: setup-test ## the page's tests with answers that come late and in pieces; SEED=2 for other delays
+	@$(BIN)/python -m pytest -n 4 --dist worksteal --late-answers $(or $(SEED),1) -m browser tests/api
 
 faults: setup-test ## the fault campaign on the emulated rig (docs/results/faults.md)
 	@$(BIN)/python -m bench.faults

@@ -34,6 +34,7 @@ LANES = {
 CAMPAIGNS = {
     "make campaigns": "whole grids, of which one of each kind is run here; a hidden patient on the wire",
     "make postgresql": "every test of the service on PostgreSQL, of which nine files are run here",
+    "make late": "the page's tests with answers that come late and in pieces",
     "make soak": "an hour of recording with fits beside it, of which 30 s are run here",
     "make faults": "every fault in every phase of a test, of which seven are run here",
     "make mutation": "changes of the rig's safety code, one by one: which of them no test sees",

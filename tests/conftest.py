@@ -23,6 +23,7 @@ settings.load_profile("shared-machine")
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--campaigns", action="store_true", help="run the tests marked `campaign`, too")
     parser.addoption("--postgresql", action="store_true", help="services keep their data in PostgreSQL, not in SQLite")
+    parser.addoption("--late-answers", type=int, metavar="SEED", help="services answer browsers late and in pieces")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

@@ -26,7 +26,8 @@ NAME, PASSWORD = "Ada", "correct horse battery"
 def open_tab(browser: Any, service: Service, signed_in: bool = True, **options: Any) -> Iterator[Any]:
     """A tab, signed in; at its end the rig is brought to rest and re-armed."""
     service.rig.confirms_stop = True
-    context = browser.new_context(viewport={"width": WIDE[0], "height": WIDE[1]}, **options)
+    # a color on its way to another one is neither of the two
+    context = browser.new_context(viewport={"width": WIDE[0], "height": WIDE[1]}, reduced_motion="reduce", **options)
     page = context.new_page()
     page.requests, page.errors = [], []
     page.on("request", lambda request: page.requests.append(request.url))
@@ -72,21 +73,21 @@ def sign_in(page: Any, service: Service, name: str = NAME, password: str = PASSW
     page.get_by_label("Name", exact=True).fill(name)
     page.get_by_label("Password").fill(password)
     page.get_by_role("button", name="Sign in", exact=True).click()
-    page.get_by_role("heading", name="Participants").wait_for()
+    there(page, "Participants")
 
 
 def sign_in_with_token(page: Any, service: Service) -> None:
     """As the administrator of the first set-up."""
     page.goto(f"{service.url}/sign-in#token={TOKEN}")
     page.get_by_role("button", name="Sign in with the token").click()
-    page.get_by_role("heading", name="Participants").wait_for()
+    there(page, "Participants")
 
 
 def participant(page: Any, service: Service, code: str) -> None:
     page.goto(service.url + "/")
     page.get_by_label("Code").fill(code)
     page.get_by_role("button", name="Create").click()
-    page.get_by_role("heading", name=code).wait_for()
+    there(page, code)
 
 
 def start(page: Any) -> None:
@@ -101,11 +102,23 @@ def say_yes(page: Any) -> None:
     page.wait_for_url("**/tests/T*")
 
 
+def there(page: Any, heading: str) -> None:
+    """Wait for the page that a click leads to: its heading is seen before its end has come and its scripts run."""
+    page.get_by_role("heading", name=heading, exact=True).wait_for()
+    page.wait_for_load_state()
+
+
 def gone(locator: Any) -> None:
     """Wait until there is no such element: the page before may have had it, with the words that were waited for."""
+    expected(locator).to_have_count(0)
+
+
+def expected(locator: Any) -> Any:
+    """What is to be true of it soon, on whichever page: a script of ours would fail on a page that is half loaded."""
     from playwright.sync_api import expect
 
-    expect(locator).to_have_count(0, timeout=30_000)
+    expect.set_options(timeout=30_000)
+    return expect(locator)
 
 
 def after_the_end(page: Any, where: str, link: str) -> None:

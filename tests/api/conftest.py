@@ -28,6 +28,7 @@ from api.web import connections
 from api.web.app import create_app
 from tests.api.fake_rig import FakeRig, RigThread
 from tests.harness import postgres
+from tests.harness.late_answers import LateAnswers
 from tests.harness.postgres import Cluster
 
 TOKEN = "administrator-token-of-the-tests"
@@ -109,6 +110,16 @@ def no_database_on_the_event_loop() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="session", autouse=True)
+def answers_come_late(request: pytest.FixtureRequest) -> Iterator[None]:
+    """With `--late-answers SEED`: to browsers, from every service."""
+    seed: int | None = request.config.getoption("--late-answers")
+    with pytest.MonkeyPatch.context() as patch:
+        if seed is not None:
+            patch.setattr(Server, "behind", staticmethod(partial(LateAnswers, seed=seed)))
+        yield
+
+
 @dataclass
 class Service:
     """A running service and ways to it."""
@@ -141,8 +152,11 @@ class Service:
 class Server:
     """uvicorn in a thread."""
 
+    behind: Callable[[Any], Any] = staticmethod(lambda app: app)
+    """What stands between it and the application."""
+
     def __init__(self, app: Any, http: Any = None) -> None:
-        http = http or connections.protocol()
+        http, app = http or connections.protocol(), self.behind(app)
         self.server = uvicorn.Server(uvicorn.Config(app, port=0, log_level="warning", ws_ping_interval=None, http=http))
 
     def __enter__(self) -> str:

@@ -41,7 +41,8 @@ def violations(page: Any) -> list[str]:
 
 
 def fits(page: Any, what: str) -> None:
-    """Nothing sticks out to the right, once the figures have taken the new width."""
+    """Nothing sticks out to the right, once the page is whole and the figures have taken the new width."""
+    page.wait_for_load_state()
     end = time.monotonic() + 8
     while not page.evaluate("document.documentElement.scrollWidth <= innerWidth"):
         assert time.monotonic() < end, (what, page.evaluate(STICKING_OUT))

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from tests.api.browser import open_tab
+from tests.api.browser import expected, open_tab
 from tests.api.conftest import STUB, Service, run_service
 
 pytestmark = pytest.mark.browser
@@ -29,6 +29,7 @@ def page(browser: Any, service: Service) -> Iterator[Any]:
         tab.goto(f"{service.url}/participants/K1/calibration")
         tab.get_by_role("button", name="Begin the calibration").click()
         tab.locator("#step-up").wait_for()
+        tab.wait_for_load_state()  # its keys are listened to from here on
         yield tab
         with service.client() as http:
             http.post("/v1/participants/K1/calibration/finish", json={"discard": True})
@@ -41,11 +42,8 @@ def widths(service: Service) -> list[float]:
 
 def settled(page: Any, trains: int) -> None:
     """Wait until the page knows of so many trains and takes the next press."""
-    page.wait_for_function(
-        """(n) => document.querySelector('[name=trains]').value == n
-             && !document.querySelector(n ? '#step-repeat' : '#step-up').disabled""",
-        arg=trains,
-    )
+    expected(page.locator("[name=trains]").first).to_have_value(str(trains))
+    expected(page.locator("#step-repeat" if trains else "#step-up")).to_be_enabled()
 
 
 def press(page: Any, key: str, trains: int) -> None:
@@ -199,13 +197,14 @@ def test_last_times_marks_stand_beside_todays(page: Any, service: Service) -> No
     for count, key in enumerate(["ArrowUp", "ArrowUp", "ArrowUp"], 1):
         press(page, key, count)
         page.keyboard.press("m")
-        page.wait_for_function("(n) => document.querySelectorAll('.marks b').length == n", arg=count)
+        expected(page.locator(".marks b")).to_have_count(count)
     page.keyboard.press("Enter")
     page.wait_for_url("**/participants/K1")
     page.goto(f"{service.url}/participants/K1/calibration")
     assert "felt at 10 µs, moves at 20 µs, comfortable up to 30 µs" in page.locator("main").inner_text()
     page.keyboard.press("Enter")  # the focus is on Begin
     page.locator("#step-up").wait_for()
+    page.wait_for_load_state()
     rows = page.locator(".marks tbody tr").all_inner_texts()
     assert ["10 µs" in rows[0], "20 µs" in rows[1], "30 µs" in rows[2]] == [True] * 3
     assert service.rig.asked.large_steps and service.rig.asked.last.sensory_pulse_width_us == 10

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from tests.api.browser import NAME, PASSWORD, gone, open_tab, participant, sign_in, sign_in_with_token, start
+from tests.api.browser import NAME, PASSWORD, gone, open_tab, participant, sign_in, sign_in_with_token, start, there
 from tests.api.conftest import STUB, Service, run_service, run_test
 
 pytestmark = pytest.mark.browser
@@ -83,7 +83,7 @@ def test_every_export_of_a_model_and_a_test_is_there(tab: Any, service: Service)
         else:
             assert body.startswith(b"\x89HDF" if suffix == ".h5" else b"time_s,pulse_width_us,torque_nm,segment")
     exports.get_by_role("link", name="Report").click()
-    tab.get_by_role("heading", name="Muscle model of C3").wait_for()
+    there(tab, "Muscle model of C3")
     pages = re.findall(rb"/Type\s*/Page\b", tab.pdf(prefer_css_page_size=True))
     assert len(pages) == 1, "the report is one sheet"
     assert tab.locator("svg.still").count() == 3 and tab.locator("script").count() == 0

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from tests.api.browser import NAME, PASSWORD, participant, start
+from tests.api.browser import NAME, PASSWORD, expected, participant, start
 from tests.api.conftest import STUB, Service, run_service, run_test
 from tests.api.test_axe import examined
 
@@ -129,7 +129,7 @@ def test_a_note_while_the_test_runs_does_not_leave_its_page(tab: Any, service: S
     tab.locator("#notes-written li", has_text="Posture").get_by_text("0.4 s").wait_for()
     tab.get_by_label("Run by").fill("Jörg Müller")
     tab.get_by_role("button", name="Save").click()
-    tab.wait_for_function("document.getElementById('ran-by').value === 'Jörg Müller'")
+    expected(tab.locator("#ran-by")).to_have_value("Jörg Müller")
     examined(tab, "notes of a test that is over")
     service.rig.speed = 30.0
 

@@ -13,7 +13,7 @@ import pytest
 from api.store.tables import Test
 from api.web.pages.views import limits_of
 from rig.messages import Bound, Status
-from tests.api.browser import participant, start
+from tests.api.browser import expected, participant, start
 from tests.api.conftest import STUB, Service, run_service
 
 pytestmark = pytest.mark.browser
@@ -51,7 +51,7 @@ def test_what_flows_is_told_in_numbers_and_a_clinicians_words(running: Any, serv
     running.locator("#segment", has_text="Random pulses").wait_for(timeout=30_000)
     assert running.locator("#segment").get_attribute("title") == "prbs"
     assert running.locator("#current").inner_text() == "20.0 mA"
-    running.wait_for_function("() => !document.querySelector('#dose').textContent.startsWith('0 µC')")
+    expected(running.locator("#dose")).not_to_have_text(re.compile("^0 µC"))
     charge_uc, pulses = map(int, re.findall(r"(\d+) µC · (\d+) pulses", running.locator("#dose").inner_text())[0])
     assert charge_uc == 6 * pulses, "300 µs at 20 mA are 6 µC"
     assert "Check (not used for fitting)" in running.locator("#track").inner_text()

@@ -12,7 +12,19 @@ from urllib.parse import urlsplit
 import pytest
 
 from api.web import pages
-from tests.api.browser import NARROW, PASSWORD, PHONE, WIDE, gone, open_tab, painted_soon, participant, say_yes, start
+from tests.api.browser import (
+    NARROW,
+    PASSWORD,
+    PHONE,
+    WIDE,
+    expected,
+    gone,
+    open_tab,
+    painted_soon,
+    participant,
+    say_yes,
+    start,
+)
 from tests.api.conftest import STUB, Service, run_service, run_test
 
 pytestmark = pytest.mark.browser
@@ -246,5 +258,5 @@ def test_a_page_that_waits_takes_nothing_away_that_somebody_writes(tab: Any) -> 
     assert tab.locator("#mine").input_value() == "half a passw"
     job["done"] = False
     tab.get_by_role("button", name="Show it").click()
-    tab.wait_for_function("document.getElementById('mine').value === ''")
+    expected(tab.locator("#mine")).to_have_value("")
     gone(tab.get_by_role("button", name="Show it"))

@@ -9,7 +9,7 @@ from typing import Any
 import httpx
 import pytest
 
-from tests.api.browser import close
+from tests.api.browser import close, there
 from tests.api.centre.conftest import Centre
 from tests.api.centre.told import AT, Teller
 from tests.api.conftest import TOKEN
@@ -31,7 +31,7 @@ def page(browser: Any, centre: Centre) -> Iterator[Any]:
     page.on("console", lambda message: page.errors.append(message.text) if message.type == "error" else None)
     page.goto(f"{centre.url}/sign-in#token={TOKEN}")
     page.get_by_role("button", name="Sign in with the token").click()
-    page.get_by_role("heading", name="Rigs", exact=True).wait_for()
+    there(page, "Rigs")
     yield page
     close(context)
 
@@ -64,12 +64,14 @@ def test_from_no_rig_to_a_download(page: Any, centre: Centre) -> None:
     page.get_by_text("latched").wait_for()
     looked_at(page, "rigs")
     page.get_by_role("link", name=re.compile("Warnings")).click()
+    there(page, "Warnings")
     looked_at(page, "warnings")
     page.get_by_role("button", name="Acknowledge: The rig's clock is off").click()
     page.get_by_text("acknowledged by administrator").wait_for()
     page.get_by_role("link", name="Participants").click()
     page.get_by_label("Effect in a model").select_option("fatigue")
     page.get_by_role("button", name="Search").click()
+    page.wait_for_url("**effect=fatigue**")
     looked_at(page, "participants")
     page.get_by_role("link", name="P017").click()
     page.get_by_text("5 sessions, 5 recordings").wait_for()
