@@ -16,6 +16,7 @@ from identify.errors import BadRequest, NotIdentifiable
 from identify.estimation.effect_fit import effect_names, with_effects
 from identify.estimation.finish import finish
 from identify.estimation.prepare import prepare
+from identify.estimation.renewed_curve import renewed_curve
 from identify.estimation.rows import fitted_rows
 from identify.methods import check_options, method_of
 from identify.methods.maximum_likelihood import METHOD as MAXIMUM_LIKELIHOOD
@@ -129,6 +130,9 @@ def _with_effects(
         progress(min(next(steps), len(wanted)) / (len(wanted) + 2), f"fitting {effect.replace('_', ' ')}")
 
     base = with_effects(base, wanted, raw, tell)
+    if "knots" not in options and (renewed := renewed_curve(base)) is not base:
+        base = renewed
+        reasons.append("knots and smoothness of the curve chosen again with the rows in which the joint moves")
     progress((len(wanted) + 1) / (len(wanted) + 2), "bands and tests of the residual")
     model = finish(MAXIMUM_LIKELIHOOD.id, base, reasons)
     progress(1.0, "done")

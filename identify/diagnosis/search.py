@@ -38,6 +38,7 @@ from identify.estimation.effect_fit import (
 )
 from identify.estimation.joint import Fitted, solve, start_from
 from identify.estimation.prepare import fit_plain, prepare
+from identify.estimation.renewed_curve import renewed_curve
 from identify.estimation.rows import fitted_rows
 from identify.estimation.samples import Raw
 from identify.noise.level import NoiseLevel
@@ -139,7 +140,7 @@ def search_effects(
     listed = list(registry().values() if effects is None else effects)
     grid, raw = prepare(record)
     plain_fit = fit_plain(grid, fitted_rows(grid, None) if fitted is None else fitted)
-    base = with_effects(plain_fit, structure, raw)
+    base = renewed_curve(with_effects(plain_fit, structure, raw))
     search = EffectSearch(record, raw, plain_fit, base)
     start = _with_detected(search, base)
     search.chain, search.quiet = [start], quiet_rows(start)

@@ -12,7 +12,7 @@ from urllib.parse import urlsplit
 import pytest
 
 from api.workers.pool import WORKER
-from tests.api.browser import PASSWORD, participant
+from tests.api.browser import PASSWORD, participant, there
 from tests.api.conftest import Service, run_service
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
@@ -54,7 +54,7 @@ def test_hidden_effect_is_found_added_and_approved_by_clicking(tab: Any, service
     assert error_of(rows.nth(1)) < 0.5 * error_of(rows.nth(0)), "the error falls to less than half on rows not seen"
     assert tab.url.split("#")[0] != first
     tab.get_by_role("link", name="Report").click()
-    tab.get_by_role("heading", name="Muscle model of H1").wait_for()
+    there(tab, "Muscle model of H1")
     assert tab.get_by_text("+ hysteresis of recruitment").is_visible()
     tab.go_back()
     tab.get_by_label("Your password, once more").first.fill(PASSWORD)

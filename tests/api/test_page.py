@@ -17,6 +17,7 @@ from tests.api.browser import (
     PASSWORD,
     PHONE,
     WIDE,
+    after_the_end,
     expected,
     gone,
     open_tab,
@@ -234,7 +235,7 @@ def test_next_experiment_runs_from_its_button(tab: Any, service: Service) -> Non
     tab.get_by_role("button", name="Run it now").click()
     tab.get_by_role("heading", name="Start the next experiment of P104?").wait_for()
     say_yes(tab)
-    tab.wait_for_url("**/models/*", timeout=60_000)
+    after_the_end(tab, "/models/", "See the model")
     assert model not in tab.url
 
 
