@@ -117,7 +117,13 @@ def judged(arm: ArmPatient, model: Model, unseen: dict[str, Any]) -> dict[str, A
     error_nm = unseen["torque_nm"] - predict(model, as_record(unseen))
     # The sensor's zero of another day is not the model's.
     error_nm = error_nm - np.median(error_nm)
-    found["unseen_over_noise"] = float(np.sqrt(np.mean(error_nm**2))) / unseen["truth"]["noise_sd_nm"]
+    noise_sd_nm = unseen["truth"]["noise_sd_nm"]
+    found["unseen_over_noise"] = float(np.sqrt(np.mean(error_nm**2))) / noise_sd_nm
+    stimulated_rad = known["angle_rad"][np.any(known["seen_g"] > 0, axis=1)]
+    angle_rad = unseen["truth"]["angle_rad"]
+    inside = (angle_rad >= stimulated_rad.min()) & (angle_rad <= stimulated_rad.max())
+    found["unseen_outside"] = float(np.mean(~inside))
+    found["unseen_inside_over_noise"] = float(np.sqrt(np.mean(error_nm[inside] ** 2))) / noise_sd_nm
     return found | active_errors(arm, model, reference)
 
 
@@ -155,12 +161,14 @@ def tell(rows: list[dict[str, Any]]) -> None:
                 f"  {part}: median error {100 * np.median(ours):.2f} %, isometric alone {100 * np.median(alone):.2f} %;"
                 f" no worse in {np.sum(ours <= 1.05 * alone)} of {ours.size}"
             )
-        unseen = np.array([row[name]["unseen_over_noise"] for row in rows])
-        print(
-            f"  unseen movement: error {np.median(unseen):.2f} x noise (median), within 1.3: "
-            f"{np.sum(unseen <= 1.3)} of {unseen.size}, worst {unseen.max():.2f}; fit "
-            f"{np.median([row[name]['cpu_s'] for row in rows]):.1f} s of a processor"
-        )
+        for key, where in (("", ""), ("inside_", ", at angles that were stimulated")):
+            unseen = np.array([row[name][f"unseen_{key}over_noise"] for row in rows])
+            print(
+                f"  unseen movement{where}: error {np.median(unseen):.2f} x noise (median), within 1.3: "
+                f"{np.sum(unseen <= 1.3)} of {unseen.size}, worst {unseen.max():.2f}"
+            )
+        outside, cpu_s = (np.median([row[name][key] for row in rows]) for key in ("unseen_outside", "cpu_s"))
+        print(f"  {100 * outside:.0f} % of the unseen movement elsewhere (median); fit {cpu_s:.1f} s of a processor")
     share = np.array([row["dose"]["guided"] / row["dose"]["paper"] for row in rows])
     print(f"torque-time of the three over the paper's test: median {np.median(share):.2f}, largest {share.max():.2f}")
 

@@ -1,0 +1,92 @@
+"""A curve that is chosen again with all rows: only where it was chosen with few, and only where the evidence rises."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+import identify
+from hardware_sim.arm_patient import ArmPatient, arm_patient
+from hardware_sim.arm_records import record
+from identify.estimation.effect_fit import fitted_with, with_effects
+from identify.estimation.joint import Fitted
+from identify.estimation.prepare import prepare
+from identify.estimation.renewed_curve import renewed_curve
+from identify.estimation.rows import fitted_rows
+from identify.fitting import MOVING_JOINT
+from identify.methods.maximum_likelihood import METHOD
+from identify.records.record import Record
+from tests.identify.test_moving_joint import as_record, joined
+
+ARM = 56
+"""A curve that bends in several places, of which the isometric test alone tells little: one of the development arms."""
+
+
+@cache
+def arm() -> ArmPatient:
+    return arm_patient(ARM)
+
+
+@cache
+def whole() -> Record:
+    held = [record(arm(), "held", place, angle_rad=x) for place, x in enumerate(np.linspace(*arm().range_rad, 5)[1:-1])]
+    made = [record(arm(), "isometric", ARM), record(arm(), "passive", ARM), *held]
+    return joined([*made, record(arm(), "moving", ARM, duration_s=30.0)])
+
+
+@cache
+def first() -> Fitted:
+    return fitted_with(whole(), MOVING_JOINT)
+
+
+def error_of(fitted: Fitted) -> float:
+    """Of the curve, as a share of its largest torque, root mean square."""
+    setup, place = fitted.problem.setup, fitted.problem.coefficients
+    width_us = np.linspace(0.0, setup.basis.largest_us, 201)
+    found_nm = setup.sign * (setup.basis.design(width_us) @ fitted.physical[place])
+    f_nm = arm().recruitment_nm(width_us) * float(arm().g(setup.reference_rad, 0.0))
+    return float(np.sqrt(np.mean((found_nm - f_nm) ** 2)) / np.ptp(f_nm))
+
+
+def test_the_other_rows_tell_of_the_curve_too():
+    renewed = renewed_curve(first())
+    assert renewed.log_evidence > first().log_evidence + 10
+    assert error_of(renewed) < 0.85 * error_of(first())
+
+
+def test_renewed_again_it_hardly_changes():
+    once = renewed_curve(first())
+    twice = renewed_curve(once)
+    assert once.log_evidence <= twice.log_evidence < once.log_evidence + 5
+
+
+@pytest.mark.parametrize("effects", [(), ("passive_torque:linear",)])
+def test_a_test_at_one_angle_keeps_its_curve(effects: tuple[str, ...]):
+    base = fitted_with(as_record(record(arm(), "isometric", 1)), effects)
+    assert renewed_curve(base) is base
+
+
+def test_a_model_that_does_not_know_of_the_joint_keeps_its_curve():
+    base = fitted_with(whole(), ())
+    assert renewed_curve(base) is base
+
+
+@pytest.mark.parametrize("options", [{"recruitment": "power-series"}, {"recruitment": "sigmoid"}])
+def test_a_curve_that_is_no_smoothed_spline_stays_of_its_kind(options: dict[str, str]):
+    grid, raw = prepare(whole())
+    base = with_effects(METHOD.start(grid, fitted_rows(grid, None), options)[0], ["passive_torque:linear"], raw)
+    assert renewed_curve(base) is base
+
+
+def test_the_number_of_knots_that_somebody_asks_for_is_kept():
+    asked = identify.fit(whole(), effects=["passive_torque:linear"], knots=25)
+    assert asked.recruitment.to_dict()["basis"]["knots_us"] == pytest.approx(
+        identify.fit(whole(), knots=25).recruitment.to_dict()["basis"]["knots_us"]
+    )
+    assert not any("chosen again" in reason for reason in asked.reasons)
+
+
+def test_the_model_says_that_its_curve_was_chosen_again():
+    assert any("chosen again" in reason for reason in identify.fit(whole(), effects=MOVING_JOINT).reasons)
