@@ -10,6 +10,7 @@ from identify.estimation.effect_fit import detected_effects, effect_names
 from identify.estimation.finish import finish
 from identify.estimation.joint import Fitted
 from identify.estimation.prepare import fit_plain, prepare
+from identify.estimation.renewed_curve import renewed_curve
 from identify.estimation.rows import fitted_rows
 from identify.estimation.samples import Raw
 from identify.model import Model
@@ -61,7 +62,7 @@ def carry(record: Record, model: Model, progress: Progress | None = None) -> Car
     if not effect_names(last):
         return _result(model, [plain_model], rows, False, _nothing(rows))
     say(0.85, f"{LAST}: bands and tests of the residual")
-    carried_model = finish(METHOD, last, [f"effects carried over: {', '.join(effect_names(last))}"])
+    carried_model = finish(METHOD, renewed_curve(last), [f"effects carried over: {', '.join(effect_names(last))}"])
     against = _against(plain, last, raw) or _less_usable(plain_model, carried_model)
     say(1.0, "done")
     return _result(model, [plain_model, carried_model], rows, against is None, against or _better(plain, last, raw))

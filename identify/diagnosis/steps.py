@@ -8,6 +8,7 @@ from typing import Any
 from identify.diagnosis.search import EffectSearch
 from identify.estimation.evaluation import evaluate
 from identify.estimation.joint import Fitted
+from identify.estimation.renewed_curve import renewed_curve
 
 
 @dataclass(frozen=True)
@@ -30,8 +31,11 @@ class Step:
 
 
 def steps(search: EffectSearch) -> list[Step]:
-    """The base, then the detected effects, then the effects found, in this order."""
-    models = [search.base, *search.with_detected, *search.chain[1:]]
+    """The base, then the detected effects, then the effects found, in this order.
+
+    The search compares models with one and the same curve. Once it is over, each may choose its curve with all rows.
+    """
+    models = map(renewed_curve, [search.base, *search.with_detected, *search.chain[1:]])
     return [
         Step(name, fitted, evaluate(fitted))
         for name, fitted in zip([None, *search.detected, *search.added], models, strict=True)

@@ -10,6 +10,9 @@ import pytest
 import identify
 from hardware_sim.arm_patient import ArmPatient, arm_patient
 from hardware_sim.arm_records import record
+from identify.diagnosis.search import search_effects
+from identify.diagnosis.steps import steps
+from identify.effects import get
 from identify.estimation.effect_fit import fitted_with, with_effects
 from identify.estimation.joint import Fitted
 from identify.estimation.prepare import prepare
@@ -90,3 +93,11 @@ def test_the_number_of_knots_that_somebody_asks_for_is_kept():
 
 def test_the_model_says_that_its_curve_was_chosen_again():
     assert any("chosen again" in reason for reason in identify.fit(whole(), effects=MOVING_JOINT).reasons)
+
+
+def test_what_a_search_finds_is_shown_with_a_renewed_curve():
+    search = search_effects(whole(), most=1, effects=[get("passive_torque")])
+    plain, found = steps(search)
+    assert plain.fitted is search.base and found.added == "passive_torque"
+    assert found.fitted.log_evidence > search.last.log_evidence
+    assert found.fitted.problem.setup.basis is not search.last.problem.setup.basis
