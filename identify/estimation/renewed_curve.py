@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 import numpy as np
 
 from identify.effects import get
@@ -33,11 +35,12 @@ def renewed_curve(base: Fitted) -> Fitted:
     """
     if not _can_be_renewed(base):
         return base
-    for _ in range(TIMES):
-        found = _renewed(base)
-        if not found.log_evidence > base.log_evidence:
-            break
-        base = found
+    with suppress(np.linalg.LinAlgError):  # then the curve as it is remains the best one known
+        for _ in range(TIMES):
+            found = _renewed(base)
+            if not found.log_evidence > base.log_evidence:
+                break
+            base = found
     return base
 
 

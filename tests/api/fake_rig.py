@@ -326,6 +326,8 @@ class FakeRig:
         ).model_dump()
 
     async def _on_rearm(self, request: Any, writer: Any) -> dict[str, Any]:
+        if self.state == "running":  # as the rig does until its recording is sealed, also after a stop
+            raise m_refusal("busy", "Not now", "a test is running; nothing to re-arm")
         if not self.device_back:
             raise m_refusal(
                 "disconnected",

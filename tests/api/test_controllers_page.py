@@ -16,6 +16,7 @@ import pytest
 from api.people import controller_keys
 from api.web import routes
 from api.workers.pool import WORKER
+from tests.api.browser import bring_to_rest
 from tests.api.conftest import Service, run_service
 from tests.api.test_worker import made_up_csv
 from tests.harness.c_program import compiled
@@ -45,11 +46,9 @@ def served(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterato
 
 @pytest.fixture(autouse=True)
 def ready(request: pytest.FixtureRequest) -> None:
-    """The page ends with a stop; a person would look and re-arm."""
+    """The page ends with a stop; a person would look and re-arm, once the test has ended."""
     if "served" in request.fixturenames:
-        service, _ = request.getfixturevalue("served")
-        with service.client() as admin:
-            admin.post("/v1/rearm")
+        bring_to_rest(request.getfixturevalue("served")[0])
 
 
 def environment(served: tuple[Service, str]) -> dict[str, str]:
@@ -103,7 +102,8 @@ def test_whoever_interrupts_the_live_example_stops_its_trial(
             words, cwd=ROOT, env=environment(served), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         ) as run:
             assert run.stdout is not None and run.stderr is not None
-            assert run.stdout.readline().startswith("time_s") and run.stdout.readline()
+            heard = run.stdout.readline()
+            assert heard.startswith("time_s") and run.stdout.readline(), heard or run.stderr.read()
             run.send_signal(number)
             said = run.stderr.read()
         assert run.returncode == 1 and "stop was pressed" in said and "Traceback" not in said

@@ -59,6 +59,16 @@ def test_the_other_rows_tell_of_the_curve_too():
     assert error_of(renewed) < 0.85 * error_of(first())
 
 
+@pytest.mark.parametrize("step", ["choose_weight", "solve"])
+def test_a_model_is_not_lost_where_no_better_curve_is_found(monkeypatch: pytest.MonkeyPatch, step: str):
+    def fails(*_: object, **__: object) -> None:
+        raise np.linalg.LinAlgError("not positive definite")
+
+    base = first()
+    monkeypatch.setattr(f"identify.estimation.renewed_curve.{step}", fails)
+    assert renewed_curve(base) is base
+
+
 def test_renewed_again_it_hardly_changes():
     once = renewed_curve(first())
     twice = renewed_curve(once)
