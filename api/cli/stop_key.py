@@ -12,7 +12,7 @@ import threading
 import tty
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import httpx
 
@@ -138,11 +138,16 @@ def at_service(url: str, token: str) -> Callable[[], str]:
     return lambda: _stop_through(url, token)
 
 
+def _rests(rig: dict[str, Any]) -> bool:
+    """Whether a service knows that its rig plays nothing: what the rig says may come late, and not at all."""
+    return rig["state"] in IDLE and rig["connected"] and rig["holder"] is None
+
+
 def _stop_through(url: str, token: str) -> str:
     with httpx.Client(base_url=url, headers={"Authorization": f"Bearer {token}"}) as client:
-        with contextlib.suppress(httpx.HTTPError, ValueError):
-            state = client.get("/v1/rig", timeout=STATUS_S)
-            if state.is_success and state.json()["state"] in IDLE:
+        with contextlib.suppress(httpx.HTTPError, ValueError, KeyError):
+            answer = client.get("/v1/rig", timeout=STATUS_S)
+            if answer.is_success and _rests(answer.json()):
                 return NOTHING
         try:
             answer = client.post("/v1/stop", json={"reason": REASON}, timeout=STOP_S + 1.0)

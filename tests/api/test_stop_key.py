@@ -66,6 +66,35 @@ def test_any_key_stops_a_running_test(
     assert termios.tcgetattr(program) == before, "the terminal is as it was"
 
 
+def test_a_key_stops_what_the_service_has_not_yet_heard_of(
+    client: httpx.Client, service: Service, participant: str, terminal: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keyboard, program = terminal
+    words: list[str] = []
+    monkeypatch.setattr(service.rig, "_send", lambda _event: None)
+    with StopKey(at_service(service.url, TOKEN), words.append, program):
+        started(client, service, participant)
+        assert client.get("/v1/rig").json()["state"] == "ready" and service.rig.state == "running"
+        os.write(keyboard, b"x")
+        assert told(words) == [stop_key.CONFIRMED]
+    assert service.rig.stopped_by == "administrator"
+
+
+def test_a_key_is_no_stray_one_where_the_service_does_not_hear_its_rig(
+    service: Service, terminal: tuple[int, int]
+) -> None:
+    keyboard, program = terminal
+    words: list[str] = []
+    with service.client() as http, StopKey(at_service(service.url, TOKEN), words.append, program):
+        service.rig_thread.__exit__(None, None, None)
+        end = time.monotonic() + 20
+        while http.get("/v1/rig").json()["connected"]:
+            assert time.monotonic() < end
+            time.sleep(0.02)
+        os.write(keyboard, b"x")
+        assert "emergency switch" in told(words)[0]
+
+
 def test_a_key_while_nothing_runs_does_not_latch(service: Service, terminal: tuple[int, int]) -> None:
     keyboard, program = terminal
     words: list[str] = []
