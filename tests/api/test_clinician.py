@@ -11,7 +11,18 @@ from typing import Any
 
 import pytest
 
-from tests.api.browser import NAME, PASSWORD, gone, open_tab, participant, sign_in, sign_in_with_token, start, there
+from tests.api.browser import (
+    NAME,
+    PASSWORD,
+    expected,
+    gone,
+    open_tab,
+    participant,
+    sign_in,
+    sign_in_with_token,
+    start,
+    there,
+)
 from tests.api.conftest import STUB, Service, run_service, run_test
 
 pytestmark = pytest.mark.browser
@@ -99,7 +110,8 @@ def test_a_recording_of_another_tool_is_taken_in_on_the_page(tab: Any, service: 
     tab.get_by_label(re.compile("or HDF5")).set_input_files(path)
     tab.get_by_role("button", name="Upload and identify").click()
     tab.get_by_role("heading", name="Measurement against model").wait_for()
-    assert tab.get_by_role("link", name="CSV").is_visible() and tab.get_by_role("link", name="HDF5").count() == 0
+    expected(tab.get_by_role("link", name="CSV")).to_be_visible()
+    assert tab.get_by_role("link", name="HDF5").count() == 0
 
 
 def test_stop_during_a_fit_is_confirmed_and_the_model_still_comes(tab: Any, service: Service) -> None:
@@ -128,7 +140,8 @@ def test_a_reader_sees_no_deeds_and_may_stop(blank: Any, service: Service) -> No
         body = {"name": "Rosa", "password": PASSWORD, "scopes": ["read-live", "read-model"]}
         assert http.post("/v1/users", json=body).status_code in (201, 409)
     sign_in(blank, service, "Rosa")
-    assert blank.get_by_text("You may not see this list").is_visible() and blank.get_by_text("C4").count() == 0
+    expected(blank.get_by_text("You may not see this list")).to_be_visible()
+    assert blank.get_by_text("C4").count() == 0
     blank.goto(f"{service.url}/models/{model}")
     blank.get_by_text("A clinician approves or rejects it.").wait_for()
     for action in ("Approve", "Reject", "Improve", "Add this effect", "Run it now", "Undo"):
@@ -154,7 +167,7 @@ def test_an_administrator_adds_a_clinician_and_a_key_by_clicking(blank: Any, ser
     with service.client(key) as controller:
         assert controller.get("/v1/participants/none/model").status_code == 404
         assert controller.get("/v1/rig").status_code == 403
-    assert blank.get_by_text("The chain of hashes is complete").is_visible()
+    expected(blank.get_by_text("The chain of hashes is complete")).to_be_visible()
     with blank.expect_download() as caught:
         blank.get_by_role("link", name="Export all").click()
     from api.cli import main
@@ -207,6 +220,7 @@ def test_the_whole_way_by_keyboard_alone(blank: Any, service: Service) -> None:
 
 def tab_to(page: Any, name: str) -> None:
     """Press Tab until what has this id or text has the focus; each stop on the way is seen."""
+    page.wait_for_load_state()
     for _ in range(40):
         page.keyboard.press("Tab")
         at = page.evaluate(

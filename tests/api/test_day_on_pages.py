@@ -42,7 +42,8 @@ def test_the_list_follows_what_is_typed(tab: Any, service: Service) -> None:
     tab.goto(service.url + "/")
     tab.get_by_label("Find a participant").press_sequentially("q")
     tab.get_by_role("link", name="R1", exact=True).wait_for(state="detached")
-    assert tab.get_by_role("link", name="Q2", exact=True).is_visible() and tab.url.endswith("q=q")
+    expected(tab.get_by_role("link", name="Q2", exact=True)).to_be_visible()
+    assert tab.url.endswith("q=q")
     tab.get_by_label("Find a participant").fill("<b>")
     tab.get_by_text("No code holds “<b>”.").wait_for()
     examined(tab, "nobody found")
@@ -75,7 +76,7 @@ def test_side_and_muscle_are_asked_for_and_seen_before_current_flows(tab: Any, s
     tab.get_by_role("heading", name="Y1").wait_for()
     tab.get_by_role("button", name="Start the pre-session test").first.click()
     tab.get_by_role("row", name="Side and muscle right, triceps brachii").wait_for()
-    assert tab.get_by_role("row", name=f"Run by {NAME}").is_visible()
+    expected(tab.get_by_role("row", name=f"Run by {NAME}")).to_be_visible()
 
 
 def test_a_question_whose_side_was_changed_starts_nothing(tab: Any, service: Service) -> None:

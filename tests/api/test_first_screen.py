@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from tests.api.browser import bring_to_rest
+from tests.api.browser import bring_to_rest, expected
 from tests.api.conftest import STUB, Service, run_service, run_test
 
 pytestmark = pytest.mark.browser
@@ -49,7 +49,7 @@ def test_verdict_chart_and_missing_effect_stand_in_the_first_screen(
 ) -> None:
     show(tab, f"{service.url}/models/{model}", size)
     tab.locator(".missing li").wait_for()
-    assert tab.get_by_text("Emulated rig").is_visible(), "with the strip that takes the most room"
+    expected(tab.get_by_text("Emulated rig")).to_be_visible()  # with the strip that takes the most room
     for what, place in FIRST.items():
         box = tab.locator(place).first.bounding_box()
         assert box["y"] >= 0 and box["y"] + box["height"] <= size[1], (what, box)
@@ -78,6 +78,7 @@ def test_a_diagnosis_under_way_moves_nothing(tab: Any, service: Service, size: t
     tab.get_by_role("link", name="Diagnose now").click()
     tab.locator(".missing li").wait_for()
     tab.locator("[data-figure=overview] .main-svg").first.wait_for()
+    tab.wait_for_load_state()  # until then the browser scrolls to the place that the address names
     tab.evaluate("scrollTo(0, 0)")
     assert [tab.locator(place).bounding_box() for place in (".verdict", "#torque")] == before
 
@@ -132,7 +133,7 @@ def test_the_line_follows_the_rig_and_takes_nothing_away(tab: Any, service: Serv
         service.rig.speed = 0.5
         http.post("/v1/tests", json={"participant": "F3"})
         tab.get_by_text("The test is running.").wait_for()
-        assert tab.get_by_role("link", name="Go to the test").is_visible()
+        expected(tab.get_by_role("link", name="Go to the test")).to_be_visible()
         bring_to_rest(service)
         tab.get_by_text("The last test was stopped.").wait_for()
         tab.get_by_label("Current of every pulse").fill("19")
@@ -149,7 +150,7 @@ def test_a_model_that_is_not_usable_wants_a_reason_that_is_one(tab: Any, service
     assert tab.locator(".first-screen .primary").inner_text() == "Test again"
     tab.get_by_role("link", name="Approve it all the same").click()
     tab.get_by_text("the recruitment curve is not identified").wait_for()
-    assert tab.get_by_text("the error is 31 % of the torque").is_visible()
+    expected(tab.get_by_text("the error is 31 % of the torque")).to_be_visible()
     for words, taken in (("asdf asdf asdf", False), ("only the delay is used today", True)):
         tab.get_by_label("Why may the controller").fill(words)
         tab.get_by_label("Your password, once more").fill("correct horse battery")

@@ -12,7 +12,7 @@ from urllib.parse import urlsplit
 import pytest
 
 from api.workers.pool import WORKER
-from tests.api.browser import PASSWORD, participant, there
+from tests.api.browser import PASSWORD, expected, participant, there
 from tests.api.conftest import Service, run_service
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
@@ -55,7 +55,7 @@ def test_hidden_effect_is_found_added_and_approved_by_clicking(tab: Any, service
     assert tab.url.split("#")[0] != first
     tab.get_by_role("link", name="Report").click()
     there(tab, "Muscle model of H1")
-    assert tab.get_by_text("+ hysteresis of recruitment").is_visible()
+    expected(tab.get_by_text("+ hysteresis of recruitment")).to_be_visible()
     tab.go_back()
     tab.get_by_label("Your password, once more").first.fill(PASSWORD)
     tab.get_by_role("button", name="Approve").click()

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from tests.api.browser import bring_to_rest, gone, open_tab, participant, start
+from tests.api.browser import bring_to_rest, expected, gone, open_tab, participant, start
 from tests.api.conftest import STUB, Service, run_service, run_test
 
 pytestmark = pytest.mark.browser
@@ -56,10 +56,10 @@ def test_every_page_in_every_tab_follows_the_rig(tab: Any, service: Service, don
     pages = [tab.context.new_page() for _ in every_page(service, done)]
     for page, address in zip(pages, every_page(service, done), strict=True):
         answer = page.goto(address)
-        expected = 404 if "nothing-here" in address else 403 if "administration" in address else 200
-        assert answer.status == expected, address
+        status = 404 if "nothing-here" in address else 403 if "administration" in address else 200
+        assert answer.status == status, address
         says(page, "No stimulation ready")
-        assert page.get_by_text("Emulated rig: no person is connected").is_visible(), address
+        expected(page.get_by_text("Emulated rig: no person is connected")).to_be_visible()
     row = pages[0].get_by_role("row", name="E1")
     start_button = pages[1].get_by_role("button", name="Start the pre-session test")
     assert start_button.is_enabled()

@@ -110,6 +110,7 @@ def test_no_request_leaves_a_page_whatever_is_pressed(tab: Any, service: Service
         tab.goto(service.url + path)
         if path == paths[0]:
             tab.locator("[data-figure=signature-fatigue]").first.wait_for(state="attached")
+        tab.wait_for_load_state()
         tab.evaluate("for (const part of document.querySelectorAll('details')) part.open = true")
         if path == paths[0]:
             tab.locator("[data-figure=signature-fatigue] .main-svg").first.wait_for()

@@ -39,7 +39,8 @@ def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterat
 def test_a_clinicians_whole_way(tab: Any, service: Service) -> None:
     service.rig.speed = 4.0
     participant(tab, service, "P100")
-    assert tab.get_by_text("No model yet.").is_visible() and tab.get_by_text("No test yet.").is_visible()
+    expected(tab.get_by_text("No model yet.")).to_be_visible()
+    expected(tab.get_by_text("No test yet.")).to_be_visible()
     start(tab)
     tab.locator("#segment", has_text="Ramp").wait_for(timeout=20_000)
     assert painted_soon(tab, "torque-chart") > 3000 and painted_soon(tab, "width-chart") > 2000
@@ -52,11 +53,11 @@ def test_a_clinicians_whole_way(tab: Any, service: Service) -> None:
     tab.locator("[data-job]").wait_for(state="detached")  # the diagnosis adds more when it is ready
     assert "follows 97.9 % of the torque" in tab.inner_text("main")
     for words in ("Torque (N·m)", "Residual (N·m)", "Time (s)"):
-        assert tab.locator("#torque").get_by_text(words).first.is_visible(), words
+        expected(tab.locator("#torque").get_by_text(words).first).to_be_visible()
     tab.get_by_label("Your password, once more").first.fill(PASSWORD)
     tab.get_by_role("button", name="Approve").click()
     tab.get_by_text("the controller gets this model").wait_for()
-    assert tab.get_by_text("Done. The controller has today's model until 23:59.").is_visible()
+    expected(tab.get_by_text("Done. The controller has today's model until 23:59.")).to_be_visible()
     assert tab.locator(".who").inner_text().split() == ["Signed", "in:", "Ada", "clinician"]
     tab.get_by_role("link", name="P100").click()
     tab.get_by_text("in use", exact=True).wait_for()
@@ -122,7 +123,7 @@ def test_unconfirmed_stop_is_told(tab: Any, service: Service) -> None:
     service.rig.confirms_stop = False
     tab.get_by_role("button", name="Stop stimulation").click()
     tab.get_by_role("heading", name="The stop is not confirmed").wait_for()
-    assert tab.get_by_text("emergency switch").first.is_visible()
+    expected(tab.get_by_text("emergency switch").first).to_be_visible()
     service.rig.confirms_stop = True
 
 
@@ -212,7 +213,7 @@ def test_hidden_effect_is_found_and_added_by_clicking(tab: Any, service: Service
     tab.set_viewport_size({"width": WIDE[0], "height": WIDE[1]})
     tab.locator("summary", has_text="Where the error sits").click()
     tab.locator("[data-figure=residual] .main-svg").first.wait_for()
-    assert tab.locator(".place-share", has_text="31 %").is_visible()
+    expected(tab.locator(".place-share", has_text="31 %")).to_be_visible()
     tab.get_by_role("button", name="Add this effect").click()
     tab.get_by_text("Error of each version", exact=True).wait_for()
     tab.locator("[data-figure=falling] .main-svg").first.wait_for()

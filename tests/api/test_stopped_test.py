@@ -14,7 +14,7 @@ import pytest
 
 from api.charts import model_charts
 from api.workers.recorded_signals import recorded
-from tests.api.browser import participant, start
+from tests.api.browser import expected, participant, start
 from tests.api.conftest import STUB, Service, run_service
 
 
@@ -36,7 +36,8 @@ def test_a_stopped_tests_page_shows_what_was_recorded(tab: Any, service: Service
     test_page = tab.url
     tab.get_by_role("button", name="Stop stimulation").click()
     tab.get_by_role("heading", name=re.compile(r"Stopped at \d\d:\d\d:\d\d")).wait_for()
-    assert "/stopped/" in tab.url and tab.get_by_text("Ada: stop pressed on the page").is_visible()
+    expected(tab.get_by_text("Ada: stop pressed on the page")).to_be_visible()
+    assert "/stopped/" in tab.url
     before = stops(service)
     with tab.expect_request(lambda request: request.is_navigation_request()) as asked:
         tab.reload()
