@@ -131,8 +131,8 @@ def _with_effects(
 
     base = with_effects(base, wanted, raw, tell)
     if "knots" not in options and (renewed := renewed_curve(base)) is not base:
-        base = renewed
-        reasons.append("knots and smoothness of the curve chosen again with the rows in which the joint moves")
+        base, size = renewed, renewed.problem.setup.basis.size
+        reasons[0] = f"spline of {size} coefficients, chosen again with the rows in which the joint moves"
     progress((len(wanted) + 1) / (len(wanted) + 2), "bands and tests of the residual")
     model = finish(MAXIMUM_LIKELIHOOD.id, base, reasons)
     progress(1.0, "done")

@@ -14,7 +14,13 @@ from api.client.rest import Client
 from api.clinical_words import adaptive_end_words
 
 
-def run_test(client: Client, participant: str, events: Callable[[], list[str]] = list, **more: Any) -> SessionTest:
+def run_test(
+    client: Client,
+    participant: str,
+    events: Callable[[], list[str]] = list,
+    over: Callable[[], object] = list,
+    **more: Any,
+) -> SessionTest:
     """Run a test, the default pre-session test unless `more` says otherwise, and show its progress.
 
     Parameters
@@ -25,6 +31,8 @@ def run_test(client: Client, participant: str, events: Callable[[], list[str]] =
         Code; made unless it is there.
     events : callable
         Says which processes of the service have ended; one is enough to give up.
+    over : callable
+        Called as soon as nothing of the test is played any more.
     **more
         As in `Client.start_test`.
 
@@ -40,6 +48,8 @@ def run_test(client: Client, participant: str, events: Callable[[], list[str]] =
     def watch(test: SessionTest) -> None:
         for event in events():
             raise ReportedError(event)
+        if test["state"] not in ("requested", "running"):
+            over()
         show(test)
 
     client.ensure_participant(participant)

@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     from api.sessions.rig_client import RigClient
 
 REASON, BY = "a key was pressed", "terminal"
-IDLE = ("ready", "latched", "uncertain", "disconnected")
+IDLE = ("ready", "latched", "disconnected")
 """Nothing is played and no calibration is open: a stray key must not latch the rig."""
-STATUS_S, STOP_S = 0.5, 8.0
+STATUS_S, STOP_S, HEARD_S = 0.5, 8.0, 2.0
 CONFIRMED, NOTHING = "stopped: the rig confirms that stimulation is off", "no test runs, nothing to stop"
 DOUBT = "THE STOP IS NOT CONFIRMED. Use the stimulator's own emergency switch now."
 
@@ -111,20 +111,34 @@ def in_foreground(descriptor: int) -> bool:
         return True
 
 
-def at_rig(path: Path) -> Callable[[], str]:
-    """What stops the rig at a socket, past the service: it need not be alive."""
+def always() -> bool:
+    """Nothing is about to play that the rig does not know of."""
+    return True
+
+
+def at_rig(path: Path, stray: Callable[[], bool] = always) -> Callable[[], str]:
+    """What stops the rig at a socket, past the service: it need not be alive.
+
+    Parameters
+    ----------
+    path : Path
+        The rig's socket.
+    stray : callable
+        Whether a key may be a stray one while the rig plays nothing. A program that has asked for a test says no: the
+        key is to stop what is about to begin.
+    """
     from api.clock import Clock
     from api.sessions.rig_client import RigClient
 
     rig = RigClient(path, Clock())
-    return lambda: asyncio.run(_stop(rig))
+    return lambda: asyncio.run(_stop(rig, stray()))
 
 
-async def _stop(rig: RigClient) -> str:
+async def _stop(rig: RigClient, stray: bool) -> str:
     from api.errors import ApiError
 
-    with contextlib.suppress(ApiError):  # who does not say what it does is stopped
-        if (await rig.ask(StatusRequest(), STATUS_S)).get("state") in IDLE:
+    with contextlib.suppress(Exception):  # who does not say what it does is stopped
+        if stray and (await rig.ask(StatusRequest(), STATUS_S)).get("state") in IDLE:
             return NOTHING
     try:
         evidence = await rig.ask_for(StopEvidence, StopRequest(reason=REASON, by=BY), STOP_S)
@@ -133,21 +147,20 @@ async def _stop(rig: RigClient) -> str:
     return CONFIRMED if evidence.confirmed else f"{DOUBT} The rig says: {evidence.detail}"
 
 
-def at_service(url: str, token: str) -> Callable[[], str]:
-    """What stops the rig of a service elsewhere."""
-    return lambda: _stop_through(url, token)
+def at_service(url: str, token: str, stray: Callable[[], bool] = always) -> Callable[[], str]:
+    """What stops the rig of a service elsewhere; `stray` as in `at_rig`."""
+    return lambda: _stop_through(url, token, stray())
 
 
 def _rests(rig: dict[str, Any]) -> bool:
     """Whether a service knows that its rig plays nothing: what the rig says may come late, and not at all."""
-    return rig["state"] in IDLE and rig["connected"] and rig["holder"] is None
+    return rig["state"] in IDLE and rig["connected"] and rig["age_s"] < HEARD_S and rig["holder"] is None
 
 
-def _stop_through(url: str, token: str) -> str:
+def _stop_through(url: str, token: str, stray: bool) -> str:
     with httpx.Client(base_url=url, headers={"Authorization": f"Bearer {token}"}) as client:
-        with contextlib.suppress(httpx.HTTPError, ValueError, KeyError):
-            answer = client.get("/v1/rig", timeout=STATUS_S)
-            if answer.is_success and _rests(answer.json()):
+        with contextlib.suppress(Exception):  # nothing in a look may prevent a stop
+            if stray and _rests(client.get("/v1/rig", timeout=STATUS_S).raise_for_status().json()):
                 return NOTHING
         try:
             answer = client.post("/v1/stop", json={"reason": REASON}, timeout=STOP_S + 1.0)

@@ -62,7 +62,8 @@ def carry(record: Record, model: Model, progress: Progress | None = None) -> Car
     if not effect_names(last):
         return _result(model, [plain_model], rows, False, _nothing(rows))
     say(0.85, f"{LAST}: bands and tests of the residual")
-    carried_model = finish(METHOD, renewed_curve(last), [f"effects carried over: {', '.join(effect_names(last))}"])
+    last = renewed_curve(last)
+    carried_model = finish(METHOD, last, [f"effects carried over: {', '.join(effect_names(last))}"])
     against = _against(plain, last, raw) or _less_usable(plain_model, carried_model)
     say(1.0, "done")
     return _result(model, [plain_model, carried_model], rows, against is None, against or _better(plain, last, raw))

@@ -8,7 +8,7 @@ from typing import Any
 from identify.diagnosis.search import EffectSearch
 from identify.estimation.evaluation import evaluate
 from identify.estimation.joint import Fitted
-from identify.estimation.renewed_curve import renewed_curve
+from identify.estimation.renewed_curve import knows_joint, renewed_curve
 
 
 @dataclass(frozen=True)
@@ -33,9 +33,12 @@ class Step:
 def steps(search: EffectSearch) -> list[Step]:
     """The base, then the detected effects, then the effects found, in this order.
 
-    The search compares models with one and the same curve. Once it is over, each may choose its curve with all rows.
+    The search compares models with one and the same curve. Once it is over, those in which it found what the joint
+    does choose their curve with all rows; a base that knew of the joint has done so before.
     """
-    models = map(renewed_curve, [search.base, *search.with_detected, *search.chain[1:]])
+    models = [search.base, *search.with_detected, *search.chain[1:]]
+    if not knows_joint(search.base):
+        models = list(map(renewed_curve, models))
     return [
         Step(name, fitted, evaluate(fitted))
         for name, fitted in zip([None, *search.detected, *search.added], models, strict=True)

@@ -69,7 +69,8 @@ def check_activity(grid: Grid) -> None:
 def fit_plain(grid: Grid, rows: np.ndarray) -> Fitted:
     """Fit the plain structure. Its set-up is shared by all candidates of the record.
 
-    Knots and smoothness of the recruitment curve are chosen here, and not changed afterwards.
+    Knots and smoothness of the recruitment curve are chosen here. They are not changed while effects are tried; once
+    that is over, those of a joint that moves may be chosen again (`renewed_curve`).
     """
     return to_fitted(estimate(grid, still_rows(grid, rows))[0], rows)
 

@@ -30,25 +30,30 @@ def renewed_curve(base: Fitted) -> Fitted:
     Parameters
     ----------
     base : Fitted
-        A model with its effects. It is returned as it is if its curve was chosen with all rows already, if no effect
-        of it depends on the joint, or if its curve is no smoothed spline.
+        A model with its effects. It is returned as it is if its curve was chosen with all rows already (also where
+        the joint was nowhere still for long enough), if no effect of it depends on the joint, or if its curve is no
+        smoothed spline.
     """
     if not _can_be_renewed(base):
         return base
     with suppress(np.linalg.LinAlgError):  # then the curve as it is remains the best one known
         for _ in range(TIMES):
             found = _renewed(base)
-            if not found.log_evidence > base.log_evidence:
+            if not found.log_evidence > base.log_evidence or (base.converged and not found.converged):
                 break
             base = found
     return base
 
 
+def knows_joint(fitted: Fitted) -> bool:
+    """Whether an effect of the model depends on the joint."""
+    return any(get(name).moves_with_joint for name, _ in fitted.effects)
+
+
 def _can_be_renewed(base: Fitted) -> bool:
     setup = base.problem.setup
     smoothed = isinstance(setup.basis, SplineBasis) and np.any(setup.roughness) and not np.any(setup.curve_nm)
-    knows = any(get(name).moves_with_joint for name, _ in base.effects)
-    return bool(smoothed and knows and not np.all(still_rows(setup.grid, setup.fitted)[setup.fitted]))
+    return bool(smoothed and knows_joint(base) and not np.all(still_rows(setup.grid, setup.fitted)[setup.fitted]))
 
 
 def _renewed(base: Fitted) -> Fitted:

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from tests.api.browser import PHONE, after_the_end, painted_soon, participant
+from tests.api.browser import PHONE, after_the_end, expected, painted_soon, participant
 from tests.api.conftest import STUB, Service, run_service
 from tests.api.fake_arm import back_and_forth, still
 
@@ -111,7 +111,7 @@ def test_a_range_is_typed_in_degrees(tab: Any, sensor: Service) -> None:
     tab.locator("#angle_to_deg").fill("90")
     tab.get_by_role("button", name="Set the limits").click()
     tab.wait_for_load_state()
-    assert tab.locator("#angle_from_deg").input_value() == "-5"
+    expected(tab.locator("#angle_from_deg")).to_have_value("-5")
     tab.locator("#angle_from_deg").fill("")
     tab.locator("#angle_to_deg").fill("")
     tab.get_by_role("button", name="Set the limits").click()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import pty
 import signal
@@ -71,6 +72,11 @@ def test_a_key_stops_what_the_service_has_not_yet_heard_of(
 ) -> None:
     keyboard, program = terminal
     words: list[str] = []
+
+    async def last_known() -> Any:
+        return service.app.state.context.rig.status
+
+    monkeypatch.setattr(service.app.state.context.rig, "fresh_status", last_known)
     monkeypatch.setattr(service.rig, "_send", lambda _event: None)
     with StopKey(at_service(service.url, TOKEN), words.append, program):
         started(client, service, participant)
@@ -156,7 +162,7 @@ def test_stimrig_test_stops_on_a_key(
     monkeypatch.setattr(stop_key, "standard_input", lambda: program)
     real = test_verb.run_test
 
-    def watched(client: httpx.Client, participant: str, watch: Any, **more: Any) -> dict[str, Any]:
+    def watched(client: httpx.Client, participant: str, watch: Any, over: Any, **more: Any) -> dict[str, Any]:
         """A key as soon as the rig plays."""
 
         def look() -> list[str]:
@@ -164,13 +170,50 @@ def test_stimrig_test_stops_on_a_key(
                 pressed.append(os.write(keyboard, b"q"))
             return []
 
-        return real(client, participant, look, **more)
+        return real(client, participant, look, over, **more)
 
     pressed: list[int] = []
     monkeypatch.setattr(test_verb, "run_test", watched)
     assert main.run(["test", "--url", service.url, "--participant", "K1"]) == 1
     said = capsys.readouterr().err
     assert "any key stops the test" in said and "ended as stopped" in said and "any key" not in said.splitlines()[-1]
+
+
+def test_a_key_before_the_rig_plays_keeps_the_test_from_beginning(
+    service: Service, terminal: tuple[int, int], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    keyboard, program = terminal
+    monkeypatch.setenv("STIMRIG_TOKEN", TOKEN)
+    monkeypatch.setattr(stop_key, "standard_input", lambda: program)
+    real = test_verb.run_test
+
+    def asked(*given: Any, **more: Any) -> dict[str, Any]:
+        os.write(keyboard, b"q")
+        end = time.monotonic() + 20
+        while service.rig.state != "latched":
+            assert time.monotonic() < end
+            time.sleep(0.02)
+        return real(*given, **more)
+
+    monkeypatch.setattr(test_verb, "run_test", asked)
+    assert main.run(["test", "--url", service.url, "--participant", "K1"]) == 1
+    assert service.rig.starts == 0 and stop_key.CONFIRMED in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("body", ["null", "[]", "{}", "<p>", '{"state": "ready", "connected": true, "age_s": 9.0}'])
+def test_nothing_that_a_service_says_of_its_rig_keeps_a_key_from_stopping(
+    monkeypatch: pytest.MonkeyPatch, body: str
+) -> None:
+    posted: list[str] = []
+
+    def answer(request: httpx.Request) -> httpx.Response:
+        posted.extend([request.url.path] if request.method == "POST" else [])
+        return httpx.Response(200, text=body)
+
+    made = functools.partial(httpx.Client, transport=httpx.MockTransport(answer))
+    monkeypatch.setattr(stop_key.httpx, "Client", made)
+    assert at_service("http://rig.test", TOKEN)() == stop_key.CONFIRMED
+    assert posted == ["/v1/stop"]
 
 
 # ---- attaching ----------------------------------------------------------------------------------------------

@@ -68,6 +68,7 @@ def test_nothing_pressed_before_a_train_counts_while_it_is_on_its_way(service: S
     end = time.monotonic() + 20
     while service.rig.state != "running":
         assert time.monotonic() < end
+        time.sleep(0.01)
     for path in ("step/repeat", "mark/sensory", "finish"):
         answer = browser.post(f"{PAGE}/{path}", data=fields)
         assert answer.status_code == 409 and "Another train was sent" in answer.text, path

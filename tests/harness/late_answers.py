@@ -41,7 +41,7 @@ class LateAnswers:
         await asyncio.sleep(self.random.random() ** 2 * LATEST_S)
 
     async def sent(self, message: Any, send: Any) -> None:
-        """In pieces, each after a while of its own; an event of a stream, or of a socket, is one piece."""
+        """In pieces, each after a while of its own; what is short is one piece."""
         body = message.get("body", b"")
         pieces = PIECES if len(body) > 1000 else 1
         cuts = sorted(self.random.randrange(len(body)) for _ in range(pieces - 1))

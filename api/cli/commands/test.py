@@ -8,6 +8,7 @@ import secrets
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from threading import Event
 from typing import Annotated, Any
 
 import typer
@@ -62,9 +63,10 @@ def test(
         token = os.environ.get("STIMRIG_TOKEN") or os.environ.get("STIMRIG_ADMIN_TOKEN")
         if not token:
             raise InputError(f"--url {url} needs a token in STIMRIG_TOKEN.")
-        with StopKey(at_service(url, token), say_aside) as key:
+        over = Event()
+        with StopKey(at_service(url, token, over.is_set), say_aside) as key:
             announce(key)
-            found = through(url, token, participant, asked=asked)
+            found = through(url, token, participant, over=over, asked=asked)
     else:
         found = on_own_services(rig, data, emulate, participant, asked)
     recording = found.pop("recording")
@@ -158,18 +160,24 @@ def on_own_services(
     settings.port = 0
     token = secrets.token_urlsafe(32)
 
+    over = Event()
     with (
         Services(settings, emulate.split(), token) as services,
-        StopKey(at_rig(services.socket), say_aside) as key,
+        StopKey(at_rig(services.socket, over.is_set), say_aside) as key,
     ):
         announce(key)
-        return through(services.url, token, participant, services.watch, asked)
+        return through(services.url, token, participant, services.watch, over, asked)
 
 
 def through(
-    url: str, token: str, participant: str, events: Callable[[], list[str]] = list, asked: dict[str, Any] | None = None
+    url: str,
+    token: str,
+    participant: str,
+    events: Callable[[], list[str]] = list,
+    over: Event | None = None,
+    asked: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """The test through a service.
+    """The test through a service; `over` is set once nothing of it is played any more.
 
     Raises
     ------
@@ -177,6 +185,6 @@ def through(
         The service cannot be reached, or the test did not end in a model.
     """
     with Client(url, token) as client:
-        document = run_test(client, participant, events, **(asked or {}))
+        document = run_test(client, participant, events, (over or Event()).set, **(asked or {}))
         model = client.model_file(document["model_id"])
         return {"test": document, "model": model, "recording": client.recording(document["recording_id"])}
