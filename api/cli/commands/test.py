@@ -66,7 +66,7 @@ def test(
         over = Event()
         with StopKey(at_service(url, token, over.is_set), say_aside) as key:
             announce(key)
-            found = through(url, token, participant, over=over, asked=asked)
+            found = through(url, token, participant, over=over.set, asked=asked)
     else:
         found = on_own_services(rig, data, emulate, participant, asked)
     recording = found.pop("recording")
@@ -166,7 +166,7 @@ def on_own_services(
         StopKey(at_rig(services.socket, over.is_set), say_aside) as key,
     ):
         announce(key)
-        return through(services.url, token, participant, services.watch, over, asked)
+        return through(services.url, token, participant, services.watch, over.set, asked)
 
 
 def through(
@@ -174,10 +174,10 @@ def through(
     token: str,
     participant: str,
     events: Callable[[], list[str]] = list,
-    over: Event | None = None,
+    over: Callable[[], object] = list,
     asked: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """The test through a service; `over` is set once nothing of it is played any more.
+    """The test through a service; `events` and `over` as in `run_test`.
 
     Raises
     ------
@@ -185,6 +185,6 @@ def through(
         The service cannot be reached, or the test did not end in a model.
     """
     with Client(url, token) as client:
-        document = run_test(client, participant, events, (over or Event()).set, **(asked or {}))
+        document = run_test(client, participant, events, over, **(asked or {}))
         model = client.model_file(document["model_id"])
         return {"test": document, "model": model, "recording": client.recording(document["recording_id"])}
