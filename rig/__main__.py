@@ -15,14 +15,14 @@ import logging
 import os
 import signal
 import sys
-import threading
 from pathlib import Path
 
 from rig import config as configuration
 from rig import devices
+from rig.adapters.machine import LocalMachine
 from rig.clock import MonotonicClock
 from rig.control.rig import Rig
-from rig.control.server import Server
+from rig.control.server import Ask, Server
 from rig.errors import RigError
 from rig.keys import StopKey
 from rig.messages import stop_socket
@@ -33,6 +33,8 @@ log = logging.getLogger("rig")
 SWITCH_INTERVAL_S = 0.0005
 """How long a thread may hold the interpreter while the sender waits; Python's default is 5 ms."""
 PROCESS_PRIORITY = 10
+HUNG_S = 5.0
+"""Real seconds after which the rig's thread counts as hung."""
 BEAT_PERIOD_S = 0.5
 """How often the process checks its parent and its own threads, s (see WatchdogSec in deploy/)."""
 
@@ -76,9 +78,9 @@ def _configure(options: argparse.Namespace) -> configuration.RigConfig:
 
 def _check(config: configuration.RigConfig) -> None:
     """Create the devices without opening them; this reads the DBC, too."""
-    clock, chosen = MonotonicClock(config.clock_speed), config.devices()
+    machine, chosen = LocalMachine(MonotonicClock(config.clock_speed)), config.devices()
     for kind, settings in chosen.items():
-        devices.find(kind, settings.device).create(settings, clock)
+        devices.find(kind, settings.device).create(settings, machine)
     print(json.dumps({"ok": True, **{kind: settings.device for kind, settings in chosen.items()}}))
 
 
@@ -93,29 +95,43 @@ async def _serve(config: configuration.RigConfig, parent: int | None) -> None:
     server, notifier = Server(), Notifier()
     if not config.require_calibration:
         log.warning("require_calibration is false: tests start without a calibration; connect no person to this rig")
-    rig = Rig(config, MonotonicClock(config.clock_speed), server.publish)
-    await asyncio.to_thread(rig.open)
-    await server.start(rig, config.socket)
+    machine = LocalMachine(MonotonicClock(config.clock_speed))
+    ask = machine.driver.ask
+    rig = Rig(config, machine, server.publish)
+    await asyncio.wrap_future(ask(rig.open))
+    await server.start(rig, ask, config.socket)
     print(json.dumps({"socket": str(config.socket), "state": rig.status().state}), flush=True)
     notifier.ready()
-    with StopKey(loop, lambda: threading.Thread(target=_stop_by_key, args=(rig,), name="stop-key").start()) as key:
+    with StopKey(loop, lambda: ask(lambda: _stop_by_key(rig))) as key:
         if key.watched:
             log.info("any key in this terminal stops stimulation; Ctrl-C ends the rig")
         while not stop.is_set() and parent in (None, os.getppid()):
-            # in a worker thread: if the event loop hangs or all threads wait, the watchdog is not fed
-            notifier.alive(await asyncio.to_thread(rig.trouble))
+            notifier.alive(await _trouble(rig, ask))
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(stop.wait(), BEAT_PERIOD_S)
     log.info("asked to end")
     notifier.stopping()
-    await asyncio.to_thread(rig.close)
+    await asyncio.wrap_future(ask(rig.close))
     await server.close()
+    machine.driver.end()
     for path in (config.socket, stop_socket(config.socket)):
         path.unlink(missing_ok=True)
 
 
-def _stop_by_key(rig: Rig) -> None:
-    evidence = rig.stop("a key in the terminal", "operator")
+async def _trouble(rig: Rig, ask: Ask) -> str | None:
+    """What `Rig.trouble` finds, or that the rig's own thread does not answer. Then the watchdog is not fed."""
+
+    async def found() -> str | None:
+        return rig.trouble()
+
+    try:
+        return await asyncio.wait_for(asyncio.wrap_future(ask(found)), HUNG_S)
+    except TimeoutError:
+        return f"the rig's thread hangs: no answer for {HUNG_S:g} s"
+
+
+async def _stop_by_key(rig: Rig) -> None:
+    evidence = await rig.stop("a key in the terminal", "operator")
     log.info("stop by key: %s, %s", "confirmed" if evidence.confirmed else "NOT CONFIRMED", evidence.detail)
 
 

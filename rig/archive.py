@@ -1,15 +1,14 @@
 """Writes a recording to HDF5, as `docs/recording.md` describes, with hashes that prove it unchanged.
 
-The file is built in memory, then written as plain bytes to a temporary file, synced and renamed. So a full disk gives
-an error message, not a crash inside the HDF5 library.
+The file is built in memory, then written as plain bytes. So a full disk gives an error message, not a crash inside the
+HDF5 library.
 """
 
 from __future__ import annotations
 
 import hashlib
+import io
 import json
-import os
-import tempfile
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +20,7 @@ from numpy.typing import NDArray
 
 from rig.assembly import Recording
 from rig.errors import RecordingError
+from rig.machine import Disk
 
 COLUMNS: tuple[tuple[str, str, str], ...] = (
     ("torque/time_s", "s", "time of each sample on the test's clock, aligned with the pulses"),
@@ -119,41 +119,13 @@ def _text(value: str) -> str:
     return value.replace("\0", "\N{REPLACEMENT CHARACTER}").encode("utf-8", "replace").decode()
 
 
-def write_atomically(path: Path, data: bytes) -> None:
-    """Write to a temporary file beside `path`, sync, rename, sync the folder.
-
-    Raises
-    ------
-    RecordingError
-        Disk error; no partial file is left.
-    """
-    temporary = None
-    try:
-        fd, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-        with os.fdopen(fd, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        Path(temporary).chmod(0o640)
-        Path(temporary).rename(path)
-        folder = os.open(path.parent, os.O_RDONLY)
-        os.fsync(folder)
-        os.close(folder)
-    except OSError as error:
-        if temporary is not None:
-            Path(temporary).unlink(missing_ok=True)
-        raise RecordingError(
-            f"{path}: {error.strerror}; the journal is kept; free some disk space and re-arm"
-        ) from None
-
-
 def place(recording: Recording, folder: Path) -> Path:
     """Path of its sealed file: named by time and test."""
     stamp = recording.attributes["created_utc"].replace("-", "").replace(":", "")[:15]
     return folder / f"{stamp}Z_{recording.attributes['test_id']}.h5"
 
 
-def seal(recording: Recording, folder: Path) -> Sealed:
+def seal(recording: Recording, folder: Path, disk: Disk) -> Sealed:
     """Seal a recording into `folder` and verify what was written.
 
     Raises
@@ -163,9 +135,15 @@ def seal(recording: Recording, folder: Path) -> Sealed:
     """
     path = place(recording, folder)
     data = to_bytes(recording)
-    write_atomically(path, data)
+    try:
+        disk.replace(path, data)
+        found = disk.read(path)
+    except OSError as error:
+        raise RecordingError(
+            f"{path}: {error.strerror}; the journal is kept; free some disk space and re-arm"
+        ) from None
     content = content_sha256(recording.columns)
-    if verify(path) != content:
+    if verify(path, io.BytesIO(found)) != content:
         raise RecordingError(f"{path}: reads back differently from what was written; the journal is kept")
     return Sealed(path, hashlib.sha256(data).hexdigest(), content, recording)
 
@@ -178,8 +156,8 @@ def _numbers(found: object) -> h5py.Dataset:
     return found
 
 
-def verify(path: Path) -> str:
-    """Read a sealed recording back and return its content's SHA-256.
+def verify(path: Path, file: io.BytesIO | None = None) -> str:
+    """Read a sealed recording back and return its content's SHA-256; `file`: what was read of it already.
 
     Raises
     ------
@@ -187,13 +165,13 @@ def verify(path: Path) -> str:
         Not a recording, or its content does not match its hash.
     """
     try:
-        with h5py.File(path, "r") as file:
-            found = layout(["angle/"] if "angle" in file else [])
-            datasets = {p: _numbers(file[p]) for p, _, _ in found}
+        with h5py.File(file or path, "r") as opened:
+            found = layout(["angle/"] if "angle" in opened else [])
+            datasets = {p: _numbers(opened[p]) for p, _, _ in found}
             if sum(dataset.nbytes for dataset in datasets.values()) > MOST_BYTES:
                 raise ValueError(f"it has more than {MOST_BYTES:.0e} bytes of values; no test is so long")
             columns = {p: np.asarray(dataset) for p, dataset in datasets.items()}
-            stated = str(file.attrs["content_sha256"])
+            stated = str(opened.attrs["content_sha256"])
     except (OSError, KeyError, TypeError, ValueError, RuntimeError, MemoryError) as error:  # h5py raises each of them
         raise RecordingError(f"{path}: not a readable recording ({error})") from None
     actual = content_sha256(columns)

@@ -5,13 +5,12 @@ and the drop is recorded. So a stalled line can hold one pulse, never several. T
 unknown until its ack is read. Intervals, rates and charge per second are therefore counted from the ack, so that they
 hold at the electrode.
 
-After `shut` has returned, no pulse is written to the line, whatever other threads do.
+After `shut` has returned, no pulse is written to the line.
 """
 
 from __future__ import annotations
 
 import contextlib
-import threading
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -50,7 +49,7 @@ class Gate:
     clock
         The rig's clock.
     on_fault, on_lost
-        Called with the reason when the device reports an error, or when its line is gone. From any thread.
+        Called with the reason when the device reports an error, or when its line is gone.
     """
 
     def __init__(
@@ -63,7 +62,6 @@ class Gate:
         self._stimulator = stimulator
         self._clock = clock
         self._on_fault = on_fault
-        self._lock = threading.Lock()
         self._journal: Journal | None = None
         self._passing = False
         self._table: dict[str, Limit] = {}
@@ -86,23 +84,22 @@ class Gate:
         """Whether a test may send pulses now."""
         return self._passing
 
-    def identify(self) -> dict[str, object]:
+    async def identify(self) -> dict[str, object]:
         """Open the line and ask the device for its identity. Raises DeviceError."""
-        return self._stimulator.open()
+        return await self._stimulator.open()
 
-    def state(self) -> tuple[bool, str]:
+    async def state(self) -> tuple[bool, str]:
         """(True if the device says that it cannot stimulate, its state in words). Raises DeviceError."""
-        return self._stimulator.state()
+        return await self._stimulator.state()
 
     def reset(self) -> None:
         """Clear the counts of the previous test."""
-        with self._lock:
-            self.last_pulse_s, self.lateness_s, self.ack_delay_s = None, [], []
-            self.charge_uc, self.dropped, self.not_sent, self.late = 0.0, 0, [], []
-            self._recent.clear()
+        self.last_pulse_s, self.lateness_s, self.ack_delay_s = None, [], []
+        self.charge_uc, self.dropped, self.not_sent, self.late = 0.0, 0, [], []
+        self._recent.clear()
 
-    def open(self, journal: Journal, table: dict[str, Limit]) -> None:
-        """Arm the device for one test.
+    async def open(self, journal: Journal, table: dict[str, Limit], halted: Callable[[], bool]) -> None:
+        """Arm the device for one test. It stays shut if the test is `halted` by the time that the device answers.
 
         Raises
         ------
@@ -110,12 +107,11 @@ class Gate:
             The gate stays shut.
         """
         journal.append_json(Kind.EVENT, {"event": "arm", "time_s": self._clock.now_s()})
-        self._stimulator.arm()
-        with self._lock:
-            self._table = table
-            self.on_its_way = None  # the device has answered since, so the line is empty
-            self._journal = journal
-            self._passing = True
+        await self._stimulator.arm()
+        self._table = table
+        self.on_its_way = None  # the device has answered since, so the line is empty
+        self._journal = journal
+        self._passing = not halted()
 
     def fire(self, index: int, pulse: Pulse, due_s: float, latest_s: float) -> PulseStatus:
         """Let one pulse through, or record why not.
@@ -132,56 +128,51 @@ class Gate:
         DeviceError, JournalError
             No pulse may follow. The caller must stop the test.
         """
-        with self._lock:
-            journal = self._journal
-            if journal is None or not self._passing:
-                return PulseStatus.REFUSED
-            if pulse.pulse_width_us == 0:
-                return PulseStatus.REST
-            verdict = admit(pulse, self._table, self._stimulator.steps)
-            if isinstance(verdict, Refusal):
-                return self._skip(journal, index, PulseStatus.REFUSED, str(verdict))
-            if verdict.pulse_width_us == 0 or verdict.current_ma == 0:
-                return self._skip(journal, index, PulseStatus.REST)
-            now_s = self._clock.now_s()
-            if not (now_s <= latest_s):
-                return self._skip(journal, index, PulseStatus.DROPPED)
-            held = self._too_close(now_s)
-            if held:
-                return self._skip(journal, index, PulseStatus.DROPPED, held)
-            refusal = self._too_much(now_s, verdict.charge_uc)
-            if refusal is not None:
-                return self._skip(journal, index, PulseStatus.REFUSED, str(refusal))
-            return self._send(journal, index, verdict, now_s, due_s, latest_s)
+        journal = self._journal
+        if journal is None or not self._passing:
+            return PulseStatus.REFUSED
+        if pulse.pulse_width_us == 0:
+            return PulseStatus.REST
+        verdict = admit(pulse, self._table, self._stimulator.steps)
+        if isinstance(verdict, Refusal):
+            return self._skip(journal, index, PulseStatus.REFUSED, str(verdict))
+        if verdict.pulse_width_us == 0 or verdict.current_ma == 0:
+            return self._skip(journal, index, PulseStatus.REST)
+        now_s = self._clock.now_s()
+        if not (now_s <= latest_s):
+            return self._skip(journal, index, PulseStatus.DROPPED)
+        held = self._too_close(now_s)
+        if held:
+            return self._skip(journal, index, PulseStatus.DROPPED, held)
+        refusal = self._too_much(now_s, verdict.charge_uc)
+        if refusal is not None:
+            return self._skip(journal, index, PulseStatus.REFUSED, str(refusal))
+        return self._send(journal, index, verdict, now_s, due_s, latest_s)
 
     def feed(self) -> None:
         """Feed the device's watchdog after a health check; does nothing unless a test runs. Raises DeviceError."""
-        with self._lock:
-            if self._passing:
-                self._stimulator.feed()
+        if self._passing:
+            self._stimulator.feed()
 
     def shut(self) -> None:
         """Write nothing more to the line. A pulse that it already holds stays in `on_its_way`."""
-        with self._lock:
-            self._passing = False
+        self._passing = False
 
     def release(self) -> None:
         """Shut, and release the test's journal: later acks are not recorded."""
-        with self._lock:
-            self._passing = False
-            self._journal = None
+        self._passing = False
+        self._journal = None
 
-    def stop(self) -> None:
+    async def stop(self) -> None:
         """Shut, discard what has not left this computer, and tell the device to stop. Raises DeviceError.
 
         The line keeps the order of bytes. A device that answers the stop has already received, or lost, the pulse
         that was sent before it.
         """
         self.shut()
-        self._stimulator.stop()
-        with self._lock:
-            if self.on_its_way is not None:
-                self.on_its_way, self.last_pulse_s = None, self._clock.now_s()
+        await self._stimulator.stop()
+        if self.on_its_way is not None:
+            self.on_its_way, self.last_pulse_s = None, self._clock.now_s()
 
     def still_possible(self) -> str:
         """A sentence if a pulse that was sent may still be felt; empty if not."""
@@ -191,16 +182,16 @@ class Gate:
         age_ms = 1e3 * (self._clock.now_s() - pulse.written_s) / self._clock.speed
         return f"pulse {pulse.index + 1} was sent {age_ms:.0f} ms ago and not acknowledged: it may still be felt"
 
-    def disconnect(self) -> None:
+    async def disconnect(self) -> None:
         """Try to stop, then close the line; never raises."""
         with contextlib.suppress(DeviceError):
-            self.stop()
+            await self.stop()
         self._stimulator.close()
 
     def _send(
         self, journal: Journal, index: int, pulse: Admitted, now_s: float, due_s: float, latest_s: float
     ) -> PulseStatus:
-        """Intent to the journal, pulse to the line, then the counts; `fire` holds the lock."""
+        """Intent to the journal, pulse to the line, then the counts."""
         journal.append(Kind.INTENT, jn.INTENT.pack(index, now_s, due_s, pulse.pulse_width_us, pulse.current_ma))
         try:
             number = self._stimulator.send(pulse, latest_s)  # checks the clock as its last step before the write
@@ -249,13 +240,12 @@ class Gate:
         return check(self._table["charge_per_second_uc"], charge_uc + sum(c for _, c in self._recent))
 
     def _acknowledged(self, ack: Ack) -> None:
-        with self._lock:  # `fire` holds it until the number is known
-            pulse, index = self.on_its_way, -1
-            unasked = ack.number >= 0 and ack.error is None and self._passing
-            if pulse is not None and pulse.number == ack.number:
-                index, unasked = pulse.index, False
-                self._settle(pulse, ack)
-            failure = self._write_ack(index, ack, unasked)
+        pulse, index = self.on_its_way, -1
+        unasked = ack.number >= 0 and ack.error is None and self._passing
+        if pulse is not None and pulse.number == ack.number:
+            index, unasked = pulse.index, False
+            self._settle(pulse, ack)
+        failure = self._write_ack(index, ack, unasked)
         place = f" at pulse {index + 1}" if index >= 0 else ""
         for reason in (
             failure,
@@ -263,7 +253,7 @@ class Gate:
             "stimulator: it acknowledged a pulse that it was not sent; is the line disturbed?" if unasked else "",
         ):
             if reason:
-                self._on_fault(reason)  # without the lock: a fault shuts the gate
+                self._on_fault(reason)
 
     def _settle(self, pulse: OnItsWay, ack: Ack) -> None:
         """The ack came: the pulse was felt at some time between its write and its ack."""

@@ -9,12 +9,11 @@ is locked while it is open, so that nobody seals it while it is still being writ
 
 from __future__ import annotations
 
-import fcntl
+import contextlib
 import json
-import os
 import struct
-import threading
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
@@ -24,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.errors import JournalError, RecordingError
+from rig.machine import Log
 
 MAGIC = b"STIMRIG\x01"
 _BLOCK = struct.Struct("<4sBxHII")
@@ -109,24 +109,27 @@ class LaidBlock:
 
 
 class Journal:
-    """One test's journal, open for appending from several threads.
+    """One test's journal, open for appending.
 
     After the first failure every further `append` raises: a journal with a gap must not look complete.
+
+    Parameters
+    ----------
+    log
+        A new file.
+
+    Raises
+    ------
+    JournalError
+        The disk gives an error.
     """
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self._lock = threading.Lock()
+    def __init__(self, log: Log) -> None:
+        self.path = log.path
+        self._log = log
         self._number = 0
         self._failure = ""
-        try:
-            self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o640)
-            fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            self._put(MAGIC)
-            self.sync()
-            _sync_directory(path.parent)
-        except OSError as error:
-            raise JournalError(f"journal {path}: {error.strerror}; free some disk space or correct data_dir") from None
+        self._written(lambda: log.append(MAGIC))
 
     def append(self, kind: Kind, payload: bytes) -> None:
         """Write one block through to the kernel.
@@ -136,17 +139,10 @@ class Journal:
         JournalError
             The disk gave an error, now or before.
         """
-        with self._lock:
-            if self._failure:
-                raise JournalError(self._failure)
-            head = _BLOCK.pack(MARK, kind, self._number & 0xFFFF, len(payload), 0)[:_CRC_AT]
-            crc = zlib.crc32(payload, zlib.crc32(head))
-            try:
-                self._put(head + struct.pack("<I", crc) + payload)
-            except OSError as error:
-                self._failure = f"journal {self.path}: {error.strerror}; the test stops; what was written is kept"
-                raise JournalError(self._failure) from None
-            self._number += 1
+        head = _BLOCK.pack(MARK, kind, self._number & 0xFFFF, len(payload), 0)[:_CRC_AT]
+        crc = zlib.crc32(payload, zlib.crc32(head))
+        self._written(lambda: self._log.append(head + _LENGTH.pack(crc) + payload))
+        self._number += 1
 
     def begin(self, header: dict[str, Any], plan: bytes) -> None:
         """Write header and plan, twice, and sync them to the disk. Raises JournalError."""
@@ -155,36 +151,29 @@ class Journal:
             self.append(Kind.PLAN, plan)
             if spacer:
                 self.append(Kind.SPACER, spacer)
-        self.sync()
+        self._written(self._log.sync)
 
     def append_json(self, kind: Kind, content: dict[str, Any]) -> None:
         """Write one block of JSON."""
         self.append(kind, json.dumps(content).encode())
 
-    def _put(self, data: bytes) -> None:
-        written = os.write(self._fd, data)
-        if written != len(data):
-            raise OSError(28, "disk full: block cut short")
-
     def sync(self) -> None:
-        """Sync everything written so far to the disk. After a failure the next `append` raises."""
-        try:
-            os.fdatasync(self._fd)
-        except OSError as error:
-            self._failure = f"journal {self.path}: {error.strerror}; the test stops; what was written is kept"
+        """Sync everything written so far to the disk; may be called from elsewhere. Raises JournalError."""
+        self._written(self._log.sync)
 
     def close(self) -> None:
-        """Sync everything to the disk and close."""
-        self.sync()
-        os.close(self._fd)
+        """Sync everything to the disk and close; never raises."""
+        with contextlib.suppress(JournalError):
+            self._written(self._log.close)
 
-
-def _sync_directory(path: Path) -> None:
-    fd = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(fd)
-    finally:
-        os.close(fd)
+    def _written(self, action: Callable[[], None]) -> None:
+        if self._failure:
+            raise JournalError(self._failure)
+        try:
+            action()
+        except OSError as error:
+            self._failure = f"journal {self.path}: {error.strerror}; the test stops; what was written is kept"
+            raise JournalError(self._failure) from None
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,17 +201,21 @@ class JournalContents:
 
 
 def read(path: Path) -> JournalContents:
-    """Read a journal, complete or partial: only damaged blocks are lost.
+    """Read a journal file. Raises RecordingError: missing, or as `parse`."""
+    try:
+        return parse(path, path.read_bytes())
+    except OSError as error:
+        raise RecordingError(f"journal {path}: {error.strerror}") from None
+
+
+def parse(path: Path, data: bytes) -> JournalContents:
+    """What a journal's bytes say, complete or partial: only damaged blocks are lost.
 
     Raises
     ------
     RecordingError
-        Missing, or not a journal.
+        Not a journal.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise RecordingError(f"journal {path}: {error.strerror}") from None
     blocks: list[tuple[Kind, bytes]] = []
     at, missing, expected = len(MAGIC), 0, 0
     damaged = sum(a != b for a, b in zip(data[:at], MAGIC, strict=False)) if len(data) > at else 0

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from rig import archive, assembly, journal
+from rig.adapters.files import Files
 from rig.errors import BusyError, RecordingError, RigError
 
 UNKNOWN_END = "recovered by hand; the journal does not say how the test ended"
@@ -56,7 +57,7 @@ def recover(path: Path, folder: Path) -> dict[str, Any]:
     if target.exists() and not known:
         raise RecordingError(f"{target}: another recording of this test exists; give another folder with -o")
     if not known:
-        archive.seal(recording, folder)
+        archive.seal(recording, folder, Files())
     columns, attributes = recording.columns, recording.attributes
     felt = np.isin(columns["pulses/status"], (0, 4, 5))
     return {

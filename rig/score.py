@@ -8,7 +8,6 @@ a second without stimulation, and nothing after it.
 
 from __future__ import annotations
 
-import threading
 from collections import deque
 from collections.abc import Sequence
 
@@ -16,7 +15,6 @@ import numpy as np
 
 from rig import journal as jn
 from rig import pieces
-from rig.clock import Clock
 from rig.errors import BusyError, PlanError, RefusedError, TooLateError
 from rig.journal import Journal, Kind
 from rig.laid import Laid
@@ -24,6 +22,7 @@ from rig.limits import Limit, check, tightened
 from rig.messages import AHEAD, Extended, LaidSegment, SegmentPlan
 from rig.pieces import Piece
 from rig.plan import PlannedTest
+from rig.tasks import Tasks
 
 MAX_EXTENSION_SEGMENTS = 8
 MAX_EXTENSION_S = 30.0
@@ -44,13 +43,13 @@ class Score:
         Gets each segment of an adaptive test that is laid after the start.
     """
 
-    def __init__(self, test: PlannedTest, table: dict[str, Limit], journal: Journal, clock: Clock) -> None:
+    def __init__(self, test: PlannedTest, table: dict[str, Limit], journal: Journal, tasks: Tasks) -> None:
         self.plan, self.adaptive, self.longest_s = test.plan, test.plan.adaptive, test.longest_s
         self.ended_by = "" if self.adaptive else "plan"
         """Why nothing more will be laid; empty: more may be."""
-        self._table, self._journal, self._clock = table, journal, clock
-        self._lock = threading.Lock()
-        self._checking = threading.Lock()
+        self._table, self._journal = table, journal
+        self._tasks, self._clock = tasks, tasks.clock
+        self._checking = False
         at_start = test.pieces[:1] if self.adaptive else test.pieces
         self._fixed = deque(test.pieces[len(at_start) :])
         self.laid = Laid(pieces.NOTHING, ())
@@ -94,17 +93,16 @@ class Score:
         JournalError
             What was to be laid could not be written.
         """
-        with self._lock:
-            if self.adaptive is not None:
-                bound_nms = self.adaptive.max_torque_time_nms
-                if not (torque_time_nms < bound_nms):
-                    self._end("torque_time", f"torque-time {torque_time_nms:.1f} of {bound_nms:g} N·m·s", cut=index)
-                elif index + AHEAD > len(self.laid) and not self.ended_by:
-                    self._go_on()
-            self._reached = index
-            return float(self.laid.pulse_width_us[index]) if index < len(self.laid) else None
+        if self.adaptive is not None:
+            bound_nms = self.adaptive.max_torque_time_nms
+            if not (torque_time_nms < bound_nms):
+                self._end("torque_time", f"torque-time {torque_time_nms:.1f} of {bound_nms:g} N·m·s", cut=index)
+            elif index + AHEAD > len(self.laid) and not self.ended_by:
+                self._go_on()
+        self._reached = index
+        return float(self.laid.pulse_width_us[index]) if index < len(self.laid) else None
 
-    def extend(self, after: int, chosen: Sequence[SegmentPlan]) -> None:
+    async def extend(self, after: int, chosen: Sequence[SegmentPlan]) -> None:
         """Lay segments behind everything that is laid: all of them, or none.
 
         Parameters
@@ -123,22 +121,20 @@ class Score:
         JournalError
             It could not be written.
         """
-        with self._lock:
-            self._may_grow(after)
-            if self._checked >= MAX_CHECKED:
-                raise BusyError(f"extend: {MAX_CHECKED} extensions were checked for this boundary; wait for the next")
-            self._checked += 1
-        if not self._checking.acquire(blocking=False):
+        self._may_grow(after)
+        if self._checked >= MAX_CHECKED:
+            raise BusyError(f"extend: {MAX_CHECKED} extensions were checked for this boundary; wait for the next")
+        self._checked += 1
+        if self._checking:
             raise BusyError("extend: another extension is being checked; send one after the other")
+        self._checking = True
         try:
-            built = self._built(chosen, after)
-            self._check(built)
+            built = await self._tasks.work(self._built_and_checked, self.laid, chosen)
         finally:
-            self._checking.release()
-        with self._lock:  # only briefly: the sender needs it
-            self._may_grow(after)
-            for piece in built:
-                self._lay(piece, "extension")
+            self._checking = False
+        self._may_grow(after)  # the test went on meanwhile
+        for piece in built:
+            self._lay(piece, "extension")
 
     def enough(self, by: str, at_once: bool) -> None:
         """End well: at the next pulse, or where the segment that plays ends. A second call may only end it sooner.
@@ -152,20 +148,14 @@ class Score:
         """
         if self.adaptive is None:
             raise PlanError("enough: this test has a fixed plan; stop it, or let it play to its end")
-        with self._lock:
-            self._may_change()
-            handed = self._reached + 1  # a segment whose first pulse is handed out to wait does not play yet
-            playing = next((s.end for s in self.laid.segments if s.end >= self._reached), len(self.laid))
-            self._end("enough", by, handed if at_once else max(handed, playing))
+        self._may_change()
+        handed = self._reached + 1  # a segment whose first pulse is handed out to wait does not play yet
+        playing = next((s.end for s in self.laid.segments if s.end >= self._reached), len(self.laid))
+        self._end("enough", by, handed if at_once else max(handed, playing))
 
     def shut(self) -> None:
-        """From now on every request is refused. Waits for nothing: whoever halts the test calls it."""
+        """From now on every request is refused."""
         self._shut = True
-
-    def close(self) -> None:
-        """As `shut`, and nothing is being written any more: the journal may be closed."""
-        with self._lock:
-            self._shut = True
 
     def left(self, torque_time_nms: float) -> Extended:
         """What is laid, and what the bounds leave of an adaptive test."""
@@ -193,8 +183,15 @@ class Score:
         if after != len(self.laid):
             raise TooLateError(f"extend.after: {after}, but {len(self.laid)} pulses are laid; look again, then decide")
 
-    def _built(self, chosen: Sequence[SegmentPlan], before: int) -> tuple[Piece, ...]:
-        most = min(MAX_EXTENSION_SEGMENTS, pieces.MAX_SEGMENTS - len(self.laid.segments) - len(self._fixed) - 1)
+    def _built_and_checked(self, laid: Laid, chosen: Sequence[SegmentPlan]) -> tuple[Piece, ...]:
+        """Behind what is laid; changes nothing, since it runs beside the sender."""
+        built = self._built(laid, chosen)
+        self._check(laid, built)
+        return built
+
+    def _built(self, laid: Laid, chosen: Sequence[SegmentPlan]) -> tuple[Piece, ...]:
+        before = len(laid)
+        most = min(MAX_EXTENSION_SEGMENTS, pieces.MAX_SEGMENTS - len(laid.segments) - len(self._fixed) - 1)
         if not (1 <= len(chosen) <= most):
             raise PlanError(f"extend.segments: {len(chosen)} segments; give 1 to {most}")
         for number, segment in enumerate(chosen, start=1):
@@ -204,9 +201,9 @@ class Score:
         table = tightened(self._table, "duration_s", longest_s, f"at most {MAX_EXTENSION_S:g} s an extension")
         return pieces.build(chosen, self.plan, table["duration_s"], before)
 
-    def _check(self, added: Sequence[Piece]) -> None:
+    def _check(self, laid: Laid, added: Sequence[Piece]) -> None:
         """Check pieces as a part of the whole, for which a safe end must be left. Raises RefusedError."""
-        before_us = self.laid.pulse_width_us
+        before_us = laid.pulse_width_us
         pieces.check_all(added, self.plan, self._table, before_us)
         whole_us = np.concatenate([before_us, *(piece.pulse_width_us for piece in added)])
         rate_hz = self.plan.pulse_rate_hz
@@ -220,7 +217,7 @@ class Score:
             return
         piece = self._fixed.popleft()
         try:
-            self._check([piece])
+            self._check(self.laid, [piece])
         except RefusedError as error:
             self._end("limit", f"next of the fixed plan: {error}", len(self.laid))
         else:

@@ -16,6 +16,7 @@ from rig.journal import Journal, Kind
 from rig.limits import Limit, check
 from rig.messages import TestPlan
 from rig.signals import Recorded
+from rig.tasks import Tasks
 
 AROUND_S = 0.1
 """Real seconds over which the median tells where the joint is before a test."""
@@ -108,11 +109,12 @@ def _worded(receiver: AngleReceiver) -> str:
     return found if found.startswith("angle sensor") else f"angle sensor: {found}"
 
 
-def await_angle(receiver: AngleReceiver, clock: Clock) -> None:
+async def await_angle(receiver: AngleReceiver, tasks: Tasks) -> None:
     """Wait a moment for the first angle: right after connecting there is none."""
+    clock = tasks.clock
     end_s = clock.now_s() + PATIENCE_S * clock.speed
     while receiver.angle_around(AROUND_S * clock.speed) is None and clock.now_s() <= end_s:
-        clock.wait(clock.now_s() + 0.02 * clock.speed)
+        await tasks.sleep(0.02)
 
 
 def check_start(receiver: AngleReceiver | None, plan: TestPlan, table: dict[str, Limit], clock: Clock) -> None:

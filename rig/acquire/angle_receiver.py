@@ -6,6 +6,7 @@ must stop is decided by what the test asks (`rig.acquire.angle_guard`).
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
@@ -18,11 +19,11 @@ from rig.acquire.angle_check import AngleCheck
 from rig.acquire.rate import RATE_TOLERANCE
 from rig.acquire.stream import Stream
 from rig.angle_velocity import LiveSlope
-from rig.clock import Clock
 from rig.devices import AngleSensor
 from rig.errors import DeviceError, JournalError
 from rig.journal import Journal, Kind
 from rig.signals import ANGLE_SAMPLE, AngleBlock, AngleScale, Recorded
+from rig.tasks import Tasks
 
 NAME = "angle sensor"
 REOPEN_S = 0.5
@@ -35,7 +36,7 @@ RECENT_S = 1.0
 
 
 class AngleReceiver(Stream[AngleBlock]):
-    """Owns the angle sensor's reading thread, which opens it, too.
+    """The angle sensor's, which opens it, too.
 
     Parameters
     ----------
@@ -43,8 +44,8 @@ class AngleReceiver(Stream[AngleBlock]):
         Not opened yet.
     """
 
-    def __init__(self, sensor: AngleSensor, clock: Clock) -> None:
-        super().__init__(NAME, sensor, clock, self._gone)
+    def __init__(self, sensor: AngleSensor, tasks: Tasks) -> None:
+        super().__init__(NAME, sensor, tasks, self._gone)
         self.sensor = sensor
         self.scale = sensor.scale
         self.identity: dict[str, Any] = {}
@@ -66,10 +67,9 @@ class AngleReceiver(Stream[AngleBlock]):
 
     def rescale(self, scale: AngleScale) -> None:
         """From now on the joint's angle by this calibration."""
-        with self._lock:
-            self.scale = scale
-            self._slope.forget()
-            self._recent = deque(self._scaled(samples) for samples in self._recent)
+        self.scale = scale
+        self._slope.forget()
+        self._recent = deque(self._scaled(samples) for samples in self._recent)
 
     def record(
         self,
@@ -87,17 +87,15 @@ class AngleReceiver(Stream[AngleBlock]):
         on_broken
             Called if the journal cannot be written.
         """
-        with self._lock:
-            self._journal, self._check = journal, check
-            self._on_fault, self._on_broken = on_fault, on_broken
-            self.counts = Recorded()
+        self._journal, self._check = journal, check
+        self._on_fault, self._on_broken = on_fault, on_broken
+        self.counts = Recorded()
 
     def release(self) -> Recorded:
         """Stop recording; returns the counts since `record`."""
-        with self._lock:
-            self._journal = self._check = None
-            self._on_fault = self._on_broken = lambda _: None
-            return replace(self.counts)
+        self._journal = self._check = None
+        self._on_fault = self._on_broken = lambda _: None
+        return replace(self.counts)
 
     def data_age_s(self, now_s: float) -> float:
         """How old the newest angle is: since its arrival, and what it came late."""
@@ -155,23 +153,21 @@ class AngleReceiver(Stream[AngleBlock]):
         while self._recent[0]["host_time_s"][-1] < now_s - RECENT_S * self._clock.speed:
             self._recent.popleft()
 
-    def _run(self) -> None:
-        """Open it, read it until it is gone, and so on until closed; who closes may not wait for an adapter to open."""
+    def start(self) -> None:
+        """Open it, read it until it is gone, and so on until closed."""
+        self._tasks.spawn(self._keep_open(), f"{NAME} opening")
+
+    async def _keep_open(self) -> None:
         while not self._closing.is_set():
             try:
-                self.identity = self.sensor.open()
+                self._count_on()  # one that was without power counts from zero: its numbers go on where the clock is
+                self.identity = await self.open()
             except DeviceError as error:
                 self._gone(str(error))
             else:
-                self._begin_anew()
-                super()._run()
-            self._closing.wait(REOPEN_S)
-        self.sensor.close()
-
-    def _begin_anew(self) -> None:
-        """A sensor that was without power counts from zero: its numbers go on from where the clock is."""
-        with self._lock:
-            self._count_on()
+                await self._tasks.wait(math.inf, self._closing, self._lost)
+            await self._tasks.sleep(REOPEN_S, self._closing)
+        await self._source.close()
 
     def _count_on(self) -> None:
         self._prompt, self._behind = None, 0

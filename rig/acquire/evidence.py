@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 
 from rig.acquire.receiver import Receiver
-from rig.clock import Clock
 from rig.errors import DeviceError
 from rig.gate import Gate
 from rig.messages import StopEvidence
+from rig.tasks import Tasks
 
 DECAY_S = 3.0
 """Rig seconds within which the torque must fall to half; the slowest muscle of the paper takes about 1 s."""
@@ -26,13 +26,13 @@ NO_SIGNAL = "there is no torque signal to confirm the stop"
 ATTEMPTS = 2
 
 
-def stop_device(gate: Gate) -> tuple[bool, str | None, str]:
+async def stop_device(gate: Gate) -> tuple[bool, str | None, str]:
     """Stop and ask: (whether the device reports that it cannot stimulate, its state, what went wrong). Never raises."""
     said = ""
     for _ in range(ATTEMPTS):  # the first answer may have been damaged on the line
         try:
-            gate.stop()
-            safe, state = gate.state()
+            await gate.stop()
+            safe, state = await gate.state()
         except DeviceError as error:
             said = str(error)
             continue
@@ -40,8 +40,8 @@ def stop_device(gate: Gate) -> tuple[bool, str | None, str]:
     return False, None, "; ".join(part for part in (said, gate.still_possible()) if part)
 
 
-def watch_decay(
-    gate: Gate, receiver: Receiver, clock: Clock, rest_nm: float | None, at_stop_nm: float | None
+async def watch_decay(
+    gate: Gate, receiver: Receiver, tasks: Tasks, rest_nm: float | None, at_stop_nm: float | None
 ) -> tuple[bool, str]:
     """Wait until the torque has fallen to half or close to rest, or until the time for that is over.
 
@@ -57,6 +57,7 @@ def watch_decay(
     if at_stop_nm is not None and not math.isfinite(at_stop_nm):
         at_stop_nm = None
     above_nm = 0.0 if at_stop_nm is None else at_stop_nm - rest_nm  # if unknown, the torque must come close to rest
+    clock = tasks.clock
     waited_s = quiet_s = 0.0
     began_s = looked_s = clock.now_s()
     while True:
@@ -69,7 +70,7 @@ def watch_decay(
             return False, f"torque is still {now_nm:.2f} N·m {since_s:.0f} s after the stop"
         if waited_s >= max(DECAY_S, SILENT_S * clock.speed) or quiet_s >= SILENT_S * clock.speed or since_s > LONGEST_S:
             return False, NO_SIGNAL
-        clock.wait(clock.now_s() + POLL_S * clock.speed)
+        await tasks.sleep(POLL_S)
         now_s = clock.now_s()
         step_s = min(now_s - looked_s, POLL_S * clock.speed)
         waited_s += step_s

@@ -2,38 +2,36 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
 from typing import Literal
 
 from rig.clock import Clock
+from rig.tasks import Signal
 
 Cause = Literal["stopped", "fault"]
 
 
 class Halt:
-    """Set once, from any thread; `event` wakes all waiting threads."""
+    """Set once; `signal` wakes all who wait."""
 
     def __init__(self, clock: Clock) -> None:
-        self.event = threading.Event()
+        self.signal = Signal()
         self.cause: Cause | None = None
         self.reason = ""
         self.time_s = 0.0
         self._clock = clock
-        self._lock = threading.Lock()
         self._heard: list[Callable[[], None]] = []
 
     def on_set(self, action: Callable[[], None]) -> None:
-        """Call `action` when halted, from the halting thread."""
+        """Call `action` when halted, before anything else goes on."""
         self._heard.append(action)
 
     def set(self, cause: Cause, reason: str) -> bool:
         """End the test; False if it was already ending."""
-        with self._lock:
-            if self.cause is not None:
-                return False
-            self.cause, self.reason, self.time_s = cause, reason, self._clock.now_s()
-            self.event.set()
+        if self.cause is not None:
+            return False
+        self.cause, self.reason, self.time_s = cause, reason, self._clock.now_s()
+        self.signal.set()
         for action in self._heard:
             action()
         return True

@@ -6,16 +6,16 @@ feeds the watchdog, or stops. A sender that hangs does not ask, so it neither se
 
 from __future__ import annotations
 
-import os
-import threading
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from rig.acquire.receiver import Receiver
 from rig.clock import Clock
+from rig.errors import JournalError
 from rig.gate import Gate
 from rig.journal import Journal
+from rig.machine import Machine
+from rig.tasks import Signal
 
 SYNC_PERIOD_S = 0.5
 STALL_S = 0.25
@@ -40,39 +40,42 @@ class Watch:
 DEFAULT_WATCH = Watch()
 
 
-class Disk:
-    """Syncs the journal to the disk twice a second in a thread of its own, and keeps the time of the last success.
+class DiskWatch:
+    """Syncs the journal to the disk twice a second, and keeps the time of the last success.
 
-    Times are real seconds, since a disk does not follow the rig's clock.
+    Its times are real seconds, since a disk does not follow the rig's clock.
     """
 
-    def __init__(self, journal: Journal, monotonic: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, journal: Journal, machine: Machine) -> None:
         self.free_bytes = MIN_FREE_BYTES
-        self._journal = journal
-        self._monotonic = monotonic
-        self._proof_s = monotonic()
-        self._done = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="journal-sync", daemon=True)
-        self._thread.start()
+        self._journal, self._disk, self._tasks = journal, machine.disk, machine.tasks
+        self._proof_s = self._now_s()
+        self._ended = Signal()
+        self._task = machine.tasks.spawn(self._run(), "journal sync")
 
-    def _run(self) -> None:
-        while not self._done.wait(SYNC_PERIOD_S):
-            self._journal.sync()
+    def _now_s(self) -> float:
+        return self._tasks.clock.now_s() / self._tasks.clock.speed
+
+    async def _run(self) -> None:
+        while not await self._tasks.sleep(SYNC_PERIOD_S, self._ended):
             try:
-                found = os.statvfs(self._journal.path.parent)
-            except OSError:
-                continue  # keeps the time of the last success
-            self.free_bytes = found.f_bavail * found.f_frsize
-            self._proof_s = self._monotonic()
+                self.free_bytes = await self._tasks.work(self._sync)
+            except (OSError, JournalError):
+                continue  # keeps the time of the last success; the next pulse finds the journal's failure
+            self._proof_s = self._now_s()
+
+    def _sync(self) -> int:
+        self._journal.sync()
+        return self._disk.free_bytes(self._journal.path.parent)
 
     def age_s(self) -> float:
         """Real seconds since the journal was last synced to the disk."""
-        return self._monotonic() - self._proof_s
+        return self._now_s() - self._proof_s
 
-    def end(self) -> None:
-        """Wait for the thread to end."""
-        self._done.set()
-        self._thread.join()
+    async def end(self) -> None:
+        """Wait until nothing is being synced any more."""
+        self._ended.set()
+        await self._tasks.join(self._task)
 
 
 class Health:
@@ -82,7 +85,7 @@ class Health:
         self,
         gate: Gate,
         receiver: Receiver,
-        disk: Disk,
+        disk: DiskWatch,
         clock: Clock,
         watch: Watch,
         angle: Callable[[], str | None] = lambda: None,

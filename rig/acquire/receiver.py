@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from rig.acquire.plausibility import PlausibilityCheck
 from rig.acquire.stream import Stream
 from rig.acquire.torque_time import TorqueTime
-from rig.clock import Clock
 from rig.devices import LoadCell
 from rig.errors import JournalError
 from rig.journal import Journal, Kind
 from rig.signals import Recorded, TorqueBlock
+from rig.tasks import Tasks
 
 LIVE_BLOCKS = 4000
 RANGE_MEAN_S = 0.01
@@ -28,18 +28,18 @@ RANGE_MEAN_S = 0.01
 
 
 class Receiver(Stream[TorqueBlock]):
-    """Owns the load cell's reading thread.
+    """The load cell's.
 
     Parameters
     ----------
     cell
-        An opened load cell.
+        Not open yet.
     on_lost
-        Called once, with the reason, when the cell is gone; the thread then ends.
+        Called once, with the reason, when the cell is gone.
     """
 
-    def __init__(self, cell: LoadCell, clock: Clock, on_lost: Callable[[str], None]) -> None:
-        super().__init__("load cell", cell, clock, on_lost)
+    def __init__(self, cell: LoadCell, tasks: Tasks, on_lost: Callable[[str], None]) -> None:
+        super().__init__("load cell", cell, tasks, on_lost)
         self._journal: Journal | None = None
         self._limits_nm = (-np.inf, np.inf)
         self._plausibility: PlausibilityCheck | None = None
@@ -59,26 +59,23 @@ class Receiver(Stream[TorqueBlock]):
         plausibility: PlausibilityCheck | None = None,
     ) -> None:
         """From now on write every sample to the journal and check it; faults are reported at once."""
-        with self._lock:
-            self._plausibility, self.torque_time = plausibility, TorqueTime()
-            self._journal, self._limits_nm, self._on_fault = journal, limits_nm, on_fault
-            self.counts, self.peak_nm = Recorded(), 0.0
-            self._begin_range()
+        self._plausibility, self.torque_time = plausibility, TorqueTime()
+        self._journal, self._limits_nm, self._on_fault = journal, limits_nm, on_fault
+        self.counts, self.peak_nm = Recorded(), 0.0
+        self._begin_range()
 
     def begin_range(self) -> None:
         """Forget the range until now: the limb may have moved before the first pulse."""
-        with self._lock:
-            self._begin_range()
+        self._begin_range()
 
     def _begin_range(self) -> None:
         self.range_nm, self._unaveraged_nm = (np.inf, -np.inf), np.empty(0)
 
     def release(self) -> Recorded:
         """Stop recording; returns the counts since `record`."""
-        with self._lock:
-            self._journal = self._plausibility = None
-            self._limits_nm, self._on_fault = (-np.inf, np.inf), lambda _: None
-            return replace(self.counts)
+        self._journal = self._plausibility = None
+        self._limits_nm, self._on_fault = (-np.inf, np.inf), lambda _: None
+        return replace(self.counts)
 
     def torque_around(self, duration_s: float) -> float | None:
         """Median of the torque over the last `duration_s`, N·m; None if there is none."""

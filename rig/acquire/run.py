@@ -1,4 +1,4 @@
-"""One test, played in its own thread: arm, send a pulse at each deadline, stop, confirm the stop.
+"""One test, played in a task of its own: arm, send a pulse at each deadline, stop, confirm the stop.
 
 Deadlines are absolute on the monotonic clock. Health is checked before each pulse. A pulse that is late, or that comes
 due before the previous one is acknowledged, is dropped and recorded, never sent in a burst.
@@ -7,11 +7,7 @@ due before the previous one is acknowledged, is dropped and recorded, never sent
 from __future__ import annotations
 
 import contextlib
-import gc
 import logging
-import os
-import threading
-import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -21,24 +17,24 @@ from rig.acquire.angle_guard import AngleGuard
 from rig.acquire.angle_receiver import AngleReceiver
 from rig.acquire.evidence import AROUND_S, evidence, stop_device, watch_decay
 from rig.acquire.halt import Cause, Halt
-from rig.acquire.health import DEFAULT_WATCH, Disk, Health, Watch
+from rig.acquire.health import DEFAULT_WATCH, DiskWatch, Health, Watch
 from rig.acquire.plausibility import PlausibilityCheck
 from rig.acquire.receiver import Receiver
-from rig.clock import Clock
 from rig.errors import DeviceError, JournalError
 from rig.gate import Gate
 from rig.journal import Journal, Kind
 from rig.limits import Limit
+from rig.machine import Machine
 from rig.messages import StopEvidence, TestOutcome
 from rig.plan import PlannedTest
 from rig.score import Score
 from rig.signals import Pulse, Recorded
+from rig.tasks import Signal
 
 log = logging.getLogger("rig.run")
 
 LEAD_S = 0.1
 """Real seconds between arming and the first deadline."""
-SENDER_PRIORITY = 50
 SETTLE_S = 3.0
 """Real seconds to wait until a backlog in buffers has been read."""
 FRESH_S = 0.5
@@ -78,7 +74,7 @@ class TestRun:
     journal
         Already contains header and plan.
     halt
-        Ends the test early from any thread.
+        Ends the test early.
     angle
         The angle sensor's receiver; None: the rig has none.
     """
@@ -92,24 +88,23 @@ class TestRun:
         journal: Journal,
         gate: Gate,
         receiver: Receiver,
-        clock: Clock,
+        machine: Machine,
         halt: Halt,
         watch: Watch = DEFAULT_WATCH,
         angle: AngleReceiver | None = None,
     ) -> None:
         self.plan = test.plan
-        self.score = Score(test, table, journal, clock)
+        self.score = Score(test, table, journal, machine.tasks)
         self.halt = halt
-        self.started = threading.Event()
+        self.started = Signal()
         self.t0_s: float | None = None
-        self.stimulation_ended = threading.Event()
         self._table = table
         self._journal = journal
         self._gate = gate
         self._receiver = receiver
-        self._clock = clock
+        self._machine, self._tasks, self._clock = machine, machine.tasks, machine.tasks.clock
         self._watch = watch
-        self._angle = AngleGuard(angle, test.plan, table, clock, watch)
+        self._angle = AngleGuard(angle, test.plan, table, self._clock, watch)
         self._angle_counts: Recorded | None = None
         self._asked_s: float | None = None
         self._rest_nm: float | None = None
@@ -119,9 +114,9 @@ class TestRun:
         halt.on_set(gate.shut)
         halt.on_set(self.score.shut)
 
-    def execute(self) -> RunResult:
+    async def execute(self) -> RunResult:
         """Play the test to its end or its halt; never raises for a fault, the result says it."""
-        cpu_s, wall_s = time.process_time(), time.monotonic()
+        cpu_s, began_s = self._machine.cpu_s(), self._clock.now_s()
         self._gate.reset()
         torque = self._table["torque_nm"]
         self._plausibility = PlausibilityCheck(
@@ -134,22 +129,22 @@ class TestRun:
         )
         self._receiver.record(self._journal, (torque.lo, torque.hi), self._fault, self._plausibility)
         self._angle.record(self._journal, self._fault)
-        disk = Disk(self._journal)
+        disk = DiskWatch(self._journal, self._machine)
         self._health = Health(self._gate, self._receiver, disk, self._clock, self._watch, self._angle.fault)
         try:
-            if self._arm():
-                with _undisturbed():
-                    self._play()
+            if await self._arm():
+                with self._machine.undisturbed():
+                    await self._play()
         except (DeviceError, JournalError) as error:
             self._fault(str(error))
         except Exception as error:  # a bug in this program must stop stimulation, too
             log.exception("the test failed")
             self._fault(f"internal: {type(error).__name__}: {error}")
-        found = self._stop()
-        elapsed_s = max(time.monotonic() - wall_s, 1e-9)
-        cpu_percent = 100 * (time.process_time() - cpu_s) / elapsed_s
-        disk.end()
-        return self._result(found, cpu_percent)
+        found = await self._stop()
+        elapsed_s = max((self._clock.now_s() - began_s) / self._clock.speed, 1e-9)
+        cpu_percent = 100 * (self._machine.cpu_s() - cpu_s) / elapsed_s
+        await disk.end()
+        return await self._result(found, cpu_percent)
 
     @property
     def journal_path(self) -> Path:
@@ -207,14 +202,14 @@ class TestRun:
     def _fault(self, reason: str) -> None:
         self.halt.set("fault", reason)
 
-    def _arm(self) -> bool:
+    async def _arm(self) -> bool:
         speed = self._clock.speed
         began_s = self._clock.now_s()
-        while True:
+        while not self.halt.signal.is_set():
             fresh = self._receiver.age_s(self._clock.now_s()) <= self._watch.stale_torque_s * speed
             settled, seen = fresh and self._receiver.settled(), self._angle.fresh()
             if settled and seen:
-                break
+                return await self._open_gate()
             waited_s = (self._clock.now_s() - began_s) / speed
             if not fresh and waited_s >= FRESH_S:
                 self._fault("load cell: no torque arrived before the test; check its cable and power supply")
@@ -222,18 +217,17 @@ class TestRun:
                 self._fault(self._angle.fault() or "angle sensor: no angle arrived before the test; check its cable")
             if waited_s >= SETTLE_S:
                 self._fault("load cell: samples arrive much faster than sample_rate_hz; check rig file and bus")
-            if self._clock.wait(self._clock.now_s() + 0.005 * speed, self.halt.event):
-                return False
+            await self._tasks.sleep(0.005, self.halt.signal)
+        return False
+
+    async def _open_gate(self) -> bool:
         self._plausibility.begin()
         self._angle.begin()
-        self._rest_nm = self._receiver.torque_around(0.1 * speed)
-        self._gate.open(self._journal, self._table)
-        if self.halt.event.is_set():
-            self._gate.shut()  # halted while arming: the gate was opened after the halt shut it
-            return False
-        return True
+        self._rest_nm = self._receiver.torque_around(0.1 * self._clock.speed)
+        await self._gate.open(self._journal, self._table, self.halt.signal.is_set)
+        return self._gate.is_open
 
-    def _play(self) -> None:
+    async def _play(self) -> None:
         clock, current_ma = self._clock, self.plan.profile.current_ma
         period_s = 1 / self.plan.pulse_rate_hz
         t0_s = clock.now_s() + LEAD_S * clock.speed
@@ -248,7 +242,7 @@ class TestRun:
             if resting and width_us > 0:
                 resting = False
                 self._at_rest()
-            if clock.wait(due_s, self.halt.event):
+            if await self._tasks.wait(due_s, self.halt.signal):
                 return
             self._asked_s = clock.now_s()
             wrong = self._health.fault(due_s)
@@ -258,7 +252,7 @@ class TestRun:
             self._gate.feed()
             self._gate.fire(index, Pulse(width_us, current_ma), due_s, due_s + late_s)
             index += 1
-        clock.wait(t0_s + index * period_s, self.halt.event)
+        await self._tasks.wait(t0_s + index * period_s, self.halt.signal)
 
     def _at_rest(self) -> None:
         """Right before the first pulse: what torque is rest, and no range or torque-time yet."""
@@ -266,23 +260,22 @@ class TestRun:
         self._receiver.begin_range()
         self._receiver.torque_time.begin(self._rest_nm or 0.0, self._clock.now_s())
 
-    def _stop(self) -> StopEvidence:
+    async def _stop(self) -> StopEvidence:
         """Stop the device, ask its state, watch the torque fall, end the journal."""
         self._asked_s = None
         clock, cause = self._clock, self.halt.cause
         at_stop_nm = self._receiver.torque_around(AROUND_S * clock.speed)
-        device = stop_device(self._gate)
-        self.stimulation_ended.set()
+        device = await stop_device(self._gate)
         if cause is None and not device[0]:  # without the device's confirmation the end is a fault
             self._fault(f"the end of stimulation is not confirmed: {device[2] or device[1]}")
         elif cause is None and (wrong := self._plausibility.fault_at_end() or self._angle.fault_at_end()):
             self._fault(wrong)
         cause = self.halt.cause
         if cause is None:
-            clock.wait(clock.now_s() + AROUND_S * clock.speed)  # samples still in transit belong to the test
+            await self._tasks.sleep(AROUND_S)  # samples still in transit belong to the test
             torque = True, "the test ended as planned"
         else:
-            torque = watch_decay(self._gate, self._receiver, clock, self._rest_nm, at_stop_nm)
+            torque = await watch_decay(self._gate, self._receiver, self._tasks, self._rest_nm, at_stop_nm)
         now_s, last_s = clock.now_s(), self._gate.last_pulse_s
         planned_end_s = (self.t0_s or now_s) + self.score.duration_s
         self._end_journal(cause, planned_end_s if cause is None else now_s)
@@ -290,7 +283,7 @@ class TestRun:
         return evidence(device, torque, None if last_s is None else now_s - last_s, may_follow)
 
     def _end_journal(self, cause: Cause | None, end_s: float) -> None:
-        self.score.close()
+        self.score.shut()
         self._outcome = cause or "completed"
         stimulation_end_s = end_s if cause is None else self.halt.time_s
         if self.t0_s is not None:
@@ -311,8 +304,8 @@ class TestRun:
                 self._journal.append_json(Kind.EVENT, event)
             self._journal.append_json(Kind.END, content)
 
-    def _result(self, found: StopEvidence, cpu_percent: float) -> RunResult:
-        self._journal.close()
+    async def _result(self, found: StopEvidence, cpu_percent: float) -> RunResult:
+        await self._tasks.work(self._journal.close)
         return RunResult(
             outcome=self._outcome,
             reason=self.halt.reason if self._outcome != "completed" else "",
@@ -339,22 +332,6 @@ class TestRun:
         if self._rest_nm is None or not (lo_nm <= hi_nm):
             return None
         return max(hi_nm - self._rest_nm, self._rest_nm - lo_nm)
-
-
-@contextlib.contextmanager
-def _undisturbed():
-    """No garbage collection, and real-time priority for this thread if the system allows it."""
-    gc.collect()
-    gc.disable()
-    policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
-    with contextlib.suppress(OSError):
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(SENDER_PRIORITY))
-    try:
-        yield
-    finally:
-        with contextlib.suppress(OSError):
-            os.sched_setscheduler(0, policy, parameters)
-        gc.enable()
 
 
 def spread_ms(durations_s: list[float]) -> dict[str, float]:

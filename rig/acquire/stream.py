@@ -1,4 +1,4 @@
-"""What the receivers of torque and angle share: one reading thread each, from connect to disconnect.
+"""What the receivers of torque and angle share: one each, from connect to disconnect.
 
 A stream unwraps the device's counter, finds lost, repeated and disordered samples, measures the rate, and notices
 silence and samples that come late.
@@ -7,7 +7,6 @@ silence and samples that come late.
 from __future__ import annotations
 
 import logging
-import threading
 from collections import deque
 from collections.abc import Callable
 from typing import Any, Generic, Protocol, TypeVar
@@ -16,13 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.acquire.rate import RATE_TOLERANCE
-from rig.clock import Clock
-from rig.errors import DeviceError
+from rig.devices import Sensor
 from rig.signals import Recorded
+from rig.tasks import Signal, Task, Tasks
 
 log = logging.getLogger("rig.receiver")
 
-READ_TIMEOUT_S = 0.02
+LOOK_S = 0.05
+"""Real seconds between two looks at whether samples still come."""
 SILENCE_S = 1.0
 """Real seconds of reading without a sample after which a device counts as gone. Its bus is closed, since some drivers
 then use a whole processor."""
@@ -38,7 +38,6 @@ JUMP_ALLOWANCE_S = 0.5
 """A counter that is further ahead of the host's clock than this has jumped, so its samples have no reliable time."""
 
 BlockT = TypeVar("BlockT", bound="Block")
-BlockT_co = TypeVar("BlockT_co", covariant=True)
 
 
 class Block(Protocol):
@@ -54,17 +53,6 @@ class Block(Protocol):
     def error_frames(self) -> int: ...
 
     def __len__(self) -> int: ...
-
-
-class Source(Protocol[BlockT_co]):
-    """What a stream reads."""
-
-    sample_rate_hz: float
-    counter_modulus: int
-
-    def read(self, timeout_s: float) -> BlockT_co: ...
-
-    def close(self) -> None: ...
 
 
 class CounterUnwrapper:
@@ -101,23 +89,24 @@ class CounterUnwrapper:
 
 
 class Stream(Generic[BlockT]):
-    """Base of the receivers: owns one device's reading thread.
+    """Base of the receivers.
 
     Parameters
     ----------
     name
         Of the device, for messages.
     source
-        An opened device.
+        A device that is not open yet.
     on_lost
-        Called once, with the reason, when the device is gone; the thread then ends.
+        Called once, with the reason, when the device is gone.
     """
 
-    def __init__(self, name: str, source: Source[BlockT], clock: Clock, on_lost: Callable[[str], None]) -> None:
-        self._name, self._source, self._clock, self._on_lost = name, source, clock, on_lost
-        self._lock = threading.Lock()
-        self._closing = threading.Event()
-        self._thread: threading.Thread | None = None
+    def __init__(self, name: str, source: Sensor[BlockT], tasks: Tasks, on_lost: Callable[[str], None]) -> None:
+        self._name, self._source, self._on_lost = name, source, on_lost
+        self._tasks, self._clock = tasks, tasks.clock
+        self._closing = Signal()
+        self._lost = Signal()
+        self._watch: Task[None] | None = None
         self._unwrapper = CounterUnwrapper(source.counter_modulus) if source.counter_modulus else None
         self._on_fault: Callable[[str], None] = lambda _: None
         self._previous: tuple[int, float] | None = None
@@ -132,22 +121,22 @@ class Stream(Generic[BlockT]):
         """Samples per second according to the rig file."""
         return self._source.sample_rate_hz
 
-    def start(self) -> None:
-        """Start reading."""
-        self._thread = threading.Thread(target=self._run, name=f"{self._name} receiver", daemon=True)
-        self._thread.start()
+    async def open(self) -> dict[str, Any]:
+        """Open the device and read it from now on; returns its identity. Raises DeviceError."""
+        self._lost.clear()
+        identity = await self._source.open(self._receive, self._lose)
+        self._watch = self._tasks.spawn(self._watch_silence(), f"{self._name} receiver")
+        return identity
 
     @property
     def living(self) -> bool:
-        """Whether its thread still runs."""
-        return self._thread is not None and self._thread.is_alive()
+        """Whether it still looks at whether samples come."""
+        return self._watch is not None and not self._watch.done.is_set()
 
-    def close(self) -> None:
-        """End the thread and close the device."""
+    async def close(self) -> None:
+        """Close the device."""
         self._closing.set()
-        if self._thread is not None and self._thread is not threading.current_thread():
-            self._thread.join(timeout=2.0)
-        self._source.close()
+        await self._source.close()
 
     def age_s(self, now_s: float) -> float:
         """Age of the newest sample, infinite before the first."""
@@ -191,18 +180,17 @@ class Stream(Generic[BlockT]):
 
     def take(self, block: BlockT) -> None:
         """Process one block from the device: unwrap, record, check."""
-        with self._lock:
-            self.counts.malformed_frames += block.malformed
-            self.counts.error_frames += block.error_frames
-            if len(block) == 0:
-                return
-            samples = self._placed(block.samples)
-            if len(samples):
-                self._time(samples)
-                self._keep(samples)
+        self.counts.malformed_frames += block.malformed
+        self.counts.error_frames += block.error_frames
+        if len(block) == 0:
+            return
+        samples = self._placed(block.samples)
+        if len(samples):
+            self._time(samples)
+            self._keep(samples)
 
     def _keep(self, samples: NDArray[Any]) -> None:
-        """Record and check samples that have their place; holds the lock."""
+        """Record and check samples that have their place."""
         raise NotImplementedError
 
     def _placed(self, samples: NDArray[Any]) -> NDArray[Any]:
@@ -237,31 +225,28 @@ class Stream(Generic[BlockT]):
         number = self._total if self._unwrapper is None else int(samples["counter"][-1])
         self._rate.append((self.last_s, self._total, self.last_s - number / self.nominal_rate_hz))
 
-    def _run(self) -> None:
+    def _receive(self, block: BlockT) -> None:
+        if self._closing.is_set() or self._lost.is_set():
+            return
         try:
-            self._read_all()
+            self.take(block)
         except Exception as error:  # a bug in a driver or here: report it at once, not after a timeout
             log.exception("the receiver of the %s failed", self._name)
             self._lose(f"{self._name}: internal: {type(error).__name__}: {error}")
 
-    def _read_all(self) -> None:
+    async def _watch_silence(self) -> None:
         silent_s = 0.0
-        while not self._closing.is_set():
-            began_s = self._clock.now_s()
-            try:
-                block = self._source.read(READ_TIMEOUT_S)
-            except DeviceError as error:
-                self._lose(str(error))
+        while True:
+            began_s, newest_s = self._clock.now_s(), self.last_s
+            if await self._tasks.sleep(LOOK_S, self._closing, self._lost):
                 return
-            read_s = min(self._clock.now_s() - began_s, LONGEST_READ_S * self._clock.speed)
-            newest_s = self.last_s
-            self.take(block)
-            silent_s = silent_s + read_s if self.last_s == newest_s else 0.0  # frames that repeat are silence, too
+            looked_s = min(self._clock.now_s() - began_s, LONGEST_READ_S * self._clock.speed)
+            silent_s = silent_s + looked_s if self.last_s == newest_s else 0.0  # frames that repeat are silence, too
             if silent_s > SILENCE_S * self._clock.speed:
                 self._lose(f"{self._name}: silent for {SILENCE_S:g} s; check its cable and supply")
-                return
 
     def _lose(self, reason: str) -> None:
-        if not self._closing.is_set():
-            self._source.close()
+        if not (self._closing.is_set() or self._lost.is_set()):
+            self._lost.set()
+            self._tasks.spawn(self._source.close(), f"{self._name} closing")
             self._on_lost(reason)

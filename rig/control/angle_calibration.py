@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from rig import archive
 from rig.acquire.angle_check import degrees
 from rig.acquire.angle_receiver import AngleReceiver
-from rig.clock import Clock, utc_text
+from rig.clock import utc_text
 from rig.devices import DeviceSettings
-from rig.errors import DeviceError, RecordingError, RefusedError, RigError
+from rig.errors import DeviceError, RefusedError, RigError
 from rig.limits import Limit, check
+from rig.machine import Machine
 from rig.messages import AngleCalibration, AnglePose
 from rig.signals import AngleScale
 
@@ -53,12 +53,18 @@ class AngleCalibrating:
         Its settings; None: the rig has none.
     """
 
-    def __init__(self, folder: Path, sensor: DeviceSettings | None, clock: Clock) -> None:
-        self._path, self._clock = folder / "angle-calibration.json", clock
+    def __init__(self, folder: Path, sensor: DeviceSettings | None, machine: Machine) -> None:
+        self._path = folder / "angle-calibration.json"
+        self._machine, self._clock = machine, machine.tasks.clock
         content = {} if sensor is None else sensor.model_dump(mode="json")
         self._sensor = {name: content[name] for name in SENSOR if name in content}
         self._first: tuple[AnglePose, float] | None = None
-        self.calibration = self._read() if sensor is not None else None
+        self.calibration: AngleCalibration | None = None
+
+    async def recall(self) -> None:
+        """Read the calibration that was stored for this sensor."""
+        if self._sensor:
+            self.calibration = await self._machine.tasks.work(self._read)
 
     @property
     def first(self) -> AnglePose | None:
@@ -87,7 +93,7 @@ class AngleCalibrating:
             "set_at_utc": "",
         }
 
-    def pose(self, angle_rad: float, by: str, receiver: AngleReceiver, bound: Limit, first: bool = False) -> bool:
+    async def pose(self, angle_rad: float, by: str, receiver: AngleReceiver, bound: Limit, first: bool = False) -> bool:
         """Take a pose; True if it completed a calibration. `first`: it begins anew, whichever one waits.
 
         Raises
@@ -108,7 +114,7 @@ class AngleCalibrating:
             self._first = pose, self._clock.now_s()
             return False
         found = self._of_two(before, pose, by, receiver.sensor.scale)
-        self._write(found)
+        await self._machine.tasks.work(self._write, found)
         self._first, self.calibration = None, found
         log.info("angle sensor calibrated by %s: %s", by, found.model_dump_json())
         return True
@@ -140,7 +146,7 @@ class AngleCalibrating:
 
     def _read(self) -> AngleCalibration | None:
         try:
-            content = json.loads(self._path.read_text("utf-8"))
+            content = json.loads(self._machine.disk.read(self._path))
             if content["sensor"] != self._sensor:
                 log.warning("%s: made with another sensor; take two poses again", self._path)
                 return None
@@ -154,9 +160,9 @@ class AngleCalibrating:
     def _write(self, found: AngleCalibration) -> None:
         content = {"sensor": self._sensor, "calibration": found.model_dump(mode="json")}
         try:
-            archive.write_atomically(self._path, json.dumps(content).encode())
-        except RecordingError as error:
-            raise RigError(f"angle_pose: {error}") from None
+            self._machine.disk.replace(self._path, json.dumps(content).encode())
+        except OSError as error:
+            raise RigError(f"angle_pose: {self._path}: {error.strerror}; free some disk space") from None
 
 
 def _slope(first: AnglePose, second: AnglePose) -> float:

@@ -16,7 +16,7 @@ log = logging.getLogger("rig")
 class Calibrating(Playing):
     """Opens, plays step by step, marks and closes a calibration."""
 
-    def calibrate(self, request: CalibrateStartRequest) -> Status:
+    async def calibrate(self, request: CalibrateStartRequest) -> Status:
         """Open a guided calibration; nothing is sent yet.
 
         Raises
@@ -26,16 +26,17 @@ class Calibrating(Playing):
         PlanError, RefusedError
             Wrong name or id; step, train, current or rate outside the limits, or too small to stimulate.
         """
-        with self._lock:
+        async with self._in_turn():
             following = self._trial.calibrate(request.participant)
             check_names("calibration", calibration_id=request.calibration_id, participant=request.participant)
             calibration = Calibration(request, self._table, self._clock.unix_s(), self._pair.steps)
-            self._store.check_room(f"{request.calibration_id}.001")
+            await self._tasks.work(self._store.check_room, f"{request.calibration_id}.001")
+            self._trial.may_start()  # a stop may have come meanwhile
             self._calibration = calibration
             self._change(following)
         return self.status()
 
-    def calibrate_step(self, direction: str, shown_us: float | None = None) -> Status:
+    async def calibrate_step(self, direction: str, shown_us: float | None = None) -> Status:
         """Play one train: a step up, a step down, or the same again; returns when it has started.
 
         Raises
@@ -44,7 +45,7 @@ class Calibrating(Playing):
             No calibration is open, or another width was shown; a train is playing; above a limit or the marked comfort
             maximum; its day is over.
         """
-        with self._lock:
+        async with self._in_turn():
             calibration = self._open_calibration()
             calibration.check_day(self._clock.unix_s())
             width_us = calibration.next_width_us(direction)
@@ -52,25 +53,26 @@ class Calibrating(Playing):
             request = calibration.train(width_us)
             test = plan.build(request, calibration.table)
             self._rest.check(test, calibration.rest)
-            self._store.check_room(request.test_id)
-            self._launch(test, calibration.table, self._trial.train(request.test_id))
+            await self._tasks.work(self._store.check_room, request.test_id)
+            self._open_calibration()  # a stop may have come meanwhile
+            await self._launch(test, calibration.table, self._trial.train(request.test_id))
         return self.status()
 
-    def calibrate_mark(self, threshold: Threshold) -> Status:
+    async def calibrate_mark(self, threshold: Threshold) -> Status:
         """Mark the last train's width as a threshold. Raises PlanError, BusyError, RefusedError (its day is over)."""
-        with self._lock:
+        async with self._in_turn():
             calibration = self._open_calibration()
             calibration.check_day(self._clock.unix_s())
             calibration.mark(threshold)
             self._publish(StateEvent(status=self.status()))
         return self.status()
 
-    def calibrate_finish(self, by: str, discard: bool) -> CalibrationResult:
+    async def calibrate_finish(self, by: str, discard: bool) -> CalibrationResult:
         """Close the calibration and give its profile.
 
         Raises PlanError (a threshold is missing), BusyError, RefusedError (its day is over).
         """
-        with self._lock:
+        async with self._in_turn():
             calibration = self._open_calibration()
             profile = None if discard else calibration.profile(self._clock.unix_s())
             log.info(

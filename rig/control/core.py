@@ -2,34 +2,31 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
-import threading
-import time
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
 from typing import Any
 
 from rig import limits
 from rig.acquire.angle_receiver import AngleReceiver
 from rig.acquire.halt import Cause, Halt
 from rig.acquire.run import TestRun
-from rig.clock import Clock
 from rig.config import RigConfig
 from rig.control.angle_calibration import AngleCalibrating
 from rig.control.calibration import Calibration
-from rig.control.latch import Latch, Remembered, lock_folder
+from rig.control.latch import Latch, Remembered
 from rig.control.live import finite, live_event
 from rig.control.pair import Pair
 from rig.control.rest import Rest
 from rig.control.sealing import RecordingStore
-from rig.errors import ConfigError, DeviceError, RigError
+from rig.errors import DeviceError, RigError
+from rig.machine import Machine
 from rig.messages import AngleStatus, Event, FinishedEvent, LiveEvent, StateEvent, Status, StopEvidence
+from rig.tasks import Signal, Task, Turn
 from rig.trial import Trial
 
 log = logging.getLogger("rig")
 
-HUNG_S = 5.0
-"""Real seconds after which a silent sender counts as hung: it asks for a health check at least once per second."""
-LOCK_PATIENCE_S = 0.2
 MAX_REQUEST_S = 60.0
 """Real seconds that a request may take: re-arming reopens both devices and seals journals that were left."""
 
@@ -37,38 +34,36 @@ MAX_REQUEST_S = 60.0
 class Core:
     """State and devices of a rig. Others use its subclass `rig.control.rig.Rig`.
 
-    `_lock` guards the state. A stop of a running test never waits for it.
+    Requests that begin something take their turn, one after the other. A stop never waits for it: it changes the state
+    at once, and what was begun finds that out before it goes on.
     """
 
-    def __init__(self, config: RigConfig, clock: Clock, publish: Callable[[Event], None]) -> None:
+    def __init__(self, config: RigConfig, machine: Machine, publish: Callable[[Event], None]) -> None:
         self._watch = config.watch.watch()
-        self._clock = clock
+        self._data_dir = config.data_dir
+        self._machine, self._tasks, self._clock = machine, machine.tasks, machine.tasks.clock
         self._publish = publish
         self._table = config.limits.table()
         self._require_calibration = config.require_calibration
-        self._store = RecordingStore(config, clock)
-        try:
-            self._store.make_folders()
-            self._folder_lock = lock_folder(config.data_dir)
-        except OSError as error:
-            raise ConfigError(f"data_dir: {error.filename or config.data_dir}: {error.strerror}") from None
-        self._latch = Latch(config.data_dir)
-        self._rest = Rest(config.data_dir, clock)
-        self._lock = threading.RLock()
+        self._store = RecordingStore(config, machine)
+        self._latch = Latch(config.data_dir, machine)
+        self._rest = Rest(config.data_dir, machine)
+        self._turn = Turn(machine.tasks)
+        self._turn_since_s: float | None = None
         self._trial = Trial()
-        self._pair = Pair(config, clock, self._fault, self._lost)
-        self._poses = AngleCalibrating(config.data_dir, config.angle_sensor, clock)
-        self._pair.rescale(self._poses.scale)
+        self._pair = Pair(config, machine, self._fault, self._lost)
+        self._poses = AngleCalibrating(config.data_dir, config.angle_sensor, machine)
         self._has_angle = config.angle_sensor is not None
         self._halt: Halt | None = None
         self._run: TestRun | None = None
-        self._thread: threading.Thread | None = None
+        self._playing: Task[None] | None = None
         self._evidence: StopEvidence | None = None
-        self._evidence_ready = threading.Event()
+        self._evidence_ready = Signal()
         self._next_live_pulse = 0
         self._calibration: Calibration | None = None
-        self._held_since_s: float | None = None
-        self._born_s = clock.now_s()
+        self._stops = 0
+        """How often it was stopped, or a fault was reported: a re-arm that began before does not count."""
+        self._born_s = self._clock.now_s()
         self.finished: FinishedEvent | None = None
 
     @property
@@ -88,9 +83,8 @@ class Core:
 
     def status(self) -> Status:
         """State, devices and limits now."""
-        with self._lock:
-            trial, run, receiver = self._trial, self._run, self._pair.receiver
-            calibration = self._calibration.status() if self._calibration else None
+        trial, run, receiver = self._trial, self._run, self._pair.receiver
+        calibration = self._calibration.status() if self._calibration else None
         elapsed_s = run.elapsed_s() if run else 0.0
         seen = receiver is not None and receiver.last_s is not None
         torque_nm = receiver.last_torque_nm if receiver else None
@@ -153,81 +147,81 @@ class Core:
         }
 
     def trouble(self) -> str | None:
-        """Which thread or request of this process hangs or has died; None: none. For the process's watchdog."""
-        if self._lock.acquire(timeout=LOCK_PATIENCE_S):
-            self._lock.release()
-            self._held_since_s = None
-        else:
-            now_s = time.monotonic()
-            since_s = self._held_since_s = self._held_since_s or now_s
-            if now_s - since_s > MAX_REQUEST_S:
-                return f"a request has been running for {now_s - since_s:.0f} s"
-        trial, run, thread, receiver = self._trial, self._run, self._thread, self._pair.receiver
-        if run is not None and run.sender_age_s() > HUNG_S:
-            return f"the sender hangs: no health check for {run.sender_age_s():.0f} s"
-        if trial.busy and not (thread is not None and (thread.is_alive() or thread.ident is None)):
-            return f"the thread of test {trial.test_id} ended, but its test did not"
+        """Which task or request of this process hangs or has died; None: none. For the process's watchdog."""
+        trial, receiver, since_s = self._trial, self._pair.receiver, self._turn_since_s
+        if since_s is not None and self._clock.now_s() - since_s > MAX_REQUEST_S * self._clock.speed:
+            return f"a request has been running for {(self._clock.now_s() - since_s) / self._clock.speed:.0f} s"
+        if trial.busy and self._run is not None and (self._playing is None or self._playing.done.is_set()):
+            return f"the task of test {trial.test_id} ended, but its test did not"
         if receiver is not None and not receiver.living and trial.state != "disconnected" and not trial.lost:
-            return "the torque receiver's thread has ended"
+            return "the torque receiver has ended"
         return None
 
     def live(self, samples: bool = False) -> LiveEvent | None:
-        """Torque and pulses since the last call, every sample if asked for; None if there is no new torque."""
-        with self._lock:
-            run, receiver, now_s = self._run, self._pair.receiver, self._clock.now_s()
-            if receiver is None:
-                return None
-            origin_s = run.t0_s if run and run.t0_s is not None else self._born_s
-            event = live_event(receiver, run, origin_s, now_s, self._next_live_pulse, samples, self._pair.angle)
-            if event is not None:
-                self._next_live_pulse += len(event.pulse_time_s)
-            return event
+        """Torque and pulses since the last call, every sample if asked for; None if there is no new torque.
+
+        It only reads, and takes what waits to be shown: it may be called from another thread than the tasks'.
+        """
+        run, receiver, now_s = self._run, self._pair.receiver, self._clock.now_s()
+        if receiver is None:
+            return None
+        origin_s = run.t0_s if run and run.t0_s is not None else self._born_s
+        event = live_event(receiver, run, origin_s, now_s, self._next_live_pulse, samples, self._pair.angle)
+        if event is not None:
+            self._next_live_pulse += len(event.pulse_time_s)
+        return event
+
+    @contextlib.asynccontextmanager
+    async def _in_turn(self) -> AsyncIterator[None]:
+        """For requests that begin something: one after the other."""
+        async with self._turn:
+            self._turn_since_s = self._clock.now_s()
+            try:
+                yield
+            finally:
+                self._turn_since_s = None
 
     def _fault(self, reason: str) -> None:
-        """A device reports a fault; called from one of its threads."""
+        """A device reports a fault."""
         log.error("%s", reason)
         self._end("fault", reason)
 
     def _lost(self, reason: str) -> None:
-        """A device is gone; called from one of its threads."""
+        """A device is gone."""
         log.error("%s", reason)
         self._end("fault", reason, latch_idle=False)
-        with self._lock:
-            self._change(self._trial.disconnected(reason))
+        self._change(self._trial.disconnected(reason))
 
     def _end(self, cause: Cause, reason: str, latch_idle: bool = True) -> bool:
-        """End the running test, or latch; True if a test runs. Takes the lock only when idle: a stop never waits."""
+        """End the running test, or latch; True if a test runs."""
+        self._stops += 1
         halt = self._halt
-        if not (self._trial.busy and halt is not None):
-            with self._lock:  # a test may be starting, and must then be ended, too
-                halt = self._halt if self._trial.busy else None
-                if halt is None and latch_idle:
-                    self._halted(reason)
-        if halt is not None:
+        if self._trial.busy and halt is not None:
             halt.set(cause, reason)
-        return halt is not None
+            return True
+        if latch_idle:
+            self._halted(reason)
+        return False
 
-    def _remember(self, state: Remembered, reason: str) -> None:
+    async def _remember(self, state: Remembered, reason: str) -> None:
         """Write the latch file. If the disk fails, the rig stays stopped, and the file still holds "running" from the
         test's start, so that the next process starts as uncertain."""
         try:
-            self._latch.write(state, reason)
+            await self._latch.write(state, reason)
         except RigError as error:
             log.error("%s", error)
 
     def _halted(self, reason: str) -> None:
-        with self._lock:
-            following = self._trial.halted(reason)
-            if following.state == "latched":
-                self._remember("latched", reason)
-            self._change(following)
+        following = self._trial.halted(reason)
+        if following.state == "latched" and following != self._trial:
+            self._tasks.spawn(self._remember("latched", reason), "latch file")
+        self._change(following)
 
     def _change(self, trial: Trial) -> None:
-        with self._lock:
-            changed = trial != self._trial
-            self._trial = trial
-            if not trial.calibrating:
-                self._calibration = None  # a stop, a fault or a lost device closes it
+        changed = trial != self._trial
+        self._trial = trial
+        if not trial.calibrating:
+            self._calibration = None  # a stop, a fault or a lost device closes it
         if changed:
             log.info("state %s %s", trial.state, trial.reason, extra={"test_id": trial.test_id})
             self._publish(StateEvent(status=self.status()))

@@ -16,11 +16,11 @@ MIN_KEY = 16
 
 
 class Extending(Calibrating):
-    """Extends the running test and ends it well. Takes no lock that a start, a re-arm or a status may hold."""
+    """Extends the running test and ends it well. Waits for no start and no re-arm."""
 
     _key = ""
 
-    def extend(self, request: ExtendRequest) -> Extended:
+    async def extend(self, request: ExtendRequest) -> Extended:
         """Lay segments behind everything that is laid.
 
         Raises
@@ -37,12 +37,12 @@ class Extending(Calibrating):
         run = self._running(request.test_id)
         if not hmac.compare_digest(request.key.encode("utf-8", "replace"), self._key.encode("utf-8", "replace")):
             raise PlanError("extend.key: it is not the key with which this test was started")
-        run.score.extend(request.after, request.segments)
+        await run.score.extend(request.after, request.segments)
         names = ", ".join(segment.name for segment in request.segments)
         log.info("extended by %s, %.3f s are laid", names, run.score.duration_s, extra={"test_id": request.test_id})
         return run.score.left(run.torque_time_nms)
 
-    def enough(self, request: EnoughRequest) -> Extended:
+    async def enough(self, request: EnoughRequest) -> Extended:
         """End the running test with its safe end. Raises TooLateError, PlanError, JournalError."""
         run = self._running(request.test_id)
         run.score.enough(request.by, request.at_once)

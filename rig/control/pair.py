@@ -10,10 +10,10 @@ from rig import devices, limits
 from rig.acquire.angle_receiver import AngleReceiver
 from rig.acquire.receiver import Receiver
 from rig.acquire.run import FRESH_S, SETTLE_S
-from rig.clock import Clock
 from rig.config import RigConfig
 from rig.errors import DeviceError
 from rig.gate import Gate
+from rig.machine import Machine
 from rig.signals import AngleScale
 
 log = logging.getLogger("rig.pair")
@@ -28,14 +28,14 @@ class Pair:
     Parameters
     ----------
     on_fault, on_lost
-        Called with the reason from the devices' threads.
+        Called with the reason.
     """
 
     def __init__(
-        self, config: RigConfig, clock: Clock, on_fault: Callable[[str], None], on_lost: Callable[[str], None]
+        self, config: RigConfig, machine: Machine, on_fault: Callable[[str], None], on_lost: Callable[[str], None]
     ) -> None:
-        self._config = config
-        self._clock = clock
+        self._config, self._machine = config, machine
+        self._tasks, self._clock = machine.tasks, machine.tasks.clock
         self._on_fault, self._on_lost = on_fault, on_lost
         self.gate: Gate | None = None
         self.receiver: Receiver | None = None
@@ -52,24 +52,23 @@ class Pair:
         """What each device says that it is."""
         return self._identity if self.angle is None else {**self._identity, "angle_sensor": self.angle.identity}
 
-    def connect(self) -> None:
+    async def connect(self) -> None:
         """Open both. A stimulator that is found able to stimulate is stopped at once, since no test runs.
 
         Raises DeviceError (both are then closed) and ConfigError (the DBC lacks the signal).
         """
         settings = self._config.stimulator, self._config.load_cell
-        stimulator = devices.find("stimulator", settings[0].device).create(settings[0], self._clock)
-        cell = devices.find("load_cell", settings[1].device).create(settings[1], self._clock)
+        stimulator = devices.find("stimulator", settings[0].device).create(settings[0], self._machine)
+        cell = devices.find("load_cell", settings[1].device).create(settings[1], self._machine)
         gate = Gate(stimulator, self._clock, self._on_fault, self._on_lost)
-        self._identity["stimulator"] = gate.identify()
+        receiver = Receiver(cell, self._tasks, self._on_lost)
+        self._identity["stimulator"] = await gate.identify()
         try:
-            self._stop_what_was_left(gate)
-            self._identity["load_cell"] = cell.open()
+            await self._stop_what_was_left(gate)
+            self._identity["load_cell"] = await receiver.open()
         except DeviceError:
-            gate.disconnect()
+            await gate.disconnect()
             raise
-        receiver = Receiver(cell, self._clock, self._on_lost)
-        receiver.start()
         self.gate, self.receiver, self.steps = gate, receiver, stimulator.steps
         self._watch_angle()
 
@@ -78,8 +77,8 @@ class Pair:
         settings = self._config.angle_sensor
         if settings is None:
             return
-        sensor = devices.find("angle_sensor", settings.device).create(settings, self._clock)
-        self.angle = AngleReceiver(sensor, self._clock)
+        sensor = devices.find("angle_sensor", settings.device).create(settings, self._machine)
+        self.angle = AngleReceiver(sensor, self._tasks)
         self.rescale(self._scale)
         self.angle.start()
 
@@ -89,49 +88,52 @@ class Pair:
         if self.angle is not None:
             self.angle.rescale(scale or self.angle.sensor.scale)
 
-    def _stop_what_was_left(self, gate: Gate) -> None:
-        safe, state = gate.state()
+    async def _stop_what_was_left(self, gate: Gate) -> None:
+        safe, state = await gate.state()
         self.found_state = state
         if not safe:
             log.warning("the stimulator was found %s; stopped", state)
-            gate.stop()
+            await gate.stop()
 
-    def disconnect(self) -> None:
+    async def disconnect(self) -> None:
         """Stop stimulation and close all; never raises."""
-        if self.gate is not None:
-            self.gate.disconnect()
-        if self.angle is not None:
-            self.angle.close()
-        if self.receiver is not None:
-            self.receiver.close()
+        gate, angle, receiver = self.gate, self.angle, self.receiver
         self.gate = self.receiver = self.angle = None
+        if gate is not None:
+            await gate.disconnect()
+        if angle is not None:
+            await angle.close()
+        if receiver is not None:
+            await receiver.close()
 
-    def reconnect(self) -> None:
+    async def reconnect(self) -> None:
         """Close both, open them again and check that torque arrives. Raises DeviceError."""
-        self.disconnect()
-        self.connect()
-        if not self.torque_comes():
+        await self.disconnect()
+        await self.connect()
+        if not await self.torque_comes():
             raise DeviceError("load cell: connected, but no torque arrives; check its cable and start frames")
 
-    def both_answer(self) -> bool:
+    async def both_answer(self) -> bool:
         """Stop the stimulator, ask its state, and check that torque arrives; False if one of them fails."""
         if self.gate is None or self.receiver is None:
             return False
         try:
-            self.gate.stop()
-            self.gate.state()
+            await self.gate.stop()
+            await self.gate.state()
         except DeviceError:
             return False
-        return self.torque_comes()
+        return await self.torque_comes()
 
-    def torque_comes(self) -> bool:
+    async def torque_comes(self) -> bool:
         """Whether a new sample arrives within a short time from now."""
-        assert self.receiver is not None
+        receiver = self.receiver
+        if receiver is None:
+            return False
         asked_s = self._clock.now_s()
         end_s = asked_s + FRESH_S * self._clock.speed
-        while self.receiver.age_s(asked_s) >= 0 or not self.receiver.settled():
-            came = self.receiver.age_s(asked_s) < 0
+        while receiver.age_s(asked_s) >= 0 or not receiver.settled():
+            came = receiver.age_s(asked_s) < 0
             if self._clock.now_s() > (end_s + SETTLE_S * self._clock.speed if came else end_s):
                 return False
-            self._clock.wait(self._clock.now_s() + 0.005 * self._clock.speed)
+            await self._tasks.sleep(0.005)
         return True

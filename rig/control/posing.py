@@ -16,7 +16,7 @@ NO_SENSOR = "{}: this rig has no angle sensor; name one in its rig file (docs/ri
 class Posing(Extending):
     """Takes poses. Nothing is sent to a device meanwhile."""
 
-    def angle_pose(self, request: AnglePoseRequest) -> Status:
+    async def angle_pose(self, request: AnglePoseRequest) -> Status:
         """The goniometer's angle of a joint that is held still; the second one completes a calibration.
 
         Raises
@@ -28,23 +28,23 @@ class Posing(Extending):
         DeviceError, RefusedError, RigError
             See `AngleCalibrating.pose`.
         """
-        with self._lock:
+        async with self._in_turn():
             if not self._has_angle:
                 raise PlanError(NO_SENSOR.format("angle_pose"))
             if self._trial.busy:
                 raise BusyError(f"test {self._trial.test_id} is {self._trial.state}; take the pose afterwards")
-            self._poses.pose(
+            await self._poses.pose(
                 request.angle_rad, request.by, self._angle_receiver(), self._table["angle_rad"], request.first
             )
             self._pair.rescale(self._poses.scale)
             self._publish(StateEvent(status=self.status()))
         return self.status()
 
-    def _await_angle(self, plan: TestPlan) -> None:
-        """Wait for a first angle, where a test asks for one; without the lock, so that no stop waits behind it."""
+    async def _await_angle(self, plan: TestPlan) -> None:
+        """Wait for a first angle, where a test asks for one."""
         receiver = self._angle_receiver() if plan.angle is not None and self._has_angle else None
         if receiver is not None:
-            await_angle(receiver, self._clock)
+            await await_angle(receiver, self._tasks)
 
     def _check_angle(self, plan: TestPlan, table: dict[str, Limit]) -> None:
         """Refuse a test that asks for an angle that this rig cannot give, or where the joint is elsewhere."""

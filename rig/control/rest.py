@@ -13,35 +13,35 @@ import json
 import logging
 from pathlib import Path
 
-from rig import archive, limits
+from rig import limits
 from rig.acquire.run import LEAD_S
-from rig.clock import Clock, utc_text
-from rig.errors import RecordingError, RestError
+from rig.clock import utc_text
+from rig.errors import RestError
+from rig.machine import Machine
 from rig.plan import PlannedTest
 
 log = logging.getLogger("rig.rest")
-
-BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 
 
 class Rest:
     """Time of the last pulse on the rig's clock; None: there was none with this data folder."""
 
-    def __init__(self, folder: Path, clock: Clock) -> None:
-        self._folder, self._clock = folder, clock
+    def __init__(self, folder: Path, machine: Machine) -> None:
+        self._folder, self._machine = folder, machine
+        self._clock, self._work = machine.tasks.clock, machine.tasks.work
         self._path = folder / "last-pulse.json"
         self.last_pulse_s: float | None = None
         self._ended = True
 
-    def recall(self, in_doubt: bool) -> None:
+    async def recall(self, in_doubt: bool) -> None:
         """Read what the last process stored. `in_doubt`: it crashed, so the time of its last pulse is unknown."""
-        remembered_s = None if in_doubt else self._read()
-        if remembered_s is not None:
+        remembered_s, used = await self._work(self._read)
+        if remembered_s is not None and not in_doubt:
             self.last_pulse_s = remembered_s
-        elif in_doubt or self._path.exists() or self._used():
-            self.pulse_at(self._clock.now_s(), ended=False)
+        elif in_doubt or used:
+            await self.pulse_at(self._clock.now_s(), ended=False)
 
-    def pulse_at(self, time_s: float, ended: bool = True) -> None:
+    async def pulse_at(self, time_s: float, ended: bool = True) -> None:
         """Store the time of the last pulse; if the disk fails, the next process is in doubt.
 
         `ended` is False if the end of stimulation is not confirmed: a stalled line may still hold a pulse.
@@ -49,21 +49,25 @@ class Rest:
         self.last_pulse_s, self._ended = time_s, ended
         content = {
             "ended": ended,
-            "boot_id": boot_id(),
+            "boot_id": self._machine.boot_id,
             "monotonic_s": time_s / self._clock.speed,
             "written_utc": utc_text(self._clock.unix_s()),
         }
-        try:
-            archive.write_atomically(self._path, json.dumps(content).encode())
-        except RecordingError as error:
-            log.error("the last pulse's time could not be written: %s", error)
-            with contextlib.suppress(OSError):  # the disk is read-only now: the latch file still says that a test ran
-                self._path.unlink(missing_ok=True)
+        await self._work(self._write, json.dumps(content).encode())
 
-    def settle(self) -> None:
+    def _write(self, data: bytes) -> None:
+        disk = self._machine.disk
+        try:
+            disk.replace(self._path, data)
+        except OSError as error:
+            log.error("the last pulse's time could not be written: %s: %s", self._path, error.strerror)
+            with contextlib.suppress(OSError):  # the disk is read-only now: the latch file still says that a test ran
+                disk.remove(self._path)
+
+    async def settle(self) -> None:
         """The stimulator has answered, so the line is empty; a held pulse may have been felt just now."""
         if not self._ended:
-            self.pulse_at(self._clock.now_s())
+            await self.pulse_at(self._clock.now_s())
 
     def check(self, test: PlannedTest, limit: limits.Limit) -> None:
         """Raise RestError if the earliest pulse follows the last one too soon."""
@@ -76,25 +80,23 @@ class Rest:
         if refusal is not None:
             raise RestError(f"plan: {refusal}; wait {limit.lo - rest_s:.1f} s")
 
-    def _read(self) -> float | None:
-        """The stored time, if it certainly belongs to this boot."""
+    def _read(self) -> tuple[float | None, bool]:
+        """The stored time, if it certainly belongs to this boot; whether any test was ever played with this folder.
+
+        Older versions stored no time of the last pulse.
+        """
+        disk, boot_id = self._machine.disk, self._machine.boot_id
+        used = any(disk.names(self._folder / name) for name in ("recordings", "journals"))
         try:
-            content = json.loads(self._path.read_text("utf-8"))
-            here, monotonic_s = boot_id(), float(content["monotonic_s"])
-            certain = bool(here) and content["boot_id"] == here and content["ended"] is True
-        except (OSError, ValueError, KeyError, TypeError):
-            return None
-        time_s = monotonic_s * self._clock.speed
-        return time_s if certain and 0 <= time_s <= self._clock.now_s() else None
-
-    def _used(self) -> bool:
-        """Whether any test was ever played with this folder; older versions stored no time of the last pulse."""
-        return any(any((self._folder / name).glob("*")) for name in ("recordings", "journals"))
-
-
-def boot_id() -> str:
-    """Id of this boot of the machine; empty if the system has none."""
-    try:
-        return BOOT_ID.read_text("ascii").strip()
-    except (OSError, ValueError):
-        return ""
+            data = disk.read(self._path)
+        except FileNotFoundError:
+            return None, used
+        except OSError:
+            return None, True
+        try:
+            content = json.loads(data)
+            time_s = float(content["monotonic_s"]) * self._clock.speed
+            certain = bool(boot_id) and content["boot_id"] == boot_id and content["ended"] is True
+        except (ValueError, KeyError, TypeError):
+            return None, True
+        return (time_s if certain and 0 <= time_s <= self._clock.now_s() else None), True

@@ -10,46 +10,57 @@ from rig.control.calibration import check_profile
 from rig.control.extending import check_key
 from rig.control.playing import check_names
 from rig.control.posing import Posing
-from rig.errors import DeviceError
-from rig.messages import PASSIVE, Status, StopEvidence, TestPlan
+from rig.errors import BusyError, ConfigError, DeviceError
+from rig.messages import PASSIVE, Sequences, Status, StopEvidence, TestPlan
 from rig.trial import Trial
 
 log = logging.getLogger("rig")
 
 STOP_TIMEOUT_S = 6.0
 """Real seconds to wait for the evidence of a stop, including the fall of the torque."""
+SEALED_WITHIN_S = 30.0
+"""Real seconds within which a test that was stopped is sealed."""
 
 
 class Rig(Posing):
-    """Owns the devices. All methods may be called from any thread.
+    """Owns the devices. All but `status`, `trouble` and `live` are tasks of the machine.
 
     Parameters
     ----------
     publish
-        Receives all events except live ones; called from any thread, must not block.
-
-    Raises
-    ------
-    ConfigError, BusyError
-        The data folder cannot be used, or another rig is using it.
+        Receives all events except live ones; must not block.
     """
 
-    def open(self) -> None:
-        """Seal what a crash left, then connect; a missing device is reported in the status, not raised."""
-        remembered, reason = self._latch.read()
-        for event in self._store.recover("the rig process died during the test"):
+    async def open(self) -> None:
+        """Seal what a crash left, then connect; a missing device is reported in the status, not raised.
+
+        Raises
+        ------
+        ConfigError, BusyError
+            The data folder cannot be used, or another rig is using it.
+        """
+        work = self._tasks.work
+        try:
+            await work(self._store.make_folders)
+            self._folder_lock = await work(self._machine.disk.lock, self._data_dir)
+        except OSError as error:
+            raise ConfigError(f"data_dir: {error.filename or self._data_dir}: {error.strerror}") from None
+        await self._poses.recall()
+        self._pair.rescale(self._poses.scale)
+        remembered, reason = await self._latch.read()
+        for event in await work(self._store.recover, "the rig process died during the test"):
             remembered = "running"
             self.finished = event
             self._publish(event)
         before = None
-        self._rest.recall(in_doubt=remembered == "running")  # after a crash the last pulse's time is unknown
+        await self._rest.recall(in_doubt=remembered == "running")  # after a crash the last pulse's time is unknown
         if remembered == "running":
             before, reason = "uncertain", f"the rig died during a test ({reason or 'its journal was left'})"
         elif remembered == "latched":
             before = "latched"
         trial = Trial().connected(before, reason)
         try:
-            self._pair.connect()
+            await self._pair.connect()
         except DeviceError as error:
             log.error("%s", error)
             trial = trial.disconnected(str(error))  # a latch stays although a device is missing
@@ -58,17 +69,16 @@ class Rig(Posing):
                 trial = replace(trial, reason=f"{reason}; the stimulator, asked now: {self._pair.found_state}")
         self._change(trial)
 
-    def close(self) -> None:
+    async def close(self) -> None:
         """Stop a running test, wait until it is sealed, disconnect."""
-        self.stop("the rig is shutting down", "rig", latch_idle=False)
-        thread = self._thread
-        if thread is not None:
-            thread.join(timeout=30)
-        self._pair.disconnect()
-        self._folder_lock.close()
+        await self.stop("the rig is shutting down", "rig", latch_idle=False)
+        if self._playing is not None:
+            await self._tasks.sleep(SEALED_WITHIN_S, self._playing.done)
+        await self._pair.disconnect()
+        self._folder_lock.__exit__(None, None, None)
 
-    def start(self, request: TestPlan, key: str = "") -> Status:
-        """Start a test in its own thread; `key` is what extensions of an adaptive test must know.
+    async def start(self, request: TestPlan, key: str = "") -> Status:
+        """Start a test; `key` is what extensions of an adaptive test must know.
 
         Raises
         ------
@@ -79,40 +89,47 @@ class Rig(Posing):
         JournalError, RigError
             The journal or the latch file cannot be written.
         """
-        self._trial.may_start()  # before the lock: a start that was asked for while stopped must not run later
-        self._await_angle(request)
-        with self._lock:
+        self._trial.may_start()  # before its turn: a start that was asked for while stopped must not run later
+        await self._await_angle(request)
+        async with self._in_turn():
             self._trial.may_start()
             check_names("plan", test_id=request.test_id, participant=request.participant)
             check_key(request, key)
             table = limits.for_plan(self._table, request)
-            test = plan.build(request, table)
+            test = await self._tasks.work(plan.build, request, table)
+            await self._tasks.work(self._store.check_room, request.test_id)
+            following = self._trial.start(request.test_id, request.participant)  # a stop may have come meanwhile
             now_s, longest_s = self._clock.unix_s(), test.longest_s / self._clock.speed
             needs_widths = self._require_calibration and request.kind != PASSIVE  # no pulse, so no width to find
             check_profile(request.profile, now_s, needs_widths, longest_s)
             plan.check_steps(test, self._pair.steps)
             self._rest.check(test, table["rest_between_tests_s"])
             self._check_angle(request, table)
-            self._store.check_room(request.test_id)
             self._key = key
-            self._launch(test, table, self._trial.start(request.test_id, request.participant))
+            await self._launch(test, table, following)
         return self.status()
 
-    def stop(self, reason: str, by: str, latch_idle: bool = True) -> StopEvidence:
+    async def library(self) -> Sequences:
+        """All sequences and protocols that a plan may name."""
+        return await self._tasks.work(plan.library)
+
+    async def stop(self, reason: str, by: str, latch_idle: bool = True) -> StopEvidence:
         """Stop stimulation now, latch, and return what device and torque showed afterwards."""
         words = f"{reason} (by {by})" if by else reason
         if self._end("stopped", words, latch_idle):
-            self._evidence_ready.wait(STOP_TIMEOUT_S)
-            return self._evidence or self._unconfirmed("no more pulses are sent; the device did not answer in time")
+            await self._tasks.sleep(STOP_TIMEOUT_S, self._evidence_ready)
+            if self._evidence is not None or self._trial.busy:
+                return self._evidence or self._unconfirmed("no more pulses are sent; the device did not answer in time")
+        await self._latch.written()
         gate = self._pair.gate
         if gate is None:
             return StopEvidence(confirmed=False, detail="the stimulator is not connected; no pulse can be sent")
         try:
-            gate.stop()
-            safe, state = gate.state()
+            await gate.stop()
+            safe, state = await gate.state()
         except DeviceError as error:
             return self._unconfirmed(str(error))
-        self._rest.settle()
+        await self._rest.settle()
         return StopEvidence(confirmed=safe, detail=f"no test was running; device: {state}", device_state=state)
 
     def _unconfirmed(self, detail: str) -> StopEvidence:
@@ -121,29 +138,33 @@ class Rig(Posing):
         words = "; ".join(part for part in (detail, possible) if part)
         return StopEvidence(confirmed=False, detail=words, pulse_may_follow=bool(possible))
 
-    def rearm(self, by: str) -> Status:
+    async def rearm(self, by: str) -> Status:
         """A person has checked participant and rig: ask both devices again, then be ready.
 
         Raises
         ------
         BusyError
-            A test is in progress.
+            A test is in progress; or the rig was stopped once more meanwhile.
         DeviceError
             A device does not answer: the rig stays stopped.
         """
-        with self._lock:
-            following = self._trial.rearm()
-            if self._trial.lost or not self._pair.both_answer():
+        async with self._in_turn():
+            stopped, stops = self._trial, self._stops
+            following = stopped.rearm()
+            if stopped.lost or not await self._pair.both_answer():
                 try:
-                    self._pair.reconnect()
+                    await self._pair.reconnect()
                 except DeviceError as error:
                     self._change(self._trial.disconnected(str(error)))
                     raise
-            for event in self._store.recover("its recording could not be sealed at its end"):
+            for event in await self._tasks.work(self._store.recover, "its recording could not be sealed at its end"):
                 self.finished = event
                 self._publish(event)
-            self._rest.settle()
-            self._latch.clear()
-            log.info("re-armed by %s after: %s", by, self._trial.reason)
+            await self._rest.settle()
+            await self._latch.clear()
+            if self._stops != stops or self._trial.lost != stopped.lost:
+                await self._remember("latched", stopped.reason)
+                raise BusyError("re-arm: the rig was stopped again meanwhile; look at the participant, then re-arm")
+            log.info("re-armed by %s after: %s", by, stopped.reason)
             self._change(following)
         return self.status()

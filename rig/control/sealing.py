@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
-import shutil
-import uuid
-from collections.abc import Iterator
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -15,10 +13,10 @@ import numpy as np
 
 from rig import archive, assembly, journal
 from rig.acquire.run import RunResult, spread_ms
-from rig.clock import Clock
 from rig.config import RigConfig
 from rig.errors import JournalError, PlanError, RecordingError
 from rig.journal import Journal
+from rig.machine import Log, Machine
 from rig.messages import FinishedEvent
 from rig.plan import PlannedTest
 
@@ -33,18 +31,18 @@ DOUBTFUL_RATE = 0.02
 
 
 class RecordingStore:
-    """The folders of unfinished journals and sealed recordings in the data folder."""
+    """The folders of unfinished journals and sealed recordings in the data folder. All of it may block for long."""
 
-    def __init__(self, config: RigConfig, clock: Clock) -> None:
+    def __init__(self, config: RigConfig, machine: Machine) -> None:
         self._config = config
-        self._clock = clock
+        self._machine, self._disk, self._clock = machine, machine.disk, machine.tasks.clock
         self.journals = config.data_dir / "journals"
         self.recordings = config.data_dir / "recordings"
 
     def make_folders(self) -> None:
         """Create what is missing. Raises OSError."""
         for folder in (self.journals, self.recordings):
-            folder.mkdir(parents=True, exist_ok=True)
+            self._disk.make_folder(folder)
 
     def check_room(self, test_id: str) -> None:
         """Check that a test of that id can be stored.
@@ -56,8 +54,8 @@ class RecordingStore:
         JournalError
             The disk is nearly full.
         """
-        used = (self.journals / f"{test_id}.journal").exists() or any(self.recordings.glob(f"*Z_{test_id}.h5"))
-        if used:
+        sealed = any(name.endswith(f"Z_{test_id}.h5") for name in self._disk.names(self.recordings))
+        if sealed or f"{test_id}.journal" in self._disk.names(self.journals):
             raise PlanError(f"plan.test_id: {test_id!r} was already used; give each test a new id")
         free = self._free_bytes()
         if free < MIN_FREE_BYTES:
@@ -67,7 +65,7 @@ class RecordingStore:
             )
 
     def _free_bytes(self) -> int:
-        return shutil.disk_usage(self._config.data_dir).free
+        return self._disk.free_bytes(self._config.data_dir)
 
     def begin(self, test: PlannedTest, identity: dict[str, Any], angle: dict[str, Any] | None = None) -> Journal:
         """Create a journal with its header and plan, synced to the disk. Raises JournalError.
@@ -75,9 +73,9 @@ class RecordingStore:
         Of an adaptive test only the first segment is certain. `angle` describes the angle sensor, if there is one.
         """
         certain = test.segments if test.plan.adaptive is None else test.segments[:1]
-        book = Journal(self.journals / f"{test.plan.test_id}.journal")
+        book = Journal(self._create(self.journals / f"{test.plan.test_id}.journal"))
         header = {
-            "recording_id": uuid.uuid4().hex,
+            "recording_id": self._machine.new_id(),
             "plan": test.plan.model_dump(mode="json"),
             "segments": [{"name": s.name, "start": s.start, "end": s.end, "by": "plan"} for s in certain],
             "current_ma": test.plan.profile.current_ma,
@@ -90,6 +88,12 @@ class RecordingStore:
         }
         book.begin(header, test.pulse_width_us[: certain[-1].end].astype("<f8").tobytes())
         return book
+
+    def _create(self, path: Path) -> Log:
+        try:
+            return self._disk.create(path)
+        except OSError as error:
+            raise JournalError(f"journal {path}: {error.strerror}; free some disk space or correct data_dir") from None
 
     def finish(self, path: Path, test_id: str, result: RunResult) -> FinishedEvent:
         """Seal a test that has just ended."""
@@ -117,7 +121,7 @@ class RecordingStore:
             summary["angle"] = {name: counts[name] for name in ("samples", "lost_samples", "duplicate_samples")}
         return self._seal(path, test_id, result.outcome, result.reason, summary, result.last_sample_unix_s)
 
-    def recover(self, reason: str) -> Iterator[FinishedEvent]:
+    def recover(self, reason: str) -> list[FinishedEvent]:
         """Seal the journals that a crash or a full disk left; a journal with nothing to seal is renamed, never deleted.
 
         Parameters
@@ -125,12 +129,18 @@ class RecordingStore:
         reason
             Why it was left; used for journals that do not say how the test ended.
         """
-        for path in sorted(self.journals.glob("*.journal")):
-            log.warning("recovering %s", path.name)
-            event = self._seal(path, path.stem, "fault", reason, {"recovered": True}, None)
-            if path.exists() and self._free_bytes() >= MIN_FREE_BYTES:  # else the disk is full: try again later
-                path.rename(path.with_suffix(".unsealed"))
-            yield event
+        events = []
+        for name in self._disk.names(self.journals):
+            path = self.journals / name
+            if path.suffix != ".journal":
+                continue
+            log.warning("recovering %s", name)
+            events.append(self._seal(path, path.stem, "fault", reason, {"recovered": True}, None))
+            left = name in self._disk.names(self.journals)
+            if left and self._free_bytes() >= MIN_FREE_BYTES:  # else the disk is full: try again later
+                with contextlib.suppress(OSError):
+                    self._disk.rename(path, path.with_suffix(".unsealed"))
+        return events
 
     def _seal(
         self, path: Path, test_id: str, outcome: str, reason: str, summary: dict[str, Any], unix_s: float | None
@@ -141,12 +151,12 @@ class RecordingStore:
         """
         sealed = None
         try:
-            contents = journal.read(path)
-            sealed = archive.seal(assembly.assemble(contents, outcome, reason), self.recordings)
+            contents = journal.parse(path, self._disk.read(path))
+            sealed = archive.seal(assembly.assemble(contents, outcome, reason), self.recordings, self._disk)
             if contents.damaged:  # the readable part is sealed; the file is kept for inspection
-                path.rename(path.with_suffix(".damaged"))
+                self._disk.rename(path, path.with_suffix(".damaged"))
             else:
-                path.unlink()
+                self._disk.remove(path)
         except (RecordingError, OSError) as error:
             log.error("%s", error, extra={"test_id": test_id})
             reason = "; ".join(part for part in (reason, str(error)) if part)

@@ -1,6 +1,6 @@
 """The Unix socket: requests in, replies and events out, one JSON object per line. Also starts the stop socket.
 
-Work with a device or the disk runs in worker threads; previews are built in another process. The numbers of
+Requests are tasks of the rig, in its own thread; previews are built in another process. The numbers of
 connections, of waiting requests and of bytes in a request are limited; requests above a limit are refused at once.
 """
 
@@ -9,25 +9,24 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Coroutine
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
-from rig import plan
 from rig.control.connections import Connections
 from rig.control.previews import Previews
 from rig.control.replies import head_of, id_of, internal_error, invalid_request, refusal, to_line
 from rig.control.rig import Rig
 from rig.control.stop_server import StopServer
 from rig.errors import BusyError, ConfigError, PlanError, RigError
-from rig.messages import LONGEST_LINE, Event, LiveEvent, Reply, Request, StateEvent, stop_socket
+from rig.messages import LONGEST_LINE, Event, LiveEvent, Reply, Request, StateEvent, Status, stop_socket
 
 log = logging.getLogger("rig.socket")
 
 LIVE_PERIOD_S = 0.05
-WORKERS = 32
 SLOW_BYTES = 1_000_000
 """A subscriber with this many unread bytes gets no live events until it has read them."""
 DEAD_BYTES = 8_000_000
@@ -38,6 +37,7 @@ MAX_PENDING = 64
 MAX_SILENT, MAX_ACTIVE = 64, 128
 
 _REQUEST: TypeAdapter[Any] = TypeAdapter(Request)
+Ask = Callable[[Callable[[], Coroutine[Any, Any, Any]]], Future[Any]]
 
 
 class Server:
@@ -45,6 +45,7 @@ class Server:
 
     def __init__(self) -> None:
         self.rig: Rig | None = None
+        self._ask: Ask
         self._loop: asyncio.AbstractEventLoop | None = None
         self._subscribers: dict[asyncio.StreamWriter, bool] = {}
         """Who gets events, and whether with every torque sample."""
@@ -59,17 +60,19 @@ class Server:
         if self._loop is not None and not self._loop.is_closed():
             self._loop.call_soon_threadsafe(self._send_all, event)
 
-    async def start(self, rig: Rig, path: Path) -> None:
-        """Listen on `path` and on the stop socket; only this user and group may connect."""
+    async def start(self, rig: Rig, ask: Ask, path: Path) -> None:
+        """Listen on `path` and on the stop socket; only this user and group may connect.
+
+        `ask` starts a task of the rig, from any thread.
+        """
         self._loop = asyncio.get_running_loop()
-        self.rig = rig
+        self.rig, self._ask = rig, ask
         self._previews = Previews(rig.table, rig.speed)
-        self._loop.set_default_executor(ThreadPoolExecutor(WORKERS, "request"))
         if await _answers(path):
             raise ConfigError(f"socket: {path}: another rig is listening there; stop it or use another path")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._stop_server = StopServer(rig.stop)
+            self._stop_server = StopServer(lambda reason, by: ask(lambda: rig.stop(reason, by)))
             self._stop_server.open(stop_socket(path))  # first: whoever can send a request can also stop
             path.unlink(missing_ok=True)
             self._server = await asyncio.start_unix_server(self._serve, path, limit=LONGEST_LINE, backlog=512)
@@ -184,7 +187,7 @@ class Server:
             await self._answer(to_line(request), writer, crowded=False)
             return
         try:
-            body = await asyncio.to_thread(self._do, request)
+            body = await asyncio.wrap_future(self._ask(lambda: self._do(request)))
             reply = Reply(id=request.id, ok=True, body=body.model_dump(mode="json"))
         except RigError as error:
             reply = refusal(request.id, error)
@@ -194,33 +197,37 @@ class Server:
         _write(writer, to_line(reply))
         if request.kind == "subscribe" and reply.ok and self.rig is not None:
             self._subscribers[writer] = request.samples
-            _write(writer, to_line(StateEvent(status=self.rig.status())))
+            _write(writer, to_line(StateEvent(status=await asyncio.wrap_future(self._ask(self._status)))))
 
-    def _do(self, request: Any) -> BaseModel:
+    async def _do(self, request: Any) -> BaseModel:
         assert self.rig is not None
         match request.kind:
             case "start":
-                return self.rig.start(request.plan, request.key)
+                return await self.rig.start(request.plan, request.key)
             case "extend":
-                return self.rig.extend(request)
+                return await self.rig.extend(request)
             case "enough":
-                return self.rig.enough(request)
+                return await self.rig.enough(request)
             case "sequences":
-                return plan.library()
+                return await self.rig.library()
             case "rearm":
-                return self.rig.rearm(request.by)
+                return await self.rig.rearm(request.by)
             case "calibrate-start":
-                return self.rig.calibrate(request)
+                return await self.rig.calibrate(request)
             case "calibrate-step":
-                return self.rig.calibrate_step(request.direction, request.shown_us)
+                return await self.rig.calibrate_step(request.direction, request.shown_us)
             case "calibrate-mark":
-                return self.rig.calibrate_mark(request.threshold)
+                return await self.rig.calibrate_mark(request.threshold)
             case "calibrate-finish":
-                return self.rig.calibrate_finish(request.by, request.discard)
+                return await self.rig.calibrate_finish(request.by, request.discard)
             case "angle_pose":
-                return self.rig.angle_pose(request)
+                return await self.rig.angle_pose(request)
             case _:
                 return self.rig.status()
+
+    async def _status(self) -> Status:
+        assert self.rig is not None
+        return self.rig.status()
 
 
 async def _answers(path: Path) -> bool:

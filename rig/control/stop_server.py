@@ -1,6 +1,6 @@
 """A second socket (`SOCKET.stop`) that accepts only stops, so that other requests cannot delay one.
 
-It has its own event loop in its own thread, and its own worker threads. It shares nothing with the requests, previews,
+It has its own event loop in its own thread. It shares nothing with the requests, previews,
 subscribers and half-open connections of the first socket.
 """
 
@@ -11,7 +11,7 @@ import contextlib
 import logging
 import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -23,9 +23,7 @@ from rig.messages import Reply, StopEvidence, StopRequest
 
 log = logging.getLogger("rig.stop")
 
-Stop = Callable[[str, str], StopEvidence]
-WORKERS = 32
-"""Stops that may wait for their evidence at the same time; the first one has already stopped the rig."""
+Stop = Callable[[str, str], Future[StopEvidence]]
 MAX_LINE_BYTES = 16_384
 MAX_SILENT, MAX_ACTIVE = 32, 64
 
@@ -42,7 +40,6 @@ class StopServer:
     def __init__(self, stop: Stop) -> None:
         self._stop = stop
         self._connections = Connections(MAX_SILENT, MAX_ACTIVE)
-        self._pool = ThreadPoolExecutor(WORKERS, "stop")
         self._loop = asyncio.new_event_loop()
         self._tasks: set[asyncio.Task[None]] = set()
         self._thread = threading.Thread(target=self._loop.run_forever, name="stop-door", daemon=True)
@@ -60,8 +57,7 @@ class StopServer:
             ) from None
 
     def close(self) -> None:
-        """Stop listening; waits for stops that are being answered."""
-        self._pool.shutdown()
+        """Stop listening."""
         if self._thread.is_alive():
             asyncio.run_coroutine_threadsafe(self._end(), self._loop).result()
             self._loop.call_soon_threadsafe(self._loop.stop)
@@ -75,8 +71,7 @@ class StopServer:
         except ValidationError as error:
             return invalid_request(id_of(line), error)
         try:
-            loop = asyncio.get_running_loop()
-            evidence = await loop.run_in_executor(self._pool, self._stop, request.reason, request.by)
+            evidence = await asyncio.wrap_future(self._stop(request.reason, request.by))
             return Reply(id=request.id, ok=True, body=evidence.model_dump(mode="json"))
         except RigError as error:
             return refusal(request.id, error)

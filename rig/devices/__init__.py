@@ -1,7 +1,7 @@
 """Devices behind three small Protocols; each device is one file here, found by its id (the file's name).
 
 A device module has `KIND` ("stimulator", "load_cell" or "angle_sensor"), `Settings` (a pydantic model, the device's
-part of the rig file) and `create(settings, clock)`. To add a device, add a file.
+part of the rig file) and `create(settings, machine)`. To add a device, add a file.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import pkgutil
 from collections.abc import Callable
 from functools import cache
 from types import ModuleType
-from typing import Any, Literal, Protocol, Self
+from typing import Any, Literal, Protocol, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict
 
@@ -20,6 +20,7 @@ from rig.limits import Admitted, Steps
 from rig.signals import Ack, AngleBlock, AngleScale, TorqueBlock
 
 Kind = Literal["stimulator", "load_cell", "angle_sensor"]
+BlockT = TypeVar("BlockT", contravariant=True)
 
 
 class DeviceSettings(BaseModel):
@@ -42,7 +43,7 @@ class Stimulator(Protocol):
     silence_s: float
     """Device seconds for which it may continue to pulse after the host's last command; 0: one command per pulse."""
 
-    def open(self) -> dict[str, Any]:
+    async def open(self) -> dict[str, Any]:
         """Open the line; returns the identity to display (device, serial number, firmware, port).
 
         Raises DeviceError, which names the port and says how to correct it.
@@ -50,10 +51,10 @@ class Stimulator(Protocol):
         ...
 
     def listen(self, on_ack: Callable[[Ack], None], on_lost: Callable[[str], None]) -> None:
-        """Register callbacks for acks and for the loss of the line; called from the device's reader thread."""
+        """Register callbacks for acks and for the loss of the line."""
         ...
 
-    def arm(self) -> None:
+    async def arm(self) -> None:
         """Make the device ready for pulses. Raises DeviceError."""
         ...
 
@@ -71,14 +72,14 @@ class Stimulator(Protocol):
         """
         ...
 
-    def stop(self) -> None:
-        """Stop stimulation; safe at any time and from any thread. Raises DeviceError.
+    async def stop(self) -> None:
+        """Stop stimulation; safe at any time. Raises DeviceError.
 
         Bytes that still wait in this computer are discarded first.
         """
         ...
 
-    def state(self) -> tuple[bool, str]:
+    async def state(self) -> tuple[bool, str]:
         """(True if the device says that it cannot stimulate, its state in words). Raises DeviceError."""
         ...
 
@@ -87,53 +88,39 @@ class Stimulator(Protocol):
         ...
 
 
-class LoadCell(Protocol):
-    """Gives torque samples as they arrive."""
+class Sensor(Protocol[BlockT]):
+    """Gives blocks of samples as they arrive."""
 
     sample_rate_hz: float
     counter_modulus: int
-    """Value at which the raw counter wraps, in samples; 0: the cell has no counter."""
+    """Value at which the raw counter wraps, in samples; 0: it has no counter."""
 
-    def open(self) -> dict[str, Any]:
-        """Open the bus and start the cell; returns the identity to display. Raises DeviceError."""
-        ...
+    async def open(self, on_block: Callable[[BlockT], None], on_lost: Callable[[str], None]) -> dict[str, Any]:
+        """Open the bus and start the sensor; returns the identity to display. Raises DeviceError.
 
-    def read(self, timeout_s: float) -> TorqueBlock:
-        """Samples that arrive within `timeout_s` real seconds; returns soon after the first one; may be empty.
-
-        Raises DeviceError when the bus is gone.
+        From now on each block goes to `on_block`, soon after its first sample arrived; a block may be empty. `on_lost`
+        is called with the reason when the bus is gone.
         """
         ...
 
-    def close(self) -> None:
-        """Stop the cell and close the bus; never raises."""
+    async def close(self) -> None:
+        """Stop the sensor and close the bus; never raises."""
         ...
 
 
-class AngleSensor(Protocol):
-    """Gives the joint's angle as it arrives. Opened after the load cell, closed before it."""
+class LoadCell(Sensor[TorqueBlock], Protocol):
+    """Gives torque."""
 
-    sample_rate_hz: float
-    counter_modulus: int
-    """As of a load cell."""
+
+class AngleSensor(Sensor[AngleBlock], Protocol):
+    """Gives the joint's angle. Opened after the load cell, closed before it."""
+
     scale: AngleScale
     """From its own value to the joint's angle, by the rig file. A calibration by two poses replaces it."""
     of_the_cell: bool
     """Whether its samples come in the load cell's own frames, counted by the cell's counter."""
     on_the_cells_bus: bool
     """Whether its frames come over the load cell's adapter: then one clock stamps both."""
-
-    def open(self) -> dict[str, Any]:
-        """Open the bus, or share the load cell's; returns the identity to display. Raises DeviceError."""
-        ...
-
-    def read(self, timeout_s: float) -> AngleBlock:
-        """As `LoadCell.read`."""
-        ...
-
-    def close(self) -> None:
-        """Close the bus, or leave it to the load cell; never raises."""
-        ...
 
 
 @cache

@@ -6,15 +6,15 @@ It shares the load cell's adapter where that is the same one, so each adapter is
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from typing import Any, Literal, Self
 
 import numpy as np
 from pydantic import Field
 
-from rig.clock import Clock
 from rig.devices import DeviceSettings
-from rig.devices._can_bus import CanBus, Frame, Tap, gather, place_of
-from rig.errors import ConfigError, DeviceError
+from rig.errors import ConfigError, DeviceError, WireError
+from rig.machine import Bus, Frame, Listener, Machine
 from rig.signals import ANGLE_SAMPLE, AngleBlock, AngleScale
 from rig.wire import dbc
 
@@ -55,8 +55,8 @@ class Settings(DeviceSettings):
 class CanAngleSensor:
     """Driver of one sensor; see `rig.devices.AngleSensor` for what the methods promise."""
 
-    def __init__(self, settings: Settings, clock: Clock) -> None:
-        self._settings, self._clock = settings, clock
+    def __init__(self, settings: Settings, machine: Machine) -> None:
+        self._settings, self._machine = settings, machine
         try:
             self._frame = dbc.SampleFrame(
                 settings.dbc,
@@ -71,51 +71,53 @@ class CanAngleSensor:
         self.sample_rate_hz, self.counter_modulus = settings.sample_rate_hz, self._frame.counter_modulus
         self.scale = AngleScale(settings.offset, settings.direction, settings.radians_per_unit)
         self.of_the_cell = settings.of_the_cell
-        self._source: CanBus | Tap | None = None
+        self.on_the_cells_bus = False
+        self._bus: Bus | None = None
+        self._listener: Listener | None = None
 
-    @property
-    def on_the_cells_bus(self) -> bool:
-        return isinstance(self._source, Tap)
-
-    def open(self) -> dict[str, Any]:
-        bus, frame_id = self._settings.bus, self._frame.frame_id
-        self._source = CanBus.tap(bus, NAME, frame_id)
-        if self._source is None:
+    async def open(self, on_block: Callable[[AngleBlock], None], on_lost: Callable[[str], None]) -> dict[str, Any]:
+        arguments, frame_id = self._settings.bus, self._frame.frame_id
+        bus = self._machine.shared_bus(arguments, NAME)
+        self.on_the_cells_bus = bus is not None
+        if bus is None:
             if self.of_the_cell:
-                raise DeviceError(f"{KIND}.of_the_cell: the load cell's bus {place_of(bus)} is not open")
-            self._source = CanBus(bus, NAME, self._clock)
+                raise DeviceError(f"{KIND}.of_the_cell: the load cell's bus is not open")
+            bus = await self._machine.tasks.work(self._machine.open_bus, arguments, NAME)
+        self._bus, self._listener = bus, Listener(frame_id, self.decode, on_block, on_lost, GATHER_S)
+        bus.listen(self._listener)
         return {
             "device": "can_angle_sensor",
-            "bus": place_of(bus),
+            "bus": bus.place,
             "frame_id": f"0x{frame_id:X}",
             "message": self._frame.message.name,
             "sample_rate_hz": self.sample_rate_hz,
         }
 
-    def read(self, timeout_s: float) -> AngleBlock:
-        if self._source is None:
-            raise DeviceError("angle sensor is not open")
+    async def close(self) -> None:
+        bus, self._bus = self._bus, None
+        if bus is None:
+            return
+        if self.on_the_cells_bus and self._listener is not None:
+            bus.leave(self._listener)
+        else:
+            await self._machine.tasks.work(bus.close)
+
+    def decode(self, frames: Sequence[Frame], damaged: int = 0, errors: int = 0) -> AngleBlock:
+        """The samples of frames, in their order; damaged ones are counted. Pure."""
         rows: list[tuple[float, float, float, float, int, int]] = []
-        counts = gather(
-            self._source, self._frame.frame_id, timeout_s, GATHER_S, lambda frame: rows.append(self._row(frame))
-        )
+        for frame in frames:
+            try:
+                found = self._frame.decode(frame.data)
+            except WireError:
+                damaged += 1
+                continue
+            rows.append((frame.host_time_s, frame.stamp_s, found.values[0], math.nan, found.counter, found.flag))
         samples = np.array(rows, dtype=ANGLE_SAMPLE)
         samples["angle_rad"] = self.scale.angle_rad(samples["raw"])
-        return AngleBlock(samples, *counts)
-
-    def close(self) -> None:
-        if isinstance(self._source, Tap):
-            CanBus.untap(self._source)
-        elif self._source is not None:
-            self._source.close()
-        self._source = None
-
-    def _row(self, frame: Frame) -> tuple[float, float, float, float, int, int]:
-        found = self._frame.decode(bytes(frame.message.data))
-        return frame.host_time_s, frame.stamp_s, found.values[0], math.nan, found.counter, found.flag
+        return AngleBlock(samples, damaged, errors)
 
 
-def create(settings: Settings, clock: Clock) -> CanAngleSensor:
+def create(settings: Settings, machine: Machine) -> CanAngleSensor:
     """The device, not yet opened.
 
     Raises
@@ -123,4 +125,4 @@ def create(settings: Settings, clock: Clock) -> CanAngleSensor:
     ConfigError
         The DBC lacks the message or signal.
     """
-    return CanAngleSensor(settings, clock)
+    return CanAngleSensor(settings, machine)

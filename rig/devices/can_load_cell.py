@@ -7,17 +7,15 @@ from __future__ import annotations
 
 import contextlib
 import re
-from functools import partial
+from collections.abc import Callable, Sequence
 from typing import Any
 
-import can
 import numpy as np
 from pydantic import Field, field_validator
 
-from rig.clock import Clock
 from rig.devices import DeviceSettings
-from rig.devices._can_bus import CanBus, Frame, gather
-from rig.errors import ConfigError, DeviceError
+from rig.errors import ConfigError, DeviceError, WireError
+from rig.machine import Bus, Frame, Listener, Machine
 from rig.signals import SAMPLE, TorqueBlock
 from rig.wire import dbc
 
@@ -57,22 +55,20 @@ class Settings(DeviceSettings):
         return scale
 
 
-def message_of(frame: str) -> can.Message:
-    """A CAN message from `id#data`; eight digits of id make it extended."""
+def message_of(frame: str) -> tuple[int, bytes, bool]:
+    """Identifier and data of `id#data`, and whether the identifier is extended: it has eight digits then."""
     matched = _FRAME.match(frame)
     assert matched is not None
     identifier, data = matched.groups()
-    return can.Message(
-        arbitration_id=int(identifier, 16), data=bytes.fromhex(data), is_extended_id=len(identifier) == 8
-    )
+    return int(identifier, 16), bytes.fromhex(data), len(identifier) == 8
 
 
 class CanLoadCell:
     """Driver of one cell; see `rig.devices.LoadCell` for what the methods promise."""
 
-    def __init__(self, settings: Settings, clock: Clock) -> None:
+    def __init__(self, settings: Settings, machine: Machine) -> None:
         self._settings = settings
-        self._clock = clock
+        self._machine = machine
         names = [settings.signal] if isinstance(settings.signal, str) else settings.signal
         try:
             self._frame = dbc.SampleFrame(
@@ -82,44 +78,52 @@ class CanLoadCell:
             raise ConfigError(f"load_cell.{error}") from None
         self.sample_rate_hz = settings.sample_rate_hz
         self.counter_modulus = self._frame.counter_modulus * self._frame.samples_per_frame
-        self._bus: CanBus | None = None
+        self._bus: Bus | None = None
 
-    def open(self) -> dict[str, Any]:
-        self._bus = CanBus(self._settings.bus, "load cell", self._clock)
-        self._bus.send(map(message_of, self._settings.start_frames))
+    async def open(self, on_block: Callable[[TorqueBlock], None], on_lost: Callable[[str], None]) -> dict[str, Any]:
+        work = self._machine.tasks.work
+        bus = self._bus = await work(self._machine.open_bus, self._settings.bus, "load cell")
+        bus.listen(Listener(self._frame.frame_id, self.decode, on_block, on_lost, GATHER_S))
+        try:
+            await work(bus.send, [message_of(frame) for frame in self._settings.start_frames])
+        except DeviceError:
+            await self.close()
+            raise
         return {
             "device": "can_load_cell",
-            "bus": self._bus.place,
+            "bus": bus.place,
             "frame_id": f"0x{self._frame.frame_id:X}",
             "message": self._frame.message.name,
             "sample_rate_hz": self.sample_rate_hz,
         }
 
-    def read(self, timeout_s: float) -> TorqueBlock:
-        if self._bus is None:
-            raise DeviceError("load cell is not open")
-        rows: list[tuple[float, float, float, int, int]] = []
-        counts = gather(self._bus, self._frame.frame_id, timeout_s, GATHER_S, partial(self._append, rows))
-        return TorqueBlock(np.array(rows, dtype=SAMPLE), *counts)
-
-    def close(self) -> None:
-        if self._bus is None:
+    async def close(self) -> None:
+        bus, self._bus = self._bus, None
+        if bus is None:
             return
+        work = self._machine.tasks.work
         with contextlib.suppress(Exception):  # an unplugged adapter raises, and there is nothing left to stop
-            self._bus.send(map(message_of, self._settings.stop_frames))
-        self._bus.close()
-        self._bus = None
+            await work(bus.send, [message_of(frame) for frame in self._settings.stop_frames])
+        await work(bus.close)
 
-    def _append(self, rows: list[tuple[float, float, float, int, int]], frame: Frame) -> None:
-        found = self._frame.decode(bytes(frame.message.data))
-        n = len(found.values)
-        for i, value in enumerate(found.values):
-            counter = found.counter * n + i if found.counter >= 0 else -1
-            stamp_s = frame.stamp_s - (n - 1 - i) / self.sample_rate_hz  # a frame is sent with its last sample
-            rows.append((frame.host_time_s, stamp_s, value * self._settings.scale_nm, counter, found.flag))
+    def decode(self, frames: Sequence[Frame], damaged: int = 0, errors: int = 0) -> TorqueBlock:
+        """The samples of frames, in their order; damaged ones are counted. Pure."""
+        rows: list[tuple[float, float, float, int, int]] = []
+        for frame in frames:
+            try:
+                found = self._frame.decode(frame.data)
+            except WireError:
+                damaged += 1
+                continue
+            n = len(found.values)
+            for i, value in enumerate(found.values):
+                counter = found.counter * n + i if found.counter >= 0 else -1
+                stamp_s = frame.stamp_s - (n - 1 - i) / self.sample_rate_hz  # a frame is sent with its last sample
+                rows.append((frame.host_time_s, stamp_s, value * self._settings.scale_nm, counter, found.flag))
+        return TorqueBlock(np.array(rows, dtype=SAMPLE), damaged, errors)
 
 
-def create(settings: Settings, clock: Clock) -> CanLoadCell:
+def create(settings: Settings, machine: Machine) -> CanLoadCell:
     """The device, not yet opened.
 
     Raises
@@ -127,4 +131,4 @@ def create(settings: Settings, clock: Clock) -> CanLoadCell:
     ConfigError
         The DBC lacks the message or signal.
     """
-    return CanLoadCell(settings, clock)
+    return CanLoadCell(settings, machine)

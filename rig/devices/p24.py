@@ -8,14 +8,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-import serial
 from pydantic import Field
 
-from rig.clock import Clock
 from rig.devices import DeviceSettings
 from rig.devices._line import PacketLine
 from rig.errors import DeviceError
 from rig.limits import Admitted, Steps
+from rig.machine import Machine
 from rig.signals import Ack
 from rig.wire import sciencemode4 as wire
 from rig.wire.framing import Packet
@@ -40,30 +39,22 @@ class P24:
     steps = Steps(pulse_width_us=1.0, current_ma=0.5, shortest_us=1.0)
     silence_s = 0.0
 
-    def __init__(self, settings: Settings, clock: Clock) -> None:
+    def __init__(self, settings: Settings, machine: Machine) -> None:
         self._settings = settings
-        self._line = PacketLine(
-            settings.port,
-            clock,
-            wire.NUMBERS,
-            wire.FRAMING.reader,
-            self._take,
-            baudrate=BAUD_RATE,
-            stopbits=serial.STOPBITS_TWO,
-            rtscts=True,
-        )
+        port = machine.port(settings.port, baudrate=BAUD_RATE, stopbits=2, rtscts=True)
+        self._line = PacketLine(machine, port, settings.port, wire.NUMBERS, wire.FRAMING.reader, self._take)
         self._on_ack: Callable[[Ack], None] = lambda _: None
 
     def listen(self, on_ack: Callable[[Ack], None], on_lost: Callable[[str], None]) -> None:
         self._on_ack = on_ack
         self._line.on_lost(on_lost)
 
-    def open(self) -> dict[str, Any]:
-        self._line.open()
+    async def open(self) -> dict[str, Any]:
+        await self._line.open()
         try:
-            serial_number = wire.parse_device_id(self._ask(Command.DEVICE_ID).data)
-            firmware = wire.parse_version(self._ask(Command.EXTENDED_VERSION).data)
-            _, state = self.state()
+            serial_number = wire.parse_device_id((await self._ask(Command.DEVICE_ID)).data)
+            firmware = wire.parse_version((await self._ask(Command.EXTENDED_VERSION)).data)
+            _, state = await self.state()
         except DeviceError:
             self.close()
             raise
@@ -76,8 +67,8 @@ class P24:
             "state": state,
         }
 
-    def arm(self) -> None:
-        self._ask(Command.LL_INIT)
+    async def arm(self) -> None:
+        await self._ask(Command.LL_INIT)
 
     def send(self, pulse: Admitted, latest_s: float) -> int:
         channel, connector = self._settings.channel - 1, self._settings.connector - 1
@@ -88,12 +79,14 @@ class P24:
     def feed(self) -> None:
         pass  # the low level has no watchdog: the device does nothing by itself
 
-    def stop(self) -> None:
+    async def stop(self) -> None:
         self._line.discard()
-        self._ask(Command.LL_STOP, fine=(0, NOT_INITIALISED))  # a device that is not initialised has already stopped
+        await self._ask(
+            Command.LL_STOP, fine=(0, NOT_INITIALISED)
+        )  # a device that is not initialised has already stopped
 
-    def state(self) -> tuple[bool, str]:
-        result, level, _ = wire.parse_status(self._ask(Command.STIM_STATUS).data)
+    async def state(self) -> tuple[bool, str]:
+        result, level, _ = wire.parse_status((await self._ask(Command.STIM_STATUS)).data)
         if result != 0:
             raise DeviceError(f"stimulator {self._settings.port} answered its state with {wire.result_text(result)}")
         return level == 0, wire.LEVELS.get(level, f"level {level}")
@@ -101,10 +94,10 @@ class P24:
     def close(self) -> None:
         self._line.close()
 
-    def _ask(self, command: Command, fine: tuple[int, ...] = (0,)) -> Packet:
+    async def _ask(self, command: Command, fine: tuple[int, ...] = (0,)) -> Packet:
         data = bytes((0,)) if command == Command.LL_INIT else b""
         name = command.name.lower().replace("_", " ")
-        packet = self._line.ask(
+        packet = await self._line.ask(
             lambda number: wire.FRAMING.encode(Packet(number, command, data)),
             name,
             command + 1,
@@ -124,6 +117,6 @@ class P24:
             self._on_ack(Ack(packet.number, time_s, words))
 
 
-def create(settings: Settings, clock: Clock) -> P24:
+def create(settings: Settings, machine: Machine) -> P24:
     """The device, not yet opened."""
-    return P24(settings, clock)
+    return P24(settings, machine)

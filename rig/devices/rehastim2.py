@@ -7,19 +7,18 @@ a new one. Only `feed` keeps it alive, which the rig calls after a health check:
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
 from typing import Any
 
-import serial
 from pydantic import Field
 
-from rig.clock import Clock
 from rig.devices import DeviceSettings
 from rig.devices._line import PacketLine
 from rig.errors import DeviceError
 from rig.limits import Admitted, Steps
+from rig.machine import Machine
 from rig.signals import Ack
+from rig.tasks import Signal
 from rig.wire import sciencemode2 as wire
 from rig.wire.framing import Packet
 from rig.wire.sciencemode2 import Command
@@ -46,20 +45,13 @@ class RehaStim2:
     steps = Steps(pulse_width_us=1.0, current_ma=2.0, shortest_us=20.0)
     silence_s = 0.0
 
-    def __init__(self, settings: Settings, clock: Clock) -> None:
+    def __init__(self, settings: Settings, machine: Machine) -> None:
         self._settings = settings
-        self._clock = clock
-        self._line = PacketLine(
-            settings.port,
-            clock,
-            wire.NUMBERS,
-            wire.FRAMING.reader,
-            self._take,
-            baudrate=BAUD_RATE,
-            parity=serial.PARITY_EVEN,
-        )
+        self._tasks, self._clock = machine.tasks, machine.tasks.clock
+        port = machine.port(settings.port, baudrate=BAUD_RATE, parity="E")
+        self._line = PacketLine(machine, port, settings.port, wire.NUMBERS, wire.FRAMING.reader, self._take)
         self._armed = False
-        self._offers = threading.Condition()
+        self._offered = Signal()
         self._offer: Packet | None = None
         self._on_ack: Callable[[Ack], None] = lambda _: None
 
@@ -67,11 +59,12 @@ class RehaStim2:
         self._on_ack = on_ack
         self._line.on_lost(on_lost)
 
-    def open(self) -> dict[str, Any]:
+    async def open(self) -> dict[str, Any]:
         self._offer = None
-        self._line.open()
+        self._offered.clear()
+        await self._line.open()
         try:
-            _, state = self.state()
+            _, state = await self.state()
         except DeviceError:
             self.close()
             raise
@@ -84,9 +77,9 @@ class RehaStim2:
             "state": state,
         }
 
-    def arm(self) -> None:
-        self.stop()  # back to the start mode, whatever the mode was
-        safe, state = self.state()
+    async def arm(self) -> None:
+        await self.stop()  # back to the start mode, whatever the mode was
+        safe, state = await self.state()
         if not safe:
             raise DeviceError(f"stimulator {self._settings.port}: cannot be armed, it is in {state}")
         self._armed = True
@@ -101,15 +94,15 @@ class RehaStim2:
         if self._armed and self._clock.now_s() - self._line.last_written_s >= FEED_S:
             self._line.tell(lambda number: wire.FRAMING.encode(Packet(number, Command.WATCHDOG)))
 
-    def stop(self) -> None:
+    async def stop(self) -> None:
         self._armed = False
         self._line.discard()
-        result = wire.result_of(self._ask(Command.STOP).data)
+        result = wire.result_of((await self._ask(Command.STOP)).data)
         if result != 0:
             raise DeviceError(f"stimulator {self._settings.port}: stop: {wire.result_text(result)}")
 
-    def state(self) -> tuple[bool, str]:
-        data = self._ask(Command.GET_MODE).data
+    async def state(self) -> tuple[bool, str]:
+        data = (await self._ask(Command.GET_MODE)).data
         result = wire.result_of(data)
         if result != 0 or len(data) < 2:
             raise DeviceError(f"stimulator {self._settings.port} answered its mode with {wire.result_text(result)}")
@@ -119,27 +112,28 @@ class RehaStim2:
         self._armed = False
         self._line.close()
 
-    def _ask(self, command: Command) -> Packet:
+    async def _ask(self, command: Command) -> Packet:
         """Ask; if the device has closed the connection, accept its next offer and ask once more."""
         try:
-            return self._ask_once(command)
+            return await self._ask_once(command)
         except DeviceError:
-            if not self._take_offer():
+            if not await self._take_offer():
                 raise
-        return self._ask_once(command)
+        return await self._ask_once(command)
 
-    def _ask_once(self, command: Command) -> Packet:
+    async def _ask_once(self, command: Command) -> Packet:
         name = command.name.lower().replace("_", " ")
         timeout_s = self._settings.reply_timeout_s
-        return self._line.ask(lambda number: wire.FRAMING.encode(Packet(number, command)), name, command + 1, timeout_s)
+        make = lambda number: wire.FRAMING.encode(Packet(number, command))  # noqa: E731
+        return await self._line.ask(make, name, command + 1, timeout_s)
 
-    def _take_offer(self) -> bool:
+    async def _take_offer(self) -> bool:
         """Accept a connection that the device offers; False if it offers none."""
-        with self._offers:
-            if not self._offers.wait_for(lambda: self._offer is not None, OFFER_S):
-                return False
-            offer, self._offer = self._offer, None
-        assert offer is not None
+        await self._tasks.sleep(OFFER_S, self._offered)
+        offer, self._offer = self._offer, None
+        self._offered.clear()
+        if offer is None:
+            return False
         accepted = offer.data[:1] == bytes((wire.VERSION,))
         result = 0 if accepted else -5
         self._line.tell(lambda _: wire.FRAMING.encode(Packet(offer.number, Command.INIT_ACK, bytes((result & 0xFF,)))))
@@ -157,16 +151,15 @@ class RehaStim2:
         elif packet.command == Command.UNKNOWN:
             self._on_ack(Ack(packet.number, time_s, "unknown command"))
         elif packet.command == Command.INIT:
-            self._offered(packet, time_s)
+            self._take_init(packet, time_s)
 
-    def _offered(self, packet: Packet, time_s: float) -> None:
-        with self._offers:
-            self._offer = packet
-            self._offers.notify_all()
+    def _take_init(self, packet: Packet, time_s: float) -> None:
+        self._offer = packet
+        self._offered.set()
         if self._armed:
             self._on_ack(Ack(-1, time_s, "it restarted during a test (reset, power failure, or its watchdog)"))
 
 
-def create(settings: Settings, clock: Clock) -> RehaStim2:
+def create(settings: Settings, machine: Machine) -> RehaStim2:
     """The device, not yet opened."""
-    return RehaStim2(settings, clock)
+    return RehaStim2(settings, machine)

@@ -1,0 +1,228 @@
+"""A CAN adapter by python-can, opened once for all devices that hang on it, with a thread that reads it.
+
+Some adapters can be opened only once (slcan). So the first device that opens one reads it for all.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import math
+import socket
+import threading
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, cast
+
+import can
+import serial
+from can.interfaces.slcan import slcanBus
+
+from rig.adapters.read_ahead import ReadAhead
+from rig.clock import Clock
+from rig.errors import DeviceError
+from rig.machine import Frame, Listener
+
+ATTEMPTS = 5
+STAMPING = ("socketcand", "socketcan", "pcan", "kvaser", "ixxat", "vector")
+"""Timestamps of these interfaces are the sender's or the kernel's, of the others the host's at reading."""
+READ_TIMEOUT_S = 0.02
+JOIN_S = 2.0
+
+_open: dict[tuple[str, ...], CanBus] = {}
+_registering = threading.Lock()
+
+
+class CanBus:
+    """See `rig.machine.Bus`.
+
+    Parameters
+    ----------
+    arguments
+        Of can.Bus.
+    name
+        Of the device that opens it, in words; with `_` it is its table in the rig file.
+    """
+
+    def __init__(
+        self, arguments: dict[str, Any], name: str, clock: Clock, post: Callable[[Callable[[], None]], None]
+    ) -> None:
+        self._name, self._clock, self._post = name, clock, post
+        self._key, self.place = _key(arguments), place_of(arguments)
+        self._arguments = dict(arguments)
+        self._listening: tuple[_Gathering, ...] = ()
+        self._stamped = arguments.get("interface") in STAMPING
+        # python-can warns about every frame that is split between two packets, which is normal
+        logging.getLogger("can").setLevel(logging.CRITICAL)
+        self.can = self._opened()
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._read, name=f"{name} bus", daemon=True)
+        self._thread.start()
+        with _registering:
+            _open[self._key] = self
+
+    @staticmethod
+    def find(arguments: dict[str, Any], name: str) -> CanBus | None:
+        """An adapter that is open already; None: it is not. Raises DeviceError if it is open with other arguments."""
+        with _registering:
+            found = _open.get(_key(arguments))
+        if found is not None and found._arguments != arguments:
+            raise DeviceError(
+                f"{_table(name)}.bus: {found.place} is already open with other arguments; give the same as for the "
+                f"{found._name}, or leave it out"
+            )
+        return found
+
+    def listen(self, listener: Listener) -> None:
+        self._listening = (*self._listening, _Gathering(listener))
+
+    def leave(self, listener: Listener) -> None:
+        self._listening = tuple(other for other in self._listening if other.listener is not listener)
+
+    def send(self, frames: Sequence[tuple[int, bytes, bool]]) -> None:
+        for frame_id, data, is_extended in frames:
+            message = can.Message(arbitration_id=frame_id, data=data, is_extended_id=is_extended)
+            try:
+                self.can.send(message, timeout=0.5)
+            except (can.CanError, OSError) as error:
+                frame = f"{frame_id:0{8 if is_extended else 3}X}#{data.hex()}"
+                raise DeviceError(f"{self._name} on {self.place}: frame {frame} not sent: {_line(error)}") from None
+
+    def close(self) -> None:
+        with _registering:
+            if _open.get(self._key) is self:
+                del _open[self._key]
+        self._closing.set()
+        if self._thread is not threading.current_thread():
+            self._thread.join(JOIN_S)
+        self._lose(f"{self._name} on {self.place}: the bus was closed")
+        with contextlib.suppress(Exception):
+            self.can.shutdown()
+
+    def _lose(self, reason: str) -> None:
+        listening, self._listening = self._listening, ()
+        for gathering in listening:
+            self._post(lambda lost=gathering.listener.lost: lost(reason))
+
+    def _read(self) -> None:
+        while not self._closing.is_set():
+            try:
+                self._read_once()
+            except (can.CanError, OSError) as error:
+                self._lose(f"{self._name} on {self.place}: the bus was lost: {_line(error)}")
+                return
+            except Exception as error:
+                self._lose(f"{self._name} on {self.place}: reading failed: {_line(error)}")
+                return
+
+    def _read_once(self) -> None:
+        try:
+            message = self.can.recv(self._wait_s(time.monotonic()))
+        except ValueError:  # slcan: a damaged line
+            message = None
+            self._count(damaged=1)
+        if message is not None:
+            self._sort(message)
+        now_s = time.monotonic()
+        for gathering in self._listening:
+            gathering.hand_over(now_s, self._post)
+
+    def _wait_s(self, now_s: float) -> float:
+        """Real seconds to wait for the next frame: not beyond the end of any gathering."""
+        ends_s = (gathering.end_s for gathering in self._listening)
+        return max(0.0, min([READ_TIMEOUT_S, *(end_s - now_s for end_s in ends_s)]))
+
+    def _sort(self, message: can.Message) -> None:
+        if message.is_error_frame:
+            self._count(errors=1)
+        elif not message.is_remote_frame:
+            stamp_s = message.timestamp if self._stamped else math.nan
+            frame = Frame(message.arbitration_id, bytes(message.data), self._clock.now_s(), stamp_s)
+            for gathering in self._listening:
+                if gathering.listener.frame_id == frame.frame_id:
+                    gathering.add(frame)
+
+    def _count(self, damaged: int = 0, errors: int = 0) -> None:
+        """What belongs to no identifier is told to who opened the bus."""
+        for gathering in self._listening[:1]:
+            gathering.damaged += damaged
+            gathering.errors += errors
+
+    def _opened(self) -> can.BusABC:
+        self._probe()
+        arguments = dict(self._arguments)
+        if arguments.get("interface") == "slcan":
+            arguments.setdefault("sleep_after_open", 0)
+        last: Exception | None = None
+        for _ in range(ATTEMPTS):
+            try:
+                bus = can.Bus(**arguments)
+            except can.CanError as error:
+                # the server's greeting and the first frame may share a packet, which aborts the handshake
+                last = error
+                time.sleep(0.05)
+                continue
+            except Exception as error:
+                last = error
+                break
+            if isinstance(bus, slcanBus) and isinstance(bus.serialPortOrig, serial.Serial):
+                bus.serialPortOrig = cast("Any", ReadAhead(bus.serialPortOrig))
+            return bus
+        raise DeviceError(f"{_table(self._name)}.bus: {self.place} cannot be opened: {_line(last)}")
+
+    def _probe(self) -> None:
+        """Fail early if no server answers: python-can itself would retry for ten seconds."""
+        if self._arguments.get("interface") != "socketcand":
+            return
+        host, port = self._arguments.get("host"), self._arguments.get("port")
+        try:
+            socket.create_connection((str(host), int(str(port))), timeout=2.0).close()
+        except (OSError, ValueError) as error:
+            raise DeviceError(
+                f"{_table(self._name)}.bus: no socketcand answers at {host}:{port} ({_line(error)}); check that it is "
+                "running"
+            ) from None
+
+
+class _Gathering:
+    """The frames of one listener that wait to be handed over."""
+
+    def __init__(self, listener: Listener) -> None:
+        self.listener = listener
+        self.damaged = self.errors = 0
+        self.end_s = math.inf
+        self._frames: list[Frame] = []
+
+    def add(self, frame: Frame) -> None:
+        if not self._frames:
+            self.end_s = time.monotonic() + self.listener.gather_s
+        self._frames.append(frame)
+
+    def hand_over(self, now_s: float, post: Callable[[Callable[[], None]], None]) -> None:
+        """Decode what was gathered and post it, once the time is over."""
+        if now_s < self.end_s and not (self.damaged or self.errors):
+            return
+        block = self.listener.decode(self._frames, self.damaged, self.errors)
+        self._frames, self.damaged, self.errors, self.end_s = [], 0, 0, math.inf
+        post(lambda: self.listener.take(block))
+
+
+def place_of(arguments: dict[str, Any]) -> str:
+    """How messages call an adapter."""
+    where = arguments.get("channel", "")
+    if "host" in arguments:
+        where = f"{where}@{arguments['host']}:{arguments.get('port')}"
+    return f"{arguments.get('interface', 'default interface')} {where}".strip()
+
+
+def _key(arguments: dict[str, Any]) -> tuple[str, ...]:
+    """What tells one adapter from another."""
+    return tuple(str(arguments.get(name, "")) for name in ("interface", "channel", "host", "port"))
+
+
+def _table(name: str) -> str:
+    return name.replace(" ", "_")
+
+
+def _line(error: Exception | None) -> str:
+    return " ".join(str(error).split())
