@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from rig.acquire.angle_receiver import AngleReceiver
-from rig.clock import VirtualClock
 from rig.errors import DeviceError
 from rig.signals import ANGLE_SAMPLE, AngleBlock, AngleScale
+from tests.simulator.virtual_time import VirtualClock
 
 RATE_HZ = 200.0
 PER_BLOCK = 2
@@ -42,15 +42,12 @@ class FakeSensor:
         self.counter = 65400
         self._rng = np.random.default_rng(3)
 
-    def open(self) -> dict[str, Any]:
+    async def open(self, on_block: Callable[[AngleBlock], None], on_lost: Callable[[str], None]) -> dict[str, Any]:
         if self.silent:
             raise DeviceError("angle_sensor.bus: it is not there")
         return {"device": "fake"}
 
-    def read(self, timeout_s: float) -> AngleBlock:
-        raise NotImplementedError
-
-    def close(self) -> None: ...
+    async def close(self) -> None: ...
 
     def block(self, n: int = PER_BLOCK, at_s: float | None = None) -> AngleBlock:
         """The next samples; the last one is taken now."""

@@ -16,7 +16,6 @@ from rig.acquire.halt import Halt
 from rig.acquire.health import DEFAULT_WATCH, Watch
 from rig.acquire.receiver import Receiver
 from rig.acquire.run import RunResult, TestRun
-from rig.clock import VirtualClock
 from rig.errors import DeviceError
 from rig.gate import Gate
 from rig.journal import Journal, Kind
@@ -24,6 +23,7 @@ from rig.limits import Admitted, Steps
 from rig.messages import AdaptivePlan, AnglePlan, Profile, SegmentPlan, TestPlan
 from rig.signals import SAMPLE, Ack, LateError, TorqueBlock
 from tests.rig.angle import FakeSensor
+from tests.simulator.virtual_time import VirtualClock, VirtualMachine
 
 RATE_HZ = 1600.0
 ON_A_BUSY_DISK = replace(DEFAULT_WATCH, stale_disk_s=60.0)
@@ -56,10 +56,10 @@ class FakeStimulator:
     def listen(self, on_ack: Callable[[Ack], None], on_lost: Callable[[str], None]) -> None:
         self.on_ack, self.on_lost = on_ack, on_lost
 
-    def open(self) -> dict[str, Any]:
+    async def open(self) -> dict[str, Any]:
         return {"device": "fake"}
 
-    def arm(self) -> None:
+    async def arm(self) -> None:
         self._answer()
         self.armed = True
 
@@ -85,12 +85,12 @@ class FakeStimulator:
         self.acked_s.append(self.clock.now_s())
         self.on_ack(Ack(number, self.clock.now_s(), error))
 
-    def stop(self) -> None:
+    async def stop(self) -> None:
         self.stops += 1
         self._answer()
         self.armed = False
 
-    def state(self) -> tuple[bool, str]:
+    async def state(self) -> tuple[bool, str]:
         self._answer()
         return not self.armed, "armed" if self.armed else "not initialised"
 
@@ -129,13 +129,10 @@ class FakeCell:
         self._held: list[Any] = []
         self._seen = 0
 
-    def open(self) -> dict[str, Any]:
+    async def open(self, on_block: Callable[[TorqueBlock], None], on_lost: Callable[[str], None]) -> dict[str, Any]:
         return {"device": "fake"}
 
-    def read(self, timeout_s: float) -> TorqueBlock:
-        raise NotImplementedError
-
-    def close(self) -> None:
+    async def close(self) -> None:
         self.silent = True
 
     def feed(self, receiver: Receiver, until_s: float, per_block: int = 10) -> None:
@@ -191,9 +188,10 @@ class VirtualRig:
         has_sensor: bool = False,
         **profile: Any,
     ) -> None:
-        self.clock = VirtualClock()
+        self.machine = VirtualMachine()
+        self.clock = self.machine.clock
         self.sensor = FakeSensor(self.clock)
-        self.angle = AngleReceiver(self.sensor, self.clock) if has_sensor else None
+        self.angle = AngleReceiver(self.sensor, self.machine.tasks) if has_sensor else None
         self.stimulator = FakeStimulator(self.clock)
         self.cell = FakeCell(self.clock, self.stimulator)
         self.halt = Halt(self.clock)
@@ -202,7 +200,7 @@ class VirtualRig:
             self.halt.set("fault", reason)
 
         self.gate = Gate(self.stimulator, self.clock, fault, fault)
-        self.receiver = Receiver(self.cell, self.clock, fault)
+        self.receiver = Receiver(self.cell, self.machine.tasks, fault)
         segments = segments or [
             SegmentPlan(name="rest", sequence="rest", settings={"duration_s": 0.5}),
             SegmentPlan(name="ramp", sequence="ramp", settings={"up_s": 1.0, "down_s": 1.0}),
@@ -215,9 +213,9 @@ class VirtualRig:
         self.table = limits.for_plan(base, self.plan)
         self.test = plan.build(self.plan, self.table)
         self.path = folder / "t.journal"
-        self.journal = Journal(self.path)
+        self.journal = Journal(self.machine.disk.create(self.path))
         self.run = TestRun(
-            self.test, self.table, self.journal, self.gate, self.receiver, self.clock, self.halt, watch, self.angle
+            self.test, self.table, self.journal, self.gate, self.receiver, self.machine, self.halt, watch, self.angle
         )
         self.journal.append_json(Kind.HEADER, header(self.run, self.clock) | ({} if self.angle is None else OF_ANGLE))
         self.journal.append(Kind.PLAN, self.run.score.laid.pulse_width_us.astype("<f8").tobytes())
@@ -231,7 +229,7 @@ class VirtualRig:
         if self.angle is not None:
             self.sensor.feed(self.angle, self.clock.now_s() + self.test.longest_s + 8)
         self.cell.feed(self.receiver, self.clock.now_s() + self.test.longest_s + 8)
-        return self.run.execute()
+        return self.machine.run(self.run.execute())
 
 
 def header(run: TestRun, clock: VirtualClock) -> dict[str, Any]:
