@@ -14,15 +14,16 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, TypeAdapter, ValidationError
+from pydantic import ValidationError
 
+from rig.control import desk
 from rig.control.connections import Connections
 from rig.control.previews import Previews
-from rig.control.replies import head_of, id_of, internal_error, invalid_request, refusal, to_line
+from rig.control.replies import head_of, id_of, invalid_request, refusal, to_line
 from rig.control.rig import Rig
 from rig.control.stop_server import StopServer
 from rig.errors import BusyError, ConfigError, PlanError, RigError
-from rig.messages import LONGEST_LINE, Event, LiveEvent, Reply, Request, StateEvent, Status, stop_socket
+from rig.messages import LONGEST_LINE, Event, LiveEvent, StateEvent, Status, stop_socket
 
 log = logging.getLogger("rig.socket")
 
@@ -36,7 +37,6 @@ MAX_PENDING = 64
 """Largest number of waiting requests of one connection."""
 MAX_SILENT, MAX_ACTIVE = 64, 128
 
-_REQUEST: TypeAdapter[Any] = TypeAdapter(Request)
 Ask = Callable[[Callable[[], Coroutine[Any, Any, Any]]], Future[Any]]
 
 
@@ -162,7 +162,7 @@ class Server:
                 _write(writer, await self._preview(line, writer))
                 return
             self._refuse_long(line, kind)
-            request = _REQUEST.validate_json(line)
+            request = desk.read(line)
         except RigError as error:
             _write(writer, to_line(refusal(id_of(line[:200]), error)))
             return
@@ -186,44 +186,13 @@ class Server:
         if request.kind in ("preview", "stop"):  # it does not begin with its kind and id
             await self._answer(to_line(request), writer, crowded=False)
             return
-        try:
-            body = await asyncio.wrap_future(self._ask(lambda: self._do(request)))
-            reply = Reply(id=request.id, ok=True, body=body.model_dump(mode="json"))
-        except RigError as error:
-            reply = refusal(request.id, error)
-        except Exception as error:
-            log.exception("request %s failed", request.kind)
-            reply = internal_error(request.id, error)
+        assert self.rig is not None
+        rig = self.rig
+        reply = await asyncio.wrap_future(self._ask(lambda: desk.obey(rig, request)))
         _write(writer, to_line(reply))
-        if request.kind == "subscribe" and reply.ok and self.rig is not None:
+        if request.kind == "subscribe" and reply.ok:
             self._subscribers[writer] = request.samples
             _write(writer, to_line(StateEvent(status=await asyncio.wrap_future(self._ask(self._status)))))
-
-    async def _do(self, request: Any) -> BaseModel:
-        assert self.rig is not None
-        match request.kind:
-            case "start":
-                return await self.rig.start(request.plan, request.key)
-            case "extend":
-                return await self.rig.extend(request)
-            case "enough":
-                return await self.rig.enough(request)
-            case "sequences":
-                return await self.rig.library()
-            case "rearm":
-                return await self.rig.rearm(request.by)
-            case "calibrate-start":
-                return await self.rig.calibrate(request)
-            case "calibrate-step":
-                return await self.rig.calibrate_step(request.direction, request.shown_us)
-            case "calibrate-mark":
-                return await self.rig.calibrate_mark(request.threshold)
-            case "calibrate-finish":
-                return await self.rig.calibrate_finish(request.by, request.discard)
-            case "angle_pose":
-                return await self.rig.angle_pose(request)
-            case _:
-                return self.rig.status()
 
     async def _status(self) -> Status:
         assert self.rig is not None
