@@ -1,0 +1,175 @@
+"""The rig's computer: a clock of its own, pauses, and one rig process after the other."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from rig.machine import Bus, Disk, Port
+from rig.tasks import Outcome, Tasks
+from tests.simulator.disk import SimulatedDisk
+from tests.simulator.world import World
+
+BORN_S = 5000.0
+"""What the computer's monotonic clock shows at the world's time 0."""
+
+
+class Computer:
+    """A clock that drifts, and the pauses during which nothing runs on it.
+
+    While a step of the rig's program is stalled, its own time goes on and the world's does not: what it does then
+    reaches the others later.
+    """
+
+    def __init__(self, world: World, drift_ppm: float, unix_s: float) -> None:
+        self.world = world
+        self.speed = 1.0
+        self.boots = 1
+        self.paused_until_s = 0.0
+        self.lag_s = 0.0
+        """How far the step that runs now is ahead of the world."""
+        self.stall_next_s = 0.0
+        """How long the next access to a port or a file takes."""
+        self._rate = 1 + drift_ppm * 1e-6
+        self._unix_s = unix_s
+
+    @property
+    def true_s(self) -> float:
+        """The world's time at which the running step is."""
+        return self.world.now_s + self.lag_s
+
+    def now_s(self) -> float:
+        return BORN_S + self.true_s * self._rate
+
+    def unix_s(self) -> float:
+        return self._unix_s + self.true_s
+
+    def set_wall_clock(self, by_s: float) -> None:
+        """The wall clock jumps; the monotonic one does not."""
+        self._unix_s += by_s
+
+    def true_at(self, clock_s: float) -> float:
+        """The world's time at which this clock shows `clock_s`."""
+        return (clock_s - BORN_S) / self._rate if clock_s < math.inf else math.inf
+
+    def pause(self, duration_s: float) -> None:
+        """Nothing runs for a while."""
+        self.paused_until_s = max(self.paused_until_s, self.world.now_s + duration_s)
+
+    def access(self) -> None:
+        """A step touches a port or a file: here it may be stalled."""
+        if self.stall_next_s:
+            self.lag_s, self.stall_next_s = self.lag_s + self.stall_next_s, 0.0
+
+
+class Process:
+    """One process on the computer: its tasks run as long as it lives."""
+
+    def __init__(self, computer: Computer, disk: SimulatedDisk, ports: Ports) -> None:
+        self.computer, self.world, self.alive = computer, computer.world, True
+        self.tasks = Tasks(computer, self._work)
+        self.disk: Disk = disk
+        self.boot_id = f"boot-{computer.boots}"
+        self._ports, self._simulated_disk = ports, disk
+        self._inbox: list[Callable[[], None]] = []
+        self._wake_s = math.inf
+        self._turns = 0
+        self._ids = 0
+
+    def post(self, action: Callable[[], None]) -> None:
+        """Something came for this process."""
+        if self.alive:
+            self._inbox.append(action)
+            self._wake_at(self.world.now_s)
+
+    def kill(self) -> None:
+        """It runs no step more; what it wrote stays."""
+        self.alive = False
+
+    def port(self, path: str, **_arguments: Any) -> Port:
+        return self._ports.port(self, path)
+
+    def open_bus(self, arguments: dict[str, Any], name: str) -> Bus:
+        return self._ports.open_bus(self, arguments, name)
+
+    def shared_bus(self, arguments: dict[str, Any], name: str) -> Bus | None:
+        return self._ports.shared_bus(self, arguments, name)
+
+    @contextlib.contextmanager
+    def undisturbed(self) -> Iterator[None]:
+        yield
+
+    def new_id(self) -> str:
+        self._ids += 1
+        return f"{self.world.chance.getrandbits(128):032x}"
+
+    def cpu_s(self) -> float:
+        return 0.0
+
+    def _wake_at(self, true_s: float) -> None:
+        if true_s < self._wake_s:
+            self._wake_s = true_s
+            self._turns += 1
+            turn = self._turns
+            self.world.at(true_s, lambda: self._turn(turn))
+
+    def _turn(self, turn: int) -> None:
+        if not self.alive or turn != self._turns:
+            return
+        self._wake_s = math.inf
+        computer = self.computer
+        if self.world.now_s < computer.paused_until_s:
+            self._wake_at(computer.paused_until_s)
+            return
+        inbox, self._inbox = self._inbox, []
+        for action in inbox:
+            action()
+        next_s = computer.true_at(self.tasks.run())
+        if computer.lag_s:
+            computer.paused_until_s = max(computer.paused_until_s, computer.true_s)
+            computer.lag_s = 0.0
+        if next_s < math.inf or self._inbox:
+            self._wake_at(max(next_s, computer.paused_until_s, self.world.now_s))
+
+    def _work(self, action: Callable[[], Any], outcome: Outcome) -> None:
+        """Done early or late in the time that it takes: a death in between finds it done, or not."""
+        takes_s = self._simulated_disk.work_s()
+        early = self.world.chance.random() < 0.5
+        done: list[tuple[Any, BaseException | None]] = []
+
+        def do() -> None:
+            if self.alive:
+                done.append(_tried(action))
+
+        def tell() -> None:
+            if not early:
+                do()
+            if done:
+                self.post(lambda: outcome(*done[0]))
+
+        true_s = self.computer.true_s
+        if early:
+            self.world.at(true_s, do)
+        self.world.at(true_s + takes_s, tell)
+
+
+def _tried(action: Callable[[], Any]) -> tuple[Any, BaseException | None]:
+    try:
+        return action(), None
+    except Exception as error:
+        return None, error
+
+
+class Ports:
+    """What a computer's ports and adapters are; see `tests.simulator.wires`."""
+
+    def port(self, process: Process, path: str) -> Port:
+        raise NotImplementedError
+
+    def open_bus(self, process: Process, arguments: dict[str, Any], name: str) -> Bus:
+        raise NotImplementedError
+
+    def shared_bus(self, process: Process, arguments: dict[str, Any], name: str) -> Bus | None:
+        raise NotImplementedError
