@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from itertools import chain, repeat
 
-from hardware_sim.load_cells.frames import AngleReading, CellProtocol, Frame, Sample, TransportProtocol
+from hardware_sim.load_cells.frames import AngleReading, CellProtocol, Frame, Sample
 from hardware_sim.patients.muscle import Muscle
 from hardware_sim.sampling import Noise, SampleClock
 
@@ -41,7 +41,8 @@ class LoadCell:
         self.counter = 0
         self.torque_nm = 0.0
         self.clock = SampleClock(rate_hz, clock_ppm, jitter_s, JITTER_SEED, epoch_us)
-        self._muscle, self._cell, self._noise = muscle, cell, noise
+        self.cell = cell
+        self._muscle, self._noise = muscle, noise
         self._converted_nm: Callable[[float, float], float] | None = getattr(muscle, "converted_nm", None)
         self._read_angle = read_angle
         self._one_by_one = self._converted_nm is not None or read_angle is not None
@@ -61,6 +62,12 @@ class LoadCell:
                 self.sample()
         elif times_s := self.clock.take(until_s):
             self._read(times_s)
+
+    def restart(self, cell: CellProtocol) -> None:
+        """Power lost and back, with electronics as they are from power-on: what has not been taken is lost."""
+        self.cell, self.counter, self._sync = cell, 0, False
+        self._held.clear()
+        self._frames.clear()
 
     def next_s(self) -> float:
         """When the next sample is due."""
@@ -100,22 +107,15 @@ class LoadCell:
 
     def _send(self, samples: Iterable[Sample]) -> None:
         """Frames of these samples; a cell that does not run throws them away."""
-        if not self._cell.running():
+        if not self.cell.running():
             self._held.clear()
             return
-        frames, held, full = [], self._held, self._cell.samples_per_frame
+        frames, held, full = [], self._held, self.cell.samples_per_frame
         for sample in samples:
             held.append(sample)
             if len(held) >= full:
-                frames.append(self._cell.encode(held))
+                frames.append(self.cell.encode(held))
                 held.clear()
         for hook in self.frame_hooks:
             frames = [changed for one in frames for changed in hook(one)]
         self._frames += frames
-
-
-def deliver(load_cell: LoadCell, transport: TransportProtocol) -> None:
-    """Send the frames made since the last call."""
-    frames = load_cell.take_frames()
-    if frames:
-        transport.send(frames)
