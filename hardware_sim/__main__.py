@@ -4,27 +4,20 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import importlib
 import json
 import os
 import signal
 import sys
+import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from hardware_sim import options as command_line
-from hardware_sim.arm import description as arms
-from hardware_sim.arm.description import Arm
-from hardware_sim.arm.tissue import bare
 from hardware_sim.emulator import Emulator
-from hardware_sim.errors import ArmError, FaultError, HardwareSimError, PatientError
-from hardware_sim.patients import registry
-from hardware_sim.patients.muscle import Muscle
+from hardware_sim.errors import FaultError, HardwareSimError
+from hardware_sim.factory import HIDDEN, hidden_patients, make_devices
 
 PROG = "stimrig emulate"
-DESIGN = "design"
 FASTEST_AT_PRIORITY = 5.0
 
 
@@ -36,16 +29,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return done.code if isinstance(done.code, int) else 2
     try:
         if options.reveal is not None:
-            print(json.dumps(_hidden().reveal(options.reveal, moving=options.arm is not None)))
+            print(json.dumps(hidden_patients().reveal(options.reveal, moving=options.arm is not None)))
             return 0
-        muscle, name = _patient(options)
-        emulator = Emulator(muscle, command_line.settings(options, name), _arm(options))
+        patient = options.patient if options.hidden is None else f"{HIDDEN}{options.hidden}"
+        settings = command_line.settings(options, patient)
+        emulator = Emulator(make_devices(settings, options.arm, options.arm_law, epoch_us=time.time_ns() // 1000))
     except HardwareSimError as error:
         print(f"{PROG}: {error}", file=sys.stderr)
         return 2
     try:
         for text in options.fault:
-            emulator.faults.on(*_fault(text))
+            emulator.devices.faults.on(*_fault(text))
         return _run(emulator, options)
     except FaultError as error:
         print(f"{PROG}: {error}", file=sys.stderr)
@@ -84,43 +78,6 @@ def _orphan_watch() -> Callable[[], bool]:
     """
     parent = os.getppid()
     return lambda: os.getppid() != parent
-
-
-def _patient(options: argparse.Namespace) -> tuple[Muscle, str]:
-    if options.hidden is not None:
-        return _hidden().make(options.hidden, moving=options.arm is not None), f"hidden:{options.hidden}"
-    name = options.patient
-    if name in registry.names():
-        return registry.make(name), name
-    if Path(name).suffix.lower() in {".toml", ".json"} or Path(name).exists():
-        return registry.from_file(Path(name)), name
-    return registry.make(name), name
-
-
-def _arm(options: argparse.Namespace) -> Arm | None:
-    """The arm asked for; a hidden patient brings all that its joint does, and how it moves if asked for by `design`."""
-    if options.arm is None:
-        return None
-    if options.hidden is None:
-        return arms.with_laws(arms.read(options.arm), options.arm_law)
-    if options.arm_law:
-        raise ArmError("--arm-law: what the arm of a hidden patient does is hidden, too")
-    if options.arm == DESIGN:
-        return Arm("waves", _hidden().movement(options.hidden), bare())
-    return replace(arms.read(options.arm), tissue=bare())
-
-
-def _hidden() -> Any:
-    module = "hardware_sim.patients.hidden"
-    try:
-        hidden = importlib.import_module(module)
-    except ModuleNotFoundError as error:
-        if error.name != module:
-            raise
-        hidden = None
-    if not hasattr(hidden, "make"):
-        raise PatientError("hidden patients are not part of this installation; use --patient")
-    return hidden
 
 
 def _fault(text: str) -> tuple[str, dict[str, Any]]:

@@ -13,12 +13,10 @@ import socket
 from pathlib import Path
 from typing import Any, Protocol
 
-from hardware_sim.arm.limb import Limb
-from hardware_sim.electrodes import Electrodes
+from hardware_sim.devices import Devices
 from hardware_sim.errors import ArmError, FaultError, HardwareSimError
-from hardware_sim.faults.registry import Faults
 from hardware_sim.reactor import Reactor
-from hardware_sim.timeline import Timeline, WallClock
+from hardware_sim.wall_clock import WallClock
 
 LONGEST_LINE = 65536
 SEND_TIMEOUT_S = 1.0
@@ -27,10 +25,7 @@ SEND_TIMEOUT_S = 1.0
 class Controlled(Protocol):
     """What the control line reads and changes."""
 
-    electrodes: Electrodes
-    faults: Faults
-    limb: Limb | None
-    timeline: Timeline
+    devices: Devices
     clock: WallClock
 
     def catch_up(self) -> None:
@@ -47,7 +42,7 @@ class Control:
 
     def __init__(self, reactor: Reactor, path: Path, emulator: Controlled) -> None:
         self.path = path
-        self._reactor, self._emulator = reactor, emulator
+        self._reactor, self._emulator, self._devices = reactor, emulator, emulator.devices
         self._clients: dict[socket.socket, bytes] = {}
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         self._listener.bind(str(path))
@@ -90,32 +85,32 @@ class Control:
 
     def _pulses(self, request: dict[str, Any]) -> dict[str, Any]:
         since = request.get("since", 0)
-        pulses = self._emulator.electrodes.pulses(since if isinstance(since, int) and since >= 0 else 0)
+        pulses = self._devices.electrodes.pulses(since if isinstance(since, int) and since >= 0 else 0)
         for pulse in pulses:
             pulse["monotonic_s"] = self._emulator.clock.monotonic_s(pulse["time_s"])
         return {"pulses": pulses}
 
     def _faults(self, _request: dict[str, Any]) -> dict[str, Any]:
-        return {"faults": self._emulator.faults.describe(), "active": self._emulator.faults.active()}
+        return {"faults": self._devices.faults.describe(), "active": self._devices.faults.active()}
 
     def _fault(self, request: dict[str, Any]) -> dict[str, Any]:
         name, on, for_s = request.pop("name", ""), request.pop("on", True), request.pop("for_s", None)
         if for_s is not None and not (isinstance(for_s, int | float) and 0 <= for_s < math.inf):
             raise FaultError(f"'for_s' must be a number of seconds, not {for_s!r}")
         if on:
-            self._emulator.faults.on(str(name), request, for_s)
+            self._devices.faults.on(str(name), request, for_s)
         else:
-            self._emulator.faults.off(str(name))
-        time_s = self._emulator.timeline.now_s
+            self._devices.faults.off(str(name))
+        time_s = self._devices.timeline.now_s
         return {
             "time_s": time_s,
             "monotonic_s": self._emulator.clock.monotonic_s(time_s),
-            "active": self._emulator.faults.active(),
-            "pulses_received": len(self._emulator.electrodes.log),
+            "active": self._devices.faults.active(),
+            "pulses_received": len(self._devices.electrodes.log),
         }
 
     def _arm(self, request: dict[str, Any]) -> dict[str, Any]:
-        limb, time_s = self._emulator.limb, self._emulator.timeline.now_s
+        limb, time_s = self._devices.limb, self._devices.timeline.now_s
         if limb is None:
             raise ArmError("this rig has no arm; start it with --arm")
         limb.move(str(request.pop("mode", "")), request, time_s)

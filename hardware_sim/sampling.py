@@ -26,6 +26,14 @@ class Noise:
             self._block = (self._sd * self._random.standard_normal(NOISE_BLOCK))[::-1].tolist()
         return self._block.pop()
 
+    def take(self, count: int) -> list[float]:
+        """Noise of the next `count` samples, at least one."""
+        while len(self._block) < count:
+            self._block = (self._sd * self._random.standard_normal(NOISE_BLOCK))[::-1].tolist() + self._block
+        taken = self._block[: -count - 1 : -1]
+        del self._block[-count:]
+        return taken
+
 
 class SampleClock:
     """When a sensor takes its next sample, in emulated seconds, and what its own clock says then.
@@ -39,22 +47,31 @@ class SampleClock:
         self._nominal_hz, self._rate, self._epoch_us = rate_hz, 1.0 + ppm * 1e-6, epoch_us
         self._jitter_seed = jitter_seed
         self._anchor_s, self._anchor_sample, self._period_s = 0.0, 0, 1.0 / (rate_hz * self._rate)
-        self._off_s = 0.0
+        self._due_s = self._off_s = 0.0
         self.set_jitter(jitter_s)
 
     def next_s(self) -> float:
         """When the next sample is due."""
-        return self._anchor_s + (self.samples - self._anchor_sample) * self._period_s + self._off_s
+        return self._due_s
 
     def taken(self) -> None:
         """The sample that was due is taken."""
         self.samples += 1
         largest_s = LARGEST_JITTER_PERIODS * self._period_s
         self._off_s = min(max(self._jitter.next(), -largest_s), largest_s) if self._jitter else 0.0
+        self._due_s = self._anchor_s + (self.samples - self._anchor_sample) * self._period_s + self._off_s
+
+    def take(self, until_s: float) -> list[float]:
+        """Times of all samples due before `until_s`, which are taken."""
+        times_s = []
+        while self._due_s < until_s:
+            times_s.append(self._due_s)
+            self.taken()
+        return times_s
 
     def set_rate_factor(self, factor: float) -> None:
         """Sample `factor` times as fast as nominal from the next sample on."""
-        self._anchor_s, self._anchor_sample = self.next_s() - self._off_s, self.samples
+        self._anchor_s, self._anchor_sample = self._due_s - self._off_s, self.samples
         self._period_s = 1.0 / (self._nominal_hz * self._rate * factor)
 
     def set_jitter(self, sd_s: float) -> None:

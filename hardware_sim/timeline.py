@@ -1,13 +1,12 @@
-"""The emulator's time: events on a clock that the caller advances.
+"""The emulated time: events on a clock that the caller advances.
 
-The process advances it with the machine's monotonic clock, tests advance it by hand and finish fast.
+The emulator advances it with the machine's monotonic clock; simulations advance it by hand and finish fast.
 """
 
 from __future__ import annotations
 
 import heapq
 import itertools
-import time
 from collections.abc import Callable
 
 
@@ -50,35 +49,24 @@ class Timeline:
 
     def next_s(self) -> float | None:
         """Time of the next event, or None."""
+        while self._events and self._events[0][2].action is None:
+            heapq.heappop(self._events)
         return self._events[0][0] if self._events else None
 
     def run_until(self, time_s: float) -> None:
-        """Advance time to `time_s`, with all events up to it."""
-        while self._events and self._events[0][0] <= time_s:
-            event_s, _, event = heapq.heappop(self._events)
-            if event.action is not None:
+        """Advance time to `time_s`, with all events up to it, also those that followers plan on the way."""
+        while True:
+            while (event_s := self.next_s()) is not None and event_s <= time_s:
                 self._move(event_s)
-                event.action()
-        self._move(time_s)
+                event = heapq.heappop(self._events)[2]
+                if event.action is not None:
+                    event.action()
+            self._move(time_s)
+            if not self._events or self._events[0][0] > time_s:
+                return
 
     def _move(self, time_s: float) -> None:
         if time_s > self.now_s:
             for follow in self.followers:
                 follow(time_s)
             self.now_s = time_s
-
-
-class WallClock:
-    """Seconds since the start on the monotonic clock, `speed` times faster."""
-
-    def __init__(self, speed: float = 1.0) -> None:
-        self.speed = speed
-        self._start_s = time.monotonic()
-
-    def now_s(self) -> float:
-        """Emulated seconds since the start."""
-        return (time.monotonic() - self._start_s) * self.speed
-
-    def monotonic_s(self, time_s: float) -> float:
-        """The machine's monotonic time at an emulated time."""
-        return self._start_s + time_s / self.speed

@@ -56,4 +56,4 @@ class AngleSensor:
         reading = self._encoder.read(time_s)
         status = FAULT_BIT if reading.fault else 0
         data = LAYOUT.pack(reading.angle_deg, self.counter & 0xFFFF, status, 0)
-        return Frame(CAN_ID, data, self.clock.time_us(time_s))
+        return Frame(CAN_ID, data, self.clock.time_us(time_s), time_s=time_s)

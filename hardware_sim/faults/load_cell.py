@@ -113,8 +113,8 @@ def torque_step(target: Target, step_nm: float = 40.0) -> Undo:
 @fault
 def bus_off(target: Target) -> Undo:
     """The adapter reports bus-off once, then nothing comes."""
-    time_us = target.load_cell.clock.time_us(target.timeline.now_s)
-    target.load_cell.add_frame(Frame(BUS_OFF_CLASS, bytes(8), time_us, error=True))
+    now_s = target.timeline.now_s
+    target.load_cell.add_frame(Frame(BUS_OFF_CLASS, bytes(8), target.load_cell.clock.time_us(now_s), True, now_s))
     return _hooked_on_bus(target, lambda _frame: ())
 
 
@@ -122,7 +122,7 @@ def bus_off(target: Target) -> Undo:
 def error_frames(target: Target, probability: float = 0.1) -> Undo:
     """Error frames come between the others; nothing is lost."""
     return _frame_fault(
-        target, probability, lambda frame: (frame, Frame(BUS_ERROR_CLASS, bytes(8), frame.time_us, error=True))
+        target, probability, lambda frame: (frame, frame._replace(can_id=BUS_ERROR_CLASS, data=bytes(8), error=True))
     )
 
 
@@ -158,12 +158,13 @@ def delivery_jitter(target: Target, largest_s: float = 0.02) -> Undo:
 
     def release() -> None:
         if waiting:
-            target.load_cell.add_frame(waiting.popleft())
+            frame = waiting.popleft()
+            target.load_cell.add_frame(frame._replace(time_s=min(frame.time_s, target.timeline.now_s)))
 
     def delay(frame: Frame) -> Iterable[Frame]:
         nonlocal last_s
-        last_s = max(last_s, target.timeline.now_s + target.random.uniform(0.0, largest_s))
-        waiting.append(frame)
+        last_s = max(last_s, frame.time_s + target.random.uniform(0.0, largest_s))
+        waiting.append(frame._replace(time_s=last_s))
         target.timeline.at(last_s, release)
         return ()
 

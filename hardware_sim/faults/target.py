@@ -27,17 +27,17 @@ class Target(Protocol):
     angle_sensor: AngleSensor | None
 
     def plug_stimulator(self) -> None:
-        """Connect the stimulator, on a new port."""
+        """Connect the stimulator."""
         ...
 
     def unplug_stimulator(self) -> None:
-        """Remove the stimulator's port."""
+        """Pull the stimulator's cable."""
         ...
 
     def plug_cell(self) -> None:
-        """Connect the load cell's adapter, on a new port."""
+        """Connect the load cell's adapter."""
         ...
 
     def unplug_cell(self) -> None:
-        """Remove the load cell's adapter."""
+        """Pull the load cell's adapter."""
         ...

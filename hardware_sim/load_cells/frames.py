@@ -16,7 +16,9 @@ class AngleReading(NamedTuple):
 
 
 class Sample(NamedTuple):
-    """One reading; `time_us` is on the cell's own clock; `counter` never wraps here, only in a cell's frames.
+    """One reading, taken at the emulated `time_s`, which is `time_us` on the cell's own clock.
+
+    `counter` never wraps here, only in a cell's frames.
 
     `angle` is there where the cell's electronics read a joint angle too.
     """
@@ -26,15 +28,21 @@ class Sample(NamedTuple):
     sync: bool
     time_us: int
     angle: AngleReading | None = None
+    time_s: float = 0.0
 
 
 class Frame(NamedTuple):
-    """One CAN frame; `error` marks a bus error that the adapter reports."""
+    """One CAN frame; `error` marks a bus error that the adapter reports.
+
+    `time_us` is the sensor's own stamp. `time_s` is the emulated time at which it leaves the sensor: that of its last
+    sample, or later where a fault delays it.
+    """
 
     can_id: int
     data: bytes
     time_us: int
     error: bool = False
+    time_s: float = 0.0
 
 
 FrameHandler = Callable[[int, bytes], None]

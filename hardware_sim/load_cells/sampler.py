@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from itertools import chain, repeat
 
-from hardware_sim.load_cells.frames import AngleReading, CellProtocol, Frame, Sample, TransportProtocol
+from hardware_sim.load_cells.frames import AngleReading, CellProtocol, Frame, Sample
 from hardware_sim.patients.muscle import Muscle
 from hardware_sim.sampling import Noise, SampleClock
 
@@ -40,9 +41,11 @@ class LoadCell:
         self.counter = 0
         self.torque_nm = 0.0
         self.clock = SampleClock(rate_hz, clock_ppm, jitter_s, JITTER_SEED, epoch_us)
-        self._muscle, self._cell, self._noise = muscle, cell, noise
+        self.cell = cell
+        self._muscle, self._noise = muscle, noise
         self._converted_nm: Callable[[float, float], float] | None = getattr(muscle, "converted_nm", None)
         self._read_angle = read_angle
+        self._one_by_one = self._converted_nm is not None or read_angle is not None
         self._offset_nm, self._has_sync = offset_nm, has_sync
         self._sync = False
         self._held: list[Sample] = []
@@ -54,8 +57,17 @@ class LoadCell:
 
     def produce(self, until_s: float) -> None:
         """Take all samples that are due before `until_s`, in emulated seconds."""
-        while self.clock.next_s() < until_s:
-            self.sample()
+        if self._one_by_one or self.torque_hooks or self.frame_hooks:
+            while self.clock.next_s() < until_s:
+                self.sample()
+        elif times_s := self.clock.take(until_s):
+            self._read(times_s)
+
+    def restart(self, cell: CellProtocol) -> None:
+        """Power lost and back, with electronics as they are from power-on: what has not been taken is lost."""
+        self.cell, self.counter, self._sync = cell, 0, False
+        self._held.clear()
+        self._frames.clear()
 
     def next_s(self) -> float:
         """When the next sample is due."""
@@ -73,34 +85,37 @@ class LoadCell:
     def sample(self) -> None:
         """Take the next sample."""
         time_s = self.clock.next_s()
-        self.torque_nm = self._muscle.torque_nm(time_s)
-        reading_nm = self.torque_nm + self._offset_nm + self._noise.next()
-        if self._converted_nm is not None:
-            reading_nm = self._converted_nm(reading_nm, time_s)
-        for hook in self.torque_hooks:
-            reading_nm = hook(reading_nm)
-        angle = self._read_angle(time_s) if self._read_angle else None
-        sample = Sample(reading_nm, self.counter, self._sync, self.clock.time_us(time_s), angle)
-        self._sync = False
-        self.counter += 1
         self.clock.taken()
-        if not self._cell.running():
+        self._read([time_s])
+
+    def _read(self, times_s: list[float]) -> None:
+        """Samples at these times; one alone where a hook, a converter or an angle wants its turn."""
+        torques_nm = list(map(self._muscle.torque_nm, times_s))
+        self.torque_nm = torques_nm[-1]
+        noise_nm = self._noise.take(len(times_s))
+        readings_nm = [nm + self._offset_nm + more for nm, more in zip(torques_nm, noise_nm, strict=True)]
+        if self._converted_nm is not None:
+            readings_nm = [self._converted_nm(readings_nm[0], times_s[0])]
+        for hook in self.torque_hooks:
+            readings_nm = [hook(readings_nm[0])]
+        angle = self._read_angle(times_s[0]) if self._read_angle else None
+        counters = range(self.counter, self.counter + len(times_s))
+        syncs = chain((self._sync,), repeat(False))
+        self._sync, self.counter = False, counters.stop
+        stamps_us = map(self.clock.time_us, times_s)
+        self._send(map(Sample, readings_nm, counters, syncs, stamps_us, repeat(angle), times_s))
+
+    def _send(self, samples: Iterable[Sample]) -> None:
+        """Frames of these samples; a cell that does not run throws them away."""
+        if not self.cell.running():
             self._held.clear()
             return
-        self._held.append(sample)
-        if len(self._held) >= self._cell.samples_per_frame:
-            self._queue(self._cell.encode(self._held))
-            self._held.clear()
-
-    def _queue(self, frame: Frame) -> None:
-        frames = [frame]
+        frames, held, full = [], self._held, self.cell.samples_per_frame
+        for sample in samples:
+            held.append(sample)
+            if len(held) >= full:
+                frames.append(self.cell.encode(held))
+                held.clear()
         for hook in self.frame_hooks:
             frames = [changed for one in frames for changed in hook(one)]
         self._frames += frames
-
-
-def deliver(load_cell: LoadCell, transport: TransportProtocol) -> None:
-    """Send the frames made since the last call."""
-    frames = load_cell.take_frames()
-    if frames:
-        transport.send(frames)

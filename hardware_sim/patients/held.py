@@ -10,6 +10,7 @@ for a pulse 1 ms late.
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import Any
 
 
@@ -76,12 +77,19 @@ class HeldPulses:
         dt = time_s - self._time_s
         if dt <= 0.0:
             return
-        decay = math.exp(-self._sigma * dt)
-        c, s = _oscillation(self._discriminant, dt)
+        y_y, y_dy, dy_y, dy_dy = _transition(self._sigma, self._omega2, self._discriminant, dt)
         offset, rate = self._y - input_nm, self._dy
-        self._y = input_nm + decay * (offset * (c + self._sigma * s) + rate * s)
-        self._dy = decay * (rate * (c - self._sigma * s) - offset * self._omega2 * s)
+        self._y = input_nm + y_y * offset + y_dy * rate
+        self._dy = dy_y * offset + dy_dy * rate
         self._time_s = time_s
+
+
+@lru_cache(maxsize=256)
+def _transition(sigma: float, omega2: float, discriminant: float, dt: float) -> tuple[float, float, float, float]:
+    """The matrix exponential over `dt`, row by row; a sampled muscle asks for the same few steps again and again."""
+    decay = math.exp(-sigma * dt)
+    c, s = _oscillation(discriminant, dt)
+    return decay * (c + sigma * s), decay * s, -decay * omega2 * s, decay * (c - sigma * s)
 
 
 def _oscillation(discriminant: float, dt: float) -> tuple[float, float]:

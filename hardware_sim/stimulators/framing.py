@@ -9,6 +9,7 @@ from abc import ABC, abstractmethod
 from typing import ClassVar, NamedTuple
 
 START, STOP, ESCAPE, KEY = 0xF0, 0x0F, 0x81, 0x55
+KEYED = bytes(byte ^ KEY for byte in range(256))
 
 
 class Packet(NamedTuple):
@@ -21,34 +22,29 @@ class Packet(NamedTuple):
 
 def stuff(data: bytes) -> bytes:
     """Escape each byte that could be mistaken for a frame's border."""
-    stuffed = bytearray()
-    for byte in data:
-        if byte in (START, STOP, ESCAPE):
-            stuffed += bytes((ESCAPE, byte ^ KEY))
-        else:
-            stuffed.append(byte)
-    return bytes(stuffed)
+    for byte in (ESCAPE, START, STOP):  # the escape first: those that it brings are not to be escaped
+        data = data.replace(bytes((byte,)), bytes((ESCAPE, byte ^ KEY)))
+    return data
 
 
 def unstuff(data: bytes) -> bytes | None:
     """The reverse of `stuff`; None if an escape is the last byte."""
     plain = bytearray()
-    pending = iter(data)
-    for byte in pending:
-        if byte == ESCAPE:
-            escaped = next(pending, None)
-            if escaped is None:
-                return None
-            plain.append(escaped ^ KEY)
-        else:
-            plain.append(byte)
-    return bytes(plain)
+    begin = 0
+    while (escape := data.find(ESCAPE, begin)) >= 0:
+        if escape + 1 == len(data):
+            return None
+        plain += data[begin:escape]
+        plain.append(data[escape + 1] ^ KEY)
+        begin = escape + 2
+    return bytes(plain + data[begin:])
 
 
 def frame(header: bytes, body: bytes) -> bytes:
     """The frame of a plain header and a stuffed body."""
-    escaped = b"".join(bytes((ESCAPE, byte ^ KEY)) for byte in header)
-    return bytes((START,)) + escaped + body + bytes((STOP,))
+    escaped = bytearray((ESCAPE,)) * (2 * len(header))
+    escaped[1::2] = header.translate(KEYED)
+    return b"%c%b%b%c" % (START, escaped, body, STOP)
 
 
 class FrameDecoder(ABC):
@@ -116,9 +112,9 @@ class FrameDecoder(ABC):
 
     def _header(self) -> bytes | None:
         escaped = self._buffer[1 : 1 + 2 * self.HEADER_BYTES]
-        if any(byte != ESCAPE for byte in escaped[::2]):
+        if escaped[::2].strip(bytes((ESCAPE,))):
             return None
-        return bytes(byte ^ KEY for byte in escaped[1::2])
+        return bytes(escaped[1::2].translate(KEYED))
 
     def _reject(self) -> None:
         """Skip this start byte: another frame may begin inside what looked like one."""

@@ -36,7 +36,7 @@ class Cell:
         """TPDO1 of one sample."""
         sample = samples[0]
         data = LAYOUT.pack(sample.torque_nm, sample.counter & 0xFFFF, int(sample.sync), 0)
-        return Frame(TPDO1_ID, data, sample.time_us)
+        return Frame(TPDO1_ID, data, sample.time_us, time_s=sample.time_s)
 
     def received(self, can_id: int, data: bytes) -> None:
         """NMT commands for this node or for all."""

@@ -31,7 +31,7 @@ class Cell:
     def encode(self, samples: Sequence[Sample]) -> Frame:
         """The frame of its samples; values are limited to full scale, NaN is the lowest count."""
         data = b"".join(_counts(sample.torque_nm).to_bytes(2, "big") for sample in samples)
-        return Frame(CAN_ID, data, samples[-1].time_us)
+        return Frame(CAN_ID, data, samples[-1].time_us, time_s=samples[-1].time_s)
 
     def received(self, can_id: int, data: bytes) -> None:
         """Takes no commands."""

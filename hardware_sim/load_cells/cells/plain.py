@@ -38,10 +38,10 @@ class Cell:
         """The frame of its samples."""
         last = samples[-1]
         if len(samples) == PACKED_SAMPLES:
-            counter = last.counter // PACKED_SAMPLES & 0xFFFF
-            return Frame(CAN_ID, PACKED.pack(*(_counts(sample.torque_nm) for sample in samples), counter), last.time_us)
-        status = SYNC_BIT if last.sync else 0
-        return Frame(CAN_ID, LAYOUT.pack(last.torque_nm, last.counter & 0xFFFF, status, 0), last.time_us)
+            data = PACKED.pack(*(_counts(one.torque_nm) for one in samples), last.counter // PACKED_SAMPLES & 0xFFFF)
+        else:
+            data = LAYOUT.pack(last.torque_nm, last.counter & 0xFFFF, SYNC_BIT if last.sync else 0, 0)
+        return Frame(CAN_ID, data, last.time_us, False, last.time_s)
 
     def received(self, can_id: int, data: bytes) -> None:
         """Takes no commands."""

@@ -37,7 +37,8 @@ class Cell:
         sample = samples[0]
         status = (SYNC_BIT if sample.sync else 0) | (FAULT_BIT if sample.angle and sample.angle.fault else 0)
         counts = _counts(sample.angle.angle_deg if sample.angle else math.nan)
-        return Frame(CAN_ID, LAYOUT.pack(sample.torque_nm, counts, sample.counter & 0xFF, status), sample.time_us)
+        data = LAYOUT.pack(sample.torque_nm, counts, sample.counter & 0xFF, status)
+        return Frame(CAN_ID, data, sample.time_us, time_s=sample.time_s)
 
     def received(self, can_id: int, data: bytes) -> None:
         """Takes no commands."""

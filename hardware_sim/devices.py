@@ -1,0 +1,213 @@
+"""The emulated devices of a rig: stimulator, muscle, load cell and angle sensor, on a clock that their owner advances.
+
+There is no I/O here, no thread, no real time and no chance without a seed: the same settings and the same inputs at
+the same emulated times give the same bytes, frames and pulses. The owner carries bytes and frames to a host: over real
+ports (`emulator`), or within one process.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from typing import Any
+
+from hardware_sim import stimulators
+from hardware_sim.angle_sensors import mounted
+from hardware_sim.arm.description import Arm
+from hardware_sim.arm.limb import Limb
+from hardware_sim.electrodes import Electrodes
+from hardware_sim.errors import SettingsError
+from hardware_sim.faults.registry import Faults
+from hardware_sim.load_cells import cells
+from hardware_sim.load_cells.frames import CellProtocol, Frame
+from hardware_sim.load_cells.sampler import LoadCell
+from hardware_sim.patients.muscle import Muscle
+from hardware_sim.sampling import Noise, take_in_order
+from hardware_sim.scan import pick
+from hardware_sim.settings import Settings
+from hardware_sim.stimulators.board import Board, FirmwareProtocol
+from hardware_sim.timeline import Timeline
+
+
+class Devices:
+    """All devices and their two cables; `faults` act on them.
+
+    How often time is advanced changes nothing about what the devices do. Without an arm the joint is held still and
+    nobody measures its angle.
+
+    Parameters
+    ----------
+    muscle : Muscle
+        At rest.
+    settings : Settings
+        `speed` and `transport` are the owner's affair.
+    arm : Arm, optional
+        What holds or moves the joint.
+    epoch_us : int
+        What the sensors' clocks show at the emulated time 0, µs.
+
+    Attributes
+    ----------
+    unread_bytes : callable
+        How many bytes that it was given the host has not read; the owner may set it.
+    on_stimulator_cable, on_cell_cable : callable
+        Called after a cable is plugged (True) or unplugged (False); the owner may set them. What was sent before is
+        still to be taken.
+    """
+
+    def __init__(self, muscle: Muscle, settings: Settings, arm: Arm | None = None, epoch_us: int = 0) -> None:
+        self.settings = settings
+        self.random = random.Random(settings.noise_seed)
+        self.timeline = Timeline()
+        self.limb = Limb(muscle, arm, settings.noise_seed) if arm else None
+        muscle = self.limb or muscle
+        self.encoder = mounted.encoder(self.limb.angle_deg, settings) if self.limb else None
+        read_angle = self.encoder.read if self.encoder and settings.angle == "in-cell" else None
+        self.load_cell = _make_load_cell(muscle, settings, epoch_us, read_angle)
+        self.angle_sensor = mounted.own_sensor(self.encoder, self.load_cell.add_frame, settings, epoch_us)
+        self.timeline.followers.append(self._sample_until)
+        self.electrodes = Electrodes(muscle, self.load_cell.raise_sync)
+        self.stimulator_plugged = self.cell_plugged = True
+        self.unread_bytes: Callable[[], int] = lambda: 0
+        self.on_stimulator_cable: Callable[[bool], None] = lambda _plugged: None
+        self.on_cell_cable: Callable[[bool], None] = lambda _plugged: None
+        self._bytes: list[tuple[float, bytes]] = []
+        self._frames: list[Frame] = []
+        self.board = Board(self.timeline, self.electrodes, self._write, self._count_unread_bytes)
+        self.firmware: FirmwareProtocol = pick(stimulators, "Firmware", settings.stimulator, "stimulator")(self.board)
+        self.faults = Faults(self)
+
+    def received(self, time_s: float, data: bytes) -> None:
+        """Bytes from the host on the stimulator's line at `time_s`, or now if that has passed."""
+        self.advance(time_s)
+        sent: bytes | None = data if self.stimulator_plugged else None
+        for hook in self.board.incoming:
+            sent = hook(sent) if sent else None
+        if sent:
+            self.firmware.received(sent)
+
+    def frame_received(self, time_s: float, can_id: int, data: bytes) -> None:
+        """A CAN frame from the host to the load cell at `time_s`, or now if that has passed."""
+        self.advance(time_s)
+        if self.cell_plugged:
+            self.load_cell.cell.received(can_id, data)
+
+    def advance(self, time_s: float) -> None:
+        """Simulate up to `time_s`: all events up to it, and all samples due before it."""
+        self.timeline.run_until(time_s)
+
+    def next_s(self) -> float | None:
+        """Time of the next event of the devices' own, or None; samples are none."""
+        return self.timeline.next_s()
+
+    def take_bytes(self) -> list[tuple[float, bytes]]:
+        """What the stimulator has written since the last call, each with the emulated time at which it did."""
+        taken, self._bytes = self._bytes, []
+        return taken
+
+    def take_frames(self) -> list[Frame]:
+        """The frames of load cell and angle sensor since the last call, in the order in which they were sent."""
+        self._collect_frames()
+        taken, self._frames = self._frames, []
+        return taken
+
+    def plug_stimulator(self) -> None:
+        """Connect the stimulator."""
+        self.stimulator_plugged = True
+        self.on_stimulator_cable(True)
+
+    def unplug_stimulator(self) -> None:
+        """Pull the stimulator's cable; the device itself goes on."""
+        self.stimulator_plugged = False
+        self.on_stimulator_cable(False)
+
+    def plug_cell(self) -> None:
+        """Connect the adapter of load cell and angle sensor."""
+        self._collect_frames()
+        self.cell_plugged = True
+        self.on_cell_cable(True)
+
+    def unplug_cell(self) -> None:
+        """Pull the adapter; the sensors go on."""
+        self._collect_frames()
+        self.cell_plugged = False
+        self.on_cell_cable(False)
+
+    def power_cycle(self) -> None:
+        """Power lost and back now, for all devices: what they have not sent is lost, and they start anew.
+
+        The muscle, the electrodes' log, the cables and the faults that are on stay as they are.
+        """
+        self.firmware.reset()
+        self.load_cell.restart(_make_cell(self.settings))
+        if self.angle_sensor is not None:
+            self.angle_sensor.counter = 0
+        self._bytes.clear()
+        self._frames.clear()
+
+    def state(self) -> dict[str, Any]:
+        """The present state, as plain values."""
+        log = self.electrodes.log
+        return {
+            **self.firmware.state(),
+            "time_s": self.timeline.now_s,
+            "pulses_received": len(log),
+            "pulses_delivered": self.electrodes.delivered_pulses,
+            "unbalanced_pulses": self.electrodes.unbalanced_pulses,
+            "last_pulse_time_s": log[-1].time_s if log else None,
+            "torque_nm": self.load_cell.torque_nm,
+            "samples": self.load_cell.clock.samples,
+            **(self.limb.state() if self.limb else {}),
+            "faults": self.faults.active(),
+        }
+
+    def _sample_until(self, time_s: float) -> None:
+        if self.angle_sensor is None:
+            self.load_cell.produce(time_s)
+        else:
+            take_in_order((self.load_cell, self.angle_sensor), time_s)
+
+    def _write(self, frame: bytes) -> None:
+        if self.stimulator_plugged:
+            self._bytes.append((self.timeline.now_s, frame))
+
+    def _count_unread_bytes(self) -> int:
+        return self.unread_bytes() + sum(len(data) for _, data in self._bytes)
+
+    def _collect_frames(self) -> None:
+        """Frames that come while the adapter is pulled are lost."""
+        frames = self.load_cell.take_frames()
+        if self.cell_plugged:
+            self._frames += frames
+
+
+def _make_load_cell(muscle: Muscle, settings: Settings, epoch_us: int, read_angle: Any) -> LoadCell:
+    return LoadCell(
+        muscle,
+        _make_cell(settings),
+        Noise(settings.noise_nm, settings.noise_seed),
+        settings.rate_hz,
+        offset_nm=settings.torque_offset_nm,
+        clock_ppm=settings.clock_ppm,
+        jitter_s=settings.clock_jitter_us * 1e-6,
+        has_sync=settings.sync,
+        epoch_us=epoch_us,
+        read_angle=read_angle,
+    )
+
+
+def _make_cell(settings: Settings) -> CellProtocol:
+    """The cell's electronics.
+
+    Raises
+    ------
+    SettingsError
+        It has no frame of so many samples.
+    """
+    kind = pick(cells, "Cell", settings.cell, "load cell")
+    if settings.samples_per_frame not in kind.layouts:
+        takes = " or ".join(map(str, kind.layouts))
+        raise SettingsError(
+            f"--samples-per-frame must be {takes} with --cell {settings.cell}, not {settings.samples_per_frame}"
+        )
+    return kind(settings.samples_per_frame)

@@ -1,0 +1,94 @@
+"""Devices as a command line or a scenario describes them: with a patient and an arm by name, file or seed."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from hardware_sim.arm import description as arms
+from hardware_sim.arm.description import Arm
+from hardware_sim.arm.tissue import bare
+from hardware_sim.devices import Devices
+from hardware_sim.errors import ArmError, PatientError
+from hardware_sim.patients import registry
+from hardware_sim.patients.muscle import Muscle
+from hardware_sim.settings import Settings
+
+DESIGN = "design"
+HIDDEN = "hidden:"
+
+
+def make_devices(
+    settings: Settings, arm: str | None = None, arm_laws: Sequence[str] = (), epoch_us: int = 0
+) -> Devices:
+    """The devices of these settings, at emulated time 0, with their muscle at rest.
+
+    Parameters
+    ----------
+    settings : Settings
+        Its `patient` is a name, the path of a file, or `hidden:SEED`.
+    arm : str, optional
+        As `--arm` takes it: a mode with settings, or a file; for a hidden patient also `design`. None: the joint is
+        held still and has no sensor.
+    arm_laws : sequence of str
+        Other laws of the arm's tissue, each `PLACE=NAME[,PARAMETER=NUMBER…]`.
+    epoch_us : int
+        What the sensors' clocks show at time 0, µs.
+
+    Raises
+    ------
+    HardwareSimError
+        Patient, arm or a setting cannot be used.
+    """
+    seed = _hidden_seed(settings.patient)
+    muscle = _muscle(settings.patient) if seed is None else hidden_patients().make(seed, moving=arm is not None)
+    return Devices(muscle, settings, None if arm is None else _arm(arm, arm_laws, seed), epoch_us)
+
+
+def hidden_patients() -> Any:
+    """The module that makes hidden patients and reveals what they hide.
+
+    Raises
+    ------
+    PatientError
+        This installation has none.
+    """
+    module = "hardware_sim.patients.hidden"
+    try:
+        hidden = importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name != module:
+            raise
+        hidden = None
+    if not hasattr(hidden, "make"):
+        raise PatientError("hidden patients are not part of this installation; use --patient")
+    return hidden
+
+
+def _hidden_seed(patient: str) -> int | None:
+    try:
+        return int(patient.removeprefix(HIDDEN)) if patient.startswith(HIDDEN) else None
+    except ValueError:
+        return None
+
+
+def _muscle(patient: str) -> Muscle:
+    if patient not in registry.names() and (
+        Path(patient).suffix.lower() in {".toml", ".json"} or Path(patient).exists()
+    ):
+        return registry.from_file(Path(patient))
+    return registry.make(patient)
+
+
+def _arm(text: str, laws: Sequence[str], hidden_seed: int | None) -> Arm:
+    """The arm asked for; a hidden patient brings all that its joint does, and how it moves if asked for by `design`."""
+    if hidden_seed is None:
+        return arms.with_laws(arms.read(text), laws)
+    if laws:
+        raise ArmError("--arm-law: what the arm of a hidden patient does is hidden, too")
+    if text == DESIGN:
+        return Arm("waves", hidden_patients().movement(hidden_seed), bare())
+    return replace(arms.read(text), tissue=bare())
