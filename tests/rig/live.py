@@ -1,51 +1,65 @@
-"""A rig in this process on devices that live in threads of real time: for tests of `rig.control.rig` without a wire."""
+"""A rig in virtual time, on a stimulator and a load cell that the clock drives: for tests of `rig.control.rig`."""
 
 from __future__ import annotations
 
 import json
-import queue
-import threading
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pytest
 
 from rig import config
-from rig.clock import MonotonicClock
 from rig.control import pair
 from rig.control.rig import Rig
 from rig.errors import DeviceError
 from rig.limits import Admitted, Steps
-from rig.messages import Event, Profile, SegmentPlan, TestPlan
+from rig.machine import Disk
+from rig.messages import Event, Profile, SegmentPlan, Status, StopEvidence, TestPlan
 from rig.signals import SAMPLE, Ack, LateError, TorqueBlock
-from tests.harness.paced_time import CLOCK
+from rig.tasks import Outcome, Task
+from tests.simulator.virtual_time import VirtualClock, VirtualMachine
 
+T = TypeVar("T")
 RATE_HZ = 1600.0
 SPEED = 4.0
-LINE = {"stimulator": "/dev/pts/gone", "can": {"interface": "virtual"}}
+BLOCK_S, ACK_S = 0.02, 0.002
+"""Rig seconds from one block of the cell to the next, and until a pulse is acknowledged."""
+ANSWER_S, WORK_S = 0.002, 0.003
+"""Real seconds until the stimulator answers, and for which a disk or a plan keeps whoever waits for it."""
+PATIENCE_S = 100.0
+LINE = {"stimulator": "/dev/pts/gone", "can": {"interface": "virtual"}, "speed": SPEED}
+
+
+class LiveMachine(VirtualMachine):
+    """Whose work takes its time; `asked` counts how often somebody had to wait for it or for the stimulator."""
+
+    def __init__(self, clock: VirtualClock, disk: Disk | None) -> None:
+        super().__init__(clock, disk)
+        self.work_s, self.asked = WORK_S, 0
+
+    def _work(self, action: Callable[[], Any], outcome: Outcome) -> None:
+        self.asked += 1
+        done_s = self.clock.now_s() + self.work_s * self.clock.speed
+        self.clock.call_at(done_s, lambda: VirtualMachine._work(action, outcome))
 
 
 class LiveStimulator:
-    """Acknowledges from a thread of its own."""
+    """Answers and acknowledges a moment later."""
 
     steps = Steps()
     silence_s = 0.0
 
-    def __init__(self, clock: MonotonicClock) -> None:
-        self.clock = clock
-        self.missing = self.deaf = self.stalled = False
+    def __init__(self, machine: LiveMachine) -> None:
+        self.machine, self.clock = machine, machine.clock
+        self.missing = self.deaf = self.stalled = self.armed = False
         self.error: str | None = None
-        self.armed = False
         self.sent: list[tuple[float, Admitted]] = []
-        self._acks: queue.Queue[int] = queue.Queue()
-        self._number = 0
-        threading.Thread(target=self._answer, daemon=True).start()
 
-    def open(self) -> dict[str, Any]:
+    async def open(self) -> dict[str, Any]:
+        await self._wait()
         if self.missing:
             raise DeviceError("stimulator: the port is not there")
         return {"device": "live"}
@@ -53,15 +67,9 @@ class LiveStimulator:
     def listen(self, on_ack: Callable[[Ack], None], on_lost: Callable[[str], None]) -> None:
         self.on_ack, self.on_lost = on_ack, on_lost
 
-    def _answer(self) -> None:
-        while True:
-            number = self._acks.get()
-            while self.stalled:
-                time.sleep(0.001)
-            self.on_ack(Ack(number, self.clock.now_s(), self.error))
-
-    def arm(self) -> None:
+    async def arm(self) -> None:
         self.armed = True
+        await self._wait()
 
     def feed(self) -> None: ...
 
@@ -69,23 +77,43 @@ class LiveStimulator:
         if not (self.clock.now_s() <= latest_s):
             raise LateError
         assert self.armed
-        self._number = (self._number + 1) % 64
         self.sent.append((self.clock.now_s(), pulse))
-        self._acks.put(self._number)
-        return self._number
+        number = len(self.sent) % 64
+        self.clock.call_at(self.clock.now_s() + ACK_S, lambda: self._acknowledge(number))
+        return number
 
-    def stop(self) -> None:
+    def _acknowledge(self, number: int) -> None:
+        now_s = self.clock.now_s()
+        if self.stalled:
+            self.clock.call_at(now_s + ACK_S, lambda: self._acknowledge(number))
+        else:
+            self.on_ack(Ack(number, now_s, self.error))
+
+    async def stop(self) -> None:
+        self.armed = self.armed and self.stalled
+        await self._wait()
         if self.stalled:
             raise DeviceError("stimulator: no answer")
-        self.armed = False
 
-    def state(self) -> tuple[bool, str]:
+    async def state(self) -> tuple[bool, str]:
+        await self._wait()
         if self.deaf or self.stalled:
             raise DeviceError("stimulator: no answer")
         return not self.armed, "armed" if self.armed else "not initialised"
 
     def close(self) -> None:
         self.armed = False
+
+    async def _wait(self) -> None:
+        self.machine.asked += 1
+        await self.machine.tasks.sleep(ANSWER_S)
+
+
+class MistakenBlock(TorqueBlock):
+    """What a driver with a mistake gives."""
+
+    def __len__(self) -> int:
+        raise ZeroDivisionError("a mistake in a driver")
 
 
 class LiveCell:
@@ -94,7 +122,7 @@ class LiveCell:
     sample_rate_hz = RATE_HZ
     counter_modulus = 65536
 
-    def __init__(self, clock: MonotonicClock, stimulator: LiveStimulator) -> None:
+    def __init__(self, clock: VirtualClock, stimulator: LiveStimulator) -> None:
         self.clock, self.stimulator = clock, stimulator
         self.silent = self.gone = self.broken = self.stuck = False
         self.rate = 1.0
@@ -102,39 +130,55 @@ class LiveCell:
         self._began_s = clock.now_s()
         self._count = 0
         self._torque_nm = 0.0
+        self._opened = 0
 
-    def open(self) -> dict[str, Any]:
+    async def open(self, on_block: Callable[[TorqueBlock], None], on_lost: Callable[[str], None]) -> dict[str, Any]:
         if self.gone:
             raise DeviceError("load cell: the bus is not there")
+        self._opened += 1
+        self._beat(self._opened, on_block, on_lost)
         return {"device": "live"}
 
-    def read(self, timeout_s: float) -> TorqueBlock:
-        time.sleep(min(0.002, timeout_s))
-        now_s = self.clock.now_s()
+    async def close(self) -> None:
+        self._opened += 1
+
+    def _beat(self, opened: int, on_block: Callable[[TorqueBlock], None], on_lost: Callable[[str], None]) -> None:
+        if opened != self._opened:
+            return
         if self.gone:
-            raise DeviceError("load cell: the bus is gone")
-        if self.broken:
-            raise ZeroDivisionError("a mistake in a driver")
+            on_lost("load cell: the bus is gone")
+            return
+        on_block(MistakenBlock(self._samples()) if self.broken else TorqueBlock(self._samples()))
+        self.clock.call_at(self.clock.now_s() + BLOCK_S, lambda: self._beat(opened, on_block, on_lost))
+
+    def _samples(self) -> np.ndarray:
+        now_s = self.clock.now_s()
         due = int((now_s - self._began_s) * RATE_HZ * self.rate)
-        block = np.zeros(0 if self.silent else max(0, due - self._count), SAMPLE)
-        block["host_time_s"], block["stamp_s"], block["sync"] = now_s, np.nan, 255
+        samples = np.zeros(0 if self.silent else due - self._count, SAMPLE)
+        samples["host_time_s"], samples["stamp_s"], samples["sync"] = now_s, np.nan, 255
         recent = [pulse for time_s, pulse in self.stimulator.sent[-2:] if now_s - time_s < 0.1]
         target_nm = 0.02 * recent[-1].pulse_width_us if recent else 0.0
-        fallen = np.exp(-np.arange(1, len(block) + 1) / RATE_HZ / 0.1)  # a muscle of 0.1 s
-        block["torque_nm"] = target_nm + (self._torque_nm - target_nm) * fallen
-        self._torque_nm = block["torque_nm"][-1] if len(block) else self._torque_nm
-        block["torque_nm"] += 0.01 * self._rng.standard_normal(len(block))
+        fallen = np.exp(-np.arange(1, len(samples) + 1) / RATE_HZ / 0.1)  # a muscle of 0.1 s
+        samples["torque_nm"] = target_nm + (self._torque_nm - target_nm) * fallen
+        self._torque_nm = samples["torque_nm"][-1] if len(samples) else self._torque_nm
+        samples["torque_nm"] += 0.01 * self._rng.standard_normal(len(samples))
         if self.stuck:
-            block["torque_nm"] = 0.25
-        block["counter"] = (self._count + np.arange(len(block))) % 65536
-        self._count = max(due, self._count)
-        return TorqueBlock(block)
-
-    def close(self) -> None: ...
+            samples["torque_nm"] = 0.25
+        samples["counter"] = (self._count + np.arange(len(samples))) % 65536
+        self._count = due
+        return samples
 
 
 class LiveRig:
-    """A `Rig` on both, and every event that it published."""
+    """A `Rig` on both, opened, and every event that it published.
+
+    Parameters
+    ----------
+    clock
+        Of a rig that was closed: time goes on where that one ended.
+    changes
+        To its configuration.
+    """
 
     def __init__(
         self,
@@ -142,20 +186,48 @@ class LiveRig:
         monkeypatch: pytest.MonkeyPatch,
         rate: float = 1.0,
         armed: bool = False,
-        speed: float = SPEED,
+        clock: VirtualClock | None = None,
+        disk: Disk | None = None,
+        **changes: Any,
     ) -> None:
-        assert CLOCK.paced, "mark the test `wire`: this rig keeps time, and other tests compute beside it"
-        self.clock = MonotonicClock(speed)
-        self.stimulator = LiveStimulator(self.clock)
+        self.clock = clock or VirtualClock()
+        self.clock.speed = SPEED
+        self.machine = LiveMachine(self.clock, disk)
+        self.stimulator = LiveStimulator(self.machine)
         self.cell = LiveCell(self.clock, self.stimulator)
-        made = {"stimulator": self.stimulator, "load_cell": self.cell}
-        found = SimpleNamespace(find=lambda kind, _: SimpleNamespace(create=lambda _settings, _clock: made[kind]))
-        monkeypatch.setattr(pair, "devices", found)
-        self.config = config.for_emulator(json.dumps({**LINE, "speed": speed}), data_dir=folder, socket=folder / "s")
         self.cell.rate, self.stimulator.armed = rate, armed
+        made = self.devices()
+        found = SimpleNamespace(find=lambda kind, _: SimpleNamespace(create=lambda _settings, _machine: made[kind]))
+        monkeypatch.setattr(pair, "devices", found)
+        self.config = config.for_emulator(json.dumps(LINE), data_dir=folder, socket=folder / "s")
+        self.config = self.config.model_copy(update=changes)
         self.events: list[Event] = []
-        self.rig = Rig(self.config, self.clock, self.events.append)
-        self.rig.open()
+        self.rig = Rig(self.config, self.machine, self.events.append)
+        self.ask(self.rig.open())
+
+    def devices(self) -> dict[str, Any]:
+        """By their kind."""
+        return {"stimulator": self.stimulator, "load_cell": self.cell}
+
+    def ask(self, coroutine: Coroutine[Any, Any, T]) -> T:
+        """Obey a request to its end, and let everything else go on meanwhile."""
+        return self.machine.run(coroutine, PATIENCE_S)
+
+    def begin(self, coroutine: Coroutine[Any, Any, T]) -> Task[T]:
+        """A request that goes on while others are made."""
+        return self.machine.tasks.spawn(coroutine, "request")
+
+    def start(self, plan: TestPlan, key: str = "") -> Status:
+        return self.ask(self.rig.start(plan, key))
+
+    def stop(self, reason: str, by: str = "nurse") -> StopEvidence:
+        return self.ask(self.rig.stop(reason, by))
+
+    def rearm(self, by: str = "nurse") -> Status:
+        return self.ask(self.rig.rearm(by))
+
+    def close(self) -> None:
+        self.ask(self.rig.close())
 
     def plan(self, test_id: str, hold_s: float = 2.0, **fields: Any) -> TestPlan:
         segments = [
@@ -166,20 +238,20 @@ class LiveRig:
             **{"test_id": test_id, "participant": "P", "profile": Profile(), "segments": segments, **fields}
         )
 
-    def wait(self, *states: str, timeout_s: float = 10.0) -> str:
+    def until(self, true: Callable[[], bool]) -> None:
+        """Let time pass until something is true."""
+        end_s = self.clock.now_s() + PATIENCE_S
+        assert self.clock.run(self.machine.tasks, end_s, true), self.rig.status()
+
+    def wait(self, *states: str) -> str:
         """Until the rig is in one of the states; gives the reason."""
-        end_s = time.monotonic() + timeout_s
-        while (status := self.rig.status()).state not in states:
-            assert time.monotonic() < end_s, status
-            time.sleep(0.005)
-        return status.reason
+        self.until(lambda: self.states[-1] in states)
+        return self.rig.status().reason
 
     def wait_pulses(self, n: int) -> None:
         """Until so many more pulses were sent."""
-        wanted, end_s = len(self.stimulator.sent) + n, time.monotonic() + 10
-        while len(self.stimulator.sent) < wanted:
-            assert time.monotonic() < end_s, self.rig.status()
-            time.sleep(0.005)
+        wanted = len(self.stimulator.sent) + n
+        self.until(lambda: len(self.stimulator.sent) >= wanted)
 
     @property
     def states(self) -> list[str]:

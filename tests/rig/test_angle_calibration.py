@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,18 +13,17 @@ import pytest
 
 from rig import journal
 from rig.acquire.angle_receiver import AngleReceiver
-from rig.clock import MonotonicClock, VirtualClock
-from rig.control import angle_calibration, pair, posing
+from rig.control import angle_calibration
 from rig.control.angle_calibration import AngleCalibrating
-from rig.control.rig import Rig
 from rig.devices import can_angle_sensor
 from rig.errors import BusyError, DeviceError, LatchedError, PlanError, RefusedError, RigError
 from rig.journal import Kind
 from rig.limits import HARD_LIMITS
-from rig.messages import AnglePlan, AnglePoseRequest
-from rig.signals import ANGLE_SAMPLE, AngleBlock, AngleScale
-from tests.rig.angle import FakeSensor
+from rig.messages import AngleCalibration, AnglePlan, AnglePoseRequest, Status, TestPlan
+from rig.signals import AngleBlock
+from tests.rig.angle import PER_BLOCK, RATE_HZ, FakeSensor
 from tests.rig.live import SPEED, LiveRig
+from tests.simulator.virtual_time import VirtualClock, VirtualMachine
 
 BOUND = HARD_LIMITS["angle_rad"]
 SETTINGS = can_angle_sensor.Settings(device="can_angle_sensor")
@@ -37,19 +33,29 @@ class Posed:
     """A calibration, its sensor, and a joint that a person moves."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder, self.clock, self.degrees = folder, VirtualClock(), 20.0
+        self.folder, self.machine, self.degrees = folder, VirtualMachine(), 20.0
         self.moving_deg_s = 0.0
-        self.sensor = FakeSensor(self.clock, lambda t: math.radians(self.degrees + self.moving_deg_s * (t - 1000.0)))
-        self.receiver = AngleReceiver(self.sensor, self.clock)
-        self.poses = AngleCalibrating(folder, SETTINGS, self.clock)
+        at = lambda t: math.radians(self.degrees + self.moving_deg_s * (t - 1000.0))  # noqa: E731
+        self.sensor = FakeSensor(self.machine.clock, at)
+        self.receiver = AngleReceiver(self.sensor, self.machine.tasks)
+        self.poses = AngleCalibrating(folder, SETTINGS, self.machine)
 
     def hold(self, degrees: float, duration_s: float = 1.5) -> None:
         self.degrees = degrees
-        self.sensor.feed(self.receiver, self.clock.now_s() + duration_s)
-        self.clock.wait(self.clock.now_s() + duration_s)
+        self.sensor.feed(self.receiver, self.machine.clock.now_s() + duration_s)
+        self.machine.wait(duration_s)
 
-    def pose(self, told_deg: float) -> bool:
-        return self.poses.pose(math.radians(told_deg), "nurse", self.receiver, BOUND)
+    def pose(self, told_deg: float, first: bool = False) -> bool:
+        told_rad = math.radians(told_deg)
+        return self.machine.run(self.poses.pose(told_rad, "nurse", self.receiver, BOUND, first))
+
+
+def kept(folder: Path, settings: can_angle_sensor.Settings | None = SETTINGS) -> AngleCalibration | None:
+    """What another process finds."""
+    machine = VirtualMachine()
+    again = AngleCalibrating(folder, settings, machine)
+    machine.run(again.recall())
+    return again.calibration
 
 
 @pytest.fixture
@@ -77,13 +83,13 @@ def test_it_is_kept_for_this_sensor_alone(posed: Posed):
     for degrees in (20.0, 90.0):
         posed.hold(degrees)
         posed.pose(degrees)
-    again = AngleCalibrating(posed.folder, SETTINGS, posed.clock)
-    assert again.calibration == posed.poses.calibration
+    assert posed.poses.calibration is not None
+    assert kept(posed.folder) == posed.poses.calibration
     other = SETTINGS.model_copy(update={"signal": "Other_deg"})
-    assert AngleCalibrating(posed.folder, other, posed.clock).calibration is None
-    assert AngleCalibrating(posed.folder, None, posed.clock).calibration is None
+    assert kept(posed.folder, other) is None
+    assert kept(posed.folder, None) is None
     (posed.folder / "angle-calibration.json").write_text('{"sensor": 1')
-    assert AngleCalibrating(posed.folder, SETTINGS, posed.clock).calibration is None
+    assert kept(posed.folder) is None
 
 
 @pytest.mark.parametrize(
@@ -113,10 +119,10 @@ def test_a_file_that_says_something_else_than_its_poses_is_no_calibration(posed:
     path = posed.folder / "angle-calibration.json"
     content = json.loads(path.read_text())
     path.write_text(json.dumps(content))
-    assert AngleCalibrating(posed.folder, SETTINGS, posed.clock).calibration == posed.poses.calibration
+    assert kept(posed.folder) == posed.poses.calibration
     content["calibration"] |= change
     path.write_text(json.dumps(content))
-    assert AngleCalibrating(posed.folder, SETTINGS, posed.clock).calibration is None
+    assert kept(posed.folder) is None
 
 
 @pytest.mark.parametrize(
@@ -124,7 +130,7 @@ def test_a_file_that_says_something_else_than_its_poses_is_no_calibration(posed:
 )
 def test_a_rig_comes_up_whatever_stands_in_the_file(tmp_path: Path, content: str):
     (tmp_path / "angle-calibration.json").write_bytes(content.encode("utf-8", "surrogateescape"))
-    assert AngleCalibrating(tmp_path, SETTINGS, VirtualClock()).calibration is None
+    assert kept(tmp_path) is None
 
 
 def test_a_new_first_pose_begins_again_and_the_old_calibration_holds_until_the_second(posed: Posed):
@@ -143,7 +149,7 @@ def test_a_new_first_pose_begins_again_and_the_old_calibration_holds_until_the_s
 def test_a_first_pose_of_long_ago_is_none(posed: Posed):
     posed.hold(20.0)
     posed.pose(20.0)
-    posed.clock.wait(posed.clock.now_s() + angle_calibration.FIRST_LASTS_S + 1.0)
+    posed.machine.wait(angle_calibration.FIRST_LASTS_S + 1.0)
     assert posed.poses.first is None
     posed.hold(75.0)  # the sensor sits elsewhere meanwhile
     assert posed.pose(90.0) is False and posed.poses.calibration is None
@@ -163,7 +169,7 @@ def test_a_wrong_first_pose_is_taken_once_more(posed: Posed):
     posed.hold(20.0)
     posed.pose(25.0)
     posed.hold(90.0)
-    assert posed.poses.pose(math.radians(90.0), "nurse", posed.receiver, BOUND, first=True) is False
+    assert posed.pose(90.0, first=True) is False
     assert posed.poses.first is not None and posed.poses.first.angle_rad == pytest.approx(math.radians(90.0))
     posed.hold(20.0)
     assert posed.pose(20.0) is True
@@ -215,7 +221,7 @@ def test_a_slip_that_would_halve_every_angle_is_refused(posed: Posed):
 def test_no_angle_of_an_elbow_is_no_pose(posed: Posed, told_rad: float):
     posed.hold(20.0)
     with pytest.raises(RefusedError, match="angle_pose: angle_rad"):
-        posed.poses.pose(told_rad, "nurse", posed.receiver, BOUND)
+        posed.pose(math.degrees(told_rad))
 
 
 def test_without_good_angles_there_is_no_pose(posed: Posed):
@@ -242,83 +248,58 @@ def test_what_cannot_be_stored_does_not_hold(posed: Posed, monkeypatch: pytest.M
     assert posed.poses.calibration is None
 
 
-class LiveSensor:
-    """Angles of real time, from the receiver's own thread."""
+class LiveSensor(FakeSensor):
+    """Angles as the clock goes."""
 
-    sample_rate_hz, counter_modulus = 200.0, 65536
-    scale, of_the_cell, on_the_cells_bus = AngleScale(30.0, -1, math.pi / 180), False, True
+    def __init__(self, clock: VirtualClock) -> None:
+        self.degrees, self.gone, self._opened = 60.0, False, 0
+        super().__init__(clock, lambda _: math.radians(self.degrees))
 
-    def __init__(self, clock: MonotonicClock) -> None:
-        self.clock, self.degrees, self.gone = clock, 60.0, False
-        self._began_s, self._count = clock.now_s(), 0
-        self._rng = np.random.default_rng(0)
-
-    def open(self) -> dict[str, Any]:
+    async def open(self, on_block: Callable[[AngleBlock], None], on_lost: Callable[[str], None]) -> dict[str, Any]:
         if self.gone:
             raise DeviceError("angle sensor: no adapter")
+        self._opened += 1
+        self._beat(self._opened, on_block, on_lost)
         return {"device": "live"}
 
-    def read(self, timeout_s: float) -> AngleBlock:
-        time.sleep(min(0.004, timeout_s))
-        if self.gone:
-            raise DeviceError("angle sensor on x: the bus was lost: gone")
-        now_s = self.clock.now_s()
-        due = int((now_s - self._began_s) * 200)
-        samples = np.zeros(max(0, due - self._count), ANGLE_SAMPLE)
-        samples["host_time_s"], samples["stamp_s"], samples["fault"] = now_s, np.nan, 0
-        samples["raw"] = 30.0 - self.degrees + 0.01 * self._rng.standard_normal(len(samples))
-        samples["counter"] = (self._count + np.arange(len(samples))) % 65536
-        self._count = max(due, self._count)
-        return AngleBlock(samples)
+    async def close(self) -> None:
+        self._opened += 1
 
-    def close(self) -> None: ...
+    def _beat(self, opened: int, on_block: Callable[[AngleBlock], None], on_lost: Callable[[str], None]) -> None:
+        if opened != self._opened:
+            return
+        if self.gone:
+            on_lost("angle sensor on x: the bus was lost: gone")
+            return
+        if not self.silent:
+            on_block(self.block())
+        self.clock.call_at(self.clock.now_s() + PER_BLOCK / RATE_HZ, lambda: self._beat(opened, on_block, on_lost))
 
 
 class AngledRig(LiveRig):
     """A `LiveRig` with an angle sensor, as its rig file says."""
 
-    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch, require: bool = False) -> None:
-        super().__init__(folder, monkeypatch)
-        self.rig.close()
+    def devices(self) -> dict[str, Any]:
         self.sensor = LiveSensor(self.clock)
-        made = {"stimulator": self.stimulator, "load_cell": self.cell, "angle_sensor": self.sensor}
-        found = SimpleNamespace(find=lambda kind, _: SimpleNamespace(create=lambda _settings, _clock: made[kind]))
-        monkeypatch.setattr(pair, "devices", found)
-        self.config = self.config.model_copy(update={"angle_sensor": SETTINGS, "require_calibration": require})
-        self.rig = Rig(self.config, self.clock, self.events.append)
-        self.rig.open()
-        self.until(lambda: self.rig.status().angle.angle_rad is not None)
+        return {**super().devices(), "angle_sensor": self.sensor}
 
-    def until(self, true: Callable[[], bool]) -> None:
-        end_s = time.monotonic() + 10
-        while not true():
-            assert time.monotonic() < end_s, self.rig.status()
-            time.sleep(0.005)
-
-    def pose(self, degrees: float, told_deg: float | None = None) -> Any:
+    def hold(self, degrees: float) -> None:
+        """For as long as a pose asks for."""
         self.sensor.degrees = degrees
-        told = AnglePoseRequest(angle_rad=math.radians(degrees if told_deg is None else told_deg), by="nurse")
-        self.until(lambda: self.held(30.0 - degrees))
-        return self.rig.angle_pose(told)
+        self.machine.wait(1.1 * angle_calibration.POSE_S * SPEED)
 
-    def held(self, raw: float) -> bool:
-        """Whether the receiver saw nothing else for as long as a pose asks for."""
-        receiver = self.rig._pair.angle
-        found = [] if receiver is None else receiver.recent(angle_calibration.POSE_S * SPEED)["raw"]
-        return len(found) > 350 and bool(np.all(np.abs(found - raw) < 0.5))
+    def pose(self, degrees: float, told_deg: float | None = None) -> Status:
+        self.hold(degrees)
+        told_rad = math.radians(degrees if told_deg is None else told_deg)
+        return self.ask(self.rig.angle_pose(AnglePoseRequest(angle_rad=told_rad, by="nurse")))
+
+
+Angled = Callable[..., AngledRig]
 
 
 @pytest.fixture
-def angled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., AngledRig]]:
-    rigs: list[AngledRig] = []
-
-    def make(**more: Any) -> AngledRig:
-        rigs.append(AngledRig(tmp_path, monkeypatch, **more))
-        return rigs[-1]
-
-    yield make
-    for live in rigs:
-        live.rig.close()
+def angled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Angled:
+    return lambda **changes: AngledRig(tmp_path, monkeypatch, angle_sensor=SETTINGS, **changes)
 
 
 HELD = {
@@ -327,10 +308,9 @@ HELD = {
 }
 
 
-@pytest.mark.wire
-@pytest.mark.slow
-def test_poses_are_told_kept_and_stand_in_the_journal(angled: Callable[..., AngledRig], tmp_path: Path):
+def test_poses_are_told_kept_and_stand_in_the_journal(angled: Angled, tmp_path: Path):
     live = angled()
+    live.machine.wait(0.2)
     told = live.rig.status().angle
     assert told.present and not told.calibrated and told.range_rad == (BOUND.lo, BOUND.hi)
     assert told.angle_rad == pytest.approx(math.radians(60), abs=0.01) and abs(told.velocity_rad_s or 9) < 0.05
@@ -338,12 +318,12 @@ def test_poses_are_told_kept_and_stand_in_the_journal(angled: Callable[..., Angl
     assert status.angle.pose is not None and not status.angle.calibrated
     status = live.pose(90.0, told_deg=95.0)
     assert status.angle.calibrated and status.angle.pose is None and status.angle.calibration is not None
-    live.until(lambda: abs((live.rig.status().angle.angle_rad or 0.0) - math.radians(95)) < 0.01)
-    live.sensor.degrees = 55.0
-    live.until(lambda: live.held(-25.0))
-    live.rig.start(live.plan("t", **HELD))
+    live.machine.wait(0.1)
+    assert live.rig.status().angle.angle_rad == pytest.approx(math.radians(95), abs=0.01)
+    live.hold(55.0)
+    live.start(live.plan("t", **HELD))
     with pytest.raises(BusyError, match="test t is"):
-        live.rig.angle_pose(AnglePoseRequest(angle_rad=1.0, by="nurse"))
+        live.ask(live.rig.angle_pose(AnglePoseRequest(angle_rad=1.0, by="nurse")))
     header = journal.read(tmp_path / "journals" / "t.journal").first_json(Kind.HEADER)
     assert header is not None and header["angle"]["calibration"]["by"] == "nurse" and header["angle"]["one_bus"] is True
     live.wait("ready")
@@ -353,77 +333,62 @@ def test_poses_are_told_kept_and_stand_in_the_journal(angled: Callable[..., Angl
     event = live.rig.live(samples=True)
     assert event is not None and event.angle and event.angle_rad == pytest.approx(math.radians(60), abs=0.02)
     assert all(len(row) == 3 for row in event.angle)
-    plain = live.plan("plain")
     live.sensor.gone = True
-    live.until(lambda: live.rig.status().angle.problem != "")
+    live.machine.wait(0.1)
+    assert live.rig.status().angle.problem != ""
     assert live.rig.status().state == "ready"  # a rig whose angle sensor is gone plays what needs no angle
+    live.machine.wait(10.0)  # it rests
     with pytest.raises(DeviceError, match=r"the bus was lost|no adapter"):
-        time.sleep(0.1)
-        live.rig.start(live.plan("u", **HELD))
-    live.until(lambda: _started(live, plain))
+        live.start(live.plan("u", **HELD))
+    live.start(live.plan("plain"))
     live.wait("ready")
     finished = live.rig.finished
     assert finished is not None and finished.outcome == "completed"
     assert any(line.startswith("angle sensor") for line in finished.summary["warnings"])
 
 
-@pytest.mark.wire
-def test_a_stop_does_not_wait_behind_a_start_that_waits_for_an_angle(
-    angled: Callable[..., AngledRig], monkeypatch: pytest.MonkeyPatch
-):
-    live, stopped = angled(), []
-
-    def stop_meanwhile(*_: Any) -> None:
-        presses = threading.Thread(target=lambda: stopped.append(live.rig.stop("pressed", "nurse")), daemon=True)
-        presses.start()
-        presses.join(10)
-        assert stopped, "the stop waits for the start"
-
-    monkeypatch.setattr(posing, "await_angle", stop_meanwhile)
-    with pytest.raises(LatchedError):
-        live.rig.start(live.plan("t", **HELD))
+def test_a_stop_does_not_wait_behind_a_start_that_waits_for_an_angle(angled: Angled):
+    live = angled()
+    live.sensor.silent = True
+    live.machine.wait(2.0)  # all angles are old
+    starting = live.begin(live.rig.start(live.plan("t", **HELD)))
+    live.machine.wait(0.1)
+    assert not starting.done.is_set()
+    asked_s = live.clock.now_s()
+    assert live.stop("pressed").confirmed
+    assert live.clock.now_s() - asked_s < 0.1
+    live.until(starting.done.is_set)
+    assert isinstance(starting.error, LatchedError)
     assert live.rig.status().state == "latched"
+    assert live.stimulator.sent == []
 
 
-def _started(live: AngledRig, plan: Any) -> bool:
-    try:
-        live.rig.start(plan)
-    except RefusedError:
-        return False
-    return True
-
-
-@pytest.mark.wire
-@pytest.mark.slow
-def test_a_clinics_rig_needs_a_calibration_for_an_angle(angled: Callable[..., AngledRig]):
-    live = angled(require=True)
+def test_a_clinics_rig_needs_a_calibration_for_an_angle(angled: Angled):
+    live = angled(require_calibration=True)
     passive = {"kind": "passive", "angle": AnglePlan(range_rad=(0.2, 2.0))}
     rest = [{"name": "rest", "sequence": "rest", "settings": {"duration_s": 0.5}}]
     plan = live.plan("p", **passive, segments=None).model_copy(update={"segments": None})
-    plan = plan.model_validate({**plan.model_dump(), "segments": rest})
+    plan = TestPlan.model_validate({**plan.model_dump(), "segments": rest})
     with pytest.raises(RefusedError, match=r"the angle sensor is not calibrated; take two poses .* 28\.6°"):
-        live.rig.start(plan)
+        live.start(plan)
     live.pose(20.0)
     live.pose(90.0)
-    live.sensor.degrees = 60.0
-    live.until(lambda: live.held(-30.0))
-    live.rig.start(plan)  # without a pulse it needs no widths that were found today
+    live.hold(60.0)
+    live.start(plan)  # without a pulse it needs no widths that were found today
     live.wait("ready")
     assert live.rig.finished is not None and live.rig.finished.outcome == "completed"
     assert live.stimulator.sent == []
     with pytest.raises(RefusedError, match="not calibrated; a test needs a calibration made on the same day"):
-        live.rig.start(live.plan("h", **HELD))
+        live.start(live.plan("h", **HELD))
 
 
-@pytest.mark.wire
-def test_without_a_sensor_poses_and_angles_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    live = LiveRig(tmp_path, monkeypatch)
+def test_without_a_sensor_poses_and_angles_are_refused(make: Callable[..., LiveRig]):
+    live = make()
     assert live.rig.status().angle.present is False
     with pytest.raises(PlanError, match="angle_pose: this rig has no angle sensor"):
-        live.rig.angle_pose(AnglePoseRequest(angle_rad=1.0, by="nurse"))
+        live.ask(live.rig.angle_pose(AnglePoseRequest(angle_rad=1.0, by="nurse")))
     with pytest.raises(PlanError, match=r"plan.angle: this rig has no angle sensor"):
-        live.rig.start(live.plan("t", **HELD))
-    live.rig.close()
+        live.start(live.plan("t", **HELD))
 
 
 def test_stillness_is_what_a_person_can_hold():

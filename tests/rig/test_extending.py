@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +15,7 @@ from rig import journal as jn
 from rig.clock import utc_text
 from rig.control.building import previewed
 from rig.control.calibration import end_of_day_s
-from rig.errors import BusyError, PlanError, RefusedError, RigError, TooLateError
+from rig.errors import BusyError, PlanError, RefusedError, TooLateError
 from rig.messages import (
     AdaptivePlan,
     EnoughRequest,
@@ -33,23 +31,8 @@ from rig.signals import PulseStatus
 from tests.rig.fakes import VirtualRig
 from tests.rig.live import LiveRig
 
-pytestmark = pytest.mark.wire  # the rig, its devices and the clock in threads, in real time
-
 KEY = "0123456789abcdef"
 Make = Callable[..., LiveRig]
-
-
-@pytest.fixture
-def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Make]:
-    made: list[LiveRig] = []
-
-    def of(**fields: Any) -> LiveRig:
-        made.append(LiveRig(tmp_path, monkeypatch, **fields))
-        return made[-1]
-
-    yield of
-    for live in made:
-        live.rig.close()
 
 
 def plan(live: LiveRig, test_id: str = "one", max_duration_s: float = 60.0, **fields: Any) -> TestPlan:
@@ -67,13 +50,17 @@ def laid(live: LiveRig) -> int:
     return len(run.score.laid)
 
 
-def extend(live: LiveRig, after: int, test_id: str = "one", key: str = KEY) -> Extended:
-    return live.rig.extend(ExtendRequest(test_id=test_id, key=key, after=after, segments=added()))
+def request(after: int = 20, test_id: str = "one", key: str = KEY) -> ExtendRequest:
+    return ExtendRequest(test_id=test_id, key=key, after=after, segments=added())
+
+
+def extend(live: LiveRig, *which: Any, **key: str) -> Extended:
+    return live.ask(live.rig.extend(request(*which, **key)))
 
 
 def test_from_start_to_sealed_file_with_one_that_extends_and_says_enough(make: Make):
     live = make()
-    live.rig.start(plan(live, hold_s=20.0), KEY)
+    live.start(plan(live, hold_s=20.0), KEY)
     first = extend(live, 20)
     assert (first.laid, first.boundary_s, first.ended_by) == (44, 1.1, "")
     assert first.duration_left_s == pytest.approx(60 - 1.1)
@@ -81,15 +68,13 @@ def test_from_start_to_sealed_file_with_one_that_extends_and_says_enough(make: M
     live.wait_pulses(5)
     assert extend(live, 44).laid == 68
     event = live.rig.live(samples=True)
-    while not (event and event.samples and event.pulse_time_s):
-        event = live.rig.live(samples=True)
-        time.sleep(0.01)
+    assert event is not None and event.samples is not None and event.pulse_time_s
     assert (event.laid, event.boundary_s, event.duration_s) == (68, 1.7, 60.0)
     assert [(s.name, s.by) for s in event.laid_segments] == [("rest", "plan"), *[("added", "extension")] * 2]
     assert len(event.samples.torque_nm) == len(event.samples.counter) == len(event.samples.host_time_s) > 0
     assert np.all(np.diff(event.samples.counter) == 1)
     assert live.rig.status().duration_s == 60.0
-    ending = live.rig.enough(EnoughRequest(test_id="one", by="nurse"))
+    ending = live.ask(live.rig.enough(EnoughRequest(test_id="one", by="nurse")))
     assert (ending.ended_by, ending.boundary_s) == ("enough", pytest.approx(2.0, abs=0.7))
     live.wait("ready")
     finished = live.rig.finished
@@ -113,21 +98,18 @@ def test_what_the_muscle_did_not_feel_is_known_by_its_index(tmp_path: Path):
 
 def test_a_live_event_is_read_as_it_was_sent(make: Make):
     live = make()
-    live.rig.start(plan(live, hold_s=20.0), KEY)
+    live.start(plan(live, hold_s=20.0), KEY)
     live.wait_pulses(5)
     run = live.rig._run
     assert run is not None
     run._gate.late, run._gate.not_sent = [(3, 0.004)], [4]
-    event = None
-    while event is None:
-        time.sleep(0.01)
-        event = live.rig.live(samples=True)
-    assert (event.late[0].index, event.late[0].by_s) == (3, 0.004)  # a busy machine adds its own
-    assert event.not_sent[0] == 4
-    plain = None
-    while plain is None:
-        time.sleep(0.01)
-        plain = live.rig.live()
+    event = live.rig.live(samples=True)
+    assert event is not None
+    assert [(late.index, late.by_s) for late in event.late] == [(3, 0.004)]
+    assert event.not_sent == [4]
+    live.machine.wait(0.1)
+    plain = live.rig.live()
+    assert plain is not None
     assert (plain.late, plain.samples) == ([], None), "only who chooses pieces needs them"
     assert LiveEvent.model_validate(json.loads(event.model_dump_json())) == event
 
@@ -136,15 +118,15 @@ def test_only_who_started_it_extends_it(make: Make):
     live = make()
     for short in ("", "15 characters!!"):
         with pytest.raises(PlanError, match="at least 16 characters"):
-            live.rig.start(plan(live), short)
-    live.rig.start(plan(live, hold_s=20.0), KEY)
+            live.start(plan(live), short)
+    live.start(plan(live, hold_s=20.0), KEY)
     for wrong in ("", KEY[:-1], KEY + "0", "0123456789abcdeF", "\ud800" * 16):
         with pytest.raises(PlanError, match="not the key"):
             extend(live, 20, key=wrong)
     with pytest.raises(TooLateError, match="test 'two' is not running"):
         extend(live, 20, "two")
     with pytest.raises(TooLateError, match="test 'two' is not running"):
-        live.rig.enough(EnoughRequest(test_id="two"))
+        live.ask(live.rig.enough(EnoughRequest(test_id="two")))
     assert extend(live, 20).laid == 44
 
 
@@ -152,85 +134,76 @@ def test_neither_before_nor_after_a_test_nor_when_it_is_stopped(make: Make):
     live = make()
 
     def refused(words: str) -> None:
-        for ask in (lambda: extend(live, 20), lambda: live.rig.enough(EnoughRequest(test_id="one"))):
+        for ask in (lambda: extend(live, 20), lambda: live.ask(live.rig.enough(EnoughRequest(test_id="one")))):
             with pytest.raises(TooLateError, match=words):
                 ask()
 
     refused("not running")
-    live.rig.start(plan(live, hold_s=20.0), KEY)
+    live.start(plan(live, hold_s=20.0), KEY)
     live.wait("running")
     live.wait_pulses(5)
-    assert live.rig.stop("that hurts", "P").confirmed
+    assert live.stop("that hurts").confirmed
     refused("is being ended|not running")
     live.wait("latched")
     refused("not running")
     count = len(live.stimulator.sent)
-    live.rig.rearm("nurse")
+    live.rearm()
     refused("not running")
-    time.sleep(0.1)
+    live.machine.wait(0.4)
     assert len(live.stimulator.sent) == count
 
 
 def test_a_fixed_test_and_a_calibration_are_not_extended(make: Make):
     live = make()
-    live.rig.start(live.plan("one", hold_s=20.0), KEY)
-    for ask in (lambda: extend(live, 840), lambda: live.rig.enough(EnoughRequest(test_id="one"))):
+    live.start(live.plan("one", hold_s=20.0), KEY)
+    for ask in (lambda: extend(live, 840), lambda: live.ask(live.rig.enough(EnoughRequest(test_id="one")))):
         with pytest.raises(PlanError, match="fixed plan"):
             ask()
 
 
 def test_many_at_the_same_time_lay_one(make: Make):
     live = make()
-    live.rig.start(plan(live, hold_s=20.0), KEY)
-
-    def one(_: int) -> object:
-        try:
-            return extend(live, 20)
-        except RigError as error:
-            return error
-
-    with ThreadPoolExecutor(8) as pool:
-        found = list(pool.map(one, range(16)))
-    assert sum(isinstance(reply, Extended) for reply in found) == 1
-    assert all(isinstance(reply, Extended | TooLateError | BusyError) for reply in found)
+    live.start(plan(live, hold_s=20.0), KEY)
+    asked = [live.begin(live.rig.extend(request())) for _ in range(16)]
+    live.until(lambda: all(one.done.is_set() for one in asked))
+    errors = [one.error for one in asked if one.error is not None]
+    assert len(errors) == 15
+    assert {type(error) for error in errors} <= {TooLateError, BusyError}
     assert laid(live) == 44
 
 
 def test_the_rest_between_tests_is_counted_to_the_first_pulse_that_may_come(make: Make):
     """The fixed plan would not stimulate for a minute, an extension might after half a second."""
     live = make()
-    live.rig.start(live.plan("before", hold_s=0.5))
+    live.start(live.plan("before", hold_s=0.5))
     live.wait("ready")
     rested = Profile(rest_between_tests_s=30.0)
     quiet = [SegmentPlan(name="rest", sequence="rest", settings={"duration_s": seconds}) for seconds in (0.5, 60.0)]
-    assert live.rig.start(live.plan("fixed", profile=rested, segments=[*quiet, *added()])).state == "arming"
-    live.rig.stop("that was only to show it", "nurse")
+    assert live.start(live.plan("fixed", profile=rested, segments=[*quiet, *added()])).state == "arming"
+    live.stop("that was only to show it")
     live.wait("latched")
-    live.rig.rearm("nurse")
+    live.rearm()
     with pytest.raises(RefusedError, match=r"rest_between_tests_s .*wait 2\d"):
-        live.rig.start(plan(live, profile=rested, segments=[*quiet, *added()], max_duration_s=90.0), KEY)
+        live.start(plan(live, profile=rested, segments=[*quiet, *added()], max_duration_s=90.0), KEY)
 
 
-def test_the_day_must_last_as_long_as_the_bound(make: Make, monkeypatch: pytest.MonkeyPatch):
+def test_the_day_must_last_as_long_as_the_bound(make: Make):
     live = make()
-    midnight_s = end_of_day_s(time.time())
-    monkeypatch.setattr(live.clock, "unix_s", lambda: midnight_s - 10.0)
+    midnight_s = end_of_day_s(live.clock.unix_s())
+    live.clock.set_unix_ahead(midnight_s - 10.0 - live.clock.unix_s())
     day = Profile(
         sensory_pulse_width_us=20.0, motor_pulse_width_us=60.0,
         set_at_utc=utc_text(midnight_s - 3600), expires_at_utc=utc_text(midnight_s),
     )  # fmt: skip
     late = plan(live, profile=day, max_duration_s=60.0)
     with pytest.raises(RefusedError, match="before the end of this test of 15 s"):
-        live.rig.start(late, KEY)
+        live.start(late, KEY)
     with pytest.raises(RefusedError, match="before the end of this test of 15 s"):
         previewed(PreviewRequest(plan=late), live.rig.table, midnight_s - 10.0, live.clock.speed)
-    assert live.rig.start(plan(live, profile=day, max_duration_s=30.0), KEY).state == "arming"
+    assert live.start(plan(live, profile=day, max_duration_s=30.0), KEY).state == "arming"
 
 
 def test_a_watcher_that_did_not_ask_gets_no_samples(make: Make):
-    live = make()
-    event = None
-    while event is None:
-        event = live.rig.live()
-    assert isinstance(event, LiveEvent)
+    event = make().rig.live()
+    assert event is not None
     assert (event.samples, event.laid, event.laid_segments) == (None, 0, [])
