@@ -70,7 +70,8 @@ class Rig(Posing):
         self._change(trial)
 
     async def close(self) -> None:
-        """Stop a running test, wait until it is sealed, disconnect."""
+        """Stop a running test, wait until it is sealed, disconnect. A start that is under way does not begin."""
+        self._change(self._trial.disconnected("the rig is shutting down"))
         await self.stop("the rig is shutting down", "rig", latch_idle=False)
         if self._playing is not None:
             await self._tasks.sleep(SEALED_WITHIN_S, self._playing.done)
@@ -163,7 +164,7 @@ class Rig(Posing):
             await self._rest.settle()
             await self._latch.clear()
             if self._stops != stops or self._trial.lost != stopped.lost:
-                await self._remember("latched", stopped.reason)
+                await self._remember("latched", self._trial.reason)
                 raise BusyError("re-arm: the rig was stopped again meanwhile; look at the participant, then re-arm")
             log.info("re-armed by %s after: %s", by, stopped.reason)
             self._change(following)
