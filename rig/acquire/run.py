@@ -98,6 +98,8 @@ class TestRun:
         self.halt = halt
         self.started = Signal()
         self.t0_s: float | None = None
+        self.told_pulses = 0
+        """How many pulses earlier live events contained; who makes these events counts here, in a thread of its own."""
         self._table = table
         self._journal = journal
         self._gate = gate

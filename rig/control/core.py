@@ -59,7 +59,6 @@ class Core:
         self._playing: Task[None] | None = None
         self._evidence: StopEvidence | None = None
         self._evidence_ready = Signal()
-        self._next_live_pulse = 0
         self._calibration: Calibration | None = None
         self._stops = 0
         """How often it was stopped, or a fault was reported: a re-arm that began before does not count."""
@@ -166,9 +165,10 @@ class Core:
         if receiver is None:
             return None
         origin_s = run.t0_s if run and run.t0_s is not None else self._born_s
-        event = live_event(receiver, run, origin_s, now_s, self._next_live_pulse, samples, self._pair.angle)
-        if event is not None:
-            self._next_live_pulse += len(event.pulse_time_s)
+        told = run.told_pulses if run else 0
+        event = live_event(receiver, run, origin_s, now_s, told, samples, self._pair.angle)
+        if event is not None and run is not None:
+            run.told_pulses += len(event.pulse_time_s)
         return event
 
     @contextlib.asynccontextmanager

@@ -43,7 +43,6 @@ class Playing(Core):
         assert gate is not None
         assert receiver is not None
         self._run = TestRun(test, table, journal, gate, receiver, self._machine, halt, self._watch, angle)
-        self._next_live_pulse = 0
         self._playing = self._tasks.spawn(self._execute(self._run), "test")
 
     async def _not_begun(self, before: Trial) -> None:
