@@ -65,7 +65,10 @@ class RecordingStore:
             )
 
     def _free_bytes(self) -> int:
-        return self._disk.free_bytes(self._config.data_dir)
+        try:
+            return self._disk.free_bytes(self._config.data_dir)
+        except OSError as error:
+            raise JournalError(f"data_dir {self._config.data_dir}: {error.strerror}; check the disk") from None
 
     def begin(self, test: PlannedTest, identity: dict[str, Any], angle: dict[str, Any] | None = None) -> Journal:
         """Create a journal with its header and plan, synced to the disk. Raises JournalError.
