@@ -19,7 +19,7 @@ from rig.limits import Admitted, Steps
 from rig.machine import Disk
 from rig.messages import Event, Profile, SegmentPlan, Status, StopEvidence, TestPlan
 from rig.signals import SAMPLE, Ack, LateError, TorqueBlock
-from rig.tasks import Outcome, Task
+from rig.tasks import Outcome, Task, Tasks
 from tests.simulator.virtual_time import VirtualClock, VirtualMachine
 
 T = TypeVar("T")
@@ -38,12 +38,13 @@ class LiveMachine(VirtualMachine):
 
     def __init__(self, clock: VirtualClock, disk: Disk | None) -> None:
         super().__init__(clock, disk)
+        self.tasks = Tasks(self.clock, self._later)
         self.work_s, self.asked = WORK_S, 0
 
-    def _work(self, action: Callable[[], Any], outcome: Outcome) -> None:
+    def _later(self, action: Callable[[], Any], outcome: Outcome) -> None:
         self.asked += 1
         done_s = self.clock.now_s() + self.work_s * self.clock.speed
-        self.clock.call_at(done_s, lambda: VirtualMachine._work(action, outcome))
+        self.clock.call_at(done_s, lambda: self._work(action, outcome))
 
 
 class LiveStimulator:

@@ -1,0 +1,244 @@
+"""What comes in the middle of something else: at each moment at which a request waits for disk, device or time."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Coroutine, Iterator
+from itertools import count
+from typing import Any
+
+import pytest
+
+from rig.control.rig import Rig
+from rig.errors import BusyError, DeviceError, LatchedError, PlanError, RigError
+from rig.messages import CalibrateStartRequest
+from rig.tasks import Task
+from tests.rig.live import LiveRig
+from tests.simulator.disk import SimulatedDisk
+from tests.simulator.world import World
+
+Make = Callable[..., LiveRig]
+Began = tuple[LiveRig, Task[Any]]
+FEW = 20
+"""Instants of the clock after which a wait is looked into once more."""
+CALIBRATION = CalibrateStartRequest(calibration_id="c", participant="P", by="t")
+
+
+def moments(
+    make: Make,
+    begin: Callable[[LiveRig], Coroutine[Any, Any, Any]],
+    over: Callable[[LiveRig], bool],
+    before: Callable[[LiveRig], object] = lambda _: None,
+) -> Iterator[Began]:
+    """A rig at each moment from when something has been asked until it is over: where it begins to wait, where it tells
+    something, and every few instants."""
+    for moment in count():
+        live = make(disk=SimulatedDisk(World(0)), clock=None)
+        before(live)
+        task = live.begin(begin(live))
+        if moment:
+            live.until(reached(live, moment, over))
+        if over(live):
+            assert moment > 2, "it was over at once"
+            return
+        yield live, task
+
+
+def reached(live: LiveRig, moment: int, over: Callable[[LiveRig], bool]) -> Callable[[], bool]:
+    """Whether so many moments have passed; to be asked at each instant."""
+    seen, instants = list[Any]([None]), count()
+
+    def ended() -> bool:
+        mark = live.machine.asked, len(live.events), next(instants) // FEW
+        if mark != seen[-1]:
+            seen.append(mark)
+        return len(seen) > moment or over(live)
+
+    return ended
+
+
+def remembered(live: LiveRig) -> dict[str, str]:
+    """The latch file."""
+    return json.loads(live.machine.disk.read(live.config.data_dir / "latch.json"))
+
+
+def playing(live: LiveRig) -> bool:
+    return len(live.stimulator.sent) >= 3
+
+
+def begin_test(live: LiveRig) -> Coroutine[Any, Any, Any]:
+    return live.rig.start(live.plan("one", hold_s=0.5))
+
+
+def is_stopped(live: LiveRig, task: Task[Any], sent: int, reason: str = "now (by nurse)") -> None:
+    """It stimulates no more, says so, remembers it, and only a person undoes it."""
+    assert live.wait("latched") == reason
+    live.until(task.done.is_set)
+    live.machine.wait(2.0)
+    assert len(live.stimulator.sent) == sent
+    assert not live.stimulator.armed
+    assert live.states[-1] == "latched"
+    assert remembered(live) == {"state": "latched", "reason": reason}
+    with pytest.raises(LatchedError):
+        live.start(live.plan("two"))
+    assert live.rearm().state == "ready"
+    assert live.states[-1] == "ready"
+    live.start(live.plan("two", hold_s=0.5))
+    live.wait("ready")
+    assert live.rig.finished is not None and live.rig.finished.outcome == "completed"
+
+
+def test_a_stop_at_each_moment_of_a_start(make: Make):
+    """While it builds its plan, makes its files, arms, and waits for its first pulse."""
+    outcomes = set()
+    for live, task in moments(make, begin_test, playing):
+        sent = len(live.stimulator.sent)
+        assert live.stop("now").confirmed
+        outcomes.add(type(task.error) if task.error else live.rig.trouble())
+        is_stopped(live, task, sent)
+    assert outcomes == {LatchedError, None}
+
+
+def test_a_lost_device_at_each_moment_of_a_start(make: Make):
+    for live, task in moments(make, begin_test, playing):
+        sent = len(live.stimulator.sent)
+        live.stimulator.on_lost("stimulator: unplugged")
+        live.until(task.done.is_set)
+        live.until(lambda live=live: not live.rig.busy)
+        live.machine.wait(2.0)
+        assert len(live.stimulator.sent) == sent
+        assert not live.stimulator.armed
+        status = live.rig.status()
+        assert status.state in ("latched", "disconnected") and "unplugged" in status.reason
+        with pytest.raises((LatchedError, DeviceError), match="unplugged"):
+            live.start(live.plan("two"))
+        assert live.rearm().state == "ready"
+
+
+def test_an_end_of_the_process_at_each_moment_of_a_start(make: Make):
+    """It waits for no test that begins only then."""
+    for live, task in moments(make, begin_test, playing):
+        sent, asked_s = len(live.stimulator.sent), live.clock.now_s()
+        live.close()
+        assert live.clock.now_s() - asked_s < 4.0
+        live.machine.wait(2.0)
+        assert task.done.is_set()
+        assert task.error is None or isinstance(task.error, RigError)
+        assert len(live.stimulator.sent) == sent
+        assert not live.stimulator.armed
+        live.machine.disk.process_ended()  # pyright: ignore[reportAttributeAccessIssue]
+        again = make(disk=live.machine.disk, clock=live.clock)
+        assert again.states[-1] == ("latched" if live.states[-1] == "latched" else "ready")
+
+
+def test_a_stop_at_each_moment_of_sealing(make: Make):
+    def seals(live: LiveRig) -> Coroutine[Any, Any, Any]:
+        live.start(live.plan("one", hold_s=0.5))
+        live.wait("sealing")
+        return live.rig.library()  # nothing else
+
+    for live, _ in moments(make, seals, lambda live: live.states[-1] == "ready"):
+        sent = len(live.stimulator.sent)
+        assert live.stop("now").confirmed
+        assert live.wait("latched") == "now (by nurse)"
+        assert live.rig.finished is not None and live.rig.finished.outcome == "completed"
+        assert live.rig.finished.recording_path is not None
+        assert len(live.stimulator.sent) == sent
+        assert remembered(live) == {"state": "latched", "reason": "now (by nurse)"}
+        assert live.rearm().state == "ready"
+
+
+def test_a_stop_at_each_moment_of_re_arming(make: Make):
+    for live, task in moments(
+        make,
+        lambda live: live.rig.rearm("nurse"),
+        lambda live: live.states[-1] == "ready",
+        lambda live: live.stop("first"),
+    ):
+        assert live.stop("now").confirmed
+        live.until(task.done.is_set)
+        assert isinstance(task.error, BusyError)
+        assert "ready" not in live.states[2:]
+        is_stopped(live, task, 0, "first (by nurse)")
+
+
+def test_a_stop_at_each_moment_of_re_arming_a_ready_rig_behind_which_a_start_waits(make: Make):
+    starts: list[Task[Any]] = []
+
+    def begin(live: LiveRig) -> Coroutine[Any, Any, Any]:
+        rearming = live.begin(live.rig.rearm("nurse"))
+        starts.append(live.begin(begin_test(live)))
+        return live.machine.tasks.join(rearming)
+
+    for live, task in moments(make, begin, playing):
+        sent = len(live.stimulator.sent)
+        assert live.stop("now").confirmed
+        live.until(task.done.is_set)
+        live.until(starts[-1].done.is_set)
+        assert task.error is None or isinstance(task.error, BusyError)
+        assert starts[-1].error is None or isinstance(starts[-1].error, LatchedError)
+        is_stopped(live, starts[-1], sent)
+
+
+def test_a_start_that_was_asked_while_stopped_is_not_played_once_rearmed(make: Make):
+    for live, task in moments(
+        make,
+        lambda live: live.rig.rearm("nurse"),
+        lambda live: live.states[-1] == "ready",
+        lambda live: live.stop("first"),
+    ):
+        with pytest.raises(LatchedError):
+            live.start(live.plan("early"))
+        live.until(task.done.is_set)
+        live.machine.wait(4.0)
+        assert live.states[-1] == "ready"
+        assert live.stimulator.sent == []
+
+
+def test_two_stops_at_once_at_each_moment_of_the_first(make: Make):
+    """Both get the evidence."""
+
+    def begin(live: LiveRig) -> Coroutine[Any, Any, Any]:
+        live.start(live.plan("one", hold_s=20.0))
+        live.wait_pulses(5)
+        return live.rig.stop("now", "nurse")
+
+    for live, task in moments(make, begin, lambda live: live.states[-1] == "latched"):
+        sent = len(live.stimulator.sent)
+        assert live.stop("too").confirmed
+        live.until(task.done.is_set)
+        assert task.result.confirmed
+        is_stopped(live, task, sent)
+
+
+def test_a_stop_at_each_moment_of_a_calibration_and_its_train(make: Make):
+    async def begin_train(rig: Rig) -> None:
+        await rig.calibrate(CALIBRATION)
+        await rig.calibrate_step("up")
+
+    for live, task in moments(make, lambda live: begin_train(live.rig), playing):
+        sent = len(live.stimulator.sent)
+        assert live.stop("now").confirmed
+        live.until(task.done.is_set)
+        assert task.error is None or isinstance(task.error, LatchedError | PlanError)
+        live.wait("latched")
+        assert live.rig.status().calibration is None
+        is_stopped(live, task, sent)
+
+
+def test_a_disk_that_fails_at_each_moment_of_a_start(make: Make):
+    """No test begins without its journal, and none goes on without it."""
+    for live, task in moments(make, begin_test, playing):
+        disk: Any = live.machine.disk
+        disk.failing = True
+        live.until(task.done.is_set)
+        live.until(lambda live=live: not live.rig.busy)
+        sent, state = len(live.stimulator.sent), live.states[-1]
+        assert isinstance(task.error, RigError) if state == "ready" else state == "latched"
+        assert not live.stimulator.armed
+        live.machine.wait(2.0)
+        assert len(live.stimulator.sent) == sent
+        disk.failing = False
+        assert live.rearm().state == "ready"
+        live.start(live.plan("two", hold_s=0.5))
+        live.wait("ready")
