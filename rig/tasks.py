@@ -120,6 +120,15 @@ class Tasks:
         self._ready.append(task)
         return task
 
+    def begin(self, coroutine: Coroutine[Any, Any, T], name: str) -> Task[T]:
+        """Start a task that takes its first step at once, before those whose time has come; not within a task.
+
+        So a stop that came while nothing ran counts before the pulse that is due by then.
+        """
+        task = Task(self, coroutine, name)
+        self._step(task)
+        return task
+
     def make_ready(self, task: Task[Any], first: bool) -> None:
         """Let a task go on in the next `run`."""
         self._ready.appendleft(task) if first else self._ready.append(task)
@@ -130,9 +139,7 @@ class Tasks:
             self._wake_due(self.clock.now_s())
             if not self._ready:
                 return self._next_s()
-            task = self._current = self._ready.popleft()
-            task.step()
-            self._current = None
+            self._step(self._ready.popleft())
 
     async def wait(self, until_s: float, *signals: Signal) -> bool:
         """Wait until a time, or until one of the signals is set: then True, at once if it is set already."""
@@ -170,6 +177,11 @@ class Tasks:
         if error is not None:
             raise error
         return result
+
+    def _step(self, task: Task[Any]) -> None:
+        self._current = task
+        task.step()
+        self._current = None
 
     def _wake_due(self, now_s: float) -> None:
         due = []

@@ -48,7 +48,7 @@ class Driver:
     def ask(self, make: Callable[[], Coroutine[Any, Any, T]]) -> Future[T]:
         """Start a task; the future has its result."""
         future: Future[T] = Future()
-        self.post(lambda: self._follow(self.tasks.spawn(make(), "request"), future))
+        self.post(lambda: self._follow(self.tasks.begin(make(), "request"), future))
         return future
 
     def end(self) -> None:
