@@ -17,13 +17,13 @@ import numpy as np
 
 from hardware_sim.electrodes import FiredPulse
 from rig import limits, plan
-from rig.clock import VirtualClock
 from rig.errors import PlanError, RefusedError
 from rig.gate import Gate
 from rig.limits import HARD_LIMITS
 from rig.messages import Profile, SegmentPlan, TestPlan
 from rig.signals import Pulse
 from tests.harness.wired_device import WiredDevice
+from tests.simulator.virtual_time import VirtualMachine
 
 MOST = {"width_us": 500.0, "current_ma": 100.0, "charge_uc": 40.0, "charge_per_s_uc": 1600.0, "pulses_per_s": 61}
 """What no table may exceed, written down here again on purpose."""
@@ -104,11 +104,12 @@ def fuzz(requests: int, seed: int) -> Found:
 def _block(
     rng: np.random.Generator, table: dict[str, limits.Limit], tightest: tuple[float, float], found: Found
 ) -> None:
-    clock = VirtualClock()
-    name = str(rng.choice(list(STIMULATORS)))
-    device = WiredDevice(name, clock, rng)
+    machine = VirtualMachine()
+    clock, name = machine.clock, str(rng.choice(list(STIMULATORS)))
+    device = WiredDevice(name, machine, rng)
     gate = Gate(device.driver, clock, lambda _: None, lambda _: None)
-    gate.open(NoJournal(), table)  # pyright: ignore[reportArgumentType]
+    machine.run(gate.identify())
+    machine.run(gate.open(NoJournal(), table, lambda: False))  # pyright: ignore[reportArgumentType]
     widths, currents = values(rng, BLOCK, tightest[0]), values(rng, BLOCK, tightest[1])
     steady = rng.random(BLOCK) < 0.5  # half of them sane, so that doses and rates are reached
     widths[steady], currents[steady] = tightest[0] * rng.random(np.sum(steady)) ** 0.1, tightest[1]
@@ -120,8 +121,8 @@ def _block(
         latest_s = now_s + (-0.001 if index % 97 == 0 else 1.0)
         gate.feed()
         gate.fire(index, Pulse(float(width_us), float(current_ma)), now_s, latest_s)
-        clock.wait(now_s + float(pause_s))
-    clock.wait(clock.now_s() + 1.0)  # what is still in the line
+        machine.wait(float(pause_s))
+    machine.wait(1.0)  # what is still in the line
     found.requests += BLOCK
     found.sent += len(gate.lateness_s)
     found.felt += len(device.felt)

@@ -212,11 +212,13 @@ class LiveRig:
 
     def ask(self, coroutine: Coroutine[Any, Any, T]) -> T:
         """Obey a request to its end, and let everything else go on meanwhile."""
-        return self.machine.run(coroutine, PATIENCE_S)
+        task = self.begin(coroutine)
+        self.until(task.done.is_set)
+        return task.result
 
     def begin(self, coroutine: Coroutine[Any, Any, T]) -> Task[T]:
         """A request that goes on while others are made."""
-        return self.machine.tasks.spawn(coroutine, "request")
+        return self.machine.tasks.begin(coroutine, "request")
 
     def start(self, plan: TestPlan, key: str = "") -> Status:
         return self.ask(self.rig.start(plan, key))

@@ -99,6 +99,16 @@ def test_a_stop_at_each_moment_of_a_start(make: Make):
     assert outcomes == {LatchedError, None}
 
 
+def test_a_stop_that_comes_while_the_computer_stands_still_counts_before_the_pulse_that_is_due_by_then(make: Make):
+    live = make()
+    live.start(live.plan("one", hold_s=20.0))
+    live.wait_pulses(5)
+    live.machine.wait(0.02)
+    live.clock.advance(0.008)
+    assert live.stop("now").confirmed
+    assert len(live.stimulator.sent) == 5
+
+
 def test_a_lost_device_at_each_moment_of_a_start(make: Make):
     for live, task in moments(make, begin_test, playing):
         sent = len(live.stimulator.sent)
