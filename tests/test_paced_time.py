@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from rig.acquire.run import SENDER_PRIORITY
+from rig.adapters.driver import PRIORITY
 from tests.harness.paced_time import CLOCK, conductor
 from tests.harness.paced_time.conductor import AHEAD_S, LATE_S, Conductor, states_of
 from tests.harness.paced_time.paced_clock import (
@@ -131,7 +131,7 @@ def test_it_does_not_wait_for_one_that_a_rig_keeps_away(world: World, other: int
 
 
 def test_a_sender_that_computes_takes_no_processor_from_the_conductor():
-    assert conductor.PRIORITY > SENDER_PRIORITY
+    assert conductor.PRIORITY > PRIORITY
 
 
 def test_it_does_not_wait_for_ever(world: World):

@@ -91,14 +91,19 @@ def test_there_and_back(machine: Machine, tmp_path: Path) -> None:
 
 def test_the_rig_reads_the_latch_of_restored_data(machine: Machine, tmp_path: Path) -> None:
     from rig.control.latch import Latch
+    from tests.simulator.virtual_time import VirtualMachine
+
+    def read(folder: Path) -> tuple[str | None, str]:
+        there = VirtualMachine()
+        return there.run(Latch(folder, there).read())
 
     (machine.rig / "latch.json").write_text('{"state": "running", "reason": "test t3"}')
     kept = backup.make(machine.rig, machine.api, tmp_path / "backups")
-    assert Latch(restored(machine, kept, tmp_path).rig).read() == ("running", "test t3")
+    assert read(restored(machine, kept, tmp_path).rig) == ("running", "test t3")
     (machine.rig / "latch.json").unlink()
     kept = backup.make(machine.rig, machine.api, tmp_path / "backups")
     backup.restore(kept, machine.rig, machine.api, force=True)
-    assert Latch(machine.rig).read()[0] == "latched"
+    assert read(machine.rig)[0] == "latched"
 
 
 def test_a_backup_while_the_service_writes_is_one_state(machine: Machine, tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import pytest
 
 from api.cli.launcher import SEAL_S
 from rig.__main__ import BEAT_PERIOD_S, PROCESS_PRIORITY
-from rig.acquire.run import SENDER_PRIORITY
+from rig.adapters.driver import PRIORITY
 
 ROOT = Path(__file__).parents[2]
 DEPLOY = ROOT / "deploy"
@@ -75,7 +75,7 @@ def test_the_rig_reaches_its_devices_and_no_network() -> None:
 
 
 def test_the_rig_may_take_the_priorities_that_it_asks_for() -> None:
-    assert int(RIG["LimitRTPRIO"][0]) >= max(SENDER_PRIORITY, PROCESS_PRIORITY)
+    assert int(RIG["LimitRTPRIO"][0]) >= max(PRIORITY, PROCESS_PRIORITY)
     assert "RestrictRealtime" not in RIG
     assert (RIG["CPUSchedulingPolicy"], int(RIG["CPUSchedulingPriority"][0])) == (["rr"], PROCESS_PRIORITY)
 
