@@ -16,9 +16,11 @@ import threading
 import time
 import tty
 
+from rig.adapters.machine import LocalMachine
+from rig.adapters.read_ahead import ReadAhead
 from rig.clock import MonotonicClock
 from rig.devices.can_load_cell import CanLoadCell, Settings
-from rig.wire.read_ahead import ReadAhead
+from rig.signals import TorqueBlock
 
 
 def measure(frames: int, ahead: bool) -> tuple[float, float]:
@@ -27,8 +29,17 @@ def measure(frames: int, ahead: bool) -> tuple[float, float]:
     tty.setraw(ours)
     tty.setraw(theirs)
     bus = {"interface": "slcan", "channel": os.ttyname(theirs)}
-    cell = CanLoadCell(Settings(device="can_load_cell", bus=bus), MonotonicClock())
-    cell.open()
+    machine = LocalMachine(MonotonicClock())
+    cell = CanLoadCell(Settings(device="can_load_cell", bus=bus), machine)
+    got, all_came = 0, threading.Event()
+
+    def take(block: TorqueBlock) -> None:
+        nonlocal got
+        got += len(block)
+        if got >= frames:
+            all_came.set()
+
+    machine.driver.ask(lambda: cell.open(take, print)).result()
     os.read(ours, 1000)
     if not ahead and isinstance(cell._bus.can.serialPortOrig, ReadAhead):  # pyright: ignore
         cell._bus.can.serialPortOrig = cell._bus.can.serialPortOrig._port  # pyright: ignore
@@ -44,13 +55,12 @@ def measure(frames: int, ahead: bool) -> tuple[float, float]:
     feeder = threading.Thread(target=feed, daemon=True)
     began_s, processor_s = time.monotonic(), time.process_time()
     feeder.start()
-    got = 0
-    while got < frames:
-        got += len(cell.read(0.02))
+    all_came.wait()
     rate_hz = frames / (time.monotonic() - began_s)
     cost_us = 1e6 * (time.process_time() - processor_s) / frames
     feeder.join()
-    cell.close()
+    machine.driver.ask(cell.close).result()
+    machine.driver.end()
     os.close(ours)
     os.close(theirs)
     return rate_hz, cost_us
