@@ -24,11 +24,12 @@ class Other(VirtualMachine):
         super().__init__()
         self.heard, self._answer, self._greeting = b"", answer, greeting
 
-    def port(self, *_: Any, **__: Any) -> Other:
+    def port(self, path: str, **arguments: Any) -> Other:
+        self.asked = path, arguments
         return self
 
-    def open(self, on_bytes: Callable[[bytes, float], None], *_: Told) -> None:
-        self._on_bytes = on_bytes
+    def open(self, on_bytes: Callable[[bytes, float], None], on_lost: Told) -> None:
+        self._on_bytes, self._on_lost = on_bytes, on_lost
         self._say(self._greeting)
 
     def write(self, data: bytes) -> int:
