@@ -1,0 +1,123 @@
+"""The people at the rig: their requests, which may be lost or come late, and what they were told."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+from rig.control import desk
+from rig.control.replies import to_line
+from rig.control.rig import Rig
+from rig.messages import (
+    EnoughRequest,
+    Event,
+    ExtendRequest,
+    FinishedEvent,
+    Reply,
+    SegmentPlan,
+    StartRequest,
+    StateEvent,
+    StopRequest,
+    TestPlan,
+)
+from tests.simulator.host import Process
+from tests.simulator.world import World
+
+TRANSIT_S = 0.0005, 0.02
+
+
+@dataclass
+class Asked:
+    """One request: when it was sent, when the rig obeyed it (None: it never came), and the reply that came back."""
+
+    kind: str
+    sent_s: float
+    process: Process
+    obeyed_s: float | None = None
+    replied_s: float | None = None
+    """When the rig replied, also where the reply was lost."""
+    reply: Reply | None = None
+    about: str = ""
+    then: Callable[[Asked], None] = lambda _: None
+    """Called when the reply has come."""
+
+
+@dataclass
+class Clinic:
+    """Sends requests and keeps what came back."""
+
+    world: World
+    asked: list[Asked] = field(default_factory=list)
+    states: list[tuple[float, Process, str]] = field(default_factory=list)
+    """Each state that the rig told, when, and which process."""
+    finished: list[FinishedEvent] = field(default_factory=list)
+    loses: float = 0.0
+    """Odds that a request or a reply is lost."""
+    process: Process | None = None
+    rig: Rig | None = None
+    state: str = "disconnected"
+    laid: int = 0
+    tests: int = 0
+
+    def meet(self, process: Process, rig: Rig) -> None:
+        """From now on requests go to this process."""
+        self.process, self.rig, self.state = process, rig, "disconnected"
+
+    def hear(self, process: Process, event: Event) -> None:
+        """What the rig tells everybody."""
+        time_s = process.computer.true_s
+        if isinstance(event, StateEvent):
+            state = event.status.state
+            self.states.append((time_s, process, state))
+            self.world.tell("rig", f"{state} {event.status.reason}".rstrip(), time_s)
+            if process is self.process:
+                self.state = state
+        elif isinstance(event, FinishedEvent):
+            self.finished.append(event)
+            self.world.tell("rig", f"finished {event.test_id} {event.outcome} {event.reason}".rstrip(), time_s)
+
+    def ask(self, request: Any, about: str = "") -> Asked:
+        """Send a request."""
+        process, rig, chance = self.process, self.rig, self.world.chance
+        assert process is not None
+        assert rig is not None
+        asked = Asked(request.kind, self.world.now_s, process, about=about)
+        self.asked.append(asked)
+        self.world.tell("people", f"{request.kind} {about}".rstrip())
+        line, lost = to_line(request), chance.random() < self.loses
+        back_s, back_lost = chance.uniform(*TRANSIT_S), chance.random() < self.loses
+
+        async def obey() -> None:
+            asked.obeyed_s = process.computer.true_s
+            asked.reply = await desk.answer(rig, line)
+            asked.replied_s = process.computer.true_s
+            problem = "" if asked.reply.problem is None else asked.reply.problem.detail
+            self.world.tell("reply", f"{asked.kind} {asked.reply.ok} {problem}".rstrip(), asked.replied_s)
+            if not back_lost:
+                self.world.at(asked.replied_s + back_s, lambda: asked.then(asked))
+
+        if lost:
+            self.world.tell("people", "it is lost")
+        else:
+            arrives_s = self.world.now_s + chance.uniform(*TRANSIT_S)
+            self.world.at(arrives_s, lambda: process.post(lambda: process.tasks.spawn(obey(), "request")))
+        return asked
+
+    def start(self, plan: TestPlan, key: str) -> Asked:
+        """Ask for a test."""
+        self.tests += 1
+        return self.ask(StartRequest(id=self.tests, plan=plan, key=key), plan.test_id)
+
+    def stop(self) -> Asked:
+        """Press stop."""
+        return self.ask(StopRequest(id=1, reason="somebody pressed", by="nurse"))
+
+    def extend(self, test_id: str, key: str, after: int) -> Asked:
+        """Lay one more segment, as a client that chooses them."""
+        more = SegmentPlan(name="more", sequence="steps", settings={"on_s": 0.5, "off_s": 0.25, "repeats": 1})
+        return self.ask(ExtendRequest(id=1, test_id=test_id, key=key, after=after, segments=[more]), test_id)
+
+    def enough(self, test_id: str) -> Asked:
+        """End an adaptive test."""
+        return self.ask(EnoughRequest(id=1, test_id=test_id, by="clinician"), test_id)

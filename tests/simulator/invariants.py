@@ -1,0 +1,228 @@
+"""What must hold in every life, judged by what the emulated electrode felt and by the files that are left.
+
+This page is the safety case's list: docs/safety/hazards.toml points at its functions. The bounds are written here once
+more on purpose: a mistake in the rig's own table must not excuse itself. Each function gives what is wrong, one line
+each; nothing where all is well. Pulses of a command that was doubled, corrupted or overtaken on the line are the
+line's; after them the rig must stop like after any fault.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+from typing import Any
+
+import h5py
+import numpy as np
+
+from rig import journal
+from rig.errors import RecordingError
+from tests.simulator.life import FOLDER, Felt, Life
+
+ON_ITS_WAY_S = 0.06
+"""A command that nothing holds is felt within this time: the line's transit, and what the stimulator does before it."""
+CLOSEST_S = 0.008
+MOST_PULSES_A_SECOND = 60
+MOST_UC_A_SECOND = 1600.0
+MOST_UC_A_PULSE = 40.0
+LONGEST_TEST_S = 300.0
+SYNCED_WITHIN_S = 1.0
+"""What is older than this survives a power failure, on a disk that works."""
+STATES = {"ready", "latched", "uncertain", "disconnected", "calibrating"}
+
+
+def every_pulse_is_within_the_limits(life: Life) -> Iterator[str]:
+    """Width, current, charge, balance: of every pulse, whatever the line did to its command."""
+    widest_us, most_ma = life.profile.max_pulse_width_us, life.profile.current_ma
+    for pulse in life.felt:
+        if not (0 < pulse.width_us <= widest_us and 0 < pulse.current_ma <= most_ma):
+            yield f"{pulse.time_s:.4f} s: {pulse.width_us:g} µs, {pulse.current_ma:g} mA; allowed {widest_us:g}, {most_ma:g}"
+        if not (pulse.width_us * pulse.current_ma * 1e-3 <= MOST_UC_A_PULSE) or not pulse.balanced:
+            yield f"{pulse.time_s:.4f} s: too much charge, or not balanced"
+
+
+def pulses_are_apart_and_not_too_many(life: Life) -> Iterator[str]:
+    """Interval, rate and charge of each second."""
+    felt = _true(life)
+    for one, other in pairwise(felt):
+        if not (other.time_s - one.time_s >= CLOSEST_S - 1e-6):
+            yield f"{other.time_s:.4f} s: {1e3 * (other.time_s - one.time_s):.2f} ms after the pulse before"
+    for last, pulse in enumerate(felt):
+        second = [p for p in felt[: last + 1] if p.time_s > pulse.time_s - 1.0]
+        charge_uc = sum(p.width_us * p.current_ma * 1e-3 for p in second)
+        if not (len(second) <= MOST_PULSES_A_SECOND and charge_uc <= MOST_UC_A_SECOND + 1e-6):
+            yield f"{pulse.time_s:.4f} s: {len(second)} pulses, {charge_uc:.1f} µC within a second"
+
+
+def nothing_is_written_while_stopped(life: Life) -> Iterator[str]:
+    """After a stop or a fault no command is written until a person has re-armed, and none by a process that is dead."""
+    for pulse in life.felt:
+        barred = [since_s for since_s, until_s in _barred(life) if since_s < pulse.written_s < until_s]
+        if barred:
+            yield f"{pulse.time_s:.4f} s: written at {pulse.written_s:.4f} s, stopped since {barred[0]:.4f} s"
+
+
+def no_pulse_is_felt_late(life: Life) -> Iterator[str]:
+    """A line that held what was sent may let go of one pulse, never of several, whatever ended the test meanwhile."""
+    late = [pulse for pulse in _true(life) if not (pulse.time_s - pulse.written_s <= ON_ITS_WAY_S)]
+    for one, other in pairwise(late):
+        if other.written_s - one.time_s < 0:
+            yield f"{other.time_s:.4f} s: felt late, beside the one written at {one.written_s:.4f} s"
+
+
+def a_confirmed_stop_is_true(life: Life) -> Iterator[str]:
+    """Once the rig has said that a stop is confirmed, no pulse that was written before is felt."""
+    for asked in life.clinic.asked:
+        if asked.kind != "stop" or asked.reply is None or asked.replied_s is None or not asked.reply.ok:
+            continue
+        if not (asked.reply.body or {}).get("confirmed"):
+            continue
+        for pulse in _true(life):
+            if pulse.written_s < asked.replied_s < pulse.time_s:
+                yield f"{pulse.time_s:.4f} s: felt after a stop that was confirmed at {asked.replied_s:.4f} s"
+
+
+def every_test_ends_in_a_documented_state(life: Life) -> Iterator[str]:
+    """And once all is well again, a re-armed rig plays a test to its end."""
+    if not life.played_at_the_end:
+        yield f"no test was played to its end within the quiet time; the rig is {life.clinic.state}"
+    for event in life.clinic.finished:
+        if event.outcome not in ("completed", "stopped", "fault"):
+            yield f"{event.test_id} ended with {event.outcome!r}"
+
+
+def every_pulse_has_its_intent_and_its_record(life: Life) -> Iterator[str]:
+    """What was felt stands in the files, in the same order; what they call acknowledged was felt."""
+    recorded = [pulse for test in _tests(life) for pulse in test]
+    found = iter(recorded)
+    for pulse in _true(life):
+        if not any(_same(pulse, one) for one in found):
+            if not _lost_with_the_power(life, pulse):
+                yield f"{pulse.time_s:.4f} s: {pulse.width_us:g} µs stands in no file"
+            found = iter(recorded)  # a power failure took it: the next ones still have to be there
+
+
+def what_the_files_call_acknowledged_was_felt(life: Life) -> Iterator[str]:
+    """No more acknowledged pulses in the files than were felt."""
+    acknowledged = sum(1 for test in _tests(life) for _, _, status in test if status == 0)
+    if acknowledged > len(life.felt):
+        yield f"{acknowledged} pulses acknowledged, {len(life.felt)} felt"
+
+
+def every_test_that_began_is_found(life: Life) -> Iterator[str]:
+    """A recording, or the journal that it was or will be made of."""
+    names = [path.name for path in life.disk.files]
+    for asked in life.clinic.asked:
+        if asked.kind == "start" and asked.reply is not None and asked.reply.ok:
+            if not any(f"{asked.about}." in f".{name}".replace("_", ".") for name in names):
+                yield f"{asked.about} left no file"
+    for event in life.clinic.finished:
+        if event.recording_path is not None and not any(str(path) == event.recording_path for path in life.disk.files):
+            yield f"{event.test_id}: {event.recording_path} is gone"
+
+
+def recordings_are_whole_and_in_order(life: Life) -> Iterator[str]:
+    """Counters rise, times rise, and each file's content is what its hash says."""
+    for path, columns in _recordings(life):
+        counter, time_s = columns["torque/counter"], columns["torque/time_s"]
+        if len(time_s) > 1 and not np.all(np.diff(time_s) > 0):
+            yield f"{path}: its times do not rise"
+        if len(counter) > 1 and counter[0] >= 0 and not np.all(np.diff(counter) > 0):
+            yield f"{path}: its counter does not rise"
+
+
+INVARIANTS: tuple[Callable[[Life], Iterator[str]], ...] = (
+    every_pulse_is_within_the_limits,
+    pulses_are_apart_and_not_too_many,
+    nothing_is_written_while_stopped,
+    no_pulse_is_felt_late,
+    a_confirmed_stop_is_true,
+    every_test_ends_in_a_documented_state,
+    every_pulse_has_its_intent_and_its_record,
+    what_the_files_call_acknowledged_was_felt,
+    every_test_that_began_is_found,
+    recordings_are_whole_and_in_order,
+)
+
+
+def broken(life: Life) -> list[str]:
+    """What did not hold, one line each."""
+    return [f"{invariant.__name__}: {words}" for invariant in INVARIANTS for words in invariant(life)]
+
+
+def _true(life: Life) -> list[Felt]:
+    return [pulse for pulse in life.felt if pulse.true]
+
+
+def _barred(life: Life) -> list[tuple[float, float]]:
+    """Times during which nothing may be written, world's time."""
+    rearmed = [
+        asked.replied_s
+        for asked in life.clinic.asked
+        if asked.kind == "rearm" and asked.reply is not None and asked.reply.ok and asked.replied_s is not None
+    ]
+    began = [asked.obeyed_s for asked in life.clinic.asked if asked.kind == "stop" and asked.obeyed_s is not None]
+    began += [time_s for time_s, _, state in life.clinic.states if state in ("latched", "uncertain")]
+    until = [(since_s, min((time_s for time_s in rearmed if time_s > since_s), default=np.inf)) for since_s in began]
+    born = [time_s for time_s, _, state in life.clinic.states if state in STATES]
+    return until + [(death_s, min((s for s in born if s > death_s), default=np.inf)) for death_s in life.deaths]
+
+
+Sent = tuple[float, float, int]
+"""A recorded pulse that may have been sent: its width, µs; its current, mA; its status."""
+
+
+def _tests(life: Life) -> list[list[Sent]]:
+    """The pulses of each file, in the order of the tests."""
+    found: dict[int, list[Sent]] = {}
+    for path, columns in _recordings(life):
+        sent = np.isfinite(columns["pulses/sent_pulse_width_us"])
+        found[_number(path.name)] = list(
+            zip(
+                columns["pulses/sent_pulse_width_us"][sent],
+                columns["pulses/current_ma"][sent],
+                columns["pulses/status"][sent],
+                strict=True,
+            )
+        )
+    for path, file in life.disk.files.items():
+        if path.parent.name == "journals" and _number(path.name) not in found:
+            found[_number(path.name)] = _of_journal(path, bytes(file.data))
+    return [found[number] for number in sorted(found)]
+
+
+def _of_journal(path: Any, data: bytes) -> list[Sent]:
+    try:
+        blocks = journal.parse(path, data).blocks
+    except RecordingError:
+        return []
+    intents = [journal.INTENT.unpack(payload) for kind, payload in blocks if kind == journal.Kind.INTENT]
+    return [(width_us, current_ma, 4) for _, _, _, width_us, current_ma in intents]
+
+
+def _number(name: str) -> int:
+    """Of a test, in the name of a file: `…_t12.h5`, `t12.journal`."""
+    return int(name.rsplit("t", 1)[1].split(".")[0]) if name.endswith(".h5") else int(name[1:].split(".")[0])
+
+
+def _recordings(life: Life) -> Iterator[tuple[Any, dict[str, np.ndarray]]]:
+    for path, file in life.disk.files.items():
+        if path.parent == FOLDER / "recordings":
+            with h5py.File(io.BytesIO(bytes(file.data)), "r") as opened:
+                yield path, {name: np.asarray(opened[name]) for name in _COLUMNS}
+
+
+_COLUMNS = (
+    "torque/time_s", "torque/counter", "pulses/sent_pulse_width_us", "pulses/current_ma", "pulses/status",
+)  # fmt: skip
+
+
+def _same(pulse: Felt, recorded: Sent) -> bool:
+    return abs(pulse.width_us - recorded[0]) < 1e-6 and abs(pulse.current_ma - recorded[1]) < 1e-6
+
+
+def _lost_with_the_power(life: Life, pulse: Felt) -> bool:
+    """Whether it was written too shortly before a power failure to be synced."""
+    patience_s = SYNCED_WITHIN_S + max(4.0, life.disk.slow_s)
+    return any(time_s - patience_s <= pulse.written_s <= time_s for time_s in life.power_failures)

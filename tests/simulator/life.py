@@ -1,0 +1,252 @@
+"""One life of a rig: some tests, some people, some accidents, and a quiet end; all of it from one seed."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Collection
+from pathlib import Path
+from typing import NamedTuple
+
+from hardware_sim.factory import make_devices
+from hardware_sim.settings import Settings
+from rig import config
+from rig.control.rig import Rig
+from rig.messages import AdaptivePlan, Profile, RearmRequest, SegmentPlan, TestPlan
+from tests.simulator import accidents
+from tests.simulator.clinic import Asked, Clinic
+from tests.simulator.disk import ROOM_BYTES, SimulatedDisk
+from tests.simulator.host import Computer, Process
+from tests.simulator.wires import Wires
+from tests.simulator.world import World
+
+FOLDER = Path("/rig")
+LASTS_S = 8.0
+"""How long accidents and people go on."""
+QUIET_S = 20.0
+"""The longest that the rig may then need until it has played one more test."""
+LOOK_S = 0.25
+KEY = "a key that only its maker knows"
+
+
+class Felt(NamedTuple):
+    """A pulse that the stimulator fired: when, when its command was written (both in the world's time), and whether the
+    command came as it was sent."""
+
+    time_s: float
+    width_us: float
+    current_ma: float
+    balanced: bool
+    written_s: float
+    true: bool
+
+
+class Life:
+    """Builds the rig of a seed and lives it.
+
+    Parameters
+    ----------
+    seed
+        Of everything.
+    only
+        Numbers of the accidents that happen; None: all. A failing life is shrunk by leaving some out.
+    """
+
+    def __init__(self, seed: int, only: Collection[int] | None = None) -> None:
+        self.world = world = World(seed)
+        chance = random.Random(f"life {seed}")
+        self.profile = Profile(
+            current_ma=chance.choice((8.0, 20.0, 40.0)), max_pulse_width_us=chance.choice((120.0, 300.0, 500.0)),
+            max_torque_nm=chance.choice((6.0, 30.0)),
+        )  # fmt: skip
+        self.rate_hz = chance.choice((20.0, 40.0, 50.0))
+        self.adaptive = chance.random() < 0.3
+        settings = Settings(
+            stimulator=chance.choice(("p24", "rehastim2")), cell=chance.choice(("plain", "plain", "counts", "canopen")),
+            rate_hz=chance.choice((200.0, 200.0, 400.0, 1600.0)), noise_seed=seed & 0xFFFF,
+            clock_ppm=chance.uniform(-200, 200),
+        )  # fmt: skip
+        self.devices = make_devices(settings, epoch_us=1_700_000_000_000_000)
+        self.disk = SimulatedDisk(world)
+        self.computer = Computer(world, chance.uniform(-100, 100), 1_764_000_000.0)
+        self.disk.access = self.computer.access
+        self.felt: list[Felt] = []
+        self.wires = Wires(world, self.devices, chance.choice((0.01, 0.02, 0.03)), self._note)
+        self.clinic = Clinic(world)
+        self.deaths: list[float] = []
+        self.power_failures: list[float] = []
+        self._config = self._rig_file(settings)
+        self.quiet = False
+        self.played_at_the_end = False
+        self._plan_accidents(chance, only)
+        self.begin_process()
+        world.after(LOOK_S, self._look)
+
+    def live(self) -> None:
+        """From the first start to the last test."""
+        self.world.run(LASTS_S)
+        self._calm()
+        end_s = LASTS_S + QUIET_S
+        while not self.played_at_the_end and self.world.now_s < end_s:
+            self.world.run(self.world.now_s + 0.5)
+        self.world.run(self.world.now_s + 0.5)
+
+    # -- processes
+
+    def begin_process(self) -> None:
+        """A rig process starts."""
+        process = Process(self.computer, self.disk, self.wires)
+        rig = Rig(self._config, process, lambda event: self.clinic.hear(process, event))
+        self.clinic.meet(process, rig)
+        self.world.tell("host", "the rig's process starts")
+        process.post(lambda: process.tasks.spawn(rig.open(), "open"))
+
+    def kill(self, again_after_s: float) -> None:
+        """The process dies now."""
+        process = self.clinic.process
+        if process is not None and process.alive:
+            process.kill()
+            self.disk.process_ended()
+            self.deaths.append(self.world.now_s)
+            self.world.after(again_after_s, self.begin_process)
+
+    def power_failure(self, again_after_s: float) -> None:
+        """The computer loses its power."""
+        if self.clinic.process is not None and self.clinic.process.alive:
+            self.kill(again_after_s)
+            self.disk.power_failure()
+            self.power_failures.append(self.world.now_s)
+            self.computer.boots += 1
+
+    def end_process(self) -> None:
+        """Asked to end; a new one starts once it has."""
+        process, rig = self.clinic.process, self.clinic.rig
+        if process is None or rig is None or not process.alive:
+            return
+
+        async def end() -> None:
+            await rig.close()
+            self.world.at(process.computer.true_s, ended)
+
+        def ended() -> None:
+            if process.alive:
+                self.kill(0.3)
+
+        process.post(lambda: process.tasks.spawn(end(), "end"))
+
+    # -- healing
+
+    def heal_disk(self) -> None:
+        """Room, no errors, quick."""
+        self.disk.free, self.disk.failing, self.disk.slow_s = ROOM_BYTES, False, 0.0
+
+    def heal_requests(self) -> None:
+        """Nothing is lost any more."""
+        self.clinic.loses = 0.0
+
+    def _calm(self) -> None:
+        self.world.tell("life", "no more accidents")
+        self.quiet = True
+        self.heal_disk()
+        self.heal_requests()
+        for way in (self.wires.to_device, self.wires.to_host):
+            way.odds.clear()
+        for name in self.devices.faults.active():
+            self.devices.faults.off(name)
+        self.computer.stall_next_s = 0.0
+
+    # -- people
+
+    def _look(self) -> None:
+        """Somebody looks at the rig now and then, and does what comes to mind."""
+        self.world.after(LOOK_S, self._look)
+        clinic, chance = self.clinic, self.world.chance
+        if clinic.process is None or not clinic.process.alive:
+            return
+        if clinic.state in ("latched", "uncertain", "disconnected"):
+            if self.quiet or chance.random() < 0.5:
+                clinic.ask(RearmRequest(id=1, by="nurse"))
+        elif clinic.state == "ready" and (self.quiet or chance.random() < 0.6):
+            self._start()
+        elif self.quiet:
+            return
+        elif clinic.state == "running" and chance.random() < 0.15:
+            for _ in range(chance.choice((1, 1, 3))):
+                clinic.stop()
+        elif clinic.state == "running" and self.adaptive and chance.random() < 0.4:
+            self._extend()
+        elif chance.random() < 0.05:
+            clinic.stop()
+
+    def _start(self) -> None:
+        clinic = self.clinic
+        test_id = f"t{clinic.tests + 1}"
+        adaptive = AdaptivePlan(max_duration_s=6.0, max_torque_time_nms=50.0) if self.adaptive else None
+        plan = TestPlan(
+            test_id=test_id, participant="P1", profile=self.profile, pulse_rate_hz=self.rate_hz, adaptive=adaptive,
+            segments=[
+                SegmentPlan(name="rest", sequence="rest", settings={"duration_s": 0.25}),
+                SegmentPlan(name="ramp", sequence="ramp", settings={"up_s": 0.75, "down_s": 0.5}),
+                SegmentPlan(name="steps", sequence="steps", settings={"on_s": 0.5, "off_s": 0.25, "repeats": 1}),
+            ],
+        )  # fmt: skip
+        quiet = self.quiet
+
+        def then(asked: Asked) -> None:
+            if quiet and asked.reply is not None and asked.reply.ok:
+                self._await_end(test_id)
+
+        clinic.start(plan, KEY).about = test_id
+        clinic.asked[-1].then = then
+
+    def _await_end(self, test_id: str) -> None:
+        finished = next((event for event in self.clinic.finished if event.test_id == test_id), None)
+        if finished is None:
+            self.world.after(LOOK_S, lambda: self._await_end(test_id))
+        elif finished.outcome == "completed":
+            self.played_at_the_end = True
+
+    def _extend(self) -> None:
+        rig = self.clinic.rig
+        run = None if rig is None else rig._run
+        if run is None:
+            return
+        if self.world.chance.random() < 0.3:
+            self.clinic.enough(run.plan.test_id)
+        else:
+            self.clinic.extend(run.plan.test_id, KEY, len(run.score.laid))
+
+    # -- set-up
+
+    def _note(self, written_s: float, true: bool) -> None:
+        for pulse in self.devices.electrodes.log[len(self.felt) :]:
+            felt = Felt(pulse.time_s, pulse.width_us, pulse.current_ma, pulse.balanced, written_s, true)
+            self.felt.append(felt)
+            deviant = "" if true else ", of a piece that came changed"
+            self.world.tell("electrode", f"{pulse.width_us:g} µs {pulse.current_ma:g} mA{deviant}", pulse.time_s)
+
+    def _plan_accidents(self, chance: random.Random, only: Collection[int] | None) -> None:
+        names = list(accidents.LIBRARY)
+        odds = [accidents.ODDS.get(name, 1.0) for name in names]
+        self.accidents = 1 + int(chance.expovariate(0.12))
+        for number in range(self.accidents):
+            time_s, name = chance.uniform(0.0, LASTS_S), chance.choices(names, odds)[0]
+            if only is None or number in only:
+                self.world.at(time_s, lambda number=number, name=name: self._befall(number, name))
+
+    def _befall(self, number: int, name: str) -> None:
+        own = random.Random(f"{self.world.seed} {number}")
+        words = accidents.LIBRARY[name](self, own)
+        self.world.faults += 1
+        self.world.tell("accident", f"{number} {name} {words}".rstrip())
+
+    def _rig_file(self, settings: Settings) -> config.RigConfig:
+        cell = config.EMULATED_CELLS[settings.cell](settings.samples_per_frame)
+        content = {
+            "require_calibration": False,
+            "stimulator": {"device": settings.stimulator, "port": "/dev/simulated"},
+            "load_cell": {
+                "device": "can_load_cell", "bus": {"interface": "simulated"}, "sample_rate_hz": settings.rate_hz,
+                **({"sync": ""} if settings.cell == "counts" else {}), **cell,
+            },
+        }  # fmt: skip
+        return config.check(content, "simulated", data_dir=FOLDER, socket=FOLDER / "socket")
