@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 
-from rig import assembly, journal
 from rig.errors import RigError
 from rig.messages import AdaptivePlan, SegmentPlan
 from tests.rig.fakes import VirtualRig
@@ -34,7 +33,12 @@ def adaptive(
     return VirtualRig(folder, fixed, adaptive=bounds, **more)
 
 
-def refusals(rig: VirtualRig, *requests: Callable[[], object]) -> list[RigError]:
+def extend(rig: VirtualRig, after: int, segments: list[SegmentPlan]) -> None:
+    """Lay segments behind pulse `after`: before the test begins, or beside its sender."""
+    return rig.machine.tasks.begin(rig.run.score.extend(after, segments), "extend").result
+
+
+def refusals(*requests: Callable[[], object]) -> list[RigError]:
     """What the requests raise, in order."""
     found: list[RigError] = []
     for request in requests:
@@ -42,10 +46,6 @@ def refusals(rig: VirtualRig, *requests: Callable[[], object]) -> list[RigError]
             request()
         found.append(told.value)
     return found
-
-
-def sealed(rig: VirtualRig) -> assembly.Recording:
-    return assembly.assemble(journal.read(rig.path))
 
 
 def widths_sent(rig: VirtualRig) -> list[int]:

@@ -42,7 +42,7 @@ class FakeSensor:
         self.counter = 65400
         self._rng = np.random.default_rng(3)
 
-    async def open(self, on_block: Callable[[AngleBlock], None], on_lost: Callable[[str], None]) -> dict[str, Any]:
+    async def open(self, *_: Callable[..., None]) -> dict[str, Any]:
         if self.silent:
             raise DeviceError("angle_sensor.bus: it is not there")
         return {"device": "fake"}

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from rig import limits, plan
+from rig import archive, assembly, journal, limits, plan
 from rig.acquire.angle_receiver import AngleReceiver
 from rig.acquire.halt import Halt
 from rig.acquire.health import DEFAULT_WATCH, Watch
 from rig.acquire.receiver import Receiver
 from rig.acquire.run import RunResult, TestRun
+from rig.adapters.files import Files
 from rig.errors import DeviceError
 from rig.gate import Gate
 from rig.journal import Journal, Kind
@@ -26,10 +26,6 @@ from tests.rig.angle import FakeSensor
 from tests.simulator.virtual_time import VirtualClock, VirtualMachine
 
 RATE_HZ = 1600.0
-ON_A_BUSY_DISK = replace(DEFAULT_WATCH, stale_disk_s=60.0)
-"""The disk alone is real here: where others write to it, it may stand still for seconds of the world's time."""
-
-
 OF_ANGLE = {"angle": {"sample_rate_hz": 200.0, "of_the_cell": False, "one_bus": True, "calibration": {"by": "nurse"}}}
 
 
@@ -129,7 +125,7 @@ class FakeCell:
         self._held: list[Any] = []
         self._seen = 0
 
-    async def open(self, on_block: Callable[[TorqueBlock], None], on_lost: Callable[[str], None]) -> dict[str, Any]:
+    async def open(self, *_: Callable[..., None]) -> dict[str, Any]:
         return {"device": "fake"}
 
     async def close(self) -> None:
@@ -180,7 +176,7 @@ class VirtualRig:
         self,
         folder: Path,
         segments: list[SegmentPlan] | None = None,
-        watch: Watch = ON_A_BUSY_DISK,
+        watch: Watch = DEFAULT_WATCH,
         adaptive: AdaptivePlan | None = None,
         base: dict[str, limits.Limit] = limits.HARD_LIMITS,
         kind: str = "pre-session",
@@ -213,7 +209,7 @@ class VirtualRig:
         self.table = limits.for_plan(base, self.plan)
         self.test = plan.build(self.plan, self.table)
         self.path = folder / "t.journal"
-        self.journal = Journal(self.machine.disk.create(self.path))
+        self.journal = journal_at(self.path)
         self.run = TestRun(
             self.test, self.table, self.journal, self.gate, self.receiver, self.machine, self.halt, watch, self.angle
         )
@@ -230,6 +226,19 @@ class VirtualRig:
             self.sensor.feed(self.angle, self.clock.now_s() + self.test.longest_s + 8)
         self.cell.feed(self.receiver, self.clock.now_s() + self.test.longest_s + 8)
         return self.machine.run(self.run.execute())
+
+    def recording(self) -> assembly.Recording:
+        """What its journal holds."""
+        return assembly.assemble(journal.read(self.path))
+
+    def seal(self) -> archive.Sealed:
+        """Its recording, sealed beside its journal."""
+        return archive.seal(self.recording(), self.path.parent, self.machine.disk)
+
+
+def journal_at(path: Path) -> Journal:
+    """A new journal."""
+    return Journal(Files().create(path))
 
 
 def header(run: TestRun, clock: VirtualClock) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -9,10 +10,12 @@ import numpy as np
 import pytest
 
 from rig import plan
-from rig.errors import PlanError, RigError, TooLateError
+from rig.errors import BusyError, PlanError, RigError, TooLateError
 from rig.messages import AHEAD, SegmentPlan
-from tests.rig.adaptive import FIXED, RATE_HZ, adaptive, hold, refusals, rest, sealed, widths_sent
+from rig.tasks import Outcome
+from tests.rig.adaptive import FIXED, RATE_HZ, adaptive, extend, hold, refusals, rest, widths_sent
 from tests.rig.fakes import VirtualRig
+from tests.simulator.virtual_time import VirtualMachine
 
 
 def test_if_nobody_extends_it_the_fixed_plan_plays_and_a_second_without_pulses(tmp_path: Path):
@@ -23,23 +26,23 @@ def test_if_nobody_extends_it_the_fixed_plan_plays_and_a_second_without_pulses(t
     same = VirtualRig(tmp_path / "fixed", FIXED)
     assert same.execute().ended_by == "plan"
     assert widths_sent(rig) == widths_sent(same)
-    recording = sealed(rig)
+    recording = rig.recording()
     assert recording.names == ["rest", "first", "ramp", "rest"]
     assert recording.columns["segments/start_s"].tolist() == [0.0, 0.5, 1.5, 2.5]
     planned_us = recording.columns["pulses/pulse_width_us"]
     assert np.array_equal(planned_us[: len(same.test.pulse_width_us)], same.test.pulse_width_us)
     assert np.flatnonzero(planned_us)[-1] == len(planned_us) - 1 - RATE_HZ
     assert (recording.attributes["adaptive"], recording.attributes["ended_by"]) == (1, "plan")
-    assert sealed(same).attributes["adaptive"] == 0
+    assert same.recording().attributes["adaptive"] == 0
 
 
 def test_what_is_added_plays_at_its_boundary_and_the_fixed_plan_goes_on_after_it(tmp_path: Path):
     rig = adaptive(tmp_path)
     added = [hold("low", max_pulse_width_us=100.0), SegmentPlan(name="validate", sequence="multilevel",
              settings={"duration_s": 1.0, "seed": 3})]  # fmt: skip
-    rig.at(0.2, lambda: rig.run.score.extend(20, added))
+    rig.at(0.2, lambda: extend(rig, 20, added))
     result = rig.execute()
-    recording = sealed(rig)
+    recording = rig.recording()
     assert recording.names == ["rest", "low", "validate", "first", "ramp", "rest"]
     assert recording.columns["segments/start_s"].tolist() == [0.0, 0.5, 1.5, 2.5, 3.5, 4.5]
     sent_us = recording.columns["pulses/sent_pulse_width_us"]
@@ -52,45 +55,60 @@ def test_what_is_added_plays_at_its_boundary_and_the_fixed_plan_goes_on_after_it
 
 def test_an_answer_to_an_old_boundary_is_refused_and_so_is_the_same_one_twice(tmp_path: Path):
     rig = adaptive(tmp_path)
-    score, found = rig.run.score, []
-    rig.at(0.2, lambda: score.extend(20, [hold("once")]))
-    rig.at(0.21, lambda: found.extend(refusals(rig, lambda: score.extend(20, [hold("again")]))))
-    rig.at(2.0, lambda: found.extend(refusals(rig, lambda: score.extend(60, [hold("late")]))))
+    found: list[RigError] = []
+    rig.at(0.2, lambda: extend(rig, 20, [hold("once")]))
+    rig.at(0.21, lambda: found.extend(refusals(lambda: extend(rig, 20, [hold("again")]))))
+    rig.at(2.0, lambda: found.extend(refusals(lambda: extend(rig, 60, [hold("late")]))))
     rig.execute()
     assert all(isinstance(error, TooLateError) for error in found) and len(found) == 2
     assert "60 pulses are laid" in str(found[0]) and "100 pulses are laid" in str(found[1])
-    assert sealed(rig).names == ["rest", "once", "first", "ramp", "rest"]
+    assert rig.recording().names == ["rest", "once", "first", "ramp", "rest"]
 
 
 @pytest.mark.parametrize("early", [True, False])
 def test_the_boundary_is_decided_two_periods_before_it(tmp_path: Path, early: bool):
     rig = adaptive(tmp_path)
     at_s = 0.5 - AHEAD / RATE_HZ + (-0.001 if early else 0.001)
-    errors: list[RigError] = []
-
-    def extend() -> None:
-        try:
-            rig.run.score.extend(20, [hold("added")])
-        except TooLateError as error:
-            errors.append(error)
-
-    rig.at(at_s, extend)
+    ask = lambda: extend(rig, 20, [hold("added")])  # noqa: E731
+    rig.at(at_s, ask if early else lambda: found.extend(refusals(ask)))
+    found: list[RigError] = []
     rig.execute()
-    assert (sealed(rig).names[1], len(errors)) == (("added", 0) if early else ("first", 1))
+    assert (rig.recording().names[1], len(found)) == (("added", 0) if early else ("first", 1))
+
+
+@pytest.mark.parametrize("takes_s", [0.05, 0.4])
+def test_while_an_extension_is_checked_the_test_goes_on(tmp_path: Path, takes_s: float):
+    """If the boundary passes meanwhile, nothing is laid; a second one is refused until the first is judged."""
+    rig, found = adaptive(tmp_path), []
+
+    def slowly(action: Callable[[], Any], outcome: Outcome) -> None:
+        rig.clock.call_at(rig.clock.now_s() + takes_s, lambda: VirtualMachine._work(action, outcome))
+
+    def ask() -> None:
+        rig.machine.tasks._worker = slowly
+        found.extend(rig.machine.tasks.begin(rig.run.score.extend(20, [hold(name)]), name) for name in ("a", "b"))
+        rig.machine.tasks._worker = VirtualMachine._work
+
+    rig.at(0.2, ask)
+    result = rig.execute()
+    late = takes_s > 0.3
+    assert result.outcome == "completed" and max(result.lateness_s) < 1e-9
+    assert [type(one.error) for one in found] == [TooLateError if late else type(None), BusyError]
+    assert rig.recording().names == ["rest", *([] if late else ["a"]), "first", "ramp", "rest"]
 
 
 def test_before_the_first_pulse_it_can_be_extended_as_well(tmp_path: Path):
     rig = adaptive(tmp_path)
-    rig.run.score.extend(20, [hold("added")])
+    extend(rig, 20, [hold("added")])
     rig.execute()
-    assert sealed(rig).names == ["rest", "added", "first", "ramp", "rest"]
+    assert rig.recording().names == ["rest", "added", "first", "ramp", "rest"]
 
 
 def test_names_of_a_plan_may_come_again_as_they_may_within_a_plan(tmp_path: Path):
     rig = adaptive(tmp_path)
-    rig.run.score.extend(20, [hold("first", 0.5), hold("validate", 0.5), hold("validate", 0.5)])
+    extend(rig, 20, [hold("first", 0.5), hold("validate", 0.5), hold("validate", 0.5)])
     rig.execute()
-    recording = sealed(rig)
+    recording = rig.recording()
     assert recording.names == ["rest", "first", "validate", "validate", "first", "ramp", "rest"]
     assert np.all(recording.columns["segments/end_s"][:-1] == recording.columns["segments/start_s"][1:])
 
@@ -98,12 +116,12 @@ def test_names_of_a_plan_may_come_again_as_they_may_within_a_plan(tmp_path: Path
 @pytest.mark.parametrize(("at_once", "pulses"), [(True, 30), (False, 40)])
 def test_enough_ends_it_well(tmp_path: Path, at_once: bool, pulses: int):
     rig = adaptive(tmp_path)
-    rig.at(0.6, lambda: rig.run.score.extend(60, [hold("never played")]))
+    rig.at(0.6, lambda: extend(rig, 60, [hold("never played")]))
     rig.at(1.21, lambda: rig.run.score.enough("P1's nurse", at_once))
     result = rig.execute()
     assert (result.outcome, result.ended_by, result.evidence.confirmed) == ("completed", "enough", True)
     assert len(rig.stimulator.sent) == pulses
-    recording = sealed(rig)
+    recording = rig.recording()
     assert recording.names == ["rest", "first", "rest"]
     assert result.duration_s == pytest.approx(0.5 + pulses / RATE_HZ + 1.0)
     assert len(recording.columns["pulses/status"]) == 20 + pulses + 40
@@ -117,12 +135,12 @@ def test_enough_twice_may_only_end_it_sooner(tmp_path: Path):
     for at_s, at_once in ((0.7, False), (0.8, False), (1.0, True), (1.1, True), (1.2, False)):
         rig.at(at_s, lambda at_once=at_once: score.enough("me", at_once))
     found: list[RigError] = []
-    rig.at(1.3, lambda: found.extend(refusals(rig, lambda: score.extend(len(score.laid), [hold()]))))
+    rig.at(1.3, lambda: found.extend(refusals(lambda: extend(rig, len(score.laid), [hold()]))))
     result = rig.execute()
     assert result.duration_s == pytest.approx(0.5 + len(rig.stimulator.sent) / RATE_HZ + 1.0)
     assert 19 <= len(rig.stimulator.sent) <= 21
     assert "is ending (enough)" in str(found[0])
-    assert [event["event"] for event in sealed(rig).events].count("ended") == 2
+    assert [event["event"] for event in rig.recording().events].count("ended") == 2
 
 
 @pytest.mark.parametrize(("before_s", "pulses"), [(0.06, 40), (0.035, 40), (0.01, 41), (-0.01, 80)])
@@ -140,14 +158,13 @@ def test_enough_before_the_first_pulse_sends_none(tmp_path: Path):
     rig.run.score.enough("me", at_once=True)
     result = rig.execute()
     assert (result.outcome, rig.stimulator.sent, result.duration_s) == ("completed", [], pytest.approx(1.0))
-    assert sealed(rig).names == ["rest"]
+    assert rig.recording().names == ["rest"]
 
 
 def test_a_fixed_test_is_neither_extended_nor_ended_early(tmp_path: Path):
     rig = VirtualRig(tmp_path, FIXED)
     extended, ended = refusals(
-        rig,
-        lambda: rig.run.score.extend(len(rig.run.score.laid), [hold()]),
+        lambda: extend(rig, len(rig.run.score.laid), [hold()]),
         lambda: rig.run.score.enough("me", at_once=True),
     )
     assert isinstance(extended, TooLateError) and isinstance(ended, PlanError)
@@ -158,28 +175,28 @@ def test_a_stop_is_a_stop(tmp_path: Path, cause: Any):
     """During the fall of the torque and after it nothing is laid, and no pulse follows."""
     rig = adaptive(tmp_path)
     score, found = rig.run.score, []
-    rig.at(0.3, lambda: score.extend(20, [hold("added", on_s=3.0)]))
+    rig.at(0.3, lambda: extend(rig, 20, [hold("added", on_s=3.0)]))
     rig.at(1.0, lambda: rig.halt.set(cause, "that hurts"))
     for at_s in (1.001, 1.01, 1.05):
         rig.at(at_s, lambda: found.extend(refusals(
-            rig, lambda: score.extend(len(score.laid), [hold()]), lambda: score.enough("me", True)
+            lambda: extend(rig, len(score.laid), [hold()]), lambda: score.enough("me", True)
         )))  # fmt: skip
     result = rig.execute()
     size = rig.path.stat().st_size
-    found += refusals(rig, lambda: score.extend(len(score.laid), [hold()]), lambda: score.enough("me", False))
+    found += refusals(lambda: extend(rig, len(score.laid), [hold()]), lambda: score.enough("me", False))
     assert (result.outcome, result.ended_by, len(found)) == (cause, cause, 8)
     assert all(isinstance(error, TooLateError) for error in found)
     assert rig.stimulator.sent[-1][0] <= rig.halt.time_s
-    recording = sealed(rig)
+    recording = rig.recording()
     assert (recording.names, recording.attributes["ended_by"]) == (["rest", "added"], cause)
     assert rig.path.stat().st_size == size
 
 
 def test_the_clock_on_the_wall_changes_nothing(tmp_path: Path):
     rig = adaptive(tmp_path)
-    rig.at(0.1, lambda: setattr(rig.clock, "_unix_offset_s", rig.clock._unix_offset_s + 86_400))
-    rig.at(0.2, lambda: rig.run.score.extend(20, [hold("added")]))
-    rig.at(0.9, lambda: setattr(rig.clock, "_unix_offset_s", -1e9))
+    rig.at(0.1, lambda: rig.clock.set_unix_ahead(86_400))
+    rig.at(0.2, lambda: extend(rig, 20, [hold("added")]))
+    rig.at(0.9, lambda: rig.clock.set_unix_ahead(-2e9))
     assert rig.execute().duration_s == pytest.approx(4.475)
 
 

@@ -8,15 +8,15 @@ import h5py
 import numpy as np
 import pytest
 
-from rig import archive, assembly, journal
+from rig import assembly, journal
 from rig.errors import JournalError
 from rig.journal import Kind, LaidBlock
-from tests.rig.adaptive import adaptive, hold, refusals, sealed, widths_sent
+from tests.rig.adaptive import adaptive, extend, hold, refusals, widths_sent
 
 
 def test_each_segment_is_in_the_journal_before_its_first_pulse(tmp_path: Path):
     rig = adaptive(tmp_path)
-    rig.at(0.2, lambda: rig.run.score.extend(20, [hold("added")]))
+    rig.at(0.2, lambda: extend(rig, 20, [hold("added")]))
     rig.at(1.7, lambda: rig.run.score.enough("me", at_once=True))
     rig.execute()
     laid_to, seen = 20, []
@@ -34,24 +34,23 @@ def test_each_segment_is_in_the_journal_before_its_first_pulse(tmp_path: Path):
 def test_a_disk_that_takes_no_segment_ends_it_as_a_fault(tmp_path: Path):
     rig = adaptive(tmp_path)
     rig.at(0.2, lambda: setattr(rig.journal, "_failure", "disk full"))
-    rig.at(0.3, lambda: refusals(rig, lambda: rig.run.score.extend(20, [hold()])))
+    rig.at(0.3, lambda: refusals(lambda: extend(rig, 20, [hold()])))
     result = rig.execute()
     assert (result.outcome, result.reason, rig.stimulator.sent) == ("fault", "disk full", [])
     (tmp_path / "2").mkdir()
     rig = adaptive(tmp_path / "2")
     rig.journal._failure = "disk full"
     with pytest.raises(JournalError):
-        rig.run.score.extend(20, [hold()])
+        extend(rig, 20, [hold()])
     assert len(rig.run.score.laid) == 20
 
 
 def test_the_sealed_file_holds_the_true_sequence(tmp_path: Path):
     rig = adaptive(tmp_path)
-    rig.at(0.2, lambda: rig.run.score.extend(20, [hold("added")]))
+    rig.at(0.2, lambda: extend(rig, 20, [hold("added")]))
     rig.at(1.0, lambda: rig.run.score.enough("me", at_once=True))
     rig.execute()
-    file_path = archive.seal(sealed(rig), tmp_path).path
-    with h5py.File(file_path) as file:
+    with h5py.File(rig.seal().path) as file:
         assert list(file["segments/name"].asstr()[:]) == ["rest", "added", "rest"]
         assert (file.attrs["adaptive"], file.attrs["ended_by"]) == (1, "enough")
         assert file["segments/end_s"][1] == file["segments/start_s"][2]
@@ -63,7 +62,7 @@ def test_the_sealed_file_holds_the_true_sequence(tmp_path: Path):
 @pytest.mark.slow
 def test_a_journal_cut_anywhere_or_without_a_laid_block_loses_no_pulse(tmp_path: Path):
     rig = adaptive(tmp_path)
-    rig.at(0.2, lambda: rig.run.score.extend(20, [hold("added", max_pulse_width_us=150.0)]))
+    rig.at(0.2, lambda: extend(rig, 20, [hold("added", max_pulse_width_us=150.0)]))
     rig.at(1.8, lambda: rig.run.score.enough("me", at_once=True))
     rig.execute()
     whole = rig.path.read_bytes()

@@ -14,7 +14,7 @@ from rig.errors import BusyError, PlanError, RefusedError, RigError
 from rig.journal import Kind
 from rig.messages import AdaptivePlan, SegmentPlan
 from rig.score import MAX_CHECKED, MAX_EXTENSION_S, MAX_EXTENSION_SEGMENTS
-from tests.rig.adaptive import RATE_HZ, adaptive, hold, refusals, rest, sealed, widths_sent
+from tests.rig.adaptive import RATE_HZ, adaptive, extend, hold, refusals, rest, widths_sent
 
 WRONG: dict[str, tuple[list[SegmentPlan], type[RigError], str]] = {
     "nothing": ([], PlanError, "0 segments; give 1 to 8"),
@@ -45,7 +45,7 @@ def test_a_wrong_extension_is_refused_and_lays_nothing(tmp_path: Path, name: str
     segments, kind, words = WRONG[name]
     rig = adaptive(tmp_path, 60.0, max_pulse_width_us=280.0)
     with pytest.raises(kind, match=words):
-        rig.run.score.extend(20, segments)
+        extend(rig, 20, segments)
     assert len(rig.run.score.laid) == 20
     assert Kind.LAID not in {kind for kind, _ in journal.read(rig.path).blocks}
 
@@ -54,13 +54,13 @@ def test_the_dose_is_that_of_the_whole_test(tmp_path: Path):
     """3 s at 6 µC are 720 µC: the third second is refused, and the fixed plan's next is not played after the second."""
     base = limits.tightened(limits.HARD_LIMITS, "charge_per_test_uc", 600.0, "rig file")
     rig = adaptive(tmp_path, base=base, fixed=[rest(0.5), hold("first"), hold("second")])
-    rig.run.score.extend(20, [hold("added")])
+    extend(rig, 20, [hold("added")])
     with pytest.raises(RefusedError, match=r"charge_per_test_uc 720 .*rig file"):
-        rig.run.score.extend(60, [hold("two more"), hold("seconds")])
+        extend(rig, 60, [hold("two more"), hold("seconds")])
     result = rig.execute()
     assert (result.ended_by, result.charge_uc) == ("limit", 480.0)
-    assert sealed(rig).names == ["rest", "added", "first", "rest"]
-    told = next(event for event in sealed(rig).events if event["event"] == "ended")
+    assert rig.recording().names == ["rest", "added", "first", "rest"]
+    told = next(event for event in rig.recording().events if event["event"] == "ended")
     assert "charge_per_test_uc 720" in told["reason"]
 
 
@@ -68,34 +68,34 @@ def test_the_charge_of_a_second_holds_across_a_boundary(tmp_path: Path):
     base = limits.tightened(limits.HARD_LIMITS, "charge_per_second_uc", 150.0, "rig file")
     half = [rest(1.0), hold("first", on_s=0.5)]
     rig = adaptive(tmp_path, base=base, fixed=half)
-    rig.run.score.extend(40, [hold("a", on_s=0.5)])
+    extend(rig, 40, [hold("a", on_s=0.5)])
     with pytest.raises(RefusedError, match="charge_per_second_uc 240"):
-        rig.run.score.extend(60, [hold("b", on_s=0.5)])
-    rig.run.score.extend(60, [rest(1.0), hold("c", on_s=0.5)])
+        extend(rig, 60, [hold("b", on_s=0.5)])
+    extend(rig, 60, [rest(1.0), hold("c", on_s=0.5)])
     assert rig.execute().ended_by == "limit"  # the fixed plan's half second would follow one without a pause
-    assert sealed(rig).names == ["rest", "a", "rest", "c", "rest"]
+    assert rig.recording().names == ["rest", "a", "rest", "c", "rest"]
 
 
 def test_the_rise_is_counted_from_the_last_pulse_that_is_laid(tmp_path: Path):
     rig = adaptive(tmp_path)
     down = {"from_pulse_width_us": 300.0, "to_pulse_width_us": 120.0}
-    rig.run.score.extend(20, [hold("up"), SegmentPlan(name="down", sequence="sweep", settings=down)])
+    extend(rig, 20, [hold("up"), SegmentPlan(name="down", sequence="sweep", settings=down)])
     up = {"from_pulse_width_us": 170.0, "to_pulse_width_us": 300.0}
-    rig.run.score.extend(100, [SegmentPlan(name="on", sequence="sweep", settings=up)])
+    extend(rig, 100, [SegmentPlan(name="on", sequence="sweep", settings=up)])
     again = {"from_pulse_width_us": 120.0, "to_pulse_width_us": 171.0}
-    rig.run.score.extend(140, [SegmentPlan(name="down", sequence="sweep", settings=again)])
+    extend(rig, 140, [SegmentPlan(name="down", sequence="sweep", settings=again)])
     wide = {"from_pulse_width_us": 222.0, "to_pulse_width_us": 222.0}
     with pytest.raises(RefusedError, match="width_rise_us 51"):
-        rig.run.score.extend(180, [SegmentPlan(name="on", sequence="sweep", settings=wide)])
+        extend(rig, 180, [SegmentPlan(name="on", sequence="sweep", settings=wide)])
 
 
 def test_the_bound_of_the_whole_test_holds_with_its_safe_end(tmp_path: Path):
     rig = adaptive(tmp_path, max_duration_s=10.0)
     with pytest.raises(RefusedError, match=r"duration_s 10\.025 .*request"):
-        rig.run.score.extend(20, [rest(9.525)])
+        extend(rig, 20, [rest(9.525)])
     with pytest.raises(RefusedError, match=r"with its safe end: duration_s 10\.1"):
-        rig.run.score.extend(20, [hold(on_s=8.6)])
-    rig.run.score.extend(20, [hold(on_s=8.5)])
+        extend(rig, 20, [hold(on_s=8.6)])
+    extend(rig, 20, [hold(on_s=8.5)])
     assert rig.run.score.left(0.0).duration_left_s == pytest.approx(1.0)
 
 
@@ -106,7 +106,7 @@ def test_however_often_it_is_extended_it_ends_within_its_bound(tmp_path: Path):
     def add() -> None:
         if not score.ended_by:
             try:
-                score.extend(len(score.laid), [hold("more", on_s=0.5, off_s=0.2)])
+                extend(rig, len(score.laid), [hold("more", on_s=0.5, off_s=0.2)])
             except (RefusedError, BusyError):
                 return
 
@@ -115,7 +115,7 @@ def test_however_often_it_is_extended_it_ends_within_its_bound(tmp_path: Path):
     result = rig.execute()
     assert (result.outcome, result.ended_by) == ("completed", "limit")
     assert 6.0 < result.duration_s <= 8.0
-    recording = sealed(rig)
+    recording = rig.recording()
     assert len(recording.columns["pulses/pulse_width_us"]) <= 8.0 * RATE_HZ
     assert np.all(recording.columns["pulses/pulse_width_us"][-40:] == 0)
 
@@ -139,7 +139,7 @@ def test_the_measured_torque_time_ends_it_within_a_pulse(tmp_path: Path, pending
     if pending == "enough":
         rig.at(0.6, lambda: rig.run.score.enough("me", at_once=False))
     if pending == "laid":
-        rig.at(0.6, lambda: rig.run.score.extend(140, [hold("ahead", on_s=3.0)]))
+        rig.at(0.6, lambda: extend(rig, 140, [hold("ahead", on_s=3.0)]))
     at_end: list[float] = []
     rig.stimulator.on_send = lambda _: at_end.append(rig.run.torque_time_nms)
     result = rig.execute()
@@ -147,7 +147,7 @@ def test_the_measured_torque_time_ends_it_within_a_pulse(tmp_path: Path, pending
     a_pulse_nms = 6.0 / RATE_HZ
     assert at_end[-1] < 5.0 + a_pulse_nms
     assert 5.0 < result.torque_time_nms < 5.0 + 2 * a_pulse_nms + 6.0 * 0.1  # the torque falls within 0.1 s
-    recording = sealed(rig)
+    recording = rig.recording()
     assert recording.names == ["rest", "long", "rest"]
     assert result.duration_s == pytest.approx(recording.columns["segments/start_s"][-1] + 1.0, abs=1e-6)
 
@@ -163,14 +163,13 @@ def test_the_torque_time_is_counted_from_rest_and_through_lost_samples(tmp_path:
 
 def test_only_so_many_are_checked_for_one_boundary(tmp_path: Path):
     rig = adaptive(tmp_path)
-    score = rig.run.score
     wrong = [hold(max_pulse_width_us=1000.0)]
-    found = refusals(rig, *[lambda: score.extend(20, wrong)] * (MAX_CHECKED + 3), lambda: score.extend(20, [hold()]))
+    found = refusals(*[lambda: extend(rig, 20, wrong)] * (MAX_CHECKED + 3), lambda: extend(rig, 20, [hold()]))
     assert [type(error) for error in found] == [RefusedError] * MAX_CHECKED + [BusyError] * 4
-    refusals(rig, *[lambda: score.extend(19, wrong)] * 100)
-    rig.at(0.7, lambda: score.extend(60, [hold("added")]))  # the next boundary
+    refusals(*[lambda: extend(rig, 19, wrong)] * 100)
+    rig.at(0.7, lambda: extend(rig, 60, [hold("added")]))  # the next boundary
     rig.execute()
-    assert sealed(rig).names == ["rest", "first", "added", "ramp", "rest"]
+    assert rig.recording().names == ["rest", "first", "added", "ramp", "rest"]
 
 
 def mad_segment(rng: np.random.Generator) -> SegmentPlan:
@@ -205,7 +204,7 @@ def test_whatever_strangers_send_the_whole_test_stays_within_its_limits(tmp_path
         before = score.laid
         after = len(before) + int(rng.choice([0, 0, 0, 0, 1, -1, 40]))
         try:
-            score.extend(after, [mad_segment(rng) for _ in range(rng.integers(0, 4))])
+            extend(rig, after, [mad_segment(rng) for _ in range(rng.integers(0, 4))])
         except RigError:
             counts["refused"] += 1
             assert score.laid is before
@@ -230,7 +229,7 @@ def test_whatever_strangers_send_the_whole_test_stays_within_its_limits(tmp_path
     assert sent_us.sum() * 20e-3 <= 900
     for time_s in times:
         assert sent_us[(times >= time_s) & (times < time_s + 1 - 1e-6)].sum() * 20e-3 <= 180 + 1e-9
-    recording = sealed(rig)
+    recording = rig.recording()
     planned_us = recording.columns["pulses/pulse_width_us"]
     assert len(planned_us) / RATE_HZ <= 12.0
     assert np.all(planned_us[-40:] == 0)

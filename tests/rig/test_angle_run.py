@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import identify
-from rig import archive, assembly, journal, limits
+from rig import archive, limits
 from rig.acquire.angle_check import outside
 from rig.acquire.angle_guard import check_start
 from rig.acquire.health import DEFAULT_WATCH
@@ -19,6 +19,7 @@ from rig.control.sealing import warnings
 from rig.errors import DeviceError, PlanError, RefusedError
 from rig.messages import AdaptivePlan, AnglePlan, SegmentPlan
 from rig.signals import Pulse, PulseStatus
+from tests.rig.adaptive import extend, refusals
 from tests.rig.fakes import VirtualRig
 
 RANGE = (math.radians(20), math.radians(120))
@@ -82,7 +83,7 @@ def test_a_test_without_an_angle_goes_on_records_and_warns(tmp_path: Path, fault
     rig.at(1.3, lambda: FAULTS[fault][0](rig))
     result = rig.execute()
     assert (result.outcome, result.reason) == ("completed", "")
-    recording = assembly.assemble(journal.read(rig.path))
+    recording = rig.recording()
     assert len(recording.columns["angle/time_s"]) > 200
     assert all(np.isfinite(recording.columns[path]).all() for path, _, _ in archive.ANGLE_COLUMNS)
     told = [line for line in warnings(recording) if line.startswith("angle sensor: ")]
@@ -94,7 +95,7 @@ def test_what_is_no_angle_spoils_no_recording_that_needs_none(tmp_path: Path, fa
     rig = VirtualRig(tmp_path, has_sensor=True)
     rig.at(1.3, lambda: (FAULTS[fault][0](rig), set_to("add_deg", rig.sensor.add_deg or 40.0)(rig)))
     assert rig.execute().outcome == "completed"
-    sealed = archive.seal(assembly.assemble(journal.read(rig.path)), tmp_path)
+    sealed = rig.seal()
     record = identify.read(sealed.path)
     assert record.time_s[-1] > 2.4
     known_rad = sealed.recording.columns["angle/angle_rad"]
@@ -106,7 +107,7 @@ def test_what_is_no_angle_spoils_no_recording_that_needs_none(tmp_path: Path, fa
 def test_a_sensor_that_works_needs_no_warning(tmp_path: Path):
     rig = VirtualRig(tmp_path, has_sensor=True)
     assert rig.execute().outcome == "completed"
-    assert warnings(assembly.assemble(journal.read(rig.path))) == []
+    assert warnings(rig.recording()) == []
 
 
 @pytest.mark.parametrize("make", [held, moving])
@@ -189,12 +190,10 @@ def test_enough_ends_a_passive_test_well_and_no_pulse_can_be_added(tmp_path: Pat
     steps = SegmentPlan(name="s", sequence="steps", settings={"max_pulse_width_us": 50.0, "on_s": 1.0, "off_s": 0.0})
     refused: list[str] = []
 
-    def extend() -> None:
-        with pytest.raises(RefusedError) as error:
-            rig.run.score.extend(len(rig.run.score.laid), [steps])
-        refused.append(str(error.value))
+    def add() -> None:
+        refused.extend(map(str, refusals(lambda: extend(rig, len(rig.run.score.laid), [steps]))))
 
-    rig.at(1.31, extend)
+    rig.at(1.31, add)
     rig.at(3.01, lambda: rig.run.score.enough("nurse", at_once=True))
     result = rig.execute()
     assert (result.outcome, result.ended_by) == ("completed", "enough")

@@ -13,30 +13,34 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from rig import journal, limits
-from rig.clock import VirtualClock
 from rig.errors import DeviceError
 from rig.gate import Gate
-from rig.journal import Journal, Kind
+from rig.journal import Kind
 from rig.messages import Profile
 from rig.signals import Ack, Pulse, PulseStatus
-from tests.rig.fakes import FakeStimulator
+from tests.rig.fakes import FakeStimulator, journal_at
+from tests.simulator.virtual_time import VirtualClock, VirtualMachine
 
 
 class Setup:
-    def __init__(self, folder: Path, **profile: float) -> None:
-        self.clock = VirtualClock()
+    """An open gate, or one that is still shut."""
+
+    def __init__(self, folder: Path, is_open: bool = True, start_s: float = 1000.0, **profile: float) -> None:
+        self.machine = VirtualMachine(VirtualClock(start_s))
+        self.clock, self.wait, self.halted = self.machine.clock, self.machine.wait, False
         self.stimulator = FakeStimulator(self.clock)
         self.faults: list[str] = []
         self.gate = Gate(self.stimulator, self.clock, self.faults.append, self.faults.append)
         self.path = folder / "gate.journal"
         self.path.unlink(missing_ok=True)
-        self.journal = Journal(self.path)
+        self.journal = journal_at(self.path)
         self.gate.reset()
-        self.gate.open(self.journal, limits.for_profile(limits.HARD_LIMITS, Profile(**profile)))
+        self.table = limits.for_profile(limits.HARD_LIMITS, Profile(**profile))
+        if is_open:
+            self.open()
 
-    def wait(self, duration_s: float) -> None:
-        """Let time pass, with the acks that come meanwhile."""
-        self.clock.wait(self.clock.now_s() + duration_s)
+    def open(self) -> None:
+        self.machine.run(self.gate.open(self.journal, self.table, lambda: self.halted))
 
     def events(self) -> list[dict[str, Any]]:
         return [json.loads(payload) for kind, payload in journal.read(self.path).blocks if kind == Kind.EVENT]
@@ -155,11 +159,11 @@ def test_a_stop_settles_what_was_on_its_way_and_says_so_until_then(tmp_path: Pat
     assert setup.gate.still_possible() == "pulse 1 was sent 80 ms ago and not acknowledged: it may still be felt"
     setup.stimulator.silent = True
     with pytest.raises(DeviceError):
-        setup.gate.stop()
+        setup.machine.run(setup.gate.stop())
     assert setup.gate.still_possible()
     setup.wait(0.5)
     setup.stimulator.silent = False
-    setup.gate.stop()  # the line keeps its order: an answer to the stop came after the pulse
+    setup.machine.run(setup.gate.stop())  # the line keeps its order: an answer to the stop came after the pulse
     assert setup.gate.still_possible() == ""
     assert setup.gate.last_pulse_s == setup.clock.now_s()
 
@@ -207,6 +211,6 @@ def test_acks_and_errors_are_matched_by_number(tmp_path: Path):
 def test_disconnecting_stops_first_and_never_raises(tmp_path: Path):
     setup = Setup(tmp_path)
     setup.stimulator.silent = True
-    setup.gate.disconnect()
+    setup.machine.run(setup.gate.disconnect())
     assert setup.stimulator.stops == 1
     assert setup.fire(100) == PulseStatus.REFUSED

@@ -8,13 +8,10 @@ import pytest
 
 from rig import journal as jn
 from rig import limits
-from rig.clock import VirtualClock
-from rig.errors import DeviceError
-from rig.gate import Gate
-from rig.journal import Journal, Kind
+from rig.errors import DeviceError, JournalError
+from rig.journal import Kind
 from rig.messages import Profile
 from rig.signals import Ack, Pulse, PulseStatus
-from tests.rig.fakes import FakeStimulator
 from tests.rig.test_gate import Setup
 
 T0_S = 1000.0
@@ -25,19 +22,17 @@ def blocks(setup: Setup, kind: Kind) -> list[bytes]:
     return [payload for found, payload in jn.read(setup.path).blocks if found == kind]
 
 
-def test_a_new_gate_is_shut_and_empty():
-    clock = VirtualClock()
-    stimulator = FakeStimulator(clock)
-    lost: list[str] = []
-    gate = Gate(stimulator, clock, lambda _: None, lost.append)
+def test_a_new_gate_is_shut_and_empty(tmp_path: Path):
+    setup = Setup(tmp_path, is_open=False)
+    gate = setup.gate
     assert gate.is_open is False
     assert (gate.on_its_way, gate.last_pulse_s) == (None, None)
     assert (gate.lateness_s, gate.ack_delay_s, gate.charge_uc, gate.dropped) == ([], [], 0.0, 0)
     assert gate.still_possible() == ""
-    assert gate.fire(0, Pulse(100, 20), clock.now_s(), clock.now_s()) == PulseStatus.REFUSED
-    stimulator.on_ack(Ack(1, clock.now_s()))  # of whoever used the device before
-    stimulator.on_lost("unplugged")
-    assert lost == ["unplugged"]
+    assert setup.fire(100) == PulseStatus.REFUSED
+    setup.stimulator.on_ack(Ack(1, T0_S))  # of whoever used the device before
+    setup.stimulator.on_lost("unplugged")
+    assert setup.faults == ["unplugged"]
 
 
 def test_a_reset_forgets_the_test_before(tmp_path: Path):
@@ -203,14 +198,11 @@ def test_late_acks_are_noted_by_real_time(tmp_path: Path, speed: float):
 
 
 def test_an_ack_after_exactly_the_time_allowed_is_not_late(tmp_path: Path):
-    clock = VirtualClock(start_s=0.0)
-    stimulator = FakeStimulator(clock)
-    stimulator.ack_delay_s = None
-    gate = Gate(stimulator, clock, lambda _: None, lambda _: None)
-    gate.open(Journal(tmp_path / "j"), limits.HARD_LIMITS)
-    gate.fire(0, Pulse(100, 20), 0.0, 0.0)
-    stimulator.on_ack(Ack(1, 0.015))
-    assert sum(kind == Kind.EVENT for kind, _ in jn.read(tmp_path / "j").blocks) == 1, "arm alone"
+    setup = Setup(tmp_path, start_s=0.0)
+    setup.stimulator.ack_delay_s = None
+    setup.fire(100)
+    setup.stimulator.on_ack(Ack(1, 0.015))
+    assert len(setup.events()) == 1, "arm alone"
 
 
 def test_how_long_a_pulse_has_been_on_its_way(tmp_path: Path):
@@ -294,23 +286,44 @@ def test_a_new_test_does_not_wait_for_an_ack_of_the_one_before(tmp_path: Path):
     setup.fire(100)
     setup.gate.release()
     setup.wait(1.0)
-    setup.gate.open(setup.journal, limits.HARD_LIMITS)
+    setup.open()
     assert setup.gate.on_its_way is None
     assert setup.fire(100) == PulseStatus.UNACKNOWLEDGED
 
 
 def test_a_gate_whose_device_or_journal_fails_stays_shut(tmp_path: Path):
-    clock = VirtualClock()
-    stimulator = FakeStimulator(clock)
-    gate = Gate(stimulator, clock, lambda _: None, lambda _: None)
-    stimulator.silent = True
-    journal = Journal(tmp_path / "j")
+    setup = Setup(tmp_path, is_open=False)
+    gate, ask = setup.gate, setup.machine.run
+    setup.stimulator.silent = True
     with pytest.raises(DeviceError):
-        gate.open(journal, limits.HARD_LIMITS)
+        setup.open()
     assert not gate.is_open
-    stimulator.silent = False
-    assert gate.identify() == {"device": "fake"}
-    assert gate.state() == (True, "not initialised")
-    gate.open(journal, limits.HARD_LIMITS)
+    setup.stimulator.silent = False
+    assert ask(gate.identify()) == {"device": "fake"}
+    assert ask(gate.state()) == (True, "not initialised")
+    setup.open()
     assert gate.is_open
-    assert gate.state() == (False, "armed")
+    assert ask(gate.state()) == (False, "armed")
+    gate.release()
+    setup.journal._failure = "disk full"
+    with pytest.raises(JournalError, match="disk full"):
+        setup.open()
+    assert not gate.is_open
+
+
+@pytest.mark.parametrize("after_s", [0.0, 0.1, 0.199, None])
+def test_a_stop_during_arming_leaves_the_gate_shut(tmp_path: Path, after_s: float | None):
+    """The device takes 0.2 s to arm: whenever the stop comes, no pulse follows."""
+    setup = Setup(tmp_path, is_open=False)
+
+    async def slowly() -> None:
+        await setup.machine.tasks.sleep(0.2)
+        setup.stimulator.armed = True
+
+    setup.stimulator.arm = slowly
+    if after_s is not None:
+        setup.clock.call_at(T0_S + after_s, lambda: setattr(setup, "halted", True))
+    setup.open()
+    assert setup.clock.now_s() == T0_S + 0.2
+    assert setup.gate.is_open is (after_s is None)
+    assert setup.fire(100) == (PulseStatus.UNACKNOWLEDGED if after_s is None else PulseStatus.REFUSED)
