@@ -14,6 +14,7 @@ import pytest
 
 import identify
 from rig import align_angle, angle_velocity, archive, assembly, journal
+from rig.adapters.files import Files
 from rig.align_angle import Reference
 from rig.errors import RecordingError
 from rig.journal import Kind
@@ -143,7 +144,7 @@ def played(folder: Path) -> VirtualRig:
 
 def test_the_sealed_file_holds_the_angle(tmp_path: Path):
     rig = played(tmp_path)
-    sealed = archive.seal(assembly.assemble(journal.read(rig.path)), tmp_path)
+    sealed = rig.seal()
     with h5py.File(sealed.path) as file:
         group = file["angle"]
         assert {f"angle/{name}" for name in group} == {path for path, _, _ in archive.ANGLE_COLUMNS}
@@ -164,7 +165,7 @@ def test_the_sealed_file_holds_the_angle(tmp_path: Path):
 def test_a_changed_angle_is_found(tmp_path: Path, change: str):
     rig = VirtualRig(tmp_path, has_sensor=change != "added")
     rig.execute()
-    sealed = archive.seal(assembly.assemble(journal.read(rig.path)), tmp_path)
+    sealed = rig.seal()
     with h5py.File(sealed.path, "a") as file:
         if change == "value":
             file["angle/angle_rad"][5] += 1e-6
@@ -188,7 +189,7 @@ def test_a_changed_angle_is_found(tmp_path: Path, change: str):
 def test_a_damaged_file_is_refused_in_one_line(tmp_path: Path, change: str, words: str):
     rig = VirtualRig(tmp_path)
     rig.execute()
-    sealed = archive.seal(assembly.assemble(journal.read(rig.path)), tmp_path)
+    sealed = rig.seal()
     with h5py.File(sealed.path, "a") as file:
         del file["torque/torque_nm"]
         if change == "a group":
@@ -205,9 +206,9 @@ def test_a_damaged_file_is_refused_in_one_line(tmp_path: Path, change: str, word
 def test_without_a_sensor_the_file_is_what_it_was(tmp_path: Path):
     rig = VirtualRig(tmp_path)
     rig.execute()
-    recording = assembly.assemble(journal.read(rig.path))
+    sealed = rig.seal()
+    recording = sealed.recording
     assert recording.angle == {} and not any(path.startswith("angle/") for path in recording.columns)
-    sealed = archive.seal(recording, tmp_path)
     with h5py.File(sealed.path) as file:
         assert "angle" not in file
     assert archive.verify(sealed.path) == sealed.content_sha256
@@ -228,7 +229,7 @@ def damaged(path: Path, spoil: Any) -> journal.JournalContents:
 
 def test_angles_are_saved_where_both_headers_are_lost(tmp_path: Path):
     rig = played(tmp_path)
-    whole = assembly.assemble(journal.read(rig.path))
+    whole = rig.recording()
     found = assembly.assemble(damaged(rig.path, lambda kind: kind in (Kind.HEADER, Kind.PLAN)))
     assert "header are lost" in found.attributes["journal_note"]
     off_s = found.columns["angle/time_s"][0] - whole.columns["angle/time_s"][0]
@@ -247,7 +248,7 @@ def test_lost_blocks_of_angles_are_gaps(tmp_path: Path):
     assert gaps.shape == (1, 2) and gaps[0, 1] == 20
     first = gaps[0, 0]
     assert np.diff(found.columns["angle/time_s"])[first - 1] == pytest.approx(21 / 200)
-    assert archive.verify(archive.seal(found, tmp_path).path)
+    assert archive.verify(archive.seal(found, tmp_path, Files()).path)
 
 
 @pytest.mark.parametrize("back", [100, 20])
@@ -260,7 +261,7 @@ def test_angles_that_overlap_are_taken_once(tmp_path: Path, back: int):
     again = np.concatenate([whole[:300], whole[300 - back :]])
     others = [block for block in contents.blocks if block[0] != Kind.ANGLE]
     doubled = replace(contents, blocks=[*others[:-1], (Kind.ANGLE, again.tobytes()), others[-1]])
-    sealed = archive.seal(assembly.assemble(doubled), tmp_path)
+    sealed = archive.seal(assembly.assemble(doubled), tmp_path, Files())
     columns = sealed.recording.columns
     assert np.all(np.diff(columns["angle/time_s"]) > 0) and np.all(np.diff(columns["angle/counter"]) > 0)
     assert identify.read(sealed.path).angle_rad is not None

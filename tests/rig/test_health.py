@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from rig.acquire import health
+from rig.acquire.health import DEFAULT_WATCH, SYNC_PERIOD_S
+from rig.adapters.files import Files
 from rig.journal import Kind
 from rig.messages import SegmentPlan
-from tests.rig.fakes import ON_A_BUSY_DISK, VirtualRig
+from rig.tasks import Outcome
+from tests.rig.fakes import VirtualRig
+from tests.simulator.virtual_time import VirtualMachine
 
-WORDS = {
-    "torque": "stale",
-    "ack": "acknowledged",
-    "disk slow": "too slow",
-    "disk full": "MB free",
-    "sender": "blocked",
+FAULTS = {
+    "torque": ("stale", 0.13),
+    "ack": ("acknowledged", 0.13),
+    "disk slow": ("too slow", DEFAULT_WATCH.stale_disk_s + 0.03),
+    "disk full": ("MB free", SYNC_PERIOD_S + 0.03),
+    "disk gone": ("too slow", DEFAULT_WATCH.stale_disk_s + 0.03),
+    "sender": ("blocked", 0.03),
 }
+"""What is told, and within how many seconds nothing is fed or sent any more."""
 REST = [SegmentPlan(name="rest", sequence="rest", settings={"duration_s": 3.0})]
 
 
@@ -30,12 +37,28 @@ def test_through_a_rest_the_device_is_fed_at_every_pulses_time(tmp_path: Path):
     assert len(rig.stimulator.fed_s) == 120
 
 
-@pytest.mark.parametrize("fault", WORDS)
+class Failing(Files):
+    """A disk that is full or gone once it is told so."""
+
+    fault = ""
+
+    def free_bytes(self, folder: Path) -> int:
+        if self.fault == "disk gone":
+            raise OSError(5, "Input/output error")
+        return 8 * 2**20 - 1 if self.fault == "disk full" else super().free_bytes(folder)
+
+
+@pytest.mark.parametrize("fault", FAULTS)
 def test_without_a_proof_nothing_is_fed(tmp_path: Path, fault: str):
-    hold = [SegmentPlan(name="hold", sequence="steps", settings={"on_s": 4.0, "off_s": 0.0, "repeats": 1})]
+    words, within_s = FAULTS[fault]
+    hold = [SegmentPlan(name="hold", sequence="steps", settings={"on_s": 6.0, "off_s": 0.0, "repeats": 1})]
     rig = VirtualRig(tmp_path, hold)
+    rig.machine.disk = disk = Failing()
+    rig.cell.noise_nm = 0.01
     at: list[float] = []
-    disk = health.Disk.__dict__["age_s"], health.MIN_FREE_BYTES
+
+    def slowly(action: Callable[[], Any], outcome: Outcome) -> None:
+        rig.clock.call_at(rig.clock.now_s() + 10.0, lambda: VirtualMachine._work(action, outcome))
 
     def inject() -> None:
         at.append(rig.clock.now_s())
@@ -44,23 +67,19 @@ def test_without_a_proof_nothing_is_fed(tmp_path: Path, fault: str):
         elif fault == "ack":
             rig.stimulator.ack_delay_s = None
         elif fault == "disk slow":
-            health.Disk.age_s = lambda _: ON_A_BUSY_DISK.stale_disk_s + 0.1  # pyright: ignore[reportAttributeAccessIssue]
-        elif fault == "disk full":
-            health.MIN_FREE_BYTES = 2**62
-        else:
+            rig.machine.tasks._worker = slowly
+        elif fault == "sender":
             rig.clock.advance(0.5)
+        else:
+            disk.fault = fault
 
     rig.at(1.0, inject)
-    try:
-        result = rig.execute()
-    finally:
-        health.Disk.age_s, health.MIN_FREE_BYTES = disk  # pyright: ignore[reportAttributeAccessIssue]
+    result = rig.execute()
     assert result.outcome == "fault"
-    assert WORDS[fault] in result.reason
-    bound_s = 0.13 if fault in ("torque", "ack") else 0.03
+    assert words in result.reason
     assert rig.stimulator.fed_s[-1] - rig.stimulator.fed_s[0] > 0.9, "before the fault it was fed"
-    assert max(rig.stimulator.fed_s) - at[0] < bound_s
-    assert max(sent_s for sent_s, _ in rig.stimulator.sent) - at[0] < bound_s
+    assert max(rig.stimulator.fed_s) - at[0] < within_s
+    assert max(sent_s for sent_s, _ in rig.stimulator.sent) - at[0] < within_s
 
 
 def test_a_pulse_whose_time_passes_while_its_intent_is_written_is_not_sent(tmp_path: Path):

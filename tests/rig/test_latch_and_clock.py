@@ -2,74 +2,70 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from pathlib import Path
 
 import pytest
 
-from rig.clock import MonotonicClock, VirtualClock, utc_text
-from rig.control.latch import Latch, lock_folder
+from rig.adapters.files import Files
+from rig.clock import MonotonicClock, utc_text
+from rig.control.latch import Latch
 from rig.errors import BusyError
+from rig.tasks import Outcome, Tasks
+from tests.simulator.virtual_time import VirtualMachine
 
 
 def test_the_latch_is_remembered(tmp_path: Path):
-    latch = Latch(tmp_path)
-    assert latch.read() == (None, "")
-    latch.write("running", "test 7")
-    assert Latch(tmp_path).read() == ("running", "test 7")
-    latch.write("latched", "electrode")
-    assert Latch(tmp_path).read() == ("latched", "electrode")
-    latch.clear()
-    latch.clear()
-    assert latch.read() == (None, "")
+    machine = VirtualMachine()
+    latch = Latch(tmp_path, machine)
+    assert machine.run(latch.read()) == (None, "")
+    machine.run(latch.write("running", "test 7"))
+    assert machine.run(Latch(tmp_path, machine).read()) == ("running", "test 7")
+    machine.run(latch.write("latched", "electrode"))
+    assert machine.run(Latch(tmp_path, machine).read()) == ("latched", "electrode")
+    machine.run(latch.clear())
+    machine.run(latch.clear())
+    assert machine.run(latch.read()) == (None, "")
 
 
 @pytest.mark.parametrize("content", ["", "{", "[]", '{"state": "running"}', "\udcff"])
 def test_a_latch_that_cannot_be_read_counts_as_a_test_that_ran(tmp_path: Path, content: str):
     (tmp_path / "latch.json").write_bytes(content.encode("utf-8", "surrogateescape"))
-    assert Latch(tmp_path).read()[0] == "running"
+    machine = VirtualMachine()
+    assert machine.run(Latch(tmp_path, machine).read())[0] == "running"
+
+
+def test_what_is_asked_for_first_is_written_first_however_slow_the_disk_is(tmp_path: Path):
+    machine, takes_s = VirtualMachine(), [0.5, 0.1, 0.3]
+
+    def slowly(action: object, outcome: Outcome) -> None:
+        machine.clock.call_at(machine.clock.now_s() + takes_s.pop(0), lambda: machine._work(action, outcome))  # pyright: ignore
+
+    machine.tasks = Tasks(machine.clock, slowly)
+    latch = Latch(tmp_path, machine)
+    asked = latch.write("running", "test 7"), latch.clear(), latch.write("latched", "electrode")
+    for number, one in enumerate(asked):
+        machine.tasks.begin(one, str(number))
+    machine.run(latch.written())
+    assert machine.clock.now_s() == pytest.approx(1000.9)
+    assert '"electrode"' in (tmp_path / "latch.json").read_text()
 
 
 def test_one_rig_a_folder(tmp_path: Path):
-    held = lock_folder(tmp_path)
+    held = Files().lock(tmp_path)
     with pytest.raises(BusyError, match="another rig"):
-        lock_folder(tmp_path)
+        Files().lock(tmp_path)
     held.close()
-    lock_folder(tmp_path).close()
+    Files().lock(tmp_path).close()
 
 
-def test_a_virtual_clock_runs_events_in_order():
-    clock, seen = VirtualClock(start_s=10.0), []
-    clock.call_at(12.0, lambda: seen.append(("b", clock.now_s())))
-    clock.call_at(11.0, lambda: seen.append(("a", clock.now_s())))
-    assert not clock.wait(13.0)
-    assert seen == [("a", 11.0), ("b", 12.0)]
-    assert clock.now_s() == 13.0
-    event = threading.Event()
-    clock.call_at(14.0, event.set)
-    assert clock.wait(20.0, event)
-    assert clock.now_s() == 14.0
-
-
-def test_a_fast_clock_waits_less():
+def test_a_fast_clock_runs_faster():
     clock = MonotonicClock(100.0)
-    asked_s, start, told_s = time.monotonic(), clock.now_s(), time.monotonic()
-    assert not clock.wait(start + 10.0)
-    again_s, now_s, end_s = time.monotonic(), clock.now_s(), time.monotonic()
-    assert 10.0 <= now_s - start < 900.0  # a tenth of a second; ten of them if it waited in the world's
-    assert 100.0 * (again_s - told_s) <= now_s - start <= 100.0 * (end_s - asked_s)
-    assert clock.wait(clock.now_s() + 1e6, _set())
-    with pytest.raises(ValueError, match="clock speed"):
-        MonotonicClock(0.0)
-    with pytest.raises(ValueError, match="clock speed"):
-        MonotonicClock(float("nan"))
-
-
-def _set() -> threading.Event:
-    event = threading.Event()
-    event.set()
-    return event
+    asked_s, start_s, told_s = time.monotonic(), clock.now_s(), time.monotonic()
+    assert 100.0 * asked_s <= start_s <= 100.0 * told_s
+    for speed in (0.0, float("nan")):
+        with pytest.raises(ValueError, match="clock speed"):
+            MonotonicClock(speed)
 
 
 def test_utc_is_written_as_iso_8601():

@@ -39,9 +39,10 @@ class FallsLate:
 def test_torque_that_falls_long_after_the_time_for_it_confirms_no_stop(tmp_path: Path):
     """The looks come 60 ms late, the samples do not."""
     rig = ended(tmp_path)
-    wait, began_s = rig.clock.wait, rig.clock.now_s()
-    rig.clock.wait = lambda until_s: wait(until_s + 0.06)  # pyright: ignore[reportAttributeAccessIssue]
-    confirmed, _ = watch_decay(rig.gate, FallsLate(rig, 15.0), rig.clock, 0.0, 20.0)  # pyright: ignore[reportArgumentType]
+    began_s, tasks = rig.clock.now_s(), rig.machine.tasks
+    sleep = tasks.sleep
+    tasks.sleep = lambda real_s: sleep(real_s + 0.06)  # pyright: ignore[reportAttributeAccessIssue]
+    confirmed, _ = rig.machine.run(watch_decay(rig.gate, FallsLate(rig, 15.0), tasks, 0.0, 20.0))  # pyright: ignore
     assert rig.clock.now_s() - began_s <= 2 * DECAY_S
     assert not confirmed
 

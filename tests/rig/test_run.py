@@ -36,7 +36,7 @@ def test_a_test_plays_to_its_end(tmp_path: Path):
 def test_the_sealed_file_holds_what_was_played(tmp_path: Path):
     rig = VirtualRig(tmp_path)
     rig.execute()
-    sealed = archive.seal(assembly.assemble(journal.read(rig.path)), tmp_path)
+    sealed = rig.seal()
     with h5py.File(sealed.path) as file:
         assert file.attrs["outcome"] == "completed"
         assert file.attrs["content_sha256"] == sealed.content_sha256 == archive.verify(sealed.path)
@@ -64,7 +64,7 @@ def test_a_late_pulse_is_dropped_and_recorded_never_burst(tmp_path: Path):
     assert result.dropped in (1, 2)
     times = np.array([t for t, _ in rig.stimulator.sent])
     assert np.min(np.diff(times)) > 0.025 - 0.4 * 0.025 - 1e-9
-    recording = assembly.assemble(journal.read(rig.path))
+    recording = rig.recording()
     status, sent = recording.columns["pulses/status"], recording.columns["pulses/sent_pulse_width_us"]
     assert np.sum(status == PulseStatus.DROPPED) == result.dropped
     assert np.all(np.isnan(sent[status == PulseStatus.DROPPED]))
@@ -107,7 +107,7 @@ def test_every_fault_stops_the_test(tmp_path: Path, name: str):
     assert rig.stimulator.stops >= 1
     assert rig.stimulator.sent[-1][0] - at[0] < 0.15  # watch period of 100 ms and two pulses
     assert rig.gate.fire(99, Pulse(100.0, 20.0), rig.clock.now_s(), math.inf) == PulseStatus.REFUSED
-    recording = assembly.assemble(journal.read(rig.path))
+    recording = rig.recording()
     assert recording.attributes["outcome"] == "fault"
     assert len(recording.columns["pulses/status"]) < len(rig.test.pulse_width_us)
 
@@ -128,7 +128,7 @@ def test_a_reason_that_no_file_can_hold_leaves_no_test_unsealed(tmp_path: Path, 
     rig = VirtualRig(tmp_path)
     rig.at(1.0, lambda: rig.halt.set("stopped", said))
     rig.execute()
-    sealed = archive.seal(assembly.assemble(journal.read(rig.path)), tmp_path)
+    sealed = rig.seal()
     with h5py.File(sealed.path) as file:
         assert file.attrs["reason"] == kept
 
@@ -164,7 +164,7 @@ def test_no_torque_no_test(tmp_path: Path):
     assert result.outcome == "fault"
     assert "no torque arrived" in result.reason
     assert rig.stimulator.sent == []
-    recording = assembly.assemble(journal.read(rig.path))
+    recording = rig.recording()
     assert recording.names == []
     assert {path: len(column) for path, column in recording.columns.items()} == {p: 0 for p, _, _ in archive.COLUMNS}
 
@@ -258,10 +258,15 @@ class Heard:
         return self.asked_s[-1] - self.asked_s[0] if self.asked_s else 0.0
 
 
-def watched(tmp_path: Path, heard: Heard, at_stop_nm: float | None) -> tuple[bool, str]:
+def watched(
+    tmp_path: Path, heard: Heard, at_stop_nm: float | None, stood_still_s: float | None = None
+) -> tuple[bool, str]:
+    """A stop of a rig that has played; `stood_still_s`: until then the machine stands still, from 0.05 s on."""
     rig = VirtualRig(tmp_path)
     rig.execute()
-    return watch_decay(rig.gate, heard, rig.clock, 0.0, at_stop_nm)  # pyright: ignore[reportArgumentType]
+    if stood_still_s is not None:
+        rig.clock.call_at(rig.clock.now_s() + 0.05, lambda: rig.clock.advance(stood_still_s - 0.05))
+    return rig.machine.run(watch_decay(rig.gate, heard, rig.machine.tasks, 0.0, at_stop_nm))  # pyright: ignore
 
 
 @pytest.mark.slow
@@ -318,14 +323,6 @@ class HeardAfter(Heard):
 @pytest.mark.slow
 def test_a_stop_waits_for_the_torque_of_a_machine_that_stood_still(tmp_path: Path):
     """Nobody looked while it stood still: that is no silence of the cell."""
-    rig = VirtualRig(tmp_path)
-    rig.execute()
-    began_s, wait = rig.clock.now_s(), rig.clock.wait
-
-    def stand_still_once(until_s: float) -> bool:
-        return wait(began_s + 0.85 if began_s + 0.05 < until_s < began_s + 0.85 else until_s)
-
-    rig.clock.wait = stand_still_once  # pyright: ignore[reportAttributeAccessIssue]
     heard = HeardAfter(0.0, settles_s=0.9)
-    assert watch_decay(rig.gate, heard, rig.clock, 0.0, 8.0)[0]  # pyright: ignore[reportArgumentType]
+    assert watched(tmp_path, heard, 8.0, stood_still_s=0.85)[0]
     assert heard.waited_s() == pytest.approx(0.9, abs=0.05)
