@@ -13,11 +13,11 @@ import pytest
 
 from api.cli import main
 from rig import archive, assembly, journal, recover
-from rig.control.latch import lock_folder
+from rig.adapters.files import Files
 from rig.errors import RecordingError
-from rig.journal import Journal, Kind
+from rig.journal import Kind
 from rig.messages import SegmentPlan
-from tests.rig.fakes import VirtualRig, header
+from tests.rig.fakes import VirtualRig, header, journal_at
 
 ROOT = Path(__file__).parents[2]
 SECTOR = 4096
@@ -34,7 +34,7 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> tuple[bytes, int, float]
     rig = VirtualRig(tmp_path_factory.mktemp("played"), PLAYED)
     rig.journal.close()
     rig.path.unlink()
-    book = Journal(rig.path)
+    book = journal_at(rig.path)
     book.begin(header(rig.run, rig.clock), rig.test.pulse_width_us.astype("<f8").tobytes())
     rig.journal = rig.run._journal = book
     assert rig.execute().outcome == "completed"
@@ -128,7 +128,7 @@ def test_with_whole_kinds_of_blocks_lost_the_others_tell(
     assert recording.attributes["pulse_rate_hz"] == pytest.approx(40.0)
     assert len(recording.columns["torque/time_s"]) > 1000
     assert recording.attributes["test_id"] == "t"
-    assert archive.seal(recording, tmp_path).path.is_file()
+    assert archive.seal(recording, tmp_path, Files()).path.is_file()
 
 
 def test_it_is_never_said_that_no_pulse_was_sent_beside_what_cannot_be_read(tmp_path: Path):
@@ -185,7 +185,7 @@ def test_recover_refuses_what_a_living_rig_has(tmp_path: Path, capsys: pytest.Ca
     rig.journal.close()
     (tmp_path / "journals").mkdir()
     path = rig.path.rename(tmp_path / "journals" / "t.journal")
-    with lock_folder(tmp_path):
+    with Files().lock(tmp_path):
         assert recover.main([str(path)]) == 2
         assert "a running rig uses it" in capsys.readouterr().err
     assert recover.main([str(path)]) == 0

@@ -12,13 +12,14 @@ from hypothesis import strategies as st
 
 from rig import journal
 from rig.errors import JournalError, RecordingError
-from rig.journal import Journal, Kind
+from rig.journal import Kind
+from tests.rig.fakes import journal_at
 
 BLOCKS = [(Kind.HEADER, b'{"a": 1}'), (Kind.PLAN, b""), (Kind.TORQUE, bytes(range(200))), (Kind.END, b"{}")]
 
 
 def written(path: Path) -> bytes:
-    book = Journal(path)
+    book = journal_at(path)
     for kind, payload in BLOCKS:
         book.append(kind, payload)
     book.close()
@@ -63,7 +64,7 @@ def test_damage_costs_the_damaged_block_only(tmp_path: Path, data: st.DataObject
 
 
 def test_a_full_disk_is_told_and_nothing_follows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    book = Journal(tmp_path / "j")
+    book = journal_at(tmp_path / "j")
     book.append(Kind.EVENT, b"1")
     real = os.write
     monkeypatch.setattr(os, "write", lambda fd, data: real(fd, data[: len(data) // 2]))
@@ -83,6 +84,6 @@ def test_mistakes_are_named(tmp_path: Path):
     (tmp_path / "other").write_bytes(b"hello")
     with pytest.raises(RecordingError, match="is not a journal"):
         journal.read(tmp_path / "other")
-    Journal(tmp_path / "j").close()
-    with pytest.raises(JournalError, match="File exists"):
-        Journal(tmp_path / "j")
+    journal_at(tmp_path / "j").close()
+    with pytest.raises(FileExistsError):
+        journal_at(tmp_path / "j")

@@ -11,12 +11,12 @@ import pytest
 
 from rig import assembly, journal
 from rig.errors import RecordingError
-from rig.journal import Journal, Kind
+from rig.journal import Kind
 from rig.lsl_outlets.follow import Journals, Tail, refuse_locking
 from rig.lsl_outlets.live_test import MARGIN_S, Batch, LiveTest
 from rig.lsl_outlets.streaming import Streaming
 from rig.signals import SAMPLE
-from tests.rig.fakes import VirtualRig
+from tests.rig.fakes import VirtualRig, journal_at
 
 RATE_HZ, PULSE_HZ, T0_S = 1600.0, 40.0, 100.0
 PLAN = {"test_id": "t", "participant": "P17", "kind": "sequence", "pulse_rate_hz": PULSE_HZ, "adaptive": None}
@@ -47,7 +47,7 @@ def write_journal(path: Path, seed: int, rest_s: float, long_s: float, ppm: floa
         ]
     blocks += [(p["host_time_s"][-1], Kind.TORQUE, p.tobytes()) for p in np.array_split(samples, n // 8)]
     end = {"outcome": "completed", "reason": "", "time_s": T0_S + long_s, "stimulation_end_s": T0_S + long_s}
-    book = Journal(path)
+    book = journal_at(path)
     widths_us = np.zeros(round(long_s * PULSE_HZ))
     widths_us[round(rest_s * PULSE_HZ) :] = 100.0 + np.arange(round(rest_s * PULSE_HZ), len(widths_us))
     segments = [{"name": "x", "start": 0, "end": len(widths_us), "by": "plan"}]
@@ -139,7 +139,7 @@ def test_a_stopped_test_as_the_rig_plays_it(tmp_path: Path):
     rig.cell.noise_nm = 0.01
     rig.at(1.2, lambda: rig.halt.set("stopped", "enough"))
     assert rig.execute().outcome == "stopped"
-    recording = assembly.assemble(journal.read(rig.path))
+    recording = rig.recording()
     batches = streamed(rig.path, tmp_path / "copy.journal")
     assert rig.run.t0_s is not None
     assert_agrees(batches, recording, rig.run.t0_s, p99_s=10e-3)  # this cell's sync line shows only each tenth sample
@@ -191,7 +191,7 @@ def test_a_block_of_nonsense_ends_nothing(tmp_path: Path, kind: Kind, payload: b
     sent: list[Batch] = []
     (tmp_path / "journals").mkdir()
     streaming = Streaming(tmp_path, SimpleNamespace(push=sent.append), 0.0, RATE_HZ, 1.0)  # pyright: ignore
-    book = Journal(tmp_path / "journals" / "t.journal")
+    book = journal_at(tmp_path / "journals" / "t.journal")
     book.append(kind, payload)
     book.append_json(Kind.START, {"t0_s": T0_S})
     book.append_json(Kind.END, {"time_s": T0_S + 1.0, "outcome": "fault"})
@@ -241,7 +241,7 @@ def test_a_journal_left_by_a_crash_is_not_followed_a_growing_one_is(tmp_path: Pa
 
 
 def test_a_tail_knows_when_its_journal_was_sealed_and_takes_no_lock(tmp_path: Path):
-    book = Journal(tmp_path / "t.journal")
+    book = journal_at(tmp_path / "t.journal")
     tail = Tail(book.path)
     book.append_json(Kind.HEADER, {"a": 1})
     assert [(kind, json.loads(payload)) for kind, payload in tail.blocks()] == [(Kind.HEADER, {"a": 1})]

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rig import archive, assembly, journal
+from rig import archive
 from rig.acquire.plausibility import PlausibilityCheck
 from rig.acquire.receiver import Receiver
 from rig.control.sealing import warnings
@@ -36,7 +36,7 @@ def test_a_short_test_of_a_cell_with_another_rate_is_a_fault(tmp_path: Path, rat
     assert told_hz == pytest.approx(1600 * rate, rel=0.02)
     assert "the rig file says 1600" in result.reason
     assert (rig.stimulator.sent == []) == (rate > 1.6)  # so fast it might be a buffer that is emptied: never armed
-    assert assembly.assemble(journal.read(rig.path)).attributes["outcome"] == "fault"
+    assert rig.recording().attributes["outcome"] == "fault"
 
 
 @pytest.mark.parametrize("rate", [0.95, 1.05])
@@ -202,7 +202,7 @@ def test_what_came_too_little_is_not_judged():
 def test_times_in_doubt_are_told_with_the_finished_test(tmp_path: Path):
     rig = VirtualRig(tmp_path)
     rig.execute()
-    recording = assembly.assemble(journal.read(rig.path))
+    recording = rig.recording()
     assert warnings(recording) == []
     for error_ms, words in ((60.0, "60.0 ms"), (float("nan"), "unknown")):
         doubtful = archive.Recording(
@@ -221,4 +221,4 @@ def test_times_in_doubt_are_told_with_the_finished_test(tmp_path: Path):
     nothing = VirtualRig(tmp_path / "2")
     nothing.cell.silent = True
     nothing.execute()
-    assert warnings(assembly.assemble(journal.read(nothing.path))) == []
+    assert warnings(nothing.recording()) == []
