@@ -7,6 +7,7 @@ silence and samples that come late.
 from __future__ import annotations
 
 import logging
+import math
 from collections import deque
 from collections.abc import Callable
 from typing import Any, Generic, Protocol, TypeVar
@@ -107,6 +108,8 @@ class Stream(Generic[BlockT]):
         self._closing = Signal()
         self._lost = Signal()
         self._watch: Task[None] | None = None
+        self._ending: Task[None] | None = None
+        """Closes the device after it was lost."""
         self._unwrapper = CounterUnwrapper(source.counter_modulus) if source.counter_modulus else None
         self._on_fault: Callable[[str], None] = lambda _: None
         self._previous: tuple[int, float] | None = None
@@ -123,6 +126,7 @@ class Stream(Generic[BlockT]):
 
     async def open(self) -> dict[str, Any]:
         """Open the device and read it from now on; returns its identity. Raises DeviceError."""
+        await self._ended()
         self._lost.clear()
         identity = await self._source.open(self._receive, self._lose)
         self._watch = self._tasks.spawn(self._watch_silence(), f"{self._name} receiver")
@@ -136,6 +140,7 @@ class Stream(Generic[BlockT]):
     async def close(self) -> None:
         """Close the device."""
         self._closing.set()
+        await self._ended()
         await self._source.close()
 
     def age_s(self, now_s: float) -> float:
@@ -248,5 +253,10 @@ class Stream(Generic[BlockT]):
     def _lose(self, reason: str) -> None:
         if not (self._closing.is_set() or self._lost.is_set()):
             self._lost.set()
-            self._tasks.spawn(self._source.close(), f"{self._name} closing")
+            self._ending = self._tasks.spawn(self._source.close(), f"{self._name} closing")
             self._on_lost(reason)
+
+    async def _ended(self) -> None:
+        """Wait until a device that was lost is closed: opened before, it would be closed for its next user."""
+        if self._ending is not None:
+            await self._tasks.wait(math.inf, self._ending.done)
