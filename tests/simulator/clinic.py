@@ -97,11 +97,15 @@ class Clinic:
             if not back_lost:
                 self.world.at(asked.replied_s + back_s, lambda: asked.then(asked))
 
+        def arrive() -> None:
+            if process.listens:
+                process.post(lambda: process.tasks.begin(obey(), "request"))
+
         if lost:
             self.world.tell("people", "it is lost")
         else:
             arrives_s = self.world.now_s + chance.uniform(*TRANSIT_S)
-            self.world.at(arrives_s, lambda: process.post(lambda: process.tasks.spawn(obey(), "request")))
+            self.world.at(arrives_s, arrive)
         return asked
 
     def start(self, plan: TestPlan, key: str) -> Asked:

@@ -69,6 +69,8 @@ class Process:
 
     def __init__(self, computer: Computer, disk: SimulatedDisk, ports: Ports) -> None:
         self.computer, self.world, self.alive = computer, computer.world, True
+        self.listens = False
+        """Whether it takes requests: not before its devices were tried."""
         self.tasks = Tasks(computer, self._work)
         self.disk: Disk = disk
         self.boot_id = f"boot-{computer.boots}"

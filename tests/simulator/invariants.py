@@ -18,6 +18,7 @@ import numpy as np
 
 from rig import journal
 from rig.errors import RecordingError
+from tests.simulator.clinic import Asked
 from tests.simulator.life import FOLDER, Felt, Life
 
 ON_ITS_WAY_S = 0.06
@@ -93,20 +94,25 @@ def every_test_ends_in_a_documented_state(life: Life) -> Iterator[str]:
 
 
 def every_pulse_has_its_intent_and_its_record(life: Life) -> Iterator[str]:
-    """What was felt stands in the files, in the same order; what they call acknowledged was felt."""
-    recorded = [pulse for test in _tests(life) for pulse in test]
-    found = iter(recorded)
+    """What was felt stands in the file of its test, in the same order."""
+    recorded = _tests(life)
+    places = dict.fromkeys(recorded, 0)
     for pulse in _true(life):
-        if not any(_same(pulse, one) for one in found):
-            if not _lost_with_the_power(life, pulse):
-                yield f"{pulse.time_s:.4f} s: {pulse.width_us:g} µs stands in no file"
-            found = iter(recorded)  # a power failure took it: the next ones still have to be there
+        test = _test_of(life, pulse)
+        sent = recorded.get(test, [])
+        place = next((at for at in range(places.get(test, 0), len(sent)) if _same(pulse, sent[at])), None)
+        if place is not None:
+            places[test] = place + 1
+        elif not _lost_with_the_power(life, pulse):
+            yield f"{pulse.time_s:.4f} s: {pulse.width_us:g} µs stands in no file of test t{test}"
 
 
 def what_the_files_call_acknowledged_was_felt(life: Life) -> Iterator[str]:
-    """No more acknowledged pulses in the files than were felt."""
-    acknowledged = sum(1 for test in _tests(life) for _, _, status in test if status == 0)
-    if acknowledged > len(life.felt):
+    """No more acknowledged pulses in the files than were felt; a pulse of which a RehaStim 2 reports that it failed is
+    acknowledged first, and ends its test."""
+    acknowledged = sum(1 for test in _tests(life).values() for _, _, status in test if status == 0)
+    failed = sum(event.outcome == "fault" for event in life.clinic.finished)
+    if acknowledged > len(life.felt) + failed:
         yield f"{acknowledged} pulses acknowledged, {len(life.felt)} felt"
 
 
@@ -173,8 +179,18 @@ Sent = tuple[float, float, int]
 """A recorded pulse that may have been sent: its width, µs; its current, mA; its status."""
 
 
-def _tests(life: Life) -> list[list[Sent]]:
-    """The pulses of each file, in the order of the tests."""
+def _test_of(life: Life, pulse: Felt) -> int:
+    """Number of the test that was started last before it was written; 0: none."""
+    started = (a for a in life.clinic.asked if a.kind == "start" and a.obeyed_s is not None)
+    return max((_number(f"{a.about}.") for a in started if (a.obeyed_s or 0.0) < pulse.written_s and not _refused(a)), default=0)
+
+
+def _refused(asked: Asked) -> bool:
+    return asked.reply is not None and not asked.reply.ok
+
+
+def _tests(life: Life) -> dict[int, list[Sent]]:
+    """The pulses of each test's file, by the test's number."""
     found: dict[int, list[Sent]] = {}
     for path, columns in _recordings(life):
         sent = np.isfinite(columns["pulses/sent_pulse_width_us"])
@@ -189,7 +205,7 @@ def _tests(life: Life) -> list[list[Sent]]:
     for path, file in life.disk.files.items():
         if path.parent.name == "journals" and _number(path.name) not in found:
             found[_number(path.name)] = _of_journal(path, bytes(file.data))
-    return [found[number] for number in sorted(found)]
+    return found
 
 
 def _of_journal(path: Any, data: bytes) -> list[Sent]:

@@ -11,6 +11,7 @@ from hardware_sim.factory import make_devices
 from hardware_sim.settings import Settings
 from rig import config
 from rig.control.rig import Rig
+from rig.errors import RigError
 from rig.messages import AdaptivePlan, Profile, RearmRequest, SegmentPlan, TestPlan
 from tests.simulator import accidents
 from tests.simulator.clinic import Asked, Clinic
@@ -56,7 +57,7 @@ class Life:
         chance = random.Random(f"life {seed}")
         self.profile = Profile(
             current_ma=chance.choice((8.0, 20.0, 40.0)), max_pulse_width_us=chance.choice((120.0, 300.0, 500.0)),
-            max_torque_nm=chance.choice((6.0, 30.0)),
+            max_torque_nm=chance.choice((9.0, 30.0)),
         )  # fmt: skip
         self.rate_hz = chance.choice((20.0, 40.0, 50.0))
         self.adaptive = chance.random() < 0.3
@@ -98,7 +99,17 @@ class Life:
         rig = Rig(self._config, process, lambda event: self.clinic.hear(process, event))
         self.clinic.meet(process, rig)
         self.world.tell("host", "the rig's process starts")
-        process.post(lambda: process.tasks.spawn(rig.open(), "open"))
+
+        async def open_rig() -> None:
+            try:
+                await rig.open()
+            except RigError as error:
+                self.world.tell("host", f"the rig's process ends: {error}")
+                self.world.at(process.computer.true_s, lambda: self.kill(1.0))
+            else:
+                process.listens = True
+
+        process.post(lambda: process.tasks.spawn(open_rig(), "open"))
 
     def kill(self, again_after_s: float) -> None:
         """The process dies now."""

@@ -112,6 +112,7 @@ class Wires(Ports):
         self._port: _SimulatedPort | None = None
         self._bus: _SimulatedBus | None = None
         self._next_event_s: float | None = None
+        self._last = 0.0, True
         devices.on_stimulator_cable = self._stimulator_cable
         devices.on_cell_cable = self._cell_cable
         world.after(block_s, self._sample)
@@ -146,13 +147,20 @@ class Wires(Ports):
     def _event(self, time_s: float) -> None:
         if self._next_event_s == time_s:
             self._next_event_s = None
-            self.devices.advance(self.world.now_s)
+            self._advance()
             self.pump()
 
     def _to_stimulator(self, data: bytes, written_s: float, true: bool) -> None:
+        self._advance()
+        self._last = written_s, true
         self.devices.received(self.world.now_s, data)
-        self._fired(written_s, true)
+        self._fired(*self._last)
         self.pump()
+
+    def _advance(self) -> None:
+        """What the devices do by themselves until now; a pulse is one of the last piece that came."""
+        self.devices.advance(self.world.now_s)
+        self._fired(*self._last)
 
     def _to_rig(self, data: bytes, _written_s: float, _true: bool) -> None:
         port = self._port
@@ -160,7 +168,7 @@ class Wires(Ports):
             port.process.post(lambda: port.take(data))
 
     def _sample(self) -> None:
-        self.devices.advance(self.world.now_s)
+        self._advance()
         if self.world.now_s >= self.bus_stalled_until_s:
             frames = self.devices.take_frames()
             if self._bus is not None and frames:

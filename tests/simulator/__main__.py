@@ -1,0 +1,140 @@
+"""`python -m tests.simulator`: as many lives of a rig as fit; see docs/simulator.md.
+
+Its last line is one JSON object. Exit 1 if anything broke: each broken life is told in one line, shrunk to the fewest
+accidents that break it, with the command that replays it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import logging
+import os
+import sys
+import time
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from itertools import count, islice
+from typing import NamedTuple
+
+from tests.simulator.invariants import broken
+from tests.simulator.life import Life
+
+AHEAD = 4
+"""Lives that are asked of each process before the first one is back."""
+
+
+class Outcome(NamedTuple):
+    """What became of one life."""
+
+    seed: int
+    wrong: list[str]
+    faults: int
+    simulated_s: float
+    digest: str
+
+
+def live(seed: int, only: frozenset[int] | None = None) -> tuple[Life, list[str]]:
+    """One life, and what did not hold in it; an exception counts."""
+    life = Life(seed, only)
+    try:
+        life.live()
+        return life, broken(life)
+    except Exception as error:
+        return life, [f"{type(error).__name__}: {error}"]
+
+
+def outcome_of(seed: int) -> Outcome:
+    """For a pool of processes."""
+    logging.disable(logging.CRITICAL)
+    life, wrong = live(seed)
+    return Outcome(seed, wrong, life.world.faults, life.world.now_s, life.world.digest())
+
+
+def shrink(seed: int) -> frozenset[int]:
+    """The fewest accidents found with which the life of a seed still breaks: one after the other is left out."""
+    life, _ = live(seed)
+    kept = frozenset(range(life.accidents))
+    for number in sorted(kept):
+        if live(seed, kept - {number})[1]:
+            kept -= {number}
+    return kept
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The exit code."""
+    parser = argparse.ArgumentParser(prog="python -m tests.simulator", description="Lives of a rig in simulated time.")
+    parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--lives", type=int, help="just so many, instead of minutes")
+    parser.add_argument("--seed", type=int, default=1, help="of the first life; the next one has the next")
+    parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--replay", action="store_true", help="one life, with its trace")
+    parser.add_argument("--only", type=_numbers, help="with --replay: numbers of the accidents that happen, as 3,7")
+    options = parser.parse_args(arguments)
+    logging.disable(logging.CRITICAL)
+    return _replay(options) if options.replay else _simulate(options)
+
+
+def _replay(options: argparse.Namespace) -> int:
+    life, wrong = live(options.seed, options.only)
+    print("\n".join(life.world.trace))
+    print(json.dumps({"seed": options.seed, "wrong": wrong, "trace_sha256": life.world.digest()}))
+    return 1 if wrong else 0
+
+
+def _simulate(options: argparse.Namespace) -> int:
+    began_s, digest = time.monotonic(), hashlib.sha256()
+    lives = faults = 0
+    simulated_s = told_s = 0.0
+    broke: list[int] = []
+    end_s = began_s + 60 * options.minutes
+    seeds = islice(count(options.seed), options.lives) if options.lives else _until(end_s, options.seed)
+    for outcome in _outcomes(seeds, options.processes):
+        lives, faults, simulated_s = lives + 1, faults + outcome.faults, simulated_s + outcome.simulated_s
+        digest.update(outcome.digest.encode())
+        if outcome.wrong:
+            broke.append(outcome.seed)
+            print(f"seed {outcome.seed} broke: {outcome.wrong[0]:.200}", flush=True)
+        if time.monotonic() - told_s > 10:
+            told_s = time.monotonic()
+            print(f"{told_s - began_s:4.0f} s: {lives} lives, {faults} faults, {len(broke)} broken", flush=True)
+    for seed in broke[:5]:
+        only = ",".join(map(str, sorted(shrink(seed))))
+        print(f"replay: .venv/bin/python -m tests.simulator --replay --seed {seed} --only '{only}'")
+    found = {
+        "lives": lives, "faults": faults, "broken": len(broke), "simulated_s": round(simulated_s, 3),
+        "wall_s": round(time.monotonic() - began_s, 3), "trace_sha256": digest.hexdigest(),
+    }  # fmt: skip
+    print(json.dumps(found))
+    return 1 if broke else 0
+
+
+def _until(end_s: float, seed: int) -> Iterator[int]:
+    for number in count(seed):
+        if time.monotonic() >= end_s:
+            return
+        yield number
+
+
+def _outcomes(seeds: Iterable[int], processes: int) -> Iterator[Outcome]:
+    """In the order of the seeds."""
+    if processes == 1:
+        yield from map(outcome_of, seeds)
+        return
+    with ProcessPoolExecutor(processes) as pool:
+        source, waiting = iter(seeds), []
+        while True:
+            for seed in islice(source, AHEAD * processes - len(waiting)):
+                waiting.append(pool.submit(outcome_of, seed))
+            if not waiting:
+                return
+            yield waiting.pop(0).result()
+
+
+def _numbers(text: str) -> frozenset[int]:
+    return frozenset(int(part) for part in text.split(",") if part.strip())
+
+
+if __name__ == "__main__":
+    sys.exit(main())
