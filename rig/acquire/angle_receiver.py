@@ -59,6 +59,8 @@ class AngleReceiver(Stream[AngleBlock]):
         """How much later the newest sample came than the promptest one, by its number, rig seconds."""
         self._prompt: tuple[float, float] | None = None
         self._behind = 0
+        self._anew = False
+        """Whether the next sample is the first one since it was opened."""
         self._slope = LiveSlope(sensor.sample_rate_hz)
         self._recent: deque[NDArray[Any]] = deque()
         self._journal: Journal | None = None
@@ -117,11 +119,14 @@ class AngleReceiver(Stream[AngleBlock]):
         return samples
 
     def _placed(self, samples: NDArray[Any]) -> NDArray[Any]:
+        if self._anew:  # one that was without power counts from zero: its numbers go on where the clock is
+            self._anew = False
+            self._count_on(float(samples["host_time_s"][0]))
         before = self.counts.disordered_samples
         placed = super()._placed(samples)
         self._behind = 0 if len(placed) else self._behind + self.counts.disordered_samples - before
         if self._behind >= RESTARTED:
-            self._count_on()
+            self._count_on(self._clock.now_s() + 1 / self.nominal_rate_hz)
             self._on_fault(f"{NAME}: its counter went back; it was without power, or what it sent comes once more")
         return placed
 
@@ -160,7 +165,7 @@ class AngleReceiver(Stream[AngleBlock]):
     async def _keep_open(self) -> None:
         while not self._closing.is_set():
             try:
-                self._count_on()  # one that was without power counts from zero: its numbers go on where the clock is
+                self._anew = True
                 self.identity = await self.open()
             except DeviceError as error:
                 self._gone(str(error))
@@ -169,11 +174,11 @@ class AngleReceiver(Stream[AngleBlock]):
             await self._tasks.sleep(REOPEN_S, self._closing)
         await self._source.close()
 
-    def _count_on(self) -> None:
+    def _count_on(self, now_s: float) -> None:
         self._prompt, self._behind = None, 0
         if self._unwrapper is not None and self._previous is not None:
-            passed_s = max(0.0, self._clock.now_s() - self._previous[1])
-            self._unwrapper.resume(self._previous[0] + 1 + round(passed_s * self.nominal_rate_hz))
+            passed_s = max(0.0, now_s - self._previous[1])
+            self._unwrapper.resume(self._previous[0] + max(1, round(passed_s * self.nominal_rate_hz)))
 
     def _gone(self, reason: str) -> None:
         self.problem = reason
