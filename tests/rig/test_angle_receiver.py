@@ -3,40 +3,84 @@
 from __future__ import annotations
 
 import math
-import threading
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 
 from rig.acquire.angle_receiver import REOPEN_S, AngleReceiver
-from rig.acquire.stream import SILENCE_S, CounterUnwrapper
-from rig.clock import VirtualClock
+from rig.acquire.stream import LOOK_S, SILENCE_S, CounterUnwrapper
 from rig.errors import DeviceError
 from rig.signals import AngleBlock, AngleScale
-from tests.rig.angle import FakeSensor
+from tests.rig.angle import RATE_HZ, FakeSensor
+from tests.simulator.virtual_time import VirtualMachine
 
 
 def swinging(time_s: float) -> float:
     return 1.0 + 0.5 * math.sin(time_s)
 
 
-def made(angle_rad: Any = swinging) -> tuple[VirtualClock, FakeSensor, AngleReceiver]:
-    clock = VirtualClock()
-    sensor = FakeSensor(clock, angle_rad)
-    sensor.noise_deg = 0.0
-    return clock, sensor, AngleReceiver(sensor, clock)
+class Sensor(FakeSensor):
+    """One whose adapter may be missing or slow, and whose samples come while it is open."""
+
+    def __init__(self, machine: VirtualMachine) -> None:
+        super().__init__(machine.clock, swinging)
+        self.machine, self.noise_deg = machine, 0.0
+        self.gone, self.opens_s, self.closes_s = False, 0.0, 0.0
+        self.done: list[str] = []
+
+    async def open(self, on_block: Callable[[AngleBlock], None], on_lost: Callable[[str], None]) -> dict[str, Any]:
+        await self.machine.tasks.sleep(self.opens_s)
+        if self.gone:
+            raise DeviceError("angle sensor: no adapter")
+        self.done.append("opened")
+        self.on_lost, self.opened = on_lost, len(self.done)
+        self._beat(on_block, self.opened)
+        return {"device": "here"}
+
+    async def close(self) -> None:
+        self.opened = 0
+        await self.machine.tasks.sleep(self.closes_s)
+        self.done.append("closed")
+
+    def _beat(self, on_block: Callable[[AngleBlock], None], opened: int) -> None:
+        if self.opened == opened:
+            if not self.silent:
+                on_block(self.block(1))
+            self.clock.call_at(self.clock.now_s() + 1 / RATE_HZ, lambda: self._beat(on_block, opened))
 
 
-def run(clock: VirtualClock, sensor: FakeSensor, receiver: AngleReceiver, duration_s: float) -> None:
-    sensor.feed(receiver, clock.now_s() + duration_s)
-    clock.wait(clock.now_s() + duration_s)
+class Heard:
+    """A sensor's receiver in virtual time."""
+
+    def __init__(self) -> None:
+        self.machine = VirtualMachine()
+        self.clock, self.wait = self.machine.clock, self.machine.wait
+        self.sensor = Sensor(self.machine)
+        self.receiver = AngleReceiver(self.sensor, self.machine.tasks)
+
+    def feed(self, duration_s: float) -> AngleReceiver:
+        """Samples for so long, of a sensor that nobody opened."""
+        self.sensor.feed(self.receiver, self.clock.now_s() + duration_s)
+        self.wait(duration_s)
+        return self.receiver
+
+    def until(self, true: Callable[[], bool]) -> float:
+        """Let time pass until something is true; when it was."""
+        assert self.clock.run(self.machine.tasks, self.clock.now_s() + 60.0, true)
+        return self.clock.now_s()
 
 
-def test_angle_and_velocity_of_now():
-    clock, sensor, receiver = made()
+@pytest.fixture
+def heard() -> Heard:
+    return Heard()
+
+
+def test_angle_and_velocity_of_now(heard: Heard):
+    receiver, clock = heard.receiver, heard.clock
     assert receiver.angle_rad is None and receiver.data_age_s(clock.now_s()) == math.inf
-    run(clock, sensor, receiver, 1.0)
+    heard.feed(1.0)
     assert receiver.angle_rad == pytest.approx(swinging(receiver.last_s or 0.0))
     assert receiver.velocity_rad_s == pytest.approx(0.5 * math.cos((receiver.last_s or 0.0) - 0.025), abs=1e-3)
     assert receiver.data_age_s(clock.now_s()) < 0.02
@@ -44,55 +88,54 @@ def test_angle_and_velocity_of_now():
     assert rows.shape[1] == 3 and len(rows) == receiver._total
 
 
-def test_an_angle_that_comes_late_is_old():
-    clock, sensor, receiver = made()
-    run(clock, sensor, receiver, 1.0)
-    sensor.late_s = 0.25
-    run(clock, sensor, receiver, 1.0)
-    assert receiver.age_s(clock.now_s()) < 0.02
-    assert receiver.data_age_s(clock.now_s()) == pytest.approx(0.25, abs=0.05)
+def test_an_angle_that_comes_late_is_old(heard: Heard):
+    heard.feed(1.0)
+    heard.sensor.late_s = 0.25
+    receiver = heard.feed(1.0)
+    assert receiver.age_s(heard.clock.now_s()) < 0.02
+    assert receiver.data_age_s(heard.clock.now_s()) == pytest.approx(0.25, abs=0.05)
 
 
-def test_a_calibration_holds_from_now_on_and_for_what_was_just_read():
-    clock, sensor, receiver = made(lambda _: 1.0)
-    run(clock, sensor, receiver, 0.8)
+def test_a_calibration_holds_from_now_on_and_for_what_was_just_read(heard: Heard):
+    heard.sensor.angle_rad = lambda _: 1.0
+    receiver = heard.feed(0.8)
     receiver.rescale(AngleScale(30.0, -1, 2 * math.pi / 180))
     assert receiver.angle_around(0.5) == pytest.approx(2.0)
-    run(clock, sensor, receiver, 0.2)
+    heard.feed(0.2)
     assert receiver.angle_rad == pytest.approx(2.0)
     assert receiver.velocity_rad_s == pytest.approx(0.0, abs=1e-6)
 
 
-def test_a_sensor_that_starts_again_counts_on_by_the_clock():
-    clock, sensor, receiver = made()
-    run(clock, sensor, receiver, 1.0)
-    before = receiver._previous
-    clock.wait(clock.now_s() + 3.0)
-    receiver._begin_anew()
-    sensor.counter = 0
-    run(clock, sensor, receiver, 0.1)
-    assert before is not None and receiver._previous is not None
-    counted, passed_s = receiver._previous[0] - before[0], receiver._previous[1] - before[1]
-    assert counted == pytest.approx(200 * passed_s, abs=5)
-    assert receiver.counts.disordered_samples == 0
+def test_a_sensor_that_starts_again_counts_on_by_the_clock(heard: Heard):
+    heard.receiver.start()
+    heard.wait(1.0)
+    before = heard.receiver._previous
+    heard.sensor.on_lost("angle sensor: unplugged")
+    heard.sensor.gone = True
+    heard.wait(3.0)
+    heard.sensor.gone, heard.sensor.counter, heard.sensor.opens_s = False, 0, 1.0
+    heard.wait(2.0)
+    after = heard.receiver._previous
+    assert before is not None and after is not None
+    counted, passed_s = after[0] - before[0], after[1] - before[1]
+    assert passed_s > 4.5 and counted == pytest.approx(200 * passed_s, abs=5)
+    assert heard.receiver.counts.disordered_samples == 0
 
 
-def test_a_sensor_that_was_without_power_for_a_moment_counts_on_soon():
-    clock, sensor, receiver = made()
-    run(clock, sensor, receiver, 1.0)
-    sensor.counter = 0
-    began_s = clock.now_s()
-    run(clock, sensor, receiver, 0.3)
-    assert receiver.data_age_s(clock.now_s()) < 0.03
+def test_a_sensor_that_was_without_power_for_a_moment_counts_on_soon(heard: Heard):
+    heard.feed(1.0)
+    heard.sensor.counter = 0
+    began_s = heard.clock.now_s()
+    receiver = heard.feed(0.3)
+    assert receiver.data_age_s(heard.clock.now_s()) < 0.03
     assert receiver.counts.disordered_samples <= 12  # 50 ms until it is believed
     assert receiver._previous is not None and receiver._previous[1] > began_s + 0.25
 
 
-def test_one_sample_that_is_no_number_leaves_no_angle():
-    clock, sensor, receiver = made()
-    run(clock, sensor, receiver, 0.5)
-    sensor.nan = True
-    receiver.take(sensor.block(1))
+def test_one_sample_that_is_no_number_leaves_no_angle(heard: Heard):
+    receiver = heard.feed(0.5)
+    heard.sensor.nan = True
+    receiver.take(heard.sensor.block(1))
     assert receiver.angle_around(0.1) is None
 
 
@@ -105,116 +148,68 @@ def test_blocks_longer_than_half_of_a_small_counter_are_unwrapped():
     assert all(keep.all() for _, keep, *_ in got)
 
 
-class Flaky:
-    """A sensor for the thread: gone, silent, or giving one sample a reading."""
-
-    sample_rate_hz, counter_modulus = 200.0, 65536
-    scale, of_the_cell, on_the_cells_bus = AngleScale(), False, False
-
-    def __init__(self, clock: VirtualClock) -> None:
-        self.clock, self.sensor = clock, FakeSensor(clock)
-        self.gone, self.silent, self.repeats = True, False, False
-        self.opened = self.closed = 0
-        self.failing: Exception | None = None
-
-    def open(self) -> dict[str, Any]:
-        if self.gone:
-            raise DeviceError("angle sensor: no adapter")
-        self.opened += 1
-        return {"device": "flaky"}
-
-    def read(self, timeout_s: float) -> AngleBlock:
-        self.clock.advance(timeout_s)
-        if self.failing is not None:
-            raise self.failing
-        self.sensor.repeating = self.repeats
-        return self.sensor.block(0 if self.silent else 1)
-
-    def close(self) -> None:
-        self.closed += 1
-
-
-class Waits(threading.Event):
-    """Stands for the pause between two attempts: does what the test says, then goes on; ends after the last."""
-
-    def __init__(self, *steps: Any) -> None:
-        super().__init__()
-        self.steps, self.waited_s = list(steps), []
-
-    def wait(self, timeout: float | None = None) -> bool:
-        self.waited_s.append(timeout)
-        if self.steps:
-            self.steps.pop(0)()
-        else:
-            self.set()
-        return self.is_set()
-
-
-def run_thread(device: Flaky, *steps: Any) -> tuple[AngleReceiver, list[Any]]:
-    """Run the receiver's thread function here, with these steps in its pauses."""
-    receiver = AngleReceiver(device, device.clock)
-    receiver._closing = waits = Waits(*steps)
-    receiver._run()
-    return receiver, waits.waited_s
-
-
-def test_a_missing_sensor_is_tried_again_and_told():
-    device, seen = Flaky(VirtualClock()), []
-
-    def appears() -> None:
-        seen.append(receiver.problem)
-        device.gone = False
-        device.failing = DeviceError("angle sensor on x: the bus was lost: gone")
-
-    receiver = AngleReceiver(device, device.clock)
-    receiver._closing = waits = Waits(appears)
-    receiver._run()
-    assert seen == ["angle sensor: no adapter"]
-    assert waits.waited_s == [REOPEN_S, REOPEN_S] and device.opened == 1
+def test_a_missing_sensor_is_tried_again_and_told(heard: Heard):
+    receiver, sensor = heard.receiver, heard.sensor
+    sensor.gone = True
+    began_s = heard.clock.now_s()
+    receiver.start()
+    heard.wait(0.1)
+    assert (receiver.problem, receiver.identity) == ("angle sensor: no adapter", {})
+    sensor.gone = False
+    assert heard.until(lambda: receiver.angle_rad is not None) == pytest.approx(began_s + REOPEN_S)
+    assert (receiver.problem, receiver.identity) == ("", {"device": "here"})
+    lost_s = heard.clock.now_s()
+    sensor.on_lost("angle sensor on x: the bus was lost: gone")
     assert "the bus was lost" in receiver.problem
+    assert (receiver.angle_rad, receiver.velocity_rad_s) == (None, None)
+    assert heard.until(lambda: receiver.angle_rad is not None) == pytest.approx(lost_s + REOPEN_S)
+    assert sensor.done == ["opened", "closed", "opened"]
 
 
-@pytest.mark.parametrize("how", ["silent", "repeats"])
-def test_silence_is_told_and_ends_when_an_angle_comes(how: str):
-    device = Flaky(VirtualClock())
-    device.gone = False
-    setattr(device, how, True)
-    problems: list[str] = []
-    receiver = AngleReceiver(device, device.clock)
-    began_s = device.clock.now_s()
-
-    def comes() -> None:
-        problems.append(receiver.problem)
-        assert device.clock.now_s() - began_s == pytest.approx(SILENCE_S, abs=0.1)
-        setattr(device, how, False)
-        device.sensor.counter += 1
-        receiver.take(device.sensor.block(1))
-        problems.append(receiver.problem)
-        device.failing = DeviceError("angle sensor: over")
-
-    receiver._closing = Waits(comes)
-    receiver._run()
-    assert problems == ["angle sensor: silent for 1 s; check its cable and supply", ""]
-    assert device.closed == 3  # when silent, when gone, and at the end of its thread
+@pytest.mark.parametrize("how", ["silent", "repeating"])
+def test_silence_is_told_and_ends_when_an_angle_comes(heard: Heard, how: str):
+    receiver, sensor = heard.receiver, heard.sensor
+    receiver.start()
+    heard.wait(1.0)
+    setattr(sensor, how, True)
+    began_s = heard.clock.now_s()
+    told_s = heard.until(lambda: bool(receiver.problem))
+    assert told_s - began_s == pytest.approx(SILENCE_S, abs=2.1 * LOOK_S)
+    assert receiver.problem == "angle sensor: silent for 1 s; check its cable and supply"
+    setattr(sensor, how, False)
+    assert heard.until(lambda: not receiver.problem) - told_s == pytest.approx(REOPEN_S, abs=0.02)
+    heard.machine.run(receiver.close())
+    heard.wait(1.0)
+    assert sensor.done[:3] == ["opened", "closed", "opened"]
+    assert set(sensor.done[3:]) == {"closed"}
+    age_s = receiver.age_s(heard.clock.now_s())
+    assert age_s == pytest.approx(1.0, abs=0.02), "nothing is read any more"
 
 
-def test_an_adapter_that_opens_while_the_rig_disconnects_is_closed(monkeypatch: pytest.MonkeyPatch):
-    _, sensor, receiver = made()
-    done: list[str] = []
-
-    def slowly() -> dict[str, Any]:
-        receiver._closing.set()  # who closed waits no longer
-        done.append("opened")
-        return {}
-
-    monkeypatch.setattr(sensor, "open", slowly)
-    monkeypatch.setattr(sensor, "close", lambda: done.append("closed"))
-    receiver._run()
-    assert done == ["opened", "closed"]
+def test_an_adapter_that_opens_while_the_rig_disconnects_is_closed(heard: Heard):
+    heard.sensor.opens_s = 0.3
+    heard.receiver.start()
+    heard.wait(0.1)
+    heard.machine.run(heard.receiver.close())  # who closes does not wait for it
+    assert heard.clock.now_s() == pytest.approx(1000.1)
+    heard.wait(1.0)
+    assert heard.sensor.done == ["closed", "opened", "closed"]
+    assert heard.receiver.angle_rad is None
 
 
-def test_a_mistake_in_a_driver_is_told_too():
-    device = Flaky(VirtualClock())
-    device.gone, device.failing = False, ZeroDivisionError("oh")
-    receiver, _ = run_thread(device)
-    assert "internal: ZeroDivisionError" in receiver.problem
+def test_an_adapter_is_opened_again_only_once_it_is_closed(heard: Heard):
+    heard.sensor.closes_s = 2.0
+    heard.receiver.start()
+    heard.wait(0.1)
+    heard.sensor.on_lost("angle sensor: unplugged")
+    heard.wait(4.0)
+    assert heard.sensor.done == ["opened", "closed", "opened"]
+
+
+def test_a_mistake_in_a_driver_is_told_too(heard: Heard, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(heard.sensor, "angle_rad", lambda _: 1.0)
+    heard.receiver.start()
+    heard.wait(0.1)
+    monkeypatch.setattr(AngleBlock, "__len__", lambda _: 1 // 0)
+    heard.wait(0.01)
+    assert "internal: ZeroDivisionError" in heard.receiver.problem

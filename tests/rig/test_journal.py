@@ -5,15 +5,18 @@ from __future__ import annotations
 import itertools
 import os
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from rig import journal
+from rig.control.sealing import RecordingStore
 from rig.errors import JournalError, RecordingError
 from rig.journal import Kind
 from tests.rig.fakes import journal_at
+from tests.simulator.virtual_time import VirtualMachine
 
 BLOCKS = [(Kind.HEADER, b'{"a": 1}'), (Kind.PLAN, b""), (Kind.TORQUE, bytes(range(200))), (Kind.END, b"{}")]
 
@@ -85,5 +88,6 @@ def test_mistakes_are_named(tmp_path: Path):
     with pytest.raises(RecordingError, match="is not a journal"):
         journal.read(tmp_path / "other")
     journal_at(tmp_path / "j").close()
-    with pytest.raises(FileExistsError):
-        journal_at(tmp_path / "j")
+    store = RecordingStore(SimpleNamespace(data_dir=tmp_path), VirtualMachine())  # pyright: ignore[reportArgumentType]
+    with pytest.raises(JournalError, match="File exists"):
+        store._create(tmp_path / "j")

@@ -10,11 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rig.acquire.receiver import Receiver
-from rig.acquire.stream import LONGEST_READ_S, READ_TIMEOUT_S, SILENCE_S, CounterUnwrapper
-from rig.clock import VirtualClock
-from rig.journal import Journal
+from rig.acquire.stream import LONGEST_READ_S, LOOK_S, SILENCE_S, CounterUnwrapper
 from rig.signals import SAMPLE, TorqueBlock
-from tests.rig.fakes import FakeCell, FakeStimulator
+from tests.rig.fakes import RATE_HZ, FakeCell, FakeStimulator, journal_at
+from tests.simulator.virtual_time import VirtualMachine
 
 
 @given(st.integers(0, 65535), st.lists(st.integers(1, 300), min_size=1, max_size=300), st.integers(1, 40))
@@ -41,11 +40,23 @@ def block(counters: list[int], torque_nm: float = 1.0) -> TorqueBlock:
     return TorqueBlock(samples, malformed=1, error_frames=2)
 
 
+class Heard(Receiver):
+    """Of a cell that only gives what a test hands over."""
+
+    def __init__(self, rate_hz: float = RATE_HZ) -> None:
+        self.machine, self.lost = VirtualMachine(), list[str]()
+        self.cell = FakeCell(self.machine.clock, FakeStimulator(self.machine.clock))
+        self.cell.sample_rate_hz = rate_hz
+        super().__init__(self.cell, self.machine.tasks, self.lost.append)
+
+    def begin(self, path: Path) -> None:
+        self.record(journal_at(path), (-10, 10), lambda _: None)
+
+
 def test_counts(tmp_path: Path):
-    clock = VirtualClock()
-    receiver = Receiver(FakeCell(clock, FakeStimulator(clock)), clock, lambda _: None)
+    receiver = Heard()
     receiver.take(block([1, 2, 5]))
-    receiver.record(Journal(tmp_path / "j"), (-10, 10), lambda _: None)
+    receiver.begin(tmp_path / "j")
     receiver.take(block([6, 9, 9, 8, 10]))
     counts = receiver.release()
     assert counts.samples == 3  # 6, 9, 10
@@ -55,8 +66,8 @@ def test_counts(tmp_path: Path):
 
 
 def test_what_is_told_of_the_newest_sample():
-    clock = VirtualClock()
-    receiver = Receiver(FakeCell(clock, FakeStimulator(clock)), clock, lambda _: None)
+    receiver = Heard()
+    clock = receiver.machine.clock
     assert receiver.age_s(clock.now_s()) == np.inf
     assert receiver.torque_around(1.0) is None
     receiver.take(block([1, 2], torque_nm=3.5))
@@ -68,11 +79,10 @@ def test_what_is_told_of_the_newest_sample():
 
 @pytest.mark.parametrize("per_block", [1, 7, 40, 1000])
 def test_the_range_does_not_depend_on_how_the_bus_cut_the_samples(tmp_path: Path, per_block: int):
-    clock = VirtualClock()
-    receiver = Receiver(FakeCell(clock, FakeStimulator(clock)), clock, lambda _: None)
+    receiver = Heard()
     for name in ("first", "again"):  # what the first recording left over is not part of the next, nor is its range
         torque_nm = np.random.default_rng(0).normal(2.0, 0.1 if name == "first" else 0.01, 999)
-        receiver.record(Journal(tmp_path / name), (-10, 10), lambda _: None)
+        receiver.begin(tmp_path / name)
         for at in range(0, 999, per_block):
             part = block(list(range(at, min(at + per_block, 999))))
             part.samples["counter"] += 0 if name == "first" else 2000
@@ -83,30 +93,22 @@ def test_the_range_does_not_depend_on_how_the_bus_cut_the_samples(tmp_path: Path
 
 
 def test_every_sample_of_a_slow_cell_counts_for_the_range(tmp_path: Path):
-    clock = VirtualClock()
-    cell = FakeCell(clock, FakeStimulator(clock))
-    cell.sample_rate_hz = 10.0
-    receiver = Receiver(cell, clock, lambda _: None)
-    receiver.record(Journal(tmp_path / "j"), (-10, 10), lambda _: None)
+    receiver = Heard(rate_hz=10.0)
+    receiver.begin(tmp_path / "j")
     receiver.take(block([1], torque_nm=1.0))
     receiver.take(block([2], torque_nm=3.0))
     assert receiver.range_nm == (1.0, 3.0)
 
 
-class SilentCell(FakeCell):
-    """One that gives nothing; its first reading lasts for as long as a machine stood still."""
-
-    readings = 0
-
-    def read(self, timeout_s: float) -> TorqueBlock:
-        self.readings += 1
-        self.clock.advance(2 * SILENCE_S if self.readings == 1 else timeout_s)
-        return TorqueBlock(np.zeros(0, SAMPLE))
-
-
 def test_a_cell_is_silent_after_a_second_of_reading_not_of_standing_still():
-    clock, reasons = VirtualClock(), []
-    cell = SilentCell(clock, FakeStimulator(clock))
-    Receiver(cell, clock, reasons.append)._run()
-    assert reasons == ["load cell: silent for 1 s; check its cable and supply"]
-    assert cell.readings == pytest.approx((SILENCE_S - LONGEST_READ_S) / READ_TIMEOUT_S, abs=3)
+    receiver = Heard()
+    clock = receiver.machine.clock
+    receiver.machine.run(receiver.open())
+    began_s = clock.now_s()
+    clock.call_at(began_s + 0.01, lambda: clock.advance(2 * SILENCE_S))
+    assert clock.run(receiver.machine.tasks, began_s + 60.0, lambda: bool(receiver.lost))
+    assert receiver.lost == ["load cell: silent for 1 s; check its cable and supply"]
+    read_s = clock.now_s() - began_s - 2 * SILENCE_S
+    assert SILENCE_S - LONGEST_READ_S < read_s < SILENCE_S - LONGEST_READ_S + 2 * LOOK_S
+    assert receiver.cell.silent, "it was closed"
+    assert not receiver.living
