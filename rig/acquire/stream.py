@@ -38,6 +38,9 @@ PROMPT_S = 5.0
 JUMP_ALLOWANCE_S = 0.5
 """A counter that is further ahead of the host's clock than this has jumped, so its samples have no reliable time."""
 
+STAMPS_BACK_S = 0.1
+"""An adapter's stamp that is further back than this is of a clock that was set, not of a frame that came late."""
+
 BlockT = TypeVar("BlockT", bound="Block")
 
 
@@ -113,6 +116,7 @@ class Stream(Generic[BlockT]):
         self._unwrapper = CounterUnwrapper(source.counter_modulus) if source.counter_modulus else None
         self._on_fault: Callable[[str], None] = lambda _: None
         self._previous: tuple[int, float] | None = None
+        self._newest_stamp_s = -np.inf
         self._rate: deque[tuple[float, int, float]] = deque(maxlen=2000)
         self._total = 0
         self.counts = Recorded()
@@ -201,7 +205,7 @@ class Stream(Generic[BlockT]):
     def _placed(self, samples: NDArray[Any]) -> NDArray[Any]:
         """The samples with unwrapped counters, without repeated and late ones; counts the lost ones."""
         if self._unwrapper is None:
-            return samples
+            return self._in_order(samples)
         counter, keep, repeats, late = self._unwrapper.unwrap(samples["counter"])
         self.counts.duplicate_samples += repeats
         self.counts.disordered_samples += late
@@ -217,6 +221,21 @@ class Stream(Generic[BlockT]):
             self._check_jump(samples, before, missing)
         self._previous = int(samples["counter"][-1]), float(samples["host_time_s"][-1])
         return samples
+
+    def _in_order(self, samples: NDArray[Any]) -> NDArray[Any]:
+        """Of a device that counts nothing: without those that its adapter's stamps show to be repeated or late."""
+        stamp_s = samples["stamp_s"]
+        if not np.all(np.isfinite(stamp_s)):
+            return samples
+        newest_s = np.maximum.accumulate(np.concatenate([[self._newest_stamp_s], stamp_s]))
+        behind_s = newest_s[:-1] - stamp_s
+        keep = (behind_s < 0) | (behind_s > STAMPS_BACK_S)  # a clock that was set back begins anew
+        repeats = int(np.sum(behind_s == 0))
+        self.counts.duplicate_samples += repeats
+        self.counts.disordered_samples += int(len(samples) - np.sum(keep)) - repeats
+        if np.any(keep):
+            self._newest_stamp_s = float(stamp_s[keep][-1])
+        return samples[keep]
 
     def _check_jump(self, samples: NDArray[Any], before: tuple[int, float], missing: int) -> None:
         elapsed_s = float(samples["host_time_s"][-1]) - before[1]
