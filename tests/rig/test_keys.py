@@ -106,13 +106,12 @@ def test_in_a_real_terminal():
     assert b"stopped" in said
 
 
-@pytest.mark.wire
 def test_the_rig_stops_by_it_and_latches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     live = LiveRig(tmp_path, monkeypatch)
-    live.rig.start(live.plan("one", hold_s=20.0))
+    live.start(live.plan("one", hold_s=20.0))
     live.wait_pulses(5)
-    program._stop_by_key(live.rig)
     sent = len(live.stimulator.sent)
+    live.ask(program._stop_by_key(live.rig))
     assert live.wait("latched") == "a key in the terminal (by operator)"
     assert len(live.stimulator.sent) == sent
-    live.rig.close()
+    live.close()

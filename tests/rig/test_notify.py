@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import os
 import socket
 import sys
 import tempfile
 from collections.abc import Iterator
+from concurrent.futures import Future
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from rig import __main__ as program
+from rig import config
+from rig.control import pair
 from rig.control.rig import Rig
 from rig.notify import Notifier
-from tests.rig.live import LiveRig
+from tests.rig.fakes import FakeCell, FakeStimulator
+from tests.rig.live import LINE, LiveRig
+from tests.simulator.virtual_time import VirtualClock
 
 
 @pytest.fixture
@@ -83,9 +90,11 @@ def test_the_process_tells_what_it_finds(
     well: bool,
     capsys: pytest.CaptureFixture[str],
 ):
-    """The program itself, on devices in this process, until its parent has died."""
-    live = LiveRig(tmp_path / "data", monkeypatch)
-    live.rig.close()
+    """The program itself on this machine, with devices in this process, until its parent has died."""
+    stimulator = FakeStimulator(VirtualClock())
+    made = {"stimulator": stimulator, "load_cell": FakeCell(stimulator.clock, stimulator)}
+    found = SimpleNamespace(find=lambda kind, _: SimpleNamespace(create=lambda _settings, _machine: made[kind]))
+    monkeypatch.setattr(pair, "devices", found)
     beats = iter(range(4))
     monkeypatch.setattr(program.os, "sched_setscheduler", lambda *_: None)
     monkeypatch.setattr(program.os, "getppid", lambda: 0 if next(beats, None) is not None else 1)
@@ -96,10 +105,19 @@ def test_the_process_tells_what_it_finds(
         monkeypatch.setattr(Rig, "trouble", lambda _: "the sender hangs")
     interval_s = sys.getswitchinterval()
     try:
-        where = {"socket": Path(manager.getsockname()).parent / "rig.sock"}
-        asyncio.run(program._serve(live.config.model_copy(update=where), 0))
+        place = Path(manager.getsockname()).parent / "rig.sock"
+        chosen = config.for_emulator(json.dumps(LINE), data_dir=tmp_path / "data", socket=place)
+        asyncio.run(program._serve(chosen, 0))
     finally:
         sys.setswitchinterval(interval_s)
     fed = ["WATCHDOG=1"] * 4 if well else ["STATUS=not fed: the sender hangs"]
     assert heard(manager) == ["READY=1", *fed, "STOPPING=1"]
     assert '"state": "ready"' in capsys.readouterr().out
+
+
+def test_a_rig_that_does_not_answer_is_trouble(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    live = LiveRig(tmp_path, monkeypatch)
+    monkeypatch.setattr(program, "HUNG_S", 0.02)
+    found = asyncio.run(program._trouble(live.rig, lambda _: Future()))
+    assert found == "the rig's thread hangs: no answer for 0.02 s"
+    live.close()
