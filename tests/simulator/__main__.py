@@ -125,8 +125,8 @@ def _outcomes(seeds: Iterable[int], processes: int) -> Iterator[Outcome]:
     with ProcessPoolExecutor(processes) as pool:
         source, waiting = iter(seeds), []
         while True:
-            for seed in islice(source, AHEAD * processes - len(waiting)):
-                waiting.append(pool.submit(outcome_of, seed))
+            more = islice(source, AHEAD * processes - len(waiting))
+            waiting += [pool.submit(outcome_of, seed) for seed in more]
             if not waiting:
                 return
             yield waiting.pop(0).result()

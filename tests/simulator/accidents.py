@@ -31,7 +31,10 @@ def device_fault(life: Life, chance: random.Random) -> str:
 
 def line_stalls(life: Life, chance: random.Random) -> str:
     """The serial line holds what is sent, in one direction or both, and lets it go at once."""
-    for_s, discards = chance.choice((0.005, 0.02, 0.08, 0.3, 1.0, 2.0)) * chance.uniform(0.5, 1.5), chance.random() < 0.5
+    for_s, discards = (
+        chance.choice((0.005, 0.02, 0.08, 0.3, 1.0, 2.0)) * chance.uniform(0.5, 1.5),
+        chance.random() < 0.5,
+    )
     ways = chance.choice(((life.wires.to_device,), (life.wires.to_host,), (life.wires.to_device, life.wires.to_host)))
     for way in ways:
         way.stall(for_s, discards)

@@ -96,8 +96,8 @@ class Process:
     def open_bus(self, arguments: dict[str, Any], name: str) -> Bus:
         return self._ports.open_bus(self, arguments, name)
 
-    def shared_bus(self, arguments: dict[str, Any], name: str) -> Bus | None:
-        return self._ports.shared_bus(self, arguments, name)
+    def shared_bus(self, _arguments: dict[str, Any], _name: str) -> Bus | None:
+        return self._ports.shared_bus(self)
 
     @contextlib.contextmanager
     def undisturbed(self) -> Iterator[None]:
@@ -173,5 +173,5 @@ class Ports:
     def open_bus(self, process: Process, arguments: dict[str, Any], name: str) -> Bus:
         raise NotImplementedError
 
-    def shared_bus(self, process: Process, arguments: dict[str, Any], name: str) -> Bus | None:
+    def shared_bus(self, process: Process) -> Bus | None:
         raise NotImplementedError

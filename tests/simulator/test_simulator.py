@@ -38,7 +38,7 @@ def test_the_same_seed_lives_the_same_life_whatever_the_hash_seed():
 def test_a_mistake_is_found_and_shrunk(monkeypatch: pytest.MonkeyPatch):
     """A gate that stays open after a halt: pulses follow a stop."""
     monkeypatch.setattr(Gate, "shut", lambda _gate: None)
-    monkeypatch.setattr(Halt, "set", lambda halt, cause, reason: setattr(halt, "cause", halt.cause or cause) is None)
+    monkeypatch.setattr(Halt, "set", lambda halt, cause, _reason: setattr(halt, "cause", halt.cause or cause) is None)
     seed = next(seed for seed in range(1, 60) if live(seed)[1])
     only = shrink(seed)
     assert live(seed, only)[1]

@@ -1,4 +1,4 @@
-"""The wires between the rig's computer and the emulated devices: a serial line and a CAN bus, with what befalls them."""
+"""The wires between the rig's computer and the emulated devices: a serial line and a CAN bus."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Direction:
         if self.stalled or self.held:
             self.held.append((data, written_s))
             return
-        for piece, true in self._befallen(data):
+        for piece, true in self._befallen(data, written_s):
             arrives_s = max(written_s + self.world.chance.uniform(*TRANSIT_S), self._last_s)
             if true or self.odds.get("reorder", 0.0) == 0.0:
                 self._last_s = arrives_s
@@ -66,7 +66,7 @@ class Direction:
             for data, written_s in held:
                 self.world.after(1e-5, lambda data=data, written_s=written_s: self._deliver(data, written_s, True))
 
-    def _befallen(self, data: bytes) -> list[tuple[bytes, bool]]:
+    def _befallen(self, data: bytes, written_s: float) -> list[tuple[bytes, bool]]:
         """The pieces as which it arrives, and whether each is as it was sent."""
         chance, found = self.world.chance, [(data, True)]
         for deviance, odds in self.odds.items():
@@ -88,7 +88,7 @@ class Direction:
                 case _:  # reorder: it comes later than what follows it
                     found = []
                     late_s = chance.uniform(0.001, 0.05)
-                    self.world.after(late_s, lambda: self._deliver(data, self.world.now_s, False))
+                    self.world.after(late_s, lambda: self._deliver(data, written_s, False))
         return [piece for piece in found if piece[0]]
 
 
@@ -126,7 +126,7 @@ class Wires(Ports):
         self._bus = _SimulatedBus(self, process, arguments)
         return self._bus
 
-    def shared_bus(self, process: Process, arguments: dict[str, Any], name: str) -> Bus | None:
+    def shared_bus(self, process: Process) -> Bus | None:
         return self._bus if self._bus is not None and self._bus.process is process else None
 
     def open_port(self, port: _SimulatedPort) -> None:
