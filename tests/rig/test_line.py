@@ -1,31 +1,119 @@
-"""The serial line: what it refuses to drive."""
+"""The serial port: what it reads, what it tells, and what it refuses to drive."""
 
 from __future__ import annotations
 
+import contextlib
 import os
+import queue
+import tty
+from collections.abc import Callable, Iterator
 
 import pytest
 
+from rig.adapters import serial_port
+from rig.adapters.serial_port import SerialPort
 from rig.clock import MonotonicClock
-from rig.devices import _line, p24
 from rig.errors import DeviceError
 
+PATIENCE_S = 30.0
 
-def test_a_clock_that_runs_fast_drives_an_emulator_only(monkeypatch: pytest.MonkeyPatch):
+
+class Line:
+    """A port on one end of a pseudo-terminal; we have the other end."""
+
+    def __init__(self) -> None:
+        self.ours, theirs = os.openpty()
+        tty.setraw(theirs)
+        self.path, self._theirs = os.ttyname(theirs), theirs
+        self._posted: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self.heard, self.times_s, self.lost = b"", list[float](), list[str]()
+
+    def port(self, speed: float = 1.0) -> SerialPort:
+        return SerialPort(self.path, MonotonicClock(speed), self._posted.put)
+
+    def open(self, speed: float = 1.0) -> SerialPort:
+        port = self.port(speed)
+        port.open(self._hear, self.lost.append)
+        return port
+
+    def until(self, true: Callable[[], object]) -> None:
+        """Do what the port's thread posts until something is true."""
+        while not true():
+            self._posted.get(timeout=PATIENCE_S)()
+
+    def hang_up(self) -> None:
+        os.close(self.ours)
+        self.ours = -1
+
+    def close(self) -> None:
+        os.close(self._theirs)
+        with contextlib.suppress(OSError):
+            os.close(self.ours)
+
+    def _hear(self, data: bytes, time_s: float) -> None:
+        self.heard += data
+        self.times_s.append(time_s)
+
+
+@pytest.fixture
+def line() -> Iterator[Line]:
+    made = Line()
+    yield made
+    made.close()
+
+
+def test_bytes_come_with_their_time_and_go_out_at_once(line: Line):
+    port = line.open()
+    before_s = MonotonicClock().now_s()
+    os.write(line.ours, b"abc")
+    line.until(lambda: line.heard == b"abc")
+    assert before_s <= line.times_s[0] <= line.times_s[-1] <= MonotonicClock().now_s()
+    assert port.write(b"defg") == 4
+    assert os.read(line.ours, 10) == b"defg"
+    port.close()
+    assert line.lost == []
+    with pytest.raises(OSError, match="not opened"):
+        port.write(b"x")
+
+
+def test_a_line_that_is_gone_is_told_once(line: Line):
+    port = line.open()
+    line.hang_up()
+    line.until(lambda: line.lost)
+    assert line.lost[0].startswith("the connection was lost (")
+    port.discard()
+    port.close()
+    assert len(line.lost) == 1
+
+
+def test_a_line_that_takes_nothing_holds_up_nobody_and_forgets_what_waits(line: Line):
+    port, taken = line.open(), 0
+    with contextlib.suppress(BlockingIOError):
+        while (n := port.write(b"x" * 1000)) == 1000:
+            taken += n
+    assert taken > 0
+    port.discard()
+    assert port.write(b"y") == 1
+    os.set_blocking(line.ours, False)
+    assert os.read(line.ours, 100_000).strip(b"x") == b"y"
+    port.close()
+
+
+def test_a_port_that_is_missing_or_in_use_is_told(line: Line):
+    port = line.open()
+    with pytest.raises(DeviceError, match=rf"{line.path} cannot be opened .*is another program using it\?"):
+        line.open()
+    port.close()
+    line.open().close()
+    line.path = "/dev/pts/gone"
+    with pytest.raises(DeviceError, match="/dev/pts/gone is missing; plug in the stimulator or correct the port"):
+        line.open()
+
+
+def test_a_clock_that_runs_fast_drives_an_emulator_only(line: Line, monkeypatch: pytest.MonkeyPatch):
     """Whatever the rig was told of its port: the port itself is looked at, at each opening."""
-    master, slave = os.openpty()
-    port = os.ttyname(slave)
-    try:
-        for speed, elsewhere, words in (
-            (50.0, True, "real device"),
-            (1.0, True, "no answer"),
-            (50.0, False, "no answer"),
-        ):
-            monkeypatch.setattr(_line, "PSEUDO_TERMINALS", "/nowhere/" if elsewhere else "/dev/pts/")
-            settings = p24.Settings(device="p24", port=port, reply_timeout_s=0.05)
-            device = p24.create(settings, MonotonicClock(speed))
-            with pytest.raises(DeviceError, match=words):
-                device.open()
-    finally:
-        os.close(master)
-        os.close(slave)
+    line.open(50.0).close()
+    monkeypatch.setattr(serial_port, "PSEUDO_TERMINALS", "/nowhere/")
+    with pytest.raises(DeviceError, match="real device"):
+        line.open(50.0)
+    line.open(1.0).close()
