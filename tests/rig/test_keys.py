@@ -9,6 +9,7 @@ import select
 import sys
 import termios
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -18,6 +19,7 @@ from rig.keys import StopKey, in_front
 from tests.rig.live import LiveRig
 
 ROOT = Path(__file__).parents[2]
+PATIENCE_S = 30.0
 CHILD = """
 import asyncio, sys
 from rig.keys import StopKey
@@ -31,58 +33,71 @@ asyncio.run(main())
 """
 
 
-def test_one_key_is_one_stop_and_the_terminal_is_given_back():
-    master, slave = os.openpty()
-    before = termios.tcgetattr(slave)
-    pressed = []
+class Loop(asyncio.AbstractEventLoop):
+    """One that reads when the test says so."""
 
-    async def press() -> None:
-        with StopKey(asyncio.get_running_loop(), lambda: pressed.append(1), slave, lambda _: True) as key:
-            assert key.watched
-            assert not termios.tcgetattr(slave)[3] & (termios.ICANON | termios.ECHO)
-            assert termios.tcgetattr(slave)[3] & termios.ISIG  # Ctrl-C is a signal as ever
-            for keys in (b" ", b"\x1b[A"):
-                os.write(master, keys)
-                await asyncio.sleep(0.05)
+    def __init__(self) -> None:
+        self.readers: dict[object, Callable[[], object]] = {}
 
-    asyncio.run(press())
-    assert len(pressed) == 2
-    assert termios.tcgetattr(slave) == before
-    os.close(slave)
-    os.close(master)
+    def add_reader(self, fd, callback, *_):  # pyright: ignore
+        self.readers[fd] = callback
+
+    def remove_reader(self, fd):  # pyright: ignore
+        return self.readers.pop(fd, None) is not None
+
+    def read(self, fd: int) -> None:
+        """Once something is there."""
+        assert select.select([fd], [], [], PATIENCE_S)[0]
+        self.readers[fd]()
 
 
-def test_without_a_terminal_of_its_own_nothing_is_read():
-    master, slave = os.openpty()  # a terminal, and not this process's
-    read, write = os.pipe()
-    os.write(write, b"x")
-
-    async def look() -> None:
-        for fd in (slave, read):
-            assert not in_front(fd)
-            with StopKey(asyncio.get_running_loop(), lambda: pytest.fail("not meant for us"), fd) as key:
-                assert not key.watched
-                await asyncio.sleep(0.02)
-
-    asyncio.run(look())
-    assert os.read(read, 1) == b"x"
-    for fd in (master, slave, read, write):
+@pytest.fixture
+def terminal() -> Iterator[tuple[int, int]]:
+    """A person's end, and the program's."""
+    ends = os.openpty()
+    yield ends
+    for fd in ends:
         os.close(fd)
 
 
-def test_moved_to_the_background_it_lets_go():
-    master, slave = os.openpty()
-    front = [True]
+def test_one_key_is_one_stop_and_the_terminal_is_given_back(terminal: tuple[int, int]):
+    person, ours = terminal
+    before, loop, pressed = termios.tcgetattr(ours), Loop(), list[int]()
+    with StopKey(loop, lambda: pressed.append(1), ours, lambda _: True) as key:
+        assert key.watched
+        assert not termios.tcgetattr(ours)[3] & (termios.ICANON | termios.ECHO)
+        assert termios.tcgetattr(ours)[3] & termios.ISIG  # Ctrl-C is a signal as ever
+        for n, keys in enumerate((b" ", b"\x1b[A"), start=1):
+            os.write(person, keys)
+            loop.read(ours)
+            assert len(pressed) == n
+        assert not select.select([ours], [], [], 0)[0], "an arrow is one key"
+    assert termios.tcgetattr(ours) == before
+    assert loop.readers == {}
 
-    async def press() -> None:
-        with StopKey(asyncio.get_running_loop(), lambda: pytest.fail("not ours"), slave, lambda _: front[0]):
-            front[0] = False
-            os.write(master, b" \n")
-            await asyncio.sleep(0.05)
 
-    asyncio.run(press())
-    os.close(slave)
-    os.close(master)
+def test_without_a_terminal_of_its_own_nothing_is_read(terminal: tuple[int, int]):
+    read, write = os.pipe()
+    os.write(write, b"x")
+    for fd in (terminal[1], read):  # a terminal that is not this process's, and none
+        assert not in_front(fd)
+        loop = Loop()
+        with StopKey(loop, lambda: pytest.fail("not meant for us"), fd) as key:
+            assert not key.watched
+            assert loop.readers == {}
+    assert os.read(read, 1) == b"x"
+    os.close(read)
+    os.close(write)
+
+
+def test_moved_to_the_background_it_lets_go(terminal: tuple[int, int]):
+    person, ours = terminal
+    front, loop = [True], Loop()
+    with StopKey(loop, lambda: pytest.fail("not ours"), ours, lambda _: front[0]):
+        front[0] = False
+        os.write(person, b" \n")
+        loop.read(ours)
+        assert loop.readers == {}
 
 
 def test_in_a_real_terminal():
@@ -90,7 +105,7 @@ def test_in_a_real_terminal():
     if pid == 0:
         os.chdir(ROOT)
         os.execv(sys.executable, [sys.executable, "-c", CHILD])
-    said, end_s = b"", time.monotonic() + 30
+    said, end_s = b"", time.monotonic() + PATIENCE_S
     while b"stopped" not in said and time.monotonic() < end_s:
         if not select.select([master], [], [], 0.2)[0]:
             continue
@@ -106,12 +121,12 @@ def test_in_a_real_terminal():
     assert b"stopped" in said
 
 
-def test_the_rig_stops_by_it_and_latches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    live = LiveRig(tmp_path, monkeypatch)
+def test_the_rig_stops_by_it_and_latches(make: Callable[..., LiveRig]):
+    live = make()
     live.start(live.plan("one", hold_s=20.0))
     live.wait_pulses(5)
-    sent = len(live.stimulator.sent)
     live.ask(program._stop_by_key(live.rig))
+    sent = len(live.stimulator.sent)
     assert live.wait("latched") == "a key in the terminal (by operator)"
-    assert len(live.stimulator.sent) == sent
-    live.close()
+    live.machine.wait(1.0)
+    assert len(live.stimulator.sent) == sent == 5

@@ -9,7 +9,6 @@ import socket
 import sys
 import tempfile
 from collections.abc import Iterator
-from concurrent.futures import Future
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -21,7 +20,7 @@ from rig.control import pair
 from rig.control.rig import Rig
 from rig.notify import Notifier
 from tests.rig.fakes import FakeCell, FakeStimulator
-from tests.rig.live import LINE, LiveRig
+from tests.rig.live import LINE
 from tests.simulator.virtual_time import VirtualClock
 
 
@@ -81,7 +80,6 @@ def test_an_abstract_socket_is_found():
         assert heard(line) == ["READY=1"]
 
 
-@pytest.mark.wire
 @pytest.mark.parametrize("well", [True, False])
 def test_the_process_tells_what_it_finds(
     manager: socket.socket,
@@ -113,11 +111,3 @@ def test_the_process_tells_what_it_finds(
     fed = ["WATCHDOG=1"] * 4 if well else ["STATUS=not fed: the sender hangs"]
     assert heard(manager) == ["READY=1", *fed, "STOPPING=1"]
     assert '"state": "ready"' in capsys.readouterr().out
-
-
-def test_a_rig_that_does_not_answer_is_trouble(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    live = LiveRig(tmp_path, monkeypatch)
-    monkeypatch.setattr(program, "HUNG_S", 0.02)
-    found = asyncio.run(program._trouble(live.rig, lambda _: Future()))
-    assert found == "the rig's thread hangs: no answer for 0.02 s"
-    live.close()
