@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from functools import lru_cache
 from typing import Any
 
 from hardware_sim.arm import registry
@@ -39,6 +40,7 @@ class Limb:
         self.converted_nm = getattr(muscle, "converted_nm", None)
         self._muscle, self._tissue = muscle, arm.tissue
         self._tell_joint: Callable[[float, float], None] | None = getattr(muscle, "joint", None)
+        self._laws = lru_cache(1)(self._laws_at)  # an arm that is held asks for one place again and again
         self._inertia_kg_m2 = arm.tissue.mechanics.inertia_kg_m2
         self._memory = arm.tissue.passive.begin(self.motion.angle_rad)
         self._time_s = 0.0
@@ -108,7 +110,11 @@ class Limb:
     def _acceleration_rad_s2(self, angle_rad: float, velocity_rad_s: float) -> float:
         return self._net_nm(angle_rad, velocity_rad_s) / self._inertia_kg_m2
 
+    def _laws_at(self, angle_rad: float, velocity_rad_s: float) -> tuple[Any, Any]:
+        """Share of active torque, and the torque of what is passive, N·m."""
+        return self._tissue.g(angle_rad, velocity_rad_s), self._tissue.h_nm(angle_rad, velocity_rad_s)
+
     def _net_nm(self, angle_rad: float, velocity_rad_s: float) -> float:
-        active_nm = self._tissue.g(angle_rad, velocity_rad_s) * self._isometric_nm
+        share, passive_nm = self._laws(angle_rad, velocity_rad_s)
         remembered_nm = self._tissue.passive.remembered_nm(self._memory, angle_rad)
-        return float(active_nm + self._tissue.h_nm(angle_rad, velocity_rad_s) + remembered_nm)
+        return float(share * self._isometric_nm + passive_nm + remembered_nm)

@@ -4,22 +4,18 @@ from __future__ import annotations
 
 import math
 import struct
-import time
-from collections.abc import Iterator
-from itertools import pairwise
 
-import can
 import numpy as np
 import pytest
 
-from hardware_sim.errors import SettingsError
+from hardware_sim.errors import FaultError, SettingsError
 from hardware_sim.load_cells.cells import canopen, counts, plain
 from hardware_sim.load_cells.frames import Sample
 from hardware_sim.load_cells.sampler import LoadCell
 from hardware_sim.sampling import Noise
 from hardware_sim.settings import Settings
-from tests.hardware_sim.emulated import Emulated, emulated
 from tests.hardware_sim.test_load_cells import Ramp
+from tests.hardware_sim.virtual_host import LAYOUT, VirtualHost
 
 RATE_HZ = 1600.0
 PERIOD_S = 1 / RATE_HZ
@@ -107,59 +103,30 @@ def test_settings_out_of_range() -> None:
             Settings(clock_jitter_us=value)
 
 
-@pytest.fixture(scope="module")
-def rig() -> Iterator[Emulated]:
-    with emulated("--clock-ppm", "-200", "--noise-nm", "0") as running:
-        yield running
+class TestFaults:
+    def test_delivery_jitter_keeps_order_and_stamps_and_loses_nothing_when_it_ends(self) -> None:
+        host = VirtualHost()
+        host.devices.faults.on("delivery_jitter", {"largest_s": 0.03}, for_s=0.5)
+        frames = host.frames(0.6)
+        counters, stamps_us = zip(*((LAYOUT.unpack(frame.data)[1], frame.time_us) for frame in frames), strict=True)
+        late_s = np.array([frame.time_s for frame in frames]) - 1e-6 * np.array(stamps_us)
+        assert counters == tuple(range(960))
+        assert stamps_us == tuple(625 * n for n in counters)
+        assert 0.008 < late_s.max() <= 0.03
+        assert np.abs(late_s[-100:]).max() < 1e-9
 
-
-@pytest.mark.wire
-class TestOverTheWire:
-    def record(self, rig: Emulated, seconds: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Counters, stamps and host times."""
-        with can.Bus(**rig.ready["can"]) as bus:
-            assert bus.recv(10.0) is not None
-            rows, end_s = [], time.monotonic() + seconds
-            while time.monotonic() < end_s:
-                message = bus.recv(0.05)
-                if message is not None:
-                    rows.append((struct.unpack("<fHBB", message.data)[1], message.timestamp, time.monotonic()))
-        counters, stamps_s, host_s = np.array(rows).T
-        return np.unwrap(counters, period=65536), stamps_s, host_s
-
-    def test_delivery_jitter_keeps_order_and_stamps(self, rig: Emulated) -> None:
-        assert rig.ask(cmd="fault", name="delivery_jitter", largest_s=0.03)["ok"]
-        counters, stamps_s, host_s = self.record(rig, 0.6)
-        assert rig.ask(cmd="fault", name="delivery_jitter", on=False)["ok"]
-        assert set(np.diff(counters)) == {1}
-        assert np.allclose(np.diff(stamps_s), PERIOD_S, atol=2e-6)
-        late_s = host_s - PERIOD_S * counters
-        assert np.percentile(late_s, 99) - np.percentile(late_s, 1) > 0.008
-        assert rig.ask(cmd="state")["frames_overrun"] == 0
-
-    def test_no_frame_is_lost_or_late_when_it_ends(self, rig: Emulated) -> None:
-        with can.Bus(**rig.ready["can"]) as bus:
-            assert bus.recv(10.0) is not None
-            rig.ask(cmd="fault", name="delivery_jitter", largest_s=0.05, for_s=0.2)
-            counters, end_s = [], time.monotonic() + 0.5
-            while time.monotonic() < end_s:
-                message = bus.recv(0.05)
-                if message is not None:
-                    counters.append(struct.unpack("<fHBB", message.data)[1])
-        assert {(b - a) & 0xFFFF for a, b in pairwise(counters)} == {1}
-
-    def test_clock_jitter(self, rig: Emulated) -> None:
-        _, before_s, _ = self.record(rig, 0.2)
-        assert rig.ask(cmd="fault", name="clock_jitter", sd_us=100)["ok"]
-        _, stamps_s, _ = self.record(rig, 0.5)
-        assert rig.ask(cmd="fault", name="clock_jitter", on=False)["ok"]
-        assert np.diff(before_s).std() < 2e-6
-        assert np.diff(stamps_s).std() == pytest.approx(math.sqrt(2) * 100e-6, rel=0.15)
+    def test_clock_jitter(self) -> None:
+        host = VirtualHost()
+        before = host.frames()
+        host.devices.faults.on("clock_jitter", {"sd_us": 100})
+        after = host.frames(2.0)
+        spreads_us = [np.diff([frame.time_us for frame in frames]).std() for frames in (before, after)]
+        assert spreads_us == pytest.approx([0.0, math.sqrt(2) * 100], rel=0.15)
 
     @pytest.mark.parametrize(("name", "setting"), [("clock_jitter", "sd_us"), ("delivery_jitter", "largest_s")])
-    def test_nonsense_is_told(self, rig: Emulated, name: str, setting: str) -> None:
+    def test_nonsense_is_told(self, name: str, setting: str) -> None:
+        faults = VirtualHost().devices.faults
         for value in (-1, math.nan):
-            answer = rig.ask(cmd="fault", name=name, **{setting: value})
-            assert not answer["ok"]
-            assert setting in answer["error"]
-        assert rig.ask(cmd="state")["faults"] == []
+            with pytest.raises(FaultError, match=setting):
+                faults.on(name, {setting: value})
+        assert faults.active() == []

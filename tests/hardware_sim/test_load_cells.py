@@ -89,14 +89,6 @@ class TestSampler:
         assert noise.std() == pytest.approx(0.1, rel=0.03)
         assert abs(np.corrcoef(noise[1:], noise[:-1])[0, 1]) < 0.03
 
-    def test_the_same_seed_gives_the_same_record(self) -> None:
-        records = []
-        for seed in (7, 7, 8):
-            made = cell(noise_nm=0.1, seed=seed)
-            made.produce(1.0)
-            records.append(made.take_frames())
-        assert records[0] == records[1] != records[2]
-
     def test_rate_factor_changes_from_the_next_sample_on(self) -> None:
         made = cell()
         made.produce(1.0)
