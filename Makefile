@@ -4,7 +4,6 @@ SHELL := /bin/bash
 VENV := .venv
 BIN := $(VENV)/bin
 export PYTHONUNBUFFERED = 1
-FAST := not wire and not browser and not service and not slow
 
 .PHONY: demo centre test check fast lint types serve bench postgresql late faults soak campaigns mutation words lock clean help setup setup-test setup-centre
 
@@ -27,7 +26,7 @@ check: setup-test ## within a minute: style, layers, types and the fast tests
 	@$(MAKE) --no-print-directory -j2 --output-sync=target lint types fast
 
 fast: setup-test
-	@echo "== fast tests"; $(BIN)/python -m pytest -n 2 --dist worksteal -m "$(FAST)" tests
+	@echo "== fast tests"; $(BIN)/python -m tests fast
 
 lint: setup-test ## style and layers
 	@echo "== ruff"; $(BIN)/ruff check . ; $(BIN)/ruff format --check .
