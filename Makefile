@@ -4,9 +4,8 @@ SHELL := /bin/bash
 VENV := .venv
 BIN := $(VENV)/bin
 export PYTHONUNBUFFERED = 1
-FAST := not wire and not browser and not service and not slow
 
-.PHONY: demo centre test check fast lint types serve bench postgresql late faults soak campaigns mutation words lock clean help setup setup-test setup-centre
+.PHONY: demo centre test check fast lint types serve bench postgresql late pauses faults soak campaigns mutation words lock clean help setup setup-test setup-centre
 
 help:
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -27,7 +26,7 @@ check: setup-test ## within a minute: style, layers, types and the fast tests
 	@$(MAKE) --no-print-directory -j2 --output-sync=target lint types fast
 
 fast: setup-test
-	@echo "== fast tests"; $(BIN)/python -m pytest -n 2 --dist worksteal -m "$(FAST)" tests
+	@echo "== fast tests"; $(BIN)/python -m tests fast
 
 lint: setup-test ## style and layers
 	@echo "== ruff"; $(BIN)/ruff check . ; $(BIN)/ruff format --check .
@@ -50,6 +49,9 @@ postgresql: setup-test ## every test of the service on PostgreSQL instead of SQL
 
 late: setup-test ## the page's tests with answers that come late and in pieces; SEED=2 for other delays
 	@$(BIN)/python -m pytest -n 4 --dist worksteal --late-answers $(or $(SEED),1) -m browser tests/api
+
+pauses: setup-test ## every test while its processes are stopped and continued at random; SEED=2 for other times, PYTEST_ARGS
+	@$(BIN)/python -m tests.harness.pauses $(if $(SEED),--seed $(SEED)) -- $(BIN)/python -m $(if $(PYTEST_ARGS),pytest $(PYTEST_ARGS),tests)
 
 faults: setup-test ## the fault campaign on the emulated rig (docs/results/faults.md)
 	@$(BIN)/python -m bench.faults

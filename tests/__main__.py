@@ -1,52 +1,56 @@
-"""`python -m tests`: every test, in lanes one after the other.
+"""`python -m tests`: every test, in lanes one after the other (`tests/runner/lanes.py`). `python -m tests fast`: one.
 
-The first lane shares the processors among several test processes. The tests of the others keep time with an emulator,
-so nothing that computes may stand beside them; those at the limits of real time have the machine for themselves.
+It tells its plan before, its progress meanwhile, and at the end the dearest tests and a command for each that failed.
 """
 
 from __future__ import annotations
 
-import os
+import json
 import subprocess
 import sys
+import tempfile
 import time
+from collections.abc import Iterable
+from pathlib import Path
 
-PROCESSORS = os.cpu_count() or 1
-SIDE_BY_SIDE = ("--dist", "worksteal", "-n")
-ON_POSTGRESQL = ("access", "archive", "controller_keys", "idle_lock", "names", "notes", "people", "session", "tracked")
-LANES = {
-    # more processes than processors: tests of the service wait half of their time
-    "pure": ("-m", "not wire", *SIDE_BY_SIDE, str(PROCESSORS + 2), "tests"),
-    # what several services share, and what the database decides; `make postgresql` runs all of it there
-    "postgresql": (
-        "--postgresql",
-        "-m",
-        "service and not browser and not wire and not slow",
-        *SIDE_BY_SIDE,
-        str(PROCESSORS + 2),
-        *(f"tests/api/test_{name}.py" for name in ON_POSTGRESQL),
-    ),
-    # two emulated rigs leave half of two processors idle
-    "wire": ("-m", "wire and not realtime", *SIDE_BY_SIDE, "2", "tests"),
-    "realtime": ("-m", "realtime", "tests"),
-}
+from tests.runner.costs import AGAIN, Costs, minutes
+from tests.runner.lanes import CAMPAIGNS, LANES, Lane
 
-CAMPAIGNS = {
-    "make campaigns": "whole grids, of which one of each kind is run here; a hidden patient on the wire",
-    "make postgresql": "every test of the service on PostgreSQL, of which nine files are run here",
-    "make late": "the page's tests with answers that come late and in pieces",
-    "make soak": "an hour of recording with fits beside it, of which 30 s are run here",
-    "make faults": "every fault in every phase of a test, of which seven are run here",
-    "make mutation": "changes of the rig's safety code, one by one: which of them no test sees",
-    "make bench": "the figures in docs/, against other programs",
-}
-"""What is not run here, by the command that runs it."""
-
-TELLING = ("FAILED ", "ERROR ", "E  ")
+ROOT = Path(__file__).parents[1]
+KEPT = ROOT / "build" / "tests"
+"""What the tests of each lane cost in its last run."""
+PLUGIN = ("-p", "tests.runner.costs")
+TELLING = ("FAILED ", "ERROR ", "E  ", AGAIN)
 """How the lines begin that say what failed: printed once more at the end, where people look first."""
+DEAREST = 10
 
 
-def run(lanes: dict[str, tuple[str, ...]], failures: list[str]) -> dict[str, int]:
+def plan(lanes: dict[str, Lane], folder: str = "tests") -> str:
+    """How many tests each lane runs, and how long it took the last time.
+
+    Raises
+    ------
+    ValueError
+        If tests can't be collected; its text is pytest's.
+    """
+    with tempfile.TemporaryDirectory() as scratch:
+        path = Path(scratch) / "plan.json"
+        command = [sys.executable, "-m", "pytest", *PLUGIN, "--plan", str(path), "--collect-only", "-qq", folder]
+        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+        if done.returncode:
+            raise ValueError(done.stdout + done.stderr)
+        tests = {test: set(markers) for test, markers in json.loads(path.read_text()).items()}
+    lines, whole_s = ["Plan:"], 0.0
+    for name, lane in lanes.items():
+        count = sum(lane.holds(test, markers) for test, markers in tests.items())
+        last_s = Costs(KEPT / f"{name}.json").wall_s
+        whole_s += last_s or 0.0
+        took = "never run here" if last_s is None else f"{minutes(last_s)} the last time"
+        lines.append(f"  {name:12} {count:5} tests, {took}")
+    return "\n".join([*lines, f"  together     {minutes(whole_s)} the last time"])
+
+
+def run(lanes: dict[str, tuple[str, ...]], failures: list[str], kept: Path = KEPT) -> dict[str, int]:
     """Run the lanes one after the other and print what they print as it comes.
 
     Parameters
@@ -54,7 +58,9 @@ def run(lanes: dict[str, tuple[str, ...]], failures: list[str]) -> dict[str, int
     lanes : dict
         pytest's arguments by the name of the lane.
     failures : list of str
-        Lines that say what failed are added to it.
+        Lines that say what failed, and how it is repeated, are added to it.
+    kept : Path
+        Folder of what tests cost.
 
     Returns
     -------
@@ -64,7 +70,7 @@ def run(lanes: dict[str, tuple[str, ...]], failures: list[str]) -> dict[str, int
     codes = {}
     for name, arguments in lanes.items():
         try:
-            codes[name] = follow(name, arguments, failures)
+            codes[name] = follow(name, (*PLUGIN, "--costs", str(kept / f"{name}.json"), *arguments), failures)
         except (OSError, ValueError) as error:  # it could not be started: the others still run
             codes[name] = 1
             failures.append(f"[{name}] {error}")
@@ -73,18 +79,25 @@ def run(lanes: dict[str, tuple[str, ...]], failures: list[str]) -> dict[str, int
 
 def follow(name: str, arguments: tuple[str, ...], failures: list[str]) -> int:
     """Run one lane; its exit code."""
-    command = [sys.executable, "-m", "pytest", "--durations=10", *arguments]
+    command = [sys.executable, "-m", "pytest", *arguments]
     began_s = time.monotonic()
     with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace"
+        command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace"
     ) as process:
         assert process.stdout is not None
-        for line in process.stdout:
+        for line in filter(str.strip, process.stdout):
             print(f"[{name}] {line}", end="", flush=True)
             if line.startswith(TELLING):
                 failures.append(f"[{name}] {line.rstrip():.300}")
-    print(f"[{name}] {time.monotonic() - began_s:.0f} s", flush=True)
+    print(f"[{name}] {minutes(time.monotonic() - began_s)}", flush=True)
     return process.returncode
+
+
+def dearest(names: Iterable[str], kept: Path = KEPT) -> str:
+    """What the dearest tests of some lanes cost."""
+    costs = {test: cost_s for name in names for test, cost_s in Costs(kept / f"{name}.json").tests.items()}
+    first = sorted(costs, key=lambda test: costs[test], reverse=True)[:DEAREST]
+    return "\n".join(["Dearest tests:", *(f"  {costs[test]:6.1f} s  {test}" for test in first)])
 
 
 def not_run() -> str:
@@ -92,18 +105,30 @@ def not_run() -> str:
     return "\n".join(["Not run here:", *(f"  {command:14} {what}" for command, what in CAMPAIGNS.items())])
 
 
-def main() -> int:
-    """Exit code 0 only if each lane ran tests and all of them passed."""
+def main(names: list[str]) -> int:
+    """Run all lanes, or those that are named; exit code 0 only if each ran tests and all of them passed."""
+    if unknown := set(names) - set(LANES):
+        print(f"No lane {', '.join(unknown)}. There are: {', '.join(LANES)}.", file=sys.stderr)
+        return 2
     began_s = time.monotonic()
+    lanes = {name: lane for name, lane in LANES.items() if name in names or not names}
     failures: list[str] = []
-    print(not_run(), flush=True)
-    codes = run(LANES, failures)
-    print(not_run())
-    if failures:
-        print("\n".join(failures[-40:]))
-    print(f"{time.monotonic() - began_s:.0f} s; exit codes {codes}")
+    if not names:
+        try:
+            print(plan(lanes), flush=True)
+        except ValueError as error:
+            print(error)
+            return 1
+    codes = run({name: lane.arguments for name, lane in lanes.items()}, failures)
+    print(dearest(lanes))
+    if not names:
+        print(not_run())
+    # first the commands that repeat what failed would be lost among the rest
+    for line in sorted(failures[-80:], key=lambda line: AGAIN in line):
+        print(line)
+    print(f"{minutes(time.monotonic() - began_s)}; exit codes {codes}")
     return 0 if set(codes.values()) == {0} else 1
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(sys.argv[1:]))

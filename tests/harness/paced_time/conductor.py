@@ -9,7 +9,8 @@ Every `TICK_S` it looks whether somebody is left without a processor, and lets t
   ordinary ones, as a rig does, used that much of all processors: it keeps the others away then.
 
 So time does not wait for a process that computes, or that waits for a disk, for a lock, or for a call that holds
-Python's own lock. It does not wait for a process that was stopped or has ended. It waits for `LOST_NS` at most.
+Python's own lock. It does not wait for a process that has ended, nor for one that was stopped, unless `make pauses`
+did it (`tests/harness/pauses.py`): that stands for a machine that pauses. It waits for `LOST_NS` at most.
 
 Nobody can read more than `AHEAD_S` beyond what was written last: when this process itself gets no processor, time waits
 as well. So at most about `LATE_S + TICK_S + AHEAD_S` of a standstill are seen, 0.043 s. That is enough to drop a pulse,
@@ -42,6 +43,8 @@ TICK_S = 0.003
 LATE_S = 0.030
 AHEAD_S = 0.010
 OWN_SHARE = 0.3
+PAUSED = "STIMRIG_TESTS_PAUSED"
+"""The environment variable with the folder of the disturber, where there is one."""
 PRIORITY = 60
 """Above that of the sender of a rig's pulses: a sender that computes takes no processor from this process."""
 
@@ -94,6 +97,8 @@ class Conductor:
         states = states_of(pid)
         if states <= {"X", "Z"}:
             self._clock.cells[place] = 0
+        if paused(pid):
+            return True
         before_ns = self._heard[place][1]
         meanwhile_ns = {other: used - before_ns.get(other, used) for other, used in used_ns.items()}
         return "R" in states and not (
@@ -122,6 +127,12 @@ def states_of(pid: int) -> set[str]:
             with contextlib.suppress(OSError):
                 found.add((thread / "stat").read_text().rpartition(") ")[2][:1])
     return found
+
+
+def paused(pid: int) -> bool:
+    """Whether the disturber has stopped it: its folder holds a file of that name."""
+    folder = os.environ.get(PAUSED)
+    return folder is not None and Path(folder, str(pid)).exists()
 
 
 def runs_first(pid: int) -> bool:
