@@ -26,7 +26,7 @@ from api.settings import Settings
 from api.store import Store, engines
 from api.web import connections
 from api.web.app import create_app
-from tests.api import stub_process
+from tests.api import thread_process
 from tests.api.fake_rig import FakeRig, RigThread
 from tests.harness import postgres
 from tests.harness.late_answers import LateAnswers
@@ -38,7 +38,8 @@ PATIENCE_S = 60.0
 NO_TLS = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
 """Services of tests speak plain HTTP: without it every client would read the machine's certificates, 20 ms each."""
 DURABLE = engines._durable_sqlite
-STUB = stub_process.COMMAND
+STUB, REAL = thread_process.STUB, thread_process.REAL
+"""Workers as threads: one that fits nothing, and one that does what a worker does."""
 STUB_PROCESS = (sys.executable, "-m", "tests.api.stub_worker")
 """The same worker as a process: for tests of what a process does."""
 
@@ -69,7 +70,7 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
 def stub_in_this_process() -> Iterator[None]:
     """To start a process takes a processor 0.1 s, and each service has several."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(asyncio, "create_subprocess_exec", stub_process.start)
+        patch.setattr(asyncio, "create_subprocess_exec", thread_process.start)
         yield
 
 

@@ -1,6 +1,6 @@
 """A worker that speaks the protocol of `api.workers.child` but fits nothing: quick, and slow when asked to be.
 
-Run as a process by tests of processes; for all others `tests/api/stub_process.py` has it in the test's own process.
+Run as a process by tests of processes; for all others `tests/api/thread_process.py` has it in the test's own process.
 """
 
 from __future__ import annotations

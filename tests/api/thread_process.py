@@ -1,17 +1,25 @@
-"""The stub worker without a process: what `api.workers.process` starts for it is a thread of the test process."""
+"""Workers without a process: what `api.workers.process` starts for the stub, or for a real one, is a thread.
+
+Tests of what a process does (shut in, killed, out of memory) start processes.
+"""
 
 from __future__ import annotations
 
 import asyncio
+import io
+import json
 import queue
 import signal
 import threading
 import traceback
+from collections.abc import Callable
 from typing import Any
 
+from api.workers import child
 from tests.api.stub_worker import Stub
 
-COMMAND = ("the stub worker, in the test's own process",)
+STUB = ("the stub worker, as a thread",)
+REAL = ("what a worker does, as a thread",)
 start_process = asyncio.create_subprocess_exec
 
 
@@ -19,10 +27,22 @@ class Killed(BaseException):
     """Ends what the stub does at the moment."""
 
 
-class StubProcess:
+class Said(io.TextIOBase):
+    """Where a worker writes: each piece is passed on."""
+
+    def __init__(self, heard: Callable[[str], Any]) -> None:
+        self.heard = heard
+
+    def write(self, text: str) -> int:
+        self.heard(text)
+        return len(text)
+
+
+class ThreadProcess:
     """As much of a process as a worker's owner uses; dies as one does: its output ends, its code is told."""
 
-    def __init__(self, limit: int) -> None:
+    def __init__(self, limit: int, *, real: bool) -> None:
+        self.real = real
         self.returncode: int | None = None
         self.stdin, self.stdout = self, asyncio.StreamReader(limit)
         self._loop, self._over = asyncio.get_running_loop(), asyncio.Event()
@@ -56,10 +76,10 @@ class StubProcess:
         self._on_loop(self.stdout.feed_data, line.encode())
 
     def _run(self) -> None:
-        stub, code = Stub(self._pause), -signal.SIGKILL.value
+        answer, code = self._real if self.real else Stub(self._pause).line, -signal.SIGKILL.value
         try:
             while (line := self._lines.get()) is not None and not self._killed.is_set():
-                stub.line(line, self._say)
+                answer(line, self._say)
         except Killed:
             pass
         except SystemExit as error:
@@ -68,6 +88,10 @@ class StubProcess:
             traceback.print_exc()
             code = 1
         self._on_loop(self._end, code)
+
+    def _real(self, line: bytes, write: Callable[[str], Any]) -> None:
+        request, out = json.loads(line), Said(write)
+        child.say(out, {"call": request["call"], **child.run(request, out)})
 
     def _end(self, code: int) -> None:
         self.returncode = code
@@ -80,7 +104,7 @@ class StubProcess:
 
 
 async def start(*command: str, **options: Any) -> Any:
-    """In place of `asyncio.create_subprocess_exec`: the stub as a thread, everything else as a process."""
-    if COMMAND[0] in command:
-        return StubProcess(options["limit"])
+    """In place of `asyncio.create_subprocess_exec`: those two as threads, everything else as a process."""
+    if {STUB[0], REAL[0]} & set(command):
+        return ThreadProcess(options["limit"], real=REAL[0] in command)
     return await start_process(*command, **options)
