@@ -22,6 +22,7 @@ from rig.journal import Journal, Kind
 from rig.limits import Admitted, Steps
 from rig.messages import AdaptivePlan, AnglePlan, Profile, SegmentPlan, TestPlan
 from rig.signals import SAMPLE, Ack, LateError, TorqueBlock
+from rig.tasks import Outcome
 from tests.rig.angle import FakeSensor
 from tests.simulator.virtual_time import VirtualClock, VirtualMachine
 
@@ -239,6 +240,17 @@ class VirtualRig:
 def journal_at(path: Path) -> Journal:
     """A new journal."""
     return Journal(Files().create(path))
+
+
+def slow_work(machine: VirtualMachine, *real_s: float) -> None:
+    """From now on each piece of work takes so long, the first ones and then the last one of these; none: no time."""
+    left = [*real_s]
+
+    def later(action: Callable[[], Any], outcome: Outcome) -> None:
+        takes_s = (left.pop(0) if len(left) > 1 else left[0]) * machine.clock.speed
+        machine.clock.call_at(machine.clock.now_s() + takes_s, lambda: VirtualMachine._work(action, outcome))
+
+    machine.tasks._worker = later if real_s else VirtualMachine._work
 
 
 def header(run: TestRun, clock: VirtualClock) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +11,8 @@ import pytest
 from rig import plan
 from rig.errors import BusyError, PlanError, RigError, TooLateError
 from rig.messages import AHEAD, SegmentPlan
-from rig.tasks import Outcome
 from tests.rig.adaptive import FIXED, RATE_HZ, adaptive, extend, hold, refusals, rest, widths_sent
-from tests.rig.fakes import VirtualRig
-from tests.simulator.virtual_time import VirtualMachine
+from tests.rig.fakes import VirtualRig, slow_work
 
 
 def test_if_nobody_extends_it_the_fixed_plan_plays_and_a_second_without_pulses(tmp_path: Path):
@@ -81,13 +78,10 @@ def test_while_an_extension_is_checked_the_test_goes_on(tmp_path: Path, takes_s:
     """If the boundary passes meanwhile, nothing is laid; a second one is refused until the first is judged."""
     rig, found = adaptive(tmp_path), []
 
-    def slowly(action: Callable[[], Any], outcome: Outcome) -> None:
-        rig.clock.call_at(rig.clock.now_s() + takes_s, lambda: VirtualMachine._work(action, outcome))
-
     def ask() -> None:
-        rig.machine.tasks._worker = slowly
+        slow_work(rig.machine, takes_s)
         found.extend(rig.machine.tasks.begin(rig.run.score.extend(20, [hold(name)]), name) for name in ("a", "b"))
-        rig.machine.tasks._worker = VirtualMachine._work
+        slow_work(rig.machine)
 
     rig.at(0.2, ask)
     result = rig.execute()

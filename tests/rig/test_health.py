@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -12,9 +10,7 @@ from rig.acquire.health import DEFAULT_WATCH, SYNC_PERIOD_S
 from rig.adapters.files import Files
 from rig.journal import Kind
 from rig.messages import SegmentPlan
-from rig.tasks import Outcome
-from tests.rig.fakes import VirtualRig
-from tests.simulator.virtual_time import VirtualMachine
+from tests.rig.fakes import VirtualRig, slow_work
 
 FAULTS = {
     "torque": ("stale", 0.13),
@@ -57,9 +53,6 @@ def test_without_a_proof_nothing_is_fed(tmp_path: Path, fault: str):
     rig.cell.noise_nm = 0.01
     at: list[float] = []
 
-    def slowly(action: Callable[[], Any], outcome: Outcome) -> None:
-        rig.clock.call_at(rig.clock.now_s() + 10.0, lambda: VirtualMachine._work(action, outcome))
-
     def inject() -> None:
         at.append(rig.clock.now_s())
         if fault == "torque":
@@ -67,7 +60,7 @@ def test_without_a_proof_nothing_is_fed(tmp_path: Path, fault: str):
         elif fault == "ack":
             rig.stimulator.ack_delay_s = None
         elif fault == "disk slow":
-            rig.machine.tasks._worker = slowly
+            slow_work(rig.machine, 10.0)
         elif fault == "sender":
             rig.clock.advance(0.5)
         else:

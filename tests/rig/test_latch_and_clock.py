@@ -11,7 +11,7 @@ from rig.adapters.files import Files
 from rig.clock import MonotonicClock, utc_text
 from rig.control.latch import Latch
 from rig.errors import BusyError
-from rig.tasks import Outcome, Tasks
+from tests.rig.fakes import slow_work
 from tests.simulator.virtual_time import VirtualClock, VirtualMachine
 
 
@@ -36,12 +36,8 @@ def test_a_latch_that_cannot_be_read_counts_as_a_test_that_ran(tmp_path: Path, c
 
 
 def test_what_is_asked_for_first_is_written_first_however_slow_the_disk_is(tmp_path: Path):
-    machine, takes_s = VirtualMachine(), [0.5, 0.1, 0.3]
-
-    def slowly(action: object, outcome: Outcome) -> None:
-        machine.clock.call_at(machine.clock.now_s() + takes_s.pop(0), lambda: machine._work(action, outcome))  # pyright: ignore
-
-    machine.tasks = Tasks(machine.clock, slowly)
+    machine = VirtualMachine()
+    slow_work(machine, 0.5, 0.1, 0.3)
     latch = Latch(tmp_path, machine)
     asked = latch.write("running", "test 7"), latch.clear(), latch.write("latched", "electrode")
     for number, one in enumerate(asked):
