@@ -223,3 +223,18 @@ def test_a_port_that_is_no_serial_line_is_left_as_it_is(machine: Adapters):
     cell = cell_of(machine, {"interface": "slcan", "channel": "loop://"})
     assert not isinstance(cell.device._bus.can.serialPortOrig, ReadAhead)
     cell.close()
+
+
+def test_a_cell_whose_start_frames_are_not_sent_is_refused_and_not_lost_as_well(
+    machine: Adapters, monkeypatch: pytest.MonkeyPatch
+):
+    def refuse(*_: object) -> None:
+        raise DeviceError("not sent")
+
+    monkeypatch.setattr(CanBus, "send", refuse)
+    with pytest.raises(DeviceError, match="not sent"):
+        cell_of(machine, {"interface": "virtual", "channel": "deaf"}, start_frames=["000#0100"])
+    assert not can_bus._open
+    while not machine._posted.empty():
+        machine._posted.get()()
+    assert machine.lost == []
