@@ -79,13 +79,10 @@ def item_hash(fields: dict[str, Any]) -> str:
     return digest(canonical({name: fields[name] for name in HASHED}))
 
 
-NEWEST = select(OutboxItem.chain, OutboxItem.seq, OutboxItem.hash).order_by(OutboxItem.id.desc()).limit(1)
-"""Asked for every second: put together once."""
-
-
 def head(session: Session) -> Head | None:
     """The newest item, or None where nothing was ever told."""
-    row = session.execute(NEWEST).first()
+    columns = (OutboxItem.chain, OutboxItem.seq, OutboxItem.hash)
+    row = session.execute(select(*columns).order_by(OutboxItem.id.desc()).limit(1)).first()
     return None if row is None else Head(*row)
 
 
