@@ -53,7 +53,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     rig.execute()
     recording = assembly.assemble(journal.read(rig.path))
     assert 2 in recording.columns["pulses/status"], "some pulses were dropped"
-    archive.seal(recording, folder)
+    archive.seal(recording, folder, rig.machine.disk)
     (folder / "table.csv").write_text(CSV)
     broken(folder, folder / "session-0.h5")
     return folder
