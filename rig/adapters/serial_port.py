@@ -26,19 +26,19 @@ class SerialPort:
     """See `rig.machine.Port`."""
 
     def __init__(self, path: str, clock: Clock, post: Post, **arguments: Any) -> None:
-        self._path, self._clock, self._post, self._arguments = path, clock, post, arguments
+        self.port, self._clock, self._post, self._arguments = path, clock, post, arguments
         self._serial: serial.Serial | None = None
         self._thread: threading.Thread | None = None
         self._closing = threading.Event()
 
     def open(self, on_bytes: Callable[[bytes, float], None], on_lost: Callable[[str], None]) -> None:
-        if not Path(self._path).exists():
-            raise DeviceError(f"stimulator.port: {self._path} is missing; plug in the stimulator or correct the port")
+        if not Path(self.port).exists():
+            raise DeviceError(f"stimulator.port: {self.port} is missing; plug in the stimulator or correct the port")
         try:
-            port = serial.Serial(self._path, timeout=READ_TIMEOUT_S, exclusive=True, **self._arguments)
+            port = serial.Serial(self.port, timeout=READ_TIMEOUT_S, exclusive=True, **self._arguments)
         except (serial.SerialException, OSError, ValueError) as error:
             raise DeviceError(
-                f"stimulator.port: {self._path} cannot be opened ({error}); is another program using it?"
+                f"stimulator.port: {self.port} cannot be opened ({error}); is another program using it?"
             ) from None
         self._serial = port
         self._refuse_fast_clock(port)
@@ -75,7 +75,7 @@ class SerialPort:
         if self._clock.speed != 1.0 and not place.startswith(PSEUDO_TERMINALS):
             self.close()
             raise DeviceError(
-                f"stimulator.port: {self._path} is {place}, a real device, and the rig's clock runs "
+                f"stimulator.port: {self.port} is {place}, a real device, and the rig's clock runs "
                 f"{self._clock.speed:g} times as fast as real time; use a rig file"
             )
 

@@ -48,7 +48,7 @@ class Latch:
             try:
                 await self._work(self._disk.remove, self._path)
             except OSError as error:
-                raise RigError(f"latch file: {self._path}: {error.strerror}") from None
+                raise RigError(f"latch file: {self._path}: {error.strerror}; free some disk space") from None
 
     async def written(self) -> None:
         """Wait until nothing waits to be written."""

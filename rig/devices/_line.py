@@ -40,9 +40,9 @@ class PacketLine:
         reader: Callable[[], FrameReader],
         on_packet: Callable[[Packet, float], None],
     ) -> None:
-        self.name = name
+        self.port = name
         self.last_written_s = -1e9
-        self._tasks, self._clock, self._port = machine.tasks, machine.tasks.clock, port
+        self._tasks, self._clock, self._serial = machine.tasks, machine.tasks.clock, port
         self._numbers, self._number = numbers, 0
         self._reader, self._frames = reader, reader()
         self._on_packet = on_packet
@@ -57,21 +57,21 @@ class PacketLine:
     async def open(self) -> None:
         """Open the port and start reading. Raises DeviceError, which names the port and says how to correct it."""
         self._frames = self._reader()
-        await self._tasks.work(self._port.open, self._read, self._lose)
+        await self._tasks.work(self._serial.open, self._read, self._lose)
         self._open, self._lost = True, ""
 
     def close(self) -> None:
         """Close the port; never raises."""
         self._open = False
         self._end("not opened")
-        self._port.close()
+        self._serial.close()
 
     def discard(self) -> None:
         """Discard bytes that were written but still wait in this computer, as on a stalled line.
 
         A frame that is cut by this is damaged, and the device drops it because of its checksum.
         """
-        self._port.discard()
+        self._serial.discard()
 
     def tell(self, make: Callable[[int], bytes], latest_s: float | None = None) -> int:
         """Write the frame that `make` returns for the next packet number; returns the number.
@@ -87,7 +87,7 @@ class PacketLine:
         try:
             frame = make(self._number)
         except WireError as error:
-            raise DeviceError(f"stimulator {self.name}: the command cannot be encoded: {error}") from None
+            raise DeviceError(f"stimulator {self.port}: the command cannot be encoded: {error}") from None
         self._write(frame, latest_s)
         return self._number
 
@@ -114,29 +114,29 @@ class PacketLine:
             del self._waiting[number]
         if not packets:
             why = self._lost or f"no answer in {timeout_s:g} s"
-            raise DeviceError(f"stimulator {self.name}: {name}: {why}; check its power")
+            raise DeviceError(f"stimulator {self.port}: {name}: {why}; check its power")
         if packets[0].command != answer:
-            raise DeviceError(f"stimulator {self.name}: {name}: answered with command {packets[0].command}")
+            raise DeviceError(f"stimulator {self.port}: {name}: answered with command {packets[0].command}")
         return packets[0]
 
     def _write(self, frame: bytes, latest_s: float | None) -> None:
         if self._lost:
-            raise DeviceError(f"stimulator {self.name} is not connected: {self._lost}")
+            raise DeviceError(f"stimulator {self.port} is not connected: {self._lost}")
         if latest_s is not None and not (self._clock.now_s() <= latest_s):
             raise LateError
         try:
-            written = self._port.write(frame)
+            written = self._serial.write(frame)
         except OSError as error:
-            raise DeviceError(f"stimulator {self.name} accepted no bytes: {error}") from None
+            raise DeviceError(f"stimulator {self.port} accepted no bytes: {error}") from None
         if written != len(frame):
-            raise DeviceError(f"stimulator {self.name} accepted {written} of {len(frame)} bytes; check its power")
+            raise DeviceError(f"stimulator {self.port} accepted {written} of {len(frame)} bytes; check its power")
         self.last_written_s = self._clock.now_s()
 
     def _read(self, data: bytes, time_s: float) -> None:
         try:
             self._take(data, time_s)
         except Exception as error:  # a bug in a driver: report it at once, not after a timeout
-            log.exception("the reader of %s failed", self.name)
+            log.exception("the reader of %s failed", self.port)
             self._lose(f"internal: {type(error).__name__}: {error}")
 
     def _take(self, data: bytes, time_s: float) -> None:
@@ -151,7 +151,7 @@ class PacketLine:
         if self._open:
             self._open = False
             self._end(reason)
-            self._on_lost(f"stimulator {self.name}: {reason}")
+            self._on_lost(f"stimulator {self.port}: {reason}")
 
     def _end(self, reason: str) -> None:
         """Nothing more is written or answered."""
