@@ -10,6 +10,7 @@ What takes long (a disk, building a plan) is handed to the owner with `work`, wh
 from __future__ import annotations
 
 import heapq
+import logging
 import math
 import types
 from collections import deque
@@ -18,6 +19,8 @@ from itertools import count
 from typing import Any, Generic, TypeVar
 
 from rig.clock import Clock
+
+log = logging.getLogger("rig.tasks")
 
 T = TypeVar("T")
 Outcome = Callable[[Any, BaseException | None], None]
@@ -31,6 +34,8 @@ class Signal:
     def __init__(self) -> None:
         self._set = False
         self._waiting: dict[Task[Any], int] = {}
+        self.awaited = False
+        """Whether anybody ever waited for it."""
 
     def is_set(self) -> bool:
         """Whether it is set."""
@@ -49,7 +54,7 @@ class Signal:
 
     def add(self, task: Task[Any], turn: int) -> None:
         """Wake this task, if it still waits in this turn."""
-        self._waiting[task] = turn
+        self._waiting[task], self.awaited = turn, True
 
 
 class Task(Generic[T]):
@@ -139,7 +144,10 @@ class Tasks:
             self._wake_due(self.clock.now_s())
             if not self._ready:
                 return self._next_s()
-            self._step(self._ready.popleft())
+            task = self._ready.popleft()
+            self._step(task)
+            if task.error is not None and not task.done.awaited:
+                log.error("task %s failed", task.name, exc_info=task.error)
 
     async def wait(self, until_s: float, *signals: Signal) -> bool:
         """Wait until a time, or until one of the signals is set: then True, at once if it is set already."""

@@ -108,7 +108,6 @@ class TestRun:
         self._watch = watch
         self._angle = AngleGuard(angle, test.plan, table, self._clock, watch)
         self._angle_counts: Recorded | None = None
-        self._asked_s: float | None = None
         self._rest_nm: float | None = None
         self._outcome: TestOutcome = "fault"
         self._duration_s = 0.0
@@ -192,11 +191,6 @@ class TestRun:
         """What ended it: stopped, fault, or why nothing more was laid."""
         return self.halt.cause or self.score.ended_by
 
-    def sender_age_s(self) -> float:
-        """Real seconds since the sender last asked for a health check; 0 while it has nothing to send."""
-        asked_s = self._asked_s
-        return 0.0 if asked_s is None else (self._clock.now_s() - asked_s) / self._clock.speed
-
     def elapsed_s(self) -> float:
         """Time on the test's clock, s; 0 before its start."""
         return 0.0 if self.t0_s is None else max(0.0, self._clock.now_s() - self.t0_s)
@@ -246,7 +240,6 @@ class TestRun:
                 self._at_rest()
             if await self._tasks.wait(due_s, self.halt.signal):
                 return
-            self._asked_s = clock.now_s()
             wrong = self._health.fault(due_s)
             if wrong is not None:
                 self._fault(wrong)
@@ -264,7 +257,6 @@ class TestRun:
 
     async def _stop(self) -> StopEvidence:
         """Stop the device, ask its state, watch the torque fall, end the journal."""
-        self._asked_s = None
         clock, cause = self._clock, self.halt.cause
         at_stop_nm = self._receiver.torque_around(AROUND_S * clock.speed)
         device = await stop_device(self._gate)

@@ -10,7 +10,8 @@ import os
 import queue
 import threading
 from collections.abc import Callable, Coroutine, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
+from functools import partial
 from typing import Any, TypeVar
 
 from rig.clock import Clock
@@ -37,7 +38,9 @@ class Driver:
         self.tasks = Tasks(clock, self._work)
         self._clock = clock
         self._inbox: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
-        self._pool = ThreadPoolExecutor(WORKERS, "work")
+        self._jobs: queue.SimpleQueue[tuple[Callable[[], Any], Outcome]] = queue.SimpleQueue()
+        for number in range(WORKERS):  # daemons: a disk that hangs keeps no process alive
+            threading.Thread(target=self._labour, name=f"work-{number}", daemon=True).start()
         self._thread = threading.Thread(target=self._run, name="rig", daemon=True)
         self._thread.start()
 
@@ -55,7 +58,6 @@ class Driver:
         """End the thread; tasks that still wait are forgotten."""
         self._inbox.put(None)
         self._thread.join()
-        self._pool.shutdown(wait=False)
 
     def _follow(self, task: Task[T], future: Future[T]) -> None:
         async def hand_over() -> None:
@@ -68,16 +70,17 @@ class Driver:
         self.tasks.spawn(hand_over(), "answer")
 
     def _work(self, action: Callable[[], Any], outcome: Outcome) -> None:
-        def run() -> None:
+        self._jobs.put((action, outcome))
+
+    def _labour(self) -> None:
+        while True:
+            action, outcome = self._jobs.get()
             try:
                 result = action()
             except BaseException as error:
-                failure = error
-                self.post(lambda: outcome(None, failure))
+                self.post(partial(outcome, None, error))
             else:
-                self.post(lambda: outcome(result, None))
-
-        self._pool.submit(run)
+                self.post(partial(outcome, result, None))
 
     def _run(self) -> None:
         while True:

@@ -29,6 +29,8 @@ log = logging.getLogger("rig")
 
 MAX_REQUEST_S = 60.0
 """Real seconds that a request may take: re-arming reopens both devices and seals journals that were left."""
+RETRY_S = 1.0
+"""Real seconds between two attempts to write a latch that the disk refused."""
 
 
 class Core:
@@ -204,12 +206,22 @@ class Core:
         return False
 
     async def _remember(self, state: Remembered, reason: str) -> None:
-        """Write the latch file. If the disk fails, the rig stays stopped, and the file still holds "running" from the
-        test's start, so that the next process starts as uncertain."""
+        """Write the latch file. If the disk fails, the rig stays stopped; a latch is written once the disk takes it.
+
+        Until then the file holds "running" if a test had begun, so that the next process starts as uncertain.
+        """
         try:
             await self._latch.write(state, reason)
         except RigError as error:
             log.error("%s", error)
+            if state == "latched":
+                self._tasks.spawn(self._remember_later(reason), "latch file")
+
+    async def _remember_later(self, reason: str) -> None:
+        await self._tasks.sleep(RETRY_S)
+        async with self._in_turn():  # not while somebody re-arms
+            if self._trial.state == "latched":
+                await self._remember("latched", reason)
 
     def _halted(self, reason: str) -> None:
         following = self._trial.halted(reason)

@@ -121,7 +121,12 @@ class Rig(Posing):
             await self._tasks.sleep(STOP_TIMEOUT_S, self._evidence_ready)
             if self._evidence is not None or self._trial.busy:
                 return self._evidence or self._unconfirmed("no more pulses are sent; the device did not answer in time")
+        evidence = await self._stop_idle()
         await self._latch.written()
+        return evidence
+
+    async def _stop_idle(self) -> StopEvidence:
+        """Ask the device although no test runs."""
         gate = self._pair.gate
         if gate is None:
             return StopEvidence(confirmed=False, detail="the stimulator is not connected; no pulse can be sent")
@@ -162,8 +167,13 @@ class Rig(Posing):
                 self.finished = event
                 self._publish(event)
             await self._rest.settle()
-            await self._latch.clear()
-            if self._stops != stops or self._trial.lost != stopped.lost:
+
+            def again() -> bool:
+                return self._stops != stops or self._trial.lost != stopped.lost
+
+            if not again():
+                await self._latch.clear()
+            if again():
                 await self._remember("latched", self._trial.reason)
                 raise BusyError("re-arm: the rig was stopped again meanwhile; look at the participant, then re-arm")
             log.info("re-armed by %s after: %s", by, stopped.reason)

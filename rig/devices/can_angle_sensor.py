@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import Field
 
 from rig.devices import DeviceSettings
-from rig.errors import ConfigError, DeviceError, WireError
+from rig.errors import ConfigError, DeviceError
 from rig.machine import Bus, Frame, Listener, Machine
 from rig.signals import ANGLE_SAMPLE, AngleBlock, AngleScale
 from rig.wire import dbc
@@ -105,16 +105,12 @@ class CanAngleSensor:
     def decode(self, frames: Sequence[Frame], damaged: int = 0, errors: int = 0) -> AngleBlock:
         """The samples of frames, in their order; damaged ones are counted. Pure."""
         rows: list[tuple[float, float, float, float, int, int]] = []
-        for frame in frames:
-            try:
-                found = self._frame.decode(frame.data)
-            except WireError:
-                damaged += 1
-                continue
+        readable, unreadable = self._frame.decode_all(frames)
+        for frame, found in readable:
             rows.append((frame.host_time_s, frame.stamp_s, found.values[0], math.nan, found.counter, found.flag))
         samples = np.array(rows, dtype=ANGLE_SAMPLE)
         samples["angle_rad"] = self.scale.angle_rad(samples["raw"])
-        return AngleBlock(samples, damaged, errors)
+        return AngleBlock(samples, damaged + unreadable, errors)
 
 
 def create(settings: Settings, machine: Machine) -> CanAngleSensor:

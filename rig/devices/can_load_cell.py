@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import Field, field_validator
 
 from rig.devices import DeviceSettings
-from rig.errors import ConfigError, DeviceError, WireError
+from rig.errors import ConfigError, DeviceError
 from rig.machine import Bus, Frame, Listener, Machine
 from rig.signals import SAMPLE, TorqueBlock
 from rig.wire import dbc
@@ -111,18 +111,14 @@ class CanLoadCell:
     def decode(self, frames: Sequence[Frame], damaged: int = 0, errors: int = 0) -> TorqueBlock:
         """The samples of frames, in their order; damaged ones are counted. Pure."""
         rows: list[tuple[float, float, float, int, int]] = []
-        for frame in frames:
-            try:
-                found = self._frame.decode(frame.data)
-            except WireError:
-                damaged += 1
-                continue
+        readable, unreadable = self._frame.decode_all(frames)
+        for frame, found in readable:
             n = len(found.values)
             for i, value in enumerate(found.values):
                 counter = found.counter * n + i if found.counter >= 0 else -1
                 stamp_s = frame.stamp_s - (n - 1 - i) / self.sample_rate_hz  # a frame is sent with its last sample
                 rows.append((frame.host_time_s, stamp_s, value * self._settings.scale_nm, counter, found.flag))
-        return TorqueBlock(np.array(rows, dtype=SAMPLE), damaged, errors)
+        return TorqueBlock(np.array(rows, dtype=SAMPLE), damaged + unreadable, errors)
 
 
 def create(settings: Settings, machine: Machine) -> CanLoadCell:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -16,6 +16,7 @@ from cantools.database.can import Message
 from cantools.database.namedsignalvalue import NamedSignalValue
 
 from rig.errors import ConfigError, WireError
+from rig.machine import Frame
 
 PACKAGED = "torque_default"
 """The default description: frame 0x181, float32 in N·m, counter, sync bit."""
@@ -135,6 +136,16 @@ class SampleFrame:
     def samples_per_frame(self) -> int:
         """Number of samples per frame."""
         return len(self._signals)
+
+    def decode_all(self, frames: Iterable[Frame]) -> tuple[list[tuple[Frame, FrameSamples]], int]:
+        """The frames that can be read, each with its values, and how many cannot."""
+        found, damaged = [], 0
+        for frame in frames:
+            try:
+                found.append((frame, self.decode(frame.data)))
+            except WireError:
+                damaged += 1
+        return found, damaged
 
     def decode(self, data: bytes) -> FrameSamples:
         """Values of one frame; NaN where the description has a word for a value (`VAL_`, as "no reading").

@@ -252,3 +252,21 @@ def test_a_disk_that_fails_at_each_moment_of_a_start(make: Make):
         assert live.rearm().state == "ready"
         live.start(live.plan("two", hold_s=0.5))
         live.wait("ready")
+
+
+def test_a_latch_that_the_disk_refused_is_written_once_it_takes_it(make: Make):
+    """Else a rig that dies later would start as if nobody had stopped it (the simulator's seed 700251)."""
+    live = make(disk=SimulatedDisk(World(0)), clock=None)
+    disk: Any = live.machine.disk
+    disk.failing = True
+    assert live.stop("somebody pressed").confirmed
+    live.machine.wait(3.0)
+    with pytest.raises(FileNotFoundError):
+        remembered(live)
+    disk.failing = False
+    live.machine.wait(2.0)
+    assert remembered(live) == {"state": "latched", "reason": "somebody pressed (by nurse)"}
+    assert live.rearm().state == "ready"
+    live.machine.wait(5.0)
+    with pytest.raises(FileNotFoundError):
+        remembered(live)

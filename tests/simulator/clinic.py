@@ -57,7 +57,6 @@ class Clinic:
     process: Process | None = None
     rig: Rig | None = None
     state: str = "disconnected"
-    laid: int = 0
     tests: int = 0
 
     def meet(self, process: Process, rig: Rig) -> None:

@@ -32,6 +32,8 @@ class SimulatedDisk:
         """How long each piece of work takes at least."""
         self.access: Callable[[], None] = lambda: None
         """Called at each append: there a step may be stalled."""
+        self.replaced: list[tuple[float, str, bool]] = []
+        """Each file that was to be replaced: when, its name, and whether the disk took it."""
         self._locked = False
 
     def work_s(self) -> float:
@@ -64,6 +66,8 @@ class SimulatedDisk:
         return bytes(self.files[path].data)
 
     def replace(self, path: Path, data: bytes) -> None:
+        takes = not self.failing and self.free >= len(data)
+        self.replaced.append((self.world.now_s, path.name, takes))
         self._may_write(path, len(data))
         self.files[path] = _File(data, len(data))
 

@@ -78,7 +78,6 @@ class Process:
         self._inbox: list[Callable[[], None]] = []
         self._wake_s = math.inf
         self._turns = 0
-        self._ids = 0
 
     def post(self, action: Callable[[], None]) -> None:
         """Something came for this process."""
@@ -96,7 +95,7 @@ class Process:
     def open_bus(self, arguments: dict[str, Any], name: str) -> Bus:
         return self._ports.open_bus(self, arguments, name)
 
-    def shared_bus(self, _arguments: dict[str, Any], _name: str) -> Bus | None:
+    def shared_bus(self, arguments: dict[str, Any], name: str) -> Bus | None:  # noqa: ARG002
         return self._ports.shared_bus(self)
 
     @contextlib.contextmanager
@@ -104,7 +103,6 @@ class Process:
         yield
 
     def new_id(self) -> str:
-        self._ids += 1
         return f"{self.world.chance.getrandbits(128):032x}"
 
     def cpu_s(self) -> float:

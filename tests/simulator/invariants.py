@@ -171,8 +171,19 @@ def _barred(life: Life) -> list[tuple[float, float]]:
     began = [asked.obeyed_s for asked in life.clinic.asked if asked.kind == "stop" and asked.obeyed_s is not None]
     began += [time_s for time_s, _, state in life.clinic.states if state in ("latched", "uncertain")]
     until = [(since_s, min((time_s for time_s in rearmed if time_s > since_s), default=np.inf)) for since_s in began]
+    until = [(since_s, min(until_s, _forgotten(life, since_s))) for since_s, until_s in until]
     born = [time_s for time_s, _, state in life.clinic.states if state in STATES]
     return until + [(death_s, min((s for s in born if s > death_s), default=np.inf)) for death_s in life.deaths]
+
+
+def _forgotten(life: Life, since_s: float) -> float:
+    """When a process died whose latch no disk had taken: the next one cannot know of it; infinite: none."""
+    for death_s in life.deaths:
+        written = (took for time_s, name, took in life.disk.replaced if name == "latch.json" and time_s < death_s)
+        latches = list(written)
+        if death_s > since_s and latches and not latches[-1]:
+            return death_s
+    return np.inf
 
 
 Sent = tuple[float, float, int]

@@ -81,7 +81,7 @@ class VirtualMachine:
     def open_bus(self, arguments: dict[str, Any], name: str) -> Bus:
         raise NotImplementedError(arguments, name)
 
-    def shared_bus(self, _arguments: dict[str, Any], _name: str) -> Bus | None:
+    def shared_bus(self, arguments: dict[str, Any], name: str) -> Bus | None:  # noqa: ARG002
         return None
 
     @contextlib.contextmanager
