@@ -18,6 +18,7 @@ log = logging.getLogger("rig")
 
 STOP_TIMEOUT_S = 6.0
 """Real seconds to wait for the evidence of a stop, including the fall of the torque."""
+STOPPED_AGAIN = "re-arm: the rig was stopped again meanwhile; look at the participant, then re-arm"
 SEALED_WITHIN_S = 30.0
 """Real seconds within which a test that was stopped is sealed."""
 
@@ -154,8 +155,11 @@ class Rig(Posing):
         DeviceError
             A device does not answer: the rig stays stopped.
         """
+        stops = self._stops  # before its turn: a stop that comes while it waits is not what the person saw
         async with self._in_turn():
-            stopped, stops = self._trial, self._stops
+            if self._stops != stops:
+                raise BusyError(STOPPED_AGAIN)
+            stopped = self._trial
             following = stopped.rearm()
             if stopped.lost or not await self._pair.both_answer():
                 try:
@@ -175,7 +179,7 @@ class Rig(Posing):
                 await self._latch.clear()
             if again():
                 await self._remember("latched", self._trial.reason)
-                raise BusyError("re-arm: the rig was stopped again meanwhile; look at the participant, then re-arm")
+                raise BusyError(STOPPED_AGAIN)
             log.info("re-armed by %s after: %s", by, stopped.reason)
             self._change(following)
         return self.status()

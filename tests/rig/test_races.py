@@ -270,3 +270,16 @@ def test_a_latch_that_the_disk_refused_is_written_once_it_takes_it(make: Make):
     live.machine.wait(5.0)
     with pytest.raises(FileNotFoundError):
         remembered(live)
+
+
+def test_a_rearm_that_waits_its_turn_releases_no_stop_that_came_meanwhile(make: Make):
+    """Two people re-arm at once, and somebody presses stop before the second one's turn."""
+    live = make(disk=SimulatedDisk(World(0)), clock=None)
+    live.stop("first")
+    one, two = (live.begin(live.rig.rearm(name)) for name in ("nurse", "doctor"))
+    live.machine.wait(0.001)
+    assert live.stop("second").confirmed
+    live.until(two.done.is_set)
+    assert all(isinstance(task.error, BusyError) for task in (one, two))
+    assert live.rig.status().state == "latched"
+    assert remembered(live)["state"] == "latched"

@@ -34,6 +34,7 @@ class SimulatedDisk:
         """Called at each append: there a step may be stalled."""
         self.replaced: list[tuple[float, str, bool]] = []
         """Each file that was to be replaced: when, its name, and whether the disk took it."""
+        self.removed: list[tuple[float, str]] = []
         self._locked = False
 
     def work_s(self) -> float:
@@ -78,6 +79,7 @@ class SimulatedDisk:
     def remove(self, path: Path) -> None:
         self._may_write(path)
         self.files.pop(path, None)
+        self.removed.append((self.world.now_s, path.name))
 
     def names(self, folder: Path) -> list[str]:
         return sorted(path.name for path in self.files if path.parent == folder)

@@ -162,18 +162,29 @@ def _true(life: Life) -> list[Felt]:
 
 
 def _barred(life: Life) -> list[tuple[float, float]]:
-    """Times during which nothing may be written, world's time."""
+    """Times during which nothing may be written, world's time. A re-arm counts for what was before it was asked for."""
     rearmed = [
-        asked.replied_s
+        (asked.sent_s, _effect_s(life, asked))
         for asked in life.clinic.asked
-        if asked.kind == "rearm" and asked.reply is not None and asked.reply.ok and asked.replied_s is not None
+        if asked.kind == "rearm" and asked.obeyed_s is not None and not _refused(asked)
     ]
     began = [asked.obeyed_s for asked in life.clinic.asked if asked.kind == "stop" and asked.obeyed_s is not None]
     began += [time_s for time_s, _, state in life.clinic.states if state in ("latched", "uncertain")]
-    until = [(since_s, min((time_s for time_s in rearmed if time_s > since_s), default=np.inf)) for since_s in began]
+    until = [
+        (since_s, min((by_s for sent_s, by_s in rearmed if sent_s > since_s), default=np.inf)) for since_s in began
+    ]
     until = [(since_s, min(until_s, _forgotten(life, since_s))) for since_s, until_s in until]
     born = [time_s for time_s, _, state in life.clinic.states if state in STATES]
     return until + [(death_s, min((s for s in born if s > death_s), default=np.inf)) for death_s in life.deaths]
+
+
+def _effect_s(life: Life, rearm: Asked) -> float:
+    """When a re-arm took effect: replied to, or the latch gone from the disk before the process died."""
+    if rearm.replied_s is not None:
+        return rearm.replied_s
+    death_s = min((time_s for time_s in life.deaths if time_s > (rearm.obeyed_s or 0.0)), default=np.inf)
+    gone = (time_s for time_s, name in life.disk.removed if name == "latch.json" and time_s > (rearm.obeyed_s or 0.0))
+    return next((time_s for time_s in gone if time_s <= death_s), np.inf)
 
 
 def _forgotten(life: Life, since_s: float) -> float:
