@@ -17,7 +17,7 @@ import time
 from dataclasses import asdict
 from multiprocessing.util import Finalize
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, BinaryIO
 
 from api.cohort.sources import Entry
 from api.cohort.tasks import Task
@@ -55,9 +55,7 @@ class Computing:
         """What the process could not be shut in from, and why."""
         self._rest = b""
         tidy()
-        self._folder = Path(tempfile.mkdtemp(prefix=PREFIX))
-        self._lock = (self._folder / LOCK).open("wb")
-        fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        self._folder, self._lock = make_folder()
 
     def compute(self, content: bytes, entry: Entry, task: Task, limit_s: float) -> dict[str, Any]:
         """The row of a record, `{"left_out": True}` where it is not meant; how the process ended is a row, too."""
@@ -174,6 +172,14 @@ def _sound(line: bytes) -> dict[str, Any] | None:
     if isinstance(row, dict) and row.get("status") in ("ok", "error"):
         return {"row": row}
     return {"left_out": True} if found == {"left_out": True} else None
+
+
+def make_folder() -> tuple[Path, BinaryIO]:
+    """A folder for records, with its lock: `tidy` of another worker finds it only once the lock is held."""
+    made = Path(tempfile.mkdtemp(prefix=f"new-{PREFIX}"))
+    lock = (made / LOCK).open("wb")
+    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    return made.rename(made.with_name(made.name.removeprefix("new-"))), lock
 
 
 def tidy() -> None:

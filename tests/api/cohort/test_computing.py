@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import os
 import signal
@@ -192,6 +193,24 @@ def test_what_a_killed_worker_left_is_taken_away(tmp_path: Path, monkeypatch: py
     assert len(list(tmp_path.iterdir())) == 2
     living.close()
     other.close()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_no_other_worker_takes_away_a_folder_that_is_being_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    take_lock = fcntl.flock
+
+    def tidied_before(file: Any, how: int) -> None:
+        monkeypatch.setattr(fcntl, "flock", take_lock)
+        parent.tidy()  # another worker starts just then
+        take_lock(file, how)
+
+    monkeypatch.setattr(fcntl, "flock", tidied_before)
+    worker = Computing(MEMORY)
+    assert [file.name for place in tmp_path.iterdir() for file in place.iterdir()] == [parent.LOCK]
+    worker.close()
     assert list(tmp_path.iterdir()) == []
 
 
