@@ -95,13 +95,15 @@ class Trial:
         return replace(self, state="running")
 
     def halted(self, reason: str) -> Trial:
-        """A stop or a fault, at any time: an idle rig latches at once, a test is ended first."""
+        """A stop or a fault, at any time: an idle rig latches at once, also without devices; a test is ended first."""
         if self.state in ("arming", "running"):
             return replace(self, state="stopping", reason=reason, latch=True)
         if self.busy:
             return replace(self, reason=self.reason or reason, latch=True)
         if self.state in ("ready", "calibrating"):
             return Trial("latched", reason)
+        if self.state == "disconnected":
+            return Trial("latched", reason, lost=self.reason)
         return self
 
     def ended(self) -> Trial:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -97,6 +98,8 @@ class TestRun:
         self.score = Score(test, table, journal, machine.tasks)
         self.halt = halt
         self.started = Signal()
+        self.on_evidence: Callable[[StopEvidence], None] = lambda _: None
+        """Called when the device has been stopped and the torque watched."""
         self.t0_s: float | None = None
         self.told_pulses = 0
         """How many pulses earlier live events contained; who makes these events counts here, in a thread of its own."""
@@ -142,6 +145,7 @@ class TestRun:
             log.exception("the test failed")
             self._fault(f"internal: {type(error).__name__}: {error}")
         found = await self._stop()
+        self.on_evidence(found)  # whoever waits for it waits for no disk
         elapsed_s = max((self._clock.now_s() - began_s) / self._clock.speed, 1e-9)
         cpu_percent = 100 * (self._machine.cpu_s() - cpu_s) / elapsed_s
         await disk.end()

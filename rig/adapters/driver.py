@@ -21,7 +21,7 @@ log = logging.getLogger("rig.driver")
 
 T = TypeVar("T")
 PRIORITY = 50
-WORKERS = 4
+WORKERS = 8
 LONGEST_WAIT_S = 3600.0
 
 

@@ -1,12 +1,20 @@
 """Limits the connections of a socket, so that idle clients cannot keep out an active one.
 
 A connection that has not yet sent a complete request is silent; the others are active. Both kinds are limited in
-number: a new connection closes the one of its kind that has been idle longest. So a new client can always connect.
+number: a new connection closes the one of its kind that has been idle longest, but none whose request may not have been
+read yet. So a client that connects is heard, however many come at once.
 """
 
 from __future__ import annotations
 
 import asyncio
+import time
+from collections.abc import Callable
+
+GRACE_S = 2.0
+"""So long after it came, or after its last request, a connection is closed for no other."""
+MOST_AT_ONCE = 600
+"""Beyond this number a new connection is closed at once: more than a listening socket's backlog."""
 
 
 class Connections:
@@ -15,12 +23,15 @@ class Connections:
     Parameters
     ----------
     max_silent, max_active
-        Largest number of each kind.
+        Number of each kind that is kept.
+    monotonic
+        Seconds.
     """
 
-    def __init__(self, max_silent: int, max_active: int) -> None:
+    def __init__(self, max_silent: int, max_active: int, monotonic: Callable[[], float] = time.monotonic) -> None:
         self._most = {False: max_silent, True: max_active}
-        self._members: dict[bool, dict[asyncio.BaseTransport, None]] = {False: {}, True: {}}
+        self._members: dict[bool, dict[asyncio.BaseTransport, float]] = {False: {}, True: {}}
+        self._monotonic = monotonic
 
     def __len__(self) -> int:
         return sum(len(members) for members in self._members.values())
@@ -40,9 +51,12 @@ class Connections:
             members.pop(transport, None)
 
     def _put(self, transport: asyncio.BaseTransport, spoken: bool) -> None:
-        members = self._members[spoken]
-        members[transport] = None  # the newest is last: dictionaries keep their order
+        members, now_s = self._members[spoken], self._monotonic()
+        members[transport] = now_s  # the newest is last: dictionaries keep their order
         if len(members) > self._most[spoken]:
-            longest = next(iter(members))
-            del members[longest]
-            longest.abort() if isinstance(longest, asyncio.WriteTransport) else longest.close()
+            longest, since_s = next(iter(members.items()))
+            if now_s - since_s < GRACE_S:
+                longest = transport if len(members) > MOST_AT_ONCE else None
+            if longest is not None:
+                del members[longest]
+                longest.abort() if isinstance(longest, asyncio.WriteTransport) else longest.close()

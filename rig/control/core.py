@@ -19,7 +19,7 @@ from rig.control.live import finite, live_event
 from rig.control.pair import Pair
 from rig.control.rest import Rest
 from rig.control.sealing import RecordingStore
-from rig.errors import DeviceError, RigError
+from rig.errors import BusyError, DeviceError, RigError
 from rig.machine import Machine
 from rig.messages import AngleStatus, Event, FinishedEvent, LiveEvent, StateEvent, Status, StopEvidence
 from rig.tasks import Signal, Task, Turn
@@ -50,6 +50,9 @@ class Core:
         self._store = RecordingStore(config, machine)
         self._latch = Latch(config.data_dir, machine)
         self._rest = Rest(config.data_dir, machine)
+        self._latching: Task[None] | None = None
+        """Writes the latch of the last stop."""
+        self._closing = False
         self._turn = Turn(machine.tasks)
         self._turn_since_s: float | None = None
         self._trial = Trial()
@@ -175,13 +178,20 @@ class Core:
 
     @contextlib.asynccontextmanager
     async def _in_turn(self) -> AsyncIterator[None]:
-        """For requests that begin something: one after the other."""
+        """For requests that begin something: one after the other. Raises BusyError once the rig shuts down."""
         async with self._turn:
+            if self._closing:
+                raise BusyError("the rig is shutting down")
             self._turn_since_s = self._clock.now_s()
             try:
                 yield
             finally:
                 self._turn_since_s = None
+
+    def _refuse_unseen(self, stops: int) -> None:
+        """Raise BusyError if the rig was stopped since `_stops` was so: who asked then has not seen it."""
+        if self._stops != stops:
+            raise BusyError("the rig was stopped while this waited; look at the participant, then ask again")
 
     def _fault(self, reason: str) -> None:
         """A device reports a fault."""
@@ -215,18 +225,19 @@ class Core:
         except RigError as error:
             log.error("%s", error)
             if state == "latched":
-                self._tasks.spawn(self._remember_later(reason), "latch file")
+                self._tasks.spawn(self._remember_later(), "latch file")
 
-    async def _remember_later(self, reason: str) -> None:
+    async def _remember_later(self) -> None:
         await self._tasks.sleep(RETRY_S)
-        async with self._in_turn():  # not while somebody re-arms
+        async with self._turn:  # not while somebody re-arms
             if self._trial.state == "latched":
-                await self._remember("latched", reason)
+                await self._remember("latched", self._trial.reason)
 
     def _halted(self, reason: str) -> None:
         following = self._trial.halted(reason)
-        if following.state == "latched" and following != self._trial:
-            self._tasks.spawn(self._remember("latched", reason), "latch file")
+        if following.state == "latched" or (following.state == "sealing" and following.latch):
+            # behind whatever is being written: a clear that was under way does not come last
+            self._latching = self._tasks.spawn(self._remember("latched", following.reason), "latch file")
         self._change(following)
 
     def _change(self, trial: Trial) -> None:

@@ -22,6 +22,7 @@ class Latch:
     def __init__(self, folder: Path, machine: Machine) -> None:
         self._path = folder / "latch.json"
         self._disk, self._work, self._turn = machine.disk, machine.tasks.work, Turn(machine.tasks)
+        self._stored: bytes | None = None
 
     async def read(self) -> tuple[Remembered | None, str]:
         """The stored state and its reason; an unreadable file counts as a running test."""
@@ -37,20 +38,20 @@ class Latch:
         """Store a state. Raises RigError if the disk fails: then nothing may start."""
         data = json.dumps({"state": state, "reason": reason}).encode()
         async with self._turn:
+            if data == self._stored:
+                return
+            self._stored = None
             try:
                 await self._work(self._disk.replace, self._path, data)
             except OSError as error:
                 raise RigError(f"latch file: {self._path}: {error.strerror}; free some disk space") from None
+            self._stored = data
 
     async def clear(self) -> None:
         """Remove the state: a person has re-armed, or a test has ended well. Raises RigError."""
         async with self._turn:
+            self._stored = None
             try:
                 await self._work(self._disk.remove, self._path)
             except OSError as error:
                 raise RigError(f"latch file: {self._path}: {error.strerror}; free some disk space") from None
-
-    async def written(self) -> None:
-        """Wait until nothing waits to be written."""
-        async with self._turn:
-            pass

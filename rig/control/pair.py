@@ -94,6 +94,9 @@ class Pair:
         if not safe:
             log.warning("the stimulator was found %s; stopped", state)
             await gate.stop()
+            safe, state = await gate.state()
+            if not safe:
+                raise DeviceError(f"stimulator: it was stopped, and still says {state}; switch it off and on")
 
     async def disconnect(self) -> None:
         """Stop stimulation and close all; never raises."""
@@ -119,10 +122,10 @@ class Pair:
             return False
         try:
             await self.gate.stop()
-            await self.gate.state()
+            safe, _ = await self.gate.state()
         except DeviceError:
             return False
-        return await self.torque_comes()
+        return safe and await self.torque_comes()
 
     async def torque_comes(self) -> bool:
         """Whether a new sample arrives within a short time from now."""

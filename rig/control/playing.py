@@ -11,8 +11,8 @@ from rig import limits, plan
 from rig.acquire.halt import Halt
 from rig.acquire.run import RunResult, TestRun
 from rig.control.core import Core
-from rig.errors import PlanError, RigError
-from rig.messages import FinishedEvent
+from rig.errors import DeviceError, PlanError, RigError
+from rig.messages import FinishedEvent, StopEvidence
 from rig.trial import Trial
 
 log = logging.getLogger("rig")
@@ -36,13 +36,14 @@ class Playing(Core):
         try:
             await self._latch.write("running", f"test {following.test_id} of participant {following.participant}")
             journal = await self._tasks.work(self._store.begin, test, self._pair.identity, self._of_angle())
-        except RigError:
+            gate, receiver, angle = self._pair.gate, self._pair.receiver, self._pair.angle
+            if gate is None or receiver is None:
+                raise DeviceError("the devices were disconnected before the test began")
+        except Exception:
             await self._not_begun(before)
             raise
-        gate, receiver, angle = self._pair.gate, self._pair.receiver, self._pair.angle
-        assert gate is not None
-        assert receiver is not None
         self._run = TestRun(test, table, journal, gate, receiver, self._machine, halt, self._watch, angle)
+        self._run.on_evidence = self._take_evidence
         self._playing = self._tasks.spawn(self._execute(self._run), "test")
 
     async def _not_begun(self, before: Trial) -> None:
@@ -58,12 +59,14 @@ class Playing(Core):
                 await self._latch.clear()
         self._evidence_ready.set()
 
+    def _take_evidence(self, evidence: StopEvidence) -> None:
+        self._evidence = evidence
+        self._evidence_ready.set()
+
     async def _execute(self, run: TestRun) -> None:
         self._tasks.spawn(self._announce(run), "announce")
         try:
             result = await run.execute()
-            self._evidence = result.evidence
-            self._evidence_ready.set()  # a stop's evidence does not wait for the disk
             await self._remember_pulse(result)
             self._change(self._trial.ended())
             finished = await self._tasks.work(self._store.finish, run.journal_path, run.plan.test_id, result)

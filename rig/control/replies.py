@@ -25,7 +25,7 @@ def id_of(line: bytes) -> int:
     """The id of an invalid request; 0 if it has none."""
     if (head := head_of(line)) is not None:
         return head[1]
-    with contextlib.suppress(ValueError, TypeError, AttributeError, RecursionError):
+    with contextlib.suppress(ValueError, TypeError, AttributeError, RecursionError, OverflowError):
         return int(json.loads(line).get("id", 0))
     return 0
 

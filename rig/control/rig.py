@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from dataclasses import replace
 
 from rig import limits, plan
@@ -18,7 +19,8 @@ log = logging.getLogger("rig")
 
 STOP_TIMEOUT_S = 6.0
 """Real seconds to wait for the evidence of a stop, including the fall of the torque."""
-STOPPED_AGAIN = "re-arm: the rig was stopped again meanwhile; look at the participant, then re-arm"
+LONGEST_WORDS = 300
+"""Characters of a stop's reason that are kept: a longer one stops, too."""
 SEALED_WITHIN_S = 30.0
 """Real seconds within which a test that was stopped is sealed."""
 
@@ -72,11 +74,13 @@ class Rig(Posing):
 
     async def close(self) -> None:
         """Stop a running test, wait until it is sealed, disconnect. A start that is under way does not begin."""
+        self._closing = True
         self._change(self._trial.disconnected("the rig is shutting down"))
         await self.stop("the rig is shutting down", "rig", latch_idle=False)
         if self._playing is not None:
             await self._tasks.sleep(SEALED_WITHIN_S, self._playing.done)
         await self._pair.disconnect()
+        await self._latch_written()  # of a stop that came meanwhile
         self._folder_lock.__exit__(None, None, None)
 
     async def start(self, request: TestPlan, key: str = "") -> Status:
@@ -92,9 +96,11 @@ class Rig(Posing):
             The journal or the latch file cannot be written.
         """
         self._trial.may_start()  # before its turn: a start that was asked for while stopped must not run later
+        stops = self._stops
         await self._await_angle(request)
         async with self._in_turn():
             self._trial.may_start()
+            self._refuse_unseen(stops)
             check_names("plan", test_id=request.test_id, participant=request.participant)
             check_key(request, key)
             table = limits.for_plan(self._table, request)
@@ -117,14 +123,21 @@ class Rig(Posing):
 
     async def stop(self, reason: str, by: str, latch_idle: bool = True) -> StopEvidence:
         """Stop stimulation now, latch, and return what device and torque showed afterwards."""
-        words = f"{reason} (by {by})" if by else reason
+        words = f"{reason:.{LONGEST_WORDS}} (by {by:.{LONGEST_WORDS}})" if by else f"{reason:.{LONGEST_WORDS}}"
         if self._end("stopped", words, latch_idle):
             await self._tasks.sleep(STOP_TIMEOUT_S, self._evidence_ready)
+            if self._trial.state == "sealing":
+                await self._latch_written()
             if self._evidence is not None or self._trial.busy:
                 return self._evidence or self._unconfirmed("no more pulses are sent; the device did not answer in time")
         evidence = await self._stop_idle()
-        await self._latch.written()
+        await self._latch_written()
         return evidence
+
+    async def _latch_written(self) -> None:
+        """Wait until what the next process has to know of the last stop is stored, or the disk refused it."""
+        if self._latching is not None:
+            await self._tasks.wait(math.inf, self._latching.done)
 
     async def _stop_idle(self) -> StopEvidence:
         """Ask the device although no test runs."""
@@ -155,10 +168,9 @@ class Rig(Posing):
         DeviceError
             A device does not answer: the rig stays stopped.
         """
-        stops = self._stops  # before its turn: a stop that comes while it waits is not what the person saw
+        stops = self._stops
         async with self._in_turn():
-            if self._stops != stops:
-                raise BusyError(STOPPED_AGAIN)
+            self._refuse_unseen(stops)
             stopped = self._trial
             following = stopped.rearm()
             if stopped.lost or not await self._pair.both_answer():
@@ -179,7 +191,7 @@ class Rig(Posing):
                 await self._latch.clear()
             if again():
                 await self._remember("latched", self._trial.reason)
-                raise BusyError(STOPPED_AGAIN)
+                raise BusyError("re-arm: the rig was stopped again meanwhile; look at the participant, then re-arm")
             log.info("re-armed by %s after: %s", by, stopped.reason)
             self._change(following)
         return self.status()

@@ -21,9 +21,9 @@ from rig.control.connections import Connections
 from rig.control.previews import Previews
 from rig.control.replies import head_of, id_of, invalid_request, refusal, to_line
 from rig.control.rig import Rig
-from rig.control.stop_server import StopServer
+from rig.control.stop_server import MAX_LINE_BYTES, StopServer
 from rig.errors import BusyError, ConfigError, PlanError, RigError
-from rig.messages import LONGEST_LINE, Event, LiveEvent, StateEvent, Status, stop_socket
+from rig.messages import LONGEST_LINE, Event, LiveEvent, StateEvent, Status, StopRequest, stop_socket
 
 log = logging.getLogger("rig.socket")
 
@@ -152,7 +152,9 @@ class Server:
     async def _answer(self, line: bytes, writer: asyncio.StreamWriter, crowded: bool) -> None:
         head = head_of(line)
         kind = head[0] if head else ""
-        if kind == "stop" and self._stop_server is not None:  # uses the threads reserved for stops
+        if kind == "stop" and self._stop_server is not None:
+            if head and len(line) > MAX_LINE_BYTES:  # it stops, but is not parsed: that would delay the sender
+                line = to_line(StopRequest(id=head[1], reason="a stop with a request that is too long"))
             _write(writer, to_line(await self._stop_server.answer(line)))
             return
         try:

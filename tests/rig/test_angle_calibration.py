@@ -363,6 +363,22 @@ def test_a_stop_does_not_wait_behind_a_start_that_waits_for_an_angle(angled: Ang
     assert live.stimulator.sent == []
 
 
+def test_a_start_that_waits_for_an_angle_is_not_played_after_a_stop_and_a_rearm(angled: Angled):
+    live = angled()
+    live.sensor.gone = True
+    live.machine.wait(2.0)
+    starting = live.begin(live.rig.start(live.plan("t", **HELD)))
+    live.machine.wait(0.4)
+    assert live.stop("pressed").confirmed
+    live.machine.wait(0.8)
+    assert live.rearm().state == "ready"
+    live.sensor.gone = False
+    live.until(starting.done.is_set)
+    assert isinstance(starting.error, BusyError)
+    live.machine.wait(8.0)
+    assert live.stimulator.sent == []
+
+
 def test_a_clinics_rig_needs_a_calibration_for_an_angle(angled: Angled):
     live = angled(require_calibration=True)
     passive = {"kind": "passive", "angle": AnglePlan(range_rad=(0.2, 2.0))}

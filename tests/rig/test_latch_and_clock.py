@@ -40,9 +40,8 @@ def test_what_is_asked_for_first_is_written_first_however_slow_the_disk_is(tmp_p
     slow_work(machine, 0.5, 0.1, 0.3)
     latch = Latch(tmp_path, machine)
     asked = latch.write("running", "test 7"), latch.clear(), latch.write("latched", "electrode")
-    for number, one in enumerate(asked):
-        machine.tasks.begin(one, str(number))
-    machine.run(latch.written())
+    tasks = [machine.tasks.begin(one, str(number)) for number, one in enumerate(asked)]
+    machine.run(machine.tasks.join(tasks[-1]))
     assert machine.clock.now_s() == pytest.approx(1000.9)
     assert '"electrode"' in (tmp_path / "latch.json").read_text()
 

@@ -283,3 +283,63 @@ def test_a_rearm_that_waits_its_turn_releases_no_stop_that_came_meanwhile(make: 
     assert all(isinstance(task.error, BusyError) for task in (one, two))
     assert live.rig.status().state == "latched"
     assert remembered(live)["state"] == "latched"
+
+
+@pytest.mark.parametrize("begin", ["re-arming", "sealing"])
+def test_a_stop_is_remembered_by_the_next_process_once_it_is_answered(make: Make, begin: str):
+    """Whatever was being written when it came, and at whichever moment after its answer the process dies."""
+
+    def before(live: LiveRig) -> None:
+        live.stop("first")
+        if begin == "sealing":
+            live.rearm()
+            live.start(live.plan("one", hold_s=0.5))
+            live.wait("sealing")
+
+    def go_on(live: LiveRig) -> Coroutine[Any, Any, Any]:
+        return live.rig.rearm("nurse") if begin == "re-arming" else live.machine.tasks.sleep(2.0)
+
+    for live, _ in moments(make, go_on, lambda live: live.states[-1] == "ready", before):
+        live.stop("now")
+        died = live.clock.now_s()
+        while live.clock.now_s() < died + 0.3:
+            latch = live.config.data_dir / "latch.json"
+            left = live.machine.disk.names(live.config.data_dir / "journals")
+            assert left or latch.name in live.machine.disk.names(latch.parent)
+            live.machine.wait(0.001)
+
+
+def test_a_bug_while_a_tests_files_are_made_leaves_a_rig_that_can_be_stopped(make: Make, monkeypatch: Any):
+    live = make(disk=SimulatedDisk(World(0)), clock=None)
+
+    def fail(*_: object) -> None:
+        raise ValueError("a mistake in this program")
+
+    monkeypatch.setattr(live.rig._store, "begin", fail)
+    with pytest.raises(ValueError, match="mistake"):
+        live.start(live.plan("one"))
+    assert live.rig.status().state == "ready"
+    assert live.stop("now").confirmed
+
+
+def test_nothing_begins_while_the_rig_shuts_down(make: Make):
+    live = make(disk=SimulatedDisk(World(0)), clock=None)
+    closing = live.begin(live.rig.close())
+    live.machine.wait(0.001)
+    with pytest.raises(BusyError, match="shutting down"):
+        live.rearm()
+    live.until(closing.done.is_set)
+    assert live.stimulator.sent == []
+
+
+def test_a_stimulator_that_can_still_stimulate_is_not_rearmed(make: Make, monkeypatch: Any):
+    live = make(disk=SimulatedDisk(World(0)), clock=None)
+    live.stop("now")
+
+    async def state() -> tuple[bool, str]:
+        return False, "stimulating"
+
+    monkeypatch.setattr(live.stimulator, "state", state)
+    with pytest.raises(DeviceError, match="still says stimulating"):
+        live.rearm()
+    assert live.rig.status().state == "latched"

@@ -158,8 +158,9 @@ def test_a_stop_leads_to_the_latch_from_everywhere_and_its_first_reason_stays():
         assert ending.halted("another") == ending
     assert replace(ARMING, state="sealing").halted("why") == SEALING
     assert READY.halted("why") == CALIBRATING.halted("why") == LATCHED
-    for stopped in (LATCHED, UNCERTAIN, Trial()):
+    for stopped in (LATCHED, UNCERTAIN):
         assert stopped.halted("another") == stopped
+    assert Trial("disconnected", "gone").halted("why") == replace(LATCHED, lost="gone")
 
 
 def test_a_lost_device_is_remembered_until_the_end_of_a_test_and_while_a_person_is_awaited():

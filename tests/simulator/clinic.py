@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from itertools import count
 from typing import Any
 
 from rig.control import desk
@@ -35,6 +36,8 @@ class Asked:
     sent_s: float
     process: Process
     obeyed_s: float | None = None
+    place: int = 0
+    """Among the requests that were obeyed, as several may come in one moment."""
     replied_s: float | None = None
     """When the rig replied, also where the reply was lost."""
     reply: Reply | None = None
@@ -52,8 +55,12 @@ class Clinic:
     states: list[tuple[float, Process, str]] = field(default_factory=list)
     """Each state that the rig told, when, and which process."""
     finished: list[FinishedEvent] = field(default_factory=list)
+    places: Iterator[int] = field(default_factory=count)
     loses: float = 0.0
     """Odds that a request or a reply is lost."""
+    dies_after_stop_s: float | None = None
+    """How long after its answer to the next stop the process dies."""
+    kill: Callable[[], None] = lambda: None
     process: Process | None = None
     rig: Rig | None = None
     state: str = "disconnected"
@@ -88,9 +95,12 @@ class Clinic:
         back_s, back_lost = chance.uniform(*TRANSIT_S), chance.random() < self.loses
 
         async def obey() -> None:
-            asked.obeyed_s = process.computer.true_s
+            asked.obeyed_s, asked.place = process.computer.true_s, next(self.places)
             asked.reply = await desk.answer(rig, line)
             asked.replied_s = process.computer.true_s
+            if asked.kind == "stop" and self.dies_after_stop_s is not None:
+                self.world.at(asked.replied_s + self.dies_after_stop_s, self.kill)
+                self.dies_after_stop_s = None
             problem = "" if asked.reply.problem is None else asked.reply.problem.detail
             self.world.tell("reply", f"{asked.kind} {asked.reply.ok} {problem}".rstrip(), asked.replied_s)
             if not back_lost:

@@ -74,6 +74,8 @@ class Process:
         self.tasks = Tasks(computer, self._work)
         self.disk: Disk = disk
         self.boot_id = f"boot-{computer.boots}"
+        self.works = 0
+        """Pieces of work, of the disk for the most part, that are under way."""
         self._ports, self._simulated_disk = ports, disk
         self._inbox: list[Callable[[], None]] = []
         self._wake_s = math.inf
@@ -138,6 +140,7 @@ class Process:
         takes_s = self._simulated_disk.work_s()
         early = self.world.chance.random() < 0.5
         done: list[tuple[Any, BaseException | None]] = []
+        self.works += 1
 
         def do() -> None:
             if self.alive:
@@ -146,6 +149,7 @@ class Process:
         def tell() -> None:
             if not early:
                 do()
+            self.works -= 1
             if done:
                 self.post(lambda: outcome(*done[0]))
 

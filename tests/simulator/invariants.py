@@ -162,20 +162,28 @@ def _true(life: Life) -> list[Felt]:
 
 
 def _barred(life: Life) -> list[tuple[float, float]]:
-    """Times during which nothing may be written, world's time. A re-arm counts for what was before it was asked for."""
-    rearmed = [
-        (asked.sent_s, _effect_s(life, asked))
-        for asked in life.clinic.asked
-        if asked.kind == "rearm" and asked.obeyed_s is not None and not _refused(asked)
-    ]
-    began = [asked.obeyed_s for asked in life.clinic.asked if asked.kind == "stop" and asked.obeyed_s is not None]
-    began += [time_s for time_s, _, state in life.clinic.states if state in ("latched", "uncertain")]
+    """Times during which nothing may be written, world's time. A re-arm counts for what was before it came.
+
+    One that was sent before a stop and comes after it releases that stop: it does not say what its person saw yet."""
+    asked = [(one.obeyed_s, one.place, one) for one in life.clinic.asked if one.obeyed_s is not None]
+    rearmed = [(*came, _effect_s(life, one)) for *came, one in asked if one.kind == "rearm" and not _refused(one)]
+    began = [(came_s, place) for came_s, place, one in asked if one.kind == "stop"]
+    began += [(time_s, -1) for time_s in _fell(life)]
     until = [
-        (since_s, min((by_s for sent_s, by_s in rearmed if sent_s > since_s), default=np.inf)) for since_s in began
+        (since[0], min((by_s for *came, by_s in rearmed if tuple(came) > since), default=np.inf)) for since in began
     ]
     until = [(since_s, min(until_s, _forgotten(life, since_s))) for since_s, until_s in until]
     born = [time_s for time_s, _, state in life.clinic.states if state in STATES]
     return until + [(death_s, min((s for s in born if s > death_s), default=np.inf)) for death_s in life.deaths]
+
+
+def _fell(life: Life) -> Iterator[float]:
+    """When a process told that it is stopped; one that only tells more of it was stopped before."""
+    before: tuple[Any, str] = (None, "")
+    for time_s, process, state in life.clinic.states:
+        if state in ("latched", "uncertain") and (process, state) != before:
+            yield time_s
+        before = process, state
 
 
 def _effect_s(life: Life, rearm: Asked) -> float:
@@ -188,11 +196,16 @@ def _effect_s(life: Life, rearm: Asked) -> float:
 
 
 def _forgotten(life: Life, since_s: float) -> float:
-    """When a process died whose latch no disk had taken: the next one cannot know of it; infinite: none."""
-    for death_s in life.deaths:
-        written = (took for time_s, name, took in life.disk.replaced if name == "latch.json" and time_s < death_s)
-        latches = list(written)
-        if death_s > since_s and latches and not latches[-1]:
+    """When a process died whose latch is not on the disk, so that the next one cannot know of it; infinite: never.
+
+    Either the disk had refused it, or was writing as the process died and nobody had been told of the stop."""
+    written = [(time_s, took) for time_s, name, took in life.disk.replaced if name == "latch.json"]
+    removed = [(time_s, False) for time_s, name in life.disk.removed if name == "latch.json"]
+    told_s = min((a.replied_s for a in life.clinic.asked if a.obeyed_s == since_s and a.replied_s), default=np.inf)
+    for death_s in (death_s for death_s in life.deaths if death_s > since_s):
+        refused = [took for time_s, took in written if time_s < death_s][-1:] == [False]
+        _, stays = max((found for found in written + removed if found[0] < death_s), default=(0.0, False))
+        if refused or (not stays and death_s in life.died_writing and death_s < told_s):
             return death_s
     return np.inf
 

@@ -73,7 +73,10 @@ class Life:
         self.felt: list[Felt] = []
         self.wires = Wires(world, self.devices, chance.choice((0.01, 0.02, 0.03)), self._note)
         self.clinic = Clinic(world)
+        self.clinic.kill = lambda: self.kill(0.3)
         self.deaths: list[float] = []
+        self.died_writing: list[float] = []
+        """Those of the deaths during which a piece of work was under way."""
         self.power_failures: list[float] = []
         self._config = self._rig_file(settings)
         self.quiet = False
@@ -118,6 +121,8 @@ class Life:
             process.kill()
             self.disk.process_ended()
             self.deaths.append(self.world.now_s)
+            if process.works:
+                self.died_writing.append(self.world.now_s)
             self.world.after(again_after_s, self.begin_process)
 
     def power_failure(self, again_after_s: float) -> None:
@@ -131,7 +136,7 @@ class Life:
     def end_process(self) -> None:
         """Asked to end; a new one starts once it has."""
         process, rig = self.clinic.process, self.clinic.rig
-        if process is None or rig is None or not process.alive:
+        if process is None or rig is None or not process.alive or not process.listens:
             return
 
         async def end() -> None:
@@ -175,7 +180,10 @@ class Life:
             return
         if clinic.state in ("latched", "uncertain", "disconnected"):
             if self.quiet or chance.random() < 0.5:
-                clinic.ask(RearmRequest(id=1, by="nurse"))
+                for _ in range(chance.choice((1, 1, 2))):
+                    clinic.ask(RearmRequest(id=1, by="nurse"))
+                if not self.quiet and chance.random() < 0.1:
+                    clinic.stop()
         elif clinic.state == "ready" and (self.quiet or chance.random() < 0.6):
             self._start()
         elif self.quiet:
