@@ -12,9 +12,9 @@ import time
 from collections.abc import Callable
 
 GRACE_S = 2.0
-"""So long after it came, or after its last request, a connection is closed for no other."""
+"""So long after it came, or after its last request, a connection is closed for no other, unless too many come."""
 MOST_AT_ONCE = 600
-"""Beyond this number a new connection is closed at once: more than a listening socket's backlog."""
+"""Of a kind: beyond it a new one closes the oldest. More than a socket's backlog, so that was read by then."""
 
 
 class Connections:
@@ -53,10 +53,8 @@ class Connections:
     def _put(self, transport: asyncio.BaseTransport, spoken: bool) -> None:
         members, now_s = self._members[spoken], self._monotonic()
         members[transport] = now_s  # the newest is last: dictionaries keep their order
-        if len(members) > self._most[spoken]:
-            longest, since_s = next(iter(members.items()))
-            if now_s - since_s < GRACE_S:
-                longest = transport if len(members) > MOST_AT_ONCE else None
-            if longest is not None:
-                del members[longest]
-                longest.abort() if isinstance(longest, asyncio.WriteTransport) else longest.close()
+        longest, since_s = next(iter(members.items()))
+        many = len(members) > self._most[spoken] and now_s - since_s >= GRACE_S
+        if many or len(members) > MOST_AT_ONCE:
+            del members[longest]
+            longest.abort() if isinstance(longest, asyncio.WriteTransport) else longest.close()
