@@ -54,9 +54,9 @@ class LiveSlope:
         inside = (behind >= 0) & (behind <= self._width)
         count = inside.sum(axis=1)
         x = -behind / self._rate_hz
-        x = np.where(inside, x - (np.sum(x * inside, axis=1) / count)[:, None], 0.0)
-        spread = np.sum(x * x, axis=1)
-        rise = np.sum(x * np.where(inside, values[None, :], 0.0), axis=1)
+        x = np.where(inside, x - ((x * inside).sum(axis=1) / count)[:, None], 0.0)
+        spread = (x * x).sum(axis=1)
+        rise = (x * np.where(inside, values[None, :], 0.0)).sum(axis=1)
         kept = numbers >= numbers[-1] - self._width
         self._number, self._value = numbers[kept], values[kept]
         return np.divide(rise, spread, out=np.full(len(number), np.nan), where=count >= LEAST)

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.acquire.rate import RateCheck
+from rig.acquire.stream import steps_from
 
 FASTEST_NM_S = 1000.0
 RAIL_VISITS = 2
@@ -74,9 +75,9 @@ class PlausibilityCheck:
 
     def _jumped(self, torque_nm: NDArray[np.float64], now_s: float) -> str | None:
         before_nm, before_s = self._last or (float(torque_nm[0]), now_s)
-        steps_nm = np.abs(np.diff(torque_nm, prepend=before_nm))
+        steps_nm = np.abs(steps_from(before_nm, torque_nm))
         steps_nm[0] -= FASTEST_NM_S * max(0.0, now_s - before_s - 0.02)  # during a gap it may change a lot
-        worst_nm = float(np.max(steps_nm))
+        worst_nm = float(steps_nm.max())
         if worst_nm <= self._jump_nm or np.isnan(worst_nm):  # NaN is reported elsewhere
             return None
         return (
@@ -89,7 +90,7 @@ class PlausibilityCheck:
         self._first_nm = before_nm if self._first_nm is None else self._first_nm
         at_rail = [rail.holds(torque_nm, before_nm) for rail in self._rails]
         at_end = any(at_rail) and abs(torque_nm[-1] - self._first_nm) >= RAIL_LEAST_NM
-        if not (np.all(torque_nm == torque_nm[0]) and torque_nm[0] == before_nm):
+        if not (torque_nm == before_nm).all():
             self._noisy += 1
             self._same_since_s = None
             return None
@@ -113,10 +114,10 @@ class _Rail:
 
     def holds(self, torque_nm: NDArray[np.float64], before_nm: float) -> bool:
         """Whether the last of these samples may be saturated."""
-        signed_nm = self._sign * np.concatenate(([before_nm], torque_nm))
-        most_nm = float(np.max(signed_nm))
+        signed_nm = self._sign * np.concatenate(((before_nm,), torque_nm))
+        most_nm = float(signed_nm.max())
         if most_nm > self._end_nm:
             self._end_nm, self._visits = most_nm, 0
         there = signed_nm == self._end_nm
-        self._visits += int(np.sum(there[1:] & ~there[:-1]))
+        self._visits += int(np.count_nonzero(there[1:] & ~there[:-1]))
         return bool(there[-1]) and self._visits >= RAIL_VISITS

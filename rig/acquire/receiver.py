@@ -101,7 +101,7 @@ class Receiver(Stream[TorqueBlock]):
             self._on_fault(fault)
 
     def _remember(self, samples: NDArray[Any]) -> None:
-        now_s, mean_nm = float(samples["host_time_s"][-1]), float(np.mean(samples["torque_nm"]))
+        now_s, mean_nm = float(samples["host_time_s"][-1]), float(samples["torque_nm"].mean())
         self.last_torque_nm = float(samples["torque_nm"][-1])
         self.recent.append((now_s, mean_nm))
         self.torque_time.add(now_s, mean_nm)
@@ -110,14 +110,14 @@ class Receiver(Stream[TorqueBlock]):
     def _check(self, torque_nm: NDArray[np.float64]) -> None:
         lo, hi = self._limits_nm
         within = (torque_nm >= lo) & (torque_nm <= hi)
-        if not np.all(within):
+        if not within.all():
             worst = float(torque_nm[np.argmin(within)])
             if np.isnan(worst):
                 self._on_fault("load cell: sent a torque that is not a number (NaN); check its amplifier")
             else:
                 self._on_fault(f"torque {worst:.2f} N·m is outside {lo:g} … {hi:g} N·m")
         elif self._journal is not None:
-            self.peak_nm = max(self.peak_nm, float(np.max(np.abs(torque_nm))))
+            self.peak_nm = max(self.peak_nm, float(np.abs(torque_nm).max()))
             self._widen(torque_nm)
 
     def _widen(self, torque_nm: NDArray[np.float64]) -> None:

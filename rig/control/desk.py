@@ -34,13 +34,13 @@ async def answer(rig: Rig, line: bytes) -> Reply:
 async def obey(rig: Rig, request: Any) -> Reply:
     """Obey a request; errors become part of the reply."""
     try:
-        body = await _do(rig, request)
+        body = (await _do(rig, request)).model_dump(mode="json")
     except RigError as error:
         return refusal(request.id, error)
     except Exception as error:
         log.exception("request %s failed", request.kind)
         return internal_error(request.id, error)
-    return Reply(id=request.id, ok=True, body=body.model_dump(mode="json"))
+    return Reply(id=request.id, ok=True, body=body)
 
 
 async def _do(rig: Rig, request: Any) -> BaseModel:

@@ -69,6 +69,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--lives", type=int, help="just so many, instead of minutes")
     parser.add_argument("--seed", type=int, default=1, help="of the first life; the next one has the next")
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--first", action="store_true", help="end at the first life that breaks, do not shrink it")
     parser.add_argument("--replay", action="store_true", help="one life, with its trace")
     parser.add_argument("--only", type=_numbers, help="with --replay: numbers of the accidents that happen, as 3,7")
     options = parser.parse_args(arguments)
@@ -96,10 +97,12 @@ def _simulate(options: argparse.Namespace) -> int:
         if outcome.wrong:
             broke.append(outcome.seed)
             print(f"seed {outcome.seed} broke: {outcome.wrong[0]:.200}", flush=True)
+            if options.first:
+                break
         if time.monotonic() - told_s > 10:
             told_s = time.monotonic()
             print(f"{told_s - began_s:4.0f} s: {lives} lives, {faults} faults, {len(broke)} broken", flush=True)
-    for seed in broke[:5]:
+    for seed in [] if options.first else broke[:5]:
         only = ",".join(map(str, sorted(shrink(seed))))
         print(f"replay: .venv/bin/python -m tests.simulator --replay --seed {seed} --only '{only}'")
     found = {

@@ -19,11 +19,17 @@ OF_DEVICES = (
     "torque_step", "bus_off", "error_frames", "counter_jump", "rate_off", "clock_jitter", "delivery_jitter",
 )  # fmt: skip
 """Faults of the emulator's own library (hardware_sim/faults)."""
+OF_THE_ANGLE = (
+    "angle_stuck", "angle_silent", "angle_unplugged", "angle_jump", "angle_nan", "angle_offset_step", "angle_reversed",
+    "angle_noise_burst", "angle_delayed", "angle_fault_bit", "angle_frames_lost", "angle_frames_repeated",
+    "angle_counter_jump", "angle_rate_off",
+)  # fmt: skip
 
 
 def device_fault(life: Life, chance: random.Random) -> str:
     """A fault of a device or its cable."""
-    name, for_s = chance.choice(OF_DEVICES), chance.uniform(0.02, 1.5)
+    names = OF_DEVICES + OF_THE_ANGLE if life.arm else OF_DEVICES
+    name, for_s = chance.choice(names), chance.uniform(0.02, 1.5)
     life.devices.faults.on(name, {}, for_s)
     life.wires.pump()
     return f"{name} for {for_s:.3f} s"

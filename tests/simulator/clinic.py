@@ -42,6 +42,8 @@ class Asked:
     """When the rig replied, also where the reply was lost."""
     reply: Reply | None = None
     about: str = ""
+    armed: bool = False
+    """Whether the stimulator could stimulate as the rig replied."""
     then: Callable[[Asked], None] = lambda _: None
     """Called when the reply has come."""
 
@@ -51,6 +53,8 @@ class Clinic:
     """Sends requests and keeps what came back."""
 
     world: World
+    device: Callable[[], dict[str, Any]]
+    """What the devices are in."""
     asked: list[Asked] = field(default_factory=list)
     states: list[tuple[float, Process, str]] = field(default_factory=list)
     """Each state that the rig told, when, and which process."""
@@ -98,6 +102,7 @@ class Clinic:
             asked.obeyed_s, asked.place = process.computer.true_s, next(self.places)
             asked.reply = await desk.answer(rig, line)
             asked.replied_s = process.computer.true_s
+            asked.armed = self.device()["mode"] not in ("none", "start")
             if asked.kind == "stop" and self.dies_after_stop_s is not None:
                 self.world.at(asked.replied_s + self.dies_after_stop_s, self.kill)
                 self.dies_after_stop_s = None

@@ -9,13 +9,17 @@ line's; after them the rig must stop like after any fault.
 from __future__ import annotations
 
 import io
+from bisect import bisect_right
 from collections.abc import Callable, Iterator
+from functools import lru_cache
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 
+from hardware_sim.angle_sensors.sensor import CAN_ID as ANGLE_ID
 from rig import journal
 from rig.errors import RecordingError
 from tests.simulator.clinic import Asked
@@ -27,9 +31,21 @@ CLOSEST_S = 0.008
 MOST_PULSES_A_SECOND = 60
 MOST_UC_A_SECOND = 1600.0
 MOST_UC_A_PULSE = 40.0
-LONGEST_TEST_S = 300.0
+MOST_UC_A_TEST = 50_000.0
+LONGEST_TEST_S = 6.0
+"""What the people of a life ask for at most."""
+REST_S, REST_BETWEEN_TRAINS_S = 1.0, 0.5
+MOST_RISE_UC = 1.0
+BLIND_S = 0.1
+"""Without a sample read for so long, nothing is sent."""
+DECIDED_S = 0.02
+"""From the look at a sensor to the command; 0.4 of the longest period of these lives."""
+NOTICED_S = 0.15
+"""A sample that must end a test may be so old as it is read, with what the alignment may be wrong by."""
 SYNCED_WITHIN_S = 1.0
 """What is older than this survives a power failure, on a disk that works."""
+ANSWERED_S = 8.0
+"""A stop waits up to 6 s for what the torque shows."""
 STATES = {"ready", "latched", "uncertain", "disconnected", "calibrating"}
 
 
@@ -56,6 +72,68 @@ def pulses_are_apart_and_not_too_many(life: Life) -> Iterator[str]:
             yield f"{pulse.time_s:.4f} s: {len(second)} pulses, {charge_uc:.1f} µC within a second"
 
 
+def a_test_is_no_longer_and_no_more_than_asked(life: Life) -> Iterator[str]:
+    """Duration and charge of each test, from what was felt."""
+    for name, felt in _by_test(life).items():
+        if not (felt[-1].time_s - felt[0].time_s <= LONGEST_TEST_S):
+            yield f"{name}: felt for {felt[-1].time_s - felt[0].time_s:.2f} s"
+        if not (sum(p.width_us * p.current_ma * 1e-3 for p in felt) <= MOST_UC_A_TEST):
+            yield f"{name}: too much charge"
+
+
+def tests_are_apart(life: Life) -> Iterator[str]:
+    """The rest between two tests, and between two trains of one calibration."""
+    for (one, felt), (other, after) in pairwise(_by_test(life).items()):
+        least_s = REST_BETWEEN_TRAINS_S if _calibration(one) and _calibration(one) == _calibration(other) else REST_S
+        if not (after[0].time_s - felt[-1].time_s >= least_s - 1e-3):
+            yield f"{other}: felt {after[0].time_s - felt[-1].time_s:.3f} s after {one}"
+
+
+def trains_rise_in_small_steps(life: Life) -> Iterator[str]:
+    """No train of a calibration carries much more charge than those that were felt before it."""
+    most_uc: dict[str, float] = {}
+    for name, felt in _by_test(life).items():
+        if calibration := _calibration(name):
+            uc = max(p.width_us * p.current_ma * 1e-3 for p in felt)
+            if not (uc <= most_uc.get(calibration, 0.0) + MOST_RISE_UC + 1e-9):
+                yield f"{name}: {uc:.2f} µC, {most_uc.get(calibration, 0.0):.2f} µC before"
+            most_uc[calibration] = max(uc, most_uc.get(calibration, 0.0))
+
+
+def nothing_is_written_blind(life: Life) -> Iterator[str]:
+    """No command unless torque came just before, and the angle where the test asks for it."""
+    for frame_id, read_s in life.wires.read_s.items():
+        for name, felt in _by_test(life).items():
+            if frame_id == ANGLE_ID and _calibration(name):
+                continue  # a train asks for no angle
+            for pulse in felt:
+                decided_s = life.wires.decided_s[pulse.written_s]
+                at = bisect_right(read_s, decided_s)
+                if not (at and decided_s - read_s[at - 1] <= BLIND_S + DECIDED_S + 1e-3):
+                    yield f"{pulse.time_s:.4f} s: written without a frame {frame_id:#x} just before"
+
+
+def one_pulse_is_on_its_way(life: Life) -> Iterator[str]:
+    """No command before the stimulator has said something after the pulse before it."""
+    for felt in _by_test(life).values():
+        for one, other in pairwise(felt):
+            decided_s = life.wires.decided_s[other.written_s]
+            if not any(one.time_s <= sent_s + 1e-9 and taken_s <= decided_s for sent_s, taken_s in life.wires.heard):
+                yield f"{other.time_s:.4f} s: written before the pulse at {one.time_s:.4f} s was acknowledged"
+
+
+def a_torque_beyond_its_limit_ends_a_test(life: Life) -> Iterator[str]:
+    """Or one that is no number."""
+    for path, columns in _recordings(life):
+        torque_nm, time_s = columns["torque/torque_nm"], columns["torque/time_s"]
+        beyond = ~(np.abs(torque_nm) <= life.profile.max_torque_nm)
+        written_s = columns["pulses/written_time_s"]
+        if _calibration(_name(path)) == "" and beyond.any():
+            since_s = time_s[np.argmax(beyond)]
+            if np.any(written_s > since_s + NOTICED_S):
+                yield f"{path}: pulses after a torque of {torque_nm[np.argmax(beyond)]:g} N·m at {since_s:.3f} s"
+
+
 def nothing_is_written_while_stopped(life: Life) -> Iterator[str]:
     """After a stop or a fault no command is written until a person has re-armed, and none by a process that is dead."""
     for pulse in life.felt:
@@ -79,6 +157,8 @@ def a_confirmed_stop_is_true(life: Life) -> Iterator[str]:
             continue
         if not (asked.reply.body or {}).get("confirmed"):
             continue
+        if asked.armed:
+            yield f"{asked.replied_s:.4f} s: a stop is confirmed, the stimulator can still stimulate"
         for pulse in _true(life):
             if pulse.written_s < asked.replied_s < pulse.time_s:
                 yield f"{pulse.time_s:.4f} s: felt after a stop that was confirmed at {asked.replied_s:.4f} s"
@@ -86,7 +166,7 @@ def a_confirmed_stop_is_true(life: Life) -> Iterator[str]:
 
 def every_test_ends_in_a_documented_state(life: Life) -> Iterator[str]:
     """And once all is well again, a re-armed rig plays a test to its end."""
-    if not life.played_at_the_end:
+    if not life.people.saw_one_end:
         yield f"no test was played to its end within the quiet time; the rig is {life.clinic.state}"
     for event in life.clinic.finished:
         if event.outcome not in ("completed", "stopped", "fault"):
@@ -96,15 +176,14 @@ def every_test_ends_in_a_documented_state(life: Life) -> Iterator[str]:
 def every_pulse_has_its_intent_and_its_record(life: Life) -> Iterator[str]:
     """What was felt stands in the file of its test, in the same order."""
     recorded = _tests(life)
-    places = dict.fromkeys(recorded, 0)
-    for pulse in _true(life):
-        test = _test_of(life, pulse)
-        sent = recorded.get(test, [])
-        place = next((at for at in range(places.get(test, 0), len(sent)) if _same(pulse, sent[at])), None)
-        if place is not None:
-            places[test] = place + 1
-        elif not _lost_with_the_power(life, pulse):
-            yield f"{pulse.time_s:.4f} s: {pulse.width_us:g} µs stands in no file of test t{test}"
+    for name, felt in _by_test(life).items():
+        sent, at = recorded.get(name, []), 0
+        for pulse in felt:
+            place = next((place for place in range(at, len(sent)) if _same(pulse, sent[place])), None)
+            if place is not None:
+                at = place + 1
+            elif not _lost_with_the_power(life, pulse):
+                yield f"{pulse.time_s:.4f} s: {pulse.width_us:g} µs stands in no file of test {name}"
 
 
 def what_the_files_call_acknowledged_was_felt(life: Life) -> Iterator[str]:
@@ -128,6 +207,14 @@ def every_test_that_began_is_found(life: Life) -> Iterator[str]:
             yield f"{event.test_id}: {event.recording_path} is gone"
 
 
+def every_request_is_answered(life: Life) -> Iterator[str]:
+    """By the process that took it, unless that died meanwhile."""
+    for asked in life.clinic.asked:
+        took = asked.obeyed_s is not None and asked.process.alive
+        if took and asked.reply is None and not (life.world.now_s - (asked.obeyed_s or 0.0) <= ANSWERED_S):
+            yield f"{asked.obeyed_s:.4f} s: {asked.kind} has no answer"
+
+
 def recordings_are_whole_and_in_order(life: Life) -> Iterator[str]:
     """Counters rise, times rise, and each file's content is what its hash says."""
     for path, columns in _recordings(life):
@@ -141,6 +228,12 @@ def recordings_are_whole_and_in_order(life: Life) -> Iterator[str]:
 INVARIANTS: tuple[Callable[[Life], Iterator[str]], ...] = (
     every_pulse_is_within_the_limits,
     pulses_are_apart_and_not_too_many,
+    a_test_is_no_longer_and_no_more_than_asked,
+    tests_are_apart,
+    trains_rise_in_small_steps,
+    nothing_is_written_blind,
+    one_pulse_is_on_its_way,
+    a_torque_beyond_its_limit_ends_a_test,
     nothing_is_written_while_stopped,
     no_pulse_is_felt_late,
     a_confirmed_stop_is_true,
@@ -148,6 +241,7 @@ INVARIANTS: tuple[Callable[[Life], Iterator[str]], ...] = (
     every_pulse_has_its_intent_and_its_record,
     what_the_files_call_acknowledged_was_felt,
     every_test_that_began_is_found,
+    every_request_is_answered,
     recordings_are_whole_and_in_order,
 )
 
@@ -214,25 +308,43 @@ Sent = tuple[float, float, int]
 """A recorded pulse that may have been sent: its width, µs; its current, mA; its status."""
 
 
-def _test_of(life: Life, pulse: Felt) -> int:
-    """Number of the test that was started last before it was written; 0: none."""
-    started = (a for a in life.clinic.asked if a.kind == "start" and a.obeyed_s is not None)
-    return max(
-        (_number(f"{a.about}.") for a in started if (a.obeyed_s or 0.0) < pulse.written_s and not _refused(a)),
-        default=0,
-    )
+@lru_cache(maxsize=1)
+def _by_test(life: Life) -> dict[str, list[Felt]]:
+    """The pulses that were felt as they were sent, by the test that was begun last before they were written."""
+    begun = [
+        (asked.obeyed_s, asked.about or _told_test(asked))
+        for asked in life.clinic.asked
+        if asked.obeyed_s is not None and not _refused(asked) and asked.kind in ("start", "calibrate-step")
+    ]
+    found: dict[str, list[Felt]] = {}
+    for pulse in sorted(_true(life), key=lambda pulse: pulse.written_s):
+        name = max(((since_s, name) for since_s, name in begun if since_s < pulse.written_s), default=(0.0, "none"))[1]
+        found.setdefault(name, []).append(pulse)
+    return found
+
+
+def _told_test(asked: Asked) -> str:
+    """The test that a reply names."""
+    body = None if asked.reply is None else asked.reply.body
+    return str((body or {}).get("test_id"))
+
+
+def _calibration(name: str) -> str:
+    """That a train belongs to; empty for a test."""
+    return name.partition(".")[0] if "." in name else ""
 
 
 def _refused(asked: Asked) -> bool:
     return asked.reply is not None and not asked.reply.ok
 
 
-def _tests(life: Life) -> dict[int, list[Sent]]:
-    """The pulses of each test's file, by the test's number."""
-    found: dict[int, list[Sent]] = {}
+@lru_cache(maxsize=1)
+def _tests(life: Life) -> dict[str, list[Sent]]:
+    """The pulses of each test's file, by the test's name."""
+    found: dict[str, list[Sent]] = {}
     for path, columns in _recordings(life):
         sent = np.isfinite(columns["pulses/sent_pulse_width_us"])
-        found[_number(path.name)] = list(
+        found[_name(path)] = list(
             zip(
                 columns["pulses/sent_pulse_width_us"][sent],
                 columns["pulses/current_ma"][sent],
@@ -241,8 +353,8 @@ def _tests(life: Life) -> dict[int, list[Sent]]:
             )
         )
     for path, file in life.disk.files.items():
-        if path.parent.name == "journals" and _number(path.name) not in found:
-            found[_number(path.name)] = _of_journal(path, bytes(file.data))
+        if path.parent.name == "journals" and _name(path) not in found:
+            found[_name(path)] = _of_journal(path, bytes(file.data))
     return found
 
 
@@ -255,20 +367,24 @@ def _of_journal(path: Any, data: bytes) -> list[Sent]:
     return [(width_us, current_ma, 4) for _, _, _, width_us, current_ma in intents]
 
 
-def _number(name: str) -> int:
-    """Of a test, in the name of a file: `…_t12.h5`, `t12.journal`."""
-    return int(name.rsplit("t", 1)[1].split(".")[0]) if name.endswith(".h5") else int(name[1:].split(".")[0])
+def _name(path: Path) -> str:
+    """Of a test, from its file: `…Z_t12.h5`, `t12.journal`."""
+    return path.stem.rpartition("Z_")[2]
 
 
-def _recordings(life: Life) -> Iterator[tuple[Any, dict[str, np.ndarray]]]:
+@lru_cache(maxsize=1)
+def _recordings(life: Life) -> list[tuple[Path, dict[str, np.ndarray]]]:
+    found = []
     for path, file in life.disk.files.items():
         if path.parent == FOLDER / "recordings":
             with h5py.File(io.BytesIO(bytes(file.data)), "r") as opened:
-                yield path, {name: np.asarray(opened[name]) for name in _COLUMNS}
+                found.append((path, {name: np.asarray(opened[name]) for name in _COLUMNS}))
+    return found
 
 
 _COLUMNS = (
-    "torque/time_s", "torque/counter", "pulses/sent_pulse_width_us", "pulses/current_ma", "pulses/status",
+    "torque/time_s", "torque/counter", "torque/torque_nm", "pulses/written_time_s", "pulses/sent_pulse_width_us",
+    "pulses/current_ma", "pulses/status",
 )  # fmt: skip
 
 

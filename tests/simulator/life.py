@@ -12,11 +12,12 @@ from hardware_sim.settings import Settings
 from rig import config
 from rig.control.rig import Rig
 from rig.errors import RigError
-from rig.messages import AdaptivePlan, Profile, RearmRequest, SegmentPlan, TestPlan
+from rig.messages import Profile
 from tests.simulator import accidents
-from tests.simulator.clinic import Asked, Clinic
+from tests.simulator.clinic import Clinic
 from tests.simulator.disk import ROOM_BYTES, SimulatedDisk
 from tests.simulator.host import Computer, Process
+from tests.simulator.people import People
 from tests.simulator.wires import Wires
 from tests.simulator.world import World
 
@@ -25,8 +26,7 @@ LASTS_S = 8.0
 """How long accidents and people go on."""
 QUIET_S = 20.0
 """The longest that the rig may then need until it has played one more test."""
-LOOK_S = 0.25
-KEY = "a key that only its maker knows"
+HELD, ROBOT = "held", "robot,from_deg=60,to_deg=110,deg_s=60,pause_s=0.2"
 
 
 class Felt(NamedTuple):
@@ -64,15 +64,18 @@ class Life:
         settings = Settings(
             stimulator=chance.choice(("p24", "rehastim2")), cell=chance.choice(("plain", "plain", "counts", "canopen")),
             rate_hz=chance.choice((200.0, 200.0, 400.0, 1600.0)), noise_seed=seed & 0xFFFF,
-            clock_ppm=chance.uniform(-200, 200),
+            clock_ppm=chance.uniform(-200, 200), angle_offset_deg=30.0, angle_direction=-1,
+            angle_clock_ppm=chance.uniform(-200, 200),
         )  # fmt: skip
-        self.devices = make_devices(settings, epoch_us=1_700_000_000_000_000)
+        self.arm = chance.choice((None, None, HELD, ROBOT))
+        """What holds or moves the joint, where the rig has an angle sensor."""
+        self.devices = make_devices(settings, self.arm, epoch_us=1_700_000_000_000_000)
         self.disk = SimulatedDisk(world)
         self.computer = Computer(world, chance.uniform(-100, 100), 1_764_000_000.0)
         self.disk.access = self.computer.access
         self.felt: list[Felt] = []
         self.wires = Wires(world, self.devices, chance.choice((0.01, 0.02, 0.03)), self._note)
-        self.clinic = Clinic(world)
+        self.clinic = Clinic(world, self.devices.state)
         self.clinic.kill = lambda: self.kill(0.3)
         self.deaths: list[float] = []
         self.died_writing: list[float] = []
@@ -80,17 +83,16 @@ class Life:
         self.power_failures: list[float] = []
         self._config = self._rig_file(settings)
         self.quiet = False
-        self.played_at_the_end = False
         self._plan_accidents(chance, only)
         self.begin_process()
-        world.after(LOOK_S, self._look)
+        self.people = People(self)
 
     def live(self) -> None:
         """From the first start to the last test."""
         self.world.run(LASTS_S)
         self._calm()
         end_s = LASTS_S + QUIET_S
-        while not self.played_at_the_end and self.world.now_s < end_s:
+        while not self.people.saw_one_end and self.world.now_s < end_s:
             self.world.run(self.world.now_s + 0.5)
         self.world.run(self.world.now_s + 0.5)
 
@@ -170,70 +172,6 @@ class Life:
             self.devices.faults.off(name)
         self.computer.stall_next_s = 0.0
 
-    # -- people
-
-    def _look(self) -> None:
-        """Somebody looks at the rig now and then, and does what comes to mind."""
-        self.world.after(LOOK_S, self._look)
-        clinic, chance = self.clinic, self.world.chance
-        if clinic.process is None or not clinic.process.alive:
-            return
-        if clinic.state in ("latched", "uncertain", "disconnected"):
-            if self.quiet or chance.random() < 0.5:
-                for _ in range(chance.choice((1, 1, 2))):
-                    clinic.ask(RearmRequest(id=1, by="nurse"))
-                if not self.quiet and chance.random() < 0.1:
-                    clinic.stop()
-        elif clinic.state == "ready" and (self.quiet or chance.random() < 0.6):
-            self._start()
-        elif self.quiet:
-            return
-        elif clinic.state == "running" and chance.random() < 0.15:
-            for _ in range(chance.choice((1, 1, 3))):
-                clinic.stop()
-        elif clinic.state == "running" and self.adaptive and chance.random() < 0.4:
-            self._extend()
-        elif chance.random() < 0.05:
-            clinic.stop()
-
-    def _start(self) -> None:
-        clinic = self.clinic
-        test_id = f"t{clinic.tests + 1}"
-        adaptive = AdaptivePlan(max_duration_s=6.0, max_torque_time_nms=50.0) if self.adaptive else None
-        plan = TestPlan(
-            test_id=test_id, participant="P1", profile=self.profile, pulse_rate_hz=self.rate_hz, adaptive=adaptive,
-            segments=[
-                SegmentPlan(name="rest", sequence="rest", settings={"duration_s": 0.25}),
-                SegmentPlan(name="ramp", sequence="ramp", settings={"up_s": 0.75, "down_s": 0.5}),
-                SegmentPlan(name="steps", sequence="steps", settings={"on_s": 0.5, "off_s": 0.25, "repeats": 1}),
-            ],
-        )  # fmt: skip
-        quiet = self.quiet
-
-        def then(asked: Asked) -> None:
-            if quiet and asked.reply is not None and asked.reply.ok:
-                self._await_end(test_id)
-
-        clinic.start(plan, KEY).about = test_id
-        clinic.asked[-1].then = then
-
-    def _await_end(self, test_id: str) -> None:
-        finished = next((event for event in self.clinic.finished if event.test_id == test_id), None)
-        if finished is None:
-            self.world.after(LOOK_S, lambda: self._await_end(test_id))
-        elif finished.outcome == "completed":
-            self.played_at_the_end = True
-
-    def _extend(self) -> None:
-        rig = self.clinic.rig
-        run = None if rig is None else rig._run
-        if run is None:
-            return
-        if self.world.chance.random() < 0.3:
-            self.clinic.enough(run.plan.test_id)
-        else:
-            self.clinic.extend(run.plan.test_id, KEY, len(run.score.laid))
-
     # -- set-up
 
     def _note(self, written_s: float, true: bool) -> None:
@@ -267,5 +205,6 @@ class Life:
                 "device": "can_load_cell", "bus": {"interface": "simulated"}, "sample_rate_hz": settings.rate_hz,
                 **({"sync": ""} if settings.cell == "counts" else {}), **cell,
             },
+            "angle_sensor": {"device": "can_angle_sensor", "offset": 30.0, "direction": -1} if self.arm else None,
         }  # fmt: skip
         return config.check(content, "simulated", data_dir=FOLDER, socket=FOLDER / "socket")

@@ -108,6 +108,12 @@ class Wires(Ports):
         self.to_device = Direction(world, "line>", self._to_stimulator)
         self.to_host = Direction(world, "line<", self._to_rig)
         self.bus_stalled_until_s = 0.0
+        self.decided_s: dict[float, float] = {}
+        """When each command was decided, by when it was written: in between the step that writes it may be stalled."""
+        self.heard: list[tuple[float, float]] = []
+        """What the rig's process took from the line: when it was sent, and when it was taken."""
+        self.read_s: dict[int, list[float]] = {}
+        """When the rig's process read frames, by their number."""
         self._block_s = block_s
         self._port: _SimulatedPort | None = None
         self._bus: _SimulatedBus | None = None
@@ -162,10 +168,10 @@ class Wires(Ports):
         self.devices.advance(self.world.now_s)
         self._fired(*self._last)
 
-    def _to_rig(self, data: bytes, _written_s: float, _true: bool) -> None:
+    def _to_rig(self, data: bytes, written_s: float, _true: bool) -> None:
         port = self._port
         if port is not None and port.on_bytes is not None:
-            port.process.post(lambda: port.take(data))
+            port.process.post(lambda: port.take(data, written_s))
 
     def _sample(self) -> None:
         self._advance()
@@ -200,13 +206,16 @@ class _SimulatedPort:
         self.on_bytes, self._on_lost = on_bytes, on_lost
 
     def write(self, data: bytes) -> int:
+        decided_s = self.process.computer.true_s
         self.process.computer.access()
         if self.on_bytes is None:
             raise OSError(errno.EIO, os.strerror(errno.EIO))
         line = self._wires.to_device
         if sum(len(piece) for piece, _ in line.held) + len(data) > MOST_HELD_BYTES:
             return 0
-        line.send(data, self.process.computer.true_s)
+        written_s = self.process.computer.true_s
+        self._wires.decided_s[written_s] = decided_s
+        line.send(data, written_s)
         return len(data)
 
     def discard(self) -> None:
@@ -216,9 +225,10 @@ class _SimulatedPort:
     def close(self) -> None:
         self.on_bytes = None
 
-    def take(self, data: bytes) -> None:
+    def take(self, data: bytes, sent_s: float) -> None:
         """Bytes that have come, in the process's own time."""
         if self.on_bytes is not None:
+            self._wires.heard.append((sent_s, self.process.computer.true_s))
             self.on_bytes(data, self.process.computer.now_s())
 
     def lose(self, reason: str) -> None:
@@ -273,5 +283,7 @@ class _SimulatedBus:
                 for frame in frames
                 if frame.can_id == listener.frame_id and not frame.error
             ]
+            if mine:
+                self._wires.read_s.setdefault(listener.frame_id, []).append(self.process.computer.true_s)
             if mine or errors:
                 listener.take(listener.decode(mine, 0, errors))

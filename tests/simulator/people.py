@@ -1,0 +1,139 @@
+"""What people do at the rig: they look now and then, and do what comes to mind."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from rig.messages import (
+    AdaptivePlan,
+    AnglePlan,
+    CalibrateFinishRequest,
+    CalibrateMarkRequest,
+    CalibrateStartRequest,
+    CalibrateStepRequest,
+    RearmRequest,
+    SegmentPlan,
+    TestPlan,
+)
+from tests.simulator.clinic import Asked
+
+if TYPE_CHECKING:
+    from tests.simulator.life import Life
+
+LOOK_S = 0.25
+KEY = "a key that only its maker knows"
+SEGMENTS = [
+    SegmentPlan(name="rest", sequence="rest", settings={"duration_s": 0.25}),
+    SegmentPlan(name="ramp", sequence="ramp", settings={"up_s": 0.75, "down_s": 0.5}),
+    SegmentPlan(name="steps", sequence="steps", settings={"on_s": 0.5, "off_s": 0.25, "repeats": 1}),
+]
+LONGEST_ADAPTIVE_S = 6.0
+
+
+class People:
+    """Those of one life. Once it is quiet they only re-arm, and start a test until one plays to its end."""
+
+    def __init__(self, life: Life) -> None:
+        self.life, self.clinic, self.chance = life, life.clinic, life.world.chance
+        self.saw_one_end = False
+        """Whether a test that was started in the quiet time was completed."""
+        life.world.after(LOOK_S, self._look)
+
+    def _look(self) -> None:
+        self.life.world.after(LOOK_S, self._look)
+        process, state, quiet = self.clinic.process, self.clinic.state, self.life.quiet
+        if process is None or not process.alive:
+            return
+        if state in ("latched", "uncertain", "disconnected"):
+            self._rearm()
+        elif state == "ready" and (quiet or self.chance.random() < 0.6):
+            self._start()
+        elif state == "calibrating":
+            self._calibrate()
+        elif quiet:
+            return
+        elif state == "running" and self.chance.random() < 0.15:
+            self._repeat(self.clinic.stop)
+        elif state == "running" and self.life.adaptive and self.chance.random() < 0.4:
+            self._extend()
+        elif self.chance.random() < 0.05:
+            self.clinic.stop()
+
+    def _repeat(self, action: Callable[[], object]) -> None:
+        """Most people press once."""
+        for _ in range(self.chance.choice((1, 1, 2))):
+            action()
+
+    def _rearm(self) -> None:
+        if self.life.quiet or self.chance.random() < 0.5:
+            self._repeat(lambda: self.clinic.ask(RearmRequest(id=1, by="nurse")))
+            if not self.life.quiet and self.chance.random() < 0.1:
+                self.clinic.stop()
+
+    def _start(self) -> None:
+        if not self.life.quiet and self.chance.random() < 0.15:
+            self._open_calibration()
+        else:
+            self._repeat(self._start_test)
+
+    def _start_test(self) -> None:
+        life, quiet = self.life, self.life.quiet
+        test_id = f"t{self.clinic.tests + 1}"
+        kind, angle = "pre-session", None
+        if life.arm:
+            kind = "held" if life.arm == "held" else "moving"
+            target_rad, still_s = (math.pi / 2, None) if kind == "held" else (None, 2.0)
+            angle = AnglePlan(range_rad=(0.2, 2.4), target_rad=target_rad, still_s=still_s)
+        bounds = AdaptivePlan(max_duration_s=LONGEST_ADAPTIVE_S, max_torque_time_nms=50.0)
+        plan = TestPlan(
+            test_id=test_id, participant="P1", kind=kind, profile=life.profile, pulse_rate_hz=life.rate_hz,
+            adaptive=bounds if life.adaptive else None, angle=angle, segments=SEGMENTS,
+        )  # fmt: skip
+
+        def then(asked: Asked) -> None:
+            if quiet and asked.reply is not None and asked.reply.ok:
+                self._await_end(test_id)
+
+        self.clinic.start(plan, KEY).then = then
+
+    def _await_end(self, test_id: str) -> None:
+        finished = next((event for event in self.clinic.finished if event.test_id == test_id), None)
+        if finished is None:
+            self.life.world.after(LOOK_S, lambda: self._await_end(test_id))
+        elif finished.outcome == "completed":
+            self.saw_one_end = True
+
+    def _extend(self) -> None:
+        rig = self.clinic.rig
+        run = None if rig is None else rig._run
+        if run is None:
+            return
+        if self.chance.random() < 0.3:
+            self.clinic.enough(run.plan.test_id)
+        else:
+            self.clinic.extend(run.plan.test_id, KEY, len(run.score.laid))
+
+    def _open_calibration(self) -> None:
+        self.clinic.tests += 1
+        request = CalibrateStartRequest(
+            calibration_id=f"c{self.clinic.tests}", participant="P1", by="nurse", train_s=0.3,
+            current_ma=self.life.profile.current_ma, max_pulse_width_us=self.life.profile.max_pulse_width_us,
+            large_steps=self.chance.random() < 0.5,
+        )  # fmt: skip
+        self.clinic.ask(request, request.calibration_id)
+
+    def _calibrate(self) -> None:
+        drawn = self.chance.random()
+        if self.life.quiet or drawn < 0.05:
+            self.clinic.ask(CalibrateFinishRequest(by="nurse", discard=True))
+        elif drawn < 0.6:
+            direction = self.chance.choice(("up", "up", "up", "fine", "repeat", "down"))
+            self._repeat(lambda: self.clinic.ask(CalibrateStepRequest(direction=direction)))
+        elif drawn < 0.8:
+            self.clinic.ask(CalibrateMarkRequest(threshold=self.chance.choice(("sensory", "motor", "comfort"))))
+        elif drawn < 0.85:
+            self.clinic.ask(CalibrateFinishRequest(by="nurse"))
+        elif drawn < 0.9:
+            self.clinic.stop()
