@@ -5,13 +5,15 @@ from __future__ import annotations
 import concurrent.futures
 import json
 import time
+from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
 from websockets.sync.client import connect
 
-from tests.api.conftest import TOKEN, Service, run_test, wait_done
+from api.store import Store, engines
+from tests.api.conftest import DURABLE, TOKEN, Service, run_test, wait_done
 
 
 def test_whole_path_to_the_controller(client: httpx.Client, service: Service, participant: str) -> None:
@@ -200,10 +202,13 @@ def test_every_deed_is_in_the_audit_trail_and_the_chain_holds(
 
 
 @pytest.mark.sqlite
-def test_database_is_durable(service: Service) -> None:
-    with service.app.state.context.store.engine.connect() as connection:
+def test_database_is_durable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(engines, "_durable_sqlite", DURABLE)
+    store = Store(f"sqlite:///{tmp_path}/durable.db")
+    with store.engine.connect() as connection:
         assert connection.exec_driver_sql("PRAGMA journal_mode").scalar() == "wal"
         assert connection.exec_driver_sql("PRAGMA synchronous").scalar() == 2
+    store.close()
 
 
 @pytest.mark.parametrize("path", ["/health", "/metrics"])

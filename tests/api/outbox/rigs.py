@@ -10,14 +10,17 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+import pytest
 
 from api.clock import Clock
+from api.outbox import pusher as pushing
 from api.outbox.feed import Feed
 from api.outbox.link import Link
 from api.outbox.pusher import Pusher
 from api.settings import Settings
 from api.store import Store, audit
 from api.store.tables import Approval, Model, OutboxItem, Participant, Recording, Test, Tracked
+from tests.api.conftest import put_database
 from tests.harness.fake_centre import KEY, FakeCentre, canonical, sha256
 
 URL = "https://centre.example.org"
@@ -48,6 +51,7 @@ class Rig:
         (folder / "recordings").mkdir(parents=True, exist_ok=True)
         self.settings = Settings(data_dir=folder, database_url=None, centre_url=URL, centre_key=KEY)  # pyright: ignore[reportArgumentType]
         self.clock = VirtualClock()
+        put_database(folder)
         self.store = Store(self.settings.database)
         self.number = 0
         if feed:
@@ -142,7 +146,13 @@ class Rig:
 
 
 def run(pusher: Pusher, for_s: float) -> None:
-    """Let it work for a virtual while."""
+    """Let it work for a virtual while; in one of minutes it looks for what is new every ten seconds only."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pushing, "POLL_S", pushing.POLL_S if for_s < 300.0 else 10.0)
+        _run(pusher, for_s)
+
+
+def _run(pusher: Pusher, for_s: float) -> None:
     clock = pusher.clock
     assert isinstance(clock, VirtualClock)
     end = clock.now_s + for_s
