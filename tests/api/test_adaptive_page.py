@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.api.browser import open_tab, participant
-from tests.api.conftest import STUB, Service, run_service, wait_done
-from tests.api.test_axe import examined
+from tests.api.conftest import Service, own_service, wait_done
+from tests.api.test_axe import COLOURS, WORDS, examined
 
 pytestmark = pytest.mark.browser
 
 
-@pytest.fixture
-def service(tmp_path: Path, short_dir: Path) -> Iterator[Service]:
-    """Slow enough to look at a running test from all sides."""
-    yield from run_service(tmp_path, short_dir, STUB, speed=0.25)
+service = own_service(speed=0.25)
+"""Slow enough to look at a running test from all sides."""
 
 
 def chosen(tab: Any, target: str) -> None:
@@ -75,7 +71,7 @@ def test_in_german(tab: Any, service: Service) -> None:
     tab.get_by_text("Hört auf, sobald beide auf 0,2 % bekannt sind.").wait_for()
     tab.locator("#known-words", has_text="Die Kurve ist auf 8,0 % bekannt").wait_for()
     tab.get_by_role("button", name="Genug").wait_for()
-    examined(tab, "in German")
+    examined(tab, "in German", **WORDS)
     assert tab.locator("#knows [lang=en]").count() == 0
 
 
@@ -103,7 +99,7 @@ def test_numbers_that_are_out_of_date_look_so_and_can_be_read(browser: Any, serv
         page.locator("#live.is-stale").wait_for()
         assert [page.evaluate(LOOKS, name) for name in numbers] == [["italic", "400"]] * 4
         assert page.evaluate(LOOKS, "age")[0] == "normal", "this one is still right"
-        examined(page, "out of date")
+        examined(page, "out of date", **({} if colours == "light" else COLOURS))
         assert page.locator("#live.is-stale").count() == 1
 
 

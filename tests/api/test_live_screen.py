@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,15 +12,13 @@ from api.store.tables import Test
 from api.web.pages.views import limits_of
 from rig.messages import Bound, Status
 from tests.api.browser import expected, participant, start
-from tests.api.conftest import STUB, Service, run_service
+from tests.api.conftest import Service, shared_service
 
 pytestmark = pytest.mark.browser
 SIZES = {"laptop": (1366, 768), "tablet": (820, 1180)}
 
 
-@pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
-    yield from run_service(tmp_path_factory.mktemp("screen"), short_dir, STUB, speed=0.7)
+service = shared_service(speed=0.7)
 
 
 @pytest.fixture

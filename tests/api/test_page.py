@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -26,14 +25,12 @@ from tests.api.browser import (
     say_yes,
     start,
 )
-from tests.api.conftest import STUB, Service, run_service, run_test
+from tests.api.conftest import Service, run_test, shared_service
 
 pytestmark = pytest.mark.browser
 
 
-@pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
-    yield from run_service(tmp_path_factory.mktemp("page"), short_dir, STUB, speed=8.0)
+service = shared_service(speed=8.0)
 
 
 def test_a_clinicians_whole_way(tab: Any, service: Service) -> None:

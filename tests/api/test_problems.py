@@ -12,7 +12,7 @@ import pytest
 from api import errors
 from api.sessions import runner
 from rig.messages import Problem as RigProblem
-from tests.api.conftest import Service, let_go, run_test, wait_done
+from tests.api.conftest import Service, let_go, run_test, soon, wait_done
 
 GOOD_HEADER = "time_s,pulse_width_us,torque_nm,segment\n"
 
@@ -105,10 +105,7 @@ def test_rig_that_is_gone_and_comes_back(client: httpx.Client, service: Service,
     assert health["status"] == "degraded" and health["rig"]["state"] == "disconnected"
     service.rig_thread.__enter__()
     service.rig.speed = 30.0
-    end = time.monotonic() + 60
-    while client.get("/health").json()["status"] != "ok":
-        assert time.monotonic() < end
-        time.sleep(0.05)
+    soon(lambda: client.get("/health").json()["status"] == "ok", 60)
     assert run_test(client, participant)["state"] == "completed"
 
 

@@ -3,29 +3,25 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import pytest
 
-from tests.api.conftest import STUB, Service, run_service
+from tests.api.conftest import Service, shared_service
 from tests.harness import sessions
 from tests.harness.muscle import Patient
 from tests.harness.sessions import Planned
 
 pytest.importorskip("axe_playwright_python.base")
-from tests.api.test_axe import examined
+from tests.api.test_axe import COLOURS, examined
 
 pytestmark = pytest.mark.browser
 LAPTOP = {"width": 1366, "height": 768}
 COUNT = 20
 
 
-@pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
-    yield from run_service(tmp_path_factory.mktemp("trend"), short_dir, STUB)
+service = shared_service()
 
 
 @pytest.fixture(scope="module")
@@ -85,4 +81,4 @@ def test_no_violation(tab: Any, service: Service, ids: list[str]) -> None:
     tab.emulate_media(color_scheme="dark")
     for path in ("/participants/P017/trend", compared):
         tab.goto(service.url + path)
-        examined(tab, f"{path}, dark")
+        examined(tab, f"{path}, dark", **COLOURS)
