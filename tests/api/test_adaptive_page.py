@@ -111,10 +111,11 @@ def test_a_worker_that_dies_is_told_on_the_page(tab: Any, service: Service) -> N
     tab.locator("#stops-once").wait_for(state="hidden")
 
 
-@pytest.mark.parametrize("typed", ["", "-1", "nan", "0,1", "51", "zwei", "1e1"])
-def test_what_is_no_target_starts_nothing(tab: Any, service: Service, typed: str) -> None:
+def test_what_is_no_target_starts_nothing(tab: Any, service: Service) -> None:
     participant(tab, service, "X1")
-    chosen(tab, typed)
-    tab.get_by_text("Target:").wait_for()
-    tab.get_by_text("Nothing was started").wait_for()
-    assert service.rig.starts == 0
+    for typed in ("", "-1", "nan", "0,1", "51", "zwei", "1e1"):
+        tab.goto(f"{service.url}/participants/X1")
+        chosen(tab, typed)
+        tab.get_by_text("Target:").wait_for()
+        tab.get_by_text("Nothing was started").wait_for()
+        assert service.rig.starts == 0, typed

@@ -25,7 +25,7 @@ from tests.api.browser import (
     say_yes,
     start,
 )
-from tests.api.conftest import Service, run_test, shared_service
+from tests.api.conftest import Service, run_test, shared_service, soon
 
 pytestmark = pytest.mark.browser
 
@@ -88,7 +88,7 @@ def test_stop_is_on_every_page_uncovered_and_nothing_sticks_out(
 def test_stop_is_confirmed_and_the_rig_waits_for_a_person(tab: Any, service: Service) -> None:
     participant(tab, service, f"S{time.time_ns() % 10**9}")
     start(tab)
-    tab.wait_for_timeout(300)
+    soon(lambda: service.rig.state == "running")
     tab.get_by_role("button", name="Stop stimulation").click()
     tab.get_by_text("The rig confirms that stimulation is off.").wait_for()
     tab.get_by_role("link", name="To the participants").click()
