@@ -33,7 +33,7 @@ WORDS = {"rules": {"color-contrast": {"enabled": False}}}
 them another in the dark."""
 
 
-def violations(page: Any, options: dict[str, Any]) -> list[str]:
+def violations(page: Any, **options: Any) -> list[str]:
     """What axe finds, rule by rule, with the elements. The page's own policy keeps foreign scripts out of its world."""
     if not page.evaluate("typeof window.axe === 'object'"):
         page.evaluate(Path(axe_path).read_text("utf-8"))
@@ -58,7 +58,7 @@ def examined(page: Any, what: str, stop: bool = True, **options: Any) -> None:
     for width, height in (WIDE, PHONE):
         page.set_viewport_size({"width": width, "height": height})
         fits(page, f"{what} at {width}")
-        assert violations(page, options) == [], (what, width)
+        assert violations(page, **options) == [], (what, width)
         assert not stop or page.evaluate(UNCOVERED), (what, width)
 
 
