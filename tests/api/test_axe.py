@@ -27,17 +27,11 @@ STICKING_OUT = """() => [...document.querySelectorAll('body *')].filter((e) => !
 service = shared_service(speed=8.0)
 
 
-COLOURS = {"runOnly": {"type": "rule", "values": ["color-contrast"]}}
-WORDS = {"rules": {"color-contrast": {"enabled": False}}}
-"""Half of axe's time goes into the contrast of colours: they are no others in another language, nor is anything but
-them another in the dark."""
-
-
-def violations(page: Any, **options: Any) -> list[str]:
+def violations(page: Any) -> list[str]:
     """What axe finds, rule by rule, with the elements. The page's own policy keeps foreign scripts out of its world."""
     if not page.evaluate("typeof window.axe === 'object'"):
         page.evaluate(Path(axe_path).read_text("utf-8"))
-    found = page.evaluate("options => axe.run(document, options)", {"resultTypes": ["violations"], **options})
+    found = page.evaluate("axe.run(document, {resultTypes: ['violations']})")
     assert found["passes"] or found["violations"], "it has looked at something"
     return [
         f"{entry['id']} ({entry['impact']}): {json.dumps([node['html'][:160] for node in entry['nodes'][:3]])}"
@@ -54,22 +48,20 @@ def fits(page: Any, what: str) -> None:
         page.wait_for_timeout(100)
 
 
-def examined(page: Any, what: str, stop: bool = True, **options: Any) -> None:
+def examined(page: Any, what: str, stop: bool = True) -> None:
     for width, height in (WIDE, PHONE):
         page.set_viewport_size({"width": width, "height": height})
         fits(page, f"{what} at {width}")
-        assert violations(page, **options) == [], (what, width)
+        assert violations(page) == [], (what, width)
         assert not stop or page.evaluate(UNCOVERED), (what, width)
 
 
-def visit(
-    page: Any, service: Service, path: str, ready: Callable[[], Any] | None = None, stop: bool = True, **options: Any
-) -> None:
+def visit(page: Any, service: Service, path: str, ready: Callable[[], Any] | None = None, stop: bool = True) -> None:
     page.set_viewport_size({"width": WIDE[0], "height": WIDE[1]})
     page.goto(service.url + path)
     if ready:
         ready()
-    examined(page, path, stop, **options)
+    examined(page, path, stop)
 
 
 def test_pages_without_a_test(browser: Any, tab: Any, service: Service) -> None:
@@ -184,22 +176,22 @@ def test_in_the_dark(browser: Any, service: Service) -> None:
 
     for page in open_tab(browser, service, color_scheme="dark"):
         for path, ready in (("/", None), ("/participants/X5", None), (model, opened), (f"/tests/{done['id']}", None)):
-            visit(page, service, path, ready, **COLOURS)
+            visit(page, service, path, ready)
         assert page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(17, 22, 27)"
         page.goto(service.url + "/participants/X5/calibration")
         page.get_by_role("button", name="Begin the calibration").click()
         page.get_by_role("button", name="Discard").wait_for()
-        examined(page, "calibration", **COLOURS)
+        examined(page, "calibration")
         service.rig.speed = 0.7
         page.get_by_role("button", name="Discard").click()
         page.wait_for_url("**/participants/X5")
         start(page)
         page.locator("#age", has_text="ms").wait_for()
-        examined(page, "live", **COLOURS)
+        examined(page, "live")
         service.rig.confirms_stop = False
         page.get_by_role("button", name="Stop stimulation").click()
         page.get_by_role("heading", name="The stop is not confirmed").wait_for()
-        examined(page, "not confirmed", **COLOURS)
+        examined(page, "not confirmed")
         service.rig.speed = 8.0
 
 
@@ -215,9 +207,9 @@ def test_in_german(tab: Any, service: Service) -> None:
         tab.locator("[data-figure=comparison] .main-svg").first.wait_for()
 
     tab.context.add_cookies([{"name": "stimrig_language", "value": "de", "url": service.url}])
-    visit(tab, service, f"/models/{done['model_id']}", opened, **WORDS)
+    visit(tab, service, f"/models/{done['model_id']}", opened)
     for path in ("/participants/X6", f"/tests/{done['id']}", "/participants/X6/trend"):
-        visit(tab, service, path, **WORDS)
+        visit(tab, service, path)
     assert tab.locator("html").get_attribute("lang") == "de"
 
 

@@ -164,7 +164,8 @@ def test_reports_have_them_and_pages_of_other_models_do_not(service: Service, mo
 
 
 @pytest.mark.browser
-@pytest.mark.parametrize(("language", "scheme"), [("en", "light"), ("de", "dark")])
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("language", ["en", "de"])
 def test_the_page_is_examined(
     browser: Any, service: Service, models: tuple[str, str], language: str, scheme: str
 ) -> None:

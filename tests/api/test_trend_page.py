@@ -14,7 +14,7 @@ from tests.harness.muscle import Patient
 from tests.harness.sessions import Planned
 
 pytest.importorskip("axe_playwright_python.base")
-from tests.api.test_axe import COLOURS, examined
+from tests.api.test_axe import examined
 
 pytestmark = pytest.mark.browser
 LAPTOP = {"width": 1366, "height": 768}
@@ -81,4 +81,4 @@ def test_no_violation(tab: Any, service: Service, ids: list[str]) -> None:
     tab.emulate_media(color_scheme="dark")
     for path in ("/participants/P017/trend", compared):
         tab.goto(service.url + path)
-        examined(tab, f"{path}, dark", **COLOURS)
+        examined(tab, f"{path}, dark")
