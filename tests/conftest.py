@@ -1,11 +1,12 @@
 """What holds for every test: how many threads a process takes, how property tests run, and what is left to campaigns.
 
-Here, above all tests: both settings have to be made before the first of them is imported.
+Here, above all tests: these settings have to be made before the first of them is imported.
 """
 
 from __future__ import annotations
 
 import os
+import sys
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -14,6 +15,10 @@ pytest_plugins = ["tests.harness.paced_time"]
 
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")  # several test processes share the processors
+
+# Test processes, and the hundreds that tests start, load what was compiled once, even where a shell says otherwise.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 
 # The machine is shared: how long an example takes says nothing about the code.
 settings.register_profile("shared-machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])

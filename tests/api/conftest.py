@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import shutil
 import ssl
-import sys
 import tempfile
 import threading
 import time
@@ -35,13 +34,13 @@ from tests.harness.postgres import Cluster
 TOKEN = "administrator-token-of-the-tests"
 PATIENCE_S = 60.0
 """For each answer: a busy machine is slow, and a test says so where an answer has to be quick."""
+QUICK_SPEED = 600.0
+"""Times the world's: a whole test is played within a frame or two."""
 NO_TLS = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
 """Services of tests speak plain HTTP: without it every client would read the machine's certificates, 20 ms each."""
 DURABLE = engines._durable_sqlite
 STUB, REAL = thread_process.STUB, thread_process.REAL
 """Workers as threads: one that fits nothing, and one that does what a worker does."""
-STUB_PROCESS = (sys.executable, "-m", "tests.api.stub_worker")
-"""The same worker as a process: for tests of what a process does."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -177,7 +176,9 @@ class Service:
     def client(self, token: str | None = TOKEN, **more: Any) -> httpx.Client:
         headers = {"Authorization": f"Bearer {token}"} if token else {}
         headers |= more.pop("headers", {})
-        return httpx.Client(base_url=self.url, headers=headers, **{"timeout": PATIENCE_S, "verify": NO_TLS} | more)
+        client = httpx.Client(base_url=self.url, headers=headers, **{"timeout": PATIENCE_S, "verify": NO_TLS} | more)
+        client.rig_thread = self.rig_thread  # type: ignore[attr-defined]  # for `run_test`
+        return client
 
     def sql(self, statement: str) -> Any:
         """Done to the database behind the service's back; what it answers."""
@@ -258,12 +259,6 @@ def shared_client(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> 
             yield client
 
 
-@pytest.fixture
-def service(tmp_path: Path, short_dir: Path) -> Iterator[Service]:
-    """A fresh service with the stub worker."""
-    yield from run_service(tmp_path, short_dir, STUB)
-
-
 @cache
 def empty_database() -> bytes:
     """SQLite's file with the tables of today, made once a process: each fresh service gets a copy."""
@@ -289,6 +284,29 @@ def run_service(tmp_path: Path, short_dir: Path, worker: Any, speed: float = 30.
         app = create_app(settings, worker=worker)
         with Server(app) as url:
             yield Service(url, app, rig, tmp_path)
+
+
+def shared_service(worker: Any = STUB, **more: Any) -> Any:
+    """A fixture of a module: one service for all its tests."""
+
+    @pytest.fixture(scope="module")
+    def shared(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
+        yield from run_service(tmp_path_factory.mktemp("shared"), short_dir, worker, **more)
+
+    return shared
+
+
+def own_service(worker: Any = STUB, **more: Any) -> Any:
+    """A fixture: a service of its own for each test."""
+
+    @pytest.fixture
+    def own(tmp_path: Path, short_dir: Path) -> Iterator[Service]:
+        yield from run_service(tmp_path, short_dir, worker, **more)
+
+    return own
+
+
+service = own_service()
 
 
 @pytest.fixture(scope="session")
@@ -329,6 +347,15 @@ def participant(client: httpx.Client) -> str:
     return "P017"
 
 
+def soon(found: Callable[[], Any], limit_s: float = 60.0) -> Any:
+    """What is found, once it is something."""
+    end = time.monotonic() + limit_s
+    while not (value := found()):
+        assert time.monotonic() < end, value
+        time.sleep(0.02)
+    return value
+
+
 def wait_done(client: httpx.Client, test_id: str, limit_s: float = 120.0) -> dict[str, Any]:
     """Poll a test to its end."""
     end = time.monotonic() + limit_s
@@ -336,7 +363,7 @@ def wait_done(client: httpx.Client, test_id: str, limit_s: float = 120.0) -> dic
         document = client.get(f"/v1/tests/{test_id}").json()
         if document["done"]:
             return document
-        time.sleep(0.05)
+        time.sleep(0.02)
     raise AssertionError(f"not done: {document}")
 
 
@@ -351,7 +378,15 @@ def let_go(client: httpx.Client, limit_s: float = 20.0) -> bool:
 
 
 def run_test(client: httpx.Client, participant: str, limit_s: float = 120.0) -> dict[str, Any]:
-    """Start a test and follow it to its end."""
-    started = client.post("/v1/tests", json={"participant": participant})
-    assert started.status_code == 202, started.text
-    return wait_done(client, started.json()["id"], limit_s)
+    """Start a test and follow it to its end; nobody looks at it on its way, so the rig is quick."""
+    rig = client.rig_thread.rig if hasattr(client, "rig_thread") else None  # type: ignore[attr-defined]
+    before = rig.speed if rig else 0.0
+    try:
+        if rig:
+            rig.speed = QUICK_SPEED
+        started = client.post("/v1/tests", json={"participant": participant})
+        assert started.status_code == 202, started.text
+        return wait_done(client, started.json()["id"], limit_s)
+    finally:
+        if rig:
+            rig.speed = before

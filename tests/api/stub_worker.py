@@ -15,6 +15,8 @@ from typing import Any
 
 from tests.api.made_up_joint import joint
 
+COMMAND = (sys.executable, "-m", "tests.api.stub_worker")
+"""To start it as a process."""
 Pause = Callable[[float], Any]
 
 

@@ -15,8 +15,9 @@ import identify
 from api.charts import model_charts, ramp_directions
 from api.charts.hover import on
 from api.charts.svg import svg, ticks
+from api.workers.pool import WORKER
 from api.workers.verbs import curves
-from tests.api.conftest import REAL, run_service, run_test
+from tests.api.conftest import run_service, run_test
 from tests.api.fake_rig import default_widths, muscle
 
 Done = tuple[httpx.Client, dict[str, Any], Path]
@@ -26,7 +27,7 @@ Done = tuple[httpx.Client, dict[str, Any], Path]
 def done(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Done]:
     """A test's recording and model, by real workers."""
     folder = tmp_path_factory.mktemp("export")
-    for service in run_service(folder, short_dir, REAL):
+    for service in run_service(folder, short_dir, WORKER):
         with service.client() as client:
             client.timeout = 120
             client.post("/v1/participants", json={"code": "P1"})

@@ -9,7 +9,8 @@ import httpx
 import numpy as np
 import pytest
 
-from tests.api.conftest import REAL, run_service
+from api.workers.pool import WORKER
+from tests.api.conftest import run_service
 from tests.api.fake_rig import muscle
 from tests.api.test_worker import made_up_csv
 
@@ -17,7 +18,7 @@ from tests.api.test_worker import made_up_csv
 @pytest.fixture(scope="module")
 def model(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[tuple[httpx.Client, str]]:
     folder = tmp_path_factory.mktemp("prediction")
-    for service in run_service(folder, short_dir, REAL):
+    for service in run_service(folder, short_dir, WORKER):
         with service.client() as client:
             client.timeout = 120
             client.post("/v1/participants", json={"code": "P1"})

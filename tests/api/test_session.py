@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import concurrent.futures
 import json
-import time
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ import pytest
 from websockets.sync.client import connect
 
 from api.store import Store, engines
-from tests.api.conftest import DURABLE, TOKEN, Service, run_test, wait_done
+from tests.api.conftest import DURABLE, TOKEN, Service, run_test, soon, wait_done
 
 
 def test_whole_path_to_the_controller(client: httpx.Client, service: Service, participant: str) -> None:
@@ -101,10 +100,7 @@ def test_live_channel_tells_history_frames_and_the_end(
 ) -> None:
     service.rig.speed = 1.0
     test_id = client.post("/v1/tests", json={"participant": participant}).json()["id"]
-    end = time.monotonic() + 20
-    while client.get(f"/v1/tests/{test_id}").json()["elapsed_s"] < 0.5:
-        assert time.monotonic() < end
-        time.sleep(0.02)
+    soon(lambda: client.get(f"/v1/tests/{test_id}").json()["elapsed_s"] >= 0.5, 20)
     url = service.url.replace("http", "ws") + f"/v1/tests/{test_id}/live"
     with connect(url, additional_headers={"Authorization": f"Bearer {TOKEN}"}, open_timeout=60) as socket:
         messages = []
@@ -141,10 +137,7 @@ def test_recording_comes_back_byte_for_byte(client: httpx.Client, service: Servi
 
 def come_to_rest(pool: Any) -> None:
     """Wait until no worker has anything to do."""
-    end = time.monotonic() + 60
-    while pool.queue or any(worker.call for worker in pool.workers):
-        assert time.monotonic() < end
-        time.sleep(0.01)
+    soon(lambda: not (pool.queue or any(worker.call for worker in pool.workers)), 60)
 
 
 def test_comparison_and_diagnosis_are_made_once_and_kept(

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.api.conftest import REAL, run_service, run_test, wait_done
+from api.workers.pool import WORKER
+from tests.api.conftest import run_service, run_test, wait_done
 
 PERSON = "/v1/participants/P1"
 WIDTHS = np.r_[np.zeros(40), np.linspace(0, 160, 100), np.full(60, 160.0), np.linspace(160, 0, 100), np.zeros(40)]
@@ -17,7 +18,7 @@ BODY = {"participant": "P1", "kind": "sequence", "segments": TRIAL}
 
 
 def test_a_muscle_that_stays_is_followed_through_the_service(tmp_path: Path, short_dir: Path) -> None:
-    for service in run_service(tmp_path, short_dir, REAL):
+    for service in run_service(tmp_path, short_dir, WORKER):
         with service.client() as client:
             client.timeout = 300
             client.post("/v1/participants", json={"code": "P1"})

@@ -17,7 +17,8 @@ import identify
 from api.models import changes, summary, trend_words
 from api.models.changes import State
 from api.store.tables import Analysis, Model
-from tests.api.conftest import REAL, Service, run_service
+from api.workers.pool import WORKER
+from tests.api.conftest import Service, run_service
 from tests.harness import sessions
 from tests.harness.muscle import Patient
 from tests.harness.sessions import Planned
@@ -113,7 +114,7 @@ def test_other_effects_are_said_and_only_large_differences_told() -> None:
 
 
 def test_models_from_before_the_figures_are_read_once(tmp_path: Path, short_dir: Path) -> None:
-    for service in run_service(tmp_path, short_dir, REAL):
+    for service in run_service(tmp_path, short_dir, WORKER):
         with service.client() as client:
             _read_once(service, client)
 

@@ -10,10 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import httpx
-import pytest
 
 from api.clock import Clock
-from api.outbox import pusher as pushing
 from api.outbox.feed import Feed
 from api.outbox.link import Link
 from api.outbox.pusher import Pusher
@@ -146,13 +144,7 @@ class Rig:
 
 
 def run(pusher: Pusher, for_s: float) -> None:
-    """Let it work for a virtual while; in one of minutes it looks for what is new every ten seconds only."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pushing, "POLL_S", pushing.POLL_S if for_s < 300.0 else 10.0)
-        _run(pusher, for_s)
-
-
-def _run(pusher: Pusher, for_s: float) -> None:
+    """Let it work for a virtual while."""
     clock = pusher.clock
     assert isinstance(clock, VirtualClock)
     end = clock.now_s + for_s
