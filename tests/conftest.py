@@ -5,6 +5,7 @@ Here, above all tests: both settings have to be made before the first of them is
 
 from __future__ import annotations
 
+import gc
 import os
 
 import pytest
@@ -14,6 +15,35 @@ pytest_plugins = ["tests.harness.paced_time"]
 
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")  # several test processes share the processors
+
+gc.disable()  # until all tests are collected: nothing of it is garbage, and looking takes a third of the time
+
+SLOW = (
+    "tests/api/centre/",
+    "tests/api/cohort/",
+    "tests/api/outbox/",
+    *(f"tests/api/test_{name}.py" for name in ("doctor", "schemas", "sentences_in_languages", "why", "worker")),
+    "tests/examples/test_ilc_tracked.py",
+    *(f"tests/hardware_sim/test_{name}.py" for name in ("changing_patient", "hidden_records")),
+    *(
+        f"tests/identify/test_{name}.py"
+        for name in (
+            "carried_answers",
+            "carrying",
+            "examples",
+            "invariance",
+            "moving_joint",
+            "renewed_curve",
+            "tracking",
+        )
+    ),
+    *(
+        f"tests/rig/test_{name}.py"
+        for name in ("adaptive", "angle_recording", "angle_run", "damaged", "health", "lsl_live", "rate", "run")
+    ),
+    "tests/stimrig/test_stimrig.py",
+)
+"""Folders and files that take seconds in all, though few of their tests do: marked `slow`, so not in `make check`."""
 
 # The machine is shared: how long an example takes says nothing about the code.
 settings.register_profile("shared-machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -26,11 +56,25 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--late-answers", type=int, metavar="SEED", help="services answer browsers late and in pieces")
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    if config.getoption("numprocesses", None) and not hasattr(config, "workerinput"):
+        gc.enable()  # it collects nothing itself
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out what only a campaign runs, and what is SQLite's own on PostgreSQL; count it as deselected."""
+    """Mark what is slow; count what only a campaign runs, and SQLite's own on PostgreSQL, as deselected."""
+    for item in items:
+        if item.nodeid.startswith(SLOW):
+            item.add_marker("slow")
     without = [] if config.getoption("--campaigns") else ["campaign"]
     without += ["sqlite"] if config.getoption("--postgresql") else []
     left_out = {item for item in items if any(item.get_closest_marker(name) for name in without)}
     if left_out:
         config.hook.pytest_deselected(items=list(left_out))
         items[:] = [item for item in items if item not in left_out]
+
+
+def pytest_collection_finish() -> None:
+    """What was collected stays: no garbage collection looks at it again, nor copies it into a process's child."""
+    gc.freeze()
+    gc.enable()
