@@ -7,9 +7,12 @@ from __future__ import annotations
 
 import gc
 import os
+from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
+
+from tests.harness import made_once
 
 pytest_plugins = ["tests.harness.paced_time"]
 
@@ -72,6 +75,15 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if left_out:
         config.hook.pytest_deselected(items=list(left_out))
         items[:] = [item for item in items if item not in left_out]
+
+
+@pytest.fixture(scope="session", autouse=True)
+def kept_for_all_processes(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> None:
+    """Beside the folders of the processes, whose parent is this run's own."""
+    base = tmp_path_factory.getbasetemp()
+    folder: Path = (base.parent if hasattr(request.config, "workerinput") else base) / "made-once"
+    folder.mkdir(exist_ok=True)
+    made_once.folder = folder
 
 
 def pytest_collection_finish() -> None:
