@@ -25,9 +25,10 @@ SLOW = (
     "tests/api/centre/",
     "tests/api/cohort/",
     "tests/api/outbox/",
-    *(f"tests/api/test_{name}.py" for name in ("doctor", "schemas", "sentences_in_languages", "why", "worker")),
-    "tests/examples/test_ilc_tracked.py",
-    *(f"tests/hardware_sim/test_{name}.py" for name in ("changing_patient", "hidden_records")),
+    *(f"tests/api/test_{name}.py" for name in ("adaptive_worker", "doctor", "languages", "migrations", "schemas")),
+    *(f"tests/api/test_{name}.py" for name in ("sentences_in_languages", "tracking_worker", "why", "worker")),
+    *(f"tests/examples/test_ilc_{name}.py" for name in ("controller", "moving_joint", "tracked")),
+    *(f"tests/hardware_sim/test_{name}.py" for name in ("arm_records", "changing_patient", "hidden_records")),
     *(
         f"tests/identify/test_{name}.py"
         for name in (
@@ -37,7 +38,9 @@ SLOW = (
             "invariance",
             "moving_joint",
             "renewed_curve",
+            "tracked_states",
             "tracking",
+            "uncertainty",
         )
     ),
     *(
