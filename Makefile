@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 export PYTHONUNBUFFERED = 1
 
-.PHONY: demo centre test check fast lint types serve bench postgresql late pauses faults soak campaigns mutation words lock clean help setup setup-test setup-centre simulate
+.PHONY: demo centre test check fast lint types changed-types serve bench postgresql late pauses faults soak campaigns mutation words lock clean help setup setup-test setup-centre simulate
 
 help:
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -22,8 +22,8 @@ centre: setup-centre ## a centre with two emulated rigs that push to it: Postgre
 test: setup-test lint types ## every check and every test; with PYTEST_ARGS those tests alone
 	@$(BIN)/python -m $(if $(PYTEST_ARGS),pytest $(PYTEST_ARGS),tests)
 
-check: setup-test ## within a minute: style, layers, types and the fast tests
-	@$(MAKE) --no-print-directory -j2 --output-sync=target lint types fast
+check: setup-test ## what one runs at each save: style, layers, types of what changed and the fast tests
+	@$(MAKE) --no-print-directory -j3 --output-sync=line lint changed-types fast
 
 fast: setup-test
 	@echo "== fast tests"; $(BIN)/python -m tests fast
@@ -34,6 +34,9 @@ lint: setup-test ## style and layers
 
 types: setup-test ## types
 	@echo "== types"; $(BIN)/basedpyright --level error
+
+changed-types: setup-test
+	@echo "== types of what changed"; $(BIN)/python -m tests.runner.changed_types
 
 bench: $(VENV)-bench/.bench ## the figures in docs/, measured on this machine
 	@$(VENV)-bench/bin/python -m bench

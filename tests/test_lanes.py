@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.__main__ import CAMPAIGNS, LANES, dearest, main, not_run, plan, run
+from tests.runner.changed_types import keys
 from tests.runner.costs import AGAIN, Costs, Progress, repeating
 from tests.runner.lanes import TOGETHER
 
@@ -115,3 +116,22 @@ def test_a_broken_run_keeps_what_the_one_before_knew(tmp_path: Path) -> None:
 def test_a_name_with_spaces_is_repeated_as_one_word() -> None:
     test = "tests/rig/test_gate.py::test_it[a b's]"
     assert shlex.split(repeating(test, "--postgresql"))[-2:] == ["--postgresql", test]
+
+
+@pytest.mark.parametrize(
+    ("content", "settings", "changed"),
+    [
+        ({}, "", set()),
+        ({"a.top": "new"}, "", {"a.top"}),
+        ({"a.low": "new"}, "", {"a.top", "a.low"}),
+        ({"a": "new"}, "", {"a", "a.top", "a.low", "a.alone"}),
+        ({}, "strict", {"a", "a.top", "a.low", "a.alone"}),
+    ],
+    ids=["nothing", "what nobody imports", "what another imports", "their package", "the checker"],
+)
+def test_types_are_checked_again_where_an_answer_may_differ(
+    content: dict[str, str], settings: str, changed: set[str]
+) -> None:
+    modules, imported = dict.fromkeys(("a", "a.top", "a.low", "a.alone"), "old"), {"a.top": {"a.low"}}
+    before, now = keys(modules, imported, ""), keys(modules | content, imported, settings)
+    assert {name for name in modules if now[name] != before[name]} == changed

@@ -79,10 +79,13 @@ def item_hash(fields: dict[str, Any]) -> str:
     return digest(canonical({name: fields[name] for name in HASHED}))
 
 
+NEWEST = select(OutboxItem.chain, OutboxItem.seq, OutboxItem.hash).order_by(OutboxItem.id.desc()).limit(1)
+"""Asked for every second: put together once."""
+
+
 def head(session: Session) -> Head | None:
     """The newest item, or None where nothing was ever told."""
-    columns = (OutboxItem.chain, OutboxItem.seq, OutboxItem.hash)
-    row = session.execute(select(*columns).order_by(OutboxItem.id.desc()).limit(1)).first()
+    row = session.execute(NEWEST).first()
     return None if row is None else Head(*row)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import shutil
 import ssl
-import sys
 import tempfile
 import threading
 import time
@@ -23,9 +22,10 @@ from sqlalchemy import text
 
 from api.people import passwords
 from api.settings import Settings
-from api.store import Store
+from api.store import Store, engines
 from api.web import connections
 from api.web.app import create_app
+from tests.api import thread_process
 from tests.api.fake_rig import FakeRig, RigThread
 from tests.harness import postgres
 from tests.harness.late_answers import LateAnswers
@@ -34,9 +34,13 @@ from tests.harness.postgres import Cluster
 TOKEN = "administrator-token-of-the-tests"
 PATIENCE_S = 60.0
 """For each answer: a busy machine is slow, and a test says so where an answer has to be quick."""
+QUICK_SPEED = 600.0
+"""Times the world's: a whole test is played within a frame or two."""
 NO_TLS = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
 """Services of tests speak plain HTTP: without it every client would read the machine's certificates, 20 ms each."""
-STUB = (sys.executable, str(Path(__file__).parent / "stub_worker.py"))
+DURABLE = engines._durable_sqlite
+STUB, REAL = thread_process.STUB, thread_process.REAL
+"""Workers as threads: one that fits nothing, and one that does what a worker does."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -46,11 +50,47 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker("service")
 
 
+LOOPS: list[Any] = [None]
+"""The loop of a browser's driver: it stands in the main thread for the whole run, as if it always ran there."""
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
+    """The driver's loop is hidden from tests without a browser: they have loops of their own in this thread."""
+    shown = LOOPS[-1] if "browser" in getattr(item, "fixturenames", ()) else None
+    asyncio._set_running_loop(shown)
+    try:
+        return (yield)
+    finally:
+        asyncio._set_running_loop(None)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def stub_in_this_process() -> Iterator[None]:
+    """To start a process takes a processor 0.1 s, and each service has several."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(asyncio, "create_subprocess_exec", thread_process.start)
+        yield
+
+
 @pytest.fixture(scope="session", autouse=True)
 def quick_passwords() -> Iterator[None]:
     """A password check costs 0.1 s of a processor on purpose; `test_people` looks at the real parameters."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(passwords, "PasswordHasher", partial(PasswordHasher, time_cost=1, memory_cost=64, parallelism=1))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def databases_that_need_not_last() -> Iterator[None]:
+    """No commit waits for the disk: a test's database outlives no machine. `test_session` looks at a real one."""
+
+    def quick(connection: Any, record: Any) -> None:
+        DURABLE(connection, record)
+        connection.execute("PRAGMA synchronous=OFF")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(engines, "_durable_sqlite", quick)
         yield
 
 
@@ -136,7 +176,9 @@ class Service:
     def client(self, token: str | None = TOKEN, **more: Any) -> httpx.Client:
         headers = {"Authorization": f"Bearer {token}"} if token else {}
         headers |= more.pop("headers", {})
-        return httpx.Client(base_url=self.url, headers=headers, **{"timeout": PATIENCE_S, "verify": NO_TLS} | more)
+        client = httpx.Client(base_url=self.url, headers=headers, **{"timeout": PATIENCE_S, "verify": NO_TLS} | more)
+        client.rig_thread = self.rig_thread  # type: ignore[attr-defined]  # for `run_test`
+        return client
 
     def sql(self, statement: str) -> Any:
         """Done to the database behind the service's back; what it answers."""
@@ -149,6 +191,32 @@ class Service:
             return client.post("/v1/tokens", json={"name": name, "scopes": list(scopes)}).json()["token"]
 
 
+class PromptServer(uvicorn.Server):
+    """Ends when it is told to; uvicorn looks for that ten times a second, and waits as long for each connection."""
+
+    def __init__(self, config: uvicorn.Config) -> None:
+        super().__init__(config)
+        self.up = threading.Event()
+        self.down: asyncio.Event
+        self.loop: asyncio.AbstractEventLoop
+
+    async def main_loop(self) -> None:
+        self.loop, self.down = asyncio.get_running_loop(), asyncio.Event()
+        await self.on_tick(0)
+        self.up.set()
+        await self.down.wait()
+
+    async def shutdown(self, sockets: Any = None) -> None:  # noqa: ARG002
+        for server in self.servers:
+            server.close()
+        for connection in list(self.server_state.connections):
+            connection.shutdown()
+        end = time.monotonic() + 10
+        while (self.server_state.connections or self.server_state.tasks) and time.monotonic() < end:
+            await asyncio.sleep(0.002)
+        await self.lifespan.shutdown()
+
+
 class Server:
     """uvicorn in a thread."""
 
@@ -157,20 +225,21 @@ class Server:
 
     def __init__(self, app: Any, http: Any = None) -> None:
         http, app = http or connections.protocol(), self.behind(app)
-        self.server = uvicorn.Server(uvicorn.Config(app, port=0, log_level="warning", ws_ping_interval=None, http=http))
+        self.server = PromptServer(
+            uvicorn.Config(app, port=0, log_level="warning", ws_ping_interval=None, http=http, lifespan="on")
+        )
 
     def __enter__(self) -> str:
         self.thread = threading.Thread(target=self.server.run, daemon=True)
         self.thread.start()
         limit = time.monotonic() + PATIENCE_S
-        while not self.server.started:
+        while not self.server.up.wait(0.5):
             assert time.monotonic() < limit and self.thread.is_alive()
-            time.sleep(0.01)
         port = self.server.servers[0].sockets[0].getsockname()[1]
         return f"http://127.0.0.1:{port}"
 
     def __exit__(self, *_: object) -> None:
-        self.server.should_exit = True
+        self.server.loop.call_soon_threadsafe(self.server.down.set)
         self.thread.join(10)
 
 
@@ -190,12 +259,6 @@ def shared_client(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> 
             yield client
 
 
-@pytest.fixture
-def service(tmp_path: Path, short_dir: Path) -> Iterator[Service]:
-    """A fresh service with the stub worker."""
-    yield from run_service(tmp_path, short_dir, STUB)
-
-
 @cache
 def empty_database() -> bytes:
     """SQLite's file with the tables of today, made once a process: each fresh service gets a copy."""
@@ -205,21 +268,50 @@ def empty_database() -> bytes:
         return path.read_bytes()
 
 
+def put_database(folder: Path) -> None:
+    """An empty one with the tables of today, where there is none yet."""
+    folder.mkdir(parents=True, exist_ok=True)
+    if not (folder / "stimrig.db").exists():
+        (folder / "stimrig.db").write_bytes(empty_database())
+
+
 def run_service(tmp_path: Path, short_dir: Path, worker: Any, speed: float = 30.0, **more: Any) -> Iterator[Service]:
     socket = short_dir / f"rig-{time.time_ns()}.sock"
     settings = Settings(data_dir=tmp_path, admin_token=TOKEN, rig_socket=socket, port=0, **more)  # pyright: ignore[reportArgumentType]
-    if settings.database == f"sqlite:///{tmp_path / 'stimrig.db'}" and not (tmp_path / "stimrig.db").exists():
-        tmp_path.mkdir(parents=True, exist_ok=True)
-        (tmp_path / "stimrig.db").write_bytes(empty_database())
+    if settings.database == f"sqlite:///{tmp_path / 'stimrig.db'}":
+        put_database(tmp_path)
     with RigThread(socket, settings.recordings_dir, speed=speed) as rig:
         app = create_app(settings, worker=worker)
         with Server(app) as url:
             yield Service(url, app, rig, tmp_path)
 
 
-@pytest.fixture(scope="module")
+def shared_service(worker: Any = STUB, **more: Any) -> Any:
+    """A fixture of a module: one service for all its tests."""
+
+    @pytest.fixture(scope="module")
+    def shared(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
+        yield from run_service(tmp_path_factory.mktemp("shared"), short_dir, worker, **more)
+
+    return shared
+
+
+def own_service(worker: Any = STUB, **more: Any) -> Any:
+    """A fixture: a service of its own for each test."""
+
+    @pytest.fixture
+    def own(tmp_path: Path, short_dir: Path) -> Iterator[Service]:
+        yield from run_service(tmp_path, short_dir, worker, **more)
+
+    return own
+
+
+service = own_service()
+
+
+@pytest.fixture(scope="session")
 def browser() -> Iterator[Any]:
-    """Debian's chromium, once a file: while it runs, playwright's event loop does, and no test can have its own."""
+    """Debian's chromium, once a test process."""
     from tests.api.browser import ARGUMENTS, CHROMIUM
 
     playwright = pytest.importorskip("playwright.sync_api")
@@ -227,8 +319,11 @@ def browser() -> Iterator[Any]:
         pytest.skip("Debian's chromium is not installed (apt-get install chromium-headless-shell)")
     with playwright.sync_playwright() as driver:
         chromium = driver.chromium.launch(executable_path=str(CHROMIUM), args=ARGUMENTS)
+        LOOPS.append(asyncio._get_running_loop())
         yield chromium
+        asyncio._set_running_loop(LOOPS.pop())
         chromium.close()
+    asyncio._set_running_loop(None)
 
 
 @pytest.fixture
@@ -252,6 +347,15 @@ def participant(client: httpx.Client) -> str:
     return "P017"
 
 
+def soon(found: Callable[[], Any], limit_s: float = 60.0) -> Any:
+    """What is found, once it is something."""
+    end = time.monotonic() + limit_s
+    while not (value := found()):
+        assert time.monotonic() < end, value
+        time.sleep(0.02)
+    return value
+
+
 def wait_done(client: httpx.Client, test_id: str, limit_s: float = 120.0) -> dict[str, Any]:
     """Poll a test to its end."""
     end = time.monotonic() + limit_s
@@ -259,7 +363,7 @@ def wait_done(client: httpx.Client, test_id: str, limit_s: float = 120.0) -> dic
         document = client.get(f"/v1/tests/{test_id}").json()
         if document["done"]:
             return document
-        time.sleep(0.05)
+        time.sleep(0.02)
     raise AssertionError(f"not done: {document}")
 
 
@@ -274,7 +378,15 @@ def let_go(client: httpx.Client, limit_s: float = 20.0) -> bool:
 
 
 def run_test(client: httpx.Client, participant: str, limit_s: float = 120.0) -> dict[str, Any]:
-    """Start a test and follow it to its end."""
-    started = client.post("/v1/tests", json={"participant": participant})
-    assert started.status_code == 202, started.text
-    return wait_done(client, started.json()["id"], limit_s)
+    """Start a test and follow it to its end; nobody looks at it on its way, so the rig is quick."""
+    rig = client.rig_thread.rig if hasattr(client, "rig_thread") else None  # type: ignore[attr-defined]
+    before = rig.speed if rig else 0.0
+    try:
+        if rig:
+            rig.speed = QUICK_SPEED
+        started = client.post("/v1/tests", json={"participant": participant})
+        assert started.status_code == 202, started.text
+        return wait_done(client, started.json()["id"], limit_s)
+    finally:
+        if rig:
+            rig.speed = before

@@ -6,8 +6,8 @@ import sys
 from functools import partial
 
 from api.web import server
-from tests.api.conftest import STUB
+from tests.api.stub_worker import COMMAND
 
 if __name__ == "__main__":
-    server.create_app = partial(server.create_app, worker=STUB)
+    server.create_app = partial(server.create_app, worker=COMMAND)
     sys.exit(server.main())

@@ -1,4 +1,7 @@
-"""A worker that speaks the protocol of `api.workers.child` but fits nothing: quick, and slow when asked to be."""
+"""A worker that speaks the protocol of `api.workers.child` but fits nothing: quick, and slow when asked to be.
+
+Run as a process by tests of processes; for all others `tests/api/thread_process.py` has it in the test's own process.
+"""
 
 from __future__ import annotations
 
@@ -6,10 +9,15 @@ import hashlib
 import json
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from tests.api.made_up_joint import joint
+
+COMMAND = (sys.executable, "-m", "tests.api.stub_worker")
+"""To start it as a process."""
+Pause = Callable[[float], Any]
 
 
 def model(effects: list[str]) -> dict[str, Any]:
@@ -99,13 +107,13 @@ def improvement(model_json: str | None = None) -> dict[str, Any]:
     return {"verdict": "effect_missing", "noise_sd_nm": 0.04, "steps": steps, "models": models, "refused": []}
 
 
-def carried(folder: Path, earlier: dict[str, Any], say: Any) -> dict[str, Any]:
+def carried(folder: Path, earlier: dict[str, Any], say: Any, pause: Pause) -> dict[str, Any]:
     """Threshold drift is never needed again; the other effects always are."""
     if (folder / "does-not-carry").exists():
         return {"error": {"expected": True, "detail": (folder / "does-not-carry").read_text(), "place": ""}}
     say(progress=0.3, text="fitting last session's structure")
     while (folder / "carrying-slowly").exists():
-        time.sleep(0.05)
+        pause(0.05)
     held = [effect["id"] for effect in earlier["effects"]]
     needed = [effect for effect in held if effect != "threshold_drift"]
     rows = [
@@ -123,8 +131,6 @@ def carried(folder: Path, earlier: dict[str, Any], say: Any) -> dict[str, Any]:
 
 
 OPENING = [0.0] * 20 + [7.5 * k for k in range(1, 41)] + [0.0] * 20
-ADVISED: list[int] = []
-"""Answers since the test began."""
 
 
 def knowledge(percent: float) -> dict[str, Any]:
@@ -139,19 +145,19 @@ def knowledge(percent: float) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def advised(arguments: dict[str, Any]) -> dict[str, Any]:
+def advised(advice: int, target: float, pause: Pause) -> dict[str, Any]:
     """Each answer halves the bands, from 8 %; the target of 45 % is one at which the worker dies, of 44 % one at which
     it is slow, of 43 % one at which the structure fits badly, of 42 % one at which the answer holds nothing."""
-    percent, target = 16.0 * 0.5 ** len(ADVISED), TARGET["curve_percent"]
-    if len(ADVISED) > 2 and target == 45.0:
+    percent = 16.0 * 0.5**advice
+    if advice > 2 and target == 45.0:
         sys.exit(9)
-    if len(ADVISED) > 2 and target == 44.0:
-        time.sleep(3)
+    if advice > 2 and target == 44.0:
+        pause(3)
     if target == 42.0:
         return {}
     kind = "next" if target >= 44.0 or percent > target else "misfit" if target == 43.0 else "enough"
     widths = [100.0, 200.0] * 20
-    segments = [{"name": f"step {len(ADVISED)}", "sequence": "widths",
+    segments = [{"name": f"step {advice}", "sequence": "widths",
                  "settings": {"pulse_width_us": widths, "jumps": True}}]  # fmt: skip
     return {
         "kind": kind, "segments": segments if kind == "next" else [], "expected_torque_time_nm_s": 2.0,
@@ -160,17 +166,14 @@ def advised(arguments: dict[str, Any]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-TARGET: dict[str, float] = {}
-
-
-def tracked(arguments: dict[str, Any]) -> dict[str, Any]:
+def tracked(arguments: dict[str, Any], pause: Pause) -> dict[str, Any]:
     """A gain 2 % lower each trial; `track.json` beside the recording says otherwise, once."""
     told = Path(arguments["data"]).parent / "track.json"
     wanted = json.loads(told.read_text()) if told.exists() else {}
     told.unlink(missing_ok=True)
     if wanted.get("die"):
         sys.exit(9)
-    time.sleep(wanted.get("slow_s", 0.0))
+    pause(wanted.get("slow_s", 0.0))
     error = None if arguments["reference_torque_nm"] is None else 7.5
     if "reason" in wanted:
         return {"error_percent": error, "reason": wanted["reason"]}
@@ -190,104 +193,133 @@ def tracked(arguments: dict[str, Any]) -> dict[str, Any]:
     return {"error_percent": error, "step": step, "model": json.dumps(moved)}
 
 
-def answer(verb: str, arguments: dict[str, Any], say: Any) -> dict[str, Any]:
-    if verb == "fit":
-        say(progress=0.5, text="identifying")
-        if "slow" in arguments.get("effects", []):
-            time.sleep(60)
-        if "die" in arguments.get("effects", []):
-            sys.exit(9)
-        if "bad" in arguments.get("effects", []):
-            return {
-                "error": {"expected": True, "detail": "no effect bad. Take one of fatigue, tremor.", "place": "effects"}
-            }
-        while (Path(arguments["data"]).parent / "fitting-slowly").exists():
-            time.sleep(0.05)
-        document = model([effect.partition(":")[0] for effect in arguments.get("effects", [])])
-        return {"result": {"json": json.dumps(document), "model": document, "notes": []}}
-    if verb == "carry":
-        return carried(Path(arguments["data"]).parent, json.loads(arguments["model_json"]), say)
-    if verb == "comparison":
-        return {"result": comparison()}
-    if verb == "curves":
-        return {"result": curves()}
-    if verb == "diagnosis":
-        slow = Path(arguments["data"]).parent / "slow"
-        say(progress=float(slow.read_text()) if slow.exists() else 0.5, text="tried fatigue")
-        if slow.exists():
-            time.sleep(60)
-        return {"result": diagnosis(arguments.get("model_json"))}
-    if verb == "improve":
-        say(progress=0.5, text="adding fatigue")
-        return {"result": improvement(arguments.get("model_json"))}
-    if verb == "adaptive_outlook":
-        if arguments["target"]["step_percent"] == 49.0:
-            time.sleep(2.0)
-        within = arguments["max_torque_time_nm_s"] >= 20.0
-        words = "The target should be reached in about 9 s with 20 N·m·s."
-        if not within:
-            words = "The target is probably out of reach: in about 4 s with 9 N·m·s the curve would be known within "
-            words += "6.0 % and the step response within 3.0 %."
-        reach = {"reachable": within, "curve_percent": 1.9 if within else 6.0, "step_percent": 3.0, "seconds": 9.0,
-                 "torque_time_nm_s": 20.0, "words": words}  # fmt: skip
-        return {"result": {"opening_us": OPENING, "reach": reach, "known": bool(arguments["models"])}}
-    if verb == "adaptive_begin":
-        ADVISED.clear()
-        TARGET.update(arguments["target"])
-    if verb == "adaptive_advise":
-        ADVISED.append(len(arguments["torque_nm"]))
-        return {"result": advised(arguments)}
-    if verb == "track":
-        return {"result": tracked(arguments)}
-    if verb == "forecast":
-        return {"result": {"torque_nm": [width / 100 for width in arguments["pulse_width_us"]]}}
-    if verb == "invert":
-        if arguments.get("table") == "":
-            return {"error": {"expected": True, "detail": "the upload: empty. Give a header.", "place": "the upload"}}
-        wanted = arguments.get("reference_torque_nm") or [0.0, 1.0, 2.0]
-        widths = [min(100.0 * torque, arguments["largest_us"] or 500.0) for torque in wanted]
-        lacks = [{"begin_s": 0.025, "end_s": 0.05, "reason": "above-plateau", "shortfall_nm": 0.5}]
-        return {"result": {"pulse_rate_hz": 40.0, "duration_s": len(wanted) / 40, "reference_torque_nm": wanted,
-                           "pulse_width_us": widths, "predicted_torque_nm": [width / 100 for width in widths],
-                           "unreachable": lacks, "fit_percent": 90.0, "whole_fit_percent": 80.0,
-                           "tolerance_nm": 0.1}}  # fmt: skip
-    if verb == "join":
-        if arguments["needs"] and (Path(arguments["parts"][0]).parent / "no-angle").exists():
-            detail = "recording 2: it has no angle_rad, which an effect of the model needs. Leave it out."
-            return {"error": {"expected": True, "detail": detail, "place": "recording 2"}}
-        Path(arguments["out"]).write_text("\n".join(arguments["parts"]))
-        return {"result": {"file_sha256": "0" * 64}}
-    if verb == "effects":
-        names = ("fatigue", "tremor", "threshold_drift", "slow", "die", "bad", *JOINT)
-        words = dict.fromkeys(("name", "stage", "equation", "source", "signature", "separated_by", "plain"), "made up")
-        lists = {name: [] for name in ("parameters", "forms", "confused_with", "needs")}
-        return {"result": {"effects": [{"id": name, **words, **lists, "predictable": True} for name in names]}}
-    if verb == "export_csv":
-        Path(arguments["out"]).write_text("time_s,pulse_width_us,torque_nm,segment\n0.0,0.0,0.0,rest\n")
-        return {"result": {"rows": 1}}
-    if verb == "plain_csv":
-        from api.workers.verbs import plain_csv
-        from identify.errors import IdentifyError
+class Stub:
+    """What one worker process remembers.
 
-        try:
-            return {"result": plain_csv(progress=lambda *_: None, **arguments)}
-        except IdentifyError as error:
-            return {"error": {"expected": True, "detail": str(error), "place": error.place}}
-    if verb == "find_recording":
-        from api.workers.verbs import find_recording
+    Parameters
+    ----------
+    pause : callable
+        How to be slow.
+    """
 
-        return {"result": find_recording(lambda *_: None, **arguments)}
-    if verb == "recorded":
-        from api.workers.recorded_signals import recorded
+    def __init__(self, pause: Pause = time.sleep) -> None:
+        self.pause = pause
+        self.advice, self.target = 0, 0.0
+        """Answers since the test began, and the target that it told."""
 
-        return {"result": recorded(progress=lambda *_: None, **arguments)}
-    return {"result": {}}
+    def line(self, line: str | bytes, write: Callable[[str], Any]) -> None:
+        """Do one call; what it says is written line by line."""
+        request = json.loads(line)
+
+        def say(**fields: Any) -> None:
+            write(json.dumps({"call": request["call"], **fields}) + "\n")
+
+        say(**self.answer(request["verb"], request["arguments"], say))
+
+    def answer(self, verb: str, arguments: dict[str, Any], say: Any) -> dict[str, Any]:
+        if verb == "fit":
+            say(progress=0.5, text="identifying")
+            if "slow" in arguments.get("effects", []):
+                self.pause(60)
+            if "die" in arguments.get("effects", []):
+                sys.exit(9)
+            if "bad" in arguments.get("effects", []):
+                return {
+                    "error": {
+                        "expected": True,
+                        "detail": "no effect bad. Take one of fatigue, tremor.",
+                        "place": "effects",
+                    }
+                }
+            while (Path(arguments["data"]).parent / "fitting-slowly").exists():
+                self.pause(0.05)
+            document = model([effect.partition(":")[0] for effect in arguments.get("effects", [])])
+            return {"result": {"json": json.dumps(document), "model": document, "notes": []}}
+        if verb == "carry":
+            return carried(Path(arguments["data"]).parent, json.loads(arguments["model_json"]), say, self.pause)
+        if verb == "comparison":
+            return {"result": comparison()}
+        if verb == "curves":
+            return {"result": curves()}
+        if verb == "diagnosis":
+            slow = Path(arguments["data"]).parent / "slow"
+            say(progress=float(slow.read_text()) if slow.exists() else 0.5, text="tried fatigue")
+            if slow.exists():
+                self.pause(60)
+            return {"result": diagnosis(arguments.get("model_json"))}
+        if verb == "improve":
+            say(progress=0.5, text="adding fatigue")
+            return {"result": improvement(arguments.get("model_json"))}
+        if verb == "adaptive_outlook":
+            if arguments["target"]["step_percent"] == 49.0:
+                self.pause(2.0)
+            within = arguments["max_torque_time_nm_s"] >= 20.0
+            words = "The target should be reached in about 9 s with 20 N·m·s."
+            if not within:
+                words = (
+                    "The target is probably out of reach: in about 4 s with 9 N·m·s the curve would be known within "
+                )
+                words += "6.0 % and the step response within 3.0 %."
+            reach = {"reachable": within, "curve_percent": 1.9 if within else 6.0, "step_percent": 3.0, "seconds": 9.0,
+                     "torque_time_nm_s": 20.0, "words": words}  # fmt: skip
+            return {"result": {"opening_us": OPENING, "reach": reach, "known": bool(arguments["models"])}}
+        if verb == "adaptive_begin":
+            self.advice, self.target = 0, arguments["target"]["curve_percent"]
+        if verb == "adaptive_advise":
+            self.advice += 1
+            return {"result": advised(self.advice, self.target, self.pause)}
+        if verb == "track":
+            return {"result": tracked(arguments, self.pause)}
+        if verb == "forecast":
+            return {"result": {"torque_nm": [width / 100 for width in arguments["pulse_width_us"]]}}
+        if verb == "invert":
+            if arguments.get("table") == "":
+                return {
+                    "error": {"expected": True, "detail": "the upload: empty. Give a header.", "place": "the upload"}
+                }
+            wanted = arguments.get("reference_torque_nm") or [0.0, 1.0, 2.0]
+            widths = [min(100.0 * torque, arguments["largest_us"] or 500.0) for torque in wanted]
+            lacks = [{"begin_s": 0.025, "end_s": 0.05, "reason": "above-plateau", "shortfall_nm": 0.5}]
+            return {"result": {"pulse_rate_hz": 40.0, "duration_s": len(wanted) / 40, "reference_torque_nm": wanted,
+                               "pulse_width_us": widths, "predicted_torque_nm": [width / 100 for width in widths],
+                               "unreachable": lacks, "fit_percent": 90.0, "whole_fit_percent": 80.0,
+                               "tolerance_nm": 0.1}}  # fmt: skip
+        if verb == "join":
+            if arguments["needs"] and (Path(arguments["parts"][0]).parent / "no-angle").exists():
+                detail = "recording 2: it has no angle_rad, which an effect of the model needs. Leave it out."
+                return {"error": {"expected": True, "detail": detail, "place": "recording 2"}}
+            Path(arguments["out"]).write_text("\n".join(arguments["parts"]))
+            return {"result": {"file_sha256": "0" * 64}}
+        if verb == "effects":
+            names = ("fatigue", "tremor", "threshold_drift", "slow", "die", "bad", *JOINT)
+            words = dict.fromkeys(
+                ("name", "stage", "equation", "source", "signature", "separated_by", "plain"), "made up"
+            )
+            lists = {name: [] for name in ("parameters", "forms", "confused_with", "needs")}
+            return {"result": {"effects": [{"id": name, **words, **lists, "predictable": True} for name in names]}}
+        if verb == "export_csv":
+            Path(arguments["out"]).write_text("time_s,pulse_width_us,torque_nm,segment\n0.0,0.0,0.0,rest\n")
+            return {"result": {"rows": 1}}
+        if verb == "plain_csv":
+            from api.workers.verbs import plain_csv
+            from identify.errors import IdentifyError
+
+            try:
+                return {"result": plain_csv(progress=lambda *_: None, **arguments)}
+            except IdentifyError as error:
+                return {"error": {"expected": True, "detail": str(error), "place": error.place}}
+        if verb == "find_recording":
+            from api.workers.verbs import find_recording
+
+            return {"result": find_recording(lambda *_: None, **arguments)}
+        if verb == "recorded":
+            from api.workers.recorded_signals import recorded
+
+            return {"result": recorded(progress=lambda *_: None, **arguments)}
+        return {"result": {}}
 
 
-for line in sys.stdin:
-    request = json.loads(line)
-
-    def say(**fields: Any) -> None:
-        print(json.dumps({"call": request["call"], **fields}), flush=True)  # noqa: B023
-
-    say(**answer(request["verb"], request["arguments"], say))
+if __name__ == "__main__":
+    stub = Stub()
+    for line in sys.stdin:
+        stub.line(line, lambda said: print(said, end="", flush=True))

@@ -7,8 +7,6 @@ import os
 import socket
 import time
 from collections import Counter
-from collections.abc import Iterator
-from pathlib import Path
 
 import httpx
 import hypothesis
@@ -16,7 +14,7 @@ import pytest
 import schemathesis
 from schemathesis.checks import CHECKS
 
-from tests.api.conftest import STUB, TOKEN, Service, run_service, wait_done
+from tests.api.conftest import TOKEN, Service, shared_service, wait_done
 
 SEED = int(os.environ.get("STIMRIG_SEED", "20261120"))
 EXAMPLES = int(os.environ.get("STIMRIG_EXAMPLES", "8"))
@@ -26,9 +24,7 @@ AUTHORIZED = {"Authorization": f"Bearer {TOKEN}"}
 CHECKED = ["not_a_server_error", "status_code_conformance", "content_type_conformance", "response_schema_conformance"]
 
 
-@pytest.fixture(scope="module")
-def abused(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
-    yield from run_service(tmp_path_factory.mktemp("abused"), short_dir, STUB, speed=400.0)
+abused = shared_service(speed=400.0)
 
 
 def test_made_up_requests_meet_no_server_error(abused: Service) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +15,10 @@ from api.sessions.adaptive_tests import KEPT
 from api.sessions.requests import TargetIn, TestIn
 from api.sessions.rig_client import no_rig
 from identify.experiments.target import LEAST_PERCENT, MOST_PERCENT, Target
-from tests.api.conftest import STUB, Service, run_service, wait_done
+from tests.api.conftest import Service, own_service, wait_done
 
-
-@pytest.fixture
-def service(tmp_path: Path, short_dir: Path) -> Iterator[Service]:
-    """Adaptive tests are decided in seconds of the rig: it plays at the speed of the world."""
-    yield from run_service(tmp_path, short_dir, STUB, speed=1.0)
+service = own_service(speed=1.0)
+"""Adaptive tests are decided in seconds of the rig: it plays at the speed of the world."""
 
 
 def start(client: httpx.Client, **more: Any) -> httpx.Response:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import httpx
@@ -11,13 +10,10 @@ import pytest
 from sqlalchemy import event
 
 from api.store.tables import Participant
-from tests.api.conftest import STUB, Service, run_service, run_test, wait_done
+from tests.api.conftest import Service, run_test, shared_service, wait_done
 from tests.api.test_access import csrf, signed_in
 
-
-@pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
-    yield from run_service(tmp_path_factory.mktemp("archive"), short_dir, STUB)
+service = shared_service()
 
 
 @pytest.fixture

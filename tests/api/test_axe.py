@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.api.browser import PASSWORD, PHONE, WIDE, open_tab, participant, sign_in_with_token, start
-from tests.api.conftest import STUB, Service, run_service, run_test, wait_done
+from tests.api.conftest import Service, run_test, shared_service, soon, wait_done
 
 axe_path = pytest.importorskip("axe_playwright_python.base").AXE_FILE_PATH
 pytestmark = pytest.mark.browser
@@ -24,9 +24,7 @@ STICKING_OUT = """() => [...document.querySelectorAll('body *')].filter((e) => !
   e.getBoundingClientRect().right > innerWidth + 1).slice(0, 5).map((e) => e.outerHTML.slice(0, 120))"""
 
 
-@pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
-    yield from run_service(tmp_path_factory.mktemp("axe"), short_dir, STUB, speed=8.0)
+service = shared_service(speed=8.0)
 
 
 def violations(page: Any) -> list[str]:
@@ -34,6 +32,7 @@ def violations(page: Any) -> list[str]:
     if not page.evaluate("typeof window.axe === 'object'"):
         page.evaluate(Path(axe_path).read_text("utf-8"))
     found = page.evaluate("axe.run(document, {resultTypes: ['violations']})")
+    assert found["passes"] or found["violations"], "it has looked at something"
     return [
         f"{entry['id']} ({entry['impact']}): {json.dumps([node['html'][:160] for node in entry['nodes'][:3]])}"
         for entry in found["violations"]
@@ -266,7 +265,4 @@ def test_without_a_rig(tab: Any, service: Service) -> None:
     finally:
         service.rig_thread.__enter__()
         with service.client() as http:
-            end = time.monotonic() + 20
-            while not http.get("/v1/rig").json()["connected"]:
-                assert time.monotonic() < end
-                time.sleep(0.05)
+            soon(lambda: http.get("/v1/rig").json()["connected"], 20)

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.api.browser import expected, open_tab
-from tests.api.conftest import STUB, Service, run_service
+from tests.api.conftest import Service, shared_service
 
 pytestmark = pytest.mark.browser
 LAPTOP, TABLET = (1366, 768), (820, 1180)
 
 
-@pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
-    yield from run_service(tmp_path_factory.mktemp("keys"), short_dir, STUB)
+service = shared_service()
 
 
 @pytest.fixture

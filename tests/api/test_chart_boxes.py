@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.api.browser import open_tab
-from tests.api.conftest import STUB, Service, run_service, run_test
+from tests.api.conftest import Service, run_test, shared_service
 
 pytestmark = pytest.mark.browser
 LAPTOP, TABLET = {"width": 1366, "height": 768}, {"width": 820, "height": 1180}
@@ -31,9 +29,7 @@ NAMED = """(name) => { const probe = document.createElement('i'); probe.style.co
   document.body.append(probe); const found = getComputedStyle(probe).color; probe.remove(); return found; }"""
 
 
-@pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
-    yield from run_service(tmp_path_factory.mktemp("boxes"), short_dir, STUB)
+service = shared_service()
 
 
 @pytest.fixture(scope="module")

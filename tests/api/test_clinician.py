@@ -23,14 +23,12 @@ from tests.api.browser import (
     start,
     there,
 )
-from tests.api.conftest import STUB, Service, run_service, run_test
+from tests.api.conftest import Service, run_test, shared_service
 
 pytestmark = pytest.mark.browser
 
 
-@pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
-    yield from run_service(tmp_path_factory.mktemp("clinician"), short_dir, STUB, speed=8.0)
+service = shared_service(speed=8.0)
 
 
 @pytest.fixture

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import httpx
 import pytest
 
-from tests.api.conftest import STUB, Service, run_service
+from tests.api.conftest import Service, shared_service
 from tests.harness import sessions
 from tests.harness.muscle import Patient
 from tests.harness.sessions import Planned
@@ -22,9 +20,7 @@ DAYS = (
 )  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
-    yield from run_service(tmp_path_factory.mktemp("compare"), short_dir, STUB)
+service = shared_service()
 
 
 @pytest.fixture(scope="module")

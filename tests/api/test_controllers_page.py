@@ -15,9 +15,8 @@ import pytest
 
 from api.people import controller_keys
 from api.web import routes
-from api.workers.pool import WORKER
 from tests.api.browser import bring_to_rest
-from tests.api.conftest import Service, run_service
+from tests.api.conftest import REAL, Service, run_service
 from tests.api.test_worker import made_up_csv
 from tests.harness.c_program import compiled
 
@@ -34,7 +33,7 @@ def blocks(language: str) -> list[str]:
 def served(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[tuple[Service, str]]:
     """A service with an approved model of P017, and a key."""
     folder = tmp_path_factory.mktemp("controllers")
-    for service in run_service(folder, short_dir, WORKER):
+    for service in run_service(folder, short_dir, REAL):
         with service.client(timeout=120) as admin:
             admin.post("/v1/participants", json={"code": "P017"})
             body = made_up_csv(folder / "record.csv").read_bytes()

@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
-from pathlib import Path
-
-import pytest
 
 from api import language
 from api.effect_words import EFFECTS, PARAMETERS, effects_words, without_unit
 from api.language import translated
 from api.models import explanation, headline, trend_words
 from identify import effects
-from tests.api.conftest import STUB, Service, run_service, run_test
+from tests.api.conftest import Service, run_test, shared_service
 from tests.api.test_access import signed_in
 
 PLAIN = {
@@ -23,9 +19,7 @@ PLAIN = {
 }
 
 
-@pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
-    yield from run_service(tmp_path_factory.mktemp("effects"), short_dir, STUB)
+service = shared_service()
 
 
 def test_titles_and_main_parameters_are_those_of_the_library() -> None:

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.api.browser import bring_to_rest, expected
-from tests.api.conftest import STUB, Service, run_service, run_test
+from tests.api.conftest import Service, run_test, shared_service
 
 pytestmark = pytest.mark.browser
 LAPTOP, TABLET = (1366, 768), (820, 1180)
@@ -25,9 +23,7 @@ FIRST = {
 """What a person needs to decide, without scrolling."""
 
 
-@pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
-    yield from run_service(tmp_path_factory.mktemp("first"), short_dir, STUB, speed=8.0, emulated=True)
+service = shared_service(speed=8.0, emulated=True)
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ from tests.api.conftest import Service, run_service
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 ROOT = Path(__file__).parents[2]
-HIDDEN = ["--effects", "recruitment_hysteresis", "--seeds", "29:30", "--strengths", "strong", "--rate-hz", "200"]
+HIDDEN = ["--effects", "recruitment_hysteresis", "--seeds", "29:30", "--strengths", "strong", "--rate-hz", "80"]
 PATIENCE_MS = 400_000
 
 

@@ -5,24 +5,20 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
 from websockets.sync.client import connect
 
-from tests.api.conftest import STUB, TOKEN, Service, run_service, run_test, wait_done
+from tests.api.conftest import TOKEN, Service, own_service, run_test, soon, wait_done
 from tests.api.fake_arm import back_and_forth, still
 from tests.api.test_controller_keys import made
 
 RANGE = [math.radians(20), math.radians(110)]
 
 
-@pytest.fixture
-def service(tmp_path: Path, short_dir: Path) -> Iterator[Service]:
-    yield from run_service(tmp_path, short_dir, STUB, speed=10.0)
+service = own_service(speed=10.0)
 
 
 @pytest.fixture
@@ -37,10 +33,7 @@ def ready(service: Service, client: httpx.Client, participant: str) -> str:
 
 def seen_soon(client: httpx.Client) -> None:
     """Until the service has asked the rig again."""
-    end = time.monotonic() + 20
-    while not client.get("/v1/rig").json()["angle"]["present"]:
-        assert time.monotonic() < end
-        time.sleep(0.05)
+    soon(lambda: client.get("/v1/rig").json()["angle"]["present"], 20)
 
 
 def begin(client: httpx.Client, code: str, kind: str, **more: Any) -> httpx.Response:

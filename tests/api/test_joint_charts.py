@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -16,7 +14,7 @@ from api.language import using
 from api.sessions import coverage
 from tests.api import made_up_joint
 from tests.api.browser import open_tab
-from tests.api.conftest import STUB, Service, run_service, run_test
+from tests.api.conftest import Service, run_test, shared_service
 from tests.api.test_axe import examined
 from tests.api.test_chart_boxes import COVERED, LAPTOP
 
@@ -134,9 +132,7 @@ def test_figures_are_drawn_on_paper_with_every_name(figures: dict[str, Any]) -> 
 # ---- the page ----------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
-    yield from run_service(tmp_path_factory.mktemp("joint"), short_dir, STUB)
+service = shared_service()
 
 
 @pytest.fixture(scope="module")
@@ -171,7 +167,7 @@ def test_reports_have_them_and_pages_of_other_models_do_not(service: Service, mo
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("language", ["en", "de"])
 def test_the_page_is_examined(
-    browser: Any, service: Service, models: tuple[str, str], scheme: str, language: str
+    browser: Any, service: Service, models: tuple[str, str], language: str, scheme: str
 ) -> None:
     for page in open_tab(browser, service, color_scheme=scheme):
         page.context.add_cookies([{"name": "stimrig_language", "value": language, "url": service.url}])

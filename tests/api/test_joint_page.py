@@ -3,34 +3,26 @@
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.api.browser import PHONE, after_the_end, expected, painted_soon, participant
-from tests.api.conftest import STUB, Service, run_service
+from tests.api.conftest import Service, own_service, soon
 from tests.api.fake_arm import back_and_forth, still
 
 pytestmark = pytest.mark.browser
 LOW, HIGH = math.radians(20), math.radians(110)
 
 
-@pytest.fixture
-def service(tmp_path: Path, short_dir: Path) -> Iterator[Service]:
-    yield from run_service(tmp_path, short_dir, STUB, speed=4.0)
+service = own_service(speed=4.0)
 
 
 @pytest.fixture
 def sensor(service: Service) -> Service:
     service.rig.arm.way = still(math.radians(65))
     with service.client() as http:
-        end = time.monotonic() + 30
-        while not http.get("/v1/rig").json()["angle"]["present"]:
-            assert time.monotonic() < end
-            time.sleep(0.05)
+        soon(lambda: http.get("/v1/rig").json()["angle"]["present"], 30)
     return service
 
 

@@ -16,7 +16,7 @@ from typing import Any
 import httpx
 
 from api.cli.launcher import Child
-from tests.api.conftest import TOKEN, wait_done
+from tests.api.conftest import TOKEN, soon, wait_done
 
 ROOT = Path(__file__).parents[2]
 KILLS, SEED = 6, 61
@@ -92,10 +92,7 @@ def action(http: httpx.Client, rng: random.Random, kept: Acknowledged) -> None:
 
 def acknowledged(what: set[str], more_than: int) -> None:
     """Wait for it: on a busy machine there would be nothing to lose yet."""
-    end = time.monotonic() + 120
-    while len(what) <= more_than:
-        assert time.monotonic() < end
-        time.sleep(0.01)
+    soon(lambda: len(what) > more_than, 120)
 
 
 def everything_is_there(http: httpx.Client, kept: Acknowledged) -> None:

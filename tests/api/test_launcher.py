@@ -17,7 +17,7 @@ from api.cli.errors import LaunchError
 from api.cli.launcher import Services
 from api.client.rest import Client
 from api.settings import Settings
-from tests.api.conftest import TOKEN
+from tests.api.conftest import TOKEN, soon
 
 pytestmark = pytest.mark.wire
 FAST = ["--speed", "4"]
@@ -66,9 +66,7 @@ def test_killed_rig_comes_back_uncertain_and_the_test_is_a_fault(tmp_path: Path)
         assert services.rig.process is not None
         services.rig.process.kill()
         services.rig.process.wait()
-        end = time.monotonic() + 5.0
-        while http.get("/v1/rig").json()["connected"]:
-            assert time.monotonic() < end
+        soon(lambda: not http.get("/v1/rig").json()["connected"], 5.0)
         assert any("rig had ended" in event for event in services.watch())
         end = time.monotonic() + 60
         while not (document := http.get(f"/v1/tests/{test_id}").json())["done"]:
@@ -114,10 +112,7 @@ def test_everything_dies_with_the_launcher(tmp_path: Path) -> None:
     assert len(children) == 3
     launcher.send_signal(signal.SIGKILL)
     launcher.wait()
-    end = time.monotonic() + 10
-    while any(Path(f"/proc/{pid}").exists() and "Z" not in state(pid) for pid in children):
-        assert time.monotonic() < end
-        time.sleep(0.1)
+    soon(lambda: not any(Path(f"/proc/{pid}").exists() and "Z" not in state(pid) for pid in children), 10)
 
 
 def state(pid: str) -> str:

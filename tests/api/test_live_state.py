@@ -5,13 +5,12 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.api.browser import bring_to_rest, expected, gone, open_tab, participant, start
-from tests.api.conftest import STUB, Service, run_service, run_test
+from tests.api.conftest import Service, run_test, shared_service
 
 pytestmark = pytest.mark.browser
 SPEED, SLOW = 4.0, 0.2
@@ -19,9 +18,7 @@ SPEED, SLOW = 4.0, 0.2
 SILENT_CELL = "load cell on can0: no frame for 1.0 s"
 
 
-@pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
-    yield from run_service(tmp_path_factory.mktemp("state"), short_dir, STUB, speed=SPEED, emulated=True)
+service = shared_service(speed=SPEED, emulated=True)
 
 
 @pytest.fixture

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
 
-from tests.api.conftest import STUB, Service, run_service, run_test, wait_done
+from tests.api.conftest import Service, run_test, shared_service, wait_done
 
-
-@pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
-    yield from run_service(tmp_path_factory.mktemp("notes"), short_dir, STUB)
+service = shared_service()
 
 
 @pytest.fixture(scope="module")

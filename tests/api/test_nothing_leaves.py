@@ -16,7 +16,7 @@ from api.charts.config import CHART_CONFIG
 from api.web.pages.report_file import comparison_html, improvement_html
 from api.workers.verbs import curves, thinned
 from tests.api.browser import open_tab
-from tests.api.conftest import STUB, Service, run_service, run_test
+from tests.api.conftest import Service, run_test, shared_service
 from tests.api.test_worker import made_up_csv
 
 pytestmark = pytest.mark.browser
@@ -26,9 +26,7 @@ PNG = b"\x89PNG"
 BUTTONS = ".js-plotly-plot :is(.modebar-btn, button, a, [role=button])"
 
 
-@pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
-    yield from run_service(tmp_path_factory.mktemp("leaves"), short_dir, STUB, speed=8.0)
+service = shared_service(speed=8.0)
 
 
 @pytest.fixture
@@ -104,7 +102,7 @@ def test_no_request_leaves_a_page_whatever_is_pressed(tab: Any, service: Service
         model = run_test(http, "N1")["model_id"]
         added = http.post(f"/v1/models/{model}/effects", json={"effects": ["fatigue"]}).json()
     added = added.get("id") or added["model"]["id"]
-    paths = (f"/models/{model}?diagnose=1", f"/models/{added}", f"/compare?model={model}&model={added}")
+    paths = (f"/models/{model}?diagnose=1", f"/models/{added}?diagnose=0", f"/compare?model={model}&model={added}")
     seen: set[str] = set()
     for path in paths:
         tab.goto(service.url + path)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import httpx
@@ -14,16 +13,14 @@ import pytest
 from api.web.responses.rig import SequencesOut
 from rig import plan
 from tests.api.browser import open_tab
-from tests.api.conftest import STUB, Service, run_service, run_test
+from tests.api.conftest import Service, run_test, shared_service
 
 OPEN = {"/health", "/metrics", "/v1/sessions", "/v1/schemas", "/v1/schemas/{name}"}
 FREE_FORM = {"JsonValue", "SchemaOut"}
 """What is made to hold anything; each says so."""
 
 
-@pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
-    yield from run_service(tmp_path_factory.mktemp("openapi"), short_dir, STUB)
+service = shared_service()
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -26,14 +25,12 @@ from tests.api.browser import (
     say_yes,
     start,
 )
-from tests.api.conftest import STUB, Service, run_service, run_test
+from tests.api.conftest import Service, run_test, shared_service, soon
 
 pytestmark = pytest.mark.browser
 
 
-@pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
-    yield from run_service(tmp_path_factory.mktemp("page"), short_dir, STUB, speed=8.0)
+service = shared_service(speed=8.0)
 
 
 def test_a_clinicians_whole_way(tab: Any, service: Service) -> None:
@@ -91,7 +88,7 @@ def test_stop_is_on_every_page_uncovered_and_nothing_sticks_out(
 def test_stop_is_confirmed_and_the_rig_waits_for_a_person(tab: Any, service: Service) -> None:
     participant(tab, service, f"S{time.time_ns() % 10**9}")
     start(tab)
-    tab.wait_for_timeout(300)
+    soon(lambda: service.rig.state == "running")
     tab.get_by_role("button", name="Stop stimulation").click()
     tab.get_by_text("The rig confirms that stimulation is off.").wait_for()
     tab.get_by_role("link", name="To the participants").click()

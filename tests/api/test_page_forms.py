@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from fastapi.routing import APIRoute
 
 from api.web import pages
-from tests.api.conftest import STUB, TOKEN, Service, run_service, run_test
+from tests.api.conftest import TOKEN, Service, run_test, shared_service
 
 HTML = {"Accept": "text/html"}
 NAMES = (
@@ -58,9 +57,7 @@ BODIES: list[tuple[str, bytes]] = [
 ]  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
-    yield from run_service(tmp_path_factory.mktemp("forms"), short_dir, STUB)
+service = shared_service()
 
 
 @pytest.fixture(scope="module")

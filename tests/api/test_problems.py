@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import time
 from typing import Any
 
 import httpx
@@ -12,7 +11,7 @@ import pytest
 from api import errors
 from api.sessions import runner
 from rig.messages import Problem as RigProblem
-from tests.api.conftest import Service, let_go, run_test, wait_done
+from tests.api.conftest import Service, let_go, run_test, soon, wait_done
 
 GOOD_HEADER = "time_s,pulse_width_us,torque_nm,segment\n"
 
@@ -98,17 +97,14 @@ def test_unknown_scope(shared_client: httpx.Client) -> None:
 
 def test_rig_that_is_gone_and_comes_back(client: httpx.Client, service: Service, participant: str) -> None:
     service.rig_thread.__exit__()
-    time.sleep(0.3)
+    soon(lambda: not client.get("/v1/rig").json()["connected"])
     found = problem(client.post("/v1/tests", json={"participant": participant}), 503)
     assert found["title"] == "The rig cannot be reached"
     health = client.get("/health").json()
     assert health["status"] == "degraded" and health["rig"]["state"] == "disconnected"
     service.rig_thread.__enter__()
     service.rig.speed = 30.0
-    end = time.monotonic() + 60
-    while client.get("/health").json()["status"] != "ok":
-        assert time.monotonic() < end
-        time.sleep(0.05)
+    soon(lambda: client.get("/health").json()["status"] == "ok", 60)
     assert run_test(client, participant)["state"] == "completed"
 
 
@@ -120,9 +116,9 @@ def test_a_rest_that_is_needed_has_a_code_of_its_own() -> None:
 def test_rig_that_dies_in_a_test_ends_the_test(client: httpx.Client, service: Service, participant: str) -> None:
     service.rig.speed = 0.5
     test_id = client.post("/v1/tests", json={"participant": participant}).json()["id"]
-    time.sleep(0.3)
+    soon(lambda: service.rig.state == "running")
     service.rig_thread.__exit__()
-    time.sleep(0.2)
+    soon(lambda: not client.get("/v1/rig").json()["connected"])
     service.rig_thread.__enter__()
     document = wait_done(client, test_id)
     assert document["state"] == "fault" and "rig's process ended" in document["reason"]

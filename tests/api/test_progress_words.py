@@ -4,21 +4,16 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator
-from pathlib import Path
 
-import pytest
 from websockets.sync.client import connect
 
-from tests.api.conftest import STUB, TOKEN, Service, run_service, run_test
+from tests.api.conftest import TOKEN, Service, run_test, shared_service
 from tests.api.test_access import signed_in
 
 GERMAN = {"Accept-Language": "de"}
 
 
-@pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
-    yield from run_service(tmp_path_factory.mktemp("progress"), short_dir, STUB)
+service = shared_service()
 
 
 def test_a_page_that_waits_reads_its_own_language(service: Service) -> None:

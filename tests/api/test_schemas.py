@@ -19,12 +19,11 @@ from api import schemas
 from api.cli import main
 from api.cli.commands.test import through
 from api.store import Store
-from api.workers.pool import WORKER
 from identify.json_values import json_value
 from identify.model import SCHEMA_VERSION, Covariance
 from identify.paper import table1
 from identify.simulation.joint_surface import joint_tables
-from tests.api.conftest import TOKEN, run_service
+from tests.api.conftest import REAL, TOKEN, run_service
 from tests.api.test_worker import made_up_csv
 
 ALL = {name: schemas.load(name) for name in schemas.NAMES}
@@ -100,7 +99,7 @@ def test_the_emulators_line_holds_to_its_schema() -> None:
 
 
 def test_a_tests_json_holds_to_its_schema(tmp_path: Path, short_dir: Path) -> None:
-    for service in run_service(tmp_path, short_dir, WORKER):
+    for service in run_service(tmp_path, short_dir, REAL):
         found = through(service.url, TOKEN, "P017")
         found.pop("recording")
     assert unmet("test", found) == []

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from pathlib import Path
 
 import httpx
 import pytest
@@ -12,7 +11,7 @@ from fastapi.routing import APIRoute
 
 from api.people.auth import Scope
 from api.web import pages, routes
-from tests.api.conftest import STUB, TOKEN, Service, run_service, run_test
+from tests.api.conftest import TOKEN, Service, run_test, shared_service
 
 SCOPES = ("read-live", "run-test", "rearm", "approve-model", "read-model", "administer")
 TABLE = """
@@ -168,9 +167,7 @@ ROWS = [tuple(line.split()) for line in TABLE.strip().splitlines()]
 IN_PATHS = {"{name}": "x", "{direction}": "up", "{threshold}": "motor"}
 
 
-@pytest.fixture(scope="module")
-def shared(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
-    yield from run_service(tmp_path_factory.mktemp("scopes"), short_dir, STUB)
+shared = shared_service()
 
 
 def filled(path: str) -> str:

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import concurrent.futures
 import json
-import time
+from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
 from websockets.sync.client import connect
 
-from tests.api.conftest import TOKEN, Service, run_test, wait_done
+from api.store import Store, engines
+from tests.api.conftest import DURABLE, TOKEN, Service, run_test, soon, wait_done
 
 
 def test_whole_path_to_the_controller(client: httpx.Client, service: Service, participant: str) -> None:
@@ -99,10 +100,7 @@ def test_live_channel_tells_history_frames_and_the_end(
 ) -> None:
     service.rig.speed = 1.0
     test_id = client.post("/v1/tests", json={"participant": participant}).json()["id"]
-    end = time.monotonic() + 20
-    while client.get(f"/v1/tests/{test_id}").json()["elapsed_s"] < 0.5:
-        assert time.monotonic() < end
-        time.sleep(0.02)
+    soon(lambda: client.get(f"/v1/tests/{test_id}").json()["elapsed_s"] >= 0.5, 20)
     url = service.url.replace("http", "ws") + f"/v1/tests/{test_id}/live"
     with connect(url, additional_headers={"Authorization": f"Bearer {TOKEN}"}, open_timeout=60) as socket:
         messages = []
@@ -139,10 +137,7 @@ def test_recording_comes_back_byte_for_byte(client: httpx.Client, service: Servi
 
 def come_to_rest(pool: Any) -> None:
     """Wait until no worker has anything to do."""
-    end = time.monotonic() + 60
-    while pool.queue or any(worker.call for worker in pool.workers):
-        assert time.monotonic() < end
-        time.sleep(0.01)
+    soon(lambda: not (pool.queue or any(worker.call for worker in pool.workers)), 60)
 
 
 def test_comparison_and_diagnosis_are_made_once_and_kept(
@@ -200,10 +195,13 @@ def test_every_deed_is_in_the_audit_trail_and_the_chain_holds(
 
 
 @pytest.mark.sqlite
-def test_database_is_durable(service: Service) -> None:
-    with service.app.state.context.store.engine.connect() as connection:
+def test_database_is_durable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(engines, "_durable_sqlite", DURABLE)
+    store = Store(f"sqlite:///{tmp_path}/durable.db")
+    with store.engine.connect() as connection:
         assert connection.exec_driver_sql("PRAGMA journal_mode").scalar() == "wal"
         assert connection.exec_driver_sql("PRAGMA synchronous").scalar() == 2
+    store.close()
 
 
 @pytest.mark.parametrize("path", ["/health", "/metrics"])

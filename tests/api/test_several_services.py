@@ -13,7 +13,6 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any
 
 import httpx
 import pytest
@@ -24,7 +23,7 @@ from api.settings import Settings
 from api.store import Store, audit, holds
 from api.store.tables import AuditEntry, Model, Test
 from api.web.app import create_app
-from tests.api.conftest import PATIENCE_S, STUB, TOKEN, Server, Service, run_test, wait_done
+from tests.api.conftest import PATIENCE_S, STUB, TOKEN, Server, Service, run_test, soon, wait_done
 from tests.api.fake_rig import RigThread
 from tests.api.test_one_service import served
 from tests.harness.postgres import Cluster, running
@@ -55,15 +54,6 @@ def two(tmp_path: Path, short_dir: Path, address: str, speed: float = 30.0) -> I
 @pytest.fixture
 def address(cluster: Cluster, tmp_path: Path) -> str:
     return cluster.database(str(tmp_path))
-
-
-def soon(found: Any, *, limit_s: float = 60.0) -> Any:
-    """What is found once it is something."""
-    end = time.monotonic() + limit_s
-    while not (value := found()):
-        assert time.monotonic() < end
-        time.sleep(0.05)
-    return value
 
 
 # ---- what one does counts at the other ----------------------------------------------------------------------

@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.api.browser import participant, start
-from tests.api.conftest import STUB, Service, run_service
+from tests.api.conftest import Service, shared_service
 
 pytestmark = pytest.mark.browser
 
 
-@pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
-    yield from run_service(tmp_path_factory.mktemp("out"), short_dir, STUB, speed=0.2)
+service = shared_service(speed=0.2)
 
 
 def test_the_page_says_that_it_is_signed_out_and_stops_all_the_same(tab: Any, service: Service) -> None:

@@ -21,7 +21,7 @@ import pytest
 from api.cli import main, stop_key
 from api.cli.commands import test as test_verb
 from api.cli.stop_key import StopKey, at_rig, at_service
-from tests.api.conftest import TOKEN, Service, wait_done
+from tests.api.conftest import TOKEN, Service, soon, wait_done
 from tests.api.fake_rig import RigThread
 
 ROOT = Path(__file__).parents[2]
@@ -93,10 +93,7 @@ def test_a_key_is_no_stray_one_where_the_service_does_not_hear_its_rig(
     words: list[str] = []
     with service.client() as http, StopKey(at_service(service.url, TOKEN), words.append, program):
         service.rig_thread.__exit__(None, None, None)
-        end = time.monotonic() + 20
-        while http.get("/v1/rig").json()["connected"]:
-            assert time.monotonic() < end
-            time.sleep(0.02)
+        soon(lambda: not http.get("/v1/rig").json()["connected"], 20)
         os.write(keyboard, b"x")
         assert "emergency switch" in told(words)[0]
 
@@ -189,10 +186,7 @@ def test_a_key_before_the_rig_plays_keeps_the_test_from_beginning(
 
     def asked(*given: Any, **more: Any) -> dict[str, Any]:
         os.write(keyboard, b"q")
-        end = time.monotonic() + 20
-        while service.rig.state != "latched":
-            assert time.monotonic() < end
-            time.sleep(0.02)
+        soon(lambda: service.rig.state == "latched", 20)
         return real(*given, **more)
 
     monkeypatch.setattr(test_verb, "run_test", asked)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +14,9 @@ import pytest
 from api.charts import model_charts
 from api.workers.recorded_signals import recorded
 from tests.api.browser import expected, participant, start
-from tests.api.conftest import STUB, Service, run_service
+from tests.api.conftest import Service, shared_service
 
-
-@pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
-    yield from run_service(tmp_path_factory.mktemp("stopped"), short_dir, STUB, speed=0.5)
+service = shared_service(speed=0.5)
 
 
 def stops(service: Service) -> int:

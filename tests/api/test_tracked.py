@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +13,7 @@ import pytest
 from api.models.tracking import NEW_TEST
 from api.store.tables import Model, Test, Tracked
 from rig.messages import FinishedEvent
-from tests.api.conftest import STUB, Service, run_service, run_test, wait_done
+from tests.api.conftest import STUB, Service, run_service, run_test, soon, wait_done
 
 WIDTHS = [{"name": "trial", "sequence": "widths", "settings": {"pulse_width_us": [100.0] * 40}}]
 MODEL, TRACKING = "/v1/participants/P017/model", "/v1/participants/P017/tracking"
@@ -48,14 +46,6 @@ def trials(client: httpx.Client) -> list[dict[str, Any]]:
 def say(service: Service, **wanted: Any) -> None:
     """What the worker says of the next trial."""
     (service.data / "recordings" / "track.json").write_text(json.dumps(wanted))
-
-
-def soon(found: Callable[[], Any]) -> Any:
-    end = time.monotonic() + 60
-    while not (value := found()):
-        assert time.monotonic() < end
-        time.sleep(0.02)
-    return value
 
 
 def gain(document: dict[str, Any], approved: dict[str, Any]) -> float:

@@ -14,9 +14,9 @@ import pytest
 import identify
 from api.store.tables import Recording
 from api.workers import tracking_verbs
-from tests.api.conftest import Service, run_test
+from tests.api.conftest import Service, run_test, soon
 from tests.api.fake_rig import PATIENT
-from tests.api.test_tracked import play, say, soon
+from tests.api.test_tracked import play, say
 from tests.api.test_tracking_worker import follow, recorded
 from tests.harness.sessions import Planned, record
 

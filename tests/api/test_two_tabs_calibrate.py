@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import threading
-import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -12,7 +11,7 @@ import httpx
 import pytest
 
 from api.store.holds import LIMITS_TURN
-from tests.api.conftest import Service
+from tests.api.conftest import Service, soon
 from tests.api.test_access import csrf, signed_in
 from tests.api.test_calibration import WHERE, up
 
@@ -43,10 +42,7 @@ def at_once(service: Service, press: Any, count: int = 2) -> list[httpx.Response
     pressing = [threading.Thread(target=lambda: answers.append(press())) for _ in range(count)]
     for thread in pressing:
         thread.start()
-    end = time.monotonic() + 20
-    while len(turn._waiters or ()) < count:
-        assert time.monotonic() < end
-        time.sleep(0.01)
+    soon(lambda: len(turn._waiters or ()) >= count, 20)
     loop.call_soon_threadsafe(turn.release)
     for thread in pressing:
         thread.join(20)
@@ -65,10 +61,7 @@ def test_two_presses_at_once_send_exactly_one_train(service: Service, tab: Any, 
 def test_nothing_pressed_before_a_train_counts_while_it_is_on_its_way(service: Service, tab: Any) -> None:
     browser, fields = tab
     service.rig_thread.become("running")
-    end = time.monotonic() + 20
-    while service.rig.state != "running":
-        assert time.monotonic() < end
-        time.sleep(0.01)
+    soon(lambda: service.rig.state == "running", 20)
     for path in ("step/repeat", "mark/sensory", "finish"):
         answer = browser.post(f"{PAGE}/{path}", data=fields)
         assert answer.status_code == 409 and "Another train was sent" in answer.text, path

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
+import io
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from api.cli import main
 from api.workers import diagnosis_verbs
 from hardware_sim import hidden_records
 
@@ -19,10 +20,11 @@ pytestmark = pytest.mark.slow
 
 def stimrig(*words: object) -> str:
     """Standard output of a verb that must succeed."""
-    command = [str(Path(sys.executable).with_name("stimrig")), *map(str, words)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=240)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        code = main.run(list(map(str, words)))
+    assert code == 0, err.getvalue()
+    return out.getvalue()
 
 
 @pytest.fixture(scope="module")

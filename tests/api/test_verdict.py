@@ -14,8 +14,7 @@ import pytest
 from api.cli import main
 from api.models import summary
 from api.models.registry import Versions
-from api.workers.process import WORKER
-from tests.api.conftest import run_service
+from tests.api.conftest import REAL, run_service
 from tests.harness.patients import Patient, make_record
 
 GATE = {"passed": False, "severity": "refuse", "says": "the dynamics are unstable"}
@@ -51,7 +50,7 @@ def test_not_usable_is_said_in_each_place(tmp_path: Path, short_dir: Path, capsy
     assert json.loads(said(capsys, "fit", data, "--json"))["quality"] == stored
     assert stored["words"] in said(capsys, "compare", tmp_path / "MODEL.json", data, "--html", report)
     pages = {"report of the command line": report.read_text("utf-8")}
-    for service in run_service(tmp_path / "service", short_dir, WORKER):
+    for service in run_service(tmp_path / "service", short_dir, REAL):
         with service.client() as client:
             client.post("/v1/participants", json={"code": "P1"})
             sent = client.post("/v1/participants/P1/recordings", content=data.read_bytes(), timeout=200)
@@ -85,7 +84,7 @@ def test_level_held_out_torque_has_no_percent(
     assert fit["held_out_rms_nm"] > 0
     assert summary.UNDEFINED in said(capsys, "compare", tmp_path / "MODEL.json", data, "--html", report)
     assert summary.UNDEFINED in report.read_text("utf-8")
-    for service in run_service(tmp_path / "service", short_dir, WORKER):
+    for service in run_service(tmp_path / "service", short_dir, REAL):
         with service.client() as client:
             client.post("/v1/participants", json={"code": "P1"})
             sent = client.post("/v1/participants/P1/recordings", content=data.read_bytes(), timeout=200)

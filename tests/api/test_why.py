@@ -15,7 +15,7 @@ import pytest
 
 from api.models import effect_evidence, explanation
 from hardware_sim import hidden_records
-from tests.api.conftest import Service, run_test, wait_done
+from tests.api.conftest import Service, run_test, soon, wait_done
 from tests.api.test_access import HTML, csrf, signed_in
 
 
@@ -23,15 +23,6 @@ from tests.api.test_access import HTML, csrf, signed_in
 def model(client: httpx.Client, participant: str) -> str:
     """The model of a test."""
     return run_test(client, participant)["model_id"]
-
-
-def until(ready: Any, limit_s: float = 60.0) -> Any:
-    """Wait for something to be true."""
-    end = time.monotonic() + limit_s
-    while not (found := ready()):
-        assert time.monotonic() < end
-        time.sleep(0.02)
-    return found
 
 
 def make_slow(service: Service, progress: float = 0.5) -> Path:
@@ -47,7 +38,7 @@ def make_slow(service: Service, progress: float = 0.5) -> Path:
 
 def test_diagnosis_is_made_after_a_test_before_anybody_asks(service: Service, model: str) -> None:
     context = service.app.state.context
-    found = until(lambda: context.analyses.known(model, "diagnosis"))
+    found = soon(lambda: context.analyses.known(model, "diagnosis"))
     assert found["verdict"] == "effect_missing"
 
 
@@ -57,10 +48,10 @@ def test_new_test_ends_the_diagnosis_in_the_background(
     make_slow(service)
     model = run_test(client, participant)["model_id"]
     analyses = service.app.state.context.analyses
-    job = until(lambda: analyses.running.get((model, "diagnosis")))
-    until(lambda: job.state == "running")
+    job = soon(lambda: analyses.running.get((model, "diagnosis")))
+    soon(lambda: job.state == "running")
     assert client.post("/v1/tests", json={"participant": participant}).status_code == 202
-    until(lambda: job.state == "cancelled")
+    soon(lambda: job.state == "cancelled")
     assert analyses.known(model, "diagnosis") is None
 
 
@@ -68,13 +59,13 @@ def test_who_asks_does_not_wait_for_low_priority(client: httpx.Client, service: 
     marker = make_slow(service, 0.2)
     model = run_test(client, participant)["model_id"]
     analyses = service.app.state.context.analyses
-    until(lambda: (job := analyses.running.get((model, "diagnosis"))) and job.background and job.progress > 0.1)
+    soon(lambda: (job := analyses.running.get((model, "diagnosis"))) and job.background and job.progress > 0.1)
     marker.unlink()
     assert client.get(f"/v1/models/{model}/diagnosis").json()["verdict"] == "effect_missing"
 
 
 def test_job_tells_how_far_it_is_and_can_be_cancelled(client: httpx.Client, service: Service, model: str) -> None:
-    until(lambda: service.app.state.context.analyses.known(model, "diagnosis"))
+    soon(lambda: service.app.state.context.analyses.known(model, "diagnosis"))
     begun = client.post(
         f"/v1/models/{model}/effects?wait=false", json={"effects": ["slow"], "force": True, "reason": "x"}
     )
@@ -84,7 +75,7 @@ def test_job_tells_how_far_it_is_and_can_be_cancelled(client: httpx.Client, serv
         f"/v1/models/{model}/effects?wait=false", json={"effects": ["slow"], "force": True, "reason": "x"}
     )
     assert again.headers["location"] == url
-    job = until(lambda: (found := client.get(url).json())["progress"] == 0.5 and found)
+    job = soon(lambda: (found := client.get(url).json())["progress"] == 0.5 and found)
     assert job["state"] == "running" and job["time_left_s"] is not None and job["text"] == "identifying"
     ended = client.delete(url).json()
     assert ended["state"] == "cancelled" and ended["problem"]["title"] == "The job was cancelled"
@@ -95,7 +86,7 @@ def test_job_tells_how_far_it_is_and_can_be_cancelled(client: httpx.Client, serv
 def test_job_leads_to_its_result(client: httpx.Client, model: str) -> None:
     begun = client.post(f"/v1/models/{model}/improve?wait=false")
     assert begun.status_code == 202
-    job = until(lambda: (found := client.get(begun.headers["location"]).json())["done"] and found)
+    job = soon(lambda: (found := client.get(begun.headers["location"]).json())["done"] and found)
     assert job["state"] == "completed" and job["progress"] == 1.0
     assert client.get(job["result_url"]).json()["effects"] == ["fatigue"]
 
@@ -178,7 +169,7 @@ def test_improving_a_version_adds_to_what_it_holds(client: httpx.Client, model: 
 def test_diagnosis_kept_before_structures_were_told_is_read(client: httpx.Client, service: Service, model: str) -> None:
     """It was made of the plain structure, and kept with the first version."""
     context = service.app.state.context
-    kept = until(lambda: context.analyses.known(model, "diagnosis"))
+    kept = soon(lambda: context.analyses.known(model, "diagnosis"))
     old = {key: value for key, value in kept.items() if key != "structure"} | {"noise_sd_nm": 0.123}
     context.analyses._keep(model, "diagnosis", old)
     assert client.get(f"/v1/models/{model}/diagnosis").json()["noise_sd_nm"] == 0.123
@@ -307,7 +298,7 @@ def test_place_is_named_without_repeating_its_share() -> None:
 
 
 def test_page_shows_the_diagnosis_adds_by_a_form_and_shows_the_fall(service: Service, model: str) -> None:
-    until(lambda: service.app.state.context.analyses.known(model, "diagnosis"))
+    soon(lambda: service.app.state.context.analyses.known(model, "diagnosis"))
     with signed_in(service) as browser:
         text = browser.get(f"/models/{model}").text
         for words in (
@@ -337,7 +328,7 @@ def test_page_shows_the_diagnosis_adds_by_a_form_and_shows_the_fall(service: Ser
 def test_forcing_on_the_page_wants_a_reason_and_refusals_are_pages(service: Service, model: str) -> None:
     with signed_in(service) as browser:
         led = browser.post(f"/models/{model}/effects", data={"csrf": csrf(browser), "effect": "tremor"})
-        page = until(lambda: (found := browser.get(led.headers["location"])).status_code != 200 and found)
+        page = soon(lambda: (found := browser.get(led.headers["location"])).status_code != 200 and found)
         assert (
             page.status_code == 409
             and "gives no evidence for this effect" in page.text
@@ -351,7 +342,7 @@ def test_cancelled_diagnosis_offers_to_begin_anew(client: httpx.Client, service:
     with signed_in(service) as browser:
         assert "Cancel" in browser.get(f"/models/{model}").text
         led = browser.post(f"/models/{model}/diagnosis/cancel", data={"csrf": csrf(browser)})
-        page = until(lambda: "Diagnose now" in (text := browser.get(led.headers["location"]).text) and text)
+        page = soon(lambda: "Diagnose now" in (text := browser.get(led.headers["location"]).text) and text)
         assert "data-job" not in page
 
 

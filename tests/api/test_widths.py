@@ -15,10 +15,9 @@ import numpy as np
 import pytest
 
 from api.cli import main
-from api.workers.pool import WORKER
 from rig.messages import Bound
 from stimrig import Client
-from tests.api.conftest import PATIENCE_S, TOKEN, Service, run_service
+from tests.api.conftest import PATIENCE_S, REAL, TOKEN, Service, run_service
 from tests.api.fake_rig import muscle
 from tests.api.test_worker import made_up_csv
 
@@ -30,7 +29,7 @@ WANTED_NM = 1.5 * np.sin(np.pi * TIME_S / 6) ** 2
 @pytest.fixture(scope="module")
 def served(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[tuple[Service, str]]:
     folder = tmp_path_factory.mktemp("widths")
-    for service in run_service(folder, short_dir, WORKER):
+    for service in run_service(folder, short_dir, REAL):
         service.rig.limits["width_rise_us"] = Bound(hi=50.0, unit="µs/pulse", owner="hard limit")
         with service.client() as client:
             client.timeout = 120

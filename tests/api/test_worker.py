@@ -12,11 +12,11 @@ import pytest
 
 from api.errors import ApiError
 from api.workers.pool import Pool
-from tests.api.conftest import STUB
 from tests.api.fake_rig import default_widths, muscle
+from tests.api.stub_worker import COMMAND
 
 
-def with_pool(work: Any, workers: int = 1, command: tuple[str, ...] = STUB) -> Any:
+def with_pool(work: Any, workers: int = 1, command: tuple[str, ...] = COMMAND) -> Any:
     async def run() -> Any:
         pool = Pool(workers, command)
         try:

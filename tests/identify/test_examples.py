@@ -33,7 +33,7 @@ def test_biceps_example_on_a_simulated_muscle(tmp_path):
         pulses.write("time_s\n")
         widths = np.r_[np.full(30, 300.0), np.zeros(10)]
         clean = Patient(gain=30.0, time_constant_s=0.08, damping=0.9).torque(widths, 1000, 1 / 0.032)
-        for train in range(20):
+        for train in range(10):
             start = 5.0 + 2.1 * train
             pulses.writelines(f"{start + 0.032 * i + rng.uniform(-5e-4, 5e-4):.4f}\n" for i in range(30))
             for i, value in enumerate(clean):

@@ -10,12 +10,12 @@ from identify.errors import BadRequest
 from identify.estimation.uncertainty import prediction_band
 from identify.model import Model
 from tests.identify import hidden_muscles
+from tests.identify.dear import fatigued, improved_with_a_delay
 
 
 @pytest.fixture(scope="module")
 def improved():
-    record = hidden_muscles.record("fatigue", seed=15)
-    return record, identify.improve(record, force=["electromechanical_delay"])
+    return fatigued(), improved_with_a_delay()
 
 
 @pytest.mark.slow

@@ -17,6 +17,7 @@ from identify.recruitment.curve import Curve
 from identify.recruitment.power import PowerBasis
 from identify.recruitment.sigmoid import SigmoidBasis
 from identify.recruitment.spline import SplineBasis
+from tests.harness.made_once import made_once
 from tests.harness.patients import Patient, make_record
 
 KEYS = {
@@ -25,11 +26,16 @@ KEYS = {
 }  # fmt: skip
 
 
-@pytest.fixture(scope="module", params=[40, 1600])
-def case(request) -> tuple[Record, identify.Model]:
+@made_once
+def fitted(rate_hz: int) -> tuple[Record, identify.Model]:
     patient = Patient(delay_s=0.0137, time_constant_s=0.3)
-    record, _ = make_record(patient, np.random.default_rng(1), rate_hz=request.param, noise_nm=0.03)
+    record, _ = make_record(patient, np.random.default_rng(1), rate_hz=rate_hz, noise_nm=0.03)
     return record, identify.fit(record)
+
+
+@pytest.fixture(params=[40, 1600])
+def case(request) -> tuple[Record, identify.Model]:
+    return fitted(request.param)
 
 
 def test_holds_what_the_contract_names(case):

@@ -17,7 +17,9 @@ import pytest
 import identify
 from identify.methods import methods
 from identify.shown import Sheet, estimate, fit_words, one_line, probability, quantity, register_plotter
+from tests.harness.made_once import made_once
 from tests.identify import hidden_muscles
+from tests.identify.dear import fatigued, improved_with_a_delay
 
 pytestmark = pytest.mark.slow
 
@@ -38,18 +40,23 @@ WORDS = "<img src=x onerror=alert(1)> & \"'\n\x1b[31m"
 
 @pytest.fixture(scope="module")
 def record():
-    return hidden_muscles.record("fatigue", seed=15, rate_hz=100)
+    return fatigued()
 
 
-@pytest.fixture(scope="module")
-def results(record) -> dict[str, Any]:
-    model = identify.fit(record)
+@made_once
+def made() -> dict[str, Any]:
+    model = identify.fit(fatigued())
     return {
         "model": model,
-        "comparison": identify.compare(model, record),
-        "diagnosis": identify.diagnose(record),
-        "improvement": identify.improve(record, force=["electromechanical_delay"]),
+        "comparison": identify.compare(model, fatigued()),
+        "diagnosis": identify.diagnose(fatigued()),
+        "improvement": improved_with_a_delay(),
     }
+
+
+@pytest.fixture
+def results() -> dict[str, Any]:
+    return dict(made())
 
 
 # ---- api/schemas --------------------------------------------------------------------------------------------

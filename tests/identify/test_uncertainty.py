@@ -14,14 +14,15 @@ from identify.estimation.residual_tests import LAGS, PaddedRows, chi_square_p
 from identify.estimation.uncertainty import prediction_band
 from identify.noise.ar1 import ar1_or_white, best_ar1, log_likelihood, whiten
 from identify.noise.level import NoiseLevel, correlation_slopes
+from tests.harness.made_once import made_once
 from tests.harness.patients import Patient, make_record
 
 RECORDS = 60
 """Enough to see a band that is off by a tenth; `python -m bench goals` counts 300."""
 
 
-@pytest.fixture(scope="module")
-def trials():
+@made_once
+def fitted_trials():
     found = []
     for seed in range(RECORDS):
         rng = np.random.default_rng(7000 + seed)
@@ -31,6 +32,11 @@ def trials():
         record, clean = make_record(patient, rng, rate_hz=100, noise_nm=0.05)
         found.append((patient, record, clean, identify.fit(record)))
     return found
+
+
+@pytest.fixture
+def trials():
+    return fitted_trials()
 
 
 @pytest.mark.slow

@@ -55,7 +55,7 @@ LANES = {
         tuple(f"tests/api/test_{name}.py" for name in ON_POSTGRESQL),
         ("--postgresql",),
     ),
-    "service": Lane(f"not wire and not ({FAST})", PROCESSORS + 2),
+    "dear": Lane(f"not wire and not ({FAST})", PROCESSORS + 2),
     # two emulated rigs leave half of two processors idle
     "wire": Lane("wire and not realtime", 2),
 }

@@ -12,17 +12,17 @@ from api.web.responses.models import JobOut, VersionOut
 from api.web.responses.participants import ParticipantOut
 from api.web.responses.rig import TestOut
 from stimrig import Client, errors
-from tests.api.conftest import PATIENCE_S, TOKEN, Service, service, short_dir  # noqa: F401  fixtures
+from tests.api.conftest import PATIENCE_S, TOKEN, Service
 
 
 @pytest.fixture
-def client(service: Service) -> Any:  # noqa: F811
+def client(service: Service) -> Any:
     with Client(service.url, TOKEN, PATIENCE_S) as client:
         client.make_participant("P017")
         yield client
 
 
-def test_a_session_from_participant_to_controller(client: Client, service: Service) -> None:  # noqa: F811
+def test_a_session_from_participant_to_controller(client: Client, service: Service) -> None:
     seen: list[float] = []
     test = client.run_test("P017", lambda now: seen.append(now["progress"]))
     assert test["state"] == "completed" and seen == sorted(seen)
@@ -67,7 +67,7 @@ def test_what_progress_raises_cancels_the_job(client: Client) -> None:
     assert client.job("J1")["done"], "nothing goes on behind the person's back"
 
 
-def test_live_signals_come_until_the_end(client: Client, service: Service) -> None:  # noqa: F811
+def test_live_signals_come_until_the_end(client: Client, service: Service) -> None:
     service.rig.speed = 5.0
     messages = list(client.live(client.start_test("P017")["id"]))
     assert {"history", "live", "test"} <= {message["type"] for message in messages}
@@ -76,7 +76,7 @@ def test_live_signals_come_until_the_end(client: Client, service: Service) -> No
         next(stranger.live("T1"))
 
 
-def test_stop_is_confirmed_and_the_test_says_so(client: Client, service: Service) -> None:  # noqa: F811
+def test_stop_is_confirmed_and_the_test_says_so(client: Client, service: Service) -> None:
     service.rig.speed = 1.0
     test_id = client.start_test("P017")["id"]
     assert client.stop("enough")["stopped"]
@@ -103,7 +103,7 @@ def test_errors_carry_the_problem(client: Client, ask: Any, error: type[errors.R
     assert isinstance(found, errors.ServiceError) and found.document["status"] == status
 
 
-def test_a_wrong_token_is_unauthorized(service: Service) -> None:  # noqa: F811
+def test_a_wrong_token_is_unauthorized(service: Service) -> None:
     with Client(service.url, "guessed") as stranger, pytest.raises(errors.Unauthorized):
         stranger.participants()
 

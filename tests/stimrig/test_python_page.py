@@ -8,14 +8,14 @@ from pathlib import Path
 import pytest
 
 import stimrig
-from tests.api.conftest import TOKEN, Service, service, short_dir  # noqa: F401  the fixtures of the served app
+from tests.api.conftest import TOKEN, Service
 from tests.api.test_worker import made_up_csv
 
 TEXT = (Path(__file__).parents[2] / "docs" / "python.md").read_text("utf-8")
 
 
 @pytest.mark.slow
-def test_every_block_runs_in_order(tmp_path: Path, service: Service) -> None:  # noqa: F811
+def test_every_block_runs_in_order(tmp_path: Path, service: Service) -> None:
     blocks = re.findall(r"^```python\n(.*?)^```", TEXT, re.MULTILINE | re.DOTALL)
     assert len(blocks) >= 9
     scope = {"path": made_up_csv(tmp_path / "record.csv"), "url": service.url, "token": TOKEN}

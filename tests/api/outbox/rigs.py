@@ -18,6 +18,7 @@ from api.outbox.pusher import Pusher
 from api.settings import Settings
 from api.store import Store, audit
 from api.store.tables import Approval, Model, OutboxItem, Participant, Recording, Test, Tracked
+from tests.api.conftest import put_database
 from tests.harness.fake_centre import KEY, FakeCentre, canonical, sha256
 
 URL = "https://centre.example.org"
@@ -48,6 +49,7 @@ class Rig:
         (folder / "recordings").mkdir(parents=True, exist_ok=True)
         self.settings = Settings(data_dir=folder, database_url=None, centre_url=URL, centre_key=KEY)  # pyright: ignore[reportArgumentType]
         self.clock = VirtualClock()
+        put_database(folder)
         self.store = Store(self.settings.database)
         self.number = 0
         if feed:

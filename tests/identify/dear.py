@@ -1,0 +1,26 @@
+"""Records, fits and diagnoses that several files of tests look at."""
+
+from __future__ import annotations
+
+import identify
+from identify.records.record import Record
+from identify.results import Diagnosis, Improvement
+from tests.harness.made_once import made_once
+from tests.identify import hidden_muscles
+
+
+@made_once
+def diagnosed(hidden: str, seed: int, ar1: float = 0.0) -> Diagnosis:
+    """Of a muscle with something hidden in it, or nothing."""
+    return identify.diagnose(hidden_muscles.record(hidden, seed=seed, ar1=ar1))
+
+
+def fatigued() -> Record:
+    """A muscle that tires."""
+    return hidden_muscles.record("fatigue", seed=15, rate_hz=100)
+
+
+@made_once
+def improved_with_a_delay() -> Improvement:
+    """Its fatigue is found; a delay that it hasn't is asked for."""
+    return identify.improve(fatigued(), force=["electromechanical_delay"])
