@@ -35,19 +35,34 @@ class Outcome(NamedTuple):
     digest: str
 
 
+class Failures(logging.Handler):
+    """Keeps what a rig logs with an exception: a mistake in its program, wherever it was caught."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.ERROR)
+        self.told: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if record.exc_info and record.exc_info[1] is not None:
+            self.told.append(f"{record.getMessage()}: {type(record.exc_info[1]).__name__}: {record.exc_info[1]}")
+
+
 def live(seed: int, only: frozenset[int] | None = None) -> tuple[Life, list[str]]:
     """One life, and what did not hold in it; an exception counts."""
+    failures, log = Failures(), logging.getLogger("rig")
+    before, log.handlers, log.propagate = log.handlers, [failures], False
     life = Life(seed, only)
     try:
         life.live()
-        return life, broken(life)
+        return life, [*failures.told, *broken(life)]
     except Exception as error:
         return life, [f"{type(error).__name__}: {error}"]
+    finally:
+        log.handlers, log.propagate = before, True
 
 
 def outcome_of(seed: int) -> Outcome:
     """For a pool of processes."""
-    logging.disable(logging.CRITICAL)
     life, wrong = live(seed)
     return Outcome(seed, wrong, life.world.faults, life.world.now_s, life.world.digest())
 
@@ -73,7 +88,6 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--replay", action="store_true", help="one life, with its trace")
     parser.add_argument("--only", type=_numbers, help="with --replay: numbers of the accidents that happen, as 3,7")
     options = parser.parse_args(arguments)
-    logging.disable(logging.CRITICAL)
     return _replay(options) if options.replay else _simulate(options)
 
 

@@ -67,7 +67,7 @@ class Life:
             clock_ppm=chance.uniform(-200, 200), angle_offset_deg=30.0, angle_direction=-1,
             angle_clock_ppm=chance.uniform(-200, 200),
         )  # fmt: skip
-        self.arm = chance.choice((None, None, HELD, ROBOT))
+        self.arm = chance.choice((None, None, None, None, HELD, ROBOT))
         """What holds or moves the joint, where the rig has an angle sensor."""
         self.devices = make_devices(settings, self.arm, epoch_us=1_700_000_000_000_000)
         self.disk = SimulatedDisk(world)

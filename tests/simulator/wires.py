@@ -252,7 +252,7 @@ class _SimulatedBus:
         self._listening.append(listener)
 
     def leave(self, listener: Listener) -> None:
-        self._listening.remove(listener)
+        self._listening = [other for other in self._listening if other is not listener]
 
     def send(self, frames: Sequence[tuple[int, bytes, bool]]) -> None:
         if not self._open:
@@ -261,8 +261,7 @@ class _SimulatedBus:
             self._wires.devices.frame_received(self._wires.world.now_s, frame_id, data)
 
     def close(self) -> None:
-        self._open = False
-        self._listening.clear()
+        self.lose(f"{self.place}: the bus was closed")
 
     def carry(self, frames: Sequence[Any]) -> None:
         """Frames on their way: the process reads them when it runs."""
@@ -271,7 +270,8 @@ class _SimulatedBus:
     def lose(self, reason: str) -> None:
         """The adapter is pulled."""
         self._open = False
-        for listener in self._listening:
+        listening, self._listening = self._listening, []
+        for listener in listening:
             self.process.post(lambda lost=listener.lost: lost(reason))
 
     def _read(self, frames: Sequence[Any]) -> None:
