@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 export PYTHONUNBUFFERED = 1
 
-.PHONY: demo centre test check fast lint types changed-types serve bench postgresql late pauses faults soak campaigns mutation words lock clean help setup setup-test setup-centre simulate
+.PHONY: demo centre test check fast lint types changed-types serve bench postgresql late pauses soak campaigns mutation words lock clean help setup setup-test setup-centre simulate
 
 help:
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -58,9 +58,6 @@ pauses: setup-test ## every test while its processes are stopped and continued a
 
 simulate: setup-test ## lives of a rig in simulated time; MINUTES=10 or LIVES=1000, SEED=1 (docs/simulator.md)
 	@$(BIN)/python -m tests.simulator --seed $(or $(SEED),1) $(if $(LIVES),--lives $(LIVES),--minutes $(or $(MINUTES),10))
-
-faults: setup-test ## the fault campaign on the emulated rig (docs/results/faults.md)
-	@$(BIN)/python -m bench.faults
 
 mutation: setup-test ## which changes of the rig's safety code no test sees (docs/results/mutation.md; needs mutmut)
 	@$(BIN)/python -m mutmut run --max-children 2

@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 
 from deploy import soup
+from tests.simulator.invariants import INVARIANTS
 
 ROOT = Path(__file__).parents[2]
 HAZARDS = ROOT / "docs" / "safety" / "hazards.toml"
@@ -46,6 +47,8 @@ def faults(hazards: list[dict[str, Any]]) -> list[str]:
             found.append(f"{name}: severity {hazard.get('severity')!r}")
         if not hazard.get("control"):
             found.append(f"{name}: no control")
+        known = {invariant.__name__ for invariant in INVARIANTS}
+        found += [f"{name}: no such invariant: {one}" for one in hazard.get("invariants", []) if one not in known]
         for control in hazard.get("control", []):
             found += [f"{name}: {fault}" for fault in control_faults(control)]
     return found
@@ -70,6 +73,11 @@ def test_every_hazard_has_controls_and_every_control_tests_that_are_there() -> N
     assert faults(hazards()) == []
 
 
+def test_every_invariant_of_the_simulator_guards_against_a_hazard() -> None:
+    named = {name for hazard in hazards() for name in hazard.get("invariants", [])}
+    assert named == {invariant.__name__ for invariant in INVARIANTS}
+
+
 @pytest.mark.parametrize(
     ("spoil", "told"),
     [
@@ -80,6 +88,7 @@ def test_every_hazard_has_controls_and_every_control_tests_that_are_there() -> N
         (lambda h: h["control"][0]["tests"].append("tests/rig/test_nothing.py::test_x"), "no such test"),
         (lambda h: h["control"][0]["tests"].append("tests/rig/test_limits.py"), "no such test"),
         (lambda h: h["control"][0]["where"].append("rig/nowhere.py"), "is not there"),
+        (lambda h: h["invariants"].append("nothing_ever_happens"), "no such invariant"),
         (lambda h: h.update(severity="harmless"), "severity"),
         (lambda h: h.update(causes=[]), "no causes"),
         (lambda h: h.update(id="H02"), "twice"),

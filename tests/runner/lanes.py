@@ -66,7 +66,7 @@ CAMPAIGNS = {
     "make pauses": "every test while its processes are stopped and continued at random",
     "make late": "the page's tests with answers that come late and in pieces",
     "make soak": "an hour of recording with fits beside it, of which 30 s are run here",
-    "make faults": "every fault in every phase of a test, of which seven are run here",
+    "make simulate": "thousands of lives of a rig in simulated time, of which 24 are lived here",
     "make mutation": "changes of the rig's safety code, one by one: which of them no test sees",
     "make bench": "the figures in docs/, against other programs",
 }

@@ -40,6 +40,8 @@ BLIND_S = 0.1
 """Without a sample read for so long, nothing is sent."""
 DECIDED_S = 0.02
 """From the look at a sensor to the command; 0.4 of the longest period of these lives."""
+UNANSWERED_S = 0.42
+"""Without an acknowledgement for 0.1 s a test ends: at the next pulse, and a computer may stand still for 0.25 s."""
 NOTICED_S = 0.15
 """A sample that must end a test may be so old as it is read, with what the alignment may be wrong by."""
 SYNCED_WITHIN_S = 1.0
@@ -122,6 +124,15 @@ def one_pulse_is_on_its_way(life: Life) -> Iterator[str]:
                 yield f"{other.time_s:.4f} s: written before the pulse at {one.time_s:.4f} s was acknowledged"
 
 
+def a_missing_acknowledgement_ends_a_test(life: Life) -> Iterator[str]:
+    """Although what comes at last would let the next pulse pass."""
+    for felt in _by_test(life).values():
+        for one, other in pairwise(felt):
+            said_s = min((taken_s for sent_s, taken_s in life.wires.heard if sent_s + 1e-9 >= one.time_s), default=0.0)
+            if not (said_s - one.written_s <= UNANSWERED_S):
+                yield f"{other.time_s:.4f} s: {said_s - one.written_s:.2f} s without a word after a pulse before it"
+
+
 def a_torque_beyond_its_limit_ends_a_test(life: Life) -> Iterator[str]:
     """Or one that is no number."""
     for path, columns in _recordings(life):
@@ -151,17 +162,18 @@ def no_pulse_is_felt_late(life: Life) -> Iterator[str]:
 
 
 def a_confirmed_stop_is_true(life: Life) -> Iterator[str]:
-    """Once the rig has said that a stop is confirmed, no pulse that was written before is felt."""
+    """After its answer no pulse is felt that was written before, unless it says that one may be; the device is off."""
     for asked in life.clinic.asked:
         if asked.kind != "stop" or asked.reply is None or asked.replied_s is None or not asked.reply.ok:
             continue
-        if not (asked.reply.body or {}).get("confirmed"):
+        body = asked.reply.body or {}
+        if body.get("pulse_may_follow"):
             continue
-        if asked.armed:
+        if body.get("confirmed") and asked.armed:
             yield f"{asked.replied_s:.4f} s: a stop is confirmed, the stimulator can still stimulate"
         for pulse in _true(life):
             if pulse.written_s < asked.replied_s < pulse.time_s:
-                yield f"{pulse.time_s:.4f} s: felt after a stop that was confirmed at {asked.replied_s:.4f} s"
+                yield f"{pulse.time_s:.4f} s: felt after the answer to a stop at {asked.replied_s:.4f} s"
 
 
 def every_test_ends_in_a_documented_state(life: Life) -> Iterator[str]:
@@ -233,6 +245,7 @@ INVARIANTS: tuple[Callable[[Life], Iterator[str]], ...] = (
     trains_rise_in_small_steps,
     nothing_is_written_blind,
     one_pulse_is_on_its_way,
+    a_missing_acknowledgement_ends_a_test,
     a_torque_beyond_its_limit_ends_a_test,
     nothing_is_written_while_stopped,
     no_pulse_is_felt_late,

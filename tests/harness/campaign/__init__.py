@@ -1,1 +1,0 @@
-"""The fault campaign: each fault, in each phase of a test, on several seeds."""
