@@ -28,6 +28,7 @@ class Computer:
         self.speed = 1.0
         self.boots = 1
         self.paused_until_s = 0.0
+        self.pauses: list[tuple[float, float]] = []
         self.lag_s = 0.0
         """How far the step that runs now is ahead of the world."""
         self.stall_next_s = 0.0
@@ -57,6 +58,7 @@ class Computer:
     def pause(self, duration_s: float) -> None:
         """Nothing runs for a while."""
         self.paused_until_s = max(self.paused_until_s, self.world.now_s + duration_s)
+        self.pauses.append((self.world.now_s, self.paused_until_s))
 
     def access(self) -> None:
         """A step touches a port or a file: here it may be stalled."""

@@ -36,12 +36,15 @@ LONGEST_TEST_S = 6.0
 """What the people of a life ask for at most."""
 REST_S, REST_BETWEEN_TRAINS_S = 1.0, 0.5
 MOST_RISE_UC = 1.0
+TRAIN_RATE_HZ, LATEST = 40.0, 0.4
 BLIND_S = 0.1
 """Without a sample read for so long, nothing is sent."""
 DECIDED_S = 0.02
 """From the look at a sensor to the command; 0.4 of the longest period of these lives."""
 UNANSWERED_S = 0.42
 """Without an acknowledgement for 0.1 s a test ends: at the next pulse, and a computer may stand still for 0.25 s."""
+STILL_S = 0.31
+"""A sender may be late by 0.25 s, and its next look is due within a period."""
 NOTICED_S = 0.15
 """A sample that must end a test may be so old as it is read, with what the alignment may be wrong by."""
 SYNCED_WITHIN_S = 1.0
@@ -81,6 +84,16 @@ def a_test_is_no_longer_and_no_more_than_asked(life: Life) -> Iterator[str]:
             yield f"{name}: felt for {felt[-1].time_s - felt[0].time_s:.2f} s"
         if not (sum(p.width_us * p.current_ma * 1e-3 for p in felt) <= MOST_UC_A_TEST):
             yield f"{name}: too much charge"
+
+
+def pulses_keep_their_pace(life: Life) -> Iterator[str]:
+    """Each is decided within a share of the period after it was due: a late one is left out, never sent in a burst."""
+    for name, felt in _by_test(life).items():
+        period_s = 1 / (TRAIN_RATE_HZ if _calibration(name) else life.rate_hz)
+        phases_s = sorted(life.wires.decided_s[pulse.written_s] % period_s for pulse in felt)
+        gaps_s = [other - one for one, other in pairwise([*phases_s, phases_s[0] + period_s])]
+        if not (max(gaps_s) >= (1 - LATEST) * period_s - 1e-3):
+            yield f"{name}: pulses come {1e3 * (period_s - max(gaps_s)):.1f} ms late"
 
 
 def tests_are_apart(life: Life) -> Iterator[str]:
@@ -131,6 +144,14 @@ def a_missing_acknowledgement_ends_a_test(life: Life) -> Iterator[str]:
             said_s = min((taken_s for sent_s, taken_s in life.wires.heard if sent_s + 1e-9 >= one.time_s), default=0.0)
             if not (said_s - one.written_s <= UNANSWERED_S):
                 yield f"{other.time_s:.4f} s: {said_s - one.written_s:.2f} s without a word after a pulse before it"
+
+
+def a_computer_that_stands_still_ends_a_test(life: Life) -> Iterator[str]:
+    """Where nothing ran for so long while pulses were due, none of that test follows."""
+    for from_s, to_s in life.computer.pauses:
+        for name, felt in _by_test(life).items():
+            if to_s - from_s > STILL_S and felt[0].written_s < from_s and felt[-1].written_s > to_s:
+                yield f"{name}: goes on after the computer stood still for {to_s - from_s:.2f} s at {from_s:.4f} s"
 
 
 def a_torque_beyond_its_limit_ends_a_test(life: Life) -> Iterator[str]:
@@ -241,11 +262,13 @@ INVARIANTS: tuple[Callable[[Life], Iterator[str]], ...] = (
     every_pulse_is_within_the_limits,
     pulses_are_apart_and_not_too_many,
     a_test_is_no_longer_and_no_more_than_asked,
+    pulses_keep_their_pace,
     tests_are_apart,
     trains_rise_in_small_steps,
     nothing_is_written_blind,
     one_pulse_is_on_its_way,
     a_missing_acknowledgement_ends_a_test,
+    a_computer_that_stands_still_ends_a_test,
     a_torque_beyond_its_limit_ends_a_test,
     nothing_is_written_while_stopped,
     no_pulse_is_felt_late,

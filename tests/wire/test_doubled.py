@@ -13,6 +13,7 @@ from tests.harness.processes import Bench, RigClient, default_plan
 
 pytestmark = [pytest.mark.wire, pytest.mark.realtime, pytest.mark.slow]
 
+
 def test_a_line_that_doubles_a_command_is_not_gone_on_with(make_bench: Callable[..., Bench]):
     """Two pulses of one cannot be prevented here: it is seen by its acks, and stays at that."""
     bench = make_bench("--noise-seed", "7", speed=1.0)
