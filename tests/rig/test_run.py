@@ -16,7 +16,9 @@ from rig.errors import RecordingError
 from rig.journal import Kind
 from rig.messages import SegmentPlan
 from rig.signals import Pulse, PulseStatus
+from tests.harness.wired_device import WiredDevice
 from tests.rig.fakes import VirtualRig
+from tests.simulator.virtual_time import VirtualMachine
 
 
 def test_a_test_plays_to_its_end(tmp_path: Path):
@@ -54,6 +56,32 @@ def test_the_sealed_file_holds_what_was_played(tmp_path: Path):
         assert list(file["segments/start_s"][:]) == [0.0, 0.5, 2.5]
         assert list(file["segments/end_s"][:]) == [0.5, 2.5, 3.0]
         assert file["alignment"].attrs["method"] == "sync"
+
+
+def test_an_end_that_the_device_does_not_confirm_is_a_fault(tmp_path: Path):
+    rig = VirtualRig(tmp_path)
+
+    async def says_nothing_of_it() -> None:
+        rig.stimulator.stops += 1
+
+    rig.stimulator.stop = says_nothing_of_it
+    result = rig.execute()
+    assert result.outcome == "fault"
+    assert "the end of stimulation is not confirmed: armed" in result.reason
+    assert not result.evidence.confirmed
+
+
+@pytest.mark.parametrize("name", ["p24", "rehastim2"])
+def test_a_stop_takes_back_what_waits_in_the_computer_before_it_asks(name: str, monkeypatch: pytest.MonkeyPatch):
+    machine, did = VirtualMachine(), list[str]()
+    device = WiredDevice(name, machine, np.random.default_rng(1), stalls=0.0)
+    machine.run(device.driver.open())
+    machine.run(device.driver.arm())
+    write = device.write
+    monkeypatch.setattr(device, "discard", lambda: did.append("discard"))
+    monkeypatch.setattr(device, "write", lambda data: (did.append("write"), write(data))[1])
+    machine.run(device.driver.stop())
+    assert did == ["discard", "write"]
 
 
 def test_a_late_pulse_is_dropped_and_recorded_never_burst(tmp_path: Path):

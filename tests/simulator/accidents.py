@@ -112,6 +112,12 @@ def rig_is_killed(life: Life, chance: random.Random) -> str:
     return f"started again after {after_s:.3f} s"
 
 
+def rig_dies_in_a_step(life: Life, _chance: random.Random) -> str:
+    """The rig's process dies between two lines of its program: after an intent and before its command, for instance."""
+    life.computer.dies_next = True
+    return "at the next access to a port or a file"
+
+
 def rig_dies_after_a_stop(life: Life, chance: random.Random) -> str:
     """The rig's process dies shortly after it has answered the next stop."""
     life.clinic.dies_after_stop_s = for_s = chance.uniform(0.0, 0.05)
@@ -149,8 +155,8 @@ LIBRARY: dict[str, Accident] = {
     accident.__name__: accident
     for accident in (
         device_fault, line_stalls, line_deviates, bus_stalls, host_pauses, step_stalls, wall_clock_jumps, disk_is_full,
-        disk_fails, disk_is_slow, rig_is_killed, rig_dies_after_a_stop, power_fails, rig_is_ended, devices_lose_power,
-        requests_are_lost,
+        disk_fails, disk_is_slow, rig_is_killed, rig_dies_in_a_step, rig_dies_after_a_stop, power_fails, rig_is_ended,
+        devices_lose_power, requests_are_lost,
     )
 }  # fmt: skip
 ODDS = {"device_fault": 6.0, "line_stalls": 3.0, "line_deviates": 3.0, "host_pauses": 3.0, "step_stalls": 2.0}

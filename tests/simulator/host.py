@@ -16,6 +16,10 @@ BORN_S = 5000.0
 """What the computer's monotonic clock shows at the world's time 0."""
 
 
+class DiedInAStep(BaseException):
+    """A process was killed where it touched a port or a file: no program catches it."""
+
+
 class Computer:
     """A clock that drifts, and the pauses during which nothing runs on it.
 
@@ -33,6 +37,8 @@ class Computer:
         """How far the step that runs now is ahead of the world."""
         self.stall_next_s = 0.0
         """How long the next access to a port or a file takes."""
+        self.dies_next = self.in_a_step = False
+        """Whether the process dies at that access; whether one of its tasks runs."""
         self._rate = 1 + drift_ppm * 1e-6
         self._unix_s = unix_s
 
@@ -61,7 +67,10 @@ class Computer:
         self.pauses.append((self.world.now_s, self.paused_until_s))
 
     def access(self) -> None:
-        """A step touches a port or a file: here it may be stalled."""
+        """A step touches a port or a file: here it may be stalled, or be its last."""
+        if self.dies_next and self.in_a_step:
+            self.dies_next = False
+            raise DiedInAStep
         if self.stall_next_s:
             self.lag_s, self.stall_next_s = self.lag_s + self.stall_next_s, 0.0
 
@@ -76,6 +85,8 @@ class Process:
         self.tasks = Tasks(computer, self._work)
         self.disk: Disk = disk
         self.boot_id = f"boot-{computer.boots}"
+        self.on_death: Callable[[], None] = lambda: None
+        """Called as it dies by itself."""
         self.works = 0
         """Pieces of work, of the disk for the most part, that are under way."""
         self._ports, self._simulated_disk = ports, disk
@@ -128,9 +139,18 @@ class Process:
             self._wake_at(computer.paused_until_s)
             return
         inbox, self._inbox = self._inbox, []
-        for action in inbox:
-            action()
-        next_s = computer.true_at(self.tasks.run())
+        computer.in_a_step = True
+        try:
+            for action in inbox:
+                action()
+            next_s = computer.true_at(self.tasks.run())
+        except DiedInAStep:
+            for task in self.tasks._ready:
+                task._coroutine.close()  # it never began
+            self.on_death()
+            return
+        finally:
+            computer.in_a_step = False
         if computer.lag_s:
             computer.paused_until_s = max(computer.paused_until_s, computer.true_s)
             computer.lag_s = 0.0

@@ -101,6 +101,7 @@ class Life:
     def begin_process(self) -> None:
         """A rig process starts."""
         process = Process(self.computer, self.disk, self.wires)
+        process.on_death = lambda: self.kill(0.3)
         rig = Rig(self._config, process, lambda event: self.clinic.hear(process, event))
         self.clinic.meet(process, rig)
         self.world.tell("host", "the rig's process starts")
@@ -170,7 +171,7 @@ class Life:
             way.odds.clear()
         for name in self.devices.faults.active():
             self.devices.faults.off(name)
-        self.computer.stall_next_s = 0.0
+        self.computer.stall_next_s, self.computer.dies_next = 0.0, False
 
     # -- set-up
 

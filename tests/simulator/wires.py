@@ -35,6 +35,8 @@ class Direction:
         self.held: list[tuple[bytes, float]] = []
         self.discards = True
         """Whether what is held waits in the sender's computer, where it can be discarded."""
+        self.left_late_s: dict[float, float] = {}
+        """When a piece that had waited in the sender's computer left it, by when it was written."""
         self._stalled_until_s, self._last_s = 0.0, 0.0
         self._deliver = deliver
 
@@ -63,6 +65,8 @@ class Direction:
     def _release(self) -> None:
         if not self.stalled:
             held, self.held = self.held, []
+            if self.discards:
+                self.left_late_s |= {written_s: self.world.now_s for _, written_s in held}
             for data, written_s in held:
                 self.world.after(1e-5, lambda data=data, written_s=written_s: self._deliver(data, written_s, True))
 
