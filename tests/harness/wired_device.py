@@ -80,6 +80,12 @@ class WiredDevice:
         self._is_lost = True
         self._on_lost("unplugged")
 
+    def restart(self) -> None:
+        """Its power is lost and back."""
+        self._timeline.run_until(self._clock.now_s() - self._began_s)
+        self._firmware.reset()
+        self._go_on()
+
     def _carry(self, way: int, arrive: Callable[[], None]) -> None:
         stalls = self._rng.random() < self._stalls
         delay_s = self._rng.uniform(0.0, STALL_S if stalls else QUICK_S)

@@ -15,7 +15,7 @@ from rig.acquire.evidence import DECAY_S, SILENT_S, watch_decay
 from rig.errors import RecordingError
 from rig.journal import Kind
 from rig.messages import SegmentPlan
-from rig.signals import Pulse, PulseStatus
+from rig.signals import Ack, Pulse, PulseStatus
 from tests.harness.wired_device import WiredDevice
 from tests.rig.fakes import VirtualRig
 from tests.simulator.virtual_time import VirtualMachine
@@ -82,6 +82,19 @@ def test_a_stop_takes_back_what_waits_in_the_computer_before_it_asks(name: str, 
     monkeypatch.setattr(device, "write", lambda data: (did.append("write"), write(data))[1])
     machine.run(device.driver.stop())
     assert did == ["discard", "write"]
+
+
+def test_a_stimulator_that_restarts_in_a_test_is_told():
+    machine, told = VirtualMachine(), list[Ack]()
+    device = WiredDevice("rehastim2", machine, np.random.default_rng(1), stalls=0.0)
+    device.driver.listen(told.append, lambda _: None)
+    machine.run(device.driver.open())
+    machine.run(device.driver.arm())
+    machine.wait(0.7)
+    assert told == []
+    device.restart()
+    machine.wait(0.7)  # it offers a connection every 0.5 s
+    assert "it restarted during a test" in str(told[0].error)
 
 
 def test_a_late_pulse_is_dropped_and_recorded_never_burst(tmp_path: Path):
