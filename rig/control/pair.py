@@ -118,11 +118,12 @@ class Pair:
 
     async def both_answer(self) -> bool:
         """Stop the stimulator, ask its state, and check that torque arrives; False if one of them fails."""
-        if self.gate is None or self.receiver is None:
+        gate = self.gate
+        if gate is None or self.receiver is None:
             return False
         try:
-            await self.gate.stop()
-            safe, _ = await self.gate.state()
+            await gate.stop()
+            safe, _ = await gate.state()  # of the same one: the rig may be shutting down meanwhile
         except DeviceError:
             return False
         return safe and await self.torque_comes()

@@ -64,6 +64,10 @@ class Rest:
             with contextlib.suppress(OSError):  # the disk is read-only now: the latch file still says that a test ran
                 disk.remove(self._path)
 
+    def doubt(self) -> str:
+        """A sentence if the line may still hold a pulse that was sent before; empty if not."""
+        return "" if self._ended else "a pulse that was sent before may still be felt"
+
     async def settle(self) -> None:
         """The stimulator has answered, so the line is empty; a held pulse may have been felt just now."""
         if not self._ended:

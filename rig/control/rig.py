@@ -143,7 +143,7 @@ class Rig(Posing):
         """Ask the device although no test runs."""
         gate = self._pair.gate
         if gate is None:
-            return StopEvidence(confirmed=False, detail="the stimulator is not connected; no pulse can be sent")
+            return self._unconfirmed("the stimulator is not connected; no pulse can be sent")
         try:
             await gate.stop()
             safe, state = await gate.state()
@@ -154,7 +154,7 @@ class Rig(Posing):
 
     def _unconfirmed(self, detail: str) -> StopEvidence:
         """Evidence if the device did not answer: a pulse that was sent before may still be felt."""
-        possible = self._pair.gate.still_possible() if self._pair.gate else ""
+        possible = self._pair.gate.still_possible() if self._pair.gate else self._rest.doubt()
         words = "; ".join(part for part in (detail, possible) if part)
         return StopEvidence(confirmed=False, detail=words, pulse_may_follow=bool(possible))
 

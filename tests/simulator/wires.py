@@ -43,7 +43,7 @@ class Direction:
     def stall(self, duration_s: float, discards: bool) -> None:
         """Hold what comes for a while, then let it go at once."""
         self._stalled_until_s = max(self._stalled_until_s, self.world.now_s + duration_s)
-        self.discards = discards
+        self.discards = discards and (self.discards or not self.held)  # what is held beyond stays there
         self.world.at(self._stalled_until_s, self._release)
 
     @property
