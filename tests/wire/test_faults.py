@@ -158,6 +158,7 @@ def test_a_stop_in_the_moment_of_starting_wins(shared: tuple[Bench, RigClient]):
     other = bench.client()
     for attempt in range(8):
         plan = default_plan(f"race{attempt}", segments=STEPS[1:])
+        before = state(bench)["pulses_received"]
         with ThreadPoolExecutor(1) as pool:
             asked = pool.submit(client.ask, "start", plan=plan)
             time.sleep(attempt * 0.004)
@@ -170,6 +171,9 @@ def test_a_stop_in_the_moment_of_starting_wins(shared: tuple[Bench, RigClient]):
         assert state(bench)["pulses_received"] == count
         assert started["ok"] or started["problem"]["code"] == "latched"
         assert client.ask("rearm", by="nurse")["ok"]
+        rested_s = state(bench)["time_s"] + (1.5 if count > before else 0.0)  # a busy machine stopped late: pulses came
+        while state(bench)["time_s"] < rested_s:
+            time.sleep(0.02)
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
