@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.acquire.rate import RateCheck
+from rig.acquire.stream import steps_from
 from rig.limits import Limit
 from rig.messages import HELD, TestPlan
 
@@ -103,11 +104,11 @@ class AngleCheck:
         """More than the limit between two samples; what could have happened while samples were missing is allowed."""
         angle_rad, counter = samples["angle_rad"], samples["counter"]
         before = self._last or (float(angle_rad[0]), int(counter[0]) - 1, float(samples["host_time_s"][0]))
-        steps_rad = np.abs(np.diff(angle_rad, prepend=before[0]))
+        steps_rad = np.abs(steps_from(before[0], angle_rad))
         if counter[0] >= 0:
-            missing_s = (np.diff(counter, prepend=before[1]) - 1) / self._rate_hz
+            missing_s = (steps_from(before[1], counter) - 1) / self._rate_hz
         else:
-            missing_s = np.maximum(0.0, np.diff(samples["host_time_s"], prepend=before[2]) - 0.02)
+            missing_s = np.maximum(0.0, steps_from(before[2], samples["host_time_s"]) - 0.02)
         worst_rad = float(np.max(steps_rad - FASTEST_RAD_S * missing_s))
         if worst_rad <= self._jump_rad:
             return None

@@ -9,10 +9,10 @@ line's; after them the rig must stop like after any fault.
 from __future__ import annotations
 
 import io
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterator
 from functools import lru_cache
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -139,8 +139,7 @@ def one_pulse_is_on_its_way(life: Life) -> Iterator[str]:
     """No command before the stimulator has said something after the pulse before it."""
     for felt in _by_test(life).values():
         for one, other in pairwise(felt):
-            decided_s = life.wires.decided_s[other.written_s]
-            if not any(one.time_s <= sent_s + 1e-9 and taken_s <= decided_s for sent_s, taken_s in life.wires.heard):
+            if not (_answered_s(life)[one] <= life.wires.decided_s[other.written_s]):
                 yield f"{other.time_s:.4f} s: written before the pulse at {one.time_s:.4f} s was acknowledged"
 
 
@@ -148,9 +147,9 @@ def a_missing_acknowledgement_ends_a_test(life: Life) -> Iterator[str]:
     """Although what comes at last would let the next pulse pass."""
     for felt in _by_test(life).values():
         for one, other in pairwise(felt):
-            said_s = min((taken_s for sent_s, taken_s in life.wires.heard if sent_s + 1e-9 >= one.time_s), default=0.0)
-            if not (said_s - one.written_s <= UNANSWERED_S):
-                yield f"{other.time_s:.4f} s: {said_s - one.written_s:.2f} s without a word after a pulse before it"
+            silent_s = _answered_s(life)[one] - one.written_s
+            if not (silent_s <= UNANSWERED_S):
+                yield f"{other.time_s:.4f} s: {silent_s:.2f} s without a word after a pulse before it"
 
 
 def a_computer_that_stands_still_ends_a_test(life: Life) -> Iterator[str]:
@@ -175,10 +174,11 @@ def a_torque_beyond_its_limit_ends_a_test(life: Life) -> Iterator[str]:
 
 def nothing_is_written_while_stopped(life: Life) -> Iterator[str]:
     """After a stop or a fault no command is written until a person has re-armed, and none by a process that is dead."""
+    barred = _barred(life)
     for pulse in life.felt:
-        barred = [since_s for since_s, until_s in _barred(life) if since_s < pulse.written_s < until_s]
-        if barred:
-            yield f"{pulse.time_s:.4f} s: written at {pulse.written_s:.4f} s, stopped since {barred[0]:.4f} s"
+        stopped_s = [since_s for since_s, until_s in barred if since_s < pulse.written_s < until_s]
+        if stopped_s:
+            yield f"{pulse.time_s:.4f} s: written at {pulse.written_s:.4f} s, stopped since {stopped_s[0]:.4f} s"
 
 
 def no_pulse_is_felt_late(life: Life) -> Iterator[str]:
@@ -249,10 +249,10 @@ def what_the_files_call_acknowledged_was_felt(life: Life) -> Iterator[str]:
 
 def every_test_that_began_is_found(life: Life) -> Iterator[str]:
     """A recording, or the journal that it was or will be made of."""
-    names = [path.name for path in life.disk.files]
+    names = {_name(path) for path in life.disk.files}
     for asked in life.clinic.asked:
         began = asked.kind == "start" and asked.reply is not None and asked.reply.ok
-        if began and not any(f"{asked.about}." in f".{name}".replace("_", ".") for name in names):
+        if began and asked.about not in names:
             yield f"{asked.about} left no file"
     for event in life.clinic.finished:
         if event.recording_path is not None and not any(str(path) == event.recording_path for path in life.disk.files):
@@ -378,6 +378,15 @@ def _by_test(life: Life) -> dict[str, list[Felt]]:
         name = max(((since_s, name) for since_s, name in begun if since_s < pulse.written_s), default=(0.0, "none"))[1]
         found.setdefault(name, []).append(pulse)
     return found
+
+
+@lru_cache(maxsize=1)
+def _answered_s(life: Life) -> dict[Felt, float]:
+    """When the rig took the first word that the stimulator sent after each pulse; infinite: none came."""
+    heard = sorted(life.wires.heard)
+    sent_s = [sent_s for sent_s, _ in heard]
+    first_s = list(accumulate((taken_s for _, taken_s in reversed(heard)), min, initial=np.inf))[::-1]
+    return {pulse: first_s[bisect_left(sent_s, pulse.time_s - 1e-9)] for pulse in life.felt}
 
 
 def _told_test(asked: Asked) -> str:
