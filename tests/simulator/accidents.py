@@ -87,21 +87,21 @@ def wall_clock_jumps(life: Life, chance: random.Random) -> str:
 def disk_is_full(life: Life, chance: random.Random) -> str:
     """Nothing more fits for a while; a block is cut short."""
     life.disk.free, for_s = chance.choice((0, 100, 5000, 20_000)), chance.uniform(0.2, 3.0)
-    life.world.after(for_s, life.heal_disk)
+    life.world.after(for_s, life.disk.heal)
     return f"for {for_s:.3f} s, {life.disk.free} bytes left"
 
 
 def disk_fails(life: Life, chance: random.Random) -> str:
     """Every access gives an error for a while."""
     life.disk.failing, for_s = True, chance.uniform(0.1, 2.0)
-    life.world.after(for_s, life.heal_disk)
+    life.world.after(for_s, life.disk.heal)
     return f"for {for_s:.3f} s"
 
 
 def disk_is_slow(life: Life, chance: random.Random) -> str:
     """Each piece of work takes long."""
     life.disk.slow_s, for_s = chance.choice((0.05, 0.3, 4.0)), chance.uniform(0.2, 4.0)
-    life.world.after(for_s, life.heal_disk)
+    life.world.after(for_s, life.disk.heal)
     return f"{life.disk.slow_s:g} s a piece, for {for_s:.3f} s"
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import math
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -30,12 +31,24 @@ class SimulatedDisk:
         self.failing = False
         self.slow_s = 0.0
         """How long each piece of work takes at least."""
+        self.well_since_s = -math.inf
+        """When it had room again, gave no errors and was quick."""
         self.access: Callable[[], None] = lambda: None
         """Called at each append: there a step may be stalled."""
         self.replaced: list[tuple[float, str, bool]] = []
         """Each file that was to be replaced: when, its name, and whether the disk took it."""
         self.removed: list[tuple[float, str]] = []
         self._locked = False
+
+    @property
+    def is_well(self) -> bool:
+        """Whether it works as it should."""
+        return not self.failing and not self.slow_s and self.free > ROOM_BYTES / 2
+
+    def heal(self) -> None:
+        """Room, no errors, quick."""
+        self.free, self.failing, self.slow_s = ROOM_BYTES, False, 0.0
+        self.well_since_s = self.world.now_s
 
     def work_s(self) -> float:
         """How long a piece of work in another thread takes."""

@@ -33,6 +33,8 @@ class Computer:
         self.boots = 1
         self.paused_until_s = 0.0
         self.pauses: list[tuple[float, float]] = []
+        self.stalls: list[tuple[float, float]] = []
+        """Within a step: when, and for how long."""
         self.lag_s = 0.0
         """How far the step that runs now is ahead of the world."""
         self.stall_next_s = 0.0
@@ -72,6 +74,7 @@ class Computer:
             self.dies_next = False
             raise DiedInAStep
         if self.stall_next_s:
+            self.stalls.append((self.true_s, self.stall_next_s))
             self.lag_s, self.stall_next_s = self.lag_s + self.stall_next_s, 0.0
 
 

@@ -52,6 +52,8 @@ NOTICED_S = 0.15
 """A sample that must end a test may be so old as it is read, with what the alignment may be wrong by."""
 SYNCED_WITHIN_S = 1.0
 """What is older than this survives a power failure, on a disk that works."""
+OPEN_WORK_S = 8.0
+"""Within this time a slow disk has ended what it was given."""
 ANSWERED_S = 8.0
 """A stop waits up to 6 s for what the torque shows."""
 WRITTEN_S = 0.05
@@ -459,6 +461,15 @@ def _same(pulse: Felt, recorded: Sent) -> bool:
 
 
 def _lost_with_the_power(life: Life, pulse: Felt) -> bool:
-    """Whether it was written too shortly before a power failure to be synced."""
-    patience_s = SYNCED_WITHIN_S + max(4.0, life.disk.slow_s)
-    return any(time_s - patience_s <= pulse.written_s <= time_s for time_s in life.power_failures)
+    """Whether it was written too shortly before a power failure to be synced.
+
+    The rig has longer by what it stood still, and no bound where pieces of work that a slow disk took may be open."""
+    stood = [(from_s, to_s - from_s) for from_s, to_s in life.computer.pauses] + life.computer.stalls
+    for time_s, well_since_s in life.power_failures:
+        if well_since_s > time_s - OPEN_WORK_S:
+            patience_s = OPEN_WORK_S
+        else:
+            patience_s = SYNCED_WITHIN_S + sum(for_s for from_s, for_s in stood if from_s > time_s - OPEN_WORK_S)
+        if time_s - patience_s <= pulse.written_s <= time_s:
+            return True
+    return False

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import random
 from collections.abc import Collection
 from pathlib import Path
@@ -15,7 +16,7 @@ from rig.errors import RigError
 from rig.messages import Profile
 from tests.simulator import accidents
 from tests.simulator.clinic import Clinic
-from tests.simulator.disk import ROOM_BYTES, SimulatedDisk
+from tests.simulator.disk import SimulatedDisk
 from tests.simulator.host import Computer, Process
 from tests.simulator.people import People
 from tests.simulator.wires import Wires
@@ -80,7 +81,8 @@ class Life:
         self.deaths: list[float] = []
         self.died_writing: list[float] = []
         """Those of the deaths during which a piece of work was under way."""
-        self.power_failures: list[float] = []
+        self.power_failures: list[tuple[float, float]] = []
+        """When, and since when the disk was well; infinite: it was not."""
         self._config = self._rig_file(settings)
         self.quiet = False
         self._plan_accidents(chance, only)
@@ -133,7 +135,7 @@ class Life:
         if self.clinic.process is not None and self.clinic.process.alive:
             self.kill(again_after_s)
             self.disk.power_failure()
-            self.power_failures.append(self.world.now_s)
+            self.power_failures.append((self.world.now_s, self.disk.well_since_s if self.disk.is_well else math.inf))
             self.computer.boots += 1
 
     def end_process(self) -> None:
@@ -154,10 +156,6 @@ class Life:
 
     # -- healing
 
-    def heal_disk(self) -> None:
-        """Room, no errors, quick."""
-        self.disk.free, self.disk.failing, self.disk.slow_s = ROOM_BYTES, False, 0.0
-
     def heal_requests(self) -> None:
         """Nothing is lost any more."""
         self.clinic.loses = 0.0
@@ -165,7 +163,7 @@ class Life:
     def _calm(self) -> None:
         self.world.tell("life", "no more accidents")
         self.quiet = True
-        self.heal_disk()
+        self.disk.heal()
         self.heal_requests()
         for way in (self.wires.to_device, self.wires.to_host):
             way.odds.clear()
