@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import inspect
 import math
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -39,8 +40,8 @@ class Computer:
         """How far the step that runs now is ahead of the world."""
         self.stall_next_s = 0.0
         """How long the next access to a port or a file takes."""
-        self.dies_next = self.in_a_step = False
-        """Whether the process dies at that access; whether one of its tasks runs."""
+        self.dies_next = self.in_a_step = self.dying = False
+        """Whether the process dies at that access; whether one of its tasks runs; whether it died in this step."""
         self._rate = 1 + drift_ppm * 1e-6
         self._unix_s = unix_s
 
@@ -50,6 +51,7 @@ class Computer:
         return self.world.now_s + self.lag_s
 
     def now_s(self) -> float:
+        self._end_if_dying()
         return BORN_S + self.true_s * self._rate
 
     def unix_s(self) -> float:
@@ -71,11 +73,16 @@ class Computer:
     def access(self) -> None:
         """A step touches a port or a file: here it may be stalled, or be its last."""
         if self.dies_next and self.in_a_step:
-            self.dies_next = False
-            raise DiedInAStep
+            self.dies_next, self.dying = False, True
+        self._end_if_dying()
         if self.stall_next_s:
             self.stalls.append((self.true_s, self.stall_next_s))
             self.lag_s, self.stall_next_s = self.lag_s + self.stall_next_s, 0.0
+
+    def _end_if_dying(self) -> None:
+        """What the program does on its way out (`finally`) and the tasks after it do nothing any more."""
+        if self.dying:
+            raise DiedInAStep
 
 
 class Process:
@@ -149,8 +156,11 @@ class Process:
             next_s = computer.true_at(self.tasks.run())
         except DiedInAStep:
             for task in self.tasks._ready:
-                task._coroutine.close()  # it never began
-            self.on_death()
+                if inspect.getcoroutinestate(task._coroutine) == inspect.CORO_CREATED:
+                    task._coroutine.close()
+            died_s = computer.paused_until_s = max(computer.paused_until_s, computer.true_s)
+            computer.dying, computer.lag_s = False, 0.0
+            self.world.at(died_s, self.on_death)
             return
         finally:
             computer.in_a_step = False

@@ -54,6 +54,12 @@ SYNCED_WITHIN_S = 1.0
 """What is older than this survives a power failure, on a disk that works."""
 OPEN_WORK_S = 8.0
 """Within this time a slow disk has ended what it was given."""
+NOT_OF_THE_CELL = tuple(
+    f"device_fault {name}" for name in (
+        "no_ack", "late_ack", "electrode_error", "emergency_switch", "high_voltage_error", "stimulator_unplugged",
+        "angle",
+    )
+)  # fmt: skip
 ANSWERED_S = 8.0
 """A stop waits up to 6 s for what the torque shows."""
 WRITTEN_S = 0.05
@@ -279,6 +285,19 @@ def recordings_are_whole_and_in_order(life: Life) -> Iterator[str]:
             yield f"{path}: its counter does not rise"
 
 
+def recordings_hold_every_sample(life: Life) -> Iterator[str]:
+    """Where the cell had no fault: none between the first and the last is missing, and the pulses lie among them."""
+    if any(words.startswith("device") and not words.startswith(NOT_OF_THE_CELL) for words in life.befallen):
+        return
+    for path, columns in _recordings(life):
+        counter, time_s, written_s = (columns[name] for name in ("torque/counter", *_TIMES))
+        if len(counter) and counter[0] >= 0 and not np.all(np.diff(counter) == 1):
+            yield f"{path}: {np.sum(np.diff(counter) - 1)} samples are missing"
+        sent_s = written_s[np.isfinite(written_s)]
+        if len(sent_s) and not (time_s[:1] <= sent_s[0] and sent_s[-1] <= time_s[-1] + BLIND_S + NOTICED_S):
+            yield f"{path}: its pulses lie outside its samples"
+
+
 INVARIANTS: tuple[Callable[[Life], Iterator[str]], ...] = (
     every_pulse_is_within_the_limits,
     pulses_are_apart_and_not_too_many,
@@ -301,6 +320,7 @@ INVARIANTS: tuple[Callable[[Life], Iterator[str]], ...] = (
     every_test_that_began_is_found,
     every_request_is_answered,
     recordings_are_whole_and_in_order,
+    recordings_hold_every_sample,
 )
 
 
@@ -450,8 +470,9 @@ def _recordings(life: Life) -> list[tuple[Path, dict[str, np.ndarray]]]:
     return found
 
 
+_TIMES = "torque/time_s", "pulses/written_time_s"
 _COLUMNS = (
-    "torque/time_s", "torque/counter", "torque/torque_nm", "pulses/written_time_s", "pulses/sent_pulse_width_us",
+    *_TIMES, "torque/counter", "torque/torque_nm", "pulses/sent_pulse_width_us",
     "pulses/current_ma", "pulses/status",
 )  # fmt: skip
 

@@ -78,6 +78,10 @@ class Life:
         self.wires = Wires(world, self.devices, chance.choice((0.01, 0.02, 0.03)), self._note)
         self.clinic = Clinic(world, self.devices.state)
         self.clinic.kill = lambda: self.kill(0.3)
+        self.befallen: list[str] = []
+        """What befell it, as the trace tells it."""
+        self.past: list[tuple[Process, Rig]] = []
+        """Kept to the end: as Python tidies a task up, its `finally` would write for a process that is dead."""
         self.deaths: list[float] = []
         self.died_writing: list[float] = []
         """Those of the deaths during which a piece of work was under way."""
@@ -105,6 +109,7 @@ class Life:
         process = Process(self.computer, self.disk, self.wires)
         process.on_death = lambda: self.kill(0.3)
         rig = Rig(self._config, process, lambda event: self.clinic.hear(process, event))
+        self.past.append((process, rig))
         self.clinic.meet(process, rig)
         self.world.tell("host", "the rig's process starts")
 
@@ -193,7 +198,8 @@ class Life:
         own = random.Random(f"{self.world.seed} {number}")
         words = accidents.LIBRARY[name](self, own)
         self.world.faults += 1
-        self.world.tell("accident", f"{number} {name} {words}".rstrip())
+        self.befallen.append(f"{name} {words}".rstrip())
+        self.world.tell("accident", f"{number} {self.befallen[-1]}")
 
     def _rig_file(self, settings: Settings) -> config.RigConfig:
         cell = config.EMULATED_CELLS[settings.cell](settings.samples_per_frame)
