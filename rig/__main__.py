@@ -20,9 +20,9 @@ from pathlib import Path
 from rig import config as configuration
 from rig import devices
 from rig.adapters.machine import LocalMachine
+from rig.adapters.server import Ask, Server
 from rig.clock import MonotonicClock
 from rig.control.rig import Rig
-from rig.control.server import Ask, Server
 from rig.errors import RigError
 from rig.keys import StopKey
 from rig.messages import stop_socket

@@ -1,4 +1,4 @@
-"""`python -m rig.builder`: builds previews for the rig in a process of its own (see `rig.control.previews`).
+"""`python -m rig.builder`: builds previews for the rig in a process of its own (see `rig.adapters.previews`).
 
 The first line on standard input holds the rig's limits. Each further line is the request for one preview, and gets one
 line as its reply. The process ends when its standard input ends, or with the rig. It has the lowest priority at the

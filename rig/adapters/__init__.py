@@ -1,1 +1,2 @@
-"""The machine on which the rig runs: threads, clock, serial ports, CAN adapters, files. Nothing here decides."""
+"""The machine on which the rig runs: threads, clock, serial ports, CAN adapters, files, sockets. Nothing here decides
+about a pulse."""

@@ -1,1 +1,1 @@
-"""The rig as others see it: tests one at a time, a Unix socket, and a latch that only a person opens."""
+"""The rig as others see it: requests, tests one at a time, and a latch that only a person opens."""

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from rig.control import previews
-from rig.control.previews import Previews
+from rig.adapters import previews
+from rig.adapters.previews import Previews
 from rig.errors import BusyError
 from rig.limits import HARD_LIMITS
 

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from rig import __main__ as program
-from rig.control.server import Server
+from rig.adapters.server import Server
 from rig.messages import Reply, StateEvent, Status
 
 READY = Status(state="ready")

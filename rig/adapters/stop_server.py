@@ -16,7 +16,7 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from rig.control.connections import Connections
+from rig.adapters.connections import Connections
 from rig.control.replies import id_of, internal_error, invalid_request, refusal, to_line
 from rig.errors import ConfigError, RigError
 from rig.messages import Reply, StopEvidence, StopRequest

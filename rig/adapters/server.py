@@ -16,12 +16,12 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from rig.adapters.connections import Connections
+from rig.adapters.previews import Previews
+from rig.adapters.stop_server import MAX_LINE_BYTES, StopServer
 from rig.control import desk
-from rig.control.connections import Connections
-from rig.control.previews import Previews
 from rig.control.replies import head_of, id_of, invalid_request, refusal, to_line
 from rig.control.rig import Rig
-from rig.control.stop_server import MAX_LINE_BYTES, StopServer
 from rig.errors import BusyError, ConfigError, PlanError, RigError
 from rig.messages import LONGEST_LINE, Event, LiveEvent, StateEvent, Status, StopRequest, stop_socket
 
