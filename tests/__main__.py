@@ -25,8 +25,8 @@ TELLING = ("FAILED ", "ERROR ", "E  ", AGAIN)
 DEAREST = 10
 
 
-def plan(lanes: dict[str, Lane], folder: str = "tests") -> str:
-    """How many tests each lane runs, and how long it took the last time.
+def collected(folder: str = "tests") -> dict[str, set[str]]:
+    """Every test and its markers.
 
     Raises
     ------
@@ -39,7 +39,11 @@ def plan(lanes: dict[str, Lane], folder: str = "tests") -> str:
         done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
         if done.returncode:
             raise ValueError(done.stdout + done.stderr)
-        tests = {test: set(markers) for test, markers in json.loads(path.read_text()).items()}
+        return {test: set(markers) for test, markers in json.loads(path.read_text()).items()}
+
+
+def plan(lanes: dict[str, Lane], tests: dict[str, set[str]]) -> str:
+    """How many tests each lane runs, and how long it took the last time."""
     lines, whole_s = ["Plan:"], 0.0
     for name, lane in lanes.items():
         count = sum(lane.holds(test, markers) for test, markers in tests.items())
@@ -114,13 +118,15 @@ def main(names: list[str]) -> int:
     began_s = time.monotonic()
     lanes = {name: lane for name, lane in LANES.items() if name in names or not names}
     failures: list[str] = []
+    tests: dict[str, set[str]] = {}
     if not names:
         try:
-            print(plan(lanes), flush=True)
+            tests = collected()
         except ValueError as error:
             print(error)
             return 1
-    codes = run({name: lane.arguments for name, lane in lanes.items()}, failures)
+        print(plan(lanes, tests), flush=True)
+    codes = run({name: lane.arguments(tests) for name, lane in lanes.items()}, failures)
     print(dearest(lanes))
     if not names:
         print(not_run())

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.__main__ import CAMPAIGNS, LANES, dearest, main, not_run, plan, run
+from tests.__main__ import CAMPAIGNS, LANES, collected, dearest, main, not_run, plan, run
 from tests.runner.changed_types import keys
 from tests.runner.costs import AGAIN, Costs, Progress, repeating
 from tests.runner.lanes import TOGETHER
@@ -68,6 +68,13 @@ def test_each_test_is_in_one_lane() -> None:
     assert again and all((ROOT / path).is_file() for path in again), "some of the service's, on PostgreSQL"
 
 
+def test_a_lane_reads_only_the_files_that_hold_its_tests() -> None:
+    tests = {"tests/rig/test_gate.py::test_it": set[str](), "tests/wire/test_lsl.py::test_it[a::b]": {"wire"}}
+    assert LANES["fast"].arguments(tests)[-1] == "tests/rig/test_gate.py"
+    assert "tests/wire/test_lsl.py" not in LANES["fast"].arguments(tests)
+    assert LANES["fast"].arguments({})[-1] == "tests"
+
+
 def test_campaigns_are_told_with_their_commands() -> None:
     targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.M))
     assert {command.removeprefix("make ") for command in CAMPAIGNS} <= targets
@@ -81,7 +88,7 @@ def test_the_plan_counts_what_pytest_runs() -> None:
     listed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
     count = sum(int(number) for number in re.findall(r": (\d+)$", listed, re.M))
     assert count > 0
-    assert re.search(rf"realtime +{count} tests", plan({"realtime": lane}, "tests/wire"))
+    assert re.search(rf"realtime +{count} tests", plan({"realtime": lane}, collected("tests/wire")))
 
 
 def test_an_unknown_lane_is_refused(capsys: pytest.CaptureFixture[str]) -> None:

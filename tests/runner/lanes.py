@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Set
+from collections.abc import Mapping, Set
 from dataclasses import dataclass
 
 from _pytest.mark.expression import Expression
@@ -31,11 +31,11 @@ class Lane:
     paths: tuple[str, ...] = ("tests",)
     options: tuple[str, ...] = ()
 
-    @property
-    def arguments(self) -> tuple[str, ...]:
-        """What pytest is given."""
+    def arguments(self, tests: Mapping[str, Set[str]]) -> tuple[str, ...]:
+        """What pytest is given: of the tests and their markers only the files that hold some; unknown ones are all."""
         together = (*TOGETHER, str(self.processes)) if self.processes else ()
-        return (*self.options, "-m", self.marks, *together, *self.paths)
+        files = sorted({test.partition("::")[0] for test, markers in tests.items() if self.holds(test, markers)})
+        return (*self.options, "-m", self.marks, *together, *(files or self.paths))
 
     def holds(self, test: str, markers: Set[str]) -> bool:
         """Whether a test of these markers is run here."""
