@@ -21,6 +21,8 @@ MEDIAN_EFFICIENCY = 1.2533
 MAX_POINTS = 400
 MISFIT_WINDOWS = 8
 COARSE_MISFIT_S = 0.005
+RATE_TOLERANCE = 0.035
+"""How far a device's rate may be from the rig file's before it ends a test."""
 BELIEVED_RATES = 0.25, 4.0
 """No two clocks differ by more. A rate outside means that a backlog was read at once: the rate is unknown."""
 
@@ -153,7 +155,19 @@ def misfit(line: Line, cell_s: Array, host_s: Array) -> float:
 
 def lower_envelope(cell_s: Array, host_s: Array) -> Line:
     """A line under the receive times: through the earliest sample of each of many windows."""
-    return robust_line(*earliest(cell_s, host_s))
+    return line_below(*earliest(cell_s, host_s))
+
+
+def line_below(cell_s: Array, host_s: Array) -> Line:
+    """A line through the earliest samples of windows, without those windows in which all came late."""
+    line = robust_line(cell_s, host_s)
+    if np.min(host_s - line.at(cell_s)) < -COARSE_MISFIT_S:  # before it was taken: too many windows came late
+        lead_s = host_s - cell_s
+        apart_s = np.abs(cell_s[:, None] - cell_s)
+        later_s = lead_s[:, None] - lead_s - RATE_TOLERANCE * apart_s  # than another window allows
+        prompt = np.max(later_s, axis=1) <= COARSE_MISFIT_S
+        line = robust_line(cell_s[prompt], host_s[prompt])
+    return line
 
 
 def earliest(cell_s: Array, host_s: Array) -> tuple[Array, Array]:

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.acquire.angle_check import AngleCheck
-from rig.acquire.rate import RATE_TOLERANCE
 from rig.acquire.stream import Stream
+from rig.align import RATE_TOLERANCE
 from rig.angle_velocity import LiveSlope
 from rig.devices import AngleSensor
 from rig.errors import DeviceError, JournalError

@@ -5,9 +5,10 @@ from __future__ import annotations
 import sys
 from bisect import bisect_left, bisect_right
 
+from rig.align import RATE_TOLERANCE
+
 RATE_WINDOW_S = 3.0
 """Real seconds over which the rate is measured, between the least delayed blocks of the first and last third."""
-RATE_TOLERANCE = 0.035
 JITTER_S = 0.06
 """At the test's end: delay that even the least delayed block of a third may have; at least the longest standstill."""
 STANDSTILL_S = 0.3

@@ -15,7 +15,7 @@ from typing import Any, Generic, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.acquire.rate import RATE_TOLERANCE
+from rig.align import RATE_TOLERANCE
 from rig.devices import Sensor
 from rig.signals import Recorded
 from rig.tasks import Signal, Task, Tasks

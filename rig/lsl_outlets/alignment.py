@@ -71,7 +71,7 @@ class LiveAlignment:
         points = np.array(self._earliest)
         if len(points) == 0:
             return
-        envelope = align.robust_line(points[:, 0], points[:, 1])
+        envelope = align.line_below(points[:, 0], points[:, 1])
         pairs = self._pairs(envelope)
         if pairs is None:
             self.line, self._span_s = envelope, float(np.ptp(points[:, 0]))
