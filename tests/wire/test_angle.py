@@ -45,10 +45,9 @@ def played(bench: Bench, client: RigClient, test_id: str, **fields: Any) -> dict
     ("options", "methods"),
     [
         (("--angle-clock-ppm", f"{PPM:g}", "--angle-jitter-us", "200"), {"order", "stamps"}),
-        (("--load-cell", "slcan", "--angle-clock-ppm", f"{PPM:g}"), {"order"}),
         (("--angle", "in-cell"), {"cell"}),
     ],
-    ids=["socketcand", "slcan", "in the cell"],
+    ids=["socketcand", "in the cell"],
 )
 def test_angles_are_recorded_and_stand_within_a_millisecond_of_the_torque(
     make_bench: Callable[..., Bench], options: tuple[str, ...], methods: set[str]
@@ -110,39 +109,6 @@ def at(bench: Bench, client: RigClient, degrees: float) -> None:
         time.sleep(0.05)
 
 
-FAULTS = {
-    "angle_silent": "stale",
-    "angle_nan": "not a number",
-    "angle_fault_bit": "a fault of its own",
-    "angle_offset_step": "jumped",
-    "angle_counter_jump": "counter jumped",
-    "angle_stuck": "no movement",
-}
-
-
-@pytest.mark.parametrize("fault", FAULTS)
-def test_a_fault_of_the_sensor_ends_the_test(ready: tuple[Bench, RigClient], fault: str):
-    bench, client = ready
-    assert bench.fault(**MOVING)["ok"]
-    client.ask("subscribe")
-    before = pulses(bench)
-    lasting = [STEPS[0], {"name": "steps", "sequence": "steps", "settings": {"on_s": 20.0, "off_s": 0.0}}]
-    assert client.start(default_plan(fault, segments=lasting, **PLAN))["ok"]
-    end = time.monotonic() + 10
-    while pulses(bench) < before + 20:
-        assert time.monotonic() < end
-        time.sleep(0.02)
-    assert bench.fault(cmd="fault", name=fault, on=True)["ok"]
-    event = client.wait_finished(fault, timeout_s=20)
-    assert event["outcome"] == "fault"
-    assert event["reason"].startswith("angle sensor: ") and FAULTS[fault] in event["reason"]
-    assert client.wait_state("latched")["reason"]
-    felt = pulses(bench)
-    time.sleep(0.3)
-    assert pulses(bench) == felt
-    assert archive.verify(Path(event["recording_path"]))
-
-
 def test_no_pulse_is_felt_in_a_passive_test(ready: tuple[Bench, RigClient]):
     bench, client = ready
     assert bench.fault(**MOVING)["ok"]
@@ -152,24 +118,6 @@ def test_no_pulse_is_felt_in_a_passive_test(ready: tuple[Bench, RigClient]):
     event = played(bench, client, "passive", **{**PLAN, "kind": "passive", "segments": REST})
     assert event["outcome"] == "completed", event
     assert pulses(bench) == before
-
-
-def test_a_held_test_starts_at_its_angle_only(ready: tuple[Bench, RigClient]):
-    bench, client = ready
-    held = {"kind": "held", "angle": {"range_rad": [0.2, 2.2], "target_rad": math.radians(60)}}
-    at(bench, client, 80.0)
-    refused = client.start(default_plan("held", segments=STEPS, **held))["problem"]
-    assert refused["code"] == "refused" and "this test needs 60.0°" in refused["detail"]
-    at(bench, client, 62.0)
-    assert played(bench, client, "held", **held)["outcome"] == "completed"
-
-
-def test_a_sensor_that_fails_does_not_end_a_test_without_an_angle(ready: tuple[Bench, RigClient]):
-    bench, client = ready
-    assert bench.fault(cmd="fault", name="angle_silent", on=True)["ok"]
-    event = played(bench, client, "plain")
-    assert event["outcome"] == "completed", event
-    assert any(line.startswith("angle sensor: ") for line in event["summary"]["warnings"])
 
 
 def test_a_sensor_that_is_plugged_in_again_is_found_by_itself(ready: tuple[Bench, RigClient]):
@@ -182,22 +130,3 @@ def test_a_sensor_that_is_plugged_in_again_is_found_by_itself(ready: tuple[Bench
     assert bench.fault(cmd="fault", name="angle_unplugged", on=False)["ok"]
     at(bench, client, 60.0)
     assert client.status()["angle"]["problem"] == ""
-
-
-def test_two_poses_calibrate_and_are_kept(make_bench: Callable[..., Bench]):
-    bench = make_bench("--arm", "held", "--noise-seed", "7", *MOUNTED, "--angle-scale", "1.1")
-    client = bench.start_rig()
-    off_deg = 4.0  # the goniometer's zero is another than the emulator's
-    for degrees in (20.0, 90.0):
-        at(bench, client, degrees)
-        end = time.monotonic() + 15
-        while not (reply := client.ask("angle_pose", angle_rad=math.radians(degrees + off_deg), by="nurse"))["ok"]:
-            assert "moved" in reply["problem"]["detail"] and time.monotonic() < end, reply
-            time.sleep(0.1)
-    found = reply["body"]["angle"]
-    assert found["calibrated"] and found["calibration"]["direction"] == -1
-    assert found["calibration"]["radians_per_unit"] == pytest.approx(math.radians(1.1), rel=0.01)
-    assert bench.rig is not None
-    bench.rig.stop()
-    again = bench.start_rig().status()["angle"]
-    assert again["calibrated"] and again["calibration"] == found["calibration"]

@@ -70,22 +70,3 @@ def test_a_calibration_from_start_to_a_test(shared: tuple[Bench, RigClient]):
     assert client.status()["calibration"] is None
     old = profile | {"expires_at_utc": profile["set_at_utc"]}
     assert client.ask("start", plan=short_plan("old", profile=old))["problem"]["code"] == "refused"
-
-
-def test_a_stop_closes_the_calibration(shared: tuple[Bench, RigClient]):
-    bench, client = shared
-    assert start(client, "stopped", train_s=2.0)["ok"]
-    assert client.ask("calibrate-step")["ok"]
-    client.wait_state("running")
-    assert client.ask("calibrate-step")["problem"]["code"] == "busy"
-    assert client.ask("stop", reason="ouch", by="participant")["body"]["confirmed"]
-    count = len(felt(bench))
-    assert client.wait_state("latched")["calibration"] is None
-    assert client.ask("calibrate-step")["problem"]["code"] == "bad-plan"
-    assert client.ask("rearm", by="therapist")["ok"]
-    assert len(felt(bench)) == count
-    assert start(client, "again")["ok"]
-    assert client.ask("rearm", by="therapist")["problem"]["code"] == "busy"
-    assert client.ask("calibrate-finish", by="therapist", discard=True)["body"]["profile"] is None
-    assert client.status()["state"] == "ready"
-    assert start(client, "../up")["problem"]["code"] == "bad-plan"

@@ -37,10 +37,7 @@ def run(*arguments: str) -> subprocess.CompletedProcess[str]:
     ("old", "new", "words"),
     [
         ('"p24"', '"p23"', "stimulator.device: unknown device 'p23'; use one of: p24"),
-        ("bus =", 'signal = "Torq"\nbus =', "load_cell.signal: torque_default has no signal 'Torq'"),
-        ("bus =", 'sample_rate_hz = "fast"\nbus =', "load_cell.sample_rate_hz"),
         ("/data", "/rig.toml/data", "data_dir"),
-        ("data_dir", "clock_speed = 20\ndata_dir", "clock_speed"),
         ("{folder}/rig.sock", "{folder}/" + "x" * 120, "socket"),
     ],
 )

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import json
-import queue
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +11,7 @@ import numpy as np
 import pytest
 
 from identify.records.read import read
-from tests.harness.processes import Bench, RigClient, default_plan, kill_hard
+from tests.harness.processes import Bench, RigClient, default_plan
 
 pytestmark = pytest.mark.wire
 
@@ -82,60 +79,3 @@ def test_a_watched_test_is_extended_to_its_end(shared: tuple[Bench, RigClient]):
     assert read(Path(finished["recording_path"])).segment_names == ("rest", "added", "ramp", "rest")
     torque_nm = np.concatenate([batch["torque_nm"] for batch in samples])
     assert finished["summary"]["torque_peak_nm"] == pytest.approx(np.max(np.abs(torque_nm)), abs=1e-4)
-
-
-def test_a_test_whose_client_dies_plays_its_fixed_plan(shared: tuple[Bench, RigClient]):
-    bench, client = shared
-    client.ask("subscribe")
-    starter = bench.client()
-    start(starter, "left")
-    assert starter.ask("extend", test_id="left", key=KEY, after=40, segments=ADDED)["ok"]
-    starter._replies[9] = queue.Queue()
-    starter.send_raw('{"kind": "extend", "id": 9, "test_id": "left", "key": "')  # it dies in the middle of a word
-    starter.close()
-    finished = events_of(client, "left")[-1]
-    assert (finished["outcome"], finished["summary"]["ended_by"]) == ("completed", "plan"), finished["reason"]
-    record = read(Path(finished["recording_path"]))
-    assert record.segment_names == ("rest", "added", "ramp", "rest")
-
-
-def test_a_stop_in_the_middle_of_many_extensions(shared: tuple[Bench, RigClient]):
-    bench, client = shared
-    client.ask("subscribe")
-    start(client, "flood")
-    wide = [{"name": "x", "sequence": "widths", "settings": {"pulse_width_us": [301.0] * 1000}}]
-    flood = json.dumps({"kind": "extend", "id": 0, "test_id": "flood", "key": KEY, "after": 40, "segments": wide * 8})
-    raw = bench.client()
-    raw._replies[0] = queue.Queue()
-    for _ in range(60):
-        raw.send_raw(flood)
-    evidence = client.ask("stop", reason="enough", by="P")["body"]
-    assert evidence["confirmed"], evidence
-    codes = {raw._replies[0].get(timeout=20)["problem"]["code"] for _ in range(60)}
-    assert codes <= {"refused", "busy", "late"}
-    finished = events_of(client, "flood")[-1]
-    assert (finished["outcome"], finished["summary"]["ended_by"]) == ("stopped", "stopped")
-    client.wait_state("latched")
-    late = client.ask("extend", test_id="flood", key=KEY, after=40, segments=ADDED)
-    assert late["problem"]["code"] == "late"
-    assert client.ask("rearm", by="nurse")["ok"]
-
-
-@pytest.mark.slow
-def test_a_rig_that_dies_leaves_the_true_sequence(make_bench: Callable[..., Bench]):
-    bench = make_bench("--noise-seed", "7")
-    client = bench.start_rig()
-    start(client, "dies")
-    assert client.ask("extend", test_id="dies", key=KEY, after=40, segments=ADDED * 8)["ok"]
-    while client.status()["elapsed_s"] < 2.5:
-        time.sleep(0.02)
-    assert bench.rig is not None
-    kill_hard(bench.rig)
-    again = bench.start_rig()
-    status = again.wait_state("uncertain")
-    late = again.ask("extend", test_id="dies", key=KEY, after=360, segments=ADDED)
-    assert late["problem"]["code"] == "late"
-    assert status["finished"]["outcome"] == "fault"
-    record = read(Path(status["finished"]["recording_path"]))
-    assert record.segment_names[:2] == ("rest", "added")
-    assert set(record.segment_names) == {"rest", "added"}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import signal
 import time
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -19,15 +18,9 @@ from tests.harness.processes import Bench, RigClient, control, default_plan, kil
 pytestmark = pytest.mark.wire
 
 FAULTS = {
-    "electrode_error": ("electrode error",),
-    "no_ack": ("not acknowledged",),
-    "cell_silent": ("stale",),
-    "torque_nan": ("not a number",),
-    "torque_step": ("outside",),
-    "counter_jump": ("jumped",),
-    "stimulator_unplugged": ("stimulator",),
-    # a reset within a pulse takes its acknowledgement with it; no further pulse is sent that it could refuse
-    "device_reset": ("not initialised", "not acknowledged"),
+    "electrode_error": "electrode error",
+    "cell_silent": "stale",
+    "stimulator_unplugged": "stimulator",
 }
 
 
@@ -73,12 +66,11 @@ def check_kept(event: dict[str, Any], outcome: str) -> None:
 def test_a_fault_stops_is_told_and_latches(shared: tuple[Bench, RigClient], fault: str):
     bench, client = shared
     start(bench, fault, client)
-    settings = {"step": 5000} if fault == "counter_jump" else {}
-    injected = bench.fault(cmd="fault", name=fault, on=True, **settings)
+    injected = bench.fault(cmd="fault", name=fault, on=True)
     assert injected["ok"], injected
     event = client.wait_finished(fault, timeout_s=20)
     check_kept(event, "fault")
-    assert any(words in event["reason"] for words in FAULTS[fault]), event["reason"]
+    assert FAULTS[fault] in event["reason"]
     felt = control(bench.emulator.ready["control"], {"cmd": "pulses", "since": 0})["pulses"]
     # with slack for a shared machine; without acknowledgements one pulse is on its way at most
     late_s = max(p["monotonic_s"] - injected["monotonic_s"] for p in felt)
@@ -107,26 +99,6 @@ def test_a_load_cell_that_is_unplugged_and_comes_back_elsewhere(bench: Bench):
     assert client.ask("start", plan=short_plan("refused"))["problem"]["code"] == "latched"
 
 
-@pytest.mark.parametrize("fault", ["frames_duplicated", "frames_out_of_order", "error_frames"])
-def test_disorder_on_the_bus_is_counted_and_harmless(shared: tuple[Bench, RigClient], fault: str):
-    bench, client = shared
-    client.ask("subscribe")
-    assert bench.fault(cmd="fault", name=fault, on=True, probability=0.05)["ok"]
-    assert client.start(short_plan(fault))["ok"]
-    event = client.wait_finished(fault)
-    bench.fault(cmd="fault", name=fault, on=False)
-    assert event["outcome"] == "completed", event
-    counted = {
-        "frames_duplicated": "duplicate_samples",
-        "frames_out_of_order": "disordered_samples",
-        "error_frames": "error_frames",
-    }[fault]
-    assert event["summary"][counted] > 50
-    with h5py.File(event["recording_path"]) as file:
-        assert np.all(np.diff(file["torque/counter"][:]) >= 1)
-        assert np.all(np.diff(file["torque/time_s"][:]) > 0)
-
-
 def test_stop_is_confirmed_by_device_and_torque(shared: tuple[Bench, RigClient]):
     bench, client = shared
     start(bench, "t", client)
@@ -145,42 +117,10 @@ def test_stop_is_confirmed_by_device_and_torque(shared: tuple[Bench, RigClient])
     assert client.ask("rearm", by="nurse")["body"]["state"] == "ready"
 
 
-def test_stop_while_idle_latches_too(shared: tuple[Bench, RigClient]):
-    client = shared[1]
-    assert client.status()["state"] == "ready"
-    assert client.ask("stop", reason="check", by="nurse")["body"]["confirmed"]
-    assert client.status()["state"] == "latched"
-    assert client.ask("rearm", by="nurse")["ok"]
-
-
-def test_a_stop_in_the_moment_of_starting_wins(shared: tuple[Bench, RigClient]):
-    bench, client = shared
-    other = bench.client()
-    for attempt in range(8):
-        plan = default_plan(f"race{attempt}", segments=STEPS[1:])
-        before = state(bench)["pulses_received"]
-        with ThreadPoolExecutor(1) as pool:
-            asked = pool.submit(client.ask, "start", plan=plan)
-            time.sleep(attempt * 0.004)
-            other.ask("stop", reason="race", by="nurse")
-            count = state(bench)["pulses_received"]
-            started = asked.result()
-        status = client.wait_state("latched")
-        assert "race" in status["reason"]
-        time.sleep(0.05)
-        assert state(bench)["pulses_received"] == count
-        assert started["ok"] or started["problem"]["code"] == "latched"
-        assert client.ask("rearm", by="nurse")["ok"]
-        rested_s = state(bench)["time_s"] + (1.5 if count > before else 0.0)  # a busy machine stopped late: pulses came
-        while state(bench)["time_s"] < rested_s:
-            time.sleep(0.02)
-
-
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_stops_stimulation_first_and_seals(bench: Bench, number: int):
+def test_a_signal_stops_stimulation_first_and_seals(bench: Bench):
     start(bench)
     assert bench.rig is not None
-    assert bench.rig.stop(number) == 0
+    assert bench.rig.stop(signal.SIGTERM) == 0
     before = state(bench)
     time.sleep(0.1)
     assert state(bench)["pulses_received"] == before["pulses_received"]

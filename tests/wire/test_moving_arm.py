@@ -64,17 +64,8 @@ def wave(time_s: np.ndarray, values: np.ndarray) -> tuple[float, float, float]:
     return float(mean), float(np.hypot(sine, cosine)), float(np.arctan2(cosine, sine))
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        pytest.param(("--angle-offset-deg", "40", "--angle-direction", "-1", "--angle-clock-ppm", "300"), id="own"),
-        pytest.param(("--angle", "in-cell", "--angle-offset-deg", "-20"), id="in-cell"),
-    ],
-)
-def test_the_sealed_angle_is_the_joints_and_the_torque_is_of_its_inertia(
-    options: tuple[str, ...], tmp_path: Path
-) -> None:
-    record = recorded(tmp_path, *options)
+def test_the_sealed_angle_is_the_joints_and_the_torque_is_of_its_inertia(tmp_path: Path) -> None:
+    record = recorded(tmp_path, "--angle-offset-deg", "40", "--angle-direction", "-1", "--angle-clock-ppm", "300")
     assert record.angle_rad is not None and record.velocity_rad_s is not None
     mean, size, phase = wave(record.time_s, record.angle_rad)
     assert math.degrees(mean) == pytest.approx(MIDDLE_DEG, abs=0.2)
