@@ -268,5 +268,5 @@ def header(run: TestRun, clock: VirtualClock) -> dict[str, Any]:
     }
 
 
-def void(_: object) -> None:
-    """Throw a value away."""
+def void(*_: object) -> None:
+    """Throw values away."""

@@ -14,8 +14,6 @@ from rig.errors import RefusedError
 from rig.limits import HARD_LIMITS, Admitted, Refusal, admit
 from rig.messages import Profile, Status, TestPlan
 from rig.signals import Pulse
-from tests.harness.calibration_fuzz import fuzz_calibrations
-from tests.harness.limits_fuzz import fuzz, fuzz_plans
 
 anything = st.one_of(
     st.floats(allow_nan=True, allow_infinity=True),
@@ -213,30 +211,6 @@ def test_every_limit_has_its_reason_and_source():
         assert row.reason
         assert row.source
         assert row.lo < row.hi
-
-
-@pytest.mark.slow
-def test_mad_requests_at_the_gate_are_not_felt():
-    """On a seed of its own, through both drivers; `python -m bench.rig_fuzz` makes a million on others."""
-    found = fuzz(100_000, seed=20)
-    assert found.outside == 0, found.example
-    assert found.felt == found.sent > 10_000  # it is no wall
-    assert found.refused_profiles > 10
-
-
-@pytest.mark.slow
-def test_a_calibration_pressed_in_any_order_is_felt_within_its_steps():
-    """On a seed of its own; `python -m bench.rig_fuzz` presses more."""
-    found = fuzz_calibrations(6, seed=20)
-    assert found.outside == 0, found.example
-    assert found.sent > 50 and found.felt > 200
-
-
-def test_no_mad_plan_is_admitted_with_anything_outside():
-    found = fuzz_plans(2000, seed=20)
-    assert found.outside == 0, found.example
-    assert found.sent > 50
-    assert found.refused_profiles > 200
 
 
 @pytest.mark.parametrize("name", sorted({r.name for r in HARD_LIMITS.values()}))

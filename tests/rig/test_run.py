@@ -3,22 +3,29 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 import pytest
 
+from hardware_sim.factory import make_devices
+from hardware_sim.settings import Settings
 from rig import archive, assembly, journal
 from rig.acquire.evidence import DECAY_S, SILENT_S, watch_decay
+from rig.devices import p24, rehastim2
 from rig.errors import RecordingError
 from rig.journal import Kind
 from rig.messages import SegmentPlan
 from rig.signals import Ack, Pulse, PulseStatus
-from tests.harness.wired_device import WiredDevice
-from tests.rig.fakes import VirtualRig
-from tests.simulator.virtual_time import VirtualMachine
+from rig.tasks import Task
+from tests.rig.fakes import VirtualRig, void
+from tests.simulator.disk import SimulatedDisk
+from tests.simulator.host import Computer, Process
+from tests.simulator.wires import SimulatedPort, Wires
+from tests.simulator.world import World
 
 
 def test_a_test_plays_to_its_end(tmp_path: Path):
@@ -71,30 +78,44 @@ def test_an_end_that_the_device_does_not_confirm_is_a_fault(tmp_path: Path):
     assert not result.evidence.confirmed
 
 
+class Line:
+    """A driver, armed, on the simulator's line to the emulated stimulator."""
+
+    def __init__(self, name: str) -> None:
+        self.world = World(1)
+        self.devices = make_devices(Settings(stimulator=name))
+        computer = Computer(self.world, 0.0, 0.0)
+        self.process = Process(computer, SimulatedDisk(self.world), Wires(self.world, self.devices, 0.02, void))
+        module = {"p24": p24, "rehastim2": rehastim2}[name]
+        self.driver = module.create(module.Settings(device=name, port="none"), self.process)
+        self.told: list[Ack] = []
+        self.driver.listen(self.told.append, void)
+        self.ask(self.driver.open())
+        self.ask(self.driver.arm())
+
+    def ask(self, request: Coroutine[Any, Any, Any]) -> None:
+        asked: list[Task[Any]] = []
+        self.process.post(lambda: asked.append(self.process.tasks.spawn(request, "test")))
+        self.world.run(self.world.now_s + 0.6)
+        assert asked[0].result is None or asked[0].result
+
+
 @pytest.mark.parametrize("name", ["p24", "rehastim2"])
 def test_a_stop_takes_back_what_waits_in_the_computer_before_it_asks(name: str, monkeypatch: pytest.MonkeyPatch):
-    machine, did = VirtualMachine(), list[str]()
-    device = WiredDevice(name, machine, np.random.default_rng(1), stalls=0.0)
-    machine.run(device.driver.open())
-    machine.run(device.driver.arm())
-    write = device.write
-    monkeypatch.setattr(device, "discard", lambda: did.append("discard"))
-    monkeypatch.setattr(device, "write", lambda data: (did.append("write"), write(data))[1])
-    machine.run(device.driver.stop())
+    line, did = Line(name), list[str]()
+    write = SimulatedPort.write
+    monkeypatch.setattr(SimulatedPort, "discard", lambda _: did.append("discard"))
+    monkeypatch.setattr(SimulatedPort, "write", lambda port, data: (did.append("write"), write(port, data))[1])
+    line.ask(line.driver.stop())
     assert did == ["discard", "write"]
 
 
 def test_a_stimulator_that_restarts_in_a_test_is_told():
-    machine, told = VirtualMachine(), list[Ack]()
-    device = WiredDevice("rehastim2", machine, np.random.default_rng(1), stalls=0.0)
-    device.driver.listen(told.append, lambda _: None)
-    machine.run(device.driver.open())
-    machine.run(device.driver.arm())
-    machine.wait(0.7)
-    assert told == []
-    device.restart()
-    machine.wait(0.7)  # it offers a connection every 0.5 s
-    assert "it restarted during a test" in str(told[0].error)
+    line = Line("rehastim2")
+    assert line.told == []
+    line.devices.power_cycle()
+    line.world.run(line.world.now_s + 0.7)  # it offers a connection every 0.5 s
+    assert "it restarted during a test" in str(line.told[0].error)
 
 
 def test_a_late_pulse_is_dropped_and_recorded_never_burst(tmp_path: Path):

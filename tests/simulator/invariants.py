@@ -294,7 +294,7 @@ def recordings_hold_every_sample(life: Life) -> Iterator[str]:
         if len(counter) and counter[0] >= 0 and not np.all(np.diff(counter) == 1):
             yield f"{path}: {np.sum(np.diff(counter) - 1)} samples are missing"
         sent_s = written_s[np.isfinite(written_s)]
-        if len(sent_s) and not (time_s[:1] <= sent_s[0] and sent_s[-1] <= time_s[-1] + BLIND_S + NOTICED_S):
+        if len(sent_s) and not (time_s[:1] - NOTICED_S <= sent_s[0] and sent_s[-1] <= time_s[-1] + BLIND_S + NOTICED_S):
             yield f"{path}: its pulses lie outside its samples"
 
 

@@ -13,6 +13,7 @@ from rig.messages import (
     CalibrateMarkRequest,
     CalibrateStartRequest,
     CalibrateStepRequest,
+    Profile,
     RearmRequest,
     SegmentPlan,
     TestPlan,
@@ -80,6 +81,9 @@ class People:
 
     def _start_test(self) -> None:
         life, quiet = self.life, self.life.quiet
+        profile, segments, rate_hz = life.profile, SEGMENTS, life.rate_hz
+        if not quiet and self.chance.random() < 0.15:
+            profile, segments, rate_hz = self._nonsense_of_a_test()
         test_id = f"t{self.clinic.tests + 1}"
         kind, angle = "pre-session", None
         if life.arm:
@@ -88,8 +92,8 @@ class People:
             angle = AnglePlan(range_rad=(0.2, 2.4), target_rad=target_rad, still_s=still_s)
         bounds = AdaptivePlan(max_duration_s=LONGEST_ADAPTIVE_S, max_torque_time_nms=50.0)
         plan = TestPlan(
-            test_id=test_id, participant="P1", kind=kind, profile=life.profile, pulse_rate_hz=life.rate_hz,
-            adaptive=bounds if life.adaptive else None, angle=angle, segments=SEGMENTS,
+            test_id=test_id, participant="P1", kind=kind, profile=profile, pulse_rate_hz=rate_hz,
+            adaptive=bounds if life.adaptive else None, angle=angle, segments=segments,
         )  # fmt: skip
 
         def then(asked: Asked) -> None:
@@ -97,6 +101,27 @@ class People:
                 self._await_end(test_id)
 
         self.clinic.start(plan, KEY).then = then
+
+    def _nonsense_of_a_test(self) -> tuple[Profile, list[SegmentPlan], float]:
+        """What a program with a mistake asks for: a list of widths that might pass but for one number, or two."""
+        most_us, chance = self.life.profile.max_pulse_width_us, self.chance
+        rise_us = chance.choice((1.0, 49.9, 50.0, 50.0000001, 80.0))
+        widths = [min(rise_us * number, most_us) for number in range(1, chance.choice((2, 20, 100)))]
+        if chance.random() < 0.7:
+            widths[chance.randrange(len(widths))] = self._nonsense(most_us)
+        settings = {"pulse_width_us": widths, "jumps": chance.random() < 0.5}
+        profile, rate_hz = self.life.profile, self.life.rate_hz
+        if chance.random() < 0.3:
+            field = chance.choice(("current_ma", "max_pulse_width_us", "max_torque_nm"))
+            profile = profile.model_copy(update={field: chance.choice((-1.0, 0.0, 0.4, 1.0, math.nan, -math.inf))})
+        if chance.random() < 0.2:
+            rate_hz = chance.choice((60.0000001, 0.999, 0.0, -40.0, 1e9, math.nan))
+        return profile, [SegmentPlan(name="widths", sequence="widths", settings=settings)], rate_hz
+
+    def _nonsense(self, most: float) -> float:
+        """A number at or beside a bound, or none at all."""
+        beyond = most, math.nextafter(most, math.inf), most + 0.5, 2 * most, 1e308, math.inf
+        return self.chance.choice((*beyond, -1.0, -0.0, 0.4999, 5e-324, -5e-324, math.nan))
 
     def _await_end(self, test_id: str) -> None:
         finished = next((event for event in self.clinic.finished if event.test_id == test_id), None)
@@ -117,8 +142,10 @@ class People:
 
     def _open_calibration(self) -> None:
         self.clinic.tests += 1
+        wild = self.chance.random() < 0.3
         request = CalibrateStartRequest(
-            calibration_id=f"c{self.clinic.tests}", participant="P1", by="nurse", train_s=0.3,
+            calibration_id=f"c{self.clinic.tests}", participant="P1", by="nurse",
+            train_s=self._nonsense(2.0) if wild else 0.3, step_us=self._nonsense(25.0) if wild else 10.0,
             current_ma=self.life.profile.current_ma, max_pulse_width_us=self.life.profile.max_pulse_width_us,
             large_steps=self.chance.random() < 0.5,
         )  # fmt: skip
@@ -130,7 +157,8 @@ class People:
             self.clinic.ask(CalibrateFinishRequest(by="nurse", discard=True))
         elif drawn < 0.6:
             direction = self.chance.choice(("up", "up", "up", "fine", "repeat", "down"))
-            self._repeat(lambda: self.clinic.ask(CalibrateStepRequest(direction=direction)))
+            shown_us = self._nonsense(500.0) if self.chance.random() < 0.1 else None
+            self._repeat(lambda: self.clinic.ask(CalibrateStepRequest(direction=direction, shown_us=shown_us)))
         elif drawn < 0.8:
             self.clinic.ask(CalibrateMarkRequest(threshold=self.chance.choice(("sensory", "motor", "comfort"))))
         elif drawn < 0.85:

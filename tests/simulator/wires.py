@@ -119,7 +119,7 @@ class Wires(Ports):
         self.read_s: dict[int, list[float]] = {}
         """When the rig's process read frames, by their number."""
         self._block_s = block_s
-        self._port: _SimulatedPort | None = None
+        self._port: SimulatedPort | None = None
         self._bus: _SimulatedBus | None = None
         self._next_event_s: float | None = None
         self._last = 0.0, True
@@ -128,7 +128,7 @@ class Wires(Ports):
         world.after(block_s, self._sample)
 
     def port(self, process: Process, path: str) -> Port:
-        return _SimulatedPort(self, process, path)
+        return SimulatedPort(self, process, path)
 
     def open_bus(self, process: Process, arguments: dict[str, Any], name: str) -> Bus:
         if not self.devices.cell_plugged:
@@ -139,7 +139,7 @@ class Wires(Ports):
     def shared_bus(self, process: Process) -> Bus | None:
         return self._bus if self._bus is not None and self._bus.process is process else None
 
-    def open_port(self, port: _SimulatedPort) -> None:
+    def open_port(self, port: SimulatedPort) -> None:
         """This port has the line from now on."""
         if not self.devices.stimulator_plugged:
             raise DeviceError(f"stimulator.port: {port.path} is missing; plug in the stimulator or correct the port")
@@ -197,7 +197,7 @@ class Wires(Ports):
             bus.lose("load cell: the bus was lost: unplugged")
 
 
-class _SimulatedPort:
+class SimulatedPort:
     """See `rig.machine.Port`."""
 
     def __init__(self, wires: Wires, process: Process, path: str) -> None:
