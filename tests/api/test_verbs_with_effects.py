@@ -14,14 +14,16 @@ import pytest
 from api.cli import main
 from api.workers import diagnosis_verbs
 from hardware_sim import hidden_records
+from tests.harness import few_effects
 
 pytestmark = pytest.mark.slow
 
 
 def stimrig(*words: object) -> str:
-    """Standard output of a verb that must succeed."""
+    """Standard output of a verb that must succeed; of three effects it finds what is missing."""
     out, err = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+    few = few_effects.only("fatigue", "output_saturation", "potentiation")
+    with few, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         code = main.run(list(map(str, words)))
     assert code == 0, err.getvalue()
     return out.getvalue()

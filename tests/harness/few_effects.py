@@ -1,0 +1,19 @@
+"""A small library of effects, for tests of verbs and pages that show whatever a diagnosis finds."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from unittest import mock
+
+from identify import effects
+
+
+@contextlib.contextmanager
+def only(*names: str) -> Iterator[None]:
+    """In this process the library holds these effects alone."""
+    kept = [effects.get(name) for name in names]
+    with mock.patch.object(effects, "_own", lambda: kept):
+        effects._everything.cache_clear()
+        yield
+    effects._everything.cache_clear()
