@@ -24,12 +24,15 @@ class Clock(Protocol):
         ...
 
     def unix_s(self) -> float:
-        """UTC, s since 1970: a label, never used for a decision."""
+        """UTC, s since 1970: a label; only the day until which a calibration holds is told by it."""
         ...
 
 
 class MonotonicClock:
-    """The machine's monotonic clock, `speed` times as fast."""
+    """The machine's monotonic clock, `speed` times as fast. It goes on while the machine is suspended.
+
+    So a test that was asleep is late, and ends, instead of going on where it was.
+    """
 
     def __init__(self, speed: float = 1.0) -> None:
         if not (0 < speed < 1000):
@@ -37,7 +40,7 @@ class MonotonicClock:
         self.speed = speed
 
     def now_s(self) -> float:
-        return time.monotonic() * self.speed
+        return time.clock_gettime(time.CLOCK_BOOTTIME) * self.speed
 
     def unix_s(self) -> float:
         return time.time()

@@ -90,7 +90,7 @@ class RecordingError(RigError):
     title = "The recording could not be sealed"
 
 
-class WireError(RigError):
+class WireError(DeviceError):
     """Bytes that are not a valid frame of the protocol: names the rule that is broken."""
 
     code = "wire"

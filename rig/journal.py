@@ -162,9 +162,9 @@ class Journal:
         self._written(self._log.sync)
 
     def close(self) -> None:
-        """Sync everything to the disk and close; never raises."""
-        with contextlib.suppress(JournalError):
-            self._written(self._log.close)
+        """Sync everything to the disk and close, also after an error; never raises."""
+        with contextlib.suppress(OSError):
+            self._log.close()
 
     def _written(self, action: Callable[[], None]) -> None:
         if self._failure:

@@ -13,9 +13,10 @@ from rig.pieces import Piece
 
 @dataclass(frozen=True, slots=True)
 class Laid:
-    """Everything that is laid: widths in µs, shape (n,), and the segments."""
+    """Everything that is laid: widths in µs and whether each may jump there, shape (n,), and the segments."""
 
     pulse_width_us: NDArray[np.float64]
+    jumps: NDArray[np.bool_]
     segments: tuple[jn.Segment, ...]
 
     def __len__(self) -> int:
@@ -24,10 +25,14 @@ class Laid:
     def cut(self, end: int) -> Laid:
         """The part before pulse `end`."""
         kept = (s._replace(end=min(s.end, end)) for s in self.segments if s.start < end)
-        return Laid(self.pulse_width_us[:end], tuple(kept))
+        return Laid(self.pulse_width_us[:end], self.jumps[:end], tuple(kept))
 
     def with_piece(self, piece: Piece, by: jn.LaidBy) -> Laid:
         """It, and a piece after it."""
         end = len(self) + len(piece.pulse_width_us)
         added = jn.Segment(piece.of.name, len(self), end, by)
-        return Laid(np.concatenate([self.pulse_width_us, piece.pulse_width_us]), (*self.segments, added))
+        return Laid(
+            np.concatenate([self.pulse_width_us, piece.pulse_width_us]),
+            np.concatenate([self.jumps, np.full(len(piece.pulse_width_us), piece.jumps)]),
+            (*self.segments, added),
+        )

@@ -52,7 +52,7 @@ class Score:
         self._checking = False
         at_start = test.pieces[:1] if self.adaptive else test.pieces
         self._fixed = deque(test.pieces[len(at_start) :])
-        self.laid = Laid(pieces.NOTHING, ())
+        self.laid = Laid(pieces.NOTHING, np.empty(0, bool), ())
         for piece in at_start:
             self.laid = self.laid.with_piece(piece, "plan")
         self._reached = -1

@@ -24,12 +24,12 @@ from rig.acquire.receiver import Receiver
 from rig.errors import DeviceError, JournalError
 from rig.gate import Gate
 from rig.journal import Journal, Kind
-from rig.limits import Limit
+from rig.limits import Limit, check
 from rig.machine import Machine
 from rig.messages import StopEvidence, TestOutcome
 from rig.plan import PlannedTest
 from rig.score import Score
-from rig.signals import Pulse, Recorded
+from rig.signals import Pulse, PulseStatus, Recorded
 from rig.tasks import Signal
 
 log = logging.getLogger("rig.run")
@@ -236,7 +236,7 @@ class TestRun:
         self._angle.started()
         self.started.set()
         late_s = self._watch.late_pulse_periods * period_s
-        index, resting = 0, True
+        index, resting, felt_us = 0, True, 0.0
         while (width_us := self.score.pulse(index, self.torque_time_nms)) is not None:
             due_s = t0_s + index * period_s
             if resting and width_us > 0:
@@ -248,8 +248,14 @@ class TestRun:
             if wrong is not None:
                 self._fault(wrong)
                 return
+            # pulses that were left out must not make a steeper rise than the plan's
+            if not self.score.laid.jumps[index] and (steep := check(self._table["width_rise_us"], width_us - felt_us)):
+                self._fault(f"pulses were left out while the width rose: {steep}")
+                return
             self._gate.feed()
-            self._gate.fire(index, Pulse(width_us, current_ma), due_s, due_s + late_s)
+            status = self._gate.fire(index, Pulse(width_us, current_ma), due_s, due_s + late_s)
+            if status in (PulseStatus.UNACKNOWLEDGED, PulseStatus.REST):
+                felt_us = width_us
             index += 1
         await self._tasks.wait(t0_s + index * period_s, self.halt.signal)
 

@@ -18,7 +18,7 @@ from pydantic import ValidationError
 
 from rig.adapters.connections import Connections
 from rig.adapters.previews import Previews
-from rig.adapters.stop_server import MAX_LINE_BYTES, StopServer
+from rig.adapters.stop_server import MAX_LINE_BYTES, UNREADABLE, StopServer
 from rig.control import desk
 from rig.control.replies import head_of, id_of, invalid_request, refusal, to_line
 from rig.control.rig import Rig
@@ -154,7 +154,7 @@ class Server:
         kind = head[0] if head else ""
         if kind == "stop" and self._stop_server is not None:
             if head and len(line) > MAX_LINE_BYTES:  # it stops, but is not parsed: that would delay the sender
-                line = to_line(StopRequest(id=head[1], reason="a stop with a request that is too long"))
+                line = to_line(StopRequest(id=head[1], reason=UNREADABLE))
             _write(writer, to_line(await self._stop_server.answer(line)))
             return
         try:

@@ -17,7 +17,7 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from rig.adapters.connections import Connections
-from rig.control.replies import id_of, internal_error, invalid_request, refusal, to_line
+from rig.control.replies import id_of, internal_error, refusal, to_line
 from rig.errors import ConfigError, RigError
 from rig.messages import Reply, StopEvidence, StopRequest
 
@@ -26,6 +26,7 @@ log = logging.getLogger("rig.stop")
 Stop = Callable[[str, str], Future[StopEvidence]]
 MAX_LINE_BYTES = 16_384
 MAX_SILENT, MAX_ACTIVE = 32, 64
+UNREADABLE = "a stop that could not be read"
 
 
 class StopServer:
@@ -65,11 +66,11 @@ class StopServer:
         self._loop.close()
 
     async def answer(self, line: bytes) -> Reply:
-        """Stop the rig; the reply contains the evidence."""
+        """Stop the rig, also where the request cannot be read; the reply contains the evidence."""
         try:
             request = StopRequest.model_validate_json(line)
-        except ValidationError as error:
-            return invalid_request(id_of(line), error)
+        except ValidationError:
+            request = StopRequest(id=id_of(line), reason=UNREADABLE)
         try:
             evidence = await asyncio.wrap_future(self._stop(request.reason, request.by))
             return Reply(id=request.id, ok=True, body=evidence.model_dump(mode="json"))
@@ -94,10 +95,12 @@ class StopServer:
         self._tasks.add(task)
         self._connections.enter(writer.transport)
         try:
-            while line := await reader.readline():
+            while (line := await reader.readline()).endswith(b"\n"):  # not one that was cut off
                 self._connections.spoke(writer.transport)
                 writer.write(to_line(await self.answer(line)))
-        except (OSError, ValueError) as error:
+        except ValueError:  # longer than the limit
+            writer.write(to_line(await self.answer(b"")))
+        except OSError as error:
             log.warning("client disconnected: %s", error)
         finally:
             self._tasks.discard(task)

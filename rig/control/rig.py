@@ -18,6 +18,8 @@ from rig.trial import Trial
 log = logging.getLogger("rig")
 
 STOP_TIMEOUT_S = 6.0
+STORED_S = 7.0
+"""Real seconds after which a stop is answered although the disk has not taken its latch."""
 """Real seconds to wait for the evidence of a stop, including the fall of the torque."""
 LONGEST_WORDS = 300
 """Characters of a stop's reason that are kept: a longer one stops, too."""
@@ -124,20 +126,21 @@ class Rig(Posing):
     async def stop(self, reason: str, by: str, latch_idle: bool = True) -> StopEvidence:
         """Stop stimulation now, latch, and return what device and torque showed afterwards."""
         words = f"{reason:.{LONGEST_WORDS}} (by {by:.{LONGEST_WORDS}})" if by else f"{reason:.{LONGEST_WORDS}}"
+        until_s = self._clock.now_s() + STORED_S * self._clock.speed
         if self._end("stopped", words, latch_idle):
             await self._tasks.sleep(STOP_TIMEOUT_S, self._evidence_ready)
             if self._trial.state == "sealing":
-                await self._latch_written()
+                await self._latch_written(until_s)
             if self._evidence is not None or self._trial.busy:
                 return self._evidence or self._unconfirmed("no more pulses are sent; the device did not answer in time")
         evidence = await self._stop_idle()
-        await self._latch_written()
+        await self._latch_written(until_s)
         return evidence
 
-    async def _latch_written(self) -> None:
-        """Wait until what the next process has to know of the last stop is stored, or the disk refused it."""
+    async def _latch_written(self, until_s: float = math.inf) -> None:
+        """Wait until what the next process has to know of the last stop is stored, or the disk refused it, or hangs."""
         if self._latching is not None:
-            await self._tasks.wait(math.inf, self._latching.done)
+            await self._tasks.wait(until_s, self._latching.done)
 
     async def _stop_idle(self) -> StopEvidence:
         """Ask the device although no test runs."""

@@ -89,7 +89,13 @@ class RecordingStore:
             "unix_s": self._clock.unix_s(),
             **({} if angle is None else {"angle": angle}),
         }
-        book.begin(header, test.pulse_width_us[: certain[-1].end].astype("<f8").tobytes())
+        try:
+            book.begin(header, test.pulse_width_us[: certain[-1].end].astype("<f8").tobytes())
+        except JournalError:
+            book.close()
+            with contextlib.suppress(OSError):  # or the next start would take it for a test that died
+                self._disk.remove(book.path)
+            raise
         return book
 
     def _create(self, path: Path) -> Log:

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import json
 import socket
-import time
 from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
 
+from rig.clock import MonotonicClock
 from rig.errors import RigError
 from rig.lsl_outlets.live_test import Batch
 
@@ -38,10 +38,10 @@ def library() -> Any:
 
 
 def clock_offset_s(lsl: Any) -> float:
-    """LSL's clock minus the machine's monotonic clock, s: on Linux it is the same clock, up to the readings' delay."""
-    shortest_s, offset_s = np.inf, 0.0
+    """LSL's clock minus the rig's at speed 1, s: on Linux what the machine was suspended, and the readings' delay."""
+    clock, shortest_s, offset_s = MonotonicClock(), np.inf, 0.0
     for _ in range(20):
-        before_s, lsl_s, after_s = time.monotonic(), lsl.local_clock(), time.monotonic()
+        before_s, lsl_s, after_s = clock.now_s(), lsl.local_clock(), clock.now_s()
         if after_s - before_s < shortest_s:
             shortest_s, offset_s = after_s - before_s, lsl_s - (before_s + after_s) / 2
     return offset_s

@@ -87,5 +87,5 @@ def test_a_pulse_whose_time_passes_while_its_intent_is_written_is_not_sent(tmp_p
     rig.journal.append = slow  # pyright: ignore[reportAttributeAccessIssue]
     result = rig.execute()
     assert rig.stimulator.sent == []
-    assert result.dropped > 50
+    assert result.dropped > 5  # and the ramp is not gone on with
     assert rig.gate.charge_uc == 0

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import fcntl
 import itertools
 import os
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -16,7 +18,10 @@ from rig.control.sealing import RecordingStore
 from rig.errors import JournalError, RecordingError
 from rig.journal import Kind
 from tests.rig.fakes import journal_at
+from tests.rig.live import LiveRig
+from tests.simulator.disk import SimulatedDisk
 from tests.simulator.virtual_time import VirtualMachine
+from tests.simulator.world import World
 
 BLOCKS = [(Kind.HEADER, b'{"a": 1}'), (Kind.PLAN, b""), (Kind.TORQUE, bytes(range(200))), (Kind.END, b"{}")]
 
@@ -37,6 +42,25 @@ def test_blocks_come_back(tmp_path: Path):
     assert (contents.damaged_bytes, contents.blocks_missing) == (0, 0)
     assert contents.first_json(Kind.HEADER) == {"a": 1}
     assert contents.first_json(Kind.START) is None
+
+
+def test_after_an_error_of_the_disk_it_is_closed_all_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    book = journal_at(tmp_path / "j")
+    with monkeypatch.context() as full:
+        full.setattr(os, "write", lambda *_: 0)
+        with pytest.raises(JournalError):
+            book.append(Kind.PLAN, b"abc")
+    book.close()
+    with (tmp_path / "j").open() as file:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # nobody holds it any more
+
+
+def test_a_start_that_the_disk_refuses_leaves_no_journal(make: Callable[..., LiveRig], tmp_path: Path):
+    live = make(disk=(disk := SimulatedDisk(World(0))))
+    disk.access = lambda: setattr(disk, "free", 1000)
+    with pytest.raises(JournalError):
+        live.start(live.plan("refused"))
+    assert not any(path.suffix == ".journal" for path in disk.files)
 
 
 def test_cut_anywhere_only_the_tail_is_lost(tmp_path: Path):

@@ -16,7 +16,7 @@ from hardware_sim.settings import Settings
 from rig import archive, assembly, journal
 from rig.acquire.evidence import DECAY_S, SILENT_S, watch_decay
 from rig.devices import p24, rehastim2
-from rig.errors import RecordingError
+from rig.errors import RecordingError, WireError
 from rig.journal import Kind
 from rig.messages import SegmentPlan
 from rig.signals import Ack, Pulse, PulseStatus
@@ -116,6 +116,31 @@ def test_a_stimulator_that_restarts_in_a_test_is_told():
     line.devices.power_cycle()
     line.world.run(line.world.now_s + 0.7)  # it offers a connection every 0.5 s
     assert "it restarted during a test" in str(line.told[0].error)
+
+
+@pytest.mark.parametrize(("up_s", "outcome"), [(2.0, "completed"), (0.2, "fault")])
+def test_pulses_that_are_left_out_make_no_steeper_rise_than_the_plan(tmp_path: Path, up_s: float, outcome: str):
+    """Of 4 µs a pulse some may be missing, of 37 µs not: the next one would be far above the last one that was felt."""
+    rig = VirtualRig(tmp_path, [SegmentPlan(name="ramp", sequence="ramp", settings={"up_s": up_s, "down_s": 1.0})])
+    rig.at(0.01, lambda: rig.clock.advance(0.16))
+    result = rig.execute()
+    assert result.outcome == outcome
+    assert ("left out while the width rose" in result.reason) is (outcome == "fault")
+    widths_us = [0, *(pulse.pulse_width_us for _, pulse in rig.stimulator.sent)]
+    assert max(np.diff(widths_us)) <= 50
+
+
+def test_a_damaged_answer_of_the_stimulator_ends_a_test_like_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    rig = VirtualRig(tmp_path)
+
+    async def state() -> tuple[bool, str]:
+        raise WireError("status: 1 byte")
+
+    monkeypatch.setattr(rig.stimulator, "state", state)
+    result = rig.execute()
+    assert (result.outcome, result.evidence.confirmed) == ("fault", False)
+    assert "status: 1 byte" in result.reason
+    assert rig.recording().attributes["outcome"] == "fault"
 
 
 def test_a_late_pulse_is_dropped_and_recorded_never_burst(tmp_path: Path):

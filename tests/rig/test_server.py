@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import socket
 from concurrent.futures import Future
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,7 +14,8 @@ import pytest
 
 from rig import __main__ as program
 from rig.adapters.server import Server
-from rig.messages import Reply, StateEvent, Status
+from rig.adapters.stop_server import MAX_LINE_BYTES, UNREADABLE, StopServer
+from rig.messages import Reply, StateEvent, Status, StopEvidence
 
 READY = Status(state="ready")
 
@@ -50,6 +52,38 @@ def test_who_left_before_the_answer_is_told_nothing_more(tmp_path: Path, leaves:
             return found
 
     assert asyncio.run(subscribers_later()) == (0 if leaves else 1)
+
+
+@pytest.mark.parametrize(
+    ("line", "stops"),
+    [
+        (b'{"kind": "stop", "id": 7, "reason": "ouch"}\n', "ouch"),
+        (b'{"kind": "stop", "id": 7}\n', UNREADABLE),
+        (b'{"kind": "stop", "id": 7, "reason": "ouch", "of a newer service": 1}\n', UNREADABLE),
+        (b"stop\n", UNREADABLE),
+        (b"s" * 2 * MAX_LINE_BYTES + b"\n", UNREADABLE),
+        (b'{"kind": "stop", "id": 7, "reason": "cut o', None),
+    ],
+)
+def test_whatever_comes_to_the_door_for_stops_stops(tmp_path: Path, line: bytes, stops: str | None) -> None:
+    asked: list[str] = []
+
+    def stop(reason: str, _by: str) -> Future[StopEvidence]:
+        asked.append(reason)
+        future: Future[StopEvidence] = Future()
+        future.set_result(StopEvidence(confirmed=True, detail="fallen"))
+        return future
+
+    server = StopServer(stop)
+    server.open(tmp_path / "s")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
+        connection.connect(str(tmp_path / "s"))
+        connection.sendall(line)
+        connection.shutdown(socket.SHUT_WR)
+        reply = connection.makefile("rb").readline()
+    server.close()
+    assert asked == ([] if stops is None else [stops])
+    assert bool(reply) is (stops is not None) and (not reply or json.loads(reply)["body"]["confirmed"])
 
 
 def test_a_rig_whose_thread_hangs_is_in_trouble(monkeypatch: pytest.MonkeyPatch) -> None:

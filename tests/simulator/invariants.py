@@ -36,6 +36,7 @@ LONGEST_TEST_S = 6.0
 """What the people of a life ask for at most."""
 REST_S, REST_BETWEEN_TRAINS_S = 1.0, 0.5
 MOST_RISE_UC = 1.0
+MOST_STEP_US = 50.0
 TRAIN_RATE_HZ = 40.0
 LATEST, EARLY = 0.4, 0.1
 """Of a period: what is later than the first is left out; within the second are those that came in time."""
@@ -285,6 +286,20 @@ def recordings_are_whole_and_in_order(life: Life) -> Iterator[str]:
             yield f"{path}: its counter does not rise"
 
 
+def what_is_left_out_makes_no_steeper_rise(life: Life) -> Iterator[str]:
+    """Where the plan rises in small steps, so does what was sent, also over pulses that were left out."""
+    for path, columns in _recordings(life):
+        if path.stem.rpartition("_")[2] in life.people.jumping:
+            continue
+        planned_us, sent_us = columns["pulses/pulse_width_us"], columns["pulses/sent_pulse_width_us"]
+        sent = np.flatnonzero(np.isfinite(sent_us) | (planned_us == 0))
+        sent_us = np.where(planned_us == 0, 0.0, sent_us)
+        for one, other in pairwise(sent):
+            steps_us = np.diff(planned_us[one : other + 1])
+            if np.all(steps_us <= MOST_STEP_US) and not (sent_us[other] - sent_us[one] <= MOST_STEP_US + 1):
+                yield f"{path}: pulse {other + 1} has {sent_us[other]:g} µs, {sent_us[one]:g} µs were felt before"
+
+
 def recordings_hold_every_sample(life: Life) -> Iterator[str]:
     """Where the cell had no fault: none between the first and the last is missing, and the pulses lie among them."""
     if any(words.startswith("device") and not words.startswith(NOT_OF_THE_CELL) for words in life.befallen):
@@ -320,6 +335,7 @@ INVARIANTS: tuple[Callable[[Life], Iterator[str]], ...] = (
     every_test_that_began_is_found,
     every_request_is_answered,
     recordings_are_whole_and_in_order,
+    what_is_left_out_makes_no_steeper_rise,
     recordings_hold_every_sample,
 )
 
@@ -472,7 +488,7 @@ def _recordings(life: Life) -> list[tuple[Path, dict[str, np.ndarray]]]:
 
 _TIMES = "torque/time_s", "pulses/written_time_s"
 _COLUMNS = (
-    *_TIMES, "torque/counter", "torque/torque_nm", "pulses/sent_pulse_width_us",
+    *_TIMES, "torque/counter", "torque/torque_nm", "pulses/pulse_width_us", "pulses/sent_pulse_width_us",
     "pulses/current_ma", "pulses/status",
 )  # fmt: skip
 

@@ -40,6 +40,8 @@ class People:
         self.life, self.clinic, self.chance = life, life.clinic, life.world.chance
         self.saw_one_end = False
         """Whether a test that was started in the quiet time was completed."""
+        self.jumping: set[str] = set()
+        """Tests of widths that say of themselves that they jump on purpose."""
         life.world.after(LOOK_S, self._look)
 
     def _look(self) -> None:
@@ -81,10 +83,10 @@ class People:
 
     def _start_test(self) -> None:
         life, quiet = self.life, self.life.quiet
+        test_id = f"t{self.clinic.tests + 1}"
         profile, segments, rate_hz = life.profile, SEGMENTS, life.rate_hz
         if not quiet and self.chance.random() < 0.15:
-            profile, segments, rate_hz = self._nonsense_of_a_test()
-        test_id = f"t{self.clinic.tests + 1}"
+            profile, segments, rate_hz = self._nonsense_of_a_test(test_id)
         kind, angle = "pre-session", None
         if life.arm:
             kind = "held" if life.arm == "held" else "moving"
@@ -102,7 +104,7 @@ class People:
 
         self.clinic.start(plan, KEY).then = then
 
-    def _nonsense_of_a_test(self) -> tuple[Profile, list[SegmentPlan], float]:
+    def _nonsense_of_a_test(self, test_id: str) -> tuple[Profile, list[SegmentPlan], float]:
         """What a program with a mistake asks for: a list of widths that might pass but for one number, or two."""
         most_us, chance = self.life.profile.max_pulse_width_us, self.chance
         rise_us = chance.choice((1.0, 49.9, 50.0, 50.0000001, 80.0))
@@ -110,6 +112,8 @@ class People:
         if chance.random() < 0.7:
             widths[chance.randrange(len(widths))] = self._nonsense(most_us)
         settings = {"pulse_width_us": widths, "jumps": chance.random() < 0.5}
+        if settings["jumps"]:
+            self.jumping.add(test_id)
         profile, rate_hz = self.life.profile, self.life.rate_hz
         if chance.random() < 0.3:
             field = chance.choice(("current_ma", "max_pulse_width_us", "max_torque_nm"))

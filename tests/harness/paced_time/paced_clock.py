@@ -40,7 +40,7 @@ LOST_NS = 10_000_000_000
 """A conductor that has written nothing for so long has ended: real time goes on."""
 FOR_EVER_NS = 2**62
 
-real_s, real_ns, real_sleep = time.monotonic, time.monotonic_ns, time.sleep
+real_s, real_ns, real_sleep, real_gettime = time.monotonic, time.monotonic_ns, time.sleep, time.clock_gettime
 
 
 class PacedClock:
@@ -101,6 +101,7 @@ class PacedClock:
     def rule(self) -> None:
         """Be the monotonic clock of this process, and what it waits by."""
         time.monotonic, time.sleep = self.now_s, self.sleep
+        time.clock_gettime = lambda clock: self.now_s() if clock == time.CLOCK_BOOTTIME else real_gettime(clock)
         select.select = select_paced
         threading.Condition.wait = wait  # pyright: ignore[reportAttributeAccessIssue]
         threading._time = self.now_s  # pyright: ignore[reportAttributeAccessIssue]
