@@ -60,7 +60,7 @@ LANES = {
 }
 
 CAMPAIGNS = {
-    "make campaigns": "whole grids, of which one of each kind is run here; a hidden patient on the wire",
+    "make campaigns": "whole grids, of which one of each kind is run here",
     "make postgresql": "every test of the service on PostgreSQL, of which nine files are run here",
     "make pauses": "every test while its processes are stopped and continued at random",
     "make late": "the page's tests with answers that come late and in pieces",
