@@ -55,8 +55,9 @@ LANES = {
         tuple(f"tests/api/test_{name}.py" for name in ON_POSTGRESQL),
         ("--postgresql",),
     ),
+    "dear": Lane(f"not wire and not ({FAST})", PROCESSORS + 2),
     # emulated rigs wait most of their time, in a time that waits for whoever is given no processor
-    "dear": Lane(f"not realtime and not ({FAST})", PROCESSORS + 2),
+    "wire": Lane("wire and not realtime", PROCESSORS + 2),
 }
 
 CAMPAIGNS = {
