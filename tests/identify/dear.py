@@ -5,6 +5,7 @@ from __future__ import annotations
 import identify
 from identify.records.record import Record
 from identify.results import Diagnosis, Improvement
+from tests.harness import few_effects
 from tests.harness.made_once import made_once
 from tests.identify import hidden_muscles
 
@@ -23,4 +24,5 @@ def fatigued() -> Record:
 @made_once
 def improved_with_a_delay() -> Improvement:
     """Its fatigue is found; a delay that it hasn't is asked for."""
-    return identify.improve(fatigued(), force=["electromechanical_delay"])
+    with few_effects.only("electromechanical_delay", "fatigue", "potentiation", "recruitment_hysteresis"):
+        return identify.improve(fatigued(), force=["electromechanical_delay"])

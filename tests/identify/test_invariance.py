@@ -17,6 +17,7 @@ from identify import Record, fit
 from identify.diagnosis import diagnose
 from identify.model import Model
 from identify.records.record import Pulses
+from tests.harness import few_effects
 from tests.identify import hidden_muscles
 
 HIDDEN = (
@@ -99,8 +100,9 @@ def answer(hidden: str) -> tuple[str, str, float]:
 
 
 def said(record: Record) -> tuple[str, str, float]:
-    """Verdict, what is named first, and its probability."""
-    result = diagnose(record)
+    """Verdict, what is named first, and its probability; of a library with one effect of each kind."""
+    with few_effects.only(*HIDDEN[1:], "baseline_drift", "mains_hum", "recruitment_hysteresis"):
+        result = diagnose(record)
     first = result.missing[0] if result.missing else {"effect": "", "probability": 0.0}
     return result.verdict, str(first["effect"]), float(first["probability"])
 

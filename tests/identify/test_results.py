@@ -17,6 +17,7 @@ import pytest
 import identify
 from identify.methods import methods
 from identify.shown import Sheet, estimate, fit_words, one_line, probability, quantity, register_plotter
+from tests.harness import few_effects
 from tests.harness.made_once import made_once
 from tests.identify import hidden_muscles
 from tests.identify.dear import fatigued, improved_with_a_delay
@@ -46,10 +47,12 @@ def record():
 @made_once
 def made() -> dict[str, Any]:
     model = identify.fit(fatigued())
+    with few_effects.only("fatigue", "potentiation", "recruitment_hysteresis"):
+        diagnosis = identify.diagnose(fatigued())
     return {
         "model": model,
         "comparison": identify.compare(model, fatigued()),
-        "diagnosis": identify.diagnose(fatigued()),
+        "diagnosis": diagnosis,
         "improvement": improved_with_a_delay(),
     }
 
@@ -106,14 +109,16 @@ def test_nothing_missing_and_nothing_held_out_keep_to_the_schema():
     bare = hidden_muscles.record(seed=13, rate_hz=100, validate=False)
     model = identify.fit(bare)
     assert errors("model", model.to_dict()) == [] == errors("comparison", identify.compare(model, bare).to_dict())
-    found = identify.diagnose(bare)
+    with few_effects.only("fatigue", "output_saturation"):
+        found = identify.diagnose(bare)
     assert found.verdict == "nothing_missing" and errors("diagnosis", found.to_dict()) == []
 
 
 def test_rivals_and_the_test_between_them_keep_to_the_schema(record, monkeypatch):
     """Every effect that was tried is made a rival, so that there is a test to plan."""
     monkeypatch.setattr(import_module("identify.diagnosis.result"), "RIVAL", 0.0)
-    found = identify.diagnose(record)
+    with few_effects.only("fatigue", "potentiation", "threshold_drift"):
+        found = identify.diagnose(record)
     assert found.missing[0]["next_experiment_plan"]["segments"] and errors("diagnosis", found.to_dict()) == []
     assert "cannot separate it from" in str(found) and "next test" in str(found)
 
