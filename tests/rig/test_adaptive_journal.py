@@ -8,9 +8,10 @@ import h5py
 import numpy as np
 import pytest
 
-from rig import assembly, journal
-from rig.errors import JournalError
+from rig import archive, assembly, journal
+from rig.errors import JournalError, RecordingError
 from rig.journal import Kind, LaidBlock
+from rig.signals import PulseStatus
 from tests.rig.adaptive import adaptive, extend, hold, refusals, widths_sent
 
 
@@ -66,14 +67,26 @@ def test_a_journal_cut_anywhere_or_without_a_laid_block_loses_no_pulse(tmp_path:
     rig.at(1.8, lambda: rig.run.score.enough("me", at_once=True))
     rig.execute()
     whole = rig.path.read_bytes()
-    copy = tmp_path / "copy.journal"
-    for end in np.linspace(9000, len(whole), 40).astype(int):
+    copy, acknowledged = tmp_path / "copy.journal", []
+    for end in np.linspace(0, len(whole), 40).astype(int):
         copy.write_bytes(whole[:end])
-        contents = journal.read(copy)
-        columns = assembly.assemble(contents).columns
-        intents = sum(kind == Kind.INTENT for kind, _ in contents.blocks)
+        try:
+            contents = journal.read(copy)
+            recording = assembly.assemble(contents, "fault", "killed")
+        except RecordingError as error:
+            assert end < 9000, error  # header and plan
+            continue
+        columns = recording.columns
+        assert recording.attributes["outcome"] == ("completed" if contents.ended else "fault")
+        told, intents = (sum(kind == of for kind, _ in contents.blocks) for of in (Kind.ACKED, Kind.INTENT))
+        assert np.sum(columns["pulses/status"] == PulseStatus.ACKNOWLEDGED) == told
         assert np.sum(np.nan_to_num(columns["pulses/current_ma"]) > 0) == intents
         assert np.sum(np.nan_to_num(columns["pulses/sent_pulse_width_us"]) > 0) == intents
+        assert np.all(np.isfinite(columns["torque/time_s"]))
+        assert len({len(column) for path, column in columns.items() if path.startswith("pulses/")}) == 1
+        acknowledged.append(told)
+        archive.to_bytes(recording)
+    assert acknowledged == sorted(acknowledged) and acknowledged[-1] > 50
     at = [place for place in range(len(whole)) if whole.startswith(journal.MARK + bytes([Kind.LAID]), place)]
     assert len(at) == 3
     for lost in ([0], [1], [2], [0, 1], [0, 1, 2]):

@@ -82,28 +82,6 @@ def test_a_cell_without_counter_is_counted_or_stamped():
     assert list(cell_time(none, np.array([7.0, 7.5, 8.0, 9.0]), 1000.0)) == [0.0, 0.5, 1.0, 2.0]
 
 
-@pytest.mark.parametrize("ppm", [0.0, 200.0, -200.0])
-@pytest.mark.parametrize("jitter_us", [0.0, 150.0])
-@pytest.mark.parametrize("wired", [True, False])
-def test_within_a_millisecond_whatever_the_clocks_do(ppm: float, jitter_us: float, wired: bool):
-    """Truth is made here: when each sample was really taken, on the host's clock."""
-    rng = np.random.default_rng(int(abs(ppm) + jitter_us) + 7)
-    n, rate = 40 * 1600, 1600.0
-    true_s = 3.7 + np.arange(n) / rate * (1 + ppm * 1e-6) + rng.normal(0, jitter_us * 1e-6, n)
-    batch = np.ceil(true_s / 0.0025) * 0.0025  # handed over in batches, some of them late
-    host_s = np.maximum.accumulate(batch + 0.0003 + rng.exponential(0.0004, n) + (rng.random(n) < 0.001) * 0.02)
-    pulses_s = 4.0 + np.arange(1500) * 0.025 + rng.exponential(0.0001, 1500)
-    sync = np.zeros(n, np.uint8) if wired else np.full(n, 255, np.uint8)
-    if wired:
-        sync[np.searchsorted(true_s, pulses_s)] = 1
-    time_s, found = align(np.arange(n) / rate, host_s, sync, pulses_s, rate)
-    assert found.method == ("sync" if wired else "regression")
-    assert np.max(np.abs(time_s - true_s)) < 1e-3 + 5 * jitter_us * 1e-6  # a jittering sample is off by its jitter
-    assert np.abs(np.mean(time_s - true_s)) < 1e-3
-    assert found.error_ms < 1.0
-    assert found.rate_ppm == pytest.approx(ppm, abs=10)
-
-
 def test_a_clock_that_is_no_line_is_not_called_exact():
     """The cell samples 5 % faster from half-way on: a line misses by far more than its standard error."""
     rate, n = 1600.0, 20 * 1600

@@ -201,9 +201,3 @@ def test_the_day_must_last_as_long_as_the_bound(make: Make):
     with pytest.raises(RefusedError, match="before the end of this test of 15 s"):
         previewed(PreviewRequest(plan=late), live.rig.table, midnight_s - 10.0, live.clock.speed)
     assert live.start(plan(live, profile=day, max_duration_s=30.0), KEY).state == "arming"
-
-
-def test_a_watcher_that_did_not_ask_gets_no_samples(make: Make):
-    event = make().rig.live()
-    assert event is not None
-    assert (event.samples, event.laid, event.laid_segments) == (None, 0, [])

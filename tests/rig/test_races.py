@@ -99,16 +99,6 @@ def test_a_stop_at_each_moment_of_a_start(make: Make):
     assert outcomes == {LatchedError, None}
 
 
-def test_a_stop_that_comes_while_the_computer_stands_still_counts_before_the_pulse_that_is_due_by_then(make: Make):
-    live = make()
-    live.start(live.plan("one", hold_s=20.0))
-    live.wait_pulses(5)
-    live.machine.wait(0.02)
-    live.clock.advance(0.008)
-    assert live.stop("now").confirmed
-    assert len(live.stimulator.sent) == 5
-
-
 def test_a_lost_device_at_each_moment_of_a_start(make: Make):
     for live, task in moments(make, begin_test, playing):
         sent = len(live.stimulator.sent)
@@ -203,22 +193,6 @@ def test_a_start_that_was_asked_while_stopped_is_not_played_once_rearmed(make: M
         live.machine.wait(4.0)
         assert live.states[-1] == "ready"
         assert live.stimulator.sent == []
-
-
-def test_two_stops_at_once_at_each_moment_of_the_first(make: Make):
-    """Both get the evidence."""
-
-    def begin(live: LiveRig) -> Coroutine[Any, Any, Any]:
-        live.start(live.plan("one", hold_s=20.0))
-        live.wait_pulses(5)
-        return live.rig.stop("now", "nurse")
-
-    for live, task in moments(make, begin, lambda live: live.states[-1] == "latched"):
-        sent = len(live.stimulator.sent)
-        assert live.stop("too").confirmed
-        live.until(task.done.is_set)
-        assert task.result.confirmed
-        is_stopped(live, task, sent)
 
 
 def test_a_stop_at_each_moment_of_a_calibration_and_its_train(make: Make):
