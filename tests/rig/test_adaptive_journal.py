@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 
@@ -44,20 +43,6 @@ def test_a_disk_that_takes_no_segment_ends_it_as_a_fault(tmp_path: Path):
     with pytest.raises(JournalError):
         extend(rig, 20, [hold()])
     assert len(rig.run.score.laid) == 20
-
-
-def test_the_sealed_file_holds_the_true_sequence(tmp_path: Path):
-    rig = adaptive(tmp_path)
-    rig.at(0.2, lambda: extend(rig, 20, [hold("added")]))
-    rig.at(1.0, lambda: rig.run.score.enough("me", at_once=True))
-    rig.execute()
-    with h5py.File(rig.seal().path) as file:
-        assert list(file["segments/name"].asstr()[:]) == ["rest", "added", "rest"]
-        assert (file.attrs["adaptive"], file.attrs["ended_by"]) == (1, "enough")
-        assert file["segments/end_s"][1] == file["segments/start_s"][2]
-        sent, planned = file["pulses/sent_pulse_width_us"][:], file["pulses/pulse_width_us"][:]
-        assert np.array_equal(sent, planned)
-        assert np.count_nonzero(sent) == len(rig.stimulator.sent)
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ from rig.clock import utc_text
 from rig.control.calibration import Calibration, check_profile, end_of_day_s
 from rig.errors import PlanError, RefusedError
 from rig.limits import HARD_LIMITS, Steps
-from rig.messages import CalibrateStartRequest, FinishedEvent, Profile, SegmentPlan, TestPlan
+from rig.messages import CalibrateStartRequest, FinishedEvent, Profile
 
 NOON_S = datetime(2026, 3, 4, 12, tzinfo=UTC).timestamp()
 
@@ -220,22 +220,6 @@ def test_no_test_without_a_calibration_where_the_rig_asks_for_one():
     check_profile(Profile(), NOON_S, required=False)
     with pytest.raises(RefusedError, match="not calibrated"):
         check_profile(Profile(), NOON_S, required=True)
-
-
-def test_a_sequence_never_exceeds_the_comfort_maximum():
-    calibrated = profile()
-    table = limits.for_profile(HARD_LIMITS, calibrated)
-    request = calibrated_plan(calibrated)
-    assert plan.build(request, table).pulse_width_us.max() == 180.0
-    wide = request.model_copy(
-        update={"segments": [SegmentPlan(name="r", sequence="ramp", settings={"max_pulse_width_us": 181})]}
-    )
-    with pytest.raises(RefusedError, match="participant's profile, over by"):
-        plan.build(wide, table)
-
-
-def calibrated_plan(of: Profile) -> Any:
-    return TestPlan(test_id="t", participant="P01", profile=of)
 
 
 @pytest.mark.parametrize("hours", [0, 1, 11.99, 12, 23.9])

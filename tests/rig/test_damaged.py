@@ -74,7 +74,7 @@ def test_one_flipped_bit_anywhere_loses_no_pulse(tmp_path: Path, played: tuple[b
     rng = np.random.default_rng(9)
     spacer = blocks_of(data, Kind.SPACER)[0]
     copies = [*range(spacer), *range(spacer + journal.APART_BYTES, blocks_of(data, Kind.START)[0])]
-    places = {*rng.choice(copies, 150).tolist(), *rng.integers(len(data), size=250).tolist(), *range(24)}
+    places = {*rng.choice(copies, 50).tolist(), *rng.integers(len(data), size=80).tolist(), *range(24)}
     for at in sorted(places):
         spoiled = bytearray(data)
         spoiled[at] ^= 1 << int(rng.integers(8))

@@ -15,7 +15,7 @@ from rig import journal as jn
 from rig.clock import utc_text
 from rig.control.building import previewed
 from rig.control.calibration import end_of_day_s
-from rig.errors import BusyError, PlanError, RefusedError, TooLateError
+from rig.errors import PlanError, RefusedError, TooLateError
 from rig.messages import (
     AdaptivePlan,
     EnoughRequest,
@@ -159,17 +159,6 @@ def test_a_fixed_test_and_a_calibration_are_not_extended(make: Make):
     for ask in (lambda: extend(live, 840), lambda: live.ask(live.rig.enough(EnoughRequest(test_id="one")))):
         with pytest.raises(PlanError, match="fixed plan"):
             ask()
-
-
-def test_many_at_the_same_time_lay_one(make: Make):
-    live = make()
-    live.start(plan(live, hold_s=20.0), KEY)
-    asked = [live.begin(live.rig.extend(request())) for _ in range(16)]
-    live.until(lambda: all(one.done.is_set() for one in asked))
-    errors = [one.error for one in asked if one.error is not None]
-    assert len(errors) == 15
-    assert {type(error) for error in errors} <= {TooLateError, BusyError}
-    assert laid(live) == 44
 
 
 def test_the_rest_between_tests_is_counted_to_the_first_pulse_that_may_come(make: Make):

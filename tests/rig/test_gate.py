@@ -74,18 +74,6 @@ def test_an_intent_that_cannot_be_written_sends_nothing(tmp_path: Path):
     assert setup.stimulator.sent == []
 
 
-def test_too_close_and_too_late_pulses_are_not_sent(tmp_path: Path):
-    setup = Setup(tmp_path)
-    assert setup.fire(100) == PulseStatus.UNACKNOWLEDGED
-    setup.wait(0.005)
-    assert setup.fire(100) == PulseStatus.DROPPED
-    setup.wait(0.02)
-    assert setup.fire(100, latest_s=setup.clock.now_s() - 0.001) == PulseStatus.DROPPED
-    assert setup.fire(100, latest_s=math.nan) == PulseStatus.DROPPED
-    assert len(setup.stimulator.sent) == 1
-    assert setup.gate.dropped == 3
-
-
 def test_one_pulse_at_most_is_on_its_way(tmp_path: Path):
     """A line that holds what it is given may hold one pulse, and lets go a burst of one."""
     setup = Setup(tmp_path)
@@ -140,7 +128,7 @@ def test_a_stop_settles_what_was_on_its_way_and_says_so_until_then(tmp_path: Pat
     assert setup.gate.last_pulse_s == setup.clock.now_s()
 
 
-@settings(max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
+@settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 @given(st.lists(st.tuples(st.floats(), st.floats(), st.floats(0, 0.1)), max_size=15))
 def test_whatever_is_asked_nothing_outside_reaches_the_device(tmp_path: Path, asked: list[tuple[float, float, float]]):
     setup = Setup(tmp_path, max_pulse_width_us=250.0)

@@ -114,11 +114,13 @@ def assert_agrees(batches: list[Batch], recording: assembly.Recording, t0_s: flo
 
 
 @pytest.mark.parametrize(
-    ("ppm", "cell"),
-    [(0.0, {}), (200.0, {}), (-200.0, {"sync": False}), (30.0, {"counter": False}), (2000.0, {})],
+    ("ppm", "cell", "rest_s"),
+    [
+        (0.0, {}, 0.6), (200.0, {}, 4.0), (-200.0, {"sync": False}, 0.6), (30.0, {"counter": False}, 4.0),
+        (2000.0, {}, 0.6),
+    ],
     ids=["exact", "slow", "no-sync", "no-counter", "far-off"],
-)
-@pytest.mark.parametrize("rest_s", [0.6, 4.0])
+)  # fmt: skip
 def test_it_agrees_with_the_recording(tmp_path: Path, ppm: float, cell: dict[str, bool], rest_s: float):
     source = tmp_path / "t.journal"
     write_journal(source, 3, rest_s, 14.0, ppm, **cell)

@@ -43,12 +43,14 @@ def test_a_short_test_of_a_cell_with_another_rate_is_a_fault(tmp_path: Path, rat
     ("rate", "outcome"), [(0.95, "fault"), (1.05, "fault"), (1.0, "completed"), (1.01, "completed")]
 )
 def test_a_restless_host_hides_no_rate_and_is_not_taken_for_one(tmp_path: Path, rate: float, outcome: str):
-    rig = VirtualRig(tmp_path, hold(12.0))
+    rig = VirtualRig(tmp_path, hold(8.0))
     rig.cell.rate = rate
     restless(rig)
+    began_s = rig.clock.now_s()
     result = rig.execute()
     assert result.outcome == outcome, result.reason
     assert ("samples/s arrive" in result.reason) == (outcome == "fault")
+    assert (rig.stimulator.sent[-1][0] - began_s < 4.5) == (outcome == "fault")
 
 
 def test_a_rig_that_runs_faster_than_the_world_still_sees_half_a_rate(tmp_path: Path):
@@ -73,8 +75,7 @@ def heard(arrival_s: list[float], size: int = 16) -> list[str | None]:
 
 
 @pytest.mark.parametrize("rate", [1.0, 1.05])
-@pytest.mark.parametrize("still_s", [0.07, 0.3, 2.0])
-@pytest.mark.parametrize("began_s", [0.0, 1.0, 2.9, 3.5])
+@pytest.mark.parametrize(("began_s", "still_s"), [(0.0, 0.3), (1.0, 2.0), (2.9, 0.3), (2.9, 2.0), (3.5, 0.07)])
 def test_what_piled_up_while_the_host_stood_still_is_no_rate(began_s: float, still_s: float, rate: float):
     before_s = [i * 0.01 for i in range(int(began_s * 100))]
     piled = int(still_s * 100 * 1.25)
@@ -85,8 +86,10 @@ def test_what_piled_up_while_the_host_stood_still_is_no_rate(began_s: float, sti
     assert all(float(words.split()[2]) == pytest.approx(1600 * rate, rel=0.01) for words in told), told
 
 
-@pytest.mark.parametrize("every_s", [0.5, 1.5, 3.5])
-@pytest.mark.parametrize("rate", [0.5, 0.95, 1.0, 1.05, 2.0])
+@pytest.mark.parametrize(
+    ("rate", "every_s"),
+    [(0.5, 1.5), (0.95, 0.5), (0.95, 3.5), (1.0, 0.5), (1.0, 1.5), (1.0, 3.5), (1.05, 1.5), (2.0, 3.5)],
+)
 def test_holes_again_and_again_hide_no_rate(rate: float, every_s: float):
     due_s = [i * 0.01 / rate for i in range(int(1200 * rate))]
     held_s = [max(t_s, every_s * (t_s // every_s) + 0.07) for t_s in due_s]  # then all at once
@@ -117,8 +120,7 @@ def test_a_rate_that_is_another_altogether_is_told_at_the_end_of_a_short_test(ra
     assert float(told.split()[2]) == pytest.approx(1600 * rate, rel=0.01)
 
 
-@pytest.mark.parametrize("every_s", [1.5, 3.5, 100.0])
-@pytest.mark.parametrize("rate", [0.5, 0.94, 1.06])
+@pytest.mark.parametrize(("rate", "every_s"), [(0.5, 3.5), (0.94, 1.5), (0.94, 100.0), (1.06, 3.5)])
 def test_a_rate_that_changes_in_the_test_is_told(rate: float, every_s: float):
     due_s = [i * 0.01 for i in range(800)] + [8.0 + i * 0.01 / rate for i in range(500)]
     held_s = [max(t_s, every_s * (t_s // every_s) + 0.07) for t_s in due_s]

@@ -57,6 +57,7 @@ def test_the_sealed_file_holds_what_was_played(tmp_path: Path):
         assert len(time_s) == pytest.approx(rig.test.duration_s * 1600, abs=12)
         assert time_s[0] < 0.01
         assert np.diff(time_s) == pytest.approx(1 / 1600)
+        assert "angle" not in file
         assert list(file["segments/name"].asstr()[:]) == ["rest", "ramp", "rest"]
         assert list(file["segments/start_s"][:]) == [0.0, 0.5, 2.5]
         assert list(file["segments/end_s"][:]) == [0.5, 2.5, 3.0]

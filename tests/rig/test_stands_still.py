@@ -22,7 +22,7 @@ def rig_with_noise(folder: Path, on_s: float, repeats: int = 1, ceiling_nm: floa
 
 @pytest.mark.parametrize("sign", [1, -1])  # a cell may be mounted the other way round
 def test_a_cell_at_its_ceiling_in_each_hold_goes_on_to_the_end(tmp_path: Path, sign: int):
-    rig = rig_with_noise(tmp_path, on_s=2.5, repeats=3)
+    rig = rig_with_noise(tmp_path, on_s=2.5, repeats=2)
     rig.cell.sign = sign
     result = rig.execute()
     assert result.outcome == "completed", result.reason
@@ -38,7 +38,7 @@ def test_a_cell_that_stays_at_its_ceiling_ends_the_test_within_3_s(tmp_path: Pat
 
 
 def test_a_cell_that_dies_at_its_ceiling_ends_the_test_within_3_s(tmp_path: Path):
-    rig = rig_with_noise(tmp_path, on_s=1.5, repeats=10)
+    rig = rig_with_noise(tmp_path, on_s=1.5, repeats=4)
     rig.at(3.7, lambda: setattr(rig.cell, "frozen", True))
     assert rig.execute().outcome == "fault"
     assert rig.stimulator.sent[-1][0] - rig.stimulator.sent[0][0] < 3.7 + 3.1
@@ -46,7 +46,7 @@ def test_a_cell_that_dies_at_its_ceiling_ends_the_test_within_3_s(tmp_path: Path
 
 @pytest.mark.parametrize("at_s", [0.1, 0.9, 3.05])  # rising, high, and falling
 def test_a_cell_that_dies_anywhere_else_ends_the_test_within_half_a_second(tmp_path: Path, at_s: float):
-    rig = rig_with_noise(tmp_path, on_s=2.0, repeats=10, ceiling_nm=20.0)
+    rig = rig_with_noise(tmp_path, on_s=2.0, repeats=2, ceiling_nm=20.0)
     rig.at(at_s, lambda: setattr(rig.cell, "frozen", True))
     result = rig.execute()
     assert result.outcome == "fault"
