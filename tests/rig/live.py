@@ -16,10 +16,10 @@ from rig.control import pair
 from rig.control.rig import Rig
 from rig.errors import DeviceError
 from rig.machine import Disk
-from rig.messages import Event, Profile, SegmentPlan, Status, StopEvidence, TestPlan
+from rig.messages import Event, Profile, Status, StopEvidence, TestPlan
 from rig.signals import SAMPLE, TorqueBlock
 from rig.tasks import Outcome, Task, Tasks
-from tests.rig.fakes import RATE_HZ, FakeStimulator
+from tests.rig.fakes import RATE_HZ, FakeStimulator, hold, rest
 from tests.simulator.virtual_time import VirtualClock, VirtualMachine
 
 T = TypeVar("T")
@@ -102,7 +102,6 @@ class LiveCell:
     def __init__(self, clock: VirtualClock, stimulator: LiveStimulator) -> None:
         self.clock, self.stimulator = clock, stimulator
         self.silent = self.gone = self.broken = self.stuck = False
-        self.rate = 1.0
         self._rng = np.random.default_rng(1)
         self._began_s = clock.now_s()
         self._count = 0
@@ -130,7 +129,7 @@ class LiveCell:
 
     def _samples(self) -> np.ndarray:
         now_s = self.clock.now_s()
-        due = int((now_s - self._began_s) * RATE_HZ * self.rate)
+        due = int((now_s - self._began_s) * RATE_HZ)
         samples = np.zeros(0 if self.silent else due - self._count, SAMPLE)
         samples["host_time_s"], samples["stamp_s"], samples["sync"] = now_s, np.nan, 255
         recent = [pulse for time_s, pulse in self.stimulator.sent[-2:] if now_s - time_s < 0.1]
@@ -161,7 +160,6 @@ class LiveRig:
         self,
         folder: Path,
         monkeypatch: pytest.MonkeyPatch,
-        rate: float = 1.0,
         armed: bool = False,
         clock: VirtualClock | None = None,
         disk: Disk | None = None,
@@ -172,7 +170,7 @@ class LiveRig:
         self.machine = LiveMachine(self.clock, disk)
         self.stimulator = LiveStimulator(self.machine)
         self.cell = LiveCell(self.clock, self.stimulator)
-        self.cell.rate, self.stimulator.armed = rate, armed
+        self.stimulator.armed = armed
         made = self.devices()
         found = SimpleNamespace(find=lambda kind, _: SimpleNamespace(create=lambda _settings, _machine: made[kind]))
         monkeypatch.setattr(pair, "devices", found)
@@ -209,10 +207,7 @@ class LiveRig:
         self.ask(self.rig.close())
 
     def plan(self, test_id: str, hold_s: float = 2.0, **fields: Any) -> TestPlan:
-        segments = [
-            SegmentPlan(name="rest", sequence="rest", settings={"duration_s": 0.5}),
-            SegmentPlan(name="hold", sequence="steps", settings={"on_s": hold_s, "off_s": 0.5, "repeats": 1}),
-        ]
+        segments = [rest(0.5), hold(on_s=hold_s, off_s=0.5)]
         return TestPlan(
             **{"test_id": test_id, "participant": "P", "profile": Profile(), "segments": segments, **fields}
         )

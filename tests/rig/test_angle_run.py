@@ -16,13 +16,13 @@ from rig.acquire.angle_check import outside
 from rig.acquire.angle_guard import check_start
 from rig.control.sealing import warnings
 from rig.errors import DeviceError, PlanError, RefusedError
-from rig.messages import AdaptivePlan, AnglePlan, SegmentPlan
+from rig.messages import AdaptivePlan, AnglePlan
 from rig.signals import Pulse, PulseStatus
 from tests.rig.adaptive import extend, refusals
-from tests.rig.fakes import VirtualRig
+from tests.rig.fakes import VirtualRig, hold, rest
 
 RANGE = (math.radians(20), math.radians(120))
-REST = [SegmentPlan(name="rest", sequence="rest", settings={"duration_s": 5.0})]
+REST = [rest(5.0)]
 HELD = AnglePlan(range_rad=RANGE, target_rad=math.radians(60))
 
 
@@ -151,9 +151,7 @@ def test_a_held_test_may_stand_still(tmp_path: Path):
 
 @pytest.mark.parametrize("rate", [0.8, 1.2])
 def test_another_rate_than_the_rig_files_ends_the_test(tmp_path: Path, rate: float):
-    rig = held(
-        tmp_path, segments=[*REST, SegmentPlan(name="s", sequence="steps", settings={"on_s": 4.0, "off_s": 1.0})]
-    )
+    rig = held(tmp_path, segments=[*REST, hold(on_s=4.0)])
     rig.sensor.rate = rate
     result = rig.execute()
     assert result.outcome == "fault" and result.reason.startswith("angle sensor: ")
@@ -176,14 +174,14 @@ def test_no_pulse_comes_through_a_passive_test(tmp_path: Path):
 
 def test_enough_ends_a_passive_test_well_and_no_pulse_can_be_added(tmp_path: Path):
     bounds = AdaptivePlan(max_duration_s=60.0, max_torque_time_nms=10.0)
-    rest = [SegmentPlan(name="passive", sequence="rest", settings={"duration_s": 30.0})]
     plan = AnglePlan(range_rad=RANGE)
-    rig = VirtualRig(tmp_path, rest, kind="passive", angle=plan, has_sensor=True, adaptive=bounds)
-    steps = SegmentPlan(name="s", sequence="steps", settings={"max_pulse_width_us": 50.0, "on_s": 1.0, "off_s": 0.0})
+    rig = VirtualRig(tmp_path, [rest(30.0)], kind="passive", angle=plan, has_sensor=True, adaptive=bounds)
     refused: list[str] = []
 
     def add() -> None:
-        refused.extend(map(str, refusals(lambda: extend(rig, len(rig.run.score.laid), [steps]))))
+        refused.extend(
+            map(str, refusals(lambda: extend(rig, len(rig.run.score.laid), [hold(max_pulse_width_us=50.0)])))
+        )
 
     rig.at(1.31, add)
     rig.at(3.01, lambda: rig.run.score.enough("nurse", at_once=True))

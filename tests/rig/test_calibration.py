@@ -139,22 +139,6 @@ def test_what_a_coarse_stimulator_would_not_send_is_no_train():
         calibration.next_width_us("down")
 
 
-def test_what_each_step_would_send_is_told_before():
-    """So that a button can say it: the width that the device sends, and none where the step would be refused."""
-    request = CalibrateStartRequest(
-        calibration_id="c1", participant="P01", by="therapist", step_us=10.5, max_pulse_width_us=45.0
-    )
-    calibration = Calibration(request, HARD_LIMITS, NOON_S, Steps(shortest_us=20.0))
-    assert calibration.status().next_us == {"up": 20.0, "fine": 20.0}
-    play(calibration, "up")
-    assert calibration.status().next_us == {"up": 30.0, "fine": 30.0, "repeat": 20.0}
-    play(calibration, "up", "up")
-    assert calibration.status().next_us == {"repeat": 40.0, "down": 29.0}
-    calibration.mark("comfort")
-    play(calibration, "down")
-    assert calibration.status().next_us == {"up": 39.0, "fine": 39.0, "repeat": 29.0}
-
-
 def test_midnight_ends_an_open_calibration_and_says_so():
     calibration = opened()
     for threshold in ("sensory", "motor", "comfort"):

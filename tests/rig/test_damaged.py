@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import h5py
@@ -209,5 +207,5 @@ def test_the_verb_gives_one_line_and_an_exit_code(
         assert told.out == ""
         assert told.err.startswith("stimrig recover: journal ")
         assert len(told.err.splitlines()) == 1
-    ended = subprocess.run([sys.executable, "-m", "rig.recover"], cwd=ROOT, capture_output=True, text=True)
-    assert ended.returncode == 2
+    with pytest.raises(SystemExit, match="2"):
+        recover.main([])

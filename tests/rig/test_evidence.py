@@ -13,7 +13,7 @@ from rig.acquire.evidence import DECAY_S, NO_SIGNAL, SILENT_S, watch_decay
 from rig.acquire.receiver import Receiver
 from rig.messages import SegmentPlan
 from rig.signals import TorqueBlock
-from tests.rig.fakes import FakeCell, VirtualRig
+from tests.rig.fakes import FakeCell, VirtualRig, rest
 from tests.simulator.virtual_time import VirtualMachine
 
 
@@ -127,9 +127,8 @@ class Starved(FakeCell):
 @pytest.mark.slow
 def test_a_reader_that_fell_behind_confirms_no_stop_by_torque_from_before_the_first_pulse(tmp_path: Path):
     """The run is stopped because samples arrive at half the rate; their torque is still that of the rest."""
-    rest = SegmentPlan(name="rest", sequence="rest", settings={"duration_s": 2.0})
     ramp = SegmentPlan(name="ramp", sequence="ramp", settings={"up_s": 1.0, "down_s": 4.0})
-    rig = VirtualRig(tmp_path, [rest, ramp])
+    rig = VirtualRig(tmp_path, [rest(2.0), ramp])
     rig.cell.__class__ = Starved
     rig.at(0.0, lambda: setattr(rig.cell, "share", 0.5))
     result = rig.execute()

@@ -28,7 +28,7 @@ from rig.messages import (
     TestPlan,
 )  # fmt: skip
 from rig.signals import PulseStatus
-from tests.rig.fakes import VirtualRig
+from tests.rig.fakes import VirtualRig, hold, rest
 from tests.rig.live import LiveRig
 
 KEY = "0123456789abcdef"
@@ -41,7 +41,7 @@ def plan(live: LiveRig, test_id: str = "one", max_duration_s: float = 60.0, **fi
 
 
 def added(on_s: float = 0.5) -> list[SegmentPlan]:
-    return [SegmentPlan(name="added", sequence="steps", settings={"on_s": on_s, "off_s": 0.1, "repeats": 1})]
+    return [hold("added", on_s, off_s=0.1)]
 
 
 def laid(live: LiveRig) -> int:
@@ -87,8 +87,7 @@ def test_from_start_to_sealed_file_with_one_that_extends_and_says_enough(make: M
 
 
 def test_what_the_muscle_did_not_feel_is_known_by_its_index(tmp_path: Path):
-    hold = SegmentPlan(name="hold", sequence="steps", settings={"on_s": 1.0, "off_s": 0.0, "repeats": 1})
-    rig = VirtualRig(tmp_path, [hold])
+    rig = VirtualRig(tmp_path, [hold()])
     rig.stimulator.ack_delay_s = 0.06  # the two pulses that come due meanwhile are dropped
     assert rig.execute().outcome == "completed"
     skipped = [jn.SKIPPED.unpack(p) for kind, p in jn.read(rig.path).blocks if kind == jn.Kind.SKIPPED]
@@ -167,7 +166,7 @@ def test_the_rest_between_tests_is_counted_to_the_first_pulse_that_may_come(make
     live.start(live.plan("before", hold_s=0.5))
     live.wait("ready")
     rested = Profile(rest_between_tests_s=30.0)
-    quiet = [SegmentPlan(name="rest", sequence="rest", settings={"duration_s": seconds}) for seconds in (0.5, 60.0)]
+    quiet = [rest(0.5), rest(60.0)]
     assert live.start(live.plan("fixed", profile=rested, segments=[*quiet, *added()])).state == "arming"
     live.stop("that was only to show it")
     live.wait("latched")

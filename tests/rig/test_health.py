@@ -8,8 +8,7 @@ import pytest
 
 from rig.acquire.health import DEFAULT_WATCH, SYNC_PERIOD_S
 from rig.adapters.files import Files
-from rig.messages import SegmentPlan
-from tests.rig.fakes import VirtualRig, slow_work
+from tests.rig.fakes import VirtualRig, hold, rest, slow_work
 
 FAULTS = {
     "disk slow": ("too slow", DEFAULT_WATCH.stale_disk_s + 0.03),
@@ -18,11 +17,10 @@ FAULTS = {
     "sender": ("blocked", 0.03),
 }
 """What is told, and within how many seconds nothing is fed or sent any more; other faults: test_run.py."""
-REST = [SegmentPlan(name="rest", sequence="rest", settings={"duration_s": 3.0})]
 
 
 def test_through_a_rest_the_device_is_fed_at_every_pulses_time(tmp_path: Path):
-    rig = VirtualRig(tmp_path, REST)
+    rig = VirtualRig(tmp_path, [rest(3.0)])
     assert rig.execute().outcome == "completed"
     assert rig.stimulator.sent == []
     assert len(rig.stimulator.fed_s) == 120
@@ -44,8 +42,7 @@ class Failing(Files):
 @pytest.mark.parametrize("fault", FAULTS)
 def test_without_a_proof_nothing_is_fed(tmp_path: Path, fault: str):
     words, within_s = FAULTS[fault]
-    hold = [SegmentPlan(name="hold", sequence="steps", settings={"on_s": 6.0, "off_s": 0.0, "repeats": 1})]
-    rig = VirtualRig(tmp_path, hold)
+    rig = VirtualRig(tmp_path, [hold(on_s=6.0)])
     rig.machine.disk = disk = Failing()
     rig.cell.noise_nm = 0.01
     at: list[float] = []

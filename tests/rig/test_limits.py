@@ -167,6 +167,7 @@ def test_a_bound_that_leaves_nothing_is_refused_and_says_what_would_do():
     assert {name: row.owner for name, row in narrowed.items() if row != HARD_LIMITS[name]} == dict.fromkeys(
         ("pulse_width_us", "current_ma", "torque_nm", "rest_between_tests_s"), "participant's profile"
     )
+    assert (narrowed["current_ma"].hi, narrowed["torque_nm"].lo, narrowed["torque_nm"].hi) == (15, -9, 9)
     gentle = limits.for_plan(HARD_LIMITS, request(Profile(max_torque_nm=0.9), max_torque_nm=0.8))
     assert (gentle["torque_nm"].lo, gentle["torque_nm"].hi) == (-0.8, 0.8)
 

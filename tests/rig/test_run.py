@@ -19,7 +19,7 @@ from rig.errors import WireError
 from rig.messages import SegmentPlan
 from rig.signals import Ack, Pulse, PulseStatus
 from rig.tasks import Task
-from tests.rig.fakes import VirtualRig, void
+from tests.rig.fakes import VirtualRig, hold, void
 from tests.simulator.disk import SimulatedDisk
 from tests.simulator.host import Computer, Process
 from tests.simulator.wires import SimulatedPort, Wires
@@ -181,8 +181,7 @@ def test_every_fault_stops_the_test(tmp_path: Path, name: str):
 
 
 def test_a_stop_is_confirmed_by_the_torque_falling(tmp_path: Path):
-    hold = [SegmentPlan(name="hold", sequence="steps", settings={"on_s": 3.0, "off_s": 0.0})]
-    rig = VirtualRig(tmp_path, hold)
+    rig = VirtualRig(tmp_path, [hold(on_s=3.0)])
     rig.at(1.5, lambda: rig.halt.set("stopped", "enough"))
     result = rig.execute()
     assert (result.outcome, result.reason) == ("stopped", "enough")
@@ -202,8 +201,7 @@ def test_a_reason_that_no_file_can_hold_leaves_no_test_unsealed(tmp_path: Path, 
 
 
 def test_a_stop_among_the_first_pulses_says_no_more_than_the_torque_does(tmp_path: Path):
-    hold = [SegmentPlan(name="hold", sequence="steps", settings={"on_s": 3.0, "off_s": 0.0})]
-    rig = VirtualRig(tmp_path, hold)
+    rig = VirtualRig(tmp_path, [hold(on_s=3.0)])
     rig.at(0.003, lambda: rig.halt.set("stopped", "enough"))
     result = rig.execute()
     assert result.evidence.confirmed
@@ -212,12 +210,11 @@ def test_a_stop_among_the_first_pulses_says_no_more_than_the_torque_does(tmp_pat
 
 
 def test_a_stop_without_effect_is_not_called_confirmed(tmp_path: Path):
-    hold = [SegmentPlan(name="hold", sequence="steps", settings={"on_s": 3.0, "off_s": 0.0})]
-    rig = VirtualRig(tmp_path, hold)
+    rig = VirtualRig(tmp_path, [hold(on_s=3.0)])
     rig.at(1.5, lambda: (setattr(rig.cell, "add_nm", 10.0), rig.halt.set("stopped", "enough")))
     assert not rig.execute().evidence.confirmed
     (tmp_path / "2").mkdir()
-    rig = VirtualRig(tmp_path / "2", hold)
+    rig = VirtualRig(tmp_path / "2", [hold(on_s=3.0)])
     rig.at(1.5, lambda: (setattr(rig.stimulator, "silent", True), rig.halt.set("stopped", "enough")))
     result = rig.execute()
     assert not result.evidence.confirmed
@@ -239,8 +236,7 @@ def test_no_torque_no_test(tmp_path: Path):
 
 @pytest.mark.parametrize(("held_s", "confirmed"), [(0.2, True), (0.6, False)])
 def test_a_stop_waits_for_the_torque_of_a_host_that_paused(tmp_path: Path, held_s: float, confirmed: bool):
-    hold = [SegmentPlan(name="hold", sequence="steps", settings={"on_s": 3.0, "off_s": 0.0})]
-    rig = VirtualRig(tmp_path, hold)
+    rig = VirtualRig(tmp_path, [hold(on_s=3.0)])
     rig.at(1.5, lambda: rig.halt.set("stopped", "enough"))
     rig.cell.held = lambda now_s: 0.0 < now_s - rig.halt.time_s < held_s if rig.halt.cause else False
     result = rig.execute()

@@ -6,16 +6,14 @@ from pathlib import Path
 
 import pytest
 
-from rig.messages import SegmentPlan
-from tests.rig.fakes import VirtualRig
+from tests.rig.fakes import VirtualRig, hold, rest
 
 pytestmark = pytest.mark.slow
 
 
 def rig_with_noise(folder: Path, on_s: float, repeats: int = 1, ceiling_nm: float = 5.0) -> VirtualRig:
     """Torque rises to 6 N·m in each hold, above the ceiling."""
-    settings = {"on_s": on_s, "off_s": 1.0, "repeats": repeats}
-    rig = VirtualRig(folder, [SegmentPlan(name="hold", sequence="steps", settings=settings)])
+    rig = VirtualRig(folder, [hold(on_s=on_s, off_s=1.0, repeats=repeats)])
     rig.cell.noise_nm, rig.cell.ceiling_nm = 0.04, ceiling_nm
     return rig
 
@@ -58,9 +56,7 @@ def test_a_cell_that_dies_anywhere_else_ends_the_test_within_half_a_second(tmp_p
 @pytest.mark.parametrize("at_s", [0.3, 4.9])  # before the first pulse, and in a later rest
 def test_a_coarse_cell_that_dies_at_rest_is_not_taken_for_one_at_its_end(tmp_path: Path, at_s: float):
     """Of a coarse converter's few codes at rest the least one comes again and again."""
-    settings = {"on_s": 2.0, "off_s": 2.0, "repeats": 3}
-    rest = SegmentPlan(name="rest", sequence="rest", settings={"duration_s": 1.0})
-    rig = VirtualRig(tmp_path, [rest, SegmentPlan(name="hold", sequence="steps", settings=settings)])
+    rig = VirtualRig(tmp_path, [rest(1.0), hold(on_s=2.0, off_s=2.0, repeats=3)])
     rig.cell.noise_nm, rig.cell.step_nm = 0.03, 0.1
 
     def die() -> None:
